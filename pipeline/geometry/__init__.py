@@ -1,0 +1,1 @@
+"""Rotations, rigid motions, covariances, cameras and trajectories. Arrays in, arrays out."""

@@ -1,0 +1,61 @@
+"""Pinhole cameras. The centre of the first pixel is (0, 0); x right, y down, z forward."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """Intrinsics in pixels of an undistorted camera; cx, cy count from the centre of the first pixel."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def matrix(self) -> NDArray[np.float64]:
+        """K [3, 3]."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def halved(self) -> "PinholeCamera":
+        """The camera of the image in which each 2x2 block became one pixel (a last odd row or column is cut)."""
+        return PinholeCamera(
+            self.width // 2,
+            self.height // 2,
+            self.fx / 2,
+            self.fy / 2,
+            (self.cx + 0.5) / 2 - 0.5,
+            (self.cy + 0.5) / 2 - 0.5,
+        )
+
+    def scaled(self, width: int, height: int) -> "PinholeCamera":
+        """The camera of the same view resampled to another size in pixels."""
+        sx, sy = width / self.width, height / self.height
+        return PinholeCamera(
+            width,
+            height,
+            self.fx * sx,
+            self.fy * sy,
+            (self.cx + 0.5) * sx - 0.5,
+            (self.cy + 0.5) * sy - 0.5,
+        )
+
+    def rays(self) -> NDArray[np.float64]:
+        """Ray of every pixel with z = 1, camera frame, [height, width, 3]."""
+        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)], axis=-1)
+
+    def project(self, points_camera: ArrayLike) -> NDArray[np.float64]:
+        """Pixels [..., 2] of points [..., 3] with z > 0 in the camera frame."""
+        p = np.asarray(points_camera, dtype=np.float64)
+        return np.stack(
+            [self.fx * p[..., 0] / p[..., 2] + self.cx, self.fy * p[..., 1] / p[..., 2] + self.cy], axis=-1
+        )
+
+    def back_project(self, depth_m: ArrayLike) -> NDArray[np.float64]:
+        """Points [height, width, 3] in the camera frame of a depth image [height, width] (z, not range)."""
+        return self.rays() * np.asarray(depth_m, dtype=np.float64)[..., None]

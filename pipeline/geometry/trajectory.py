@@ -1,0 +1,136 @@
+"""Trajectories: TUM files, association, alignment, absolute and relative errors."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.errors import DuagError
+from pipeline.geometry import se3, so3
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Poses of one body over time.
+
+    stamps_ns: int64 [n], strictly increasing. poses: T_reference_body float64 [n, 4, 4].
+    """
+
+    stamps_ns: NDArray[np.int64]
+    poses: Array
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def positions(self) -> Array:
+        """Metres, [n, 3]."""
+        return self.poses[:, :3, 3]
+
+
+def write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Write `timestamp tx ty tz qx qy qz qw`, seconds with nine decimals, then full double precision."""
+    quats = so3.to_quat_wxyz(trajectory.poses[:, :3, :3])
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    for stamp, t, q in zip(trajectory.stamps_ns.tolist(), trajectory.positions, quats, strict=True):
+        values = " ".join(f"{v:.17g}" for v in (*t, q[1], q[2], q[3], q[0]))
+        lines.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {values}")
+    partial = path.with_name(path.name + ".part")
+    partial.write_text("\n".join(lines) + "\n")
+    partial.replace(path)
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read a TUM trajectory. Raises DuagError for a line that is not eight finite numbers."""
+    stamps, rows = [], []
+    try:
+        text = path.read_text()
+    except OSError as error:
+        raise DuagError(f"{path}: {error.strerror or error}, expected a TUM trajectory") from error
+    for number, line in enumerate(text.splitlines(), start=1):
+        fields = line.replace(",", " ").split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        try:
+            row = [float(f) for f in fields[1:]]
+            stamp = _nanoseconds(fields[0])
+        except ValueError:
+            row = []
+        if len(row) != 7 or not np.all(np.isfinite(row)):
+            raise DuagError(f"{path}: line {number} is {line.strip()[:60]!r}, expected eight finite numbers")
+        stamps.append(stamp)
+        rows.append(row)
+    if not rows:
+        raise DuagError(f"{path}: found no pose, expected lines `timestamp tx ty tz qx qy qz qw`")
+    values = np.array(rows)
+    poses = se3.from_quat_translation(values[:, [6, 3, 4, 5]], values[:, :3])
+    return Trajectory(np.array(stamps, dtype=np.int64), poses)
+
+
+def _nanoseconds(text: str) -> int:
+    """Seconds written as a decimal, in integer nanoseconds, without passing through a float where possible."""
+    if "e" in text.lower():
+        return round(float(text) * 1e9)
+    whole, _, fraction = text.partition(".")
+    sign = -1 if whole.startswith("-") else 1
+    return int(whole or "0") * 10**9 + sign * int((fraction + "000000000")[:9])
+
+
+def associate(a: Trajectory, b: Trajectory, tolerance_ns: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices (into a, into b) of poses whose stamps differ by at most `tolerance_ns`, nearest first, each used once."""
+    order = np.searchsorted(b.stamps_ns, a.stamps_ns)
+    pairs = []
+    for i, j in enumerate(order):
+        for k in (j - 1, j, j + 1):
+            if 0 <= k < len(b):
+                gap = abs(int(b.stamps_ns[k]) - int(a.stamps_ns[i]))
+                if gap <= tolerance_ns:
+                    pairs.append((gap, i, int(k)))
+    used_a: set[int] = set()
+    used_b: set[int] = set()
+    chosen = []
+    for _, i, k in sorted(pairs):
+        if i not in used_a and k not in used_b:
+            used_a.add(i)
+            used_b.add(k)
+            chosen.append((i, k))
+    chosen.sort()
+    out = np.array(chosen, dtype=np.int64).reshape(-1, 2)
+    return out[:, 0], out[:, 1]
+
+
+def align(points_a: ArrayLike, points_b: ArrayLike) -> Array:
+    """T_a_b [4, 4] that minimises sum |a - T_a_b b|^2 over paired points [n, 3] (Horn; no scale).
+
+    Raises:
+        DuagError: fewer than three pairs, or points on one line: the rotation is not determined.
+    """
+    a, b = np.asarray(points_a, dtype=np.float64), np.asarray(points_b, dtype=np.float64)
+    if len(a) < 3:
+        raise DuagError(f"alignment needs at least 3 paired positions, found {len(a)}")
+    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    U, S, Vt = np.linalg.svd((a - mean_a).T @ (b - mean_b))
+    if S[1] <= 1e-12 * max(S[0], 1e-300):
+        raise DuagError("alignment is not determined: the positions lie on one line")
+    D = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    R = U @ D @ Vt
+    return se3.from_rotation_translation(R, mean_a - R @ mean_b)
+
+
+def ate_rmse_m(positions_true: ArrayLike, positions_estimated: ArrayLike) -> float:
+    """Absolute trajectory error after SE(3) alignment: root of the mean squared distance, metres."""
+    true, estimated = np.asarray(positions_true), np.asarray(positions_estimated)
+    T = align(true, estimated)
+    return float(np.sqrt(np.mean(np.sum((true - se3.transform(T, estimated)) ** 2, axis=1))))
+
+
+def rpe_rmse(poses_true: ArrayLike, poses_estimated: ArrayLike, step: int = 1) -> tuple[float, float]:
+    """Relative pose error over `step` poses: RMSE of translation (m) and rotation (rad)."""
+    true, estimated = np.asarray(poses_true), np.asarray(poses_estimated)
+    d_true = se3.inverse(true[:-step]) @ true[step:]
+    d_estimated = se3.inverse(estimated[:-step]) @ estimated[step:]
+    translation, rotation = se3.distance(d_true, d_estimated)
+    return float(np.sqrt(np.mean(translation**2))), float(np.sqrt(np.mean(rotation**2)))

@@ -1,0 +1,84 @@
+"""A set of Gaussians as a structure of arrays (paper eq. (1))."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.geometry import se3, so3
+
+_SHAPES: dict[str, tuple[type, tuple[int, ...]]] = {
+    "ids": (np.int64, ()),
+    "anchors": (np.int32, ()),
+    "means": (np.float32, (3,)),
+    "quats_wxyz": (np.float32, (4,)),
+    "log_scales": (np.float32, (3,)),
+    "colors": (np.float32, (3,)),
+    "opacity_logits": (np.float32, ()),
+}
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """n Gaussians with covariance R(q) diag(exp 2 s) R(q)^T, in one frame named by whoever holds them.
+
+    ids: int64 [n], unique within their owner and stable. anchors: int32 [n], index of the owner's keyframe they
+    hang on. means: float32 [n, 3], metres. quats_wxyz: float32 [n, 4], any non-zero length. log_scales: float32
+    [n, 3], log of metres. colors: float32 [n, 3], RGB as in the image, 0..1 (training may leave the range).
+    opacity_logits: float32 [n].
+    """
+
+    ids: NDArray[np.int64]
+    anchors: NDArray[np.int32]
+    means: NDArray[np.float32]
+    quats_wxyz: NDArray[np.float32]
+    log_scales: NDArray[np.float32]
+    colors: NDArray[np.float32]
+    opacity_logits: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        n = len(self.ids)
+        for name, (dtype, tail) in _SHAPES.items():
+            array = np.ascontiguousarray(getattr(self, name), dtype=dtype)
+            if array.shape != (n, *tail):
+                raise ValueError(f"Gaussians.{name} has shape {array.shape}, expected {(n, *tail)}")
+            object.__setattr__(self, name, array)
+
+    @staticmethod
+    def empty() -> Gaussians:
+        """No Gaussians."""
+        return Gaussians(**{name: np.zeros((0, *tail), dtype) for name, (dtype, tail) in _SHAPES.items()})
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def select(self, index: ArrayLike | slice) -> Gaussians:
+        """The Gaussians of a mask, a slice or an index array, in that order."""
+        return Gaussians(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    def replace(self, **arrays: Any) -> Gaussians:
+        """The same Gaussians with some arrays exchanged."""
+        return replace(self, **arrays)
+
+    @staticmethod
+    def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
+        """All Gaussians of all parts, in order."""
+        if not parts:
+            return Gaussians.empty()
+        return Gaussians(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in _SHAPES})
+
+    def transformed(self, T_b_a: ArrayLike) -> Gaussians:
+        """The Gaussians of frame a in frame b; T_b_a is [4, 4] for all or [n, 4, 4], one each."""
+        T = np.asarray(T_b_a, dtype=np.float64)
+        means = (T[..., :3, :3] @ self.means.astype(np.float64)[..., None])[..., 0] + T[..., :3, 3]
+        quats = so3.multiply_quat_wxyz(so3.to_quat_wxyz(T[..., :3, :3]), self.quats_wxyz)
+        return self.replace(means=means.astype(np.float32), quats_wxyz=quats.astype(np.float32))
+
+    def moved(self, T_old_keyframe: ArrayLike, T_new_keyframe: ArrayLike) -> Gaussians:
+        """Every Gaussian moved with its anchor: keyframe poses [k, 4, 4] before and after, by anchor index."""
+        change = np.asarray(T_new_keyframe) @ se3.inverse(T_old_keyframe)
+        return self.transformed(change[self.anchors]) if len(self) else self
