@@ -80,26 +80,19 @@ def _nanoseconds(text: str) -> int:
 
 
 def associate(a: Trajectory, b: Trajectory, tolerance_ns: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices (into a, into b) of poses whose stamps differ by at most `tolerance_ns`, nearest first, each used once."""
-    order = np.searchsorted(b.stamps_ns, a.stamps_ns)
-    pairs = []
-    for i, j in enumerate(order):
-        for k in (j - 1, j, j + 1):
-            if 0 <= k < len(b):
-                gap = abs(int(b.stamps_ns[k]) - int(a.stamps_ns[i]))
-                if gap <= tolerance_ns:
-                    pairs.append((gap, i, int(k)))
-    used_a: set[int] = set()
-    used_b: set[int] = set()
-    chosen = []
-    for _, i, k in sorted(pairs):
-        if i not in used_a and k not in used_b:
-            used_a.add(i)
-            used_b.add(k)
-            chosen.append((i, k))
-    chosen.sort()
-    out = np.array(chosen, dtype=np.int64).reshape(-1, 2)
-    return out[:, 0], out[:, 1]
+    """Indices (into a, into b) of paired poses: for each pose of the shorter one the nearest of the other.
+
+    Pairs further apart than `tolerance_ns` are left out (the rule of the evo package).
+    """
+    if len(a) > len(b):
+        j, i = associate(b, a, tolerance_ns)
+        return i, j
+    after = np.clip(np.searchsorted(b.stamps_ns, a.stamps_ns), 1, max(len(b) - 1, 1))
+    neighbours = np.minimum(np.stack([after - 1, after]), len(b) - 1)
+    gaps = np.abs(b.stamps_ns[neighbours] - a.stamps_ns)
+    nearest = neighbours[np.argmin(gaps, axis=0), np.arange(len(a))]
+    close = np.flatnonzero(np.min(gaps, axis=0) <= tolerance_ns)
+    return close, nearest[close]
 
 
 def align(points_a: ArrayLike, points_b: ArrayLike) -> Array:

@@ -1,0 +1,53 @@
+# `make demo` and `make test` are all a fresh clone needs; both set up .venv first.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.set-up
+SOURCES := pyproject.toml CMakeLists.txt $(wildcard pipeline/kernels/src/*)
+DEMO := outputs/demo
+
+.PHONY: help setup demo test bench lint format check-full clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make demo        set up, then simulate two robots, fuse their maps, evaluate, report ($(DEMO))"
+	@echo "make test        set up, then run the tests"
+	@echo "make lint        ruff and mypy"
+	@echo "make bench       speed of the kernels, side by side with plain torch"
+	@echo "make check-full  the slow checks as well (minutes)"
+
+setup: $(STAMP)
+
+$(STAMP): $(SOURCES)
+	@command -v $(PYTHON) >/dev/null || { echo "setup: $(PYTHON) not found; install Python 3.11 or later" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "setup: $$($(PYTHON) --version) found, Python 3.11 or later expected; set PYTHON=" >&2; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || { echo "setup: Python module venv not found; on Debian: apt-get install python3-venv" >&2; exit 1; }
+	@command -v c++ >/dev/null || { echo "setup: no C++ compiler found; on Debian: apt-get install g++" >&2; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[test,lint,dev]"
+	touch $(STAMP)
+
+demo: setup
+	$(BIN)/duagc demo --out $(DEMO) --force
+
+test: setup
+	$(BIN)/python -m pytest -m "not slow"
+
+check-full: setup
+	$(BIN)/python -m pytest
+
+bench: setup
+	$(BIN)/duagc bench raster
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: setup
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf build $(STAMP)

@@ -1,0 +1,72 @@
+"""Trajectory files and errors, with known answers from public benchmark files where they are present."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import DuagError
+from pipeline.geometry import se3, trajectory
+from pipeline.geometry.trajectory import Trajectory
+
+BENCHMARK = Path(__file__).parents[2].parent / "shared" / "data" / "trajectories"
+
+
+def walk(n: int = 40) -> Trajectory:
+    rng = np.random.default_rng(3)
+    poses = np.stack([np.eye(4)] * n)
+    for i in range(1, n):
+        poses[i] = poses[i - 1] @ se3.exp(rng.normal(scale=0.05, size=6))
+    return Trajectory(np.arange(n, dtype=np.int64) * 33_333_333 + 1_700_000_000_123_456_789, poses)
+
+
+def test_tum_files_keep_nanoseconds_and_poses(tmp_path: Path) -> None:
+    before = walk()
+    trajectory.write_tum(tmp_path / "t.tum", before)
+    after = trajectory.read_tum(tmp_path / "t.tum")
+    np.testing.assert_array_equal(after.stamps_ns, before.stamps_ns)
+    np.testing.assert_allclose(after.poses, before.poses, atol=1e-14)
+    assert [p.name for p in tmp_path.iterdir()] == ["t.tum"]
+
+
+@pytest.mark.parametrize("line", ["1.0 1 2 3 0 0 0", "1.0 1 2 3 0 0 0 nan", "x 1 2 3 0 0 0 1", ""])
+def test_bad_tum_lines_are_named(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "bad.tum"
+    path.write_text(line + "\n")
+    with pytest.raises(DuagError, match=r"bad\.tum"):
+        trajectory.read_tum(path)
+
+
+def test_ate_ignores_the_frame_but_sees_the_noise() -> None:
+    true = walk(400)
+    T = se3.exp(np.array([3, -2, 1, 0.4, 2.0, -1.0]))
+    moved = se3.transform(T, true.positions)
+    assert trajectory.ate_rmse_m(true.positions, moved) < 1e-12
+    noise = np.random.default_rng(4).normal(scale=0.01, size=moved.shape)
+    # 400 positions with 6 free parameters: the expected value is 0.01 sqrt(3) sqrt(1 - 6/1200)
+    assert trajectory.ate_rmse_m(true.positions, moved + noise) == pytest.approx(0.01 * np.sqrt(3), rel=0.1)
+
+
+def test_alignment_says_when_it_is_not_determined() -> None:
+    line = np.outer(np.arange(5.0), [1, 2, 3])
+    with pytest.raises(DuagError, match="one line"):
+        trajectory.align(line, line)
+    with pytest.raises(DuagError, match="at least 3"):
+        trajectory.align(line[:2], line[:2])
+
+
+@pytest.mark.skipif(not BENCHMARK.is_dir(), reason="the benchmark trajectories are not beside this checkout")
+@pytest.mark.parametrize(
+    ("truth", "estimate", "expected_m"),
+    [
+        ("rgbd_dataset_freiburg1_xyz-groundtruth.txt", "freiburg1_xyz-rgbdslam.txt", 0.013473),
+        ("rgbd_dataset_freiburg1_desk-groundtruth.txt", "freiburg1_desk-rgbdslam.txt", 0.025831),
+        ("rgbd_dataset_freiburg2_desk-groundtruth.txt", "freiburg2_desk-rgbdslam.txt", 0.095114),
+    ],
+)
+def test_ate_of_public_trajectories(truth: str, estimate: str, expected_m: float) -> None:
+    true, estimated = trajectory.read_tum(BENCHMARK / truth), trajectory.read_tum(BENCHMARK / estimate)
+    i, j = trajectory.associate(true, estimated, tolerance_ns=20_000_000)
+    assert trajectory.ate_rmse_m(true.positions[i], estimated.positions[j]) == pytest.approx(
+        expected_m, abs=2e-6
+    )
