@@ -1,8 +1,9 @@
 """Progress with time left, on standard error: a bar on a terminal, a plain line now and then elsewhere."""
 
+import multiprocessing
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -18,8 +19,9 @@ def track(iterable: Iterable[Item], description: str, total: int | None = None) 
         total: number of items, if the iterable does not tell it by `len`.
     """
     if total is None:
-        total = len(iterable) if hasattr(iterable, "__len__") else None
-    if sys.stderr.isatty():
+        total = len(iterable) if isinstance(iterable, Sized) else None
+    alone = multiprocessing.parent_process() is None  # several workers cannot share one bar
+    if alone and sys.stderr.isatty():
         yield from _bar(iterable, description, total)
     else:
         yield from _lines(iterable, description, total)

@@ -23,10 +23,10 @@ def sym_to_vec(S: ArrayLike) -> Array:
 
 def vec_to_sym(v: ArrayLike) -> Array:
     """Symmetric matrix [..., 3, 3] of a 6-vector [..., 6]."""
-    v = np.asarray(v, dtype=np.float64) / _WEIGHT
-    S = np.empty((*v.shape[:-1], 3, 3))
-    S[..., _ROW, _COLUMN] = v
-    S[..., _COLUMN, _ROW] = v
+    entries = np.asarray(v, dtype=np.float64) / _WEIGHT
+    S = np.empty((*entries.shape[:-1], 3, 3))
+    S[..., _ROW, _COLUMN] = entries
+    S[..., _COLUMN, _ROW] = entries
     return S
 
 

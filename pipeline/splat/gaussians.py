@@ -43,7 +43,7 @@ class Gaussians:
     def __post_init__(self) -> None:
         n = len(self.ids)
         for name, (dtype, tail) in _SHAPES.items():
-            array = np.ascontiguousarray(getattr(self, name), dtype=dtype)
+            array: NDArray[Any] = np.ascontiguousarray(getattr(self, name), dtype=dtype)
             if array.shape != (n, *tail):
                 raise ValueError(f"Gaussians.{name} has shape {array.shape}, expected {(n, *tail)}")
             object.__setattr__(self, name, array)

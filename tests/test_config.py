@@ -1,0 +1,66 @@
+"""Configuration files: round trip, overrides, and errors that name what is wrong."""
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.config import Config, dump, load
+from pipeline.errors import DuagError
+
+
+class Link(Config):
+    """A link between two robots."""
+
+    loss_probability: float = 0.0
+    """Per packet, independent."""
+
+    name: str = "radio"
+    """What it is called."""
+
+
+class Whole(Config):
+    """All of it."""
+
+    seed: int = 0
+    """Of every random stream."""
+
+    link: Link = Link()
+
+
+def test_dump_and_load_round_trip(tmp_path: Path) -> None:
+    config = Whole(seed=7, link=Link(loss_probability=0.25))
+    text = dump(config)
+    assert "# Per packet, independent." in text
+    (tmp_path / "c.toml").write_text(text)
+    assert load(Whole, tmp_path / "c.toml") == config
+
+
+def test_overrides_win_over_the_file(tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text("seed = 3\n[link]\nloss_probability = 0.5\n")
+    config = load(Whole, tmp_path / "c.toml", ["link.loss_probability=0.75", "link.name=wire"])
+    assert config == Whole(seed=3, link=Link(loss_probability=0.75, name="wire"))
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("link.los=1", "link.los is not a known setting"),
+        ("link.loss_probability=much", "link.loss_probability = 'much'"),
+        ("seed", "expected section.name=value"),
+        ("seed.x=1", "seed = {'x': 1}"),
+    ],
+)
+def test_errors_name_the_setting(override: str, expected: str) -> None:
+    with pytest.raises(DuagError) as caught:
+        load(Whole, overrides=[override])
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_broken_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "c.toml"
+    path.write_text("seed = = 3")
+    with pytest.raises(DuagError, match=r"c\.toml: not valid TOML"):
+        load(Whole, path)
+    with pytest.raises(DuagError, match=r"absent\.toml"):
+        load(Whole, tmp_path / "absent.toml")
