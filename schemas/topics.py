@@ -1,0 +1,114 @@
+"""Every topic that may stand in a log, in one table."""
+
+import re
+from dataclasses import dataclass
+from enum import Enum
+
+
+class Scope(Enum):
+    """Who may read a topic."""
+
+    SENSOR = "sensor"  # input of the estimator
+    TRUTH = "truth"  # evaluation only
+    ROBOT = "robot"  # the robot itself, and readers of finished runs
+    TEAM = "team"  # written by the exchange; one log for all robots
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One row: `pattern` with <robot> for the robot's name, full name of the schema, who writes, who reads."""
+
+    pattern: str
+    schema: str
+    producer: str
+    scope: Scope
+    meaning: str
+
+    def of(self, robot: str) -> str:
+        """The topic of one robot, for example "/alpha/odometry"."""
+        return self.pattern.replace("<robot>", robot)
+
+
+COLOR = Topic(
+    "/<robot>/camera/color",
+    "foxglove.CompressedImage",
+    "converters",
+    Scope.SENSOR,
+    "colour image, JPEG or PNG as the source had it",
+)
+DEPTH = Topic(
+    "/<robot>/camera/depth",
+    "foxglove.RawImage",
+    "converters",
+    Scope.SENSOR,
+    "16UC1 depth along z, registered to colour, 0 = none; channel metadata depth_scale = metres per unit",
+)
+CALIBRATION = Topic(
+    "/<robot>/camera/calibration",
+    "foxglove.CameraCalibration",
+    "converters",
+    Scope.SENSOR,
+    "pinhole intrinsics of the colour camera",
+)
+GROUNDTRUTH_POSE = Topic(
+    "/<robot>/groundtruth/pose",
+    "foxglove.PoseInFrame",
+    "converters",
+    Scope.TRUTH,
+    "pose of the colour camera in the common world frame",
+)
+GROUNDTRUTH_DEPTH = Topic(
+    "/<robot>/groundtruth/depth",
+    "foxglove.RawImage",
+    "converters",
+    Scope.TRUTH,
+    "exact depth, 16UC1 with depth_scale, where the log's depth is noisy",
+)
+ODOMETRY = Topic("/<robot>/odometry", "duagc.v1.Odometry", "frontend", Scope.ROBOT, "pose of every frame")
+KEYFRAME = Topic("/<robot>/keyframe", "duagc.v1.Keyframe", "frontend", Scope.ROBOT, "pose of every keyframe")
+MAP_UPDATE = Topic(
+    "/<robot>/map_update", "duagc.v1.MapUpdate", "frontend", Scope.ROBOT, "what one keyframe did to the map"
+)
+MAP = Topic("/<robot>/map", "duagc.v1.GaussianMap", "frontend", Scope.ROBOT, "the robot's own map")
+INFORMATION = Topic(
+    "/<robot>/information",
+    "duagc.v1.GaussianInformation",
+    "information",
+    Scope.ROBOT,
+    "Fisher information of the robot's own map",
+)
+FUSED_MAP = Topic("/<robot>/fused_map", "duagc.v1.GaussianMap", "fusion", Scope.ROBOT, "the map after fusion")
+CORRECTED_KEYFRAMES = Topic(
+    "/<robot>/corrected_keyframes",
+    "duagc.v1.CorrectedKeyframes",
+    "fusion",
+    Scope.ROBOT,
+    "keyframe poses after consensus",
+)
+
+TOPICS: tuple[Topic, ...] = (
+    COLOR,
+    DEPTH,
+    CALIBRATION,
+    GROUNDTRUTH_POSE,
+    GROUNDTRUTH_DEPTH,
+    ODOMETRY,
+    KEYFRAME,
+    MAP_UPDATE,
+    MAP,
+    INFORMATION,
+    FUSED_MAP,
+    CORRECTED_KEYFRAMES,
+)
+
+ROBOT_NAME = r"[a-z][a-z0-9_]*"
+_MATCHERS = tuple((re.compile(t.pattern.replace("<robot>", f"(?P<robot>{ROBOT_NAME})")), t) for t in TOPICS)
+
+
+def find(topic: str) -> tuple[Topic, str] | None:
+    """The row of a topic and the robot in it ("" if the topic names none); None if the table does not have it."""
+    for matcher, row in _MATCHERS:
+        match = matcher.fullmatch(topic)
+        if match:
+            return row, match.groupdict().get("robot", "")
+    return None
