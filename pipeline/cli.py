@@ -1,0 +1,324 @@
+"""The command `duagc`. Every command imports what it needs when it runs, so that `--help` is quick."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pipeline import __version__, numeric
+from pipeline.errors import DuagError
+
+EXIT_FAILED, EXIT_DIFFERENT = 1, 3
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+config_app = typer.Typer(no_args_is_help=True, help="Settings of a run and their documentation.")
+bench_app = typer.Typer(no_args_is_help=True, help="Speed, side by side with something else in the same run.")
+app.add_typer(config_app, name="config")
+app.add_typer(bench_app, name="bench")
+
+Out = Annotated[
+    Path, typer.Option("--out", "-o", help="Folder to write; must not exist.", show_default=False)
+]
+Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
+Workers = Annotated[int, typer.Option(min=1, help="Robots prepared at the same time; changes no result.")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", metavar="a.b=VALUE", help="Change one setting; repeatable.")
+]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="TOML file; see `duagc config show`.")]
+Json = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
+
+
+def main() -> None:
+    """Entry point: one line and exit code 1 for whatever a user can fix."""
+    numeric.settle()
+    try:
+        app()
+    except DuagError as error:
+        print(f"duagc: {error}", file=sys.stderr)
+        sys.exit(EXIT_FAILED)
+    except KeyboardInterrupt:
+        print("duagc: interrupted", file=sys.stderr)
+        sys.exit(EXIT_FAILED)
+
+
+def say(line: str) -> None:
+    """Progress goes to standard error, results to standard output."""
+    print(f"duagc: {line}", file=sys.stderr, flush=True)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"duagc {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Recordings of a robot team to one uncertainty-weighted Gaussian map, without a central server.
+
+    Start with `duagc demo`, or with your own data: `duagc convert`, then `duagc run`.
+    """
+
+
+@app.command()
+def demo(
+    out: Out = Path("outputs/demo"),
+    robots: Annotated[int, typer.Option(min=2, max=4, help="Robots to simulate.")] = 2,
+    frames: Annotated[int, typer.Option(min=20, help="Frames per robot.")] = 160,
+    seed: Annotated[int, typer.Option(help="Seed of scene, paths and run.")] = 0,
+    workers: Workers = 2,
+    force: Force = False,
+) -> None:
+    """Simulate a team, fuse its maps, evaluate and report: the whole job on an embedded default.
+
+    Example: `duagc demo --out outputs/demo`
+    """
+    from converters.simulate import simulate as simulate_recording
+
+    from pipeline.runner import RunConfig, new_folder
+    from pipeline.runner import run as run_stages
+
+    with new_folder(out, force) as folder:
+        say(f"simulate: {robots} robots, {frames} frames each")
+        simulate_recording(folder / "recording", robots=robots, frames=frames, seed=seed, workers=workers)
+        run_stages(folder / "recording", folder / "run", RunConfig(seed=seed), workers=workers, say=say)
+    _print_outputs(out / "run")
+
+
+@app.command()
+def simulate(
+    out: Out,
+    robots: Annotated[int, typer.Option(min=1, help="Number of robots.")] = 2,
+    frames: Annotated[int, typer.Option(min=2, help="Frames per robot.")] = 160,
+    scene: Annotated[str, typer.Option(help="Name of a procedural scene.")] = "room",
+    width: Annotated[int, typer.Option(min=32, help="Pixels.")] = 480,
+    height: Annotated[int, typer.Option(min=32, help="Pixels.")] = 360,
+    noise: Annotated[str, typer.Option(help="none or kinect.")] = "none",
+    seed: Annotated[int, typer.Option(help="Seed of scene, paths and noise.")] = 0,
+    workers: Workers = 2,
+    force: Force = False,
+) -> None:
+    """Render a recording of a robot team in a procedural room, with exact ground truth.
+
+    Example: `duagc simulate --robots 3 --noise kinect --out recordings/room`
+    """
+    from converters.simulate import simulate as simulate_recording
+
+    simulate_recording(
+        out,
+        robots=robots,
+        frames=frames,
+        scene=scene,
+        size=(width, height),
+        noise=noise,
+        seed=seed,
+        workers=workers,
+        force=force,
+    )
+    print(out)
+
+
+@app.command()
+def run(
+    recording: Annotated[Path, typer.Argument(help="Folder of a recording.", show_default=False)],
+    out: Out,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    workers: Workers = 2,
+    force: Force = False,
+    no_cache: Annotated[
+        bool, typer.Option("--no-cache", help="Compute every stage (this version always does).")
+    ] = False,
+) -> None:
+    """Run all stages on a recording: maps, information, exchange, fusion, metrics, report, view.
+
+    Examples:
+    `duagc run recordings/redkitchen --out outputs/redkitchen`,
+    `duagc run recordings/room --out outputs/lossy --set exchange.link.loss_probability=0.3`
+    """
+    from pipeline.config import load
+    from pipeline.runner import RunConfig
+    from pipeline.runner import run as run_stages
+
+    run_stages(
+        recording, out, load(RunConfig, config, overrides or []), workers=workers, force=force, say=say
+    )
+    _print_outputs(out)
+
+
+def _print_outputs(run_folder: Path) -> None:
+    print(f"report     {run_folder / 'report' / 'index.html'}")
+    print(f"view       {run_folder / 'run.rrd'}")
+    for path in sorted(run_folder.glob("robots/*/fused.ply")):
+        print(f"fused map  {path}")
+    print(f"metrics    {run_folder / 'metrics.json'}")
+
+
+@app.command()
+def replay(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.", show_default=False)],
+    robot: Annotated[str | None, typer.Option(help="One robot; all by default.")] = None,
+    recording: Annotated[Path | None, typer.Option(help="Where the recording is now.")] = None,
+) -> None:
+    """Recompute each robot from its own log and the packets that reached it; compare bit for bit.
+
+    Exit code 3 if anything differs. Example: `duagc replay outputs/demo/run`
+    """
+    from pipeline.replay import recording_of, robots_of
+    from pipeline.replay import replay as replay_robots
+
+    robots = [robot] if robot else robots_of(run_folder)
+    comparisons = replay_robots(run_folder, recording or recording_of(run_folder), robots, say)
+    for c in comparisons:
+        verdict = (
+            "equal" if c.equal else f"DIFFERS: recorded {c.recorded[:12]}, recomputed {c.recomputed[:12]}"
+        )
+        print(f"{c.robot:<10} {c.name:<17} {verdict}")
+    if not all(c.equal for c in comparisons):
+        raise typer.Exit(EXIT_DIFFERENT)
+
+
+@app.command()
+def digest(
+    path: Annotated[Path, typer.Argument(help="A log, a recording or a run.", show_default=False)],
+) -> None:
+    """Print 64 hex characters that stand for the content: messages and results, not encoders or clocks.
+
+    Example: `duagc digest outputs/demo/run`
+    """
+    from pipeline.digest import digest as digest_path
+
+    print(digest_path(path))
+
+
+@app.command()
+def info(
+    path: Annotated[Path, typer.Argument(help="A recording, a run or a log.", show_default=False)],
+    as_json: Json = False,
+) -> None:
+    """Say what is in a recording, a run or a log.
+
+    Example: `duagc info recordings/redkitchen`
+    """
+    from pipeline import recording
+
+    content = recording.info(path)
+    print(json.dumps(content, indent=2) if as_json else recording.format_info(content))
+
+
+@app.command()
+def evaluate(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.", show_default=False)],
+    recording: Annotated[Path | None, typer.Option(help="Where the recording is now.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Measure a run against ground truth, where there is any, and write metrics.json.
+
+    Example: `duagc evaluate outputs/demo/run --json`
+    """
+    from pipeline.evaluation import evaluate as evaluate_run
+    from pipeline.replay import recording_of
+    from pipeline.runner import threads_per_worker
+
+    metrics = evaluate_run(run_folder, recording or recording_of(run_folder), threads=threads_per_worker(1))
+    print(json.dumps(metrics, indent=2) if as_json else run_folder / "metrics.json")
+
+
+@app.command()
+def report(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.", show_default=False)],
+    recording: Annotated[Path | None, typer.Option(help="Where the recording is now.")] = None,
+) -> None:
+    """Write the self-contained HTML report of a run.
+
+    Example: `duagc report outputs/demo/run`
+    """
+    from pipeline.replay import recording_of
+    from pipeline.report import write_report
+
+    print(write_report(run_folder, recording or recording_of(run_folder)))
+
+
+@app.command()
+def view(
+    path: Annotated[Path, typer.Argument(help="A run or a recording.", show_default=False)],
+    save: Annotated[Path | None, typer.Option(help="Write a .rrd file instead of opening a window.")] = None,
+    screenshot: Annotated[Path | None, typer.Option(help="Write a PNG instead of opening a window.")] = None,
+) -> None:
+    """Open a run or a recording in Rerun.
+
+    Example: `duagc view outputs/demo/run --save demo.rrd`
+    """
+    from pipeline import viewer
+
+    viewer.view(path, save=save, screenshot=screenshot)
+
+
+@app.command()
+def convert(
+    dataset: Annotated[str | None, typer.Argument(help="Name of the dataset; see --list.")] = None,
+    source: Annotated[Path | None, typer.Argument(metavar="SRC", help="Where its files are.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write; must not exist.")] = None,
+    robots: Annotated[int, typer.Option(min=1, help="Cut one sequence into this many robots.")] = 1,
+    options: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Option of the converter; repeatable."),
+    ] = None,
+    force: Force = False,
+    list_datasets: Annotated[
+        bool, typer.Option("--list", help="List the datasets and their options.")
+    ] = False,
+) -> None:
+    """Convert a dataset, as it is distributed, into one log per robot.
+
+    Example: `duagc convert 7scenes ~/data/redkitchen --robots 2 --out recordings/redkitchen`
+    """
+    import converters
+
+    if list_datasets:
+        print(converters.describe())
+        return
+    if dataset is None or source is None or out is None:
+        raise typer.BadParameter("expected DATASET SRC --out REC, or --list")
+    converters.convert(dataset, source, out, robots=robots, force=force, options=options or [])
+    print(out)
+
+
+@config_app.command("show")
+def config_show(config: ConfigFile = None, overrides: Overrides = None) -> None:
+    """Print the resolved configuration as TOML, every setting with its documentation."""
+    from pipeline.config import dump, load
+    from pipeline.runner import RunConfig
+
+    print(dump(load(RunConfig, config, overrides or [])), end="")
+
+
+@config_app.command("check")
+def config_check(config: Annotated[Path, typer.Argument(show_default=False)]) -> None:
+    """Say whether a configuration file is sound."""
+    from pipeline.config import load
+    from pipeline.runner import RunConfig
+
+    load(RunConfig, config)
+    print(f"{config}: sound")
+
+
+@bench_app.command("raster")
+def bench_raster(as_json: Json = False) -> None:
+    """Time the rasterizer beside plain torch."""
+    from pipeline.kernels import bench
+
+    result: Any = bench.run()
+    print(json.dumps(result, indent=2) if as_json else bench.format_table(result))

@@ -1,0 +1,106 @@
+"""Recompute a robot from its own log and the packets it received, and compare with what the run recorded.
+
+This is the proof of decentralisation: nothing of the other robots' logs, maps or memory is read.
+"""
+
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.config import load
+from pipeline.digest import digest_file
+from pipeline.errors import DuagError
+from pipeline.runner import RunConfig, agent_input, prepare_robot, threads_per_worker
+
+COMPARED = ("frontend.mcap", "information.mcap", "fused.mcap", "fused.ply", "trajectory.tum", "odometry.tum")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One result of one robot, recorded and recomputed."""
+
+    robot: str
+    name: str
+    recorded: str
+    recomputed: str
+
+    @property
+    def equal(self) -> bool:
+        return self.recorded == self.recomputed
+
+
+def replay(
+    run: Path,
+    recording: Path,
+    robots: list[str],
+    say: Callable[[str], None],
+) -> list[Comparison]:
+    """Recompute robots, front end included, without any store.
+
+    Args:
+        run: folder of a finished run. recording: folder of its recording. robots: which to recompute.
+        say: gets a line at the start of every step.
+    Returns:
+        One comparison per result file, and one for the packets that the robot sent.
+    """
+    from pipeline.recording import Recording
+
+    config = load(RunConfig, run / "config.toml")
+    logs = Recording(recording)
+    out = []
+    for robot in robots:
+        if not (run / "robots" / robot).is_dir():
+            raise DuagError(f"{run}: robot {robot} not found, expected one of {', '.join(robots_of(run))}")
+        folder = Path(tempfile.mkdtemp(prefix=f"duagc-replay-{robot}-"))
+        try:
+            out += _replay_one(run, logs.log(robot), robot, folder, config, say)
+        finally:
+            shutil.rmtree(folder)
+    return out
+
+
+def robots_of(run: Path) -> list[str]:
+    """Names of the robots of a run."""
+    if not (run / "robots").is_dir():
+        raise DuagError(f"{run}: expected a finished run, found no folder robots/")
+    return sorted(p.name for p in (run / "robots").iterdir() if p.is_dir())
+
+
+def recording_of(run: Path) -> Path:
+    """Where a run says that its recording is. Raises DuagError if it is not there."""
+    try:
+        recording = run / json.loads((run / "manifest.json").read_text())["recording"]
+    except (OSError, ValueError, KeyError) as error:
+        raise DuagError(
+            f"{run / 'manifest.json'}: unreadable ({error}), expected that of a finished run"
+        ) from error
+    if not recording.is_dir():
+        raise DuagError(f"{run / 'manifest.json'}: recording {recording} not found; give --recording")
+    return recording.resolve()
+
+
+def _replay_one(
+    run: Path, log: Path, robot: str, folder: Path, config: RunConfig, say: Callable[[str], None]
+) -> list[Comparison]:
+    from pipeline.exchange.replay import replay_agent
+    from pipeline.fusion.stage import run_fusion
+
+    say(f"{robot}: front end and information")
+    prepare_robot(log, robot, folder, config, threads_per_worker(1))
+    say(f"{robot}: agent, from its delivered packets")
+    result, sent = replay_agent(
+        agent_input(robot, log, folder),
+        config.exchange,
+        seed=config.seed,
+        exchange_path=run / "exchange.mcap",
+    )
+    say(f"{robot}: fusion")
+    run_fusion(log, folder / "frontend.mcap", folder / "information.mcap", result, folder, config.fusion)
+    comparisons = [Comparison(robot, "packets sent", sent.recorded, sent.recomputed)]
+    for name in COMPARED:
+        recorded = digest_file(run / "robots" / robot / name)
+        comparisons.append(Comparison(robot, name, recorded, digest_file(folder / name)))
+    return comparisons

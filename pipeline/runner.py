@@ -1,0 +1,238 @@
+"""The main job: from a recording to fused maps, metrics, report and view.
+
+Robots are prepared in parallel processes; the exchange is one ordered stage in this process. Everything is
+written into a folder beside the output, which gets its final name when all is done.
+"""
+
+import json
+import multiprocessing
+import os
+import resource
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pipeline import __version__, numeric
+from pipeline.config import Config, dump
+from pipeline.digest import digest_file, result_files
+from pipeline.errors import DuagError
+from pipeline.exchange.config import ExchangeConfig
+from pipeline.frontend.config import FrontendConfig
+from pipeline.fusion.config import FusionConfig
+from pipeline.information.config import InformationConfig
+
+LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
+
+
+class RunConfig(Config):
+    """Everything that decides what a run computes."""
+
+    seed: int = 0
+    """Seed of every random stream of the run."""
+
+    frontend: FrontendConfig = FrontendConfig()
+    information: InformationConfig = InformationConfig()
+    exchange: ExchangeConfig = ExchangeConfig()
+    fusion: FusionConfig = FusionConfig()
+
+
+class Timing:
+    """Wall time, processor time and peak memory per stage; not part of any digest."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, dict[str, Any]] = {}
+
+    @contextmanager
+    def stage(self, name: str, robot: str | None = None) -> Iterator[None]:
+        wall, cpu = time.perf_counter(), time.process_time()
+        yield
+        self.stages[f"{name}.{robot}" if robot else name] = {
+            "stage": name,
+            "robot": robot,
+            "wall_s": round(time.perf_counter() - wall, 3),
+            "cpu_s": round(time.process_time() - cpu, 3),
+            "peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+        }
+
+
+def threads_per_worker(workers: int) -> int:
+    """Threads of each of `workers` processes on this machine."""
+    return max(1, len(os.sched_getaffinity(0)) // workers)
+
+
+def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, threads: int) -> dict[str, Any]:
+    """Front end and Fisher information of one robot, from its own log alone.
+
+    Args:
+        log: the robot's log. folder: where frontend.mcap and information.mcap go.
+        threads: of the kernels; changes no bit of the result.
+    Returns:
+        The timings of the stages.
+    """
+    from pipeline.frontend.stage import run_frontend
+    from pipeline.information.stage import run_information
+
+    numeric.settle_opencv()
+    timing = Timing()
+    with timing.stage("frontend", robot):
+        parts = run_frontend(
+            log, folder / "frontend.mcap", config.frontend, seed=config.seed, threads=threads
+        )
+    timing.stages[f"frontend.{robot}"]["parts"] = parts
+    with timing.stage("information", robot):
+        run_information(
+            log, folder / "frontend.mcap", folder / "information.mcap", config.information, threads=threads
+        )
+    return timing.stages
+
+
+def prepare_robots(
+    logs: dict[str, Path], folders: dict[str, Path], config: RunConfig, workers: int
+) -> dict[str, Any]:
+    """`prepare_robot` for every robot, `workers` at a time, each in a fresh process."""
+    threads = threads_per_worker(workers)
+    spawn = multiprocessing.get_context("spawn")
+    stages: dict[str, Any] = {}
+    with ProcessPoolExecutor(workers, mp_context=spawn, max_tasks_per_child=1) as pool:
+        jobs = [pool.submit(prepare_robot, logs[r], r, folders[r], config, threads) for r in logs]
+        try:
+            for job in jobs:
+                stages.update(job.result())
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return stages
+
+
+def run(
+    recording_path: Path,
+    out: Path,
+    config: RunConfig,
+    *,
+    workers: int = 2,
+    force: bool = False,
+    say: Callable[[str], None] = lambda line: print(line, file=sys.stderr, flush=True),
+) -> None:
+    """Run all stages on a recording.
+
+    Args:
+        recording_path: folder of the recording. out: folder of the run; must not exist unless `force`.
+        workers: robots prepared at the same time; changes no bit of the result.
+        say: gets a line at the start of every stage.
+    Raises:
+        DuagError: what a user can fix; nothing is left under the name `out`.
+    """
+    from pipeline.recording import Recording
+
+    recording = Recording(recording_path)
+    with new_folder(out, force) as folder:
+        timing = Timing()
+        (folder / "config.toml").write_text(dump(config))
+        logs = {robot: recording.log(robot) for robot in recording.robots}
+        robots = {robot: folder / "robots" / robot for robot in recording.robots}
+        for path in robots.values():
+            path.mkdir(parents=True)
+        say(f"front end and information: {len(logs)} robots, {min(workers, len(logs))} at a time")
+        timing.stages.update(prepare_robots(logs, robots, config, min(workers, len(logs))))
+        say("exchange and consensus")
+        results = _exchange(logs, folder, config, timing)
+        for robot, result in results.items():
+            say(f"fusion: {robot}")
+            _fuse(robot, logs[robot], robots[robot], result, config, timing)
+        _write_json(folder / "manifest.json", _manifest(recording, folder, config))
+        _write_json(folder / "timing.json", {"stages": timing.stages})
+        say("evaluation")
+        _evaluate(folder, recording_path, timing)
+        say("report and view")
+        _present(folder, recording_path, timing)
+
+
+@contextmanager
+def new_folder(out: Path, force: bool) -> Iterator[Path]:
+    """A folder beside `out` that takes its name when the block ends well, and is removed when it does not."""
+    if out.exists() and not force:
+        raise DuagError(f"{out}: exists already; choose another --out or give --force")
+    partial = out.with_name(out.name + ".part")
+    if partial.exists():
+        shutil.rmtree(partial)
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        if out.exists():
+            shutil.rmtree(out)
+        partial.rename(out)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def _exchange(logs: dict[str, Path], folder: Path, config: RunConfig, timing: Timing) -> dict[str, Any]:
+    from pipeline.exchange.session import AgentInput, run_session
+
+    numeric.settle_opencv()
+    inputs = [agent_input(robot, log, folder / "robots" / robot) for robot, log in logs.items()]
+    assert all(isinstance(i, AgentInput) for i in inputs)
+    with timing.stage("exchange"):
+        return run_session(
+            inputs,
+            config.exchange,
+            seed=config.seed,
+            exchange_path=folder / "exchange.mcap",
+            consensus_path=folder / "consensus.mcap",
+        )
+
+
+def agent_input(robot: str, log: Path, folder: Path) -> Any:
+    """What the agent of a robot may know before the first packet: its own log and its own results."""
+    from pipeline.exchange.session import AgentInput
+
+    return AgentInput(robot, log, folder / "frontend.mcap", folder / "information.mcap")
+
+
+def _fuse(robot: str, log: Path, folder: Path, result: Any, config: RunConfig, timing: Timing) -> None:
+    from pipeline.fusion.stage import run_fusion
+
+    with timing.stage("fusion", robot):
+        run_fusion(log, folder / "frontend.mcap", folder / "information.mcap", result, folder, config.fusion)
+
+
+def _evaluate(folder: Path, recording: Path, timing: Timing) -> None:
+    from pipeline.evaluation import evaluate
+
+    with timing.stage("evaluation"):
+        evaluate(folder, recording, threads=threads_per_worker(1))
+    _write_json(folder / "timing.json", {"stages": timing.stages})
+
+
+def _present(folder: Path, recording: Path, timing: Timing) -> None:
+    from pipeline.report import write_report
+    from pipeline.viewer import write_rrd
+
+    with timing.stage("report"):
+        write_report(folder, recording)
+    with timing.stage("rrd"):
+        write_rrd(folder, recording, folder / "run.rrd")
+    _write_json(folder / "timing.json", {"stages": timing.stages})
+
+
+def _manifest(recording: Any, folder: Path, config: RunConfig) -> dict[str, Any]:
+    """What went in and what came out, by digest."""
+    from importlib.metadata import version
+
+    return {
+        "schema": 1,
+        "duagc": __version__,
+        "libraries": {name: version(name) for name in LIBRARIES},
+        "recording": os.path.relpath(recording.path, folder),
+        "inputs": {robot: digest_file(recording.log(robot)) for robot in recording.robots},
+        "outputs": {p.as_posix(): digest_file(folder / p) for p in result_files(folder)},
+    }
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n")
