@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 import schemas
 from pipeline.errors import DuagError
+from pipeline.geometry import se3, so3
+from pipeline.geometry.camera import PinholeCamera
 from pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]
@@ -461,3 +463,102 @@ def unpack(message: Any) -> Any:
     """The dataclass of a protobuf message that has one here; any other message as it is."""
     function = _UNPACK.get(message.DESCRIPTOR.full_name)
     return message if function is None else function(message)
+
+
+# --- foxglove schemas of the sensors --------------------------------------------------------------------------------
+
+
+def _foxglove(name: str, stamp_ns: int, frame_id: str, **fields: Any) -> Any:
+    message: Any = schemas.message_class(f"foxglove.{name}")(frame_id=frame_id, **fields)
+    pack_stamp(message, stamp_ns)
+    return message
+
+
+def camera_frame(robot: str) -> str:
+    """Name of the frame of a robot's colour camera: x right, y down, z forward."""
+    return f"{robot}/camera"
+
+
+def pack_color(stamp_ns: int, robot: str, data: bytes, image_format: str) -> Any:
+    """foxglove.CompressedImage of encoded bytes; `image_format` is "jpeg" or "png"."""
+    return _foxglove("CompressedImage", stamp_ns, camera_frame(robot), data=data, format=image_format)
+
+
+def pack_depth(stamp_ns: int, robot: str, depth: NDArray[np.uint16]) -> Any:
+    """foxglove.RawImage, 16UC1 little-endian, of depth in units of the channel's depth_scale, uint16 [H, W]."""
+    if depth.dtype != np.uint16 or depth.ndim != 2:
+        raise ValueError(f"depth is {depth.dtype} {depth.shape}, expected uint16 [H, W]")
+    height, width = depth.shape
+    data = pack_array(depth, "uint16")
+    fields = {"width": width, "height": height, "encoding": "16UC1", "step": 2 * width, "data": data}
+    return _foxglove("RawImage", stamp_ns, camera_frame(robot), **fields)
+
+
+def unpack_depth(m: Any, where: str) -> NDArray[np.uint16]:
+    """uint16 [H, W] of a foxglove.RawImage; `where` begins the line of an error."""
+    if m.encoding != "16UC1":
+        raise DuagError(f"{where} is {m.encoding or 'without encoding'}, expected 16UC1")
+    if m.step < 2 * m.width or m.step % 2 or m.height * m.width == 0:
+        raise DuagError(
+            f"{where} has rows of {m.step} bytes for {m.width}x{m.height} pixels, expected two per pixel"
+        )
+    return unpack_array(m.data, "uint16", (m.height, m.step // 2), where)[:, : m.width]
+
+
+def pack_calibration(stamp_ns: int, robot: str, camera: PinholeCamera) -> Any:
+    """foxglove.CameraCalibration of an undistorted camera."""
+    K = camera.matrix()
+    return _foxglove(
+        "CameraCalibration",
+        stamp_ns,
+        camera_frame(robot),
+        width=camera.width,
+        height=camera.height,
+        K=K.ravel().tolist(),
+        R=np.eye(3).ravel().tolist(),
+        P=np.hstack([K, np.zeros((3, 1))]).ravel().tolist(),
+    )
+
+
+def unpack_calibration(m: Any) -> PinholeCamera:
+    """Camera of a foxglove.CameraCalibration.
+
+    Raises:
+        DuagError: lens distortion, numbers that are not finite, or no image size.
+    """
+    K = _numbers(m.K, (3, 3), "K")
+    if any(d != 0 for d in m.D):
+        raise DuagError(
+            f"found lens distortion {m.distortion_model!r} {list(m.D)}, expected undistorted images"
+        )
+    if not np.all(np.isfinite(K)) or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise DuagError(f"K is {K.ravel().tolist()}, expected finite numbers and positive focal lengths")
+    if K[0, 1] != 0 or not np.array_equal(np.delete(K.ravel(), [0, 1, 2, 4, 5]), [0, 0, 0, 1]):
+        raise DuagError(f"K is {K.ravel().tolist()}, expected a camera without skew")
+    if m.width == 0 or m.height == 0:
+        raise DuagError(f"image size is {m.width}x{m.height}, expected at least one pixel")
+    return PinholeCamera(m.width, m.height, *(float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))))
+
+
+def pack_pose_in_frame(stamp_ns: int, frame_id: str, T_frame_body: ArrayLike) -> Any:
+    """foxglove.PoseInFrame of a motion [4, 4]; its rotation is kept as a unit quaternion."""
+    T = np.asarray(T_frame_body, dtype=np.float64)
+    w, x, y, z = so3.to_quat_wxyz(T[:3, :3]).tolist()
+    tx, ty, tz = T[:3, 3].tolist()
+    pose = {"position": {"x": tx, "y": ty, "z": tz}, "orientation": {"x": x, "y": y, "z": z, "w": w}}
+    return _foxglove("PoseInFrame", stamp_ns, frame_id, pose=pose)
+
+
+def unpack_pose_in_frame(m: Any) -> Array:
+    """Motion T_frame_body [4, 4] of a foxglove.PoseInFrame.
+
+    Raises:
+        DuagError: numbers that are not finite, or a quaternion of no length.
+    """
+    p, q = m.pose.position, m.pose.orientation
+    quat = np.array([q.w, q.x, q.y, q.z])
+    if not np.all(np.isfinite([p.x, p.y, p.z, *quat])) or not 0.9 < np.linalg.norm(quat) < 1.1:
+        raise DuagError(
+            f"pose is {(p.x, p.y, p.z)}, wxyz {tuple(quat.tolist())}, expected a finite rigid motion"
+        )
+    return se3.from_quat_translation(quat, [p.x, p.y, p.z])
