@@ -1,0 +1,340 @@
+"""Mapping: one robot's Gaussian map, grown keyframe by keyframe from RGB-D images with known poses.
+
+At a keyframe the map is rendered, discs are seeded where it does not explain the image, and the Gaussians of a
+window of keyframes are optimised by Adam on a robust colour and depth loss. `finish` refines the map over all
+keyframes. Everything is elementwise or summed in a fixed order: the same input gives the same bits on any number of
+threads. See docs/mapping.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import streams
+from pipeline.config import Config
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.kernels import FisherSums, Rasterizer
+from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.losses import Loss, LossConfig, halve, rgbd_loss
+from pipeline.splat.optimiser import Adam, LearningRates
+from pipeline.splat.seeding import SeedingConfig, seed, unexplained
+
+Image = NDArray[np.float32]
+
+
+class MappingConfig(Config):
+    """How the map is grown and optimised."""
+
+    max_gaussians: int = 60_000
+    """Hard cap. When a keyframe would exceed it, the Gaussians whose removal changes the keyframes least go first."""
+    first_share: float = 0.35
+    """Share of the cap that the first keyframe may fill."""
+    keyframe_share: float = 0.12
+    """Share of the cap that any later keyframe may add."""
+    window: int = 8
+    """Keyframes optimised together: the newest and those that see most of what it sees."""
+    random_keyframes: int = 2
+    """Older keyframes added to the window by lot, against forgetting."""
+    iterations: int = 24
+    """Optimisation steps (one view each) at a keyframe; every second one is on the newest keyframe."""
+    iterations_level: int = 1
+    """Image pyramid level of these steps: 0 full size, 1 half size."""
+    final_iterations: int = 30
+    """Steps of the final refinement per keyframe, at full size."""
+    final_densify: bool = True
+    """Seed once more, early in the final refinement, where the map does not explain a keyframe."""
+    rates: LearningRates = LearningRates()
+    final_rate_decay: float = 0.05
+    """The final refinement's learning rates fall exponentially to this share."""
+    loss: LossConfig = LossConfig()
+    seeding: SeedingConfig = SeedingConfig()
+    min_opacity: float = 0.03
+    """Gaussians below are pruned."""
+    max_scale_m: float = 0.5
+    """Gaussians that grew beyond are pruned."""
+    min_contribution: float = 0.25
+    """Gaussians whose removal changes the keyframes by less (squared, in units of the noise below) are pruned."""
+    contribution_color_sigma: float = 0.03
+    contribution_depth_sigma_m: float = 0.02
+    exposure: bool = False
+    """Fit a gain and an offset per keyframe (the first keyframe's stay 1 and 0)."""
+    exposure_rate: float = 2e-3
+
+
+@dataclass(frozen=True)
+class MappingStats:
+    """What a keyframe did to the map; losses are those of its own view before and after the optimisation."""
+
+    inserted: int
+    pruned: int
+    total: int
+    loss_before: float
+    loss_after: float
+
+
+@dataclass
+class _View:
+    """A keyframe as the mapper keeps it: colours as bytes, depth in metres."""
+
+    index: int
+    color: NDArray[np.uint8]
+    depth_m: Image
+    half_color: Image
+    half_depth_m: Image
+    T_map_camera: NDArray[np.float64]
+    exposure: tuple[float, float] = (0.0, 0.0)
+    exposure_moments: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    exposure_steps: int = 0
+
+    def images(self, level: int) -> tuple[Image, Image]:
+        if level == 0:
+            return self.color.astype(np.float32) * np.float32(1 / 255), self.depth_m
+        return self.half_color, self.half_depth_m
+
+
+class Mapper:
+    """Grow and refine the Gaussian map of one robot."""
+
+    def __init__(
+        self, camera: PinholeCamera, config: MappingConfig, seed: int, rasterizer: Rasterizer | None = None
+    ) -> None:
+        self.config, self.seed = config, seed
+        self.cameras = (camera, camera.halved())
+        self.rasterizer = rasterizer if rasterizer is not None else Rasterizer()
+        self._gaussians = Gaussians.empty()
+        self._adam = Adam()
+        self._views: list[_View] = []
+        self._next_id = 0
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The map so far, in the map frame."""
+        return self._gaussians
+
+    @property
+    def exposures(self) -> dict[int, tuple[float, float]]:
+        """Keyframe index to (a, b): the image is about exp(a) * rendered + b."""
+        return {view.index: view.exposure for view in self._views}
+
+    def add_keyframe(
+        self, keyframe_index: int, color: Image, depth_m: Image, T_map_camera: NDArray[np.float64]
+    ) -> MappingStats:
+        """Seed what the map does not explain of a new keyframe and optimise the window around it.
+
+        Args:
+            keyframe_index: 0, 1, 2, ... in order of arrival.
+            color: RGB 0..1 [H, W, 3] (kept as bytes). depth_m: metres [H, W], 0 where there is none.
+            T_map_camera: pose of the camera in the map frame.
+        """
+        if keyframe_index != len(self._views):
+            raise ValueError(f"keyframe {keyframe_index} added after {len(self._views)} keyframes")
+        view = _view(keyframe_index, color, depth_m, T_map_camera)
+        self._views.append(view)
+        inserted, pruned = self._seed(
+            view, self.config.first_share if keyframe_index == 0 else self.config.keyframe_share
+        )
+        before = self._loss(view, self.config.iterations_level).value
+        for other in self._window(view):
+            self._optimise(other, self.config.iterations_level, self.config.rates)
+        pruned += self._prune_degenerate()
+        after = self._loss(view, self.config.iterations_level).value
+        return MappingStats(inserted, pruned, len(self._gaussians), before, after)
+
+    def set_keyframe_poses(self, T_map_keyframe: Mapping[int, NDArray[np.float64]] | NDArray[np.float64]) -> None:
+        """Move keyframes to refined poses, and every Gaussian with the keyframe it hangs on.
+
+        T_map_keyframe: [k, 4, 4] for keyframes 0..k-1, or index to [4, 4]; keyframes not named stay.
+        """
+        old = np.stack([view.T_map_camera for view in self._views]) if self._views else np.zeros((0, 4, 4))
+        new = old.copy()
+        poses = (
+            T_map_keyframe.items() if isinstance(T_map_keyframe, Mapping) else enumerate(np.asarray(T_map_keyframe))
+        )
+        for index, T in poses:
+            new[index] = T
+            self._views[index].T_map_camera = new[index]
+        self._gaussians = self._gaussians.moved(old, new)
+
+    def finish(self) -> MappingStats:
+        """Refine geometry and colour over all keyframes, `final_iterations` steps for each.
+
+        Returns:
+            Counts of the whole refinement, losses as means over all keyframes at full size.
+        """
+        config, views = self.config, self._views
+        before = self._mean_loss()
+        inserted = pruned = 0
+        rounds = config.final_iterations
+        for done in range(rounds):
+            if done == rounds // 4 and config.final_densify:
+                room = config.max_gaussians - len(self._gaussians)
+                for view in views:
+                    share = max(room, 0) / config.max_gaussians / len(views) + config.keyframe_share / len(views)
+                    new, gone = self._seed(view, share)
+                    inserted, pruned = inserted + new, pruned + gone
+            rates = config.rates.times(config.final_rate_decay ** (done / max(rounds - 1, 1)))
+            order = streams.generator(self.seed, "mapping.finish", round=done).permutation(len(views))
+            for index in order:
+                self._optimise(views[index], 0, rates)
+            if done == rounds // 2:
+                pruned += self._prune_degenerate()
+        return MappingStats(inserted, pruned, len(self._gaussians), before, self._mean_loss())
+
+    # --- one view -----------------------------------------------------------------------------------------------
+
+    def _render(self, view: _View, level: int) -> tuple[object, Loss]:
+        color, depth_m = view.images(level)
+        render = self.rasterizer.forward(self._gaussians, self.cameras[level], se3.inverse(view.T_map_camera))
+        return render, rgbd_loss(render, color, depth_m, self.config.loss, view.exposure)
+
+    def _loss(self, view: _View, level: int) -> Loss:
+        return self._render(view, level)[1]
+
+    def _mean_loss(self) -> float:
+        return float(np.mean([self._loss(view, 0).value for view in self._views])) if self._views else 0.0
+
+    def _optimise(self, view: _View, level: int, rates: LearningRates) -> None:
+        """One Adam step of all Gaussians in one view."""
+        loss = self._loss(view, level)
+        gradients = self.rasterizer.backward(loss.d_color, loss.d_depth, loss.d_alpha)
+        stepped = self._adam.step(self._gaussians, gradients, rates)
+        floor = np.float32(np.log(self.config.seeding.thickness_m))
+        self._gaussians = stepped.replace(
+            log_scales=np.maximum(stepped.log_scales, floor),
+            opacity_logits=np.clip(stepped.opacity_logits, np.float32(-6), np.float32(6)),
+        )
+
+    # --- what is in the map -------------------------------------------------------------------------------------
+
+    def _seed(self, view: _View, share: float) -> tuple[int, int]:
+        """Insert discs for what the map does not explain of a view; returns how many came and how many had to go."""
+        config = self.config
+        budget = int(share * config.max_gaussians)
+        color, depth_m = view.images(0)
+        if len(self._gaussians):
+            render = self.rasterizer.forward(self._gaussians, self.cameras[0], se3.inverse(view.T_map_camera))
+            wanted = unexplained(render, color, depth_m, config.seeding)
+        else:
+            wanted = depth_m > 0
+        new = seed(
+            color,
+            depth_m,
+            wanted,
+            self.cameras[0],
+            view.T_map_camera,
+            budget,
+            self._next_id,
+            view.index,
+            config.seeding,
+        )
+        excess = len(self._gaussians) + len(new) - config.max_gaussians
+        pruned = self._prune_least(excess) if excess > 0 else 0
+        self._next_id += len(new)
+        self._gaussians = Gaussians.concatenate([self._gaussians, new])
+        self._adam.extend(len(new))
+        return len(new), pruned
+
+    def _contributions(self) -> NDArray[np.float64]:
+        """Squared change of all keyframes' images, in units of the noise, if a Gaussian was removed, [n].
+
+        A pixel is linear in each Gaussian's blending factor, and the derivative by the opacity logit is that
+        factor's derivative times (1 - opacity), so the Gauss-Newton information of the logit divided by
+        (1 - opacity)^2 is exactly the sum of squared changes.
+        """
+        sums = FisherSums(len(self._gaussians))
+        camera = self.cameras[1]
+        inverse_color = np.full((camera.height, camera.width), self.config.contribution_color_sigma**-2, np.float32)
+        for view in self._views:
+            self.rasterizer.forward(self._gaussians, camera, se3.inverse(view.T_map_camera))
+            inverse_depth = (view.half_depth_m > 0) * np.float32(self.config.contribution_depth_sigma_m**-2)
+            self.rasterizer.fisher(inverse_color, inverse_depth, sums)
+        transparency = 1.0 / (1.0 + np.exp(self._gaussians.opacity_logits.astype(np.float64)))
+        return sums.opacity / transparency**2
+
+    def _prune_least(self, count: int) -> int:
+        """Remove the `count` Gaussians that contribute least; ties go by position."""
+        order = np.argsort(self._contributions(), kind="stable")
+        keep = np.ones(len(self._gaussians), bool)
+        keep[order[:count]] = False
+        return self._keep(keep)
+
+    def _prune_degenerate(self) -> int:
+        """Remove Gaussians that are transparent or huge."""
+        config = self.config
+        logit = np.log(config.min_opacity / (1 - config.min_opacity))
+        huge = self._gaussians.log_scales.max(axis=1, initial=-np.inf) > np.log(config.max_scale_m)
+        return self._keep((self._gaussians.opacity_logits >= logit) & ~huge)
+
+    def _keep(self, mask: NDArray[np.bool_]) -> int:
+        if not mask.all():
+            self._gaussians = self._gaussians.select(mask)
+            self._adam.select(mask)
+        return int(np.count_nonzero(~mask))
+
+    # --- which views --------------------------------------------------------------------------------------------
+
+    def _window(self, newest: _View) -> list[_View]:
+        """The views of this keyframe's iterations: every second one the newest, the others in turn."""
+        older = self._views[: newest.index]
+        overlaps = [overlap(newest.depth_m, newest.T_map_camera, v.depth_m, v.T_map_camera, self.cameras[0]) for v in older]
+        ranked = sorted(range(len(older)), key=lambda k: (-overlaps[k], -k))
+        chosen, rest = ranked[: self.config.window - 1], sorted(ranked[self.config.window - 1 :])
+        draw = streams.generator(self.seed, "mapping.window", keyframe=newest.index)
+        lot = draw.permutation(len(rest))[: self.config.random_keyframes]
+        others = [older[k] for k in chosen] + [older[rest[k]] for k in lot]
+        steps = self.config.iterations
+        if not others:
+            return [newest] * steps
+        return [newest if k % 2 == 0 else others[(k // 2) % len(others)] for k in range(steps)]
+
+
+def overlap(
+    depth_m: Image,
+    T_map_camera: NDArray[np.float64],
+    other_depth_m: Image,
+    T_map_other: NDArray[np.float64],
+    camera: PinholeCamera,
+    stride_px: int = 16,
+) -> float:
+    """Share of one view's measured pixels (every `stride_px`-th) that another view measured too.
+
+    A pixel counts if its point projects into the other image and lies within 10 % of the depth measured there.
+    """
+    z = depth_m[stride_px // 2 :: stride_px, stride_px // 2 :: stride_px].astype(np.float64)
+    rays = camera.rays()[stride_px // 2 :: stride_px, stride_px // 2 :: stride_px]
+    points = (rays * z[..., None])[z > 0]
+    if len(points) == 0:
+        return 0.0
+    seen = se3.transform(se3.inverse(T_map_other) @ T_map_camera, points)
+    seen = seen[seen[:, 2] > 0.05]
+    uv = np.rint(camera.project(seen)).astype(np.int64)
+    inside = (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
+    there = other_depth_m[uv[inside, 1], uv[inside, 0]]
+    agree = np.abs(there - seen[inside, 2]) < 0.1 * seen[inside, 2]
+    return float(np.count_nonzero(agree)) / len(points)
+
+
+def _view(index: int, color: Image, depth_m: Image, T_map_camera: NDArray[np.float64]) -> _View:
+    kept = np.rint(np.clip(color, 0, 1) * 255).astype(np.uint8)
+    depth_m = np.asarray(depth_m, dtype=np.float32)
+    return _View(
+        index=index,
+        color=kept,
+        depth_m=depth_m,
+        half_color=halve(kept.astype(np.float32) * np.float32(1 / 255)),
+        half_depth_m=_halve_depth(depth_m),
+        T_map_camera=np.array(T_map_camera, dtype=np.float64),
+    )
+
+
+def _halve_depth(depth_m: Image) -> Image:
+    """Means of 2x2 blocks of measured depths on one surface (within 2 %); 0 where a pixel is missing or differs."""
+    h, w = depth_m.shape[0] // 2 * 2, depth_m.shape[1] // 2 * 2
+    quarters = np.stack([depth_m[i:h:2, j:w:2] for i in (0, 1) for j in (0, 1)])
+    nearest, farthest = quarters.min(axis=0), quarters.max(axis=0)
+    return np.where((nearest > 0) & (farthest <= 1.02 * nearest), halve(depth_m), np.float32(0))

@@ -1,0 +1,263 @@
+"""New Gaussians from one RGB-D image: flat, footprint-sized discs where the map does not explain what was seen.
+
+The image is cut into square cells of a quadtree: a cell with detail in colour, or with more than one surface, is
+split down to the finest size. Each remaining cell becomes one disc on the surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config import Config
+from pipeline.geometry import se3, so3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.losses import Rendered
+
+Image = NDArray[np.float32]
+THICKNESS_FLOOR_M = 1e-3
+"""Thickness below which no splat is told from a plane: log-scales stop here, and carry no information there."""
+
+
+class SeedingConfig(Config):
+    """Where Gaussians are put and what they look like at first."""
+
+    cell_sizes_px: tuple[int, ...] = (8, 4, 2)
+    """Sides of the quadtree's cells, coarse to fine, each half of the one before."""
+    detail: float = 0.02
+    """Standard deviation of grey (0..1) in a cell above which it is split; raised until the budget holds."""
+    min_alpha: float = 0.6
+    """Rendered opacity below which a pixel is not explained."""
+    color_error: float = 0.1
+    """Mean colour error (0..1), smoothed over a cell, above which a pixel is not explained."""
+    depth_error_m: float = 0.04
+    """Depth error above which a pixel is not explained, plus depth_error_relative times the depth."""
+    depth_error_relative: float = 0.02
+    opacity: float = 0.8
+    """Initial opacity."""
+    spread: float = 0.55
+    """Standard deviation of a disc in units of its cell's side on the surface."""
+    thickness_m: float = THICKNESS_FLOOR_M
+    """Standard deviation across the surface at first; also the floor of every log-scale while mapping."""
+    min_depth_m: float = 0.2
+    max_depth_m: float = 10.0
+
+
+def unexplained(render: Rendered, color: Image, depth_m: Image, config: SeedingConfig) -> NDArray[np.bool_]:
+    """Measured pixels [H, W] whose opacity, depth or colour the rendered map does not explain."""
+    from scipy.ndimage import uniform_filter
+
+    alpha = np.maximum(render.alpha, np.float32(1e-3))
+    thin = render.alpha < config.min_alpha
+    allowed = config.depth_error_m + config.depth_error_relative * depth_m
+    displaced = np.abs(render.depth / alpha - depth_m) > allowed
+    error = uniform_filter(np.abs(render.color - color).mean(axis=2), size=config.cell_sizes_px[0] // 2 + 1)
+    return (depth_m > 0) & (thin | displaced | (error > config.color_error))
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Leaves of the quadtree: pixel centre uv [n, 2], side [n] px, depth [n] m, colour [n, 3], detail [n]."""
+
+    uv: NDArray[np.float64]
+    side_px: NDArray[np.float64]
+    depth_m: NDArray[np.float64]
+    color: NDArray[np.float64]
+
+
+def seed(
+    color: Image,
+    depth_m: Image,
+    wanted: NDArray[np.bool_],
+    camera: PinholeCamera,
+    T_map_camera: NDArray[np.float64],
+    budget: int,
+    first_id: int,
+    anchor: int,
+    config: SeedingConfig,
+) -> Gaussians:
+    """At most `budget` discs for the wanted pixels, in the map frame.
+
+    Args:
+        color, depth_m: the image, RGB 0..1 [H, W, 3] and metres [H, W].
+        wanted: pixels [H, W] to be explained.
+        T_map_camera: pose of the camera.
+        first_id: ids count up from here, in the order of the cells (coarse to fine, row by row).
+        anchor: keyframe index the Gaussians hang on.
+    """
+    depth_m = np.where((depth_m >= config.min_depth_m) & (depth_m <= config.max_depth_m), depth_m, 0)
+    cells = quadtree(color, depth_m, wanted & (depth_m > 0), budget, config)
+    normals = surface_normals(depth_m, cells, camera)
+    rays = np.stack(
+        [(cells.uv[:, 0] - camera.cx) / camera.fx, (cells.uv[:, 1] - camera.cy) / camera.fy, np.ones(len(cells.uv))],
+        axis=1,
+    )
+    cos_tilt = np.abs((normals * rays).sum(axis=1)) / np.linalg.norm(rays, axis=1)
+    R_camera_disc = _disc_axes(normals, rays)
+    pitch = cells.side_px * cells.depth_m / np.sqrt(camera.fx * camera.fy)
+    # a tilted surface is sampled more sparsely along its slope
+    sigma = config.spread * np.stack([pitch, pitch / np.clip(cos_tilt, 0.4, 1.0)], axis=1)
+    thin = np.full((len(pitch), 1), config.thickness_m)
+    scales = np.maximum(np.concatenate([sigma, thin], axis=1), config.thickness_m)
+    n = len(pitch)
+    T = np.asarray(T_map_camera, dtype=np.float64)
+    return Gaussians(
+        ids=np.arange(first_id, first_id + n, dtype=np.int64),
+        anchors=np.full(n, anchor, np.int32),
+        means=se3.transform(T, rays * cells.depth_m[:, None]).astype(np.float32),
+        quats_wxyz=so3.to_quat_wxyz(T[:3, :3] @ R_camera_disc).astype(np.float32),
+        log_scales=np.log(scales).astype(np.float32),
+        colors=cells.color.astype(np.float32),
+        opacity_logits=np.full(n, np.log(config.opacity / (1 - config.opacity)), np.float32),
+    )
+
+
+def quadtree(
+    color: Image, depth_m: Image, wanted: NDArray[np.bool_], budget: int, config: SeedingConfig
+) -> Cells:
+    """Leaves that hold wanted pixels, at most `budget` of them.
+
+    A leaf takes part if at least half of its pixels are wanted; its depth, position and colour are means over its
+    wanted pixels within 5 % of the nearest one, so that a leaf on an edge belongs to the front surface. The detail
+    threshold rises by steps of sqrt(2) until the leaves fit the budget; if the coarsest cells alone do not, every
+    second, third, ... is taken.
+    """
+    sides = config.cell_sizes_px
+    grids = [_grid(color, depth_m, wanted, side) for side in sides]
+    threshold, coarsest_only = config.detail, False
+    while True:
+        leaves = _leaves(grids, np.inf if coarsest_only else threshold)
+        total = sum(int(np.count_nonzero(mask)) for mask in leaves)
+        if total <= budget or coarsest_only:
+            break
+        threshold *= np.sqrt(2.0)
+        coarsest_only = threshold > 1.0
+    parts = [
+        (np.stack([grid.u[mask], grid.v[mask]], axis=1), np.full(mask.sum(), side), grid.z[mask], grid.color[mask])
+        for grid, mask, side in zip(grids, leaves, sides, strict=True)
+    ]
+    uv, side_px, z, rgb = (np.concatenate([part[k] for part in parts]) for k in range(4))
+    keep = slice(None) if total <= budget else np.arange(total)[:: -(-total // max(budget, 1))][:budget]
+    return Cells(uv[keep], side_px[keep].astype(np.float64), z[keep], rgb[keep])
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Statistics of the cells [rows, columns] of one size."""
+
+    side: int
+    filled: NDArray[np.bool_]  # at least half of its pixels are wanted
+    detail: NDArray[np.float64]  # standard deviation of grey; infinite where two surfaces meet
+    u: NDArray[np.float64]
+    v: NDArray[np.float64]
+    z: NDArray[np.float64]
+    color: NDArray[np.float64]
+
+
+def _blocks(image: NDArray, side: int) -> NDArray:
+    """Cells of an image [H, W, ...] as [rows, columns, side * side, ...], zero-padded at the right and bottom."""
+    h, w = image.shape[:2]
+    pad = [(0, -h % side), (0, -w % side), *[(0, 0)] * (image.ndim - 2)]
+    image = np.pad(image, pad)
+    rows, columns = image.shape[0] // side, image.shape[1] // side
+    blocks = image.reshape(rows, side, columns, side, *image.shape[2:]).swapaxes(1, 2)
+    return blocks.reshape(rows, columns, side * side, *image.shape[2:])
+
+
+def _grid(color: Image, depth_m: Image, wanted: NDArray[np.bool_], side: int) -> _Grid:
+    mask, z = _blocks(wanted, side), _blocks(depth_m, side).astype(np.float64)
+    rgb = _blocks(color, side).astype(np.float64)
+    nearest = np.where(mask, z, np.inf).min(axis=2)
+    farthest = np.where(mask, z, -np.inf).max(axis=2)
+    front = mask & (z <= 1.05 * nearest[..., None])
+    weight = front / np.maximum(front.sum(axis=2), 1)[..., None]
+    inverse_z = np.where(front, 1.0 / np.where(front, z, 1.0), 0.0)
+    rows, columns = mask.shape[:2]
+    offset = np.arange(side * side)
+    u = side * np.arange(columns)[None, :, None] + (offset % side)[None, None, :]
+    v = side * np.arange(rows)[:, None, None] + (offset // side)[None, None, :]
+    grey = rgb.mean(axis=3)
+    mean = (weight * grey).sum(axis=2)
+    detail = np.sqrt(np.maximum((weight * grey * grey).sum(axis=2) - mean * mean, 0.0))
+    with np.errstate(divide="ignore"):
+        z_mean = 1.0 / (weight * inverse_z).sum(axis=2)
+    return _Grid(
+        side=side,
+        filled=mask.sum(axis=2) * 2 >= side * side,
+        detail=np.where(farthest > 1.05 * nearest, np.inf, detail),
+        u=(weight * u).sum(axis=2),
+        v=(weight * v).sum(axis=2),
+        z=z_mean,
+        color=(weight[..., None] * rgb).sum(axis=2),
+    )
+
+
+def _leaves(grids: list[_Grid], threshold: float) -> list[NDArray[np.bool_]]:
+    """Masks of the cells, size by size, that are leaves and filled."""
+    leaves = []
+    open_cells = np.ones_like(grids[0].filled)  # cells whose parents were all split
+    for level, grid in enumerate(grids):
+        finest = level == len(grids) - 1 or np.isinf(threshold)
+        split = np.zeros_like(open_cells) if finest else grid.detail > threshold
+        # a half-empty cell is split too: its filled quarters may still stand for themselves
+        split = split if finest else split | ~grid.filled
+        leaves.append(open_cells & ~split & grid.filled)
+        if level + 1 < len(grids):
+            children = grids[level + 1].filled.shape
+            inherited = (open_cells & split).repeat(2, axis=0).repeat(2, axis=1)
+            open_cells = inherited[: children[0], : children[1]]
+    return leaves
+
+
+def surface_normals(depth_m: Image, cells: Cells, camera: PinholeCamera, radius_px: int = 4) -> NDArray[np.float64]:
+    """Unit normals [n, 3] in the camera frame, facing the camera, at the cells' centres.
+
+    A plane n . X = 1 has inverse depth 1 / z = n . ray, affine in the pixel: fit that affine function over the
+    pixels of a (2 radius + 1)^2 window within 5 % of the cell's inverse depth. Where it is not determined the
+    normal is the viewing ray.
+    """
+    h, w = depth_m.shape
+    du, dv = np.meshgrid(np.arange(-radius_px, radius_px + 1), np.arange(-radius_px, radius_px + 1))
+    du, dv = du.ravel(), dv.ravel()
+    u = np.rint(cells.uv[:, 0]).astype(np.int64)[:, None] + du
+    v = np.rint(cells.uv[:, 1]).astype(np.int64)[:, None] + dv
+    inside = (u >= 0) & (u < w) & (v >= 0) & (v < h)
+    z = np.where(inside, depth_m[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)], 0).astype(np.float64)
+    q = 1.0 / np.where(z > 0, z, np.inf)
+    q_cell = 1.0 / cells.depth_m
+    weight = ((z > 0) & (np.abs(q / q_cell[:, None] - 1) < 0.05)).astype(np.float64)
+    x, y = du.astype(np.float64), dv.astype(np.float64)
+    s = weight.sum(axis=1)
+    safe = np.maximum(s, 1.0)
+    mx, my, mq = ((weight * value).sum(axis=1) / safe for value in (x, y, q))
+    cxx = (weight * x * x).sum(axis=1) / safe - mx * mx
+    cyy = (weight * y * y).sum(axis=1) / safe - my * my
+    cxy = (weight * x * y).sum(axis=1) / safe - mx * my
+    cxq = (weight * x * q).sum(axis=1) / safe - mx * mq
+    cyq = (weight * y * q).sum(axis=1) / safe - my * mq
+    det = cxx * cyy - cxy * cxy
+    determined = (s >= 6) & (det > 0.25)
+    det = np.where(determined, det, 1.0)
+    slope_u = np.where(determined, (cyy * cxq - cxy * cyq) / det, 0.0)
+    slope_v = np.where(determined, (cxx * cyq - cxy * cxq) / det, 0.0)
+    level = q_cell - slope_u * (cells.uv[:, 0] - camera.cx) - slope_v * (cells.uv[:, 1] - camera.cy)
+    normal = np.stack([slope_u * camera.fx, slope_v * camera.fy, level], axis=1)
+    ray = np.stack(
+        [(cells.uv[:, 0] - camera.cx) / camera.fx, (cells.uv[:, 1] - camera.cy) / camera.fy, np.ones_like(s)], axis=1
+    )
+    normal = np.where(determined[:, None], normal, ray)
+    return -normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def _disc_axes(normals: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotations [n, 3, 3] with columns (across the slope, along the slope, normal) in the camera frame."""
+    across = np.cross(normals, rays)
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    # seen head on there is no slope: any direction in the surface will do
+    horizontal = np.cross(normals, np.array([0.0, 1.0, 0.0]) * np.ones_like(normals))
+    across = np.where(length > 1e-6, across, horizontal)
+    across = across / np.linalg.norm(across, axis=1, keepdims=True)
+    return np.stack([across, np.cross(normals, across), normals], axis=2)
