@@ -1,0 +1,98 @@
+"""Configuration of the exchange: links, transport, places, verification, what is sent."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from pipeline.config import Config
+
+
+class LinkConfig(Config):
+    """The simulated radio between two robots."""
+
+    enabled: bool = True
+    """False: nobody talks to anybody, whatever the topology."""
+    topology: Literal["full", "ring", "chain", "star", "none"] = "full"
+    """Who can talk to whom, over the robots in alphabetical order; the centre of the star is the first."""
+    loss_probability: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Chance that a packet is lost, independent of every other packet."""
+    latency_ns: int = Field(default=20_000_000, ge=0)
+    """Time from sending to delivery."""
+    budget_bytes: int = Field(default=250_000, ge=2_400)
+    """Most that one robot sends to one neighbour in one round, headers included."""
+
+
+class TransportConfig(Config):
+    """Selective acknowledgement and retransmission, in rounds."""
+
+    retransmit_after_rounds: int = Field(default=4, ge=1)
+    """An unacknowledged packet of a reliable message is sent again after so many rounds."""
+    contact_lost_after_rounds: int = Field(default=64, ge=1)
+    """A neighbour not heard for so long gets one small beacon per round and nothing else."""
+    silent_after_rounds: int = Field(default=400, ge=1)
+    """A neighbour not heard for so long is given up; the agent ends without it."""
+    max_message_bytes: int = Field(default=1 << 28, ge=1)
+    """A message that claims to be larger is refused."""
+    max_open_messages: int = Field(default=4096, ge=1)
+    """Incomplete messages kept per neighbour; further ones are refused until some are complete."""
+
+
+class PlacesConfig(Config):
+    """Place descriptors and candidates for closures."""
+
+    features_per_place: int = Field(default=80, ge=4)
+    """Descriptors of one keyframe that a neighbour gets to recognise the place (128 bytes each)."""
+    features_per_keyframe: int = Field(default=400, ge=4)
+    """Descriptors with 3-D points of one keyframe, for verification."""
+    ratio: float = Field(default=0.8, gt=0.0, lt=1.0)
+    """Nearest over second-nearest distance below which a match counts."""
+    min_score: int = Field(default=8, ge=1)
+    """Matches from which a pair of keyframes is a candidate."""
+    candidates_per_keyframe: int = Field(default=3, ge=1)
+    """Best candidates tried for each keyframe of the neighbour."""
+    max_requested_keyframes: int = Field(default=24, ge=1)
+    """Keyframes whose sample is requested from one neighbour, best scores first."""
+
+
+class VerificationConfig(Config):
+    """From a candidate to a closure: RANSAC over 3-D matches, then registration."""
+
+    hypotheses: int = Field(default=500, ge=1)
+    """Three-point hypotheses per candidate."""
+    inlier_m: float = Field(default=0.05, gt=0.0)
+    """Distance below which a match agrees with a hypothesis, at one metre of depth; grows with depth."""
+    min_inliers: int = Field(default=12, ge=4)
+    """Matches that must agree."""
+    min_inlier_share: float = Field(default=0.25, ge=0.0, le=1.0)
+    """Share of the matches that must agree."""
+    samples: int = Field(default=2000, ge=50)
+    """Points with normal and intensity of the neighbour's keyframe used by the registration."""
+    max_refinement_m: float = Field(default=0.15, gt=0.0)
+    """Largest translation by which the registration may change what RANSAC found."""
+    max_refinement_rad: float = Field(default=0.10, gt=0.0)
+    """Largest rotation by which the registration may change what RANSAC found."""
+
+
+class ExchangeConfig(Config):
+    """One session of the team."""
+
+    period_ns: int = Field(default=100_000_000, ge=1)
+    """Length of one round."""
+    max_rounds: int = Field(default=1500, ge=1)
+    """The session ends here, whatever has been agreed."""
+    coverage: Literal["all", "overlap"] = "all"
+    """Send every Gaussian to everybody, or only those in space that the receiver's keyframes saw."""
+    overlap_voxel_m: float = Field(default=0.25, gt=0.0)
+    """Edge of the voxels that say which space a robot saw (coverage = overlap)."""
+    pose_wire: Literal["float32", "float64"] = "float32"
+    """Precision of the poses of a pose round; final anchor poses are always float64."""
+    tolerance: float = Field(default=1e-5, gt=0.0)
+    """Poses are agreed when no pose changes by more than this (m, rad) in a round."""
+    min_closures: int = Field(default=2, ge=1)
+    """Consistent closures from which two robots are joined."""
+    max_closures: int = Field(default=40, ge=1)
+    """Closures kept per pair of robots, most informative first."""
+    link: LinkConfig = LinkConfig()
+    transport: TransportConfig = TransportConfig()
+    places: PlacesConfig = PlacesConfig()
+    verification: VerificationConfig = VerificationConfig()

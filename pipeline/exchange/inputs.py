@@ -1,0 +1,108 @@
+"""What an agent has before its first packet: its own log, and what its own front end made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import DuagError
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.messages import GaussianInformation, GaussianMap, Keyframe
+from pipeline.splat.gaussians import Gaussians
+from schemas import topics
+
+Array = NDArray[np.float64]
+Images = tuple[NDArray[np.uint8], NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class AgentInput:
+    """The files of one robot."""
+
+    robot: str
+    log: Path
+    frontend: Path
+    information: Path
+
+
+@dataclass(frozen=True)
+class Step:
+    """Odometry between two own keyframes: T_i_j [4, 4] and its information [6, 6] (right tangent)."""
+
+    i: int
+    j: int
+    T_i_j: Array
+    information: Array
+
+
+@dataclass(frozen=True)
+class RobotData:
+    """One robot's own results in memory.
+
+    T_map_keyframe: [n, 4, 4] by keyframe index. images: gives colour uint8 RGB [h, w, 3] and depth float32 [h, w]
+    (m, 0 = unknown) of a keyframe. information: of the Gaussians, in the map frame, by the same ids.
+    """
+
+    robot: str
+    camera: PinholeCamera
+    T_map_keyframe: Array
+    odometry: list[Step]
+    images: Callable[[int], Images]
+    gaussians: Gaussians
+    information: GaussianInformation
+
+    @property
+    def keyframes(self) -> int:
+        """Number of keyframes."""
+        return len(self.T_map_keyframe)
+
+
+def load(source: AgentInput) -> RobotData:
+    """Read one robot's files.
+
+    Raises:
+        DuagError: a file lacks what it should hold, or two files do not belong together.
+    """
+    from pipeline.recording import open_rgbd, read_log
+
+    robot = source.robot
+    wanted = (topics.KEYFRAME.of(robot), topics.MAP.of(robot))
+    keyframes: list[Keyframe] = []
+    gaussian_map: GaussianMap | None = None
+    for record in read_log(source.frontend, wanted):
+        message = record.message()
+        if isinstance(message, Keyframe):
+            keyframes.append(message)
+        else:
+            gaussian_map = message
+    if gaussian_map is None:
+        raise DuagError(f"{source.frontend}: {wanted[1]} not found, expected the final map")
+    if [k.keyframe_index for k in keyframes] != list(range(len(keyframes))):
+        raise DuagError(f"{source.frontend}: {wanted[0]} is not numbered 0, 1, 2, ...")
+    information: GaussianInformation | None = None
+    for record in read_log(source.information, (topics.INFORMATION.of(robot),)):
+        information = record.message()
+    if information is None:
+        raise DuagError(f"{source.information}: {topics.INFORMATION.of(robot)} not found")
+    if not np.array_equal(information.ids, gaussian_map.gaussians.ids):
+        raise DuagError(
+            f"{source.information}: is about other Gaussians than {source.frontend}, expected the same ids"
+        )
+    log = open_rgbd(source.log)
+    frames = [k.frame_index for k in keyframes]
+
+    def images(keyframe: int) -> Images:
+        frame = log.frame(frames[keyframe])
+        return frame.color, frame.depth
+
+    steps = [
+        Step(k.previous_index, k.keyframe_index, k.T_previous_keyframe, k.information)
+        for k in keyframes
+        if k.previous_index >= 0
+    ]
+    poses = np.array([k.T_map_camera for k in keyframes], dtype=np.float64).reshape(-1, 4, 4)
+    return RobotData(robot, log.camera, poses, steps, images, gaussian_map.gaussians, information)

@@ -1,0 +1,149 @@
+"""Packets of at most 1200 bytes: header, strict parser, cutting of messages.
+
+    offset  size  field
+    0       2     magic "DG"
+    2       1     version
+    3       1     kind of the message
+    4       2     sender, index in the sorted list of the team
+    6       2     receiver, likewise
+    8       4     sequence number of the packet on this directed link
+    12      4     round in which it was sent
+    16      4     message id, unique for its sender
+    20      4     offset of the payload in the message
+    24      4     total length of the message
+    28      2     length of the payload
+    30      4     CRC-32 of everything else
+
+Little-endian. A message is cut at multiples of `chunk_bytes(kind)`, so an offset names a chunk and a parser can tell
+a wrong one. A pose or evidence chunk holds whole records and is useful alone.
+"""
+
+import struct
+import zlib
+from dataclasses import dataclass
+from enum import IntEnum
+
+MAGIC = b"DG"
+VERSION = 1
+MAX_PACKET_BYTES = 1200
+_FIELDS = struct.Struct("<2sBBHHIIIIIH")
+_CRC = struct.Struct("<I")
+HEADER_BYTES = _FIELDS.size + _CRC.size
+MAX_PAYLOAD_BYTES = MAX_PACKET_BYTES - HEADER_BYTES
+
+EVIDENCE_HEAD_BYTES = 8
+EVIDENCE_RECORD_BYTES = 188
+EVIDENCE_RECORDS_PER_CHUNK = (MAX_PAYLOAD_BYTES - EVIDENCE_HEAD_BYTES) // EVIDENCE_RECORD_BYTES
+EVIDENCE_CHUNK_BYTES = EVIDENCE_HEAD_BYTES + EVIDENCE_RECORDS_PER_CHUNK * EVIDENCE_RECORD_BYTES
+
+
+class Kind(IntEnum):
+    """What a message holds. The order is the order of sending within a round."""
+
+    ACK = 1  # chunks received, per message
+    STATE = 2  # where the sender stands, and its poses of this round if it has any
+    FRAME = 3  # root of the component and the sender's map frame in the common frame
+    DESCRIPTORS = 4  # compact descriptors of every keyframe, to recognise places
+    REQUEST = 5  # keyframes whose sample is wanted
+    SAMPLE = 6  # one keyframe: features with 3-D points, and points for registration
+    CLOSURES = 7  # verdict on the pair: shared keyframes, metric, relative frame
+    VOXELS = 8  # space that the sender's keyframes saw
+    ANCHORS = 9  # agreed poses of the keyframes of one robot
+    PAIRS = 10  # matched Gaussians of two robots
+    EVIDENCE = 11  # Gaussians of one robot with their information
+
+
+FIRE_AND_FORGET = frozenset({Kind.ACK, Kind.STATE})
+"""Kinds that are sent once, in one packet, and never acknowledged."""
+
+
+class MalformedError(ValueError):
+    """A packet or a message that does not say what it should; the text is the reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One parsed packet."""
+
+    kind: Kind
+    sender: int
+    receiver: int
+    sequence: int
+    round: int
+    message: int
+    offset: int
+    total: int
+    payload: bytes
+
+
+def chunk_bytes(kind: Kind) -> int:
+    """Distance between the cuts of a message of this kind."""
+    return EVIDENCE_CHUNK_BYTES if kind is Kind.EVIDENCE else MAX_PAYLOAD_BYTES
+
+
+def chunk_count(kind: Kind, total_bytes: int) -> int:
+    """Number of packets that a message of `total_bytes` needs; an empty message needs one."""
+    return max(1, -(-total_bytes // chunk_bytes(kind)))
+
+
+def serialise(packet: Packet) -> bytes:
+    """Bytes of a packet, header and payload."""
+    return b"".join(header_and_payload(packet))
+
+
+def header_and_payload(packet: Packet) -> tuple[bytes, bytes]:
+    """Header, with its CRC over header and payload, and payload."""
+    if len(packet.payload) > MAX_PAYLOAD_BYTES:
+        raise ValueError(f"payload of {len(packet.payload)} bytes, at most {MAX_PAYLOAD_BYTES} fit")
+    fields = _FIELDS.pack(
+        MAGIC,
+        VERSION,
+        packet.kind,
+        packet.sender,
+        packet.receiver,
+        packet.sequence,
+        packet.round,
+        packet.message,
+        packet.offset,
+        packet.total,
+        len(packet.payload),
+    )
+    return fields + _CRC.pack(zlib.crc32(packet.payload, zlib.crc32(fields))), packet.payload
+
+
+def parse(data: bytes) -> Packet:
+    """Read one packet.
+
+    Raises:
+        MalformedError: anything is not as `serialise` writes it; the text says what.
+    """
+    if not HEADER_BYTES <= len(data) <= MAX_PACKET_BYTES:
+        raise MalformedError(f"{len(data)} bytes, expected {HEADER_BYTES} to {MAX_PACKET_BYTES}")
+    fields = data[: _FIELDS.size]
+    magic, version, kind, sender, receiver, sequence, round_, message, offset, total, length = _FIELDS.unpack(
+        fields
+    )
+    payload = data[HEADER_BYTES:]
+    if magic != MAGIC:
+        raise MalformedError(f"magic {magic!r}, expected {MAGIC!r}")
+    if version != VERSION:
+        raise MalformedError(f"version {version}, expected {VERSION}")
+    if length != len(payload):
+        raise MalformedError(f"length {length} in the header, {len(payload)} bytes follow")
+    if _CRC.unpack_from(data, _FIELDS.size)[0] != zlib.crc32(payload, zlib.crc32(fields)):
+        raise MalformedError("CRC does not match")
+    if kind not in Kind._value2member_map_:
+        raise MalformedError(f"unknown kind {kind}")
+    kind = Kind(kind)
+    if sender == receiver:
+        raise MalformedError("sender and receiver are the same robot")
+    step = chunk_bytes(kind)
+    if kind in FIRE_AND_FORGET and (offset, total) != (0, length):
+        raise MalformedError(f"{kind.name} must be one packet, found offset {offset} of {total}")
+    if offset % step or (offset >= total and (offset, total) != (0, 0)):
+        raise MalformedError(f"offset {offset} is not a cut of a {kind.name} of {total} bytes")
+    if length != min(step, total - offset):
+        raise MalformedError(
+            f"{length} bytes at offset {offset} of {total}, expected {min(step, total - offset)}"
+        )
+    return Packet(kind, sender, receiver, sequence, round_, message, offset, total, payload)

@@ -1,0 +1,275 @@
+"""Reliable messages to one neighbour: cutting, bursts within a budget, selective acknowledgement, reassembly.
+
+A burst holds, in this order: acknowledgements, the state of this round, then the open messages by kind and id,
+what is overdue before what is new. Nothing here looks into a payload, save that evidence is handed on chunk by chunk.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.config import TransportConfig
+from pipeline.exchange.packets import (
+    HEADER_BYTES,
+    MAX_PAYLOAD_BYTES,
+    Kind,
+    MalformedError,
+    Packet,
+    chunk_bytes,
+    chunk_count,
+    serialise,
+)
+
+_ACK_HEAD = struct.Struct("<IIH")  # message id, first chunk, number of chunks told; then one bit per chunk
+ACK_CHUNKS = 8 * (MAX_PAYLOAD_BYTES - _ACK_HEAD.size)
+
+
+@dataclass(frozen=True)
+class Message:
+    """A message on its way out: id unique for its sender, kind, bytes."""
+
+    id: int
+    kind: Kind
+    payload: bytes
+
+
+@dataclass(frozen=True)
+class Outgoing:
+    """One packet on its way out, and the message it is cut from."""
+
+    receiver: str
+    packet: bytes
+    message: Message
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """What a delivered packet brought: a chunk of evidence, or a complete message."""
+
+    kind: Kind
+    message: int
+    payload: bytes
+    complete: bool
+
+
+@dataclass
+class _Open:
+    """An outgoing message: which chunks are acknowledged, and from which round each may be sent (again)."""
+
+    message: Message
+    acknowledged: NDArray[np.bool_]
+    due_round: NDArray[np.int64]
+
+
+@dataclass
+class _Partial:
+    """An incoming message: its chunks so far."""
+
+    kind: Kind
+    total: int
+    chunks: dict[int, bytes] = field(default_factory=dict)
+
+
+class Transport:
+    """One end of the link to one neighbour."""
+
+    def __init__(self, own: int, peer: int, peer_name: str, config: TransportConfig) -> None:
+        """own, peer: indices in the sorted team."""
+        self.own, self.peer, self.peer_name, self.config = own, peer, peer_name, config
+        self.sequence = 0
+        self.last_heard: int | None = None
+        self._open: dict[int, _Open] = {}
+        self._partial: dict[int, _Partial] = {}
+        self._received: dict[int, tuple[Kind, int]] = {}  # complete messages: kind, total bytes
+        self._to_acknowledge: dict[int, tuple[int, int]] = {}  # message: first and last chunk with news
+
+    # --- outgoing
+
+    def send(self, message: Message) -> None:
+        """Queue a reliable message."""
+        n = chunk_count(message.kind, len(message.payload))
+        self._open[message.id] = _Open(message, np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64))
+
+    def cancel(self, message: int) -> None:
+        """Stop sending a message, if it is still open."""
+        self._open.pop(message, None)
+
+    def is_open(self, message: int) -> bool:
+        """Whether a message is not yet fully acknowledged."""
+        return message in self._open
+
+    @property
+    def idle(self) -> bool:
+        """Whether every queued message has been acknowledged."""
+        return not self._open
+
+    def in_contact(self, round_index: int) -> bool:
+        """Whether the neighbour was heard lately."""
+        return (
+            self.last_heard is not None
+            and round_index - self.last_heard <= self.config.contact_lost_after_rounds
+        )
+
+    def burst(self, round_index: int, states: list[Message], budget_bytes: int) -> list[Outgoing]:
+        """All packets of this round for this neighbour.
+
+        Args:
+            states: fire-and-forget messages, one packet each. budget_bytes: most that may be sent, headers included.
+        """
+        out: list[Outgoing] = []
+        for message in [*self._acknowledgements(), *states]:
+            budget_bytes -= HEADER_BYTES + len(message.payload)
+            if budget_bytes < 0:
+                return out
+            out.append(self._packet(message, 0, round_index))
+        if self.in_contact(round_index):
+            for entry, chunk in self._due(round_index):
+                size = HEADER_BYTES + min(
+                    chunk_bytes(entry.message.kind),
+                    len(entry.message.payload) - chunk * chunk_bytes(entry.message.kind),
+                )
+                if size > budget_bytes:
+                    break
+                budget_bytes -= size
+                entry.due_round[chunk] = round_index + self.config.retransmit_after_rounds
+                out.append(self._packet(entry.message, chunk, round_index))
+        return out
+
+    def _due(self, round_index: int) -> Iterator[tuple[_Open, int]]:
+        for entry in sorted(self._open.values(), key=lambda e: (e.message.kind, e.message.id)):
+            for chunk in np.flatnonzero(~entry.acknowledged & (entry.due_round <= round_index)).tolist():
+                yield entry, chunk
+
+    def _packet(self, message: Message, chunk: int, round_index: int) -> Outgoing:
+        step = chunk_bytes(message.kind)
+        packet = Packet(
+            message.kind,
+            self.own,
+            self.peer,
+            self.sequence,
+            round_index,
+            message.id,
+            chunk * step,
+            len(message.payload),
+            message.payload[chunk * step : (chunk + 1) * step],
+        )
+        self.sequence += 1
+        return Outgoing(self.peer_name, serialise(packet), message)
+
+    def _acknowledgements(self) -> list[Message]:
+        """One or more ACK messages for every chunk that arrived since the last burst, with what arrived around it."""
+        parts: list[bytes] = []
+        for message in sorted(self._to_acknowledge):
+            first, last = self._to_acknowledge[message]
+            for base in range(first - first % 8, last + 1, ACK_CHUNKS):
+                bits = self._bits(message, base, ACK_CHUNKS)
+                parts.append(
+                    _ACK_HEAD.pack(message, base, len(bits)) + np.packbits(bits, bitorder="little").tobytes()
+                )
+        self._to_acknowledge.clear()
+        payloads: list[bytes] = []
+        for part in parts:
+            if payloads and len(payloads[-1]) + len(part) <= MAX_PAYLOAD_BYTES:
+                payloads[-1] += part
+            else:
+                payloads.append(part)
+        return [Message(0, Kind.ACK, payload) for payload in payloads]
+
+    def _bits(self, message: int, base: int, most: int) -> NDArray[np.bool_]:
+        """Which of the chunks from `base` on, at most so many, are here."""
+        if message in self._received:
+            n = chunk_count(*self._received[message])
+            return np.ones(min(most, n - base), dtype=bool)
+        partial = self._partial[message]
+        bits = np.zeros(min(most, chunk_count(partial.kind, partial.total) - base), dtype=bool)
+        here = np.fromiter(partial.chunks, dtype=np.int64, count=len(partial.chunks)) - base
+        bits[here[(here >= 0) & (here < len(bits))]] = True
+        return bits
+
+    # --- incoming
+
+    def receive(self, packet: Packet, round_index: int) -> Arrival | None:
+        """Take one parsed packet from this neighbour.
+
+        Returns:
+            A complete message, or a chunk of evidence not seen before; None if there is nothing to act on.
+        Raises:
+            MalformedError: it contradicts what came before, or asks for too much; it is then ignored.
+        """
+        self.last_heard = round_index
+        if packet.kind is Kind.ACK:
+            self._take_acknowledgements(packet.payload)
+            return None
+        if packet.kind is Kind.STATE:
+            return Arrival(packet.kind, packet.message, packet.payload, complete=True)
+        return self._take_chunk(packet)
+
+    def _take_chunk(self, packet: Packet) -> Arrival | None:
+        known = self._received.get(packet.message)
+        partial = self._partial.get(packet.message)
+        if partial is not None:
+            known = (partial.kind, partial.total)
+        if known is not None and known != (packet.kind, packet.total):
+            raise MalformedError(
+                f"message {packet.message} was {known[0].name} of {known[1]} bytes, "
+                f"now {packet.kind.name} of {packet.total}"
+            )
+        chunk = packet.offset // chunk_bytes(packet.kind)
+        if known is None:
+            if packet.total > self.config.max_message_bytes:
+                raise MalformedError(
+                    f"message of {packet.total} bytes, at most {self.config.max_message_bytes}"
+                )
+            if len(self._partial) >= self.config.max_open_messages:
+                raise MalformedError(f"more than {self.config.max_open_messages} incomplete messages")
+            partial = self._partial[packet.message] = _Partial(packet.kind, packet.total)
+        first, last = self._to_acknowledge.get(packet.message, (chunk, chunk))
+        self._to_acknowledge[packet.message] = (min(first, chunk), max(last, chunk))
+        if partial is None or chunk in partial.chunks:
+            return None
+        partial.chunks[chunk] = packet.payload
+        n = chunk_count(packet.kind, packet.total)
+        complete = len(partial.chunks) == n
+        if complete:
+            del self._partial[packet.message]
+            self._received[packet.message] = (packet.kind, packet.total)
+            return Arrival(
+                packet.kind, packet.message, b"".join(partial.chunks[i] for i in range(n)), complete=True
+            )
+        if packet.kind is Kind.EVIDENCE:
+            return Arrival(packet.kind, packet.message, packet.payload, complete=False)
+        return None
+
+    def accept_rest(self, message: int) -> None:
+        """Acknowledge all of a message that is not needed any more: its content is here already."""
+        partial = self._partial.pop(message, None)
+        if partial is not None:
+            self._received[message] = (partial.kind, partial.total)
+            self._to_acknowledge[message] = (0, chunk_count(partial.kind, partial.total) - 1)
+
+    def _take_acknowledgements(self, payload: bytes) -> None:
+        """Mark what the neighbour says it has; what it says about anything else has no effect."""
+        position = 0
+        while position < len(payload):
+            if position + _ACK_HEAD.size > len(payload):
+                raise MalformedError("acknowledgement is cut short")
+            message, base, count = _ACK_HEAD.unpack_from(payload, position)
+            position += _ACK_HEAD.size
+            size = -(-count // 8)
+            if position + size > len(payload):
+                raise MalformedError("bits of an acknowledgement are cut short")
+            raw = np.frombuffer(payload, np.uint8, size, position)
+            position += size
+            entry = self._open.get(message)
+            if entry is None or base + count > len(entry.acknowledged):
+                continue
+            entry.acknowledged[base : base + count] |= np.unpackbits(
+                raw, count=count, bitorder="little"
+            ).astype(bool)
+            if entry.acknowledged.all():
+                del self._open[message]

@@ -1,0 +1,147 @@
+"""From a candidate pair of keyframes to a closure: 3-D matches, RANSAC, registration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.consensus.closures import Closure
+from pipeline.exchange.config import VerificationConfig
+from pipeline.exchange.places import Features, matches
+from pipeline.geometry import se3, so3
+from pipeline.registration import Reference, RgbdPyramid, register
+
+Array = NDArray[np.float64]
+REFINEMENT_ROUNDS = 3  # of fitting to the inliers and finding them again
+
+
+class Verdict(Enum):
+    """What became of a candidate."""
+
+    KEPT = "kept"
+    NOT_ASKED_FOR = "enough matches, but better pairs used up the budget"
+    FEW_MATCHES = "too few matches between all features of the two keyframes"
+    FEW_INLIERS = "too few matches agree on one motion"
+    NOT_REGISTERED = "registration of the two views failed"
+    MOVED = "registration moved far from what the matches say"
+    INCONSISTENT = "disagrees with the other closures of this pair of robots"
+    BEYOND_BUDGET = "consistent, but more informative closures used up the budget"
+
+
+@dataclass(frozen=True)
+class Verified:
+    """Outcome of one candidate; closure only if it was kept."""
+
+    verdict: Verdict
+    matches: int
+    inliers: int
+    detail: str = ""
+    closure: Closure | None = None
+
+
+def fit(points_a: Array, points_b: Array) -> Array:
+    """T_a_b [..., 4, 4] that minimises sum |a - T_a_b b|^2 over paired points [..., n, 3] (Kabsch, batched)."""
+    mean_a, mean_b = points_a.mean(axis=-2, keepdims=True), points_b.mean(axis=-2, keepdims=True)
+    R = so3.project(np.swapaxes(points_a - mean_a, -1, -2) @ (points_b - mean_b))
+    return se3.from_rotation_translation(R, mean_a[..., 0, :] - (R @ mean_b[..., 0, :, None])[..., 0])
+
+
+def ransac(
+    points_a: Array, points_b: Array, inlier_m: float, hypotheses: int, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.bool_]]:
+    """The motion that most matched points agree on.
+
+    Args:
+        points_a, points_b: paired points [n, 3], n >= 3, camera frames, metres.
+        inlier_m: largest distance at one metre of depth; it grows with depth as the noise of a depth camera does.
+        hypotheses: three-point samples drawn.
+    Returns:
+        T_a_b [4, 4], fitted to its inliers, and the inliers [n].
+    """
+    n = len(points_a)
+    # three different indices per row, without rejection: the second and third skip those before them
+    i = rng.integers(0, n, hypotheses)
+    j = rng.integers(0, n - 1, hypotheses)
+    k = rng.integers(0, n - 2, hypotheses)
+    j += j >= i
+    low, high = np.minimum(i, j), np.maximum(i, j)
+    k += k >= low
+    k += k >= high
+    triples = np.stack([i, j, k], axis=1)
+    limit_m = inlier_m * np.maximum(1.0, np.maximum(points_a[:, 2], points_b[:, 2]))
+
+    def agreeing(T: Array) -> NDArray[np.bool_]:
+        return np.linalg.norm(points_a - se3.transform(T, points_b), axis=-1) < limit_m
+
+    T = fit(points_a[triples], points_b[triples])
+    counts = agreeing(T).sum(axis=1)
+    best = T[int(np.argmax(counts))]
+    inliers = agreeing(best)
+    for _ in range(REFINEMENT_ROUNDS):
+        if inliers.sum() < 3:
+            break
+        best = fit(points_a[inliers], points_b[inliers])
+        inliers = agreeing(best)
+    return best, inliers
+
+
+def verify(
+    own_keyframe: int,
+    peer_keyframe: int,
+    own: Features,
+    own_pyramid: RgbdPyramid,
+    peer: Features,
+    peer_reference: Reference,
+    ratio: float,
+    config: VerificationConfig,
+    rng: np.random.Generator,
+) -> Verified:
+    """Verify one candidate.
+
+    Args:
+        own, own_pyramid: all features and the images of the own keyframe.
+        peer, peer_reference: features and registration samples of the neighbour's keyframe, as it sent them.
+        ratio: of the ratio test. rng: the stream of this pair of keyframes.
+    Returns:
+        The verdict, and the closure T_own_peer with its information if the verdict is KEPT.
+    """
+    pairs = matches(own.descriptors, peer.descriptors, ratio)
+    if len(pairs) < config.min_inliers:
+        return Verified(
+            Verdict.FEW_MATCHES, len(pairs), 0, f"{len(pairs)} matches, {config.min_inliers} needed"
+        )
+    points_own = own.points[pairs[:, 0]].astype(np.float64)
+    points_peer = peer.points[pairs[:, 1]].astype(np.float64)
+    T_own_peer, agree = ransac(points_own, points_peer, config.inlier_m, config.hypotheses, rng)
+    inliers = int(agree.sum())
+    needed = max(config.min_inliers, int(np.ceil(config.min_inlier_share * len(pairs))))
+    if inliers < needed:
+        return Verified(
+            Verdict.FEW_INLIERS, len(pairs), inliers, f"{inliers} of {len(pairs)} agree, {needed} needed"
+        )
+    result = register(peer_reference, own_pyramid, se3.inverse(T_own_peer))
+    if not result.ok:
+        return Verified(Verdict.NOT_REGISTERED, len(pairs), inliers, f"registration: {result.outcome.value}")
+    T_refined = se3.inverse(result.T_reference_target)
+    moved_m, moved_rad = (float(d) for d in se3.distance(T_own_peer, T_refined))
+    if moved_m > config.max_refinement_m or moved_rad > config.max_refinement_rad:
+        return Verified(Verdict.MOVED, len(pairs), inliers, f"by {moved_m:.3f} m and {moved_rad:.3f} rad")
+    closure = Closure(
+        own_keyframe,
+        peer_keyframe,
+        T_refined,
+        inverse_information(result.T_reference_target, result.information),
+    )
+    return Verified(
+        Verdict.KEPT, len(pairs), inliers, f"refined by {moved_m:.4f} m, {moved_rad:.4f} rad", closure
+    )
+
+
+def inverse_information(T_a_b: Array, information: Array) -> Array:
+    """Information [6, 6] of T_b_a in its right tangent, from that of T_a_b: inverse(T exp(x)) = T^-1 exp(-Ad(T) x)."""
+    adjoint_inverse = se3.adjoint(se3.inverse(T_a_b))
+    out = adjoint_inverse.T @ information @ adjoint_inverse
+    return 0.5 * (out + out.T)

@@ -1,0 +1,387 @@
+"""Bytes of every kind of message, and their strict reading. Little-endian throughout.
+
+Readers trust nothing: every count is checked against the bytes that are there, every index against its limit, every
+number that enters the mathematics must be finite. What does not fit raises MalformedError with the reason.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange.packets import MalformedError
+from pipeline.exchange.places import DIMENSIONS, Descriptors, Features
+from pipeline.registration import Reference, ReferenceLevel
+
+Array = NDArray[np.float64]
+
+MAX_KEYFRAMES = 100_000
+ROTATION_TOLERANCE = 1e-6  # of R R' = 1 in a pose that a neighbour sent
+
+
+class Reader:
+    """Walks through the bytes of a message and never past their end."""
+
+    def __init__(self, data: bytes, what: str) -> None:
+        self.data, self.what, self.position = data, what, 0
+
+    def fields(self, layout: struct.Struct) -> tuple[Any, ...]:
+        """Fixed fields."""
+        return layout.unpack(self._take(layout.size))
+
+    def array(self, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
+        """An array in C order; floats must be finite."""
+        kind = np.dtype(dtype).newbyteorder("<")
+        count = 1
+        for n in shape:
+            count *= n
+        values = np.frombuffer(self._take(count * kind.itemsize), kind).reshape(shape).astype(dtype)
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            raise MalformedError(f"{self.what}: not a finite number")
+        return values
+
+    def poses(self, n: int) -> Array:
+        """Motions [n, 4, 4] from their upper rows, float64."""
+        T = np.tile(np.eye(4), (n, 1, 1))
+        T[:, :3] = self.array("float64", (n, 3, 4))
+        R = T[:, :3, :3]
+        if n and (
+            np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max() > ROTATION_TOLERANCE
+            or np.linalg.det(R).min() < 0
+        ):
+            raise MalformedError(f"{self.what}: a pose is not a rigid motion")
+        return T
+
+    def done(self) -> None:
+        """Check that nothing is left."""
+        if self.position != len(self.data):
+            raise MalformedError(f"{self.what}: {len(self.data) - self.position} bytes too many")
+
+    def _take(self, size: int) -> bytes:
+        if self.position + size > len(self.data):
+            raise MalformedError(f"{self.what}: {len(self.data)} bytes, more were announced")
+        part = self.data[self.position : self.position + size]
+        self.position += size
+        return part
+
+
+def array_bytes(values: Any, dtype: str) -> bytes:
+    """Little-endian bytes in C order."""
+    return np.ascontiguousarray(values, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()
+
+
+def pose_bytes(T: Array) -> bytes:
+    """Upper rows of motions [..., 4, 4], float64."""
+    return array_bytes(np.asarray(T)[..., :3, :], "float64")
+
+
+# --- state: once per link and round
+
+
+@dataclass(frozen=True)
+class State:
+    """Where an agent stands, as it tells its neighbours in every round.
+
+    root: index of the lowest-named robot that it knows to be in its component. members: bit mask over the team.
+    frames_hops, still_hops: how many hops around it everybody has decided on all links, and holds still; 0 = not
+    itself. agreed: its poses are final. done: it needs nothing more. sources: uint8 [team], for each owner of
+    evidence where it comes from: a neighbour's index, COMPLETE or NOBODY.
+    """
+
+    root: int
+    members: int
+    frames_hops: int
+    still_hops: int
+    agreed: bool
+    done: bool
+    sources: NDArray[np.uint8]
+
+
+COMPLETE, NOBODY = 254, 255
+MAX_TEAM = 64
+_STATE = struct.Struct("<HQBBBB")
+
+
+def write_state(state: State) -> bytes:
+    """Bytes of a state; the poses of the round may follow."""
+    flags = int(state.agreed) | 2 * int(state.done)
+    head = _STATE.pack(
+        state.root, state.members, state.frames_hops, state.still_hops, flags, len(state.sources)
+    )
+    return head + array_bytes(state.sources, "uint8")
+
+
+def read_state(data: bytes, team: int) -> tuple[State, bytes]:
+    """A state and the bytes that follow it."""
+    reader = Reader(data, "state")
+    root, members, frames_hops, still_hops, flags, n = reader.fields(_STATE)
+    if n != team:
+        raise MalformedError(f"state: about a team of {n}, expected {team}")
+    if flags > 3 or root >= team or members >> team:
+        raise MalformedError("state: names a robot outside the team, or has unknown flags")
+    sources = reader.array("uint8", (n,))
+    state = State(root, members, frames_hops, still_hops, bool(flags & 1), bool(flags & 2), sources)
+    return state, data[reader.position :]
+
+
+# --- places
+
+
+@dataclass(frozen=True)
+class PlaceBook:
+    """What a robot tells its neighbour to let it recognise places.
+
+    descriptors: one array per keyframe. T_map_keyframe: [n, 4, 4]. drift: [n, 2], accumulated variance of its
+    odometry from keyframe 0 (m^2, rad^2).
+    """
+
+    descriptors: list[Descriptors]
+    T_map_keyframe: Array
+    drift: Array
+
+
+_COUNT = struct.Struct("<I")
+
+
+def write_places(book: PlaceBook) -> bytes:
+    """Bytes of DESCRIPTORS."""
+    return b"".join(
+        [
+            _COUNT.pack(len(book.descriptors)),
+            pose_bytes(book.T_map_keyframe),
+            array_bytes(book.drift, "float64"),
+            array_bytes([len(d) for d in book.descriptors], "uint16"),
+            *(array_bytes(d, "uint8") for d in book.descriptors),
+        ]
+    )
+
+
+def read_places(data: bytes) -> PlaceBook:
+    """From DESCRIPTORS."""
+    reader = Reader(data, "descriptors")
+    n = _keyframe_count(reader)
+    T, drift = reader.poses(n), reader.array("float64", (n, 2))
+    if n and (drift.min() < 0 or np.diff(drift, axis=0).min(initial=0.0) < 0):
+        raise MalformedError("descriptors: the drift of the odometry must grow from zero")
+    counts = reader.array("uint16", (n,)).tolist()
+    book = PlaceBook([reader.array("uint8", (count, DIMENSIONS)) for count in counts], T, drift)
+    reader.done()
+    return book
+
+
+def _keyframe_count(reader: Reader) -> int:
+    (n,) = reader.fields(_COUNT)
+    if n > MAX_KEYFRAMES:
+        raise MalformedError(f"{reader.what}: {n} keyframes, at most {MAX_KEYFRAMES}")
+    return int(n)
+
+
+def write_indices(indices: list[int]) -> bytes:
+    """Bytes of REQUEST: keyframe indices."""
+    return array_bytes(indices, "uint32")
+
+
+def read_indices(data: bytes, limit: int) -> list[int]:
+    """From REQUEST: ascending keyframe indices below `limit`."""
+    if len(data) % 4:
+        raise MalformedError("request: not a list of indices")
+    indices = Reader(data, "request").array("uint32", (len(data) // 4,)).tolist()
+    if indices != sorted(set(indices)) or (indices and indices[-1] >= limit):
+        raise MalformedError(f"request: indices must ascend and stay below {limit}")
+    return indices
+
+
+# --- one keyframe
+
+
+@dataclass(frozen=True)
+class KeyframeSample:
+    """What is needed of a keyframe to verify a closure with it: features, and samples for the registration."""
+
+    keyframe: int
+    features: Features
+    reference: Reference
+
+
+_SAMPLE = struct.Struct("<IHfHBf")
+_INT16 = 32767
+
+
+def write_sample(sample: KeyframeSample) -> bytes:
+    """Bytes of SAMPLE; points in steps of the largest coordinate / 32767, normals in bytes, grey in bytes."""
+    levels = sample.reference.levels
+    feature_scale, feature_points = _shorts(sample.features.points)
+    sample_scale, sample_points = _shorts(levels[0].points)
+    return b"".join(
+        [
+            _SAMPLE.pack(
+                sample.keyframe,
+                len(sample.features),
+                feature_scale,
+                len(levels[0]),
+                len(levels),
+                sample_scale,
+            ),
+            array_bytes(sample.features.descriptors, "uint8"),
+            feature_points,
+            sample_points,
+            array_bytes(np.rint(levels[0].normals * 127), "int8"),
+            *(array_bytes(np.rint(np.clip(level.intensities, 0, 1) * 255), "uint8") for level in levels),
+        ]
+    )
+
+
+def read_sample(data: bytes, limit: int) -> KeyframeSample:
+    """From SAMPLE of a keyframe below `limit`."""
+    reader = Reader(data, "sample")
+    keyframe, n, feature_scale, m, levels, sample_scale = reader.fields(_SAMPLE)
+    if keyframe >= limit:
+        raise MalformedError(f"sample: keyframe {keyframe}, expected one below {limit}")
+    if not (0 <= feature_scale < 1 and 0 <= sample_scale < 1) or not 1 <= levels <= 8:
+        raise MalformedError("sample: impossible scale of points or number of levels")
+    descriptors = reader.array("uint8", (n, DIMENSIONS))
+    points = reader.array("int16", (n, 3)).astype(np.float32) * np.float32(feature_scale)
+    sample_points = reader.array("int16", (m, 3)).astype(np.float32) * np.float32(sample_scale)
+    normals = reader.array("int8", (m, 3)).astype(np.float32)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    if m and length.min() == 0:
+        raise MalformedError("sample: a normal of length zero")
+    normals = (normals / np.maximum(length, np.float32(1e-6))).astype(np.float32)
+    grays = [reader.array("uint8", (m,)).astype(np.float32) / np.float32(255) for _ in range(levels)]
+    reader.done()
+    reference = Reference(tuple(ReferenceLevel(sample_points, normals, gray) for gray in grays))
+    return KeyframeSample(keyframe, Features(descriptors, points), reference)
+
+
+def _shorts(points: NDArray[np.float32]) -> tuple[float, bytes]:
+    """Step (m) and bytes of points in that step; the step as it will be read back."""
+    largest = float(np.abs(points).max(initial=0.0))
+    step = np.float32(largest * 1.000001 / _INT16)
+    return float(step), array_bytes(np.rint(points / max(step, np.float32(1e-12))), "int16")
+
+
+# --- frames and final poses
+
+
+_FRAME = struct.Struct("<HH")
+
+
+def write_frame(root: int, hops: int, T_world_map: Array) -> bytes:
+    """Bytes of FRAME: lowest robot of the component, distance to it, own map frame in the root's."""
+    return _FRAME.pack(root, hops) + pose_bytes(T_world_map)
+
+
+def read_frame(data: bytes, team: int) -> tuple[int, int, Array]:
+    """From FRAME: root, hops, T_world_map of the sender."""
+    reader = Reader(data, "frame")
+    root, hops = reader.fields(_FRAME)
+    T = reader.poses(1)[0]
+    reader.done()
+    if root >= team or hops >= team:
+        raise MalformedError("frame: names a robot outside the team")
+    return root, hops, T
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Agreed poses of one robot's keyframes in the common frame of the consensus, and of the first in its own map.
+
+    T_common_keyframe: [n, 4, 4]. T_map_first: [4, 4].
+    """
+
+    owner: int
+    T_common_keyframe: Array
+    T_map_first: Array
+
+
+_OWNER = struct.Struct("<HI")
+
+
+def write_anchors(anchors: Anchors) -> bytes:
+    """Bytes of ANCHORS."""
+    head = _OWNER.pack(anchors.owner, len(anchors.T_common_keyframe))
+    return head + pose_bytes(anchors.T_map_first) + pose_bytes(anchors.T_common_keyframe)
+
+
+def read_anchors(data: bytes, team: int) -> Anchors:
+    """From ANCHORS."""
+    reader = Reader(data, "anchors")
+    owner, n = reader.fields(_OWNER)
+    if owner >= team or not 1 <= n <= MAX_KEYFRAMES:
+        raise MalformedError("anchors: names a robot outside the team, or no keyframe")
+    first, T = reader.poses(1)[0], reader.poses(n)
+    reader.done()
+    return Anchors(owner, T, first)
+
+
+# --- space seen, matched Gaussians
+
+
+def write_voxels(owner: int, keys: NDArray[np.int64]) -> bytes:
+    """Bytes of VOXELS: ascending keys of the voxels that `owner` saw, differences in LEB128."""
+    out = bytearray(_OWNER.pack(owner, len(keys)))
+    for step in np.diff(keys, prepend=np.int64(0)).tolist():
+        while step > 127:
+            out.append(step & 127 | 128)
+            step >>= 7
+        out.append(step)
+    return bytes(out)
+
+
+def read_voxels(data: bytes, team: int) -> tuple[int, NDArray[np.int64]]:
+    """From VOXELS: owner and ascending keys."""
+    reader = Reader(data, "voxels")
+    owner, n = reader.fields(_OWNER)
+    values = np.frombuffer(data, np.uint8, offset=_OWNER.size).astype(np.int64)
+    last = np.flatnonzero(values < 128)
+    if owner >= team or len(last) != n or (len(values) and values[-1] >= 128):
+        raise MalformedError("voxels: the list does not have the announced length")
+    first = np.concatenate([[0], last[:-1] + 1]) if n else last
+    place = np.arange(len(values)) - np.repeat(first, last - first + 1)
+    if place.max(initial=0) > 8:
+        raise MalformedError("voxels: a number is too large")
+    steps = np.add.reduceat((values & 127) << (7 * place), first) if n else np.zeros(0, np.int64)
+    if n > 1 and steps[1:].min() < 1:
+        raise MalformedError("voxels: keys must ascend")
+    if float(steps.astype(np.float64).sum()) >= 2.0**63:
+        raise MalformedError("voxels: a number is too large")
+    return owner, np.cumsum(steps)
+
+
+_PAIRS = struct.Struct("<HHHI")
+
+
+@dataclass(frozen=True)
+class PairList:
+    """Matched Gaussians of two robots, lower index first.
+
+    ids: int64 [n, 2]. version: of the list; a later one replaces an earlier one.
+    """
+
+    lower: int
+    higher: int
+    version: int
+    ids: NDArray[np.int64]
+
+
+def write_pairs(pairs: PairList) -> bytes:
+    """Bytes of PAIRS."""
+    head = _PAIRS.pack(pairs.lower, pairs.higher, pairs.version, len(pairs.ids))
+    return head + array_bytes(pairs.ids, "int64")
+
+
+def read_pairs(data: bytes, team: int) -> PairList:
+    """From PAIRS."""
+    reader = Reader(data, "pairs")
+    lower, higher, version, n = reader.fields(_PAIRS)
+    if not lower < higher < team:
+        raise MalformedError("pairs: the two robots must be in the team, lower first")
+    ids = reader.array("int64", (n, 2))
+    reader.done()
+    if len(np.unique(ids[:, 0])) != n or len(np.unique(ids[:, 1])) != n:
+        raise MalformedError("pairs: a Gaussian is matched twice")
+    return PairList(lower, higher, version, ids)
