@@ -1,0 +1,260 @@
+"""Closures between two robots: which of them agree, and the relative frame they agree on.
+
+Pairwise consistency only chooses the *start* (`docs/consensus.md`): used as a filter it loses good closures. The
+graduated weights of `pipeline.consensus.poses` may let every closure back in, or throw it out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config import Config
+from pipeline.consensus.factors import Factors, inflated
+from pipeline.geometry import se3, so3
+
+Array = NDArray[np.float64]
+CHI2_3_999 = 16.27  # 99.9 % quantile of chi^2 with 3 degrees of freedom
+_CANDIDATES = 150  # relative frames tried as the start of the mean
+
+
+class ClosureConfig(Config):
+    """Trust in single closures and in their mutual agreement."""
+
+    sigma_floor_m: float = 0.005
+    """Added to every closure's covariance: registration reports only the noise of its pixels, not its bias (m)."""
+    sigma_floor_rad: float = 0.003
+    """The same for its rotation (rad)."""
+    drift_floor_m: float = 0.005
+    """Least assumed drift of the odometry from one keyframe to the next (m)."""
+    drift_floor_rad: float = 0.003
+    """The same for its rotation (rad)."""
+    margin: float = 4.0
+    """Factor on the variances of the pairwise test; fitted on two public data sets (`docs/consensus.md`)."""
+    min_support: int = 2
+    """Closures that must agree before two robots are put into one frame: one alone cannot be checked."""
+    frame_sigma_m: float = 0.1
+    """Scale of the Cauchy weights of the relative frame, translation."""
+    frame_sigma_rad: float = 0.05
+    """Scale of the Cauchy weights of the relative frame, rotation."""
+
+
+@dataclass(frozen=True)
+class Closure:
+    """One verified relative pose between a keyframe of the holder and a keyframe of a peer.
+
+    T_own_peer [4, 4]: peer keyframe's coordinates to own keyframe's. information [6, 6]: right tangent (translation,
+    rotation) of T_own_peer.
+    """
+
+    own_keyframe: int
+    peer_keyframe: int
+    T_own_peer: Array
+    information: Array
+
+    def reversed(self) -> Closure:
+        """The same measurement as its peer writes it down."""
+        to_inverse = se3.adjoint(se3.inverse(self.T_own_peer))  # right tangent of T^-1 -> right tangent of T
+        # T Exp(xi) inverted is T^-1 Exp(-Ad(T) xi): xi = -Ad(T^-1) xi'
+        information = to_inverse.T @ self.information @ to_inverse
+        return Closure(self.peer_keyframe, self.own_keyframe, se3.inverse(self.T_own_peer), information)
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """What the closures of one pair of robots say together.
+
+    keep: bool [m], the mutually consistent group. T_ownmap_peermap: [4, 4], or None if too few agree. reasons: one
+    per closure, in words. support: size of the group.
+    """
+
+    keep: NDArray[np.bool_]
+    T_ownmap_peermap: Array | None
+    reasons: tuple[str, ...]
+    support: int
+
+
+def closure_factors(closures: Sequence[Closure], config: ClosureConfig | None = None) -> Factors:
+    """Closures as factors between own keyframe i and peer keyframe j; with a config, its sigma floor is added."""
+    information = np.array([c.information for c in closures], dtype=np.float64).reshape(-1, 6, 6)
+    if config is not None:
+        floor = np.repeat([config.sigma_floor_m**2, config.sigma_floor_rad**2], 3)
+        information = inflated(information, floor * np.eye(6))
+    return Factors(
+        np.array([c.own_keyframe for c in closures]),
+        np.array([c.peer_keyframe for c in closures]),
+        np.array([c.T_own_peer for c in closures]).reshape(-1, 4, 4),
+        information,
+    )
+
+
+def drift(odometry: Factors, keyframes: int, config: ClosureConfig) -> Array:
+    """Accumulated variance of the odometry along the chain of keyframes, the input of `consistent`.
+
+    Args:
+        odometry: factors between own keyframes; those from k to k + 1 count.
+        keyframes: how many there are.
+    Returns:
+        [keyframes, 2]: translation m^2 and rotation rad^2 per axis, from keyframe 0 to keyframe k. A step that
+        nothing measured counts with one square metre and one square radian.
+    """
+    step = np.ones((max(keyframes - 1, 0), 2))
+    chain = np.flatnonzero(odometry.j - odometry.i == 1)
+    covariance = np.linalg.inv(odometry.information[chain] + np.eye(6))  # the identity is that weak prior
+    variances = np.diagonal(covariance, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)
+    for k, variance in zip(odometry.i[chain].tolist(), variances, strict=True):
+        step[k] = np.minimum(step[k], variance)
+    step += [config.drift_floor_m**2, config.drift_floor_rad**2]
+    return np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])[:keyframes]
+
+
+def consistent(
+    closures: Sequence[Closure],
+    T_map_keyframe_own: Array,
+    T_map_keyframe_peer: Array,
+    drift_own: Array,
+    drift_peer: Array,
+    config: ClosureConfig,
+) -> Consistency:
+    """Largest group of mutually consistent closures of one pair of robots, and its relative frame.
+
+    Two closures k and l are consistent if the relative frames of the two maps that each implies agree within the
+    variance of both closures and of both robots' odometry between them, where they overlap: that is the error of the
+    cycle own k -> peer k -> peer l -> own l.
+
+    Args:
+        closures: all of one pair, measured by or turned to one end.
+        T_map_keyframe_own, T_map_keyframe_peer: [n, 4, 4], each robot's keyframes in its own map, by keyframe index;
+            only those named by closures are read.
+        drift_own, drift_peer: [n, 2] from `drift`, likewise.
+    """
+    m = len(closures)
+    if m == 0:
+        return Consistency(np.zeros(0, dtype=bool), None, (), 0)
+    factors = closure_factors(closures, config)
+    own, peer = T_map_keyframe_own[factors.i], T_map_keyframe_peer[factors.j]
+    frames = own @ factors.T_i_j @ se3.inverse(peer)  # T_ownmap_peermap implied by each closure
+    rotation_rad, translation_m = _disagreement(frames, peer[:, :3, 3])
+    closure_variance = np.linalg.inv(factors.information + np.eye(6))
+    closure_variance = np.diagonal(closure_variance, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)
+    variance = closure_variance[:, None] + closure_variance[None]
+    variance = variance + np.abs(drift_own[factors.i][:, None] - drift_own[factors.i][None])
+    variance = variance + np.abs(drift_peer[factors.j][:, None] - drift_peer[factors.j][None])
+    lever_m = np.maximum(_distances(own[:, :3, 3]), _distances(peer[:, :3, 3]))
+    variance_rotation = config.margin * variance[..., 1]
+    variance_translation = config.margin * variance[..., 0] + variance_rotation * lever_m**2 / 3
+    agree = (rotation_rad**2 < CHI2_3_999 * variance_rotation) & (
+        translation_m**2 < CHI2_3_999 * variance_translation
+    )
+    keep = _clique(agree | agree.T)
+    support = int(keep.sum())
+    if support < config.min_support:
+        reason = f"largest consistent group has {support} of {m} closures, needs {config.min_support}"
+        return Consistency(np.zeros(m, dtype=bool), None, (reason,) * m, support)
+    rejected = f"disagrees with the consistent group of {support} among {m} closures"
+    reasons = tuple("consistent" if k else rejected for k in keep.tolist())
+    return Consistency(keep, robust_frame(frames[keep], config), reasons, support)
+
+
+def robust_frame(frames: Array, config: ClosureConfig) -> Array:
+    """One motion [4, 4] from many proposals [m, 4, 4]: the best supported one, then a Cauchy-weighted mean."""
+    tried = np.unique(np.linspace(0, len(frames) - 1, _CANDIDATES).round().astype(np.int64))
+    support = [float(_cauchy(frames, frames[k], config).sum()) for k in tried]
+    T = frames[tried[int(np.argmax(support))]]
+    for _ in range(20):
+        w = _cauchy(frames, T, config)
+        R = so3.project(np.sum(w[:, None, None] * frames[:, :3, :3], axis=0))
+        T = se3.from_rotation_translation(R, np.sum(w[:, None] * frames[:, :3, 3], axis=0) / w.sum())
+    return T
+
+
+def _cauchy(frames: Array, T: Array, config: ClosureConfig) -> Array:
+    """Weight [m] of every proposal, as seen from T."""
+    rotation_rad = np.linalg.norm(so3.log(T[:3, :3].T @ frames[:, :3, :3]), axis=1)
+    translation_m = np.linalg.norm(frames[:, :3, 3] - T[:3, 3], axis=1)
+    distance = (rotation_rad / config.frame_sigma_rad) ** 2 + (translation_m / config.frame_sigma_m) ** 2
+    return 1.0 / (1.0 + distance)
+
+
+def _disagreement(frames: Array, points_peermap: Array) -> tuple[Array, Array]:
+    """Angle and distance [m, m] between implied frames k and l, the distance at closure l's own place."""
+    R, t = frames[:, :3, :3], frames[:, :3, 3]
+    # angle of Rk' Rl from its trace's complement: |Rk - Rl|_F = 2 sqrt2 sin(angle / 2)
+    chord = np.sqrt(np.sum((R[:, None] - R[None]) ** 2, axis=(-1, -2)))
+    rotation_rad = 2 * np.arcsin(np.minimum(chord / np.sqrt(8.0), 1.0))
+    at_own = (R @ points_peermap[..., None])[..., 0] + t
+    at_other = np.einsum("kab,lb->kla", R, points_peermap) + t[:, None]
+    translation_m = np.linalg.norm(at_other - at_own[None], axis=-1)
+    return rotation_rad, np.minimum(translation_m, translation_m.T)
+
+
+def _distances(points: Array) -> Array:
+    return np.linalg.norm(points[:, None] - points[None], axis=-1)
+
+
+def _clique(agree: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Greedy largest clique of a symmetric relation, from the ten best connected starts; ties by index."""
+    agree = agree.copy()
+    np.fill_diagonal(agree, True)
+    best: list[int] = []
+    for start in np.argsort(-agree.sum(axis=1), kind="stable")[:10].tolist():
+        clique, candidates = [start], agree[start].copy()
+        candidates[start] = False
+        while candidates.any():
+            left = np.flatnonzero(candidates)
+            chosen = int(left[np.argmax(agree[np.ix_(left, left)].sum(axis=1))])
+            clique.append(chosen)
+            candidates &= agree[chosen]
+            candidates[chosen] = False
+        if len(clique) > len(best):
+            best = clique
+    keep = np.zeros(len(agree), dtype=bool)
+    keep[best] = True
+    return keep
+
+
+def holder(own: str, peer: str, closures: Sequence[Closure]) -> str:
+    """Which end of a pair holds its closures: the one that then copies fewer keyframes; the lower name on a tie.
+
+    Args:
+        closures: as `own` writes them down.
+    """
+    copied_by_own = len({c.peer_keyframe for c in closures})
+    copied_by_peer = len({c.own_keyframe for c in closures})
+    if copied_by_own == copied_by_peer:
+        return min(own, peer)
+    return own if copied_by_own < copied_by_peer else peer
+
+
+def chain_frames(
+    pairs: Mapping[tuple[str, str], tuple[Array, float]], robots: Sequence[str]
+) -> dict[str, Array]:
+    """Frames of all robots in their component's root, the lowest name, along the best supported spanning tree.
+
+    Args:
+        pairs: (a, b) -> (T_amap_bmap, support); one direction of each pair is enough.
+        robots: all names.
+    Returns:
+        T_world_map [4, 4] of every robot; the identity for every root, a robot without a partner included.
+    """
+    edges = {}
+    for (a, b), (T_a_b, support) in pairs.items():
+        edges[a, b] = (support, np.asarray(T_a_b))
+        edges.setdefault((b, a), (support, se3.inverse(T_a_b)))
+    T_world_map: dict[str, Array] = {}
+    for root in sorted(robots):
+        if root in T_world_map:
+            continue
+        T_world_map[root] = np.eye(4)
+        component = {root}
+        while True:
+            border = [(-edges[e][0], e) for e in edges if e[0] in component and e[1] not in component]
+            if not border:
+                break
+            a, b = min(border)[1]
+            T_world_map[b] = T_world_map[a] @ edges[a, b][1]
+            component.add(b)
+    return T_world_map

@@ -1,0 +1,582 @@
+"""Pose consensus of one robot: relaxed edge-ADMM (Douglas-Rachford form) with per-pair adaptive penalties.
+
+Every closure between two robots is held by one of them, which keeps a *copy* of the other's keyframe beside its own
+poses. For every copied keyframe s there is one edge variable y at each end of the link. Per round a robot
+
+    1. takes one Gauss-Newton step on  f(x) + 1/2 sum over links |x (-) y|_W^2,   W = penalty * metric,
+    2. sends                           m = x (+) (x (-) y)                        (that is 2 x - y),
+    3. on arrival sets                 y <- y (+) relaxation (m (-) y);
+
+a packet that does not arrive changes nothing. At a fixed point x agrees at both ends and the forces W (x (-) y) of
+the two ends cancel, so that x minimises the sum of all robots' costs: the centralised optimum, whatever the
+penalties and the losses on the way were. Source: `docs/consensus.md`; paper eqs. (8), (10), (11), (14), corrected.
+
+Penalty handshake. The end with the lower name decides. Versions count up from 0, and a packet is used only by a
+receiver of the same version.
+
+    * Every packet carries the sender's version; the decider's also its penalties; the follower's also its curvature
+      once it has received enough in this version.
+    * The decider, having received enough itself and holding a curvature of this version, takes new penalties, moves
+      its y so that its force W (x (-) y) stays, and counts the version up.
+    * The follower takes over penalties and version from the first newer packet that reaches it, keeping its force
+      likewise, and then uses that packet.
+
+So the ends differ by at most one version (the decider cannot decide again before it has heard the follower in the new
+version), a lost packet only delays the follower's change, and what the follower sent before it is dropped by the
+decider, as if lost. Keeping the force keeps every fixed point: there m (-) y = 0 before and after.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.config import Config
+from pipeline.consensus import factors as pose_factors
+from pipeline.consensus.closures import Closure, ClosureConfig, closure_factors
+from pipeline.consensus.factors import Factors, difference, inflated, retract
+from pipeline.geometry import se3, so3
+
+Array = NDArray[np.float64]
+_BLOCK = [0, 0, 0, 1, 1, 1]  # translation, rotation -> the six rows of a tangent
+_STEADY = 1e-3  # m, rad: a link that moves less has left its start behind
+
+
+class PoseConsensusConfig(Config):
+    """The decentralised solver of the team's keyframe poses."""
+
+    relaxation: float = 0.9
+    """Share of the way that an edge variable goes to what arrived (0.5 is the textbook's, slower)."""
+    penalty_start: float = 0.1
+    """First penalty, as a multiple of the metric (the information of the pair's closures)."""
+    penalty_min: float = 0.015
+    """Least penalty; below it one Gauss-Newton step per round can diverge."""
+    penalty_max: float = 3.0
+    """Greatest penalty."""
+    penalty_period: int = 5
+    """Packets that both ends must have received between two changes of the penalty."""
+    penalty_decay: float = 20.0
+    """Packets after which the allowed change shrinks: factor 1 + 2 / max(1, received / penalty_decay)."""
+    adaptive: bool = True
+    """Adapt the penalties; if not, the first ones stay."""
+    relinearise_rad: float = 1e-2
+    """The factorisation is kept until rotations moved this much in sum."""
+    tolerance: float = 1e-5
+    """An end is settled when its steps and edge variables change less than this (m, rad)."""
+    wire: Literal["float32", "float64"] = "float32"
+    """Precision of poses in a packet."""
+    robust: bool = True
+    """Weigh closures by graduated non-convexity, truncated least squares; if not, `keep` decides alone."""
+    truncation: float = 7.5
+    """A closure whose whitened residual is longer than this counts as an outlier."""
+    robust_warm_up: int = 40
+    """Packets received with the start weights before the graduated weights begin (fewer if the link is steady)."""
+    robust_packets: int = 5
+    """Packets received per step of the graduated weights."""
+    robust_growth: float = 1.4
+    """Factor on the control parameter mu per step; 1.6 freezes robots on wrong weights."""
+    robust_passes: tuple[tuple[float, int], ...] = ((0.01, 25), (0.1, 15))
+    """Passes of the graduated weights: (first mu, steps)."""
+    odometry_floor_m: float = 0.002
+    """Added to the covariance of every odometry factor: registration does not report its bias (m)."""
+    odometry_floor_rad: float = 0.001
+    """The same for rotations (rad)."""
+    closures: ClosureConfig = ClosureConfig()
+    """Trust in closures."""
+
+
+@dataclass(frozen=True)
+class SharedKeyframes:
+    """Set-up message of a link, from the end that holds the closures to the end that owns the keyframes.
+
+    keyframes: int32 [s], indices of the receiver's keyframes, ascending. metric: float32 [s, 6], diagonal of the
+    information (translation, rotation) that the pair's closures have about each, isotropic per block, so that it
+    holds in every frame; both ends must use the same numbers.
+    """
+
+    keyframes: NDArray[np.int32]
+    metric: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class PosePacket:
+    """One direction of one link in one round. It may be cut by keyframe; every part is useful alone.
+
+    sequence: counts the sender's packets on this link. version: of the penalties. keyframes: int32 [s], indices of
+    the non-holder's keyframes. quats_wxyz [s, 4], translations [s, 3] (m): 2 x - y in the sender's world frame.
+    penalties: float32 [2] (translation, rotation) of this version. curvature: float32 [2] or None, the stiffness that
+    the sender met in this version. converged: the sender is settled.
+    """
+
+    sequence: int
+    version: int
+    keyframes: NDArray[np.int32]
+    quats_wxyz: NDArray[Any]
+    translations: NDArray[Any]
+    penalties: NDArray[np.float32]
+    curvature: NDArray[np.float32] | None
+    converged: bool
+
+    def part(self, index: slice | NDArray[np.int64]) -> PosePacket:
+        """The packet with some of its keyframes only."""
+        return PosePacket(
+            self.sequence,
+            self.version,
+            self.keyframes[index],
+            self.quats_wxyz[index],
+            self.translations[index],
+            self.penalties,
+            self.curvature,
+            self.converged,
+        )
+
+
+@dataclass
+class _Link:
+    """One end of a link. Arrays over its s shared keyframes, which belong to the end that holds no closures."""
+
+    peer: str
+    decides: bool
+    holds: bool
+    keyframes: NDArray[np.int32]
+    metric: Array
+    slots: NDArray[np.int64]  # [s] where the shared keyframes stand among this robot's variables
+    closures: Factors  # held ones, between own keyframe and *position* in `keyframes`; empty at the other end
+    weights: Array
+    penalties: Array  # [2] translation, rotation
+    y: Array | None = None  # T_world_keyframe [s, 4, 4]
+    version: int = 0
+    sent: int = 0
+    received: float = 0.0  # packets since the last change of penalties, parts counted by their share
+    received_total: float = 0.0
+    newest: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # [s] sequence last used
+    newest_header: int = 0
+    change: Array = field(default_factory=lambda: np.zeros(0))  # [s] last change of y (m, rad)
+    reference: tuple[Array, Array] | None = None  # force and poses when the curvature window began
+    peer_curvature: Array | None = None
+    peer_converged: bool = False
+    robust_step: int = -1  # -1 while warming up
+    robust_next: float = 0.0  # received_total at which the next step is due
+    robust_done: bool = True
+
+    def __post_init__(self) -> None:
+        self.newest = np.zeros(len(self.keyframes), np.int64)
+        self.change = np.full(len(self.keyframes), np.inf)
+
+    def penalty(self) -> Array:
+        """Diagonal penalty [s, 6]."""
+        return self.metric * self.penalties[_BLOCK]
+
+    def largest_change(self) -> float:
+        return float(self.change.max())
+
+
+class PoseAgent:
+    """One robot's side of the pose consensus: own keyframes, copies of the neighbours', and what packets brought.
+
+    Robots have names that sort; the lower name of a pair decides on penalties, the lowest of a component (the root)
+    on the gauge. Nobody is held during the iteration; results are expressed in the root's map frame afterwards
+    (`gauge_correction` at the root, `apply_gauge` everywhere).
+    """
+
+    def __init__(
+        self, robot: str, T_map_keyframe: ArrayLike, odometry: Factors, config: PoseConsensusConfig
+    ) -> None:
+        """Take a robot's own graph.
+
+        Args:
+            robot: its name.
+            T_map_keyframe: [n, 4, 4], keyframes in its own map; also the start of the iteration.
+            odometry: factors between own keyframes (by index), loops within the robot included.
+            config: the same at all robots.
+        """
+        self.robot, self.config = robot, config
+        self.T_map_keyframe = np.array(T_map_keyframe, dtype=np.float64)
+        floor = np.repeat([config.odometry_floor_m**2, config.odometry_floor_rad**2], 3) * np.eye(6)
+        self.odometry = Factors(odometry.i, odometry.j, odometry.T_i_j, inflated(odometry.information, floor))
+        self.T_world_map = np.eye(4)
+        self.gauge = np.eye(4)
+        self.links: dict[str, _Link] = {}
+        self.rounds = self.factorisations = 0
+        self.step_change = np.inf
+        self._copies_start: dict[str, Array] = {}
+        self._started = False
+        self._x = self.T_map_keyframe.copy()
+        self._factors, self._weights = self.odometry, np.ones(len(self.odometry))
+        self._solve: Callable[[Array], Array] | None = None
+        self._moved_rad = 0.0
+        self._dual_change = 0.0
+
+    # ---- set-up ----
+
+    def set_frame(self, T_world_map: ArrayLike) -> None:
+        """Start from this pose of the own map in the common frame; call before the first step."""
+        if self._started:
+            raise ValueError(f"{self.robot}: the frame cannot change after the first step")
+        self.T_world_map = np.array(T_world_map, dtype=np.float64)
+
+    def add_link(
+        self,
+        peer: str,
+        closures_held: Sequence[Closure] = (),
+        shared: SharedKeyframes | None = None,
+        *,
+        keep: ArrayLike | None = None,
+        T_world_keyframe_peer: Mapping[int, ArrayLike] | None = None,
+    ) -> SharedKeyframes:
+        """Join a neighbour, either with the closures that this end holds or with the keyframes that it shares.
+
+        Args:
+            peer: the neighbour's name.
+            closures_held: all closures of the pair, if this end holds them.
+            shared: what the neighbour's `add_link` returned, if it holds them.
+            keep: bool per closure, start of the robust weights (default: all).
+            T_world_keyframe_peer: start of the copies by peer keyframe index, in this robot's idea of the world
+                frame; default: from the first kept closure that names it.
+        Returns:
+            What the neighbour needs for its own `add_link` (with `shared`: the same again).
+        """
+        if self._started:
+            raise ValueError(f"{self.robot}: a link to {peer} cannot be added after the first step")
+        if peer in self.links or peer == self.robot:
+            raise ValueError(f"{self.robot}: there is a link to {peer} already")
+        if bool(closures_held) == (shared is not None):
+            raise ValueError(
+                f"{self.robot}: a link to {peer} needs held closures or shared keyframes, one of the two"
+            )
+        if shared is None:
+            factors = closure_factors(closures_held, self.config.closures)
+            kept = np.ones(len(factors), dtype=bool) if keep is None else np.asarray(keep, dtype=bool)
+            keyframes = np.unique(factors.j)
+            position = np.searchsorted(keyframes, factors.j)
+            shared = SharedKeyframes(keyframes.astype(np.int32), _metric(factors, position, len(keyframes)))
+            factors = Factors(factors.i, position, factors.T_i_j, factors.information)
+            self._copies_start[peer] = self._copies(factors, kept, keyframes, T_world_keyframe_peer or {})
+        else:
+            factors, kept = Factors.empty(), np.zeros(0, dtype=bool)
+        self.links[peer] = _Link(
+            peer=peer,
+            decides=self.robot < peer,
+            holds=len(factors) > 0,
+            keyframes=np.asarray(shared.keyframes, dtype=np.int32),
+            metric=np.asarray(shared.metric, dtype=np.float64),
+            slots=np.asarray(shared.keyframes, dtype=np.int64),
+            closures=factors,
+            weights=kept.astype(np.float64),
+            penalties=np.full(2, np.float64(np.float32(self.config.penalty_start))),
+            robust_done=not (self.config.robust and len(factors) > 0),
+        )
+        self.links = {name: self.links[name] for name in sorted(self.links)}
+        return shared
+
+    def _copies(
+        self, factors: Factors, kept: NDArray[np.bool_], keyframes: NDArray[np.int64], known: Mapping[int, ArrayLike]
+    ) -> Array:
+        """Start of the peer's keyframes [s, 4, 4] in the own map frame, or in the world frame where known."""
+        out = np.zeros((len(keyframes), 4, 4))
+        from_world = se3.inverse(self.T_world_map)
+        for s, keyframe in enumerate(keyframes.tolist()):
+            if keyframe in known:
+                out[s] = from_world @ np.asarray(known[keyframe], dtype=np.float64)
+            else:
+                named = np.flatnonzero(factors.j == s)
+                k = int(named[np.argmax(kept[named])])
+                out[s] = self.T_map_keyframe[factors.i[k]] @ factors.T_i_j[k]
+        return out
+
+    def _start(self) -> None:
+        """Lay out the variables: own keyframes, then copies by neighbour; factors over all of them."""
+        self._started = True
+        poses, parts, count = [self.T_map_keyframe], [self.odometry], len(self.T_map_keyframe)
+        for link in self.links.values():
+            if link.holds:
+                copies = self._copies_start[link.peer]
+                link.slots = count + np.arange(len(copies))
+                poses.append(copies)
+                f = link.closures
+                parts.append(Factors(f.i, link.slots[f.j], f.T_i_j, f.information))
+                count += len(copies)
+        self._x = self.T_world_map @ np.concatenate(poses)
+        self._factors = Factors.concatenate(parts)
+        for link in self.links.values():
+            link.y = self._x[link.slots]
+        self._collect_weights()
+
+    def _collect_weights(self) -> None:
+        held = [link.weights for link in self.links.values() if link.holds]
+        self._weights = np.concatenate([np.ones(len(self.odometry)), *held])
+        self._solve = None
+
+    # ---- one round ----
+
+    def step(self) -> float:
+        """One Gauss-Newton step; returns its largest component (m, rad). Without links nothing moves."""
+        self.rounds += 1
+        if not self.links:
+            self.step_change = 0.0
+            return 0.0
+        if not self._started:
+            self._start()
+        for link in self.links.values():
+            self._weigh(link)
+            self._decide(link)
+        force_before = {peer: self._force(link) for peer, link in self.links.items()}
+        g, jacobians = pose_factors.gradient(self._factors, self._weights, self._x)
+        for peer, link in self.links.items():
+            g[link.slots] += force_before[peer]
+        if self._solve is None or self._moved_rad > self.config.relinearise_rad:
+            diagonal = np.zeros_like(g)
+            for link in self.links.values():
+                diagonal[link.slots] += link.penalty()
+            diagonal += 1e-9 * diagonal.max()  # a variable that nothing holds stays where it is
+            H = pose_factors.curvature_matrix(self._factors, jacobians, diagonal)
+            self._solve, self._moved_rad = pose_factors.factorised(H), 0.0
+            self.factorisations += 1
+        delta = -self._solve(g.ravel()).reshape(-1, 6)
+        self._x = retract(self._x, delta)
+        self._moved_rad += float(np.abs(delta[:, 3:]).max())
+        self.step_change = float(np.abs(delta).max())
+        self._dual_change = max(
+            float(np.abs((self._force(link) - force_before[peer]) / np.sqrt(link.metric)).max())
+            for peer, link in self.links.items()
+        )
+        return self.step_change
+
+    def outgoing(self, peer: str) -> PosePacket:
+        """What to send to a neighbour after a step."""
+        if not self._started:
+            self._start()
+        link = self.links[peer]
+        link.sent += 1
+        x = self._x[link.slots]
+        m = retract(x, difference(x, self._y(link)))
+        curvature = None if link.decides else self._curvature(link)
+        return PosePacket(
+            sequence=link.sent,
+            version=link.version,
+            keyframes=link.keyframes,
+            quats_wxyz=so3.to_quat_wxyz(m[:, :3, :3]).astype(self.config.wire),
+            translations=m[:, :3, 3].astype(self.config.wire),
+            penalties=link.penalties.astype(np.float32),
+            curvature=None if curvature is None else curvature.astype(np.float32),
+            converged=self.settled,
+        )
+
+    def receive(self, peer: str, packet: PosePacket) -> bool:
+        """Use a neighbour's packet; False if it was of another version or brought nothing newer."""
+        if not self._started:
+            self._start()
+        link = self.links[peer]
+        if not link.decides and packet.version > link.version:
+            self._change_penalties(link, packet.penalties.astype(np.float64), packet.version)
+        if packet.version != link.version:
+            return False
+        if packet.sequence >= link.newest_header:
+            link.newest_header, link.peer_converged = packet.sequence, packet.converged
+            if packet.curvature is not None:
+                link.peer_curvature = packet.curvature.astype(np.float64)
+        at = np.searchsorted(link.keyframes, packet.keyframes)
+        if not np.array_equal(link.keyframes[np.minimum(at, len(link.keyframes) - 1)], packet.keyframes):
+            raise ValueError(f"{self.robot}: {peer} sent keyframes that the link does not share")
+        newer = packet.sequence > link.newest[at]
+        if not newer.any():
+            return False
+        at = at[newer]
+        m = se3.from_quat_translation(
+            packet.quats_wxyz[newer].astype(np.float64), packet.translations[newer].astype(np.float64)
+        )
+        y = self._y(link)
+        delta = self.config.relaxation * difference(m, y[at])
+        y[at] = retract(y[at], delta)
+        link.newest[at] = packet.sequence
+        link.change[at] = np.abs(delta).max(axis=1)
+        share = len(at) / len(link.keyframes)
+        link.received += share
+        link.received_total += share
+        return True
+
+    # ---- penalties ----
+
+    def _y(self, link: _Link) -> Array:
+        if link.y is None:
+            raise ValueError(f"{self.robot}: the link to {link.peer} has not started")
+        return link.y
+
+    def _force(self, link: _Link) -> Array:
+        """W (x (-) y) [s, 6]: the multiplier of this end (dual)."""
+        return link.penalty() * difference(self._x[link.slots], self._y(link))
+
+    def _curvature(self, link: _Link) -> Array | None:
+        """Stiffness [2] met on the way since the last change of penalties: |change of force| / |change of pose|.
+
+        In the metric, for translation and rotation apart; None before enough was received or if nothing moved.
+        """
+        if not (self.config.adaptive and self.robust_done) or link.received < self.config.penalty_period:
+            return None
+        if link.reference is None:
+            self._mark(link)
+            return None
+        force, poses = link.reference
+        root = np.sqrt(link.metric)
+        d_force = (self._force(link) - force) / root
+        d_pose = difference(self._x[link.slots], poses) * root
+        stiffness = []
+        for block in (slice(0, 3), slice(3, 6)):
+            moved = float(np.linalg.norm(d_pose[:, block]))
+            changed = float(np.linalg.norm(d_force[:, block]))
+            if moved == 0.0 or changed == 0.0:
+                return None
+            stiffness.append(changed / moved)
+        return np.array(stiffness)
+
+    def _mark(self, link: _Link) -> None:
+        """Begin a new window of the curvature."""
+        link.reference = (self._force(link), self._x[link.slots].copy())
+        link.received = 0.0
+        link.peer_curvature = None
+
+    def _decide(self, link: _Link) -> None:
+        """At the lower end: take new penalties once both ends have met enough of the path in this version."""
+        if not link.decides:
+            return
+        own = self._curvature(link)
+        if own is None or link.peer_curvature is None:
+            return
+        c = self.config
+        limit = 1.0 + 2.0 / max(1.0, link.received_total / c.penalty_decay)
+        penalties = np.sqrt(own * link.peer_curvature)
+        penalties = np.clip(penalties, link.penalties / limit, link.penalties * limit)
+        penalties = np.clip(penalties, c.penalty_min, c.penalty_max).astype(np.float32).astype(np.float64)
+        self._change_penalties(link, penalties, link.version + 1)
+
+    def _change_penalties(self, link: _Link, penalties: Array, version: int) -> None:
+        """Change W and move y so that the force W (x (-) y) stays."""
+        x = self._x[link.slots]
+        link.y = retract(x, difference(self._y(link), x) * (link.penalties / penalties)[_BLOCK])
+        link.penalties, link.version = penalties, version
+        self._solve = None
+        self._mark(link)
+
+    # ---- robust weights of held closures ----
+
+    def _weigh(self, link: _Link) -> None:
+        """Graduated non-convexity, truncated least squares, paced by what arrives on the link."""
+        if link.robust_done:
+            return
+        c = self.config
+        if link.robust_step < 0:
+            steady = link.received_total >= c.penalty_period and link.largest_change() < _STEADY
+            if link.received_total < c.robust_warm_up and not steady:
+                return
+            squared, c2 = self._squared(link), c.truncation**2
+            link.robust_step = 0
+            if np.all(squared <= c2):  # no closure is in doubt: every truncated weight is one
+                self._finish_weights(link, np.ones(len(squared)))
+                return
+        if link.received_total < link.robust_next:
+            return
+        link.robust_next = link.received_total + c.robust_packets
+        schedule = [mu * c.robust_growth**k for mu, steps in c.robust_passes for k in range(steps)]
+        squared, c2 = self._squared(link), c.truncation**2
+        if link.robust_step == len(schedule):
+            self._finish_weights(link, (squared <= c2).astype(np.float64))
+            return
+        link.weights = graduated_weights(squared, c2, schedule[link.robust_step])
+        link.robust_step += 1
+        self._collect_weights()
+
+    def _squared(self, link: _Link) -> Array:
+        f = link.closures
+        return pose_factors.squared_residuals(Factors(f.i, link.slots[f.j], f.T_i_j, f.information), self._x)
+
+    def _finish_weights(self, link: _Link, weights: Array) -> None:
+        link.weights, link.robust_done = weights, True
+        link.reference, link.received = None, 0.0
+        self._collect_weights()
+
+    # ---- results ----
+
+    @property
+    def robust_done(self) -> bool:
+        """Whether the weights of all held closures are final."""
+        return all(link.robust_done for link in self.links.values())
+
+    @property
+    def largest_change(self) -> float:
+        """Largest change of a pose or an edge variable in the last round (m, rad)."""
+        return max([self.step_change, *(link.largest_change() for link in self.links.values())])
+
+    @property
+    def settled(self) -> bool:
+        """This end changes less than the tolerance, and its weights are final."""
+        return self.robust_done and self.largest_change < self.config.tolerance
+
+    @property
+    def agreed(self) -> bool:
+        """This end and, by their last packets, all neighbours are settled."""
+        return self.settled and all(link.peer_converged for link in self.links.values())
+
+    @property
+    def T_world_keyframe(self) -> Array:  # noqa: N802
+        """Own keyframes [n, 4, 4]; in the root's map frame once the gauge was applied. Odometry if without links."""
+        if not self.links:
+            return self.T_map_keyframe.copy()
+        if not self._started:
+            self._start()
+        return self.gauge @ self._x[: len(self.T_map_keyframe)]
+
+    def gauge_correction(self) -> Array:
+        """At the root: T [4, 4] with T @ (own estimate of keyframe 0) = T_map_keyframe[0]; to be told to everybody."""
+        if not self.links:
+            return np.eye(4)
+        if not self._started:
+            self._start()
+        return self.T_map_keyframe[0] @ se3.inverse(self._x[0])
+
+    def apply_gauge(self, T: ArrayLike) -> None:
+        """Express results (not the iteration) in the frame that the root's correction leads to."""
+        self.gauge = np.array(T, dtype=np.float64)
+
+    def weights(self, peer: str) -> Array:
+        """Weight [m] of every closure held with a neighbour, in the order given."""
+        return self.links[peer].weights.copy()
+
+    def residuals(self) -> dict[str, Any]:
+        """What a round looked like, for the record.
+
+        primal: largest |2 x_peer - y_peer - y| over links, the disagreement (m, rad). dual: largest change of a force
+        in the last step, over the root of the metric (no unit). cost: own factors, weighted. step: largest component
+        of the last step (m, rad). penalties: (translation, rotation) per neighbour. versions, weights: per neighbour.
+        """
+        changes = [link.largest_change() for link in self.links.values()]
+        return {
+            "primal": max(changes, default=0.0) / self.config.relaxation,
+            "dual": self._dual_change,
+            "cost": pose_factors.cost(self._factors, self._x, self._weights) if self._started else 0.0,
+            "step": self.step_change,
+            "penalties": {peer: tuple(link.penalties.tolist()) for peer, link in self.links.items()},
+            "versions": {peer: link.version for peer, link in self.links.items()},
+            "weights": {peer: link.weights.tolist() for peer, link in self.links.items() if link.holds},
+            "factorisations": self.factorisations,
+        }
+
+
+def graduated_weights(squared: Array, c2: float, mu: float) -> Array:
+    """Weights of truncated least squares at control parameter mu (Yang et al. 2020): mu -> infinity truncates at c2."""
+    low, high = mu / (mu + 1) * c2, (mu + 1) / mu * c2
+    between = np.sqrt(c2 * mu * (mu + 1) / np.maximum(squared, 1e-300)) - mu
+    return np.where(squared <= low, 1.0, np.where(squared >= high, 0.0, between))
+
+
+def _metric(factors: Factors, position: NDArray[np.int64], count: int) -> NDArray[np.float32]:
+    """Information [count, 6] of the factors about each copied keyframe, averaged over directions per block."""
+    blocks = np.diagonal(factors.information, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)
+    total = np.zeros((count, 2))
+    np.add.at(total, position, blocks)
+    if not np.all(total > 0):
+        raise ValueError("a closure without information about translation or rotation cannot join two robots")
+    return total[:, _BLOCK].astype(np.float32)
