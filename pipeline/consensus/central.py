@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.consensus import factors as pose_factors
-from pipeline.consensus.closures import Closure, closure_factors
+from pipeline.consensus.closures import Closure, ClosureConfig, closure_factors
 from pipeline.consensus.factors import Factors
 
 Array = NDArray[np.float64]
@@ -84,8 +84,16 @@ def team_graph(
     T_world_keyframe: Mapping[str, Array],
     odometry: Mapping[str, Factors],
     closures: Sequence[tuple[str, str, Sequence[Closure]]],
+    config: ClosureConfig,
 ) -> Team:
-    """Put every robot's factors and all closures (own robot, peer robot, closures) into one graph."""
+    """Put the whole team into one graph.
+
+    Args:
+        T_world_keyframe: start [n, 4, 4] of every robot, in one frame.
+        odometry: every robot's own factors, as its agent uses them (`PoseAgent.odometry`).
+        closures: (own robot, peer robot, closures that the own robot holds); factors in this order after the odometry.
+        config: for the sigma floor, as the agents use it.
+    """
     first, count = {}, 0
     for robot in sorted(T_world_keyframe):
         first[robot] = count
@@ -95,7 +103,8 @@ def team_graph(
         for robot in sorted(first)
     ]
     for own, peer, held in closures:
-        f = closure_factors(held)
-        parts.append(Factors(f.i + first[own], f.j + first[peer], f.T_i_j, f.information))
+        i = [first[own] + c.own_keyframe for c in held]
+        j = [first[peer] + c.peer_keyframe for c in held]
+        parts.append(closure_factors(held, i, j, config))
     start = np.concatenate([T_world_keyframe[robot] for robot in sorted(first)])
     return Team(first, Factors.concatenate(parts), start)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pipeline.config import Config
 from pipeline.consensus.factors import Factors, inflated
@@ -47,20 +47,22 @@ class Closure:
     """One verified relative pose between a keyframe of the holder and a keyframe of a peer.
 
     T_own_peer [4, 4]: peer keyframe's coordinates to own keyframe's. information [6, 6]: right tangent (translation,
-    rotation) of T_own_peer.
+    rotation) of the measured motion, which is T_own_peer, or T_peer_own if `measured_from_peer`. Turning a closure
+    round for the other end keeps the measured motion, so that the objective does not depend on who holds it.
     """
 
     own_keyframe: int
     peer_keyframe: int
     T_own_peer: Array
     information: Array
+    measured_from_peer: bool = False
 
     def reversed(self) -> Closure:
         """The same measurement as its peer writes it down."""
-        to_inverse = se3.adjoint(se3.inverse(self.T_own_peer))  # right tangent of T^-1 -> right tangent of T
-        # T Exp(xi) inverted is T^-1 Exp(-Ad(T) xi): xi = -Ad(T^-1) xi'
-        information = to_inverse.T @ self.information @ to_inverse
-        return Closure(self.peer_keyframe, self.own_keyframe, se3.inverse(self.T_own_peer), information)
+        T_peer_own = se3.inverse(self.T_own_peer)
+        return Closure(
+            self.peer_keyframe, self.own_keyframe, T_peer_own, self.information, not self.measured_from_peer
+        )
 
 
 @dataclass(frozen=True)
@@ -77,17 +79,25 @@ class Consistency:
     support: int
 
 
-def closure_factors(closures: Sequence[Closure], config: ClosureConfig | None = None) -> Factors:
-    """Closures as factors between own keyframe i and peer keyframe j; with a config, its sigma floor is added."""
+def closure_factors(
+    closures: Sequence[Closure], own_variable: ArrayLike, peer_variable: ArrayLike, config: ClosureConfig
+) -> Factors:
+    """Closures as factors of a solver, with the sigma floor of `config` added.
+
+    Args:
+        closures: of one pair of robots, m in number.
+        own_variable, peer_variable: int [m], the solver's variables of each closure's two keyframes.
+    """
+    own, peer = np.asarray(own_variable, dtype=np.int64), np.asarray(peer_variable, dtype=np.int64)
+    turned = np.array([c.measured_from_peer for c in closures], dtype=bool)
+    T_own_peer = np.array([c.T_own_peer for c in closures], dtype=np.float64).reshape(-1, 4, 4)
     information = np.array([c.information for c in closures], dtype=np.float64).reshape(-1, 6, 6)
-    if config is not None:
-        floor = np.repeat([config.sigma_floor_m**2, config.sigma_floor_rad**2], 3)
-        information = inflated(information, floor * np.eye(6))
+    floor = np.repeat([config.sigma_floor_m**2, config.sigma_floor_rad**2], 3)
     return Factors(
-        np.array([c.own_keyframe for c in closures]),
-        np.array([c.peer_keyframe for c in closures]),
-        np.array([c.T_own_peer for c in closures]).reshape(-1, 4, 4),
-        information,
+        np.where(turned, peer, own),
+        np.where(turned, own, peer),
+        np.where(turned[:, None, None], se3.inverse(T_own_peer), T_own_peer),
+        inflated(information, floor * np.eye(6)),
     )
 
 
@@ -134,15 +144,18 @@ def consistent(
     m = len(closures)
     if m == 0:
         return Consistency(np.zeros(0, dtype=bool), None, (), 0)
-    factors = closure_factors(closures, config)
-    own, peer = T_map_keyframe_own[factors.i], T_map_keyframe_peer[factors.j]
-    frames = own @ factors.T_i_j @ se3.inverse(peer)  # T_ownmap_peermap implied by each closure
+    i = np.array([c.own_keyframe for c in closures], dtype=np.int64)
+    j = np.array([c.peer_keyframe for c in closures], dtype=np.int64)
+    own, peer = np.asarray(T_map_keyframe_own)[i], np.asarray(T_map_keyframe_peer)[j]
+    # T_ownmap_peermap implied by each closure
+    frames = own @ np.array([c.T_own_peer for c in closures], dtype=np.float64) @ se3.inverse(peer)
     rotation_rad, translation_m = _disagreement(frames, peer[:, :3, 3])
-    closure_variance = np.linalg.inv(factors.information + np.eye(6))
+    information = closure_factors(closures, i, j, config).information
+    closure_variance = np.linalg.inv(information + np.eye(6))
     closure_variance = np.diagonal(closure_variance, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)
     variance = closure_variance[:, None] + closure_variance[None]
-    variance = variance + np.abs(drift_own[factors.i][:, None] - drift_own[factors.i][None])
-    variance = variance + np.abs(drift_peer[factors.j][:, None] - drift_peer[factors.j][None])
+    variance = variance + np.abs(drift_own[i][:, None] - drift_own[i][None])
+    variance = variance + np.abs(drift_peer[j][:, None] - drift_peer[j][None])
     lever_m = np.maximum(_distances(own[:, :3, 3]), _distances(peer[:, :3, 3]))
     variance_rotation = config.margin * variance[..., 1]
     variance_translation = config.margin * variance[..., 0] + variance_rotation * lever_m**2 / 3

@@ -141,11 +141,11 @@ class _Link:
 
     peer: str
     decides: bool
-    holds: bool
     keyframes: NDArray[np.int32]
     metric: Array
     slots: NDArray[np.int64]  # [s] where the shared keyframes stand among this robot's variables
-    closures: Factors  # held ones, between own keyframe and *position* in `keyframes`; empty at the other end
+    closures: tuple[Closure, ...]  # held ones; none at the other end
+    factors: Factors  # the same, between this robot's variables
     weights: Array
     penalties: Array  # [2] translation, rotation
     y: Array | None = None  # T_world_keyframe [s, 4, 4]
@@ -166,6 +166,10 @@ class _Link:
     def __post_init__(self) -> None:
         self.newest = np.zeros(len(self.keyframes), np.int64)
         self.change = np.full(len(self.keyframes), np.inf)
+
+    @property
+    def holds(self) -> bool:
+        return bool(self.closures)
 
     def penalty(self) -> Array:
         """Diagonal penalty [s, 6]."""
@@ -248,44 +252,46 @@ class PoseAgent:
             raise ValueError(
                 f"{self.robot}: a link to {peer} needs held closures or shared keyframes, one of the two"
             )
+        closures = tuple(closures_held)
+        kept = np.ones(len(closures), dtype=bool) if keep is None else np.asarray(keep, dtype=bool)
         if shared is None:
-            factors = closure_factors(closures_held, self.config.closures)
-            kept = np.ones(len(factors), dtype=bool) if keep is None else np.asarray(keep, dtype=bool)
-            keyframes = np.unique(factors.j)
-            position = np.searchsorted(keyframes, factors.j)
-            shared = SharedKeyframes(keyframes.astype(np.int32), _metric(factors, position, len(keyframes)))
-            factors = Factors(factors.i, position, factors.T_i_j, factors.information)
-            self._copies_start[peer] = self._copies(factors, kept, keyframes, T_world_keyframe_peer or {})
-        else:
-            factors, kept = Factors.empty(), np.zeros(0, dtype=bool)
+            keyframes = np.unique([c.peer_keyframe for c in closures])
+            shared = SharedKeyframes(
+                keyframes.astype(np.int32), _metric(closures, keyframes, self.config.closures)
+            )
+            self._copies_start[peer] = self._copies(closures, kept, keyframes, T_world_keyframe_peer or {})
         self.links[peer] = _Link(
             peer=peer,
             decides=self.robot < peer,
-            holds=len(factors) > 0,
             keyframes=np.asarray(shared.keyframes, dtype=np.int32),
             metric=np.asarray(shared.metric, dtype=np.float64),
             slots=np.asarray(shared.keyframes, dtype=np.int64),
-            closures=factors,
+            closures=closures,
+            factors=Factors.empty(),
             weights=kept.astype(np.float64),
             penalties=np.full(2, np.float64(np.float32(self.config.penalty_start))),
-            robust_done=not (self.config.robust and len(factors) > 0),
+            robust_done=not (self.config.robust and bool(closures)),
         )
         self.links = {name: self.links[name] for name in sorted(self.links)}
         return shared
 
     def _copies(
-        self, factors: Factors, kept: NDArray[np.bool_], keyframes: NDArray[np.int64], known: Mapping[int, ArrayLike]
+        self,
+        closures: Sequence[Closure],
+        kept: NDArray[np.bool_],
+        keyframes: NDArray[np.int64],
+        known: Mapping[int, ArrayLike],
     ) -> Array:
-        """Start of the peer's keyframes [s, 4, 4] in the own map frame, or in the world frame where known."""
+        """Start of the peer's keyframes [s, 4, 4] in the own map frame."""
         out = np.zeros((len(keyframes), 4, 4))
         from_world = se3.inverse(self.T_world_map)
         for s, keyframe in enumerate(keyframes.tolist()):
             if keyframe in known:
                 out[s] = from_world @ np.asarray(known[keyframe], dtype=np.float64)
             else:
-                named = np.flatnonzero(factors.j == s)
-                k = int(named[np.argmax(kept[named])])
-                out[s] = self.T_map_keyframe[factors.i[k]] @ factors.T_i_j[k]
+                named = [k for k, c in enumerate(closures) if c.peer_keyframe == keyframe]
+                best = closures[max(named, key=lambda k: bool(kept[k]))]
+                out[s] = self.T_map_keyframe[best.own_keyframe] @ best.T_own_peer
         return out
 
     def _start(self) -> None:
@@ -297,8 +303,10 @@ class PoseAgent:
                 copies = self._copies_start[link.peer]
                 link.slots = count + np.arange(len(copies))
                 poses.append(copies)
-                f = link.closures
-                parts.append(Factors(f.i, link.slots[f.j], f.T_i_j, f.information))
+                own = [c.own_keyframe for c in link.closures]
+                copy = link.slots[np.searchsorted(link.keyframes, [c.peer_keyframe for c in link.closures])]
+                link.factors = closure_factors(link.closures, own, copy, self.config.closures)
+                parts.append(link.factors)
                 count += len(copies)
         self._x = self.T_world_map @ np.concatenate(poses)
         self._factors = Factors.concatenate(parts)
@@ -472,7 +480,7 @@ class PoseAgent:
             steady = link.received_total >= c.penalty_period and link.largest_change() < _STEADY
             if link.received_total < c.robust_warm_up and not steady:
                 return
-            squared, c2 = self._squared(link), c.truncation**2
+            squared, c2 = pose_factors.squared_residuals(link.factors, self._x), c.truncation**2
             link.robust_step = 0
             if np.all(squared <= c2):  # no closure is in doubt: every truncated weight is one
                 self._finish_weights(link, np.ones(len(squared)))
@@ -481,17 +489,13 @@ class PoseAgent:
             return
         link.robust_next = link.received_total + c.robust_packets
         schedule = [mu * c.robust_growth**k for mu, steps in c.robust_passes for k in range(steps)]
-        squared, c2 = self._squared(link), c.truncation**2
+        squared, c2 = pose_factors.squared_residuals(link.factors, self._x), c.truncation**2
         if link.robust_step == len(schedule):
             self._finish_weights(link, (squared <= c2).astype(np.float64))
             return
         link.weights = graduated_weights(squared, c2, schedule[link.robust_step])
         link.robust_step += 1
         self._collect_weights()
-
-    def _squared(self, link: _Link) -> Array:
-        f = link.closures
-        return pose_factors.squared_residuals(Factors(f.i, link.slots[f.j], f.T_i_j, f.information), self._x)
 
     def _finish_weights(self, link: _Link, weights: Array) -> None:
         link.weights, link.robust_done = weights, True
@@ -572,10 +576,14 @@ def graduated_weights(squared: Array, c2: float, mu: float) -> Array:
     return np.where(squared <= low, 1.0, np.where(squared >= high, 0.0, between))
 
 
-def _metric(factors: Factors, position: NDArray[np.int64], count: int) -> NDArray[np.float32]:
-    """Information [count, 6] of the factors about each copied keyframe, averaged over directions per block."""
-    blocks = np.diagonal(factors.information, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)
-    total = np.zeros((count, 2))
+def _metric(
+    closures: Sequence[Closure], keyframes: NDArray[np.int64], config: ClosureConfig
+) -> NDArray[np.float32]:
+    """Information [s, 6] of the closures about each copied keyframe, averaged over directions per block."""
+    position = np.searchsorted(keyframes, [c.peer_keyframe for c in closures])
+    information = closure_factors(closures, np.zeros(len(closures)), position, config).information
+    blocks = np.diagonal(information, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)
+    total = np.zeros((len(keyframes), 2))
     np.add.at(total, position, blocks)
     if not np.all(total > 0):
         raise ValueError("a closure without information about translation or rotation cannot join two robots")
