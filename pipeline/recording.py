@@ -13,6 +13,7 @@ import json
 import math
 import os
 import struct
+import weakref
 import zlib
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -353,6 +354,7 @@ class _LogFile:
         verify(self.path)
         with _parsing(self.path):
             self._stream = self.path.open("rb")
+            weakref.finalize(self, self._stream.close)
             self._reader = SeekingReader(self._stream, validate_crcs=True)
             summary = self._reader.get_summary()
             if summary is None:

@@ -1,0 +1,59 @@
+"""From files as they are distributed to recordings: one module per dataset, named in one table."""
+
+import tomllib
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from pipeline.errors import DuagError
+
+# name on the command line -> module with `Options` and `convert(src, out, robots=, force=, **options)`
+DATASETS = {"7scenes": "converters.seven_scenes"}
+
+
+def _module(dataset: str) -> ModuleType:
+    if dataset not in DATASETS:
+        raise DuagError(f"dataset {dataset!r}, expected one of: {', '.join(sorted(DATASETS))}")
+    return import_module(DATASETS[dataset])
+
+
+def convert(
+    dataset: str, src: Path, out: Path, robots: int = 1, force: bool = False, options: Sequence[str] = ()
+) -> None:
+    """Convert a dataset into a recording.
+
+    Args:
+        dataset: a name in `DATASETS`.
+        src: where its files are. out: the folder to write.
+        robots: how many robots to make of it.
+        force: replace a recording that is there.
+        options: `name=value` of the converter, values in TOML notation.
+    """
+    module = _module(dataset)
+    module.convert(Path(src), Path(out), robots=robots, force=force, **_parse(options))
+
+
+def _parse(options: Sequence[str]) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for option in options:
+        name, separator, text = option.partition("=")
+        if not separator or not name.strip():
+            raise DuagError(f"--set {option}: expected NAME=VALUE")
+        try:
+            values[name.strip()] = tomllib.loads(f"value = {text.strip()}")["value"]
+        except tomllib.TOMLDecodeError:
+            values[name.strip()] = text.strip()
+    return values
+
+
+def describe() -> str:
+    """The datasets and the options of their converters, as text."""
+    lines = []
+    for name in sorted(DATASETS):
+        module = _module(name)
+        lines.append(f"{name}: {(module.__doc__ or '').splitlines()[0]}")
+        for option, field in module.Options.model_fields.items():
+            lines.append(f"    --set {option}={field.default}  {' '.join((field.description or '').split())}")
+    return "\n".join(lines)

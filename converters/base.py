@@ -1,0 +1,326 @@
+"""Writes a recording: a folder with one log per robot, its ground truth apart, and `recording.json`.
+
+A recording has its final name only when it is complete. One process may write it all, or each robot's logs may be
+written by a process of its own:
+
+    with RecordingWriter(out, name, source, converter) as recording:
+        with recording.robot("alpha", camera, depth_scale) as robot:
+            robot.add_frame(...)
+
+    with RecordingWriter(out, name, source, converter) as recording:
+        folder = recording.folder            # give it to the workers; each one does:
+        #     with RobotWriter(folder, "alpha", camera, depth_scale) as robot:
+        #         robot.add_frame(...)
+        #     return robot.summary
+        for summary in pool.map(work, names):
+            recording.add(summary)
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import __version__, messages
+from pipeline.errors import DuagError
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.recording import (
+    DEPTH_SCALE_KEY,
+    RECORDING_FILE,
+    RECORDING_FORMAT,
+    RECORDING_SCHEMA,
+    LogWriter,
+)
+from schemas import topics
+
+ROBOT_NAMES = (
+    *(
+        "alpha",
+        "bravo",
+        "charlie",
+        "delta",
+        "echo",
+        "foxtrot",
+        "golf",
+        "hotel",
+        "india",
+        "juliett",
+        "kilo",
+        "lima",
+    ),
+    *(
+        "mike",
+        "november",
+        "oscar",
+        "papa",
+        "quebec",
+        "romeo",
+        "sierra",
+        "tango",
+        "uniform",
+        "victor",
+        "whiskey",
+    ),
+    *("xray", "yankee", "zulu"),
+)
+NANOSECONDS = 1_000_000_000
+UNITS = {"time": "ns", "length": "m", "depth": "depth_scale_m per unit, along z, 0 = none", "angle": "rad"}
+
+
+def robot_names(count: int) -> list[str]:
+    """The first names of the spelling alphabet: alpha, bravo, charlie, ..."""
+    if not 1 <= count <= len(ROBOT_NAMES):
+        raise DuagError(f"{count} robots, expected 1 to {len(ROBOT_NAMES)}")
+    return list(ROBOT_NAMES[:count])
+
+
+class RobotWriter:
+    """Writes the logs of one robot into the folder of a recording; a context manager.
+
+    `summary` is, after a clean exit, what `recording.json` says about the robot: plain numbers and text.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        name: str,
+        camera: PinholeCamera,
+        depth_scale: float,
+        sensors: Mapping[str, str] | None = None,
+    ) -> None:
+        """Args:
+        folder: `RecordingWriter.folder`.
+        name: of the robot: lower-case letters, digits, underscores.
+        camera: of colour and depth alike.
+        depth_scale: metres per unit of the depth images.
+        sensors: what is known about the sensors, for example {"depth_noise": "none"}; kept in the log's metadata.
+        """
+        if not re.fullmatch(topics.ROBOT_NAME, name):
+            raise DuagError(f"robot {name!r}: expected lower-case letters, digits and underscores")
+        self.folder, self.name, self.camera, self.depth_scale = Path(folder), name, camera, float(depth_scale)
+        self.sensors = dict(sensors or {})
+        self.summary: dict[str, Any] = {}
+        self._files = ExitStack()
+        self._log = LogWriter(self.folder / f"{name}.mcap", name, self.sensors)
+        self._truth: LogWriter | None = None
+        self._has_exact_depth = False
+        self._stamps: list[int] = []
+        self._positions: list[NDArray[np.float64]] = []
+
+    def __enter__(self) -> RobotWriter:
+        self._files.enter_context(self._log)
+        self._log.channel(
+            topics.DEPTH.of(self.name), topics.DEPTH.schema, {DEPTH_SCALE_KEY: repr(self.depth_scale)}
+        )
+        return self
+
+    def add_frame(
+        self,
+        stamp_ns: int,
+        color: bytes,
+        color_format: str,
+        depth: NDArray[np.uint16],
+        T_world_camera: NDArray[np.float64] | None = None,
+        exact_depth: NDArray[np.uint16] | None = None,
+    ) -> None:
+        """Append one frame.
+
+        Args:
+            stamp_ns: time of the recording, increasing.
+            color: the encoded colour image as it is; color_format: "jpeg" or "png".
+            depth: uint16 [H, W] in units of depth_scale along z, registered to colour, 0 = none.
+            T_world_camera: true pose [4, 4] of the colour camera in the world that all robots share, where known.
+            exact_depth: like depth, without noise, where that differs and is known.
+        """
+        self._check_size(depth)
+        if color_format not in ("jpeg", "png"):
+            raise ValueError(f"colour format {color_format!r}, expected 'jpeg' or 'png'")
+        if self._stamps and stamp_ns <= self._stamps[-1]:
+            raise ValueError(f"frame at {stamp_ns} ns comes after one at {self._stamps[-1]} ns")
+        name = self.name
+        if not self._stamps:
+            calibration = messages.pack_calibration(stamp_ns, name, self.camera)
+            self._log.write(topics.CALIBRATION.of(name), calibration, stamp_ns)
+        self._stamps.append(int(stamp_ns))
+        self._log.write(
+            topics.COLOR.of(name), messages.pack_color(stamp_ns, name, color, color_format), stamp_ns
+        )
+        self._log.write(topics.DEPTH.of(name), messages.pack_depth(stamp_ns, name, depth), stamp_ns)
+        if T_world_camera is not None:
+            pose = messages.pack_pose_in_frame(stamp_ns, messages.WORLD_FRAME, T_world_camera)
+            self._truth_log().write(topics.GROUNDTRUTH_POSE.of(name), pose, stamp_ns)
+            self._positions.append(np.asarray(T_world_camera, dtype=np.float64)[:3, 3].copy())
+        if exact_depth is not None:
+            self._check_size(exact_depth)
+            truth, topic = self._truth_log(), topics.GROUNDTRUTH_DEPTH.of(name)
+            if not self._has_exact_depth:
+                truth.channel(
+                    topic, topics.GROUNDTRUTH_DEPTH.schema, {DEPTH_SCALE_KEY: repr(self.depth_scale)}
+                )
+                self._has_exact_depth = True
+            truth.write(topic, messages.pack_depth(stamp_ns, name, exact_depth), stamp_ns)
+
+    def _check_size(self, depth: NDArray[np.uint16]) -> None:
+        if depth.shape != (self.camera.height, self.camera.width):
+            raise ValueError(f"depth is {depth.shape}, expected {(self.camera.height, self.camera.width)}")
+
+    def _truth_log(self) -> LogWriter:
+        """The ground-truth log, opened when there is something to say."""
+        if self._truth is None:
+            truth = LogWriter(self.folder / f"{self.name}.groundtruth.mcap", self.name)
+            self._truth = self._files.enter_context(truth)
+        return self._truth
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._files.__exit__(kind, error, trace)
+        if kind is None:
+            self.summary = self._summarise()
+
+    def _summarise(self) -> dict[str, Any]:
+        if not self._stamps:
+            raise DuagError(f"robot {self.name}: found no frame, expected at least one")
+        gaps = np.diff(self._stamps) if len(self._stamps) > 1 else np.zeros(1, np.int64)
+        summary: dict[str, Any] = {
+            "robot": self.name,
+            "log": self._log.path.name,
+            "groundtruth": self._truth.path.name if self._truth else None,
+            "frames": len(self._stamps),
+            "start_ns": self._stamps[0],
+            "end_ns": self._stamps[-1],
+            "longest_interval_ns": int(gaps.max()),
+            "camera": asdict(self.camera),
+            "depth_scale_m": self.depth_scale,
+            "sensors": self.sensors,
+            "digests": {self._log.path.name: self._log.digest},
+            "path": None,
+        }
+        if self._truth:
+            summary["digests"][self._truth.path.name] = self._truth.digest
+        if self._positions:
+            positions = np.array(self._positions)
+            length = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+            low, high = positions.min(axis=0).tolist(), positions.max(axis=0).tolist()
+            summary["path"] = {"length_m": length, "low_m": low, "high_m": high}
+        return summary
+
+
+class RecordingWriter:
+    """Writes the folder of a recording; a context manager. See the top of this file."""
+
+    def __init__(
+        self,
+        out: Path,
+        name: str = "",
+        source: Mapping[str, Any] | None = None,
+        converter: str = "",
+        parameters: Mapping[str, Any] | None = None,
+        force: bool = False,
+    ) -> None:
+        """Args:
+        out: the folder; must not exist, unless `force` and it is a recording.
+        name: of the recording; the name of the folder if empty.
+        source: what it was made from; no absolute paths.
+        converter: what made it.
+        parameters: the settings it was made with.
+        """
+        self.out = Path(out)
+        self.name = name or self.out.resolve().name
+        self.warnings: list[str] = []
+        self.parameters = dict(parameters or {})
+        self.checks: dict[str, Any] = {}
+        self._source, self._converter, self._force = dict(source or {}), converter, force
+        self._robots: dict[str, dict[str, Any]] = {}
+        self._open: list[RobotWriter] = []
+        self._geometry: str | None = None
+        self.folder = self.out.with_name(f".{self.out.name}.{os.getpid()}.part")
+
+    def __enter__(self) -> RecordingWriter:
+        self._check_out()
+        try:
+            if self.folder.exists():  # left by a process of the same number that was killed
+                shutil.rmtree(self.folder)
+            self.folder.mkdir(parents=True)
+        except OSError as error:
+            raise DuagError(
+                f"{self.out}: {error.strerror or error}, expected to write a recording"
+            ) from error
+        return self
+
+    def _check_out(self) -> None:
+        if not self.out.exists():
+            return
+        if not self._force:
+            raise DuagError(f"{self.out}: exists already; choose another --out or give --force")
+        replaceable = self.out.is_dir() and (
+            (self.out / RECORDING_FILE).is_file() or not any(self.out.iterdir())
+        )
+        if not replaceable:
+            raise DuagError(f"{self.out}: is not a recording, expected one; --force replaces nothing else")
+
+    def robot(
+        self, name: str, camera: PinholeCamera, depth_scale: float, sensors: Mapping[str, str] | None = None
+    ) -> RobotWriter:
+        """The writer of one robot's logs, to be used as a context manager within this one."""
+        writer = RobotWriter(self.folder, name, camera, depth_scale, sensors)
+        self._open.append(writer)
+        return writer
+
+    def add(self, summary: Mapping[str, Any]) -> None:
+        """Take in a robot whose logs another `RobotWriter` has written into `folder`, by its summary."""
+        row = dict(summary)
+        robot = row.pop("robot")
+        if robot in self._robots:
+            raise ValueError(f"robot {robot} is in the recording already")
+        self._robots[robot] = row
+
+    def add_geometry(self, write: Callable[[Path], None]) -> None:
+        """Add the true geometry of the scene: `write` is called with the path of a .ply file to write."""
+        self._geometry = "groundtruth.ply"
+        write(self.folder / self._geometry)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                for writer in self._open:
+                    self.add(writer.summary)
+                self._finish()
+        finally:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _finish(self) -> None:
+        if not self._robots:
+            raise DuagError(f"{self.out}: found no robot, expected at least one")
+        description = {
+            "format": RECORDING_FORMAT,
+            "schema": RECORDING_SCHEMA,
+            "name": self.name,
+            "source": self._source,
+            "converter": {"name": self._converter, "version": __version__},
+            "parameters": self.parameters,
+            "units": UNITS,
+            "geometry": self._geometry,
+            "robots": {robot: self._robots[robot] for robot in sorted(self._robots)},
+            "checks": self.checks,
+            "warnings": self.warnings,
+        }
+        text = json.dumps(description, indent=2, allow_nan=False) + "\n"
+        (self.folder / RECORDING_FILE).write_text(text)
+        self._check_out()
+        if self.out.exists():
+            shutil.rmtree(self.out)
+        self.folder.rename(self.out)
