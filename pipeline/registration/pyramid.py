@@ -1,0 +1,143 @@
+"""Image pyramids of an RGB-D frame: grey value, inverse depth, their gradients and surface normals.
+
+Depth is kept as inverse depth (1/m, 0 = unknown) because the inverse depth of a plane is affine in the pixel
+coordinates: averages over a block, bilinear interpolation and finite differences are then exact on planes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.camera import PinholeCamera
+
+Image = NDArray[np.floating]
+
+GREY_OF_RGB = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601 luma
+SAME_SURFACE = np.float32(0.05)  # relative difference of depth up to which neighbours count as one surface
+NORMAL_WINDOWS = (5, 3)  # pixels; the smaller one is used where the larger touches an edge or a hole
+
+
+@dataclass(frozen=True)
+class Level:
+    """One resolution of a frame.
+
+    camera: intrinsics of this resolution. gray: float32 [h, w], 0..1. inverse_depth: float32 [h, w], 1/m, 0 where
+    the depth is unknown.
+    """
+
+    camera: PinholeCamera
+    gray: Image
+    inverse_depth: Image
+
+    @cached_property
+    def gradients(self) -> tuple[Image, Image]:
+        """Derivatives of the grey value by u and v, 1/px, [h, w] each; zero on the border."""
+        gu, gv = np.zeros_like(self.gray), np.zeros_like(self.gray)
+        gu[:, 1:-1] = 0.5 * (self.gray[:, 2:] - self.gray[:, :-2])
+        gv[1:-1] = 0.5 * (self.gray[2:] - self.gray[:-2])
+        return gu, gv
+
+    @cached_property
+    def channels(self) -> Image:
+        """(grey, d/du, d/dv, inverse depth or NaN) for interpolation, [h * w, 4].
+
+        NaN makes every value that touches an unknown depth unknown, and fails every gate.
+        """
+        gu, gv = self.gradients
+        inverse_depth = np.where(self.inverse_depth > 0, self.inverse_depth, np.float32(np.nan))
+        return np.stack([self.gray, gu, gv, inverse_depth], axis=-1).reshape(-1, 4)
+
+    @cached_property
+    def normals(self) -> Image:
+        """Unit surface normals in the camera frame that face the camera, [h, w, 3]; zero where unknown.
+
+        A plane n . X = rho has the inverse depth n . (x, y, 1) / rho at the ray (x, y, 1), so n follows from a
+        plane fitted to the inverse depth in a square window. A window that holds an unknown depth or a step of
+        more than 5 % of the depth gives no normal.
+        """
+        normals = np.zeros((*self.gray.shape, 3), dtype=np.float32)
+        missing = np.ones(self.gray.shape, dtype=bool)
+        for window in NORMAL_WINDOWS:
+            du, dv, mean, sound = _fit_planes(self.inverse_depth, window)
+            take = missing & sound
+            rays = self.camera.rays().astype(np.float32)[take]
+            nx, ny = du[take] * np.float32(self.camera.fx), dv[take] * np.float32(self.camera.fy)
+            nz = mean[take] - nx * rays[:, 0] - ny * rays[:, 1]
+            length = np.sqrt(nx * nx + ny * ny + nz * nz)
+            normals[take] = -np.stack([nx, ny, nz], axis=-1) / length[:, None]
+            missing &= ~sound
+        return normals
+
+    def halved(self) -> Level:
+        """The next coarser level: blocks of 2x2 pixels become one.
+
+        The grey value is the mean. The inverse depth is the mean over the nearest surface in the block (members
+        within 5 % of the nearest pixel), unknown if fewer than two pixels show it.
+        """
+        camera = self.camera.halved()
+        blocks = _blocks(self.inverse_depth, camera)
+        members = blocks > blocks.max(axis=0) * (1 - SAME_SURFACE)
+        count = members.sum(axis=0, dtype=np.float32)
+        total = np.where(members, blocks, np.float32(0)).sum(axis=0)
+        inverse_depth = np.where((total > 0) & (count >= 2), total / np.maximum(count, 1), np.float32(0))
+        return Level(camera, _blocks(self.gray, camera).sum(axis=0) * np.float32(0.25), inverse_depth)
+
+
+@dataclass(frozen=True)
+class RgbdPyramid:
+    """A frame at several resolutions; levels[0] is the full one, each next one has half the size."""
+
+    levels: tuple[Level, ...]
+
+    @staticmethod
+    def build(image: Image, depth_m: Image, camera: PinholeCamera, levels: int = 3) -> RgbdPyramid:
+        """Build the pyramid of a frame.
+
+        Args:
+            image: colour float32 [h, w, 3] or grey [h, w], 0..1.
+            depth_m: float32 [h, w], metres along z; 0, negative or not finite means unknown.
+            camera: intrinsics of both images.
+            levels: number of resolutions.
+        """
+        gray = image @ GREY_OF_RGB if image.ndim == 3 else np.asarray(image, dtype=np.float32)
+        shape = (camera.height, camera.width)
+        if gray.shape != shape or depth_m.shape != shape:
+            raise ValueError(f"images of {gray.shape} and {depth_m.shape}, camera of {shape}")
+        known = np.isfinite(depth_m) & (depth_m > 0)
+        inverse_depth = np.where(known, 1 / np.where(known, depth_m, 1), 0).astype(np.float32)
+        built = [Level(camera, np.ascontiguousarray(gray), inverse_depth)]
+        while len(built) < levels:
+            built.append(built[-1].halved())
+        return RgbdPyramid(tuple(built))
+
+
+def _blocks(image: Image, half: PinholeCamera) -> Image:
+    """The four pixels of every 2x2 block, [4, half.height, half.width]."""
+    cut = image[: 2 * half.height, : 2 * half.width]
+    return np.stack([cut[::2, ::2], cut[::2, 1::2], cut[1::2, ::2], cut[1::2, 1::2]])
+
+
+def _fit_planes(values: Image, window: int) -> tuple[NDArray, NDArray, NDArray, NDArray[np.bool_]]:
+    """Least-squares plane of `values` in a square window around every pixel.
+
+    Returns:
+        Slopes along u and v (per px), value at the centre, and where the window has no unknown value and no step.
+    """
+    import cv2
+
+    reach = window // 2
+    offsets = np.arange(-reach, reach + 1, dtype=np.float32)
+    slope, box = offsets / np.float32((offsets**2).sum()), np.full(window, 1 / window, dtype=np.float32)
+    du = cv2.sepFilter2D(values, cv2.CV_32F, slope, box, borderType=cv2.BORDER_CONSTANT)
+    dv = cv2.sepFilter2D(values, cv2.CV_32F, box, slope, borderType=cv2.BORDER_CONSTANT)
+    mean = cv2.sepFilter2D(values, cv2.CV_32F, box, box, borderType=cv2.BORDER_CONSTANT)
+    element = np.ones((window, window), dtype=np.uint8)
+    lowest, highest = cv2.erode(values, element), cv2.dilate(values, element)
+    sound = (lowest > 0) & (highest - lowest < SAME_SURFACE * window / 2 * values)
+    sound[:reach] = sound[-reach:] = False
+    sound[:, :reach] = sound[:, -reach:] = False
+    return du, dv, mean, sound

@@ -1,0 +1,135 @@
+"""What a view is compared with: samples with a point, a normal and an intensity, at every pyramid level."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.registration.pyramid import Level, RgbdPyramid
+
+Samples = NDArray[np.floating]
+
+DEFAULT_STRIDES = (4, 2, 1)
+GRADIENT_SHARE = 2 / 3  # of a sparse reference's samples; the rest is spread evenly for the geometry
+MARGIN = 2  # pixels at the border that are not sampled
+
+
+@dataclass(frozen=True)
+class ReferenceLevel:
+    """Samples for one pyramid level.
+
+    points: float32 [n, 3], metres, reference camera frame. normals: float32 [n, 3], unit length, same frame.
+    intensities: float32 [n], grey value 0..1 of that level's image at the sample.
+    """
+
+    points: Samples
+    normals: Samples
+    intensities: Samples
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Samples of one view; levels[0] belongs to the finest image. Plain arrays: it can be sent and rebuilt."""
+
+    levels: tuple[ReferenceLevel, ...]
+
+    @staticmethod
+    def from_pyramid(pyramid: RgbdPyramid, strides: tuple[int, ...] = DEFAULT_STRIDES) -> Reference:
+        """Sample every level on a grid, `strides` pixels apart, finest level first, wherever a normal is known."""
+        levels = []
+        for level, stride in zip(pyramid.levels, strides, strict=True):
+            rows = np.arange(MARGIN, level.camera.height - MARGIN, stride)
+            columns = np.arange(MARGIN, level.camera.width - MARGIN, stride)
+            v, u = (axis.ravel() for axis in np.meshgrid(rows, columns, indexing="ij"))
+            known = _has_normal(level)[v, u]
+            levels.append(_samples(level, v[known], u[known]))
+        return Reference(tuple(levels))
+
+    @staticmethod
+    def sample(pyramid: RgbdPyramid, count: int = 2000) -> Reference:
+        """At most about `count` samples, the same points and normals at every level, for sending to another robot.
+
+        Two thirds are the pixels of strongest grey gradient in the tiles of a grid, one third is spread evenly
+        over a coarser grid, so that weakly textured surfaces still hold the geometry. No random draws.
+        """
+        finest = pyramid.levels[0]
+        gu, gv = finest.gradients
+        known = _has_normal(finest)
+        strength = np.where(known, np.sqrt(gu * gu + gv * gv), np.float32(-1))
+        textured = round(count * GRADIENT_SHARE)
+        chosen = np.union1d(
+            _strongest_of_tiles(strength, textured), _centres_of_tiles(known, count - textured)
+        )
+        v, u = np.divmod(chosen, finest.camera.width)
+        samples = _samples(finest, v, u)
+        levels = [samples]
+        for index, level in enumerate(pyramid.levels[1:], start=1):
+            scale = 2.0**index
+            gray = _bilinear(level.gray, (u + 0.5) / scale - 0.5, (v + 0.5) / scale - 0.5)
+            levels.append(ReferenceLevel(samples.points, samples.normals, gray))
+        return Reference(tuple(levels))
+
+
+def _has_normal(level: Level) -> NDArray[np.bool_]:
+    """Pixels [h, w] off the border whose normal is known."""
+    known = level.normals[..., 2] != 0
+    known[:MARGIN] = known[-MARGIN:] = False
+    known[:, :MARGIN] = known[:, -MARGIN:] = False
+    return known
+
+
+def _samples(level: Level, v: NDArray[np.int64], u: NDArray[np.int64]) -> ReferenceLevel:
+    """The samples at pixels (u, v), each [n], of known depth and normal."""
+    camera, z = level.camera, 1 / level.inverse_depth[v, u].astype(np.float64)
+    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
+    return ReferenceLevel(points.astype(np.float32), level.normals[v, u], level.gray[v, u])
+
+
+def _tiles(image: Samples, count: int) -> tuple[Samples, int, NDArray[np.int64]]:
+    """About `count` square tiles of an image [h, w]: values [tiles, side * side], side (px), flat pixel indices."""
+    h, w = image.shape
+    side = max(1, int(np.sqrt(h * w / max(count, 1))))
+    rows, columns = -(-h // side), -(-w // side)
+    padded = np.full((rows * side, columns * side), -1, dtype=np.float32)
+    padded[:h, :w] = image
+    index = np.full(padded.shape, -1, dtype=np.int64)
+    index[:h, :w] = np.arange(h * w).reshape(h, w)
+
+    def split(a: NDArray) -> NDArray:
+        return a.reshape(rows, side, columns, side).swapaxes(1, 2).reshape(rows * columns, side * side)
+
+    return split(padded), side, split(index)
+
+
+def _strongest_of_tiles(score: Samples, count: int) -> NDArray[np.int64]:
+    """Flat index of the highest non-negative score in every tile that has one."""
+    values, _, index = _tiles(score, count)
+    best = values.argmax(axis=1)
+    tiles = np.arange(len(values))
+    return index[tiles, best][values[tiles, best] >= 0]
+
+
+def _centres_of_tiles(known: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
+    """Flat index of the known pixel nearest to the centre of every tile that has one."""
+    values, side, index = _tiles(np.where(known, np.float32(0), np.float32(-1)), count)
+    offset = np.arange(side) - (side - 1) / 2
+    distance = (offset[:, None] ** 2 + offset**2).ravel()
+    best = np.where(values >= 0, distance, np.inf).argmin(axis=1)
+    tiles = np.arange(len(values))
+    return index[tiles, best][values[tiles, best] >= 0]
+
+
+def _bilinear(image: Samples, u: NDArray[np.float64], v: NDArray[np.float64]) -> Samples:
+    """Image [h, w] at pixels (u, v), clamped to the border."""
+    h, w = image.shape
+    u, v = np.clip(u, 0, w - 1), np.clip(v, 0, h - 1)
+    u0, v0 = np.minimum(u.astype(np.int64), w - 2), np.minimum(v.astype(np.int64), h - 2)
+    a, b = u - u0, v - v0
+    top = (1 - a) * image[v0, u0] + a * image[v0, u0 + 1]
+    bottom = (1 - a) * image[v0 + 1, u0] + a * image[v0 + 1, u0 + 1]
+    return ((1 - b) * top + b * bottom).astype(np.float32)
