@@ -1,0 +1,429 @@
+"""Microsoft 7-Scenes: Kinect v1 sequences of seven rooms, poses by KinectFusion, one world per room.
+
+A sequence is a folder of `frame-NNNNNN.color.png` (or .jpg), `.depth.png` (16 bit, millimetres, 0 and 65535 invalid)
+and `.pose.txt` (4x4, depth camera to world, x right, y down, z forward). There are no time stamps: they are made at
+30 Hz from the frame number. The depth is not registered to colour: it is here, with the constants below.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError
+
+from converters.base import NANOSECONDS, RecordingWriter, RobotWriter, robot_names
+from pipeline import numeric
+from pipeline.config import Config
+from pipeline.errors import DuagError
+from pipeline.geometry import se3, so3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.progress import track
+
+Depth = NDArray[np.float64]
+
+WIDTH, HEIGHT = 640, 480
+DEPTH_SCALE = 0.001
+NO_DEPTH = (0, 65535)
+FRAME_FILE = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(png|jpg|jpeg|txt)")
+SEQUENCE_FOLDER = re.compile(r"seq-(\d+)")
+KINDS = ("color", "depth", "pose")
+
+CONNECTED_RATIO = (
+    0.03  # neighbouring depths that differ by less than this share of the nearer are one surface
+)
+SELF_CHECK_GAP = 10  # frames
+SELF_CHECK_PAIRS = 8
+SELF_CHECK_STRIDE = 6  # pixels
+SELF_CHECK_MIN_PIXELS = 200
+SELF_CHECK_MAX_RATIO = 0.02  # of the median depth (rule 1 of the converters)
+MAX_ROTATION_DEFECT = 0.01  # largest entry of |R - nearest rotation|; the data has 4e-4
+
+
+class Options(Config):
+    """Cameras and time; the defaults are those of the Kinect that recorded 7-Scenes."""
+
+    depth_focal_px: float = Field(585.0, gt=0)
+    """Focal length of the depth camera, as the dataset's page gives it."""
+    depth_cx_px: float = 320.0
+    """Principal point of the depth camera, as the dataset's page gives it."""
+    depth_cy_px: float = 240.0
+    """Principal point of the depth camera, as the dataset's page gives it."""
+    color_focal_px: float = Field(525.0, gt=0)
+    """Focal length of the colour camera, nominal; it agrees with the images of RedKitchen to 2 px."""
+    color_cx_px: float = 320.0
+    """Principal point of the colour camera; fitted on RedKitchen to 1 px, together with the baseline."""
+    color_cy_px: float = 237.8
+    """Principal point of the colour camera; fitted on RedKitchen: depth edges fall on colour edges."""
+    baseline_m: float = 0.025
+    """The colour camera sits this far to the right (+x) of the depth camera; a point shifts by -f b / z pixels."""
+    rate_hz: int = Field(30, gt=0)
+    """Frames per second; the dataset has no time stamps."""
+    sequences: str = ""
+    """Numbers of the sequences to take, for example "1,3"; all if empty. Several make one robot each."""
+
+    def depth_camera(self) -> PinholeCamera:
+        """The camera that the depth images were taken with."""
+        f = self.depth_focal_px
+        return PinholeCamera(WIDTH, HEIGHT, f, f, self.depth_cx_px, self.depth_cy_px)
+
+    def color_camera(self) -> PinholeCamera:
+        """The camera that the colour images were taken with."""
+        f = self.color_focal_px
+        return PinholeCamera(WIDTH, HEIGHT, f, f, self.color_cx_px, self.color_cy_px)
+
+
+@dataclass(frozen=True)
+class FrameFiles:
+    """The files of one frame; `pose` is None in a sequence without poses."""
+
+    number: int
+    color: Path
+    depth: Path
+    pose: Path | None
+
+
+def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:
+    """Convert one sequence, cut into `robots` contiguous parts, or several sequences, one robot each.
+
+    All robots start at time 0, as if they had moved together; they share the world of the dataset.
+
+    Args:
+        src: a folder of frames, or a folder of `seq-NN` folders.
+        out: the recording to write.
+        robots: number of parts of a single sequence; of several sequences, their number.
+        force: replace a recording that is there.
+        options: see `Options`.
+    Raises:
+        DuagError: names the file, what was found and what was expected.
+    """
+    numeric.settle_opencv()
+    settings = _options(options)
+    parts, skipped = _parts(Path(src), robots, settings)
+    source = {
+        "dataset": "7-Scenes",
+        "folder": Path(src).resolve().name,
+        "sequences": sorted({p[0] for p in parts}),
+    }
+    parameters = {"robots": robots, **settings.model_dump()}
+    with RecordingWriter(out, "", source, "7scenes", parameters, force) as recording:
+        recording.warnings += skipped
+        recording.warnings.append(
+            f"no time stamps in the dataset: made from frame numbers at {settings.rate_hz} Hz"
+        )
+        for name, (sequence, frames) in zip(robot_names(len(parts)), parts, strict=True):
+            sensors = {"depth": "Kinect v1, registered to colour by the converter", "sequence": sequence}
+            with recording.robot(name, settings.color_camera(), DEPTH_SCALE, sensors) as robot:
+                check = _write_robot(robot, frames, settings, str(src))
+            recording.checks[name] = {
+                "first_frame": frames[0].number,
+                "last_frame": frames[-1].number,
+                **check,
+            }
+            if frames[0].pose is None:
+                recording.warnings.append(f"{name}: the sequence has no poses: no ground truth")
+
+
+def _options(values: dict[str, Any]) -> Options:
+    try:
+        return Options(**values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        known = ", ".join(Options.model_fields)
+        raise DuagError(
+            f"7scenes: {name} = {first['input']!r}: {first['msg']}; options are {known}"
+        ) from error
+
+
+# --- which frames make which robot ----------------------------------------------------------------------------------
+
+
+def _parts(src: Path, robots: int, options: Options) -> tuple[list[tuple[str, list[FrameFiles]]], list[str]]:
+    """(name of the sequence, its frames) per robot, and warnings about frames that are missing."""
+    folders = _sequence_folders(src, options)
+    warnings: list[str] = []
+    sequences = []
+    for folder in folders:
+        frames, missing = list_frames(folder)
+        sequences.append((folder.name if len(folders) > 1 or folder != src else "", frames))
+        if missing:
+            shown = ", ".join(str(n) for n in missing[:10]) + (", ..." if len(missing) > 10 else "")
+            warnings.append(
+                f"{folder.name}: {len(missing)} frame numbers are missing and were skipped: {shown}"
+            )
+    if len(sequences) > 1:
+        if robots != len(sequences):
+            found = ", ".join(name for name, _ in sequences)
+            expected = f"expected --robots {len(sequences)}, or one sequence chosen with --set sequences=1"
+            raise DuagError(f"{src}: found sequences {found} for {robots} robots, {expected}")
+        return sequences, warnings
+    name, frames = sequences[0]
+    robot_names(robots)
+    if len(frames) < robots:
+        raise DuagError(f"{src}: found {len(frames)} frames, expected at least {robots} for {robots} robots")
+    cuts = [i * len(frames) // robots for i in range(robots + 1)]
+    return [(name, frames[a:b]) for a, b in pairwise(cuts)], warnings
+
+
+def _sequence_folders(src: Path, options: Options) -> list[Path]:
+    if not src.is_dir():
+        raise DuagError(f"{src}: no such folder, expected a sequence of 7-Scenes")
+    found = {
+        int(m[1]): p for p in sorted(src.iterdir()) if (m := SEQUENCE_FOLDER.fullmatch(p.name)) and p.is_dir()
+    }
+    if not options.sequences:
+        return [found[n] for n in sorted(found)] or [src]
+    wanted = [text.strip() for text in options.sequences.split(",")]
+    if not all(text.isdigit() and int(text) in found for text in wanted):
+        numbers = ", ".join(str(n) for n in sorted(found)) or "none"
+        raise DuagError(f"{src}: found sequences {numbers}, expected {options.sequences!r} among them")
+    return [found[n] for n in sorted({int(text) for text in wanted})]
+
+
+def list_frames(folder: Path) -> tuple[list[FrameFiles], list[int]]:
+    """Frames of a sequence in order of their number, and the numbers that are missing in between.
+
+    Raises:
+        DuagError: a frame lacks its colour, depth or (unless the sequence has no pose at all) its pose.
+    """
+    files: dict[str, dict[int, Path]] = {kind: {} for kind in KINDS}
+    for path in sorted(folder.iterdir()):
+        match = FRAME_FILE.fullmatch(path.name)
+        if match and (match[2] == "pose") == (match[3] == "txt"):
+            other = files[match[2]].setdefault(int(match[1]), path)
+            if other != path:
+                raise DuagError(f"{path}: found beside {other.name}, expected one of them")
+    numbers = sorted(set().union(*files.values()))
+    if not numbers:
+        raise DuagError(f"{folder}: found no frame-NNNNNN.color.png or .jpg, expected a sequence of 7-Scenes")
+    kinds = KINDS if files["pose"] else KINDS[:2]
+    for kind in kinds:
+        for number in numbers:
+            if number not in files[kind]:
+                there = next(files[k][number] for k in KINDS if number in files[k])
+                raise DuagError(f"{there}: has no {kind} beside it, expected frame-{number:06d}.{kind}.*")
+    missing = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers))
+    return [
+        FrameFiles(n, files["color"][n], files["depth"][n], files["pose"].get(n)) for n in numbers
+    ], missing
+
+
+# --- one robot ------------------------------------------------------------------------------------------------------
+
+
+def _write_robot(
+    robot: RobotWriter, frames: list[FrameFiles], options: Options, label: str
+) -> dict[str, Any]:
+    """Write all frames of a robot; returns what the self-check measured."""
+    T_depth_color = se3.from_rotation_translation(np.eye(3), [options.baseline_m, 0.0, 0.0])
+    register = Registration(options.depth_camera(), options.color_camera(), options.baseline_m)
+    check = _ReprojectionCheck(options.color_camera(), len(frames))
+    holes = invalid = 0
+    for index, files in enumerate(track(frames, f"convert {robot.name}")):
+        depth = register(_read_depth(files.depth))
+        color, color_format = _read_color(files.color)
+        T_world_camera = None
+        if files.pose is not None:
+            T_world_camera = _read_pose(files.pose) @ T_depth_color
+            check.add(index, depth, T_world_camera)
+        stamp_ns = (files.number - frames[0].number) * NANOSECONDS // options.rate_hz
+        raw = np.rint(depth / DEPTH_SCALE).astype(np.uint16)
+        robot.add_frame(stamp_ns, color, color_format, raw, T_world_camera)
+        holes += _count_holes(raw)
+        invalid += int((raw == 0).sum())
+    pixels = len(frames) * WIDTH * HEIGHT
+    rates = {"registered_without_depth": invalid / pixels, "registered_holes": holes / pixels}
+    return {**rates, **check.result(label)}
+
+
+def _count_holes(depth: NDArray[np.uint16]) -> int:
+    """Pixels without depth whose left and right, or upper and lower, neighbours have some: cracks of the warp."""
+    empty, full = depth == 0, depth != 0
+    crack = np.zeros_like(empty)
+    crack[:, 1:-1] |= empty[:, 1:-1] & full[:, :-2] & full[:, 2:]
+    crack[1:-1] |= empty[1:-1] & full[:-2] & full[2:]
+    return int(crack.sum())
+
+
+def _read_color(path: Path) -> tuple[bytes, str]:
+    """The encoded bytes as they are, once they are known to decode to the size of the dataset."""
+    import cv2
+
+    data = _read_bytes(path)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if image is None:
+        raise DuagError(f"{path}: {len(data)} bytes that no decoder reads, expected a colour image")
+    _check_size(path, image.shape)
+    return data, "png" if data.startswith(b"\x89PNG") else "jpeg"
+
+
+def _read_depth(path: Path) -> Depth:
+    """Depth [480, 640] in metres, 0 where there is none."""
+    import cv2
+
+    data = _read_bytes(path)
+    raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if raw is None:
+        raise DuagError(f"{path}: {len(data)} bytes that no decoder reads, expected a depth image")
+    if raw.dtype != np.uint16 or raw.ndim != 2:
+        raise DuagError(f"{path}: is {raw.dtype} with {raw.ndim} axes, expected 16-bit depth in millimetres")
+    _check_size(path, raw.shape)
+    return np.where(np.isin(raw, NO_DEPTH), 0, raw) * DEPTH_SCALE
+
+
+def _check_size(path: Path, shape: tuple[int, ...]) -> None:
+    if shape[:2] != (HEIGHT, WIDTH):
+        raise DuagError(f"{path}: is {shape[1]}x{shape[0]}, expected {WIDTH}x{HEIGHT}")
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DuagError(f"{path}: {error.strerror or error}, expected a file of 7-Scenes") from error
+
+
+def _read_pose(path: Path) -> NDArray[np.float64]:
+    """T_world_depth [4, 4], its rotation made exactly orthonormal."""
+    try:
+        T = np.array(_read_bytes(path).decode().split(), dtype=np.float64).reshape(4, 4)
+    except ValueError as error:
+        raise DuagError(f"{path}: {error}, expected 4x4 numbers") from error
+    if not np.all(np.isfinite(T)):
+        raise DuagError(f"{path}: found numbers that are not finite, expected a pose")
+    R = so3.project(T[:3, :3])
+    defect = float(np.abs(T[:3, :3] - R).max())
+    if defect > MAX_ROTATION_DEFECT or not np.allclose(T[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
+        raise DuagError(
+            f"{path}: its rotation is off by {defect:.2g}, expected a rigid motion (within {MAX_ROTATION_DEFECT})"
+        )
+    return se3.from_rotation_translation(R, T[:3, 3])
+
+
+# --- depth into the colour camera -----------------------------------------------------------------------------------
+
+
+class Registration:
+    """Resamples depth for a camera displaced along x, with another focal length and principal point.
+
+    With w = 1 / z a point of depth pixel (u, v) falls on colour column A u + B - f b w and row A v + C: rows map to
+    rows. First the rows are resampled, then each row is redrawn as a chain of segments between neighbours. Inverse
+    depth is interpolated, in which planes are linear, and only within a surface (CONNECTED_RATIO); where surfaces
+    overlap the nearest wins; at the border of a surface a pixel covers half its width.
+    """
+
+    def __init__(self, depth_camera: PinholeCamera, color_camera: PinholeCamera, baseline_m: float) -> None:
+        d, c = depth_camera, color_camera
+        self._zoom = c.fx / d.fx
+        self._offset = c.cx - self._zoom * d.cx
+        self._shift_px_m = c.fx * baseline_m
+        self._shape = (c.height, c.width)
+        row = (np.arange(c.height) - c.cy) * (d.fy / c.fy) + d.cy
+        self._row_near = np.clip(np.floor(row).astype(int), 0, d.height - 2)
+        self._row_part = (row - self._row_near)[:, None]
+        self._row_inside = ((row >= -0.5) & (row <= d.height - 0.5))[:, None]
+        self._columns = np.arange(d.width)
+
+    def __call__(self, depth: Depth) -> Depth:
+        """Depth [h, w] in metres of the depth camera, 0 where none -> depth [H, W] in metres of the colour camera."""
+        with np.errstate(divide="ignore"):
+            w = np.where(depth > 0, 1.0 / depth, 0.0)
+        w = self._resample_rows(w)
+        out = np.zeros(self._shape)
+        self._draw_segments(w, out)
+        with np.errstate(divide="ignore"):
+            return np.where(out > 0, 1.0 / out, 0.0)
+
+    def _resample_rows(self, w: Depth) -> Depth:
+        upper, lower, part = w[self._row_near], w[self._row_near + 1], self._row_part
+        nearest = np.where(part < 0.5, upper, lower)
+        between = _connected(upper, lower) & (part >= 0) & (part <= 1)
+        return np.where(self._row_inside, np.where(between, upper + part * (lower - upper), nearest), 0.0)
+
+    def _draw_segments(self, w: Depth, out: Depth) -> None:
+        x = self._zoom * self._columns + self._offset - self._shift_px_m * w
+        left, right, w_left, w_right = x[:, :-1], x[:, 1:], w[:, :-1], w[:, 1:]
+        joined = _connected(w_left, w_right)
+        first = np.ceil(left)
+        for column in (first, first + 1):  # connected neighbours are less than two columns apart
+            inside = joined & (column <= right)
+            part = (column - left) / np.where(right > left, right - left, 1.0)
+            self._keep_nearest(out, inside, column, w_left + part * (w_right - w_left))
+        half = 0.5 * self._zoom
+        nearest = np.rint(x)
+        border_left = np.ones(w.shape, bool)
+        border_left[:, 1:] = ~joined
+        border_right = np.ones(w.shape, bool)
+        border_right[:, :-1] = ~joined
+        covered = np.where(nearest < x, border_left, border_right) & (np.abs(nearest - x) <= half)
+        self._keep_nearest(out, covered & (w > 0), nearest, w)
+
+    def _keep_nearest(self, out: Depth, mask: NDArray[np.bool_], column: Depth, w: Depth) -> None:
+        mask = mask & (column >= 0) & (column < self._shape[1])
+        rows = np.nonzero(mask)[0]
+        np.maximum.at(out, (rows, column[mask].astype(int)), w[mask])
+
+
+def _connected(w_a: Depth, w_b: Depth) -> NDArray[np.bool_]:
+    """Whether two inverse depths belong to one surface; no measurement belongs to none."""
+    return (w_a > 0) & (w_b > 0) & (np.abs(w_a - w_b) <= CONNECTED_RATIO * np.minimum(w_a, w_b))
+
+
+# --- self-check -----------------------------------------------------------------------------------------------------
+
+
+class _ReprojectionCheck:
+    """Moves the depth of a frame into a later one by the poses and compares: one number for axes, direction of poses,
+    scale, intrinsics and association."""
+
+    def __init__(self, camera: PinholeCamera, frames: int) -> None:
+        self._camera = camera
+        gap = min(SELF_CHECK_GAP, frames - 1)
+        starts = (
+            np.unique(np.linspace(0, max(frames - 1 - gap, 0), SELF_CHECK_PAIRS).astype(int)) if gap else []
+        )
+        self._second = {int(i) + gap: int(i) for i in starts}
+        self._kept: dict[int, tuple[Depth, NDArray[np.float64]]] = {}
+        self._residuals: list[Depth] = []
+        self._depths: list[Depth] = []
+
+    def add(self, index: int, depth: Depth, T_world_camera: NDArray[np.float64]) -> None:
+        if index in self._second.values():
+            self._kept[index] = (depth, T_world_camera)
+        if index in self._second:
+            first, T_world_first = self._kept.pop(self._second[index])
+            self._compare(first, T_world_first, depth, T_world_camera)
+
+    def _compare(self, first: Depth, T_world_first: Depth, second: Depth, T_world_second: Depth) -> None:
+        points = self._camera.back_project(first)[::SELF_CHECK_STRIDE, ::SELF_CHECK_STRIDE].reshape(-1, 3)
+        points = se3.transform(se3.inverse(T_world_second) @ T_world_first, points[points[:, 2] > 0])
+        points = points[points[:, 2] > 0.05]
+        pixels = np.rint(self._camera.project(points)).astype(int)
+        inside = ((pixels >= 0) & (pixels < (WIDTH, HEIGHT))).all(axis=1)
+        found = second[pixels[inside, 1], pixels[inside, 0]]
+        expected = points[inside, 2]
+        self._residuals.append(np.abs(found - expected)[found > 0])
+        self._depths.append(found[found > 0])
+
+    def result(self, label: str) -> dict[str, Any]:
+        """Median residual and median depth in metres, None where too little overlaps.
+
+        Raises:
+            DuagError: the residual is too large: poses, depth and intrinsics do not belong together.
+        """
+        residuals = np.concatenate([*self._residuals, np.zeros(0)])
+        if len(residuals) < SELF_CHECK_MIN_PIXELS:
+            return {"reprojection_median_m": None, "median_depth_m": None}
+        residual, depth = float(np.median(residuals)), float(np.median(np.concatenate(self._depths)))
+        if residual > SELF_CHECK_MAX_RATIO * depth:
+            raise DuagError(
+                f"{label}: depth moved by the poses differs by {residual:.3f} m at {depth:.2f} m (medians), expected "
+                f"less than {SELF_CHECK_MAX_RATIO:.0%}: poses, intrinsics and depth do not belong together"
+            )
+        return {"reprojection_median_m": residual, "median_depth_m": depth}
