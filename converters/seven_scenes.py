@@ -385,10 +385,10 @@ class _ReprojectionCheck:
     def __init__(self, camera: PinholeCamera, frames: int) -> None:
         self._camera = camera
         gap = min(SELF_CHECK_GAP, frames - 1)
-        starts = (
-            np.unique(np.linspace(0, max(frames - 1 - gap, 0), SELF_CHECK_PAIRS).astype(int)) if gap else []
-        )
-        self._second = {int(i) + gap: int(i) for i in starts}
+        starts: list[int] = []
+        if gap > 0:
+            starts = np.linspace(0, frames - 1 - gap, SELF_CHECK_PAIRS).astype(int).tolist()
+        self._second = {start + gap: start for start in starts}  # second frame of a pair -> first
         self._kept: dict[int, tuple[Depth, NDArray[np.float64]]] = {}
         self._residuals: list[Depth] = []
         self._depths: list[Depth] = []
