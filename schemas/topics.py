@@ -85,6 +85,44 @@ CORRECTED_KEYFRAMES = Topic(
     Scope.ROBOT,
     "keyframe poses after consensus",
 )
+PEER_MESSAGE = Topic(
+    "/<robot>/peer/message",
+    "duagc.v1.PeerMessage",
+    "exchange",
+    Scope.TEAM,
+    "every message it sent, once, with its bytes",
+)
+PEER_PACKET = Topic(
+    "/<robot>/peer/packet",
+    "duagc.v1.PeerPacket",
+    "exchange",
+    Scope.TEAM,
+    "every packet it sent, with its fate",
+)
+EXCHANGE_SUMMARY = Topic(
+    "/exchange/summary", "duagc.v1.ExchangeSummary", "exchange", Scope.TEAM, "what a session cost"
+)
+AGENT_ROUND = Topic(
+    "/<robot>/consensus/agent",
+    "duagc.v1.AgentRound",
+    "exchange",
+    Scope.TEAM,
+    "what its agent holds and misses",
+)
+CONSENSUS_ROUND = Topic(
+    "/<robot>/consensus/poses",
+    "duagc.v1.ConsensusRound",
+    "exchange",
+    Scope.TEAM,
+    "one round of the pose consensus",
+)
+CLOSURE_DECISION = Topic(
+    "/<robot>/consensus/closure",
+    "duagc.v1.ClosureDecision",
+    "exchange",
+    Scope.TEAM,
+    "every candidate for a closure and what became of it",
+)
 
 TOPICS: tuple[Topic, ...] = (
     COLOR,
@@ -99,6 +137,12 @@ TOPICS: tuple[Topic, ...] = (
     INFORMATION,
     FUSED_MAP,
     CORRECTED_KEYFRAMES,
+    PEER_MESSAGE,
+    PEER_PACKET,
+    EXCHANGE_SUMMARY,
+    AGENT_ROUND,
+    CONSENSUS_ROUND,
+    CLOSURE_DECISION,
 )
 
 ROBOT_NAME = r"[a-z][a-z0-9_]*"

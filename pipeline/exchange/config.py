@@ -5,6 +5,9 @@ from typing import Literal
 from pydantic import Field
 
 from pipeline.config import Config
+from pipeline.consensus.matching import MatchingConfig
+from pipeline.consensus.poses import PoseConsensusConfig
+from pipeline.registration import RegistrationConfig
 
 
 class LinkConfig(Config):
@@ -29,7 +32,7 @@ class TransportConfig(Config):
     """An unacknowledged packet of a reliable message is sent again after so many rounds."""
     contact_lost_after_rounds: int = Field(default=64, ge=1)
     """A neighbour not heard for so long gets one small beacon per round and nothing else."""
-    silent_after_rounds: int = Field(default=400, ge=1)
+    silent_after_rounds: int = Field(default=200, ge=1)
     """A neighbour not heard for so long is given up; the agent ends without it."""
     max_message_bytes: int = Field(default=1 << 28, ge=1)
     """A message that claims to be larger is refused."""
@@ -69,6 +72,8 @@ class VerificationConfig(Config):
     """Points with normal and intensity of the neighbour's keyframe used by the registration."""
     max_refinement_m: float = Field(default=0.15, gt=0.0)
     """Largest translation by which the registration may change what RANSAC found."""
+    registration: RegistrationConfig = RegistrationConfig()
+    """The registration itself."""
     max_refinement_rad: float = Field(default=0.10, gt=0.0)
     """Largest rotation by which the registration may change what RANSAC found."""
 
@@ -84,15 +89,9 @@ class ExchangeConfig(Config):
     """Send every Gaussian to everybody, or only those in space that the receiver's keyframes saw."""
     overlap_voxel_m: float = Field(default=0.25, gt=0.0)
     """Edge of the voxels that say which space a robot saw (coverage = overlap)."""
-    pose_wire: Literal["float32", "float64"] = "float32"
-    """Precision of the poses of a pose round; final anchor poses are always float64."""
-    tolerance: float = Field(default=1e-5, gt=0.0)
-    """Poses are agreed when no pose changes by more than this (m, rad) in a round."""
-    min_closures: int = Field(default=2, ge=1)
-    """Consistent closures from which two robots are joined."""
-    max_closures: int = Field(default=40, ge=1)
-    """Closures kept per pair of robots, most informative first."""
     link: LinkConfig = LinkConfig()
     transport: TransportConfig = TransportConfig()
     places: PlacesConfig = PlacesConfig()
     verification: VerificationConfig = VerificationConfig()
+    consensus: PoseConsensusConfig = PoseConsensusConfig()
+    matching: MatchingConfig = MatchingConfig()

@@ -6,8 +6,9 @@ what is overdue before what is new. Nothing here looks into a payload, save that
 
 from __future__ import annotations
 
+import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,6 +27,7 @@ from pipeline.exchange.packets import (
 )
 
 _ACK_HEAD = struct.Struct("<IIH")  # message id, first chunk, number of chunks told; then one bit per chunk
+MAX_REPEATS = 32
 ACK_CHUNKS = 8 * (MAX_PAYLOAD_BYTES - _ACK_HEAD.size)
 
 
@@ -75,18 +77,31 @@ class _Partial:
     chunks: dict[int, bytes] = field(default_factory=dict)
 
 
+@dataclass
+class _News:
+    """Chunks of one message to acknowledge: from `first` to `last`, up to and including a round."""
+
+    first: int
+    last: int
+    until_round: int
+
+
 class Transport:
     """One end of the link to one neighbour."""
 
-    def __init__(self, own: int, peer: int, peer_name: str, config: TransportConfig) -> None:
-        """own, peer: indices in the sorted team."""
+    def __init__(
+        self, own: int, peer: int, peer_name: str, config: TransportConfig, new_id: Callable[[], int]
+    ) -> None:
+        """own, peer: indices in the sorted team. new_id: gives message ids that are unique for this sender."""
         self.own, self.peer, self.peer_name, self.config = own, peer, peer_name, config
+        self.new_id = new_id
         self.sequence = 0
         self.last_heard: int | None = None
         self._open: dict[int, _Open] = {}
         self._partial: dict[int, _Partial] = {}
         self._received: dict[int, tuple[Kind, int]] = {}  # complete messages: kind, total bytes
-        self._to_acknowledge: dict[int, tuple[int, int]] = {}  # message: first and last chunk with news
+        self._to_acknowledge: dict[int, _News] = {}
+        self._packets_heard = self._highest_sequence = 0
 
     # --- outgoing
 
@@ -102,6 +117,11 @@ class Transport:
     def is_open(self, message: int) -> bool:
         """Whether a message is not yet fully acknowledged."""
         return message in self._open
+
+    @property
+    def open_messages(self) -> int:
+        """Queued messages that are not yet fully acknowledged."""
+        return len(self._open)
 
     @property
     def idle(self) -> bool:
@@ -122,7 +142,7 @@ class Transport:
             states: fire-and-forget messages, one packet each. budget_bytes: most that may be sent, headers included.
         """
         out: list[Outgoing] = []
-        for message in [*self._acknowledgements(), *states]:
+        for message in [*self._acknowledgements(round_index), *states]:
             budget_bytes -= HEADER_BYTES + len(message.payload)
             if budget_bytes < 0:
                 return out
@@ -161,24 +181,34 @@ class Transport:
         self.sequence += 1
         return Outgoing(self.peer_name, serialise(packet), message)
 
-    def _acknowledgements(self) -> list[Message]:
-        """One or more ACK messages for every chunk that arrived since the last burst, with what arrived around it."""
+    def _acknowledgements(self, round_index: int) -> list[Message]:
+        """ACK messages for every chunk that arrived lately, with what arrived around it."""
         parts: list[bytes] = []
         for message in sorted(self._to_acknowledge):
-            first, last = self._to_acknowledge[message]
-            for base in range(first - first % 8, last + 1, ACK_CHUNKS):
-                bits = self._bits(message, base, ACK_CHUNKS)
-                parts.append(
-                    _ACK_HEAD.pack(message, base, len(bits)) + np.packbits(bits, bitorder="little").tobytes()
-                )
-        self._to_acknowledge.clear()
+            news = self._to_acknowledge[message]
+            for base in range(news.first - news.first % 8, news.last + 1, ACK_CHUNKS):
+                bits = self._bits(message, base, ACK_CHUNKS)  # up to the last one that is here
+                head = _ACK_HEAD.pack(message, base, len(bits))
+                parts.append(head + np.packbits(bits, bitorder="little").tobytes())
+            if news.until_round <= round_index:
+                del self._to_acknowledge[message]
         payloads: list[bytes] = []
         for part in parts:
             if payloads and len(payloads[-1]) + len(part) <= MAX_PAYLOAD_BYTES:
                 payloads[-1] += part
             else:
                 payloads.append(part)
-        return [Message(0, Kind.ACK, payload) for payload in payloads]
+        return [Message(self.new_id(), Kind.ACK, payload) for payload in payloads]
+
+    def _repeats(self) -> int:
+        """In how many further rounds to repeat an acknowledgement, so that 19 of 20 get through.
+
+        The loss is that of the packets heard, seen from the gaps in their sequence numbers: none, no repetition.
+        """
+        loss = 1.0 - self._packets_heard / (self._highest_sequence + 1)
+        if loss <= 0.0:
+            return 0
+        return min(MAX_REPEATS, math.ceil(math.log(0.05) / math.log(loss)))
 
     def _bits(self, message: int, base: int, most: int) -> NDArray[np.bool_]:
         """Which of the chunks from `base` on, at most so many, are here."""
@@ -188,8 +218,9 @@ class Transport:
         partial = self._partial[message]
         bits = np.zeros(min(most, chunk_count(partial.kind, partial.total) - base), dtype=bool)
         here = np.fromiter(partial.chunks, dtype=np.int64, count=len(partial.chunks)) - base
-        bits[here[(here >= 0) & (here < len(bits))]] = True
-        return bits
+        here = here[(here >= 0) & (here < len(bits))]
+        bits[here] = True
+        return bits[: here.max(initial=-1) + 1]
 
     # --- incoming
 
@@ -202,14 +233,16 @@ class Transport:
             MalformedError: it contradicts what came before, or asks for too much; it is then ignored.
         """
         self.last_heard = round_index
+        self._packets_heard += 1
+        self._highest_sequence = max(self._highest_sequence, packet.sequence)
         if packet.kind is Kind.ACK:
             self._take_acknowledgements(packet.payload)
             return None
         if packet.kind is Kind.STATE:
             return Arrival(packet.kind, packet.message, packet.payload, complete=True)
-        return self._take_chunk(packet)
+        return self._take_chunk(packet, round_index)
 
-    def _take_chunk(self, packet: Packet) -> Arrival | None:
+    def _take_chunk(self, packet: Packet, round_index: int) -> Arrival | None:
         known = self._received.get(packet.message)
         partial = self._partial.get(packet.message)
         if partial is not None:
@@ -228,8 +261,9 @@ class Transport:
             if len(self._partial) >= self.config.max_open_messages:
                 raise MalformedError(f"more than {self.config.max_open_messages} incomplete messages")
             partial = self._partial[packet.message] = _Partial(packet.kind, packet.total)
-        first, last = self._to_acknowledge.get(packet.message, (chunk, chunk))
-        self._to_acknowledge[packet.message] = (min(first, chunk), max(last, chunk))
+        news = self._to_acknowledge.setdefault(packet.message, _News(chunk, chunk, 0))
+        news.first, news.last = min(news.first, chunk), max(news.last, chunk)
+        news.until_round = round_index + self._repeats()
         if partial is None or chunk in partial.chunks:
             return None
         partial.chunks[chunk] = packet.payload
@@ -245,12 +279,13 @@ class Transport:
             return Arrival(packet.kind, packet.message, packet.payload, complete=False)
         return None
 
-    def accept_rest(self, message: int) -> None:
+    def accept_rest(self, message: int, round_index: int) -> None:
         """Acknowledge all of a message that is not needed any more: its content is here already."""
         partial = self._partial.pop(message, None)
         if partial is not None:
             self._received[message] = (partial.kind, partial.total)
-            self._to_acknowledge[message] = (0, chunk_count(partial.kind, partial.total) - 1)
+            last = chunk_count(partial.kind, partial.total) - 1
+            self._to_acknowledge[message] = _News(0, last, round_index + self._repeats())
 
     def _take_acknowledgements(self, payload: bytes) -> None:
         """Mark what the neighbour says it has; what it says about anything else has no effect."""

@@ -28,7 +28,6 @@ class Verdict(Enum):
     NOT_REGISTERED = "registration of the two views failed"
     MOVED = "registration moved far from what the matches say"
     INCONSISTENT = "disagrees with the other closures of this pair of robots"
-    BEYOND_BUDGET = "consistent, but more informative closures used up the budget"
 
 
 @dataclass(frozen=True)
@@ -122,8 +121,8 @@ def verify(
         return Verified(
             Verdict.FEW_INLIERS, len(pairs), inliers, f"{inliers} of {len(pairs)} agree, {needed} needed"
         )
-    result = register(peer_reference, own_pyramid, se3.inverse(T_own_peer))
-    if not result.ok:
+    result = register(peer_reference, own_pyramid, se3.inverse(T_own_peer), config.registration)
+    if not result.ok or np.linalg.eigvalsh(result.information)[0] <= 0:
         return Verified(Verdict.NOT_REGISTERED, len(pairs), inliers, f"registration: {result.outcome.value}")
     T_refined = se3.inverse(result.T_reference_target)
     moved_m, moved_rad = (float(d) for d in se3.distance(T_own_peer, T_refined))

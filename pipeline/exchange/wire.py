@@ -13,7 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.packets import MalformedError
+from pipeline.consensus.poses import PosePacket, SharedKeyframes
+from pipeline.exchange.packets import (
+    EVIDENCE_CHUNK_BYTES,
+    EVIDENCE_HEAD_BYTES,
+    EVIDENCE_RECORD_BYTES,
+    EVIDENCE_RECORDS_PER_CHUNK,
+    MalformedError,
+)
 from pipeline.exchange.places import DIMENSIONS, Descriptors, Features
 from pipeline.registration import Reference, ReferenceLevel
 
@@ -193,6 +200,122 @@ def read_indices(data: bytes, limit: int) -> list[int]:
     if indices != sorted(set(indices)) or (indices and indices[-1] >= limit):
         raise MalformedError(f"request: indices must ascend and stay below {limit}")
     return indices
+
+
+# --- the verdict on a pair of robots
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """What the lower-named end found out about a pair.
+
+    candidates, verified, consistent: pairs of keyframes that were tried, that became closures, that agree.
+    joined: the two robots share a frame; only then the rest holds. T_lower_higher: [4, 4], map frame of the higher
+    end in that of the lower. shared: keyframes of the higher end that the lower one copies, and their metric.
+    """
+
+    candidates: int
+    verified: int
+    consistent: int
+    joined: bool
+    T_lower_higher: Array
+    shared: SharedKeyframes
+
+
+_VERDICTS = struct.Struct("<IIIBI")
+
+
+def write_verdicts(verdicts: Verdicts) -> bytes:
+    """Bytes of CLOSURES."""
+    n = len(verdicts.shared.keyframes)
+    head = (verdicts.candidates, verdicts.verified, verdicts.consistent, verdicts.joined, n)
+    return b"".join(
+        [
+            _VERDICTS.pack(*head),
+            pose_bytes(verdicts.T_lower_higher),
+            array_bytes(verdicts.shared.keyframes, "int32"),
+            array_bytes(verdicts.shared.metric, "float32"),
+        ]
+    )
+
+
+def read_verdicts(data: bytes, limit: int) -> Verdicts:
+    """From CLOSURES about keyframes below `limit`."""
+    reader = Reader(data, "closures")
+    candidates, verified, consistent, joined, n = reader.fields(_VERDICTS)
+    T = reader.poses(1)[0]
+    if joined > 1 or bool(joined) != bool(n) or n > MAX_KEYFRAMES:
+        raise MalformedError("closures: joined robots share keyframes, others do not")
+    keyframes, metric = reader.array("int32", (n,)), reader.array("float32", (n, 6))
+    reader.done()
+    if n and (keyframes[0] < 0 or keyframes[-1] >= limit or np.diff(keyframes).min(initial=1) < 1):
+        raise MalformedError(f"closures: shared keyframes must ascend and stay below {limit}")
+    if n and not (metric.min() > 0 and metric.max() < 1e15):
+        raise MalformedError("closures: the metric must be positive")
+    return Verdicts(candidates, verified, consistent, bool(joined), T, SharedKeyframes(keyframes, metric))
+
+
+# --- poses of a round
+
+
+_POSES = struct.Struct("<IIBH2f2f")
+_CONVERGED, _CURVATURE, _DOUBLE = 1, 2, 4
+
+
+def write_poses(packet: PosePacket) -> bytes:
+    """Bytes of the poses of a round, float32 or float64 as the packet has them."""
+    double = packet.translations.dtype == np.float64
+    flags = _CONVERGED * packet.converged + _CURVATURE * (packet.curvature is not None) + _DOUBLE * double
+    curvature = (0.0, 0.0) if packet.curvature is None else packet.curvature.tolist()
+    n = len(packet.keyframes)
+    dtype = "float64" if double else "float32"
+    return b"".join(
+        [
+            _POSES.pack(packet.sequence, packet.version, flags, n, *packet.penalties.tolist(), *curvature),
+            array_bytes(packet.keyframes, "int32"),
+            array_bytes(packet.quats_wxyz, dtype),
+            array_bytes(packet.translations, dtype),
+        ]
+    )
+
+
+def poses_per_packet(room_bytes: int, double: bool) -> int:
+    """Keyframes that fit into the rest of a packet."""
+    return (room_bytes - _POSES.size) // (4 + 7 * (8 if double else 4))
+
+
+def read_poses(data: bytes, shared: NDArray[np.int32]) -> PosePacket:
+    """Poses of a round about some of the keyframes `shared`, ascending."""
+    reader = Reader(data, "poses")
+    sequence, version, flags, n, *numbers = reader.fields(_POSES)
+    if flags > _CONVERGED + _CURVATURE + _DOUBLE or not np.isfinite(numbers).all() or min(numbers) < 0:
+        raise MalformedError("poses: unknown flags, or impossible penalties")
+    if not (min(numbers[:2]) > 0 and max(numbers) < 1e9):
+        raise MalformedError("poses: penalties must be positive")
+    dtype = "float64" if flags & _DOUBLE else "float32"
+    keyframes = reader.array("int32", (n,))
+    quats, translations = reader.array(dtype, (n, 4)), reader.array(dtype, (n, 3))
+    reader.done()
+    if np.diff(keyframes).min(initial=1) < 1 or not np.isin(keyframes, shared).all():
+        raise MalformedError("poses: of keyframes that the link does not share")
+    if n and (
+        np.abs((quats.astype(np.float64) ** 2).sum(axis=1) - 1).max() > 1e-3
+        or np.abs(translations).max() > 1e6
+    ):
+        raise MalformedError("poses: not rigid motions")
+    curvature = np.array(numbers[2:], dtype=np.float32) if flags & _CURVATURE else None
+    if curvature is not None and curvature.min() <= 0:
+        raise MalformedError("poses: the curvature must be positive")
+    return PosePacket(
+        sequence,
+        version,
+        keyframes,
+        quats,
+        translations,
+        np.array(numbers[:2], dtype=np.float32),
+        curvature,
+        bool(flags & _CONVERGED),
+    )
 
 
 # --- one keyframe
@@ -385,3 +508,71 @@ def read_pairs(data: bytes, team: int) -> PairList:
     if len(np.unique(ids[:, 0])) != n or len(np.unique(ids[:, 1])) != n:
         raise MalformedError("pairs: a Gaussian is matched twice")
     return PairList(lower, higher, version, ids)
+
+
+# --- evidence
+
+RECORD = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f4", 13), ("information", "<f4", 31)])
+_EVIDENCE = struct.Struct("<HHI")  # owner, version, records of the whole message
+MAX_COORDINATE = 1e6  # of anything in theta; beyond it exponentials overflow or positions lose their meaning
+assert RECORD.itemsize == EVIDENCE_RECORD_BYTES
+assert _EVIDENCE.size == EVIDENCE_HEAD_BYTES
+
+
+def write_evidence(owner: int, version: int, records: NDArray[Any]) -> bytes:
+    """Bytes of EVIDENCE: chunks of whole records, each with its own head, as they are cut into packets."""
+    n, per = len(records), EVIDENCE_RECORDS_PER_CHUNK
+    head = _EVIDENCE.pack(owner, version, n)
+    chunks = chunk_count_of_records(n)
+    rows = np.zeros((chunks, EVIDENCE_CHUNK_BYTES), np.uint8)
+    rows[:, :EVIDENCE_HEAD_BYTES] = np.frombuffer(head, np.uint8)
+    padded = np.zeros(chunks * per, RECORD)
+    padded[:n] = records
+    rows[:, EVIDENCE_HEAD_BYTES:] = padded.view(np.uint8).reshape(chunks, per * EVIDENCE_RECORD_BYTES)
+    return rows.tobytes()[: chunks * EVIDENCE_HEAD_BYTES + n * EVIDENCE_RECORD_BYTES]
+
+
+def chunk_count_of_records(n: int) -> int:
+    """Packets that n records of evidence need; none need one, to say so."""
+    return max(1, -(-n // EVIDENCE_RECORDS_PER_CHUNK))
+
+
+def read_evidence_head(chunk: bytes, team: int) -> tuple[int, int]:
+    """Owner of a chunk of evidence and the number of records of the whole message."""
+    owner, _, n = Reader(chunk, "evidence").fields(_EVIDENCE)
+    if owner >= team or (len(chunk) - EVIDENCE_HEAD_BYTES) % EVIDENCE_RECORD_BYTES:
+        raise MalformedError("evidence: names a robot outside the team, or holds a part of a record")
+    return owner, n
+
+
+def read_evidence(data: bytes, team: int) -> tuple[int, NDArray[Any]]:
+    """Owner and records of any number of consecutive chunks of one message, each id once.
+
+    A complete message must have the announced number of records; parts of one have fewer.
+    """
+    owner, announced = read_evidence_head(data[:EVIDENCE_HEAD_BYTES], team)
+    chunks = -(-len(data) // EVIDENCE_CHUNK_BYTES)
+    rows = np.zeros(chunks * EVIDENCE_CHUNK_BYTES, np.uint8)
+    rows[: len(data)] = np.frombuffer(data, np.uint8)
+    rows = rows.reshape(chunks, EVIDENCE_CHUNK_BYTES)
+    if (rows[:, :EVIDENCE_HEAD_BYTES] != rows[0, :EVIDENCE_HEAD_BYTES]).any():
+        raise MalformedError("evidence: chunks of different messages")
+    n, odd = divmod(len(data) - chunks * EVIDENCE_HEAD_BYTES, EVIDENCE_RECORD_BYTES)
+    if odd or n > announced:
+        raise MalformedError(f"evidence: {len(data)} bytes are no {announced} records")
+    records = np.ascontiguousarray(rows[:, EVIDENCE_HEAD_BYTES:]).reshape(-1).view(RECORD)[:n].copy()
+    check_evidence(records)
+    return owner, records
+
+
+def check_evidence(records: NDArray[Any]) -> None:
+    """Refuse records with impossible numbers. Raises MalformedError."""
+    theta, information = records["theta"], records["information"]
+    if not np.isfinite(theta).all() or not np.isfinite(information).all():
+        raise MalformedError("evidence: not a finite number")
+    if len(records) and (np.abs(theta).max() > MAX_COORDINATE or np.abs(theta[:, 3:9]).max() > 60.0):
+        raise MalformedError("evidence: a Gaussian of impossible place or size")
+    if len(records) and records["anchor"].min() < 0:
+        raise MalformedError("evidence: a negative keyframe")
+    if len(np.unique(records["id"])) != len(records):
+        raise MalformedError("evidence: a Gaussian twice")

@@ -1,0 +1,126 @@
+"""What an agent knows of its team beyond itself: evidence, agreed poses and pair lists, by owner.
+
+Kept as they arrived, so that they can be handed on unchanged, however many hops away their owner is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.exchange import wire
+from pipeline.exchange.packets import MalformedError
+from pipeline.exchange.wire import RECORD, Anchors, PairList
+
+Records = NDArray[Any]
+
+
+@dataclass
+class Incoming:
+    """Evidence of one owner on its way in from one neighbour: its chunks so far, by message."""
+
+    owner: int
+    provider: int
+    chunks: list[bytes] = field(default_factory=list)
+
+
+class Knowledge:
+    """Evidence, anchors and pairs of the team, as one agent holds them."""
+
+    def __init__(self, own: int, team: int) -> None:
+        self.own, self.team = own, team
+        self.evidence: dict[int, Records] = {}  # complete, by owner
+        self.evidence_bytes: dict[int, bytes] = {}
+        self.incoming: dict[tuple[int, int], Incoming] = {}  # by (provider, message)
+        self.anchors: dict[int, Anchors] = {}
+        self.anchors_bytes: dict[int, bytes] = {}
+        self.pairs: dict[tuple[int, int], PairList] = {}
+        self.pairs_bytes: dict[tuple[int, int], bytes] = {}
+
+    def take_evidence(self, provider: int, message: int, payload: bytes, complete: bool) -> int | None:
+        """Take a chunk, or the complete message. Returns the owner if its evidence is here completely."""
+        if not complete:
+            owner, _ = wire.read_evidence_head(payload, self.team)
+            if owner not in self.evidence:
+                entry = self.incoming.setdefault((provider, message), Incoming(owner, provider))
+                if entry.owner != owner:
+                    raise MalformedError("evidence: chunks of different owners in one message")
+                entry.chunks.append(payload)
+            return owner if owner in self.evidence else None
+        self.incoming.pop((provider, message), None)
+        owner, records = wire.read_evidence(payload, self.team)
+        if owner == self.own:
+            raise MalformedError("evidence: a neighbour speaks for this robot")
+        if owner not in self.evidence:
+            self.evidence[owner], self.evidence_bytes[owner] = records, payload
+        return owner
+
+    def forget_incoming(self, owner: int) -> list[tuple[int, int]]:
+        """Drop what else is on its way in from an owner that is complete; returns (provider, message)."""
+        keys = sorted(k for k, entry in self.incoming.items() if entry.owner == owner)
+        for key in keys:
+            del self.incoming[key]
+        return keys
+
+    def sources(self, direct: set[int], living: set[int]) -> NDArray[np.uint8]:
+        """Where the evidence of each owner comes from: COMPLETE, a neighbour, or NOBODY.
+
+        Args:
+            direct: neighbours that will send their own evidence themselves. living: neighbours not given up.
+        """
+        out = np.full(self.team, wire.NOBODY, np.uint8)
+        for owner in range(self.team):
+            if owner == self.own or owner in self.evidence:
+                out[owner] = wire.COMPLETE
+            elif owner in direct:
+                out[owner] = owner
+            else:
+                providers = sorted({e.provider for e in self.incoming.values() if e.owner == owner} & living)
+                if providers:
+                    out[owner] = providers[0]
+        return out
+
+    def take_anchors(self, payload: bytes) -> int:
+        """Take agreed poses, if they are news; returns their owner."""
+        anchors = wire.read_anchors(payload, self.team)
+        if anchors.owner == self.own:
+            raise MalformedError("anchors: a neighbour speaks for this robot")
+        if anchors.owner not in self.anchors:
+            self.anchors[anchors.owner], self.anchors_bytes[anchors.owner] = anchors, payload
+        return anchors.owner
+
+    def take_pairs(self, payload: bytes) -> tuple[int, int]:
+        """Take a pair list, if it is news; returns the pair. The lower-named robot of a pair speaks for it."""
+        pairs = wire.read_pairs(payload, self.team)
+        key = (pairs.lower, pairs.higher)
+        if pairs.lower == self.own:
+            raise MalformedError("pairs: a neighbour speaks for this robot")
+        if key not in self.pairs:
+            self.pairs[key], self.pairs_bytes[key] = pairs, payload
+        return key
+
+    def records(self, owner: int) -> Records:
+        """All records of an owner that are here, whether complete or not, each id once, sorted by id."""
+        if owner in self.evidence:
+            records = self.evidence[owner]
+        else:
+            parts = []
+            for key in sorted(k for k, entry in self.incoming.items() if entry.owner == owner):
+                for chunk in self.incoming[key].chunks:
+                    try:
+                        parts.append(wire.read_evidence(chunk, self.team)[1])
+                    except MalformedError:
+                        continue
+            records = np.concatenate(parts) if parts else np.zeros(0, RECORD)
+        _, first = np.unique(records["id"], return_index=True)
+        return records[first]
+
+    def sound_records(self, owner: int) -> Records:
+        """`records` whose anchor is among the owner's agreed poses; none without agreed poses."""
+        if owner not in self.anchors:
+            return np.zeros(0, RECORD)
+        records = self.records(owner)
+        return records[records["anchor"] < len(self.anchors[owner].T_common_keyframe)]

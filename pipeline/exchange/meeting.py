@@ -1,0 +1,251 @@
+"""How two robots find out whether they have been in the same place, and where one's map lies in the other's.
+
+    higher-named end                                    lower-named end
+    DESCRIPTORS  compact descriptors of all keyframes ->
+                                                      <- REQUEST   keyframes worth a closer look
+    SAMPLE       one per requested keyframe           ->
+                                                      <- CLOSURES  verdict, shared keyframes, relative frame
+
+The lower-named end keeps the closures. It has decided when its verdict has been acknowledged, the other end when
+the verdict has arrived.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import streams
+from pipeline.consensus.closures import Closure, consistent, drift
+from pipeline.consensus.factors import Factors
+from pipeline.consensus.poses import PoseAgent, SharedKeyframes
+from pipeline.exchange import places, wire
+from pipeline.exchange.config import ExchangeConfig
+from pipeline.exchange.inputs import RobotData
+from pipeline.exchange.packets import Kind, MalformedError
+from pipeline.exchange.places import Candidate, Features
+from pipeline.exchange.verification import Verdict, Verified, verify
+from pipeline.exchange.wire import KeyframeSample, PlaceBook, Verdicts
+from pipeline.geometry import se3
+from pipeline.registration import Reference, RgbdPyramid
+
+Array = NDArray[np.float64]
+Send = Callable[[Kind, bytes], None]
+PYRAMIDS_KEPT = 12
+
+
+class OwnPlaces:
+    """A robot's own keyframes as others may ask for them; computed when first needed."""
+
+    def __init__(self, data: RobotData, config: ExchangeConfig) -> None:
+        self.data, self.config = data, config
+        self._pyramid = lru_cache(maxsize=PYRAMIDS_KEPT)(self._build_pyramid)
+        self._features: list[Features] | None = None
+        self.odometry = Factors(
+            np.array([s.i for s in data.odometry]),
+            np.array([s.j for s in data.odometry]),
+            np.array([s.T_i_j for s in data.odometry]).reshape(-1, 4, 4),
+            np.array([s.information for s in data.odometry]).reshape(-1, 6, 6),
+        )
+
+    @property
+    def features(self) -> list[Features]:
+        """All features of every keyframe."""
+        if self._features is None:
+            most = self.config.places.features_per_keyframe
+            camera = self.data.camera
+            self._features = [
+                places.extract(*self.data.images(k), camera, most) for k in range(self.data.keyframes)
+            ]
+        return self._features
+
+    def pyramid(self, keyframe: int) -> RgbdPyramid:
+        """Images of a keyframe at several resolutions."""
+        return self._pyramid(keyframe)
+
+    def _build_pyramid(self, keyframe: int) -> RgbdPyramid:
+        color, depth = self.data.images(keyframe)
+        return RgbdPyramid.build(color.astype(np.float32) / np.float32(255), depth, self.data.camera)
+
+    @property
+    def drift(self) -> Array:
+        """Accumulated variance of the own odometry, [n, 2]."""
+        return drift(self.odometry, self.data.keyframes, self.config.consensus.closures)
+
+    def book(self) -> PlaceBook:
+        """What a neighbour gets to recognise places."""
+        most = self.config.places.features_per_place
+        compact = [f.descriptors[:most] for f in self.features]
+        return PlaceBook(compact, self.data.T_map_keyframe, self.drift)
+
+    def sample(self, keyframe: int) -> KeyframeSample:
+        """What a neighbour gets to verify closures with one keyframe."""
+        reference = Reference.sample(self.pyramid(keyframe), self.config.verification.samples)
+        return KeyframeSample(keyframe, self.features[keyframe], reference)
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One candidate and what became of it, for the record."""
+
+    candidate: Candidate
+    result: Verified
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Two robots that share a frame: closures at the end that holds them, shared keyframes at both."""
+
+    T_own_peer: Array
+    closures: tuple[Closure, ...]
+    keep: NDArray[np.bool_]
+    shared: SharedKeyframes
+
+
+class Meeting:
+    """The lower-named end of a pair, or the higher-named one: two subclasses."""
+
+    def __init__(self, own: str, peer: str, places_: OwnPlaces, config: ExchangeConfig, seed: int) -> None:
+        self.own, self.peer, self.places, self.config, self.seed = own, peer, places_, config, seed
+        self.verdicts: Verdicts | None = None
+        self.joined: Joined | None = None
+        self.tried: list[Tried] = []
+        self.begun = False
+
+    def begin(self, send: Send) -> None:
+        """Called once, when the neighbour has been heard for the first time."""
+        self.begun = True
+
+    def take(self, kind: Kind, payload: bytes, send: Send) -> None:
+        """Take one complete message of this meeting."""
+        raise NotImplementedError
+
+
+class HigherEnd(Meeting):
+    """Sends descriptors and the samples it is asked for; gets the verdict."""
+
+    def begin(self, send: Send) -> None:
+        super().begin(send)
+        send(Kind.DESCRIPTORS, wire.write_places(self.places.book()))
+
+    def take(self, kind: Kind, payload: bytes, send: Send) -> None:
+        limit = self.places.data.keyframes
+        if kind is Kind.REQUEST:
+            for keyframe in wire.read_indices(payload, limit):
+                send(Kind.SAMPLE, wire.write_sample(self.places.sample(keyframe)))
+        elif kind is Kind.CLOSURES and self.verdicts is None:
+            verdicts = wire.read_verdicts(payload, limit)
+            self.verdicts = verdicts
+            if verdicts.joined:
+                T_own_peer = se3.inverse(verdicts.T_lower_higher)
+                self.joined = Joined(T_own_peer, (), np.zeros(0, dtype=bool), verdicts.shared)
+        else:
+            raise MalformedError(f"{kind.name} is not for the higher-named end, or came twice")
+
+
+class LowerEnd(Meeting):
+    """Chooses candidates, verifies them, and decides."""
+
+    def __init__(self, own: str, peer: str, places_: OwnPlaces, config: ExchangeConfig, seed: int) -> None:
+        super().__init__(own, peer, places_, config, seed)
+        self.book: PlaceBook | None = None
+        self.waiting: dict[int, list[Candidate]] = {}  # by keyframe of the neighbour
+
+    def take(self, kind: Kind, payload: bytes, send: Send) -> None:
+        if kind is Kind.DESCRIPTORS and self.book is None:
+            self._choose(wire.read_places(payload), send)
+        elif kind is Kind.SAMPLE and self.book is not None:
+            sample = wire.read_sample(payload, len(self.book.descriptors))
+            if sample.keyframe not in self.waiting:
+                raise MalformedError(f"sample of keyframe {sample.keyframe} was not asked for, or came twice")
+            self._verify(sample)
+            if not self.waiting:
+                self._decide(send)
+        else:
+            raise MalformedError(f"{kind.name} is not for the lower-named end, or came twice")
+
+    def _choose(self, book: PlaceBook, send: Send) -> None:
+        """Score all pairs of keyframes and ask for the samples of the best."""
+        self.book = book
+        c = self.config.places
+        kept, left = places.candidates(
+            self.places.features,
+            book.descriptors,
+            c.ratio,
+            c.min_score,
+            c.candidates_per_keyframe,
+            c.max_requested_keyframes,
+        )
+        for candidate in left:
+            self.tried.append(Tried(candidate, Verified(Verdict.NOT_ASKED_FOR, candidate.score, 0)))
+        for candidate in kept:
+            self.waiting.setdefault(candidate.peer_keyframe, []).append(candidate)
+        if self.waiting:
+            send(Kind.REQUEST, wire.write_indices(sorted(self.waiting)))
+        else:
+            self._decide(send)
+
+    def _verify(self, sample: KeyframeSample) -> None:
+        for candidate in self.waiting.pop(sample.keyframe):
+            rng = streams.generator(
+                self.seed,
+                "ransac",
+                robot=self.own,
+                peer=self.peer,
+                own_keyframe=candidate.own_keyframe,
+                peer_keyframe=candidate.peer_keyframe,
+            )
+            result = verify(
+                candidate.own_keyframe,
+                candidate.peer_keyframe,
+                self.places.features[candidate.own_keyframe],
+                self.places.pyramid(candidate.own_keyframe),
+                sample.features,
+                sample.reference,
+                self.config.places.ratio,
+                self.config.verification,
+                rng,
+            )
+            self.tried.append(Tried(candidate, result))
+
+    def _decide(self, send: Send) -> None:
+        """Pairwise consistency, the relative frame, and the message that says so."""
+        assert self.book is not None
+        self.tried.sort(key=lambda t: (t.candidate.peer_keyframe, t.candidate.own_keyframe))
+        closures = [t.result.closure for t in self.tried if t.result.closure is not None]
+        agreement = consistent(
+            closures,
+            self.places.data.T_map_keyframe,
+            self.book.T_map_keyframe,
+            self.places.drift,
+            self.book.drift,
+            self.config.consensus.closures,
+        )
+        verdicts = iter(zip(agreement.keep.tolist(), agreement.reasons, strict=True))
+        for at, t in enumerate(self.tried):
+            if t.result.closure is not None:
+                keep, reason = next(verdicts)
+                if not keep:
+                    result = replace(t.result, verdict=Verdict.INCONSISTENT, detail=reason)
+                    self.tried[at] = Tried(t.candidate, result)
+        T = agreement.T_ownmap_peermap
+        shared = SharedKeyframes(np.zeros(0, np.int32), np.zeros((0, 6), np.float32))
+        if T is not None:
+            trial = PoseAgent(
+                self.own, self.places.data.T_map_keyframe, self.places.odometry, self.config.consensus
+            )
+            shared = trial.add_link(self.peer, closures, keep=agreement.keep)
+            self.joined = Joined(T, tuple(closures), agreement.keep, shared)
+        self.verdicts = Verdicts(
+            candidates=len(self.tried),
+            verified=len(closures),
+            consistent=int(agreement.keep.sum()),
+            joined=T is not None,
+            T_lower_higher=np.eye(4) if T is None else T,
+            shared=shared,
+        )
+        send(Kind.CLOSURES, wire.write_verdicts(self.verdicts))

@@ -1,0 +1,285 @@
+"""The logs of a session: every message once, every packet by reference, every round of every agent."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import schemas
+from pipeline.errors import DuagError
+from pipeline.exchange.agent import Agent
+from pipeline.exchange.links import Fate
+from pipeline.exchange.packets import HEADER_BYTES, Kind, MalformedError, parse
+from pipeline.exchange.results import AgentResult
+from pipeline.exchange.transport import Outgoing
+from pipeline.messages import map_frame, pack_pose, pack_stamp
+from pipeline.recording import LogWriter, read_log
+from schemas import topics
+
+
+class ExchangeRecorder:
+    """Writes exchange.mcap."""
+
+    def __init__(self, writer: LogWriter) -> None:
+        self.writer = writer
+        self._known: set[tuple[str, int]] = set()
+        self._by_content: dict[bytes, tuple[str, int]] = {}
+        self._totals: dict[tuple[str, str, str], list[int]] = {}  # packets, dropped, bytes, bytes delivered
+
+    def packet(
+        self, sender: str, out: Outgoing, sequence: int, round_index: int, send_ns: int, fate: Fate
+    ) -> None:
+        """Record one packet, and its message if this is the first packet of it."""
+        self._message(sender, out, send_ns)
+        packet = parse(out.packet)
+        message = schemas.new(
+            "PeerPacket",
+            robot=sender,
+            receiver=out.receiver,
+            sequence=sequence,
+            round=round_index,
+            message=out.message.id,
+            offset=packet.offset,
+            length=len(packet.payload),
+            header=out.packet[:HEADER_BYTES],
+            delivered=fate.delivered,
+            deliver_ns=fate.deliver_ns or 0,
+            dropped=fate.reason,
+        )
+        pack_stamp(message, send_ns)
+        self.writer.write(topics.PEER_PACKET.of(sender), message, send_ns)
+        totals = self._totals.setdefault((sender, out.receiver, out.message.kind.name), [0, 0, 0, 0])
+        totals[0] += 1
+        totals[1] += not fate.delivered
+        totals[2] += len(out.packet)
+        totals[3] += len(out.packet) * fate.delivered
+
+    def _message(self, sender: str, out: Outgoing, send_ns: int) -> None:
+        key = (sender, out.message.id)
+        if key in self._known:
+            return
+        self._known.add(key)
+        payload = out.message.payload
+        earlier = self._by_content.setdefault(hashlib.sha256(payload).digest(), key)
+        message = schemas.new(
+            "PeerMessage",
+            robot=sender,
+            message=out.message.id,
+            kind=int(out.message.kind),
+            kind_name=out.message.kind.name,
+            length=len(payload),
+        )
+        if earlier == key:
+            message.payload = payload
+        else:
+            message.same_as_robot, message.same_as_message = earlier
+        pack_stamp(message, send_ns)
+        self.writer.write(topics.PEER_MESSAGE.of(sender), message, send_ns)
+
+    def summary(
+        self, team: list[str], rounds: int, converged: bool, bytes_raw_alternative: int, now_ns: int
+    ) -> None:
+        """Record what the session cost."""
+        message = schemas.new(
+            "ExchangeSummary",
+            team=team,
+            rounds=rounds,
+            converged=converged,
+            messages=len(self._known),
+            bytes_raw_alternative=bytes_raw_alternative,
+        )
+        for (sender, receiver, kind), (packets, dropped, size, arrived) in sorted(self._totals.items()):
+            message.links.add(
+                sender=sender,
+                receiver=receiver,
+                kind_name=kind,
+                packets_sent=packets,
+                packets_dropped=dropped,
+                bytes_sent=size,
+                bytes_delivered=arrived,
+            )
+            message.packets_sent += packets
+            message.packets_dropped += dropped
+            message.bytes_sent += size
+            message.bytes_delivered += arrived
+            message.bytes_setup += size * (kind not in RUNNING_KINDS)
+        pack_stamp(message, now_ns)
+        self.writer.write(topics.EXCHANGE_SUMMARY.pattern, message, now_ns)
+
+
+RUNNING_KINDS = frozenset({Kind.ACK.name, Kind.STATE.name, Kind.EVIDENCE.name})
+"""Kinds whose bytes are not set-up."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recorded session: the team, the number of rounds, all packets in the order of sending."""
+
+    team: tuple[str, ...]
+    rounds: int
+    packets: list[RecordedPacket]
+
+
+@dataclass(frozen=True)
+class RecordedPacket:
+    """One packet of a recorded session, rebuilt."""
+
+    sender: str
+    receiver: str
+    sequence: int
+    round: int
+    kind_name: str
+    send_ns: int
+    deliver_ns: int | None
+    dropped: str
+    data: bytes
+
+
+def read_session(exchange_path: Path) -> Recorded:
+    """A session with every packet rebuilt from its header and its message.
+
+    Raises:
+        DuagError: a packet refers to a message that is not there or is not what its header says; no summary.
+    """
+    messages: dict[tuple[str, int], tuple[str, bytes]] = {}
+    packets: list[RecordedPacket] = []
+    summary = None
+    for record in read_log(exchange_path):
+        m = record.message()
+        if record.schema == topics.PEER_MESSAGE.schema:
+            payload = m.payload
+            if m.same_as_robot:
+                payload = _lookup(exchange_path, messages, m.same_as_robot, m.same_as_message)[1]
+            messages[m.robot, m.message] = (m.kind_name, payload)
+        elif record.schema == topics.PEER_PACKET.schema:
+            kind_name, payload = _lookup(exchange_path, messages, m.robot, m.message)
+            data = m.header + payload[m.offset : m.offset + m.length]
+            try:
+                parse(data)
+            except MalformedError as error:
+                where = f"{exchange_path}: {record.topic} sequence {m.sequence}"
+                raise DuagError(f"{where} is no packet ({error}), expected what its header says") from error
+            packets.append(
+                RecordedPacket(
+                    m.robot,
+                    m.receiver,
+                    m.sequence,
+                    m.round,
+                    kind_name,
+                    record.log_time_ns,
+                    m.deliver_ns if m.delivered else None,
+                    m.dropped,
+                    data,
+                )
+            )
+        elif record.schema == topics.EXCHANGE_SUMMARY.schema:
+            summary = m
+    if summary is None:
+        raise DuagError(
+            f"{exchange_path}: {topics.EXCHANGE_SUMMARY.pattern} not found, expected a finished session"
+        )
+    return Recorded(tuple(summary.team), summary.rounds, packets)
+
+
+def _lookup(
+    path: Path, messages: dict[tuple[str, int], tuple[str, bytes]], robot: str, message: int
+) -> tuple[str, bytes]:
+    found = messages.get((robot, message))
+    if found is None:
+        raise DuagError(f"{path}: message {message} of {robot} not found before its first use")
+    return found
+
+
+class ConsensusRecorder:
+    """Writes consensus.mcap."""
+
+    def __init__(self, writer: LogWriter) -> None:
+        self.writer = writer
+        self._last: dict[str, bytes] = {}
+
+    def round(self, agent: Agent, round_index: int, now_ns: int) -> None:
+        """Record where an agent stands, if that changed, and its pose round, if there was one."""
+        robot = agent.data.robot
+        self._write_changed(topics.AGENT_ROUND.of(robot), self._agent(agent), round_index, now_ns)
+        if agent.poses is not None:
+            self._write_changed(topics.CONSENSUS_ROUND.of(robot), self._poses(agent), round_index, now_ns)
+
+    def _write_changed(self, topic: str, message: Any, round_index: int, now_ns: int) -> None:
+        """Rounds in which nothing changed are left out: the last one written still holds."""
+        content = message.SerializeToString(deterministic=True)
+        if self._last.get(topic) != content:
+            self._last[topic] = content
+            message.round = round_index
+            pack_stamp(message, now_ns)
+            self.writer.write(topic, message, now_ns)
+
+    @staticmethod
+    def _agent(agent: Agent) -> Any:
+        neighbours = agent.neighbours.values()
+        return schemas.new(
+            "AgentRound",
+            frame_id=map_frame(agent.team[agent.root]),
+            robot=agent.data.robot,
+            root=agent.team[agent.root],
+            members=[name for i, name in enumerate(agent.team) if agent.members >> i & 1],
+            joined_links=sum(n.joined for n in neighbours),
+            undecided_links=sum(not n.decided for n in neighbours),
+            evidence_owners=len(agent.knowledge.evidence),
+            pair_lists=len(agent.knowledge.pairs),
+            open_messages=sum(n.transport.open_messages for n in neighbours),
+            agreed=agent.agreed,
+            done=agent.done,
+            packets_refused=sum(agent.refused.values()),
+        )
+
+    @staticmethod
+    def _poses(agent: Agent) -> Any:
+        assert agent.poses is not None
+        values = agent.poses.residuals()
+        largest = agent.poses.largest_change
+        message = schemas.new(
+            "ConsensusRound",
+            frame_id=map_frame(agent.team[agent.root]),
+            robot=agent.data.robot,
+            primal=values["primal"],
+            dual=values["dual"],
+            cost=values["cost"],
+            step=values["step"],
+            largest_change=largest,
+            settled=agent.poses.settled,
+            agreed=agent.agreed,
+            factorisations=values["factorisations"],
+        )
+        for peer, (translation, rotation) in sorted(values["penalties"].items()):
+            message.links.add(
+                peer=peer,
+                penalty_translation=translation,
+                penalty_rotation=rotation,
+                version=values["versions"][peer],
+                weights=values["weights"].get(peer, []),
+            )
+        return message
+
+    def result(self, result: AgentResult, now_ns: int) -> None:
+        """Record what became of every candidate."""
+        for c in result.closures:
+            message = schemas.new(
+                "ClosureDecision",
+                robot=c.robot,
+                peer=c.peer,
+                own_keyframe=c.own_keyframe,
+                peer_keyframe=c.peer_keyframe,
+                score=c.score,
+                matches=c.matches,
+                inliers=c.inliers,
+                verdict=c.verdict,
+                detail=c.detail,
+                measured=c.T_own_peer is not None,
+                weight=-1.0 if c.weight is None else c.weight,
+            )
+            if c.T_own_peer is not None:
+                message.pose_own_peer.CopyFrom(pack_pose(c.T_own_peer))
+            pack_stamp(message, now_ns)
+            self.writer.write(topics.CLOSURE_DECISION.of(c.robot), message, now_ns)

@@ -1,0 +1,63 @@
+"""One agent again, from its own files and the packets that reached it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.exchange import links
+from pipeline.exchange.agent import Agent
+from pipeline.exchange.config import ExchangeConfig
+from pipeline.exchange.inputs import AgentInput, RobotData, load
+from pipeline.exchange.record import read_session
+from pipeline.exchange.results import AgentResult
+from pipeline.exchange.session import Delivery, due
+
+
+@dataclass(frozen=True)
+class SentPackets:
+    """Digest of all packets that a robot sent, in order: as recorded, and as recomputed."""
+
+    recorded: str
+    recomputed: str
+
+    @property
+    def equal(self) -> bool:
+        """Whether they are the same bit for bit."""
+        return self.recorded == self.recomputed
+
+
+def replay_agent(
+    source: AgentInput, config: ExchangeConfig, *, seed: int, exchange_path: Path
+) -> tuple[AgentResult, SentPackets]:
+    """Recompute one robot's agent.
+
+    Args:
+        source: files of this robot only. config, seed: of the run.
+        exchange_path: its exchange.mcap; only packets delivered to this robot are given to the agent.
+    Returns:
+        What the robot takes home, and whether it sent the same packets.
+    """
+    return replay_agent_of(load(source), config, seed=seed, exchange_path=exchange_path)
+
+
+def replay_agent_of(
+    data: RobotData, config: ExchangeConfig, *, seed: int, exchange_path: Path
+) -> tuple[AgentResult, SentPackets]:
+    """`replay_agent` on data in memory."""
+    session = read_session(exchange_path)
+    waiting: list[Delivery] = []
+    recorded, recomputed = hashlib.sha256(), hashlib.sha256()
+    for p in session.packets:
+        if p.sender == data.robot:
+            recorded.update(p.data)
+        if p.receiver == data.robot and p.deliver_ns is not None:
+            waiting.append((p.deliver_ns, p.sender, p.sequence, p.data))
+    neighbours = links.neighbours(config.link, session.team)[data.robot]
+    agent = Agent(data, session.team, neighbours, config, seed)
+    for round_index in range(session.rounds):
+        now_ns = round_index * config.period_ns
+        for out in agent.tick(round_index, now_ns, due(waiting, now_ns)):
+            recomputed.update(out.packet)
+    return agent.result(), SentPackets(recorded.hexdigest(), recomputed.hexdigest())

@@ -1,0 +1,114 @@
+"""A tiny world to meet in: a textured box room, seen by robots whose map frames nobody knows."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import streams
+from pipeline.exchange.inputs import RobotData, Step
+from pipeline.geometry import se3, so3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.messages import GaussianInformation
+from pipeline.splat.gaussians import Gaussians
+
+Array = NDArray[np.float64]
+CAMERA = PinholeCamera(240, 180, 200.0, 200.0, 119.5, 89.5)
+HALF_M = np.array([2.0, 1.3, 2.4])  # half the edges of the room
+
+
+@lru_cache(maxsize=1)
+def textures() -> Array:
+    """Colour of the six walls, [6, 256, 256, 3], smooth noise with edges."""
+    rng = streams.generator(0, "textures")
+    walls = np.zeros((6, 256, 256, 3))
+    for cells, weight in ((8, 0.3), (32, 0.4), (128, 0.3)):
+        coarse = rng.random((6, cells, cells, 3))
+        walls += weight * np.repeat(np.repeat(coarse, 256 // cells, axis=1), 256 // cells, axis=2)
+    return walls
+
+
+def view(T_world_camera: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Colour and depth of the room from inside."""
+    rays = CAMERA.rays() @ T_world_camera[:3, :3].T
+    origin = T_world_camera[:3, 3]
+    with np.errstate(divide="ignore"):
+        reach = (np.sign(rays) * HALF_M - origin) / rays
+    axis = np.argmin(reach, axis=-1)
+    depth = np.take_along_axis(reach, axis[..., None], axis=-1)[..., 0]
+    hit = origin + depth[..., None] * rays
+    wall = 2 * axis + (np.take_along_axis(rays, axis[..., None], axis=-1)[..., 0] > 0)
+    others = np.array([[1, 2], [0, 2], [0, 1]])[axis]
+    uv = np.take_along_axis(hit / HALF_M, others, axis=-1)
+    texel = np.clip(((uv + 1) * 128).astype(int), 0, 255)
+    color = textures()[wall, texel[..., 0], texel[..., 1]]
+    return np.rint(255 * color).astype(np.uint8), depth.astype(np.float32)
+
+
+def path(first_turn_rad: float, keyframes: int) -> Array:
+    """T_world_camera [k, 4, 4]: looking outwards, turning about the vertical while moving a little."""
+    poses = []
+    for k in range(keyframes):
+        angle = first_turn_rad + 0.3 * k
+        R = so3.exp([0.0, angle, 0.0]) @ so3.exp([0.05 * np.sin(k), 0.0, 0.0])
+        poses.append(se3.from_rotation_translation(R, [0.3 * np.cos(angle), 0.1, 0.3 * np.sin(angle)]))
+    return np.array(poses)
+
+
+def robot(
+    name: str, first_turn_rad: float, keyframes: int = 5, gaussians: int = 300
+) -> tuple[RobotData, Array]:
+    """A robot's data, and the truth: T_world_camera of its keyframes."""
+    rng = streams.generator(0, "boxworld", robot=name)
+    truth = path(first_turn_rad, keyframes)
+    steps, T_map = [], [np.eye(4)]
+    for k in range(1, keyframes):
+        noise = np.concatenate([rng.normal(0, 0.004, 3), rng.normal(0, 0.002, 3)])
+        T = se3.inverse(truth[k - 1]) @ truth[k] @ se3.exp(noise)
+        information = np.diag([1 / 0.004**2] * 3 + [1 / 0.002**2] * 3)
+        steps.append(Step(k - 1, k, T, information))
+        T_map.append(T_map[-1] @ T)
+    poses = np.array(T_map)
+    images = [view(T) for T in truth]
+    anchors = rng.integers(0, keyframes, gaussians)
+    v, u = rng.integers(5, CAMERA.height - 5, gaussians), rng.integers(5, CAMERA.width - 5, gaussians)
+    depth = np.array([images[a][1][y, x] for a, y, x in zip(anchors, v, u, strict=True)])
+    color = np.array([images[a][0][y, x] for a, y, x in zip(anchors, v, u, strict=True)]) / 255
+    points = CAMERA.rays()[v, u] * depth[:, None]
+    means = (poses[anchors, :3, :3] @ points[..., None])[..., 0] + poses[anchors, :3, 3]
+    maps = Gaussians(
+        np.arange(gaussians) + 10,
+        anchors.astype(np.int32),
+        means,
+        rng.normal(size=(gaussians, 4)),
+        np.log(rng.uniform(0.01, 0.04, (gaussians, 3))),
+        color,
+        rng.normal(size=gaussians),
+    )
+    return RobotData(
+        name, CAMERA, poses, steps, images.__getitem__, maps, information_of(name, maps, rng)
+    ), truth
+
+
+def information_of(name: str, maps: Gaussians, rng: np.random.Generator) -> GaussianInformation:
+    """Random positive semidefinite information, zero for a tenth of the Gaussians."""
+    n = len(maps)
+    root = rng.normal(size=(n, 9, 9)) * np.array([100.0] * 3 + [10.0] * 6)[:, None]
+    full = root @ np.swapaxes(root, 1, 2)
+    full[::10] = 0.0
+    rows, columns = np.triu_indices(9)
+    return GaussianInformation(
+        0,
+        name,
+        "gauss_newton",
+        "all",
+        maps.ids,
+        full[:, rows, columns].astype(np.float32),
+        rng.uniform(0, 1e4, (n, 3)).astype(np.float32),
+        rng.uniform(0, 10, n).astype(np.float32),
+        np.full(n, 3, np.uint32),
+        0.02,
+        "0.0012 + 0.0019 (z - 0.4)^2",
+    )
