@@ -1,0 +1,109 @@
+"""How far the Gaussians of a map lie from the true surface, and how far they were predicted to lie."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.evaluation import calibration
+from pipeline.evaluation.groundtruth import Surface
+from pipeline.evaluation.results import Absent
+from pipeline.evaluation.run_folder import position_information
+from pipeline.geometry import se3
+from pipeline.messages import GaussianMap
+
+Array = NDArray[np.float64]
+WORST_CONDITION = 1e12
+MIN_GAUSSIANS = 100
+NAMES = (
+    "ece_paper", "ece_rank", "ece_rank_shuffled", "spearman", "ause", "nll", "coverage_95",
+    "nll_scaled", "coverage_95_scaled", "sigma_scale", "gaussians", "gaussians_without_information",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class MapErrors:
+    """One row per Gaussian with full position information.
+
+    error_m: distance from the nearest surface. sigma_m: predicted standard deviation of that distance, along the
+    surface normal. paper_uncertainty: 1 / sqrt of the trace of the position information, as the companion code has it.
+    without_information: Gaussians left out, because a direction of their position is not determined.
+    """
+
+    error_m: Array
+    sigma_m: Array
+    paper_uncertainty: Array
+    without_information: int
+
+
+def position_sigma_m(gaussian_map: GaussianMap, normals: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Predicted standard deviation (m) of every Gaussian's centre along unit directions [n, 3], and where it exists.
+
+    sigma^2 = n^T F^-1 n with F the position block of the Fisher information: everything else of the Gaussian and all
+    poses held fixed. It does not exist where F is singular (condition above 1e12).
+    """
+    sigma = np.full(len(gaussian_map.gaussians), np.inf)
+    determined = np.zeros(len(sigma), dtype=bool)
+    if gaussian_map.information is None:
+        return sigma, determined
+    F = position_information(gaussian_map.information.geometry)
+    values = np.linalg.eigvalsh(F)
+    determined = (values[:, 0] > 0) & (values[:, 2] < WORST_CONDITION * values[:, 0])
+    solved = np.linalg.solve(F[determined], normals[determined][..., None])[..., 0]
+    sigma[determined] = np.sqrt(np.sum(normals[determined] * solved, axis=1))
+    return sigma, determined
+
+
+def map_errors(gaussian_map: GaussianMap, surface: Surface, T_gt_map: Array) -> MapErrors:
+    """Measure a map against the true surface.
+
+    Args:
+        gaussian_map: with information, in its frame. T_gt_map: [4, 4], from that frame into the ground-truth world.
+    """
+    means_gt = se3.transform(T_gt_map, gaussian_map.gaussians.means.astype(np.float64))
+    error_m, normals_gt = surface.closest(means_gt)
+    sigma_m, determined = position_sigma_m(gaussian_map, normals_gt @ T_gt_map[:3, :3])
+    trace = np.zeros(len(sigma_m))
+    if gaussian_map.information is not None:
+        F = position_information(gaussian_map.information.geometry)
+        trace = np.trace(F, axis1=1, axis2=2)
+    return MapErrors(
+        error_m[determined],
+        sigma_m[determined],
+        1.0 / np.sqrt(trace[determined]),
+        int(np.count_nonzero(~determined)),
+    )
+
+
+def scores(errors: MapErrors, robot: str) -> dict[str, Any]:
+    """All calibration numbers of one map, in the names of metrics.json; `robot` names the random stream.
+
+    The scale of `nll_scaled` and `coverage_95_scaled` is fitted on every second Gaussian and judged on the others.
+    """
+    n = len(errors.error_m)
+    if n < MIN_GAUSSIANS:
+        absent = Absent(
+            f"only {n} Gaussians of {robot} have full position information, {MIN_GAUSSIANS} are needed"
+        )
+        counts = {"gaussians": n, "gaussians_without_information": errors.without_information}
+        return {name: counts.get(name, absent) for name in NAMES}
+    sigma, error = errors.sigma_m, errors.error_m
+    scale = calibration.fitted_scale(sigma[::2], error[::2])
+    judged = scale * sigma[1::2], error[1::2]
+    return {
+        "ece_paper": calibration.ece_paper(errors.paper_uncertainty, error),
+        "ece_rank": calibration.ece_rank(sigma, error),
+        "ece_rank_shuffled": calibration.ece_rank(calibration.shuffled(sigma, robot), error),
+        "spearman": calibration.spearman(sigma, error),
+        "ause": calibration.ause(sigma, error),
+        "nll": calibration.nll(sigma, error),
+        "coverage_95": calibration.coverage_95(sigma, error),
+        "nll_scaled": calibration.nll(*judged),
+        "coverage_95_scaled": calibration.coverage_95(*judged),
+        "sigma_scale": scale,
+        "gaussians": n,
+        "gaussians_without_information": errors.without_information,
+    }

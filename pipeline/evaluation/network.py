@@ -1,0 +1,248 @@
+"""What the robots said to each other and how they came to agree, from exchange.mcap and consensus.mcap.
+
+The one place that knows the messages of these two logs. A run whose robots never talked has empty logs, and absent
+values with that reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import DuagError
+from pipeline.evaluation.results import Absent
+from pipeline.evaluation.run_folder import RunFolder
+from pipeline.recording import read_log
+from schemas import topics
+
+Series = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
+
+SOLVER = "relaxed edge-ADMM (poses), evidence sent once (Gaussians)"
+PURPOSE = {  # of a message, by its kind
+    "DESCRIPTORS": "set-up",
+    "REQUEST": "set-up",
+    "SAMPLE": "set-up",
+    "CLOSURES": "set-up",
+    "FRAME": "set-up",
+    "VOXELS": "set-up",
+    "PAIRS": "set-up",
+    "ANCHORS": "set-up",
+    "EVIDENCE": "Gaussians",
+    "STATE": "poses",
+    "ACK": "acknowledgements",
+}
+PURPOSES = ("Gaussians", "poses", "set-up", "acknowledgements")
+KEPT_WEIGHT = 0.5
+PAPER_BYTES_PER_PAIR = 2 * 28 * 4  # 28 float32 from each of the two robots
+NO_EXCHANGE = Absent("the robots exchanged nothing")
+NO_ORACLE = Absent("the centralised answer was not computed")
+
+
+@dataclass(frozen=True)
+class Packets:
+    """Every packet of a session, one element each, in the order of the log.
+
+    round: when it was sent. sender, receiver, purpose: names. size_bytes: header and payload. delivered: or lost.
+    """
+
+    round: NDArray[np.int64]
+    sender: NDArray[np.str_]
+    receiver: NDArray[np.str_]
+    purpose: NDArray[np.str_]
+    size_bytes: NDArray[np.int64]
+    delivered: NDArray[np.bool_]
+    messages: int
+
+    def __len__(self) -> int:
+        return len(self.round)
+
+
+@dataclass(frozen=True)
+class Link:
+    """One direction of one link: packets and bytes sent, packets lost."""
+
+    sender: str
+    receiver: str
+    packets: int
+    dropped: int
+    size_bytes: int
+
+
+def counts(closure: Any) -> bool:
+    """Whether a closure counted in the end: it took part, and the robust weight did not turn it off."""
+    return closure.weight >= KEPT_WEIGHT
+
+
+class Session:
+    """The two logs of the exchange of one run; each is read when it is asked for, and once."""
+
+    def __init__(self, run: RunFolder) -> None:
+        self.run = run
+
+    def _log(self, name: str, topic: topics.Topic) -> list[Any]:
+        """The messages of all robots on one topic, in order of the log."""
+        path = self.run.path / name
+        if not path.is_file():
+            raise DuagError(f"{path}: not found, expected the log of the exchange")
+        return [
+            record.message()
+            for record in read_log(path, topics=[topic.of(robot) for robot in self.run.robots])
+        ]
+
+    @cached_property
+    def packets(self) -> Packets:
+        """All packets of the session.
+
+        Raises:
+            DuagError: a packet refers to a message that the log does not have, or to an unknown kind.
+        """
+        kinds = {(m.robot, m.message): m.kind_name for m in self._log("exchange.mcap", topics.PEER_MESSAGE)}
+        rows = []
+        for p in self._log("exchange.mcap", topics.PEER_PACKET):
+            kind = kinds.get((p.robot, p.message))
+            if kind not in PURPOSE:
+                found = "no message" if kind is None else f"a message of kind {kind}"
+                raise DuagError(
+                    f"{self.run.path / 'exchange.mcap'}: packet {p.sequence} of {p.robot} is cut from {found}, "
+                    f"expected one of {', '.join(PURPOSE)}"
+                )
+            rows.append((p.round, p.robot, p.receiver, PURPOSE[kind], len(p.header) + p.length, p.delivered))
+        columns = list(zip(*rows, strict=True)) or [()] * 6
+        return Packets(
+            np.array(columns[0], dtype=np.int64),
+            np.array(columns[1], dtype=np.str_),
+            np.array(columns[2], dtype=np.str_),
+            np.array(columns[3], dtype=np.str_),
+            np.array(columns[4], dtype=np.int64),
+            np.array(columns[5], dtype=np.bool_),
+            len(kinds),
+        )
+
+    @cached_property
+    def links(self) -> list[Link]:
+        """Every direction that was used, in order of the names."""
+        p = self.packets
+        out = []
+        for sender, receiver in sorted(set(zip(p.sender.tolist(), p.receiver.tolist(), strict=True))):
+            on = (p.sender == sender) & (p.receiver == receiver)
+            dropped = int(np.count_nonzero(on & ~p.delivered))
+            out.append(
+                Link(sender, receiver, int(np.count_nonzero(on)), dropped, int(p.size_bytes[on].sum()))
+            )
+        return out
+
+    @cached_property
+    def agent_rounds(self) -> list[Any]:
+        """Every duagc.v1.AgentRound, in order of the log."""
+        return self._log("consensus.mcap", topics.AGENT_ROUND)
+
+    @cached_property
+    def consensus_rounds(self) -> list[Any]:
+        """Every duagc.v1.ConsensusRound, in order of the log."""
+        return self._log("consensus.mcap", topics.CONSENSUS_ROUND)
+
+    @cached_property
+    def closures(self) -> list[Any]:
+        """Every duagc.v1.ClosureDecision: candidates for closures between robots and what became of them."""
+        return self._log("consensus.mcap", topics.CLOSURE_DECISION)
+
+    def closure_counts(self) -> dict[str, int]:
+        """Closures between robots that counted in the end, and candidates that did not."""
+        kept = sum(counts(closure) for closure in self.closures)
+        return {"inter_robot_closures": kept, "inter_robot_closures_rejected": len(self.closures) - kept}
+
+    def matched_pairs(self) -> int:
+        """Pairs of matched Gaussians over all pairs of robots, from the pair lists that were sent; each list once."""
+        from pipeline.exchange.wire import read_pairs
+
+        newest: dict[tuple[int, int], tuple[int, int]] = {}
+        for message in self._log("exchange.mcap", topics.PEER_MESSAGE):
+            if message.kind_name == "PAIRS" and message.payload:
+                pairs = read_pairs(message.payload, len(self.run.robots))
+                newest[pairs.lower, pairs.higher] = max(
+                    newest.get((pairs.lower, pairs.higher), (-1, 0)), (pairs.version, len(pairs.ids))
+                )
+        return sum(count for _, count in newest.values())
+
+    @cached_property
+    def summary(self) -> Any:
+        """The duagc.v1.ExchangeSummary that closes the log of the exchange.
+
+        Raises:
+            DuagError: it is missing: the session did not end.
+        """
+        path, topic = self.run.path / "exchange.mcap", topics.EXCHANGE_SUMMARY.pattern
+        found = [record.message() for record in read_log(path, topics=[topic])] if path.is_file() else []
+        if not found:
+            raise DuagError(f"{path}: {topic} not found, expected the log of a finished session")
+        return found[-1]
+
+    def exchange_section(self) -> dict[str, Any]:
+        """The section `exchange` of metrics.json."""
+        p = self.packets
+        ticks, matched = self.summary.rounds, self.matched_pairs()
+        robot_pairs = len({frozenset((link.sender, link.receiver)) for link in self.links})
+        sent = int(p.size_bytes.sum())
+        per_pair = sent / (ticks * robot_pairs) if ticks * robot_pairs else NO_EXCHANGE
+        return {
+            "sessions": 1,
+            "rounds": ticks,
+            "messages": p.messages,
+            "packets_sent": len(p),
+            "packets_dropped": int(np.count_nonzero(~p.delivered)),
+            "bytes_sent": sent,
+            "bytes_delivered": int(p.size_bytes[p.delivered].sum()),
+            "bytes_setup": int(p.size_bytes[p.purpose == "set-up"].sum()),
+            "bytes_per_round_per_robot_pair": per_pair,
+            "bytes_raw_alternative": self.summary.bytes_raw_alternative,
+            "bytes_paper_accounting": matched * PAPER_BYTES_PER_PAIR * ticks,
+            "matched_pairs": matched,
+        }
+
+    def consensus_section(self) -> dict[str, Any]:
+        """The section `consensus` of metrics.json."""
+        gaps = dict.fromkeys(("gap_to_oracle_sigma", "gap_to_oracle_m", "gap_to_oracle_rad"), NO_ORACLE)
+        together = {m.robot for m in self.agent_rounds if len(m.members) > 1}
+        agreed: dict[str, int] = {}
+        for m in self.agent_rounds:
+            if m.agreed:
+                agreed.setdefault(m.robot, m.round)
+        ticks: int | Absent = max((agreed.get(robot, 0) for robot in together), default=0) + 1
+        if not together:
+            ticks = Absent("no two robots share a world")
+        elif together - set(agreed):
+            late = ", ".join(sorted(together - set(agreed)))
+            ticks = Absent(f"{late} did not get there in {self.summary.rounds} rounds")
+        return {"solver": SOLVER, "converged": self.summary.converged, "rounds_to_tolerance": ticks, **gaps}
+
+    def series_by_round(self) -> Mapping[str, Series]:
+        """Curves over rounds: "change" and "primal" per robot (m and rad), "bytes" per purpose."""
+        change: dict[str, list[tuple[int, float, float]]] = {}
+        for m in self.consensus_rounds:
+            change.setdefault(m.robot, []).append((m.round, m.largest_change, m.primal))
+        p = self.packets
+        ticks = np.arange(self.summary.rounds, dtype=np.int64)
+        spent: Series = {}
+        for purpose in PURPOSES:
+            on = p.purpose == purpose
+            if on.any():
+                weights = p.size_bytes[on].astype(np.float64)
+                spent[purpose] = (ticks, np.bincount(p.round[on], weights, len(ticks)).astype(np.float64))
+        return {
+            "change": {robot: _columns(rows, 1) for robot, rows in sorted(change.items())},
+            "primal": {robot: _columns(rows, 2) for robot, rows in sorted(change.items())},
+            "bytes": spent,
+        }
+
+
+def _columns(
+    rows: list[tuple[int, float, float]], column: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    return np.array([r[0] for r in rows], dtype=np.int64), np.array(
+        [r[column] for r in rows], dtype=np.float64
+    )

@@ -1,0 +1,178 @@
+"""A finished run as arrays: what evaluation, report and viewer read. Nothing here opens ground truth."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import DuagError
+from pipeline.geometry.trajectory import Trajectory, read_tum
+from pipeline.messages import (
+    CorrectedKeyframes,
+    GaussianInformation,
+    GaussianMap,
+    Keyframe,
+    MapUpdate,
+    Odometry,
+)
+from pipeline.recording import read_log
+from schemas import topics
+
+HELD_OUT_EVERY, HELD_OUT_AT = 8, 4
+
+
+def is_held_out(frame_index: int) -> bool:
+    """Frames that are tracked but never mapped: index % 8 == 4."""
+    return frame_index % HELD_OUT_EVERY == HELD_OUT_AT
+
+
+@dataclass(frozen=True)
+class RobotRun:
+    """What a run says about one robot; files are read when they are asked for, and once."""
+
+    robot: str
+    folder: Path
+
+    @cached_property
+    def odometry(self) -> Trajectory:
+        """T_map_camera of all frames, before consensus, in the robot's own map frame."""
+        return read_tum(self.folder / "odometry.tum")
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """T_world_camera of all frames, after consensus, by the robot's own estimate."""
+        return read_tum(self.folder / "trajectory.tum")
+
+    @cached_property
+    def frames(self) -> list[Odometry]:
+        """Every frame of the log, in order, as the front end tracked it."""
+        return self._all("frontend.mcap", topics.ODOMETRY)
+
+    @cached_property
+    def keyframes(self) -> list[Keyframe]:
+        """Every keyframe, in order of its index."""
+        return self._all("frontend.mcap", topics.KEYFRAME)
+
+    @cached_property
+    def map_updates(self) -> list[MapUpdate]:
+        """What the mapping of every keyframe did, in order."""
+        return self._all("frontend.mcap", topics.MAP_UPDATE)
+
+    @cached_property
+    def own_map(self) -> GaussianMap:
+        """The robot's own map, in its own map frame, as it was at the end of its log."""
+        return self._last("frontend.mcap", topics.MAP)
+
+    @cached_property
+    def information(self) -> GaussianInformation:
+        """Fisher information of the own map."""
+        return self._last("information.mcap", topics.INFORMATION)
+
+    @cached_property
+    def fused_map(self) -> GaussianMap:
+        """The map after fusion, world frame, with the information of its Gaussians."""
+        return self._last("fused.mcap", topics.FUSED_MAP)
+
+    @cached_property
+    def corrected(self) -> CorrectedKeyframes:
+        """Keyframe poses after consensus, and the component that the robot believes to be in."""
+        return self._last("fused.mcap", topics.CORRECTED_KEYFRAMES)
+
+    @property
+    def component(self) -> tuple[str, ...]:
+        """Names of the robots that share this robot's world frame, itself among them."""
+        return tuple(sorted({*self.corrected.component, self.robot}))
+
+    def _all(self, file: str, topic: topics.Topic) -> list[Any]:
+        path = self.folder / file
+        if not path.is_file():
+            raise DuagError(f"{path}: not found; run the stages that write it first")
+        return [r.message() for r in read_log(path, topics=[topic.of(self.robot)])]
+
+    def _last(self, file: str, topic: topics.Topic) -> Any:
+        found = self._all(file, topic)
+        if not found:
+            raise DuagError(
+                f"{self.folder / file}: found no message on {topic.of(self.robot)}, expected at least one"
+            )
+        return found[-1]
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run: its robots in order of their names, its settings and timings."""
+
+    path: Path
+
+    @cached_property
+    def robots(self) -> dict[str, RobotRun]:
+        """Robots by name, in order of the names."""
+        folder = self.path / "robots"
+        names = sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
+        if not names:
+            raise DuagError(f"{self.path}: found no folder robots/<robot>, expected a run")
+        return {name: RobotRun(name, folder / name) for name in names}
+
+    @cached_property
+    def largest_component(self) -> tuple[str, ...]:
+        """The robots that agree to share one world, most robots first, then lowest names.
+
+        A robot counts as a member if its own belief about the component is the same as that of the others.
+        """
+        claims = [robot.component for robot in self.robots.values()]
+        members = {
+            claim: tuple(r for r in self.robots if self.robots[r].component == claim) for claim in claims
+        }
+        return min(members.values(), key=lambda names: (-len(names), names))
+
+    @property
+    def config_text(self) -> str:
+        """The resolved configuration as TOML, empty if the run has none."""
+        path = self.path / "config.toml"
+        return path.read_text(encoding="utf-8") if path.is_file() else ""
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration, nested by section."""
+        try:
+            return tomllib.loads(self.config_text)
+        except tomllib.TOMLDecodeError as error:
+            raise DuagError(f"{self.path / 'config.toml'}: not valid TOML: {error}") from error
+
+    @property
+    def timing(self) -> dict[str, dict[str, Any]]:
+        """Stage -> {"robot", "wall_s", "cpu_s", "peak_rss_mb"}; empty if the run has no timing.json."""
+        return self._json("timing.json").get("stages", {})
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """metrics.json; empty if the run was not evaluated."""
+        return self._json("metrics.json")
+
+    def _json(self, name: str) -> dict[str, Any]:
+        path = self.path / name
+        if not path.is_file():
+            return {}
+        try:
+            return json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise DuagError(f"{path}: not valid JSON: {error}") from error
+
+
+def position_information(geometry: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Position block [n, 3, 3], 1/m^2, of geometry information [n, 45] (upper triangle of 9x9, row-major)."""
+    values = geometry.astype(np.float64)
+    row_1, row_2 = 9, 17  # places of the diagonal elements (1, 1) and (2, 2) in the upper triangle
+    F = np.empty((len(values), 3, 3))
+    F[:, 0, 0], F[:, 0, 1], F[:, 0, 2] = values[:, 0], values[:, 1], values[:, 2]
+    F[:, 1, 1], F[:, 1, 2] = values[:, row_1], values[:, row_1 + 1]
+    F[:, 2, 2] = values[:, row_2]
+    F[:, 1, 0], F[:, 2, 0], F[:, 2, 1] = F[:, 0, 1], F[:, 0, 2], F[:, 1, 2]
+    return F

@@ -1,0 +1,326 @@
+"""Measure a finished run: metrics.json and metrics.parquet. docs/evaluation.md says what every number means."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import DuagError
+from pipeline.evaluation import calibration, groundtruth, map_errors, trajectory_errors, views
+from pipeline.evaluation.network import Session
+from pipeline.evaluation.results import (
+    Absent,
+    Row,
+    leaves,
+    mean,
+    split_reasons,
+    write_json,
+    write_parquet,
+)
+from pipeline.evaluation.run_folder import RobotRun, RunFolder, is_held_out
+from pipeline.evaluation.trajectory_errors import Paired, TeamError
+from pipeline.geometry.trajectory import Trajectory
+from pipeline.progress import track
+from pipeline.recording import Recording, RgbdLog, open_rgbd
+
+SCHEMA = 1
+MAPS = ("own", "fused")
+VIEW_SETS = ("held_out", "training")
+
+PROTOCOL = {
+    "alignment": "se3",
+    "ate": "root mean square over all frames that have ground truth within 20 ms; robots: own alignment each",
+    "team_ate": "one alignment for all robots of the largest component, pooled root mean square",
+    "rpe": "root mean square from each frame to the next",
+    "initial_relative_poses": "unknown",
+    "held_out": "index % 8 == 4",
+    "training": "keyframes",
+    "poses": "own: odometry.tum in the robot's map frame; fused: trajectory.tum in the world frame",
+    "exposure": "none fitted",
+    "background": "black",
+    "psnr": "render clamped to 0..1, mean over views, at most 100 dB",
+    "ssim": "one scale, 11x11 Gaussian window of sigma 1.5, windows inside the image",
+    "ms_ssim": "five scales, weights of Wang et al. 2003",
+    "depth": "blended depth / alpha where alpha >= 0.5; mean over pixels with both depths, then over views",
+    "calibration": "distance of fused Gaussians from the true surface against sigma along its normal; mean of robots",
+}
+
+
+def evaluate(run_dir: Path, recording: Path, threads: int = 2, progress: bool = True) -> dict[str, Any]:
+    """Measure a run against its recording and write metrics.json and metrics.parquet into its folder.
+
+    Args:
+        run_dir: folder of the run. recording: folder of its recording; its ground truth is optional.
+        threads: views rendered at the same time; changes no bit of the result.
+        progress: say on standard error how far it is.
+    Returns:
+        The content of metrics.json.
+    Raises:
+        DuagError: the run or the recording is incomplete or they do not fit together.
+    """
+    run, source = RunFolder(run_dir), Recording(recording)
+    strangers = sorted(set(run.robots) - set(source.robots))
+    if strangers:
+        raise DuagError(f"{recording}: has no robot {strangers[0]}, expected the robots of {run_dir}")
+    truth, session = TruePaths.of(run, source), Session(run)
+    rows: list[Row] = []
+    tree = {
+        "schema": SCHEMA,
+        "robots": {name: _robot_section(robot, truth) for name, robot in run.robots.items()},
+        "team": _team_section(run, truth) | session.closure_counts(),
+        "rendering": _rendering_section(run, source, threads, progress, rows),
+        "calibration": _calibration_section(run, source, truth, rows),
+        "exchange": session.exchange_section(),
+        "consensus": session.consensus_section(),
+        "protocol": PROTOCOL,
+    }
+    metrics, reasons = split_reasons(tree)
+    metrics["reasons"] = reasons
+    write_json(run_dir / "metrics.json", metrics)
+    write_parquet(run_dir / "metrics.parquet", [*_rows_of(tree), *rows])
+    return metrics
+
+
+# --- trajectories ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TruePaths:
+    """Estimates paired with ground truth, by robot: after and before consensus; and the joint alignment of the team."""
+
+    after: Mapping[str, Paired | Absent]
+    before: Mapping[str, Paired | Absent]
+    team: TeamError | Absent
+
+    @staticmethod
+    def of(run: RunFolder, source: Recording) -> TruePaths:
+        after, before = {}, {}
+        for name, robot in run.robots.items():
+            true = groundtruth.trajectory(source, name)
+            after[name] = _paired(true, robot.trajectory)
+            before[name] = _paired(true, robot.odometry)
+        known = {r: p for r in run.largest_component if not isinstance(p := after[r], Absent)}
+        missing = [p for r in run.largest_component if isinstance(p := after[r], Absent)]
+        alone = len(run.largest_component) < 2
+        team = missing[0] if missing and not alone else trajectory_errors.team_error(known)
+        return TruePaths(after, before, team)
+
+    def T_gt_world(self, robot: str) -> NDArray[np.float64] | Absent:  # noqa: N802 (a transform)
+        """[4, 4]: the joint alignment for robots of the largest component, its own for any other robot."""
+        if not isinstance(self.team, Absent) and robot in self.team.ate_rmse_m_of:
+            return self.team.T_gt_world
+        pairs = self.after[robot]
+        return pairs if isinstance(pairs, Absent) else trajectory_errors.alignment([pairs])
+
+
+def _paired(true: Trajectory | Absent, estimated: Trajectory) -> Paired | Absent:
+    if isinstance(true, Absent):
+        return true
+    pairs = trajectory_errors.pair(true, estimated)
+    return pairs if len(pairs) else Absent("no frame has a ground-truth pose within 20 ms")
+
+
+def _robot_section(robot: RobotRun, truth: TruePaths) -> dict[str, Any]:
+    after, before = truth.after[robot.robot], truth.before[robot.robot]
+    section: dict[str, Any] = {
+        "frames": len(robot.frames),
+        "tracked": sum(frame.status != "lost" for frame in robot.frames),
+        "keyframes": len(robot.keyframes),
+        "gaussians": len(robot.own_map.gaussians),
+        "gaussians_fused": len(robot.fused_map.gaussians),
+        "robots_in_component": len(robot.component),
+    }
+    if isinstance(after, Absent) or isinstance(before, Absent):
+        absent = after if isinstance(after, Absent) else before
+        names = ("ate_rmse_m", "ate_rmse_m_before_consensus", "ate_rmse_m_keyframes", "ate_rmse_m_joint")
+        return (
+            section | dict.fromkeys((*names, "rpe_trans_m", "rpe_rot_rad"), absent) | {"frames_with_truth": 0}
+        )
+    relative = trajectory_errors.rpe(after)
+    rpe_trans_m, rpe_rot_rad = (relative, relative) if isinstance(relative, Absent) else relative
+    return section | {
+        "ate_rmse_m": trajectory_errors.ate_rmse_m(after),
+        "ate_rmse_m_before_consensus": trajectory_errors.ate_rmse_m(before),
+        "ate_rmse_m_keyframes": _ate_of_keyframes(robot, after),
+        "ate_rmse_m_joint": _joint_error(truth.team, robot.robot),
+        "rpe_trans_m": rpe_trans_m,
+        "rpe_rot_rad": rpe_rot_rad,
+        "frames_with_truth": len(after),
+    }
+
+
+def _ate_of_keyframes(robot: RobotRun, pairs: Paired) -> float | Absent:
+    """The ATE that many published tables give: keyframes only."""
+    stamps = {keyframe.stamp_ns for keyframe in robot.keyframes}
+    keep = np.array([stamp in stamps for stamp in pairs.stamps_ns.tolist()], dtype=bool)
+    return trajectory_errors.ate_rmse_m(
+        Paired(pairs.stamps_ns[keep], pairs.true[keep], pairs.estimated[keep])
+    )
+
+
+def _joint_error(team: TeamError | Absent, robot: str) -> float | Absent:
+    if isinstance(team, Absent):
+        return team
+    return team.ate_rmse_m_of.get(robot, Absent(f"{robot} is not in the largest component"))
+
+
+def _team_section(run: RunFolder, truth: TruePaths) -> dict[str, Any]:
+    solo: list[float | Absent] = [
+        p if isinstance(p, Absent) else trajectory_errors.ate_rmse_m(p) for p in truth.after.values()
+    ]
+    missing = [s for s in solo if isinstance(s, Absent)]
+    return {
+        "robots": len(run.robots),
+        "robots_in_largest_component": len(run.largest_component),
+        "ate_rmse_m": truth.team if isinstance(truth.team, Absent) else truth.team.ate_rmse_m,
+        "ate_rmse_m_mean_of_robots": missing[0] if missing else mean(solo),
+    }
+
+
+# --- rendering ---------------------------------------------------------------------------------------------------
+
+
+def _rendering_section(
+    run: RunFolder, source: Recording, threads: int, progress: bool, rows: list[Row]
+) -> dict[str, Any]:
+    """Scores of both maps of all robots over held-out and training views; one row per view and score."""
+    scores: dict[tuple[str, str], list[Any]] = {(m, s): [] for m in MAPS for s in VIEW_SETS}
+    for name, robot in run.robots.items():
+        with open_rgbd(source.log(name)) as log:
+            indices = _view_indices(robot, len(log))
+            for kind, found in _robot_views(robot, log, source, indices, threads, progress):
+                view_set = "held_out" if is_held_out(found[0]) else "training"
+                scores[kind, view_set].append(found[1])
+                rows += _view_rows(name, f"{kind}/{view_set}", *found)
+    return {
+        m: {s: views.summary(scores[m, s], f"there is no {s.replace('_', '-')} view") for s in VIEW_SETS}
+        for m in MAPS
+    }
+
+
+def _view_indices(robot: RobotRun, frames: int) -> list[int]:
+    """Frames to render: all held-out ones and all keyframes."""
+    return sorted({i for i in range(frames) if is_held_out(i)} | {k.frame_index for k in robot.keyframes})
+
+
+def _robot_views(
+    robot: RobotRun, log: RgbdLog, source: Recording, indices: list[int], threads: int, progress: bool
+) -> Iterator[tuple[str, tuple[int, Any]]]:
+    """("own" | "fused", (frame index, score)) of every view of one robot."""
+    maps = {
+        "own": (robot.own_map.gaussians, poses_by_stamp(robot.odometry)),
+        "fused": (robot.fused_map.gaussians, poses_by_stamp(robot.trajectory)),
+    }
+    stamps = {frame.stamp_ns for frame in robot.frames if frame.frame_index in set(indices)}
+    exact = groundtruth.exact_depths(source, robot.robot, stamps)
+    recorded_is_exact = groundtruth.recorded_depth_is_exact(source, robot.robot)
+    for kind, (gaussians, poses) in maps.items():
+        found = views.score_map(
+            gaussians, log.camera, _views(log, indices, exact, recorded_is_exact), poses, threads
+        )
+        if progress:
+            found = track(found, f"render {kind} map of {robot.robot}", total=len(indices))
+        for scored in found:
+            yield kind, scored
+
+
+def _views(
+    log: RgbdLog, indices: list[int], exact: Mapping[int, Any] | Absent, recorded_is_exact: bool
+) -> Iterator[views.View]:
+    for index in indices:
+        frame = log.frame(index)
+        if recorded_is_exact:
+            yield views.View(frame, frame.depth)
+        elif isinstance(exact, Absent):
+            yield views.View(frame, exact)
+        else:
+            yield views.View(frame, exact.get(frame.stamp_ns, Absent("the frame has no exact depth")))
+
+
+def poses_by_stamp(trajectory: Trajectory) -> dict[int, NDArray[np.float64]]:
+    """Poses [4, 4] by time stamp in ns."""
+    return dict(zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True))
+
+
+def _view_rows(robot: str, view_set: str, frame_index: int, score: views.ViewScore | Absent) -> list[Row]:
+    return [
+        Row(
+            "view",
+            robot,
+            view_set,
+            frame_index,
+            f.name,
+            score if isinstance(score, Absent) else getattr(score, f.name),
+        )
+        for f in fields(views.ViewScore)
+    ]
+
+
+# --- calibration -------------------------------------------------------------------------------------------------
+
+
+def _calibration_section(
+    run: RunFolder, source: Recording, truth: TruePaths, rows: list[Row]
+) -> dict[str, Any]:
+    """Mean over robots of the calibration of their fused maps; the values of each robot go into rows."""
+    surface = groundtruth.surface(source)
+    if isinstance(surface, Absent):
+        return dict.fromkeys(map_errors.NAMES, surface)
+    of_robots: dict[str, dict[str, Any]] = {}
+    for name, robot in run.robots.items():
+        T_gt_world = truth.T_gt_world(name)
+        if isinstance(T_gt_world, Absent):
+            of_robots[name] = dict.fromkeys(map_errors.NAMES, T_gt_world)
+            continue
+        errors = map_errors.map_errors(robot.fused_map, surface, T_gt_world)
+        of_robots[name] = map_errors.scores(errors, name)
+        rows += _reliability_rows(name, errors)
+    for name, values in of_robots.items():
+        rows += [Row("calibration", name, "", -1, key, value) for key, value in values.items()]
+    return {
+        key: _mean_or_sum(key, [values[key] for values in of_robots.values()]) for key in map_errors.NAMES
+    }
+
+
+def _mean_or_sum(name: str, values: list[float | Absent]) -> float | Absent:
+    """Counts add up over robots, scores average."""
+    if name.startswith("gaussians"):
+        counts = [v for v in values if not isinstance(v, Absent)]
+        return int(math.fsum(counts)) if counts else values[0]
+    return mean(values)
+
+
+def _reliability_rows(robot: str, errors: map_errors.MapErrors) -> list[Row]:
+    if len(errors.error_m) < map_errors.MIN_GAUSSIANS:
+        return []
+    rows = []
+    for decile, (predicted_m, observed_m) in enumerate(
+        calibration.reliability(errors.sigma_m, errors.error_m)
+    ):
+        rows.append(Row("reliability", robot, f"decile {decile}", -1, "predicted_rms_m", predicted_m))
+        rows.append(Row("reliability", robot, f"decile {decile}", -1, "observed_rms_m", observed_m))
+    return rows
+
+
+# --- the long table ----------------------------------------------------------------------------------------------
+
+
+def _rows_of(tree: Mapping[str, Any]) -> list[Row]:
+    """The numbers of metrics.json as rows of the long table."""
+    rows = []
+    for path, value in leaves(tree):
+        if isinstance(value, str) or path == ("schema",):
+            continue
+        scope, name = path[0].removesuffix("s") if path[0] == "robots" else path[0], path[-1]
+        robot = path[1] if path[0] == "robots" else ""
+        view_set = "/".join(path[1:-1]) if path[0] == "rendering" else ""
+        rows.append(
+            Row(scope, robot, view_set, -1, name, value if isinstance(value, Absent) else float(value))
+        )
+    return rows

@@ -1,0 +1,99 @@
+"""Errors of trajectories, per robot and for the team (docs/evaluation.md, "Trajectories")."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import DuagError
+from pipeline.evaluation.results import Absent
+from pipeline.geometry import se3
+from pipeline.geometry.trajectory import Trajectory, align, associate, rpe_rmse
+
+Array = NDArray[np.float64]
+ASSOCIATION_TOLERANCE_NS = 20_000_000  # that of the TUM tools
+MIN_PAIRS = 3
+
+
+@dataclass(frozen=True)
+class Paired:
+    """Poses of one camera that have a ground-truth pose of the same time.
+
+    stamps_ns: int64 [n], of the estimate. true: T_gt_camera [n, 4, 4]. estimated: T_frame_camera [n, 4, 4].
+    """
+
+    stamps_ns: NDArray[np.int64]
+    true: Array
+    estimated: Array
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+def pair(true: Trajectory, estimated: Trajectory) -> Paired:
+    """Pair every estimated pose with the nearest ground-truth pose within 20 ms; poses without one are left out."""
+    i, j = associate(estimated, true, ASSOCIATION_TOLERANCE_NS)
+    return Paired(estimated.stamps_ns[i], true.poses[j], estimated.poses[i])
+
+
+def alignment(pairs: list[Paired]) -> Array | Absent:
+    """T_gt_frame [4, 4], the one SE(3) that brings all pairs onto the ground truth; Absent if not determined."""
+    true = np.concatenate([p.true[:, :3, 3] for p in pairs]) if pairs else np.zeros((0, 3))
+    estimated = np.concatenate([p.estimated[:, :3, 3] for p in pairs]) if pairs else np.zeros((0, 3))
+    try:
+        return align(true, estimated)
+    except DuagError as error:
+        return Absent(str(error))
+
+
+def squared_errors_m2(pairs: Paired, T_gt_frame: Array) -> Array:
+    """Squared distance of every aligned position from the true one, m^2 [n]."""
+    difference = pairs.true[:, :3, 3] - se3.transform(T_gt_frame, pairs.estimated[:, :3, 3])
+    return np.sum(difference**2, axis=1)
+
+
+def ate_rmse_m(pairs: Paired) -> float | Absent:
+    """Root mean squared position error after the robot's own SE(3) alignment, all paired frames, metres."""
+    T_gt_frame = alignment([pairs])
+    if isinstance(T_gt_frame, Absent):
+        return T_gt_frame
+    return float(np.sqrt(np.mean(squared_errors_m2(pairs, T_gt_frame))))
+
+
+def rpe(pairs: Paired) -> tuple[float, float] | Absent:
+    """Relative pose error from frame to frame: RMSE of translation (m) and of rotation (rad)."""
+    if len(pairs) < 2:
+        return Absent(f"relative errors need at least 2 paired poses, found {len(pairs)}")
+    return rpe_rmse(pairs.true, pairs.estimated, step=1)
+
+
+@dataclass(frozen=True)
+class TeamError:
+    """One alignment T_gt_world [4, 4] for all robots of a component; pooled RMSE and that of each robot, metres."""
+
+    T_gt_world: Array
+    ate_rmse_m: float
+    ate_rmse_m_of: dict[str, float]
+
+
+def team_error(pairs_of: Mapping[str, Paired]) -> TeamError | Absent:
+    """Align all robots of a component with one SE(3) transform and pool their errors over all paired frames.
+
+    Only a joint alignment sees the error between robots: each robot may lie well by itself and the team lie apart.
+    """
+    if len(pairs_of) < 2:
+        found = "nobody" if not pairs_of else "only " + ", ".join(sorted(pairs_of))
+        return Absent(
+            f"a joint alignment needs at least 2 robots with ground truth in one component, found {found}"
+        )
+    T_gt_world = alignment([pairs_of[robot] for robot in sorted(pairs_of)])
+    if isinstance(T_gt_world, Absent):
+        return T_gt_world
+    squared = {robot: squared_errors_m2(pairs_of[robot], T_gt_world) for robot in sorted(pairs_of)}
+    pooled = np.concatenate([squared[robot] for robot in sorted(squared)])
+    return TeamError(
+        T_gt_world,
+        float(np.sqrt(np.mean(pooled))),
+        {robot: float(np.sqrt(np.mean(values))) for robot, values in squared.items()},
+    )

@@ -1,0 +1,156 @@
+"""Renders beside images: the scores of one view, and the mean over a set of views (docs/evaluation.md, "Rendering")."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from threading import local
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.evaluation.results import Absent, mean
+from pipeline.geometry import se3
+from pipeline.splat import losses
+from pipeline.splat.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from pipeline.geometry.camera import PinholeCamera
+    from pipeline.kernels import Render
+    from pipeline.recording import RgbdFrame
+
+Score = float | Absent
+PSNR_CEILING_DB = 100.0  # of a render equal to its image: infinity has no place in a JSON file
+MS_SSIM_MIN_SIDE_PX = 176  # the 11 px window at the fifth scale
+MIN_ALPHA = 0.5
+NO_LPIPS = Absent("LPIPS needs the weights of a trained network, which this build does not carry")
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """Scores of one rendered view; names and meanings as in metrics.json."""
+
+    psnr_db: Score
+    ssim: Score
+    ms_ssim: Score
+    depth_l1_m: Score
+    depth_l1_exact_m: Score
+    depth_completeness: Score
+
+
+def surface_depth(render: Render) -> NDArray[np.float32]:
+    """Depth [h, w] in metres of what was rendered: blended depth / alpha where alpha >= 0.5, else 0."""
+    covered = render.alpha >= MIN_ALPHA
+    depth = np.zeros(render.alpha.shape, dtype=np.float32)
+    depth[covered] = render.depth[covered] / render.alpha[covered]
+    return depth
+
+
+def score_view(
+    render: Render, color: NDArray[np.uint8], depth_m: NDArray[np.float32], exact_m: Any
+) -> ViewScore:
+    """Compare a render with the image of the same pose.
+
+    Args:
+        render: of the map, at the pose of the frame, black background, no exposure fitted.
+        color: [h, w, 3] RGB. depth_m: recorded depth [h, w], 0 where there is none.
+        exact_m: exact depth [h, w] in metres, or Absent.
+    """
+    image = color.astype(np.float64) / 255.0
+    l1_m, completeness = _depth(render, depth_m, "recorded")
+    side = min(image.shape[:2])
+    return ViewScore(
+        psnr_db=min(losses.psnr(render.color, image), PSNR_CEILING_DB),
+        ssim=losses.ssim(render.color, image),
+        ms_ssim=losses.ms_ssim(render.color, image)
+        if side >= MS_SSIM_MIN_SIDE_PX
+        else Absent(f"the shorter side is {side} px; five scales need {MS_SSIM_MIN_SIDE_PX} px"),
+        depth_l1_m=l1_m,
+        depth_l1_exact_m=exact_m if isinstance(exact_m, Absent) else _depth(render, exact_m, "exact")[0],
+        depth_completeness=completeness,
+    )
+
+
+def _depth(render: Render, reference_m: NDArray[np.float32], name: str) -> tuple[Score, Score]:
+    """L1 over pixels that have both depths, and the share of the reference's valid pixels that are rendered."""
+    if not np.any(reference_m > 0):
+        absent = Absent(f"the {name} depth image has no valid pixel")
+        return absent, absent
+    l1_m, completeness = losses.depth_error(render, reference_m, MIN_ALPHA)
+    if completeness == 0.0:
+        return Absent(f"no pixel has both a rendered and a {name} depth"), 0.0
+    return l1_m, completeness
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame to be rendered: its image and depth, and the exact depth or why there is none."""
+
+    frame: RgbdFrame
+    exact_depth_m: Any
+
+
+def score_map(
+    gaussians: Gaussians,
+    camera: PinholeCamera,
+    views: Iterable[View],
+    poses: Mapping[int, NDArray[np.float64]],
+    threads: int,
+) -> Iterator[tuple[int, ViewScore | Absent]]:
+    """Render a map from every view and score it, in order of the views.
+
+    Args:
+        gaussians: the map. camera: of the views.
+        poses: T_map_camera [4, 4] by time stamp in ns; a view without a pose is Absent.
+        threads: views at a time, each with a rasterizer of one thread; changes no bit of the result.
+    Yields:
+        Frame index and scores.
+    """
+    from pipeline.kernels import Rasterizer
+
+    own = local()
+
+    def score(view: View) -> tuple[int, ViewScore | Absent]:
+        T_map_camera = poses.get(view.frame.stamp_ns)
+        if T_map_camera is None:
+            return view.frame.index, Absent("the trajectory has no pose of this frame")
+        if not hasattr(own, "rasterizer"):
+            own.rasterizer = Rasterizer(threads=1)
+        render = own.rasterizer.forward(gaussians, camera, se3.inverse(T_map_camera))
+        return view.frame.index, score_view(render, view.frame.color, view.frame.depth, view.exact_depth_m)
+
+    with ThreadPoolExecutor(threads) as pool:
+        batch: list[View] = []
+        for view in views:  # frames are read by this thread only, a few at a time
+            batch.append(view)
+            if len(batch) == 4 * threads:
+                yield from pool.map(score, batch)
+                batch = []
+        yield from pool.map(score, batch)
+
+
+def summary(scores: Sequence[ViewScore | Absent], reason_if_none: str) -> dict[str, Any]:
+    """Means over the views that were rendered, in the layout of metrics.json.
+
+    A value that is absent in every view is absent in the mean, with the reason of the first view.
+    """
+    rendered = [s for s in scores if not isinstance(s, Absent)]
+    without = Absent(reason_if_none)
+    means = {
+        field.name: mean([getattr(s, field.name) for s in rendered]) if rendered else without
+        for field in fields(ViewScore)
+    }
+    return {
+        "views": len(rendered),
+        "views_without_pose": len(scores) - len(rendered),
+        "psnr_db": means["psnr_db"],
+        "ssim": means["ssim"],
+        "ms_ssim": means["ms_ssim"],
+        "lpips": NO_LPIPS,
+        "st_lpips": NO_LPIPS,
+        "depth_l1_m": means["depth_l1_m"],
+        "depth_l1_exact_m": means["depth_l1_exact_m"],
+        "depth_completeness": means["depth_completeness"],
+    }

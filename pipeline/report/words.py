@@ -1,0 +1,141 @@
+"""Numbers in words: how a value is written with its unit, and what every metric means in one phrase."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.evaluation.results import unit_of
+
+NONE = "–"
+
+
+def bytes_text(count: float) -> str:
+    """Bytes with a decimal prefix: 1 kB is 1000 B."""
+    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.3g} {unit}"
+    return f"{count:.0f} B" if float(count).is_integer() else f"{count:.1f} B"
+
+
+def metres_text(value_m: float) -> str:
+    """Metres, or millimetres below a tenth of a metre."""
+    if abs(value_m) < 0.1:
+        return f"{1e3 * value_m:.1f} mm" if abs(value_m) >= 1e-3 else f"{1e3 * value_m:.3g} mm"
+    return f"{value_m:.3f} m"
+
+
+def text(name: str, value: Any) -> str:
+    """A metric's value with its unit, as the report prints it; a dash for a value that is absent."""
+    if value is None:
+        return NONE
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, str):
+        return value
+    unit = unit_of(name)
+    if unit == "m":
+        return metres_text(value)
+    if unit == "rad":
+        return f"{np.degrees(value):.3g}°"
+    if unit == "B":
+        return bytes_text(value)
+    if name == "depth_completeness" or name.startswith("coverage_95"):
+        return f"{100 * value:.1f} %"
+    if isinstance(value, int):
+        return f"{value:,}".replace(",", "\u202f")
+    if unit == "dB":
+        return f"{value:.2f} dB"
+    number = f"{value:.3f}" if 1e-3 <= abs(value) < 1e3 else f"{value:.3g}"
+    return number if unit == "1" else f"{number} {unit.replace('sigma', 'σ')}"
+
+
+# path in metrics.json -> (label, what it means in one phrase)
+TEAM = {
+    "ate_rmse_m": ("Team ATE", "position error of all robots of the largest component under one common alignment"),
+    "ate_rmse_m_mean_of_robots": ("Mean robot ATE", "each robot aligned by itself: blind to errors between robots"),
+    "robots": ("Robots", "robots in this run"),
+    "robots_in_largest_component": ("Largest component", "robots that agree on one common world"),
+    "inter_robot_closures": ("Closures between robots", "places that two robots recognised, counted in the end"),
+    "inter_robot_closures_rejected": ("Closures rejected", "candidates that failed a check or were outvoted"),
+}  # fmt: skip
+
+ROBOT = {
+    "frames": ("Frames", "images in the robot's log"),
+    "tracked": ("Tracked", "frames whose pose the front end trusts"),
+    "keyframes": ("Keyframes", "frames that carry the map"),
+    "gaussians": ("Own Gaussians", "Gaussians in the robot's own map"),
+    "gaussians_fused": ("Fused Gaussians", "Gaussians in the robot's map after fusion"),
+    "ate_rmse_m_before_consensus": ("ATE before", "position error of the front end alone, own alignment, all frames"),
+    "ate_rmse_m": ("ATE after", "position error after consensus, own alignment, all frames"),
+    "ate_rmse_m_joint": ("ATE, joint", "position error after consensus under the alignment that the whole team shares"),
+    "rpe_trans_m": ("RPE, position", "error of the motion from one frame to the next"),
+    "rpe_rot_rad": ("RPE, rotation", "error of the turn from one frame to the next"),
+}  # fmt: skip
+
+RENDERING = {
+    "views": ("Views", "rendered and compared with the image taken there"),
+    "psnr_db": ("PSNR", "likeness of colours; higher is better"),
+    "ssim": ("SSIM", "likeness of structure at one scale; 1 is equal"),
+    "ms_ssim": ("MS-SSIM", "likeness of structure over five scales; 1 is equal, always kinder than SSIM"),
+    "lpips": ("LPIPS", "perceptual distance by a trained network"),
+    "depth_l1_m": ("Depth L1", "mean error against the recorded depth, where both exist"),
+    "depth_l1_exact_m": ("Depth L1, exact", "the same against the exact depth"),
+    "depth_completeness": ("Completeness", "share of recorded depth pixels that the map covers"),
+}  # fmt: skip
+
+EXCHANGE = {
+    "sessions": ("Sessions", "meetings of the team"),
+    "rounds": ("Rounds", "ticks of the agents until the session ended"),
+    "messages": ("Messages", "what the robots had to say, before cutting into packets"),
+    "packets_sent": ("Packets sent", "of at most 1200 bytes, all attempts"),
+    "packets_dropped": ("Packets lost", "by the simulated radio"),
+    "bytes_sent": ("Bytes sent", "all attempts, headers included"),
+    "bytes_delivered": ("Bytes delivered", "what arrived, headers included"),
+    "bytes_setup": ("Set-up bytes", "descriptors, samples, closures, frames, agreed poses, pair lists"),
+    "bytes_per_round_per_robot_pair": ("Bytes per round and pair", "both directions, mean over the session"),
+    "bytes_raw_alternative": ("Raw alternative", "every map and pose graph uncompressed to every other robot, once"),
+    "bytes_paper_accounting": ("Paper's accounting", "28 float32 per matched pair, both ways, in every round"),
+    "matched_pairs": ("Matched Gaussians", "pairs of Gaussians of two robots that show the same piece of surface"),
+}  # fmt: skip
+
+CONSENSUS = {
+    "solver": ("Solver", "how the robots reach agreement"),
+    "converged": ("Converged", "every robot agreed with its component before the last allowed round"),
+    "rounds_to_tolerance": ("Rounds to tolerance", "until no pose moved by more than the tolerance"),
+    "gap_to_oracle_sigma": ("Gap to oracle, Gaussians", "largest difference from the centralised answer"),
+    "gap_to_oracle_m": ("Gap to oracle, position", "largest difference of a keyframe from the centralised answer"),
+    "gap_to_oracle_rad": ("Gap to oracle, rotation", "largest turn of a keyframe from the centralised answer"),
+}  # fmt: skip
+
+CALIBRATION = {
+    "spearman": ("Spearman", "rank correlation of predicted and observed error; 1 is perfect, 0 knows nothing"),
+    "ause": ("AUSE", "cost of trusting the predicted order of errors; 0 is perfect"),
+    "ece_rank": ("ECE, ranks", "gap between predicted and observed rank per decile; 0 is perfect, 0.25 knows nothing"),
+    "ece_rank_shuffled": ("ECE, ranks, shuffled", "the same with the predictions dealt out at random"),
+    "ece_paper": ("ECE, companion code", "the paper's formula, for comparison only: near 0 without any knowledge, too"),
+    "coverage_95": ("Coverage of 95 %", "share of errors within 1.96 predicted σ, as predicted"),
+    "coverage_95_scaled": ("Coverage, one scale fitted", "the same after one factor, fitted on the other half"),
+    "sigma_scale": ("Fitted scale", "the factor on σ; 1 if well scaled, above 1 if over-confident"),
+    "nll": ("NLL", "negative log-likelihood of the errors; lower is better"),
+    "nll_scaled": ("NLL, one scale fitted", "the same after the factor"),
+    "gaussians": ("Gaussians judged", "fused Gaussians with full position information, all robots"),
+    "gaussians_without_information": ("Left out", "Gaussians with a direction that nothing determines"),
+}  # fmt: skip
+
+
+def rows(
+    section: dict[str, Any], words: dict[str, tuple[str, str]], reasons: dict[str, str], path: str
+) -> list[dict[str, str]]:
+    """Label, value with unit, meaning and, if the value is absent, the reason: one row per metric that is known."""
+    return [
+        {
+            "label": label,
+            "value": text(name, section[name]),
+            "meaning": meaning,
+            "reason": reasons.get(f"{path}.{name}", ""),
+        }
+        for name, (label, meaning) in words.items()
+        if name in section
+    ]

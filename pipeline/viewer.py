@@ -1,0 +1,406 @@
+"""Runs and recordings in Rerun. The only module that imports it; what it writes is no part of a digest.
+
+A run is logged piece by piece (`write_rrd`). A recording opens in Rerun as it is; `recording_to_rrd` adds what the
+viewer does not derive by itself: depth images with their unit, and names of frames that hang together.
+"""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import DuagError
+from pipeline.evaluation.network import Session
+from pipeline.evaluation.paths import Path3, paths
+from pipeline.evaluation.results import Absent
+from pipeline.evaluation.run_folder import RobotRun, RunFolder
+from pipeline.evaluation.stage import poses_by_stamp
+from pipeline.geometry import so3
+from pipeline.recording import RECORDING_FILE, Recording, open_rgbd
+from pipeline.report import words
+from pipeline.report.figures import color_of
+from pipeline.report.page import position_sigma_m, sigma_colors
+from pipeline.splat.gaussians import Gaussians
+from schemas import topics
+
+if TYPE_CHECKING:
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+APPLICATION = "duagc"
+TIME, ROUND = "time", "round"  # timelines: nanoseconds of the recording, rounds of the session
+VIEWER_MEMORY = "4GiB"
+MIN_OPACITY = 1.0 / 255.0
+
+
+def view(path: Path, save: Path | None = None, screenshot: Path | None = None) -> None:
+    """Open a run, a recording or a log in Rerun, or write it to a .rrd file or a picture.
+
+    Args:
+        path: folder of a run or of a recording, or an .mcap or .rrd file.
+        save: write this .rrd file instead of opening a window. screenshot: write this PNG instead.
+    Raises:
+        DuagError: the path is none of these, or no picture can be drawn on this machine.
+    """
+    with tempfile.TemporaryDirectory(prefix="duagc-view-") as folder:
+        rrd = _as_rrd(Path(path), Path(folder))
+        if save is not None:
+            _copy(rrd, save)
+        if screenshot is not None:
+            take_screenshot(rrd, screenshot)
+        if save is None and screenshot is None:
+            _open_window(rrd)
+
+
+def _as_rrd(path: Path, folder: Path) -> Path:
+    if path.suffix == ".rrd" and path.is_file():
+        return path
+    out = folder / f"{path.name or 'view'}.rrd"
+    if (path / "robots").is_dir():
+        from pipeline.replay import recording_of
+
+        made = path / "run.rrd"
+        return made if made.is_file() else write_rrd(path, recording_of(path), out)
+    if (path / RECORDING_FILE).is_file():
+        recording = Recording(path)
+        return recording_to_rrd([recording.log(robot) for robot in recording.robots], out)
+    if path.suffix == ".mcap" and path.is_file():
+        return recording_to_rrd([path], out)
+    raise DuagError(
+        f"{path}: expected a run (robots/), a recording ({RECORDING_FILE}), an .mcap or an .rrd file"
+    )
+
+
+def _copy(rrd: Path, save: Path) -> None:
+    partial = save.with_name(save.name + ".part")
+    shutil.copyfile(rrd, partial)
+    partial.replace(save)
+
+
+# --- a run -------------------------------------------------------------------------------------------------------
+
+
+def write_rrd(run_dir: Path, recording: Path, out: Path, max_gaussians: int = 300_000) -> Path:
+    """Write a run as one .rrd file with its own layout.
+
+    Args:
+        run_dir: folder of the run. recording: folder of its recording. out: the file; appears when it is complete.
+        max_gaussians: of each map; a larger map is thinned to those that cover most of the image.
+    Returns:
+        `out`.
+    """
+    import rerun as rr
+
+    run, source = RunFolder(run_dir), Recording(recording)
+    partial = out.with_name(out.name + ".part")
+    stream = rr.RecordingStream(APPLICATION, recording_id=f"run-{source.name}")
+    stream.save(partial, default_blueprint=_blueprint(run))
+    _log_run(stream, run, source, max_gaussians)
+    stream.flush()
+    stream.disconnect()
+    partial.replace(out)
+    return out
+
+
+def _world_of(run: RunFolder, component: Sequence[str]) -> str:
+    """Entity that holds what the robots of one component share; robots of different components share no frame."""
+    return (
+        "world" if component == run.robots[run.largest_component[0]].component else f"world_of_{component[0]}"
+    )
+
+
+def _log_run(stream: rr.RecordingStream, run: RunFolder, source: Recording, max_gaussians: int) -> None:
+    import rerun as rr
+
+    names, session = list(run.robots), Session(run)
+    for way in paths(run, source):
+        world = _world_of(run, way.component)
+        stream.log(
+            world, rr.ViewCoordinates.RDF, static=True
+        )  # a world is the first camera of its lowest robot
+        _log_path(stream, f"{world}/paths/{way.robot}", way, names.index(way.robot))
+    for i, (name, robot) in enumerate(run.robots.items()):
+        world = _world_of(run, robot.component)
+        _log_map(stream, f"{world}/maps/{name}", robot, max_gaussians)
+        _log_keyframes(stream, f"{world}/cameras/{name}", robot, source, i)
+    _log_rounds(stream, session)
+    _log_network(stream, session)
+    stream.log("summary", rr.TextDocument(_summary(run), media_type=rr.MediaType.MARKDOWN), static=True)
+
+
+def _log_path(stream: rr.RecordingStream, entity: str, way: Path3, index: int) -> None:
+    import rerun as rr
+
+    color = color_of(index)
+    parts = [("before_consensus", way.before, color + "66"), ("after_consensus", way.after, color + "ff")]
+    if not isinstance(way.true, Absent):
+        parts.append(("ground_truth", way.true, "#8899a6ff"))
+    for name, trajectory, rgba in parts:
+        strip = rr.LineStrips3D([trajectory.positions], colors=[_rgba(rgba)], radii=rr.Radius.ui_points(1.5))
+        stream.log(f"{entity}/{name}", strip, static=True)
+
+
+def _rgba(text: str) -> list[int]:
+    return [int(text[i : i + 2], 16) for i in (1, 3, 5, 7)]
+
+
+def thinned(gaussians: Gaussians, most: int) -> NDArray[np.int64]:
+    """Indices, ascending, of at most `most` Gaussians: those of the greatest opacity times area; ties by position."""
+    if len(gaussians) <= most:
+        return np.arange(len(gaussians))
+    scales = np.sort(gaussians.log_scales.astype(np.float64), axis=1)
+    opacity = 1.0 / (1.0 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    cover = np.log(np.maximum(opacity, 1e-12)) + scales[:, 1] + scales[:, 2]
+    return np.sort(np.argsort(-cover, kind="stable")[:most])
+
+
+def _log_map(stream: rr.RecordingStream, entity: str, robot: RobotRun, max_gaussians: int) -> None:
+    fused = robot.fused_map
+    chosen = thinned(fused.gaussians, max_gaussians)
+    shown = fused.gaussians.select(chosen)
+    stream.log(f"{entity}/fused", _splats(shown, shown.colors), static=True)
+    if fused.information is not None:
+        colors, _, _ = sigma_colors(position_sigma_m(fused.information.geometry))
+        stream.log(f"{entity}/uncertainty", _splats(shown, colors[chosen]), static=True)
+
+
+def _splats(gaussians: Gaussians, colors: NDArray[np.float32]) -> Any:
+    """Gaussians as Rerun draws them: linear scales, xyzw quaternions, RGBA with the peak opacity."""
+    import rerun as rr
+
+    opacity = 1.0 / (1.0 + np.exp(-gaussians.opacity_logits.astype(np.float64)))
+    rgba = np.concatenate([np.clip(colors, 0.0, 1.0), opacity[:, None]], axis=1)
+    quats = gaussians.quats_wxyz / np.linalg.norm(gaussians.quats_wxyz, axis=1, keepdims=True)
+    return rr.GaussianSplats3D(
+        gaussians.means,
+        scales=np.exp(gaussians.log_scales),
+        quaternions=quats[:, [1, 2, 3, 0]],
+        colors=np.rint(rgba * 255.0).astype(np.uint8),
+    )
+
+
+def _log_keyframes(
+    stream: rr.RecordingStream, entity: str, robot: RobotRun, source: Recording, index: int
+) -> None:
+    """The camera with its image and depth at every keyframe, where consensus puts it."""
+    import rerun as rr
+
+    poses = poses_by_stamp(robot.trajectory)
+    with open_rgbd(source.log(robot.robot)) as log:
+        pinhole = rr.Pinhole(
+            image_from_camera=log.camera.matrix(),
+            resolution=[log.camera.width, log.camera.height],
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=0.25,
+            color=_rgba(color_of(index) + "ff"),
+        )
+        stream.log(entity, pinhole, static=True)
+        for keyframe in robot.keyframes:
+            T_world_camera = poses.get(keyframe.stamp_ns)
+            if T_world_camera is None:
+                continue
+            frame = log.frame(keyframe.frame_index)
+            stream.set_time(TIME, duration=np.timedelta64(frame.stamp_ns, "ns"))
+            quat = so3.to_quat_wxyz(T_world_camera[:3, :3])
+            stream.log(
+                entity,
+                rr.Transform3D(
+                    translation=T_world_camera[:3, 3], quaternion=rr.Quaternion(xyzw=quat[[1, 2, 3, 0]])
+                ),
+            )
+            stream.log(f"{entity}/image", rr.Image(frame.color).compress(jpeg_quality=85))
+            millimetres = np.rint(np.minimum(frame.depth, 65.0) * 1000.0).astype(np.uint16)
+            stream.log(f"{entity}/depth", rr.DepthImage(millimetres, meter=1000.0))
+    stream.reset_time()
+
+
+def _log_rounds(stream: rr.RecordingStream, session: Session) -> None:
+    """What happened in every round, on the timeline of rounds."""
+    import rerun as rr
+
+    for group, series in session.series_by_round().items():
+        for name, (rounds, values) in series.items():
+            entity = f"rounds/{group}/{name}"
+            stream.log(entity, rr.SeriesLines(names=name), static=True)
+            stream.send_columns(
+                entity,
+                indexes=[rr.TimeColumn(ROUND, sequence=np.asarray(rounds, dtype=np.int64))],
+                columns=rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64)),
+            )
+
+
+def _log_network(stream: rr.RecordingStream, session: Session) -> None:
+    """Who sent to whom."""
+    import rerun as rr
+
+    names = list(session.run.robots)
+    stream.log(
+        "network",
+        rr.GraphNodes(names, labels=names, colors=[_rgba(color_of(i) + "ff") for i in range(len(names))]),
+        rr.GraphEdges([(link.sender, link.receiver) for link in session.links], graph_type="directed"),
+        static=True,
+    )
+
+
+def _summary(run: RunFolder) -> str:
+    """The headline of metrics.json as Markdown."""
+    metrics = run.metrics
+    if not metrics:
+        return "The run was not evaluated."
+    lines = ["| | | |", "|---|---|---|"]
+    for section, table in (
+        ("team", words.TEAM),
+        ("exchange", words.EXCHANGE),
+        ("consensus", words.CONSENSUS),
+    ):
+        for row in words.rows(metrics[section], table, metrics["reasons"], section):
+            meaning = f"absent: {row['reason']}" if row["reason"] else row["meaning"]
+            lines.append(f"| {row['label']} | **{row['value']}** | {meaning} |")
+    return "\n".join(lines)
+
+
+def _blueprint(run: RunFolder) -> rrb.Blueprint:
+    """One robot's map with all paths, its uncertainty, the images, the rounds, the network and the numbers."""
+    import rerun.blueprint as rrb
+
+    first = run.largest_component[0]
+    world = _world_of(run, run.robots[first].component)
+    scene = [f"/{world}/paths/**", f"/{world}/cameras/**"]
+    images = [
+        rrb.Spatial2DView(
+            origin=f"/{_world_of(run, robot.component)}/cameras/{name}",
+            contents=["$origin/image"],
+            name=f"{name}: keyframes",
+        )
+        for name, robot in run.robots.items()
+    ]
+    charts = [
+        rrb.TimeSeriesView(origin=f"/rounds/{group}", name=title)
+        for group, title in (("change", "Change per round"), ("bytes", "Bytes per round"))
+    ]
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(
+                rrb.Tabs(
+                    rrb.Spatial3DView(
+                        origin=f"/{world}",
+                        contents=[*scene, f"/{world}/maps/{first}/fused"],
+                        name="Fused map",
+                    ),
+                    rrb.Spatial3DView(
+                        origin=f"/{world}",
+                        contents=[*scene, f"/{world}/maps/{first}/uncertainty"],
+                        name="Uncertainty",
+                    ),
+                ),
+                rrb.Vertical(*images),
+                column_shares=[3, 1],
+            ),
+            rrb.Horizontal(
+                *charts,
+                rrb.GraphView(origin="/network", name="Network"),
+                rrb.TextDocumentView(origin="/summary", name="Numbers"),
+            ),
+            row_shares=[2, 1],
+        ),
+        rrb.TimePanel(timeline=TIME, state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+
+
+# --- a recording -------------------------------------------------------------------------------------------------
+
+
+def recording_to_rrd(logs: Sequence[Path], out: Path) -> Path:
+    """Write logs as one .rrd file: what Rerun reads from MCAP by itself, and depth as depth images with their unit.
+
+    Rerun takes a depth image of Foxglove's schema for a grey image. Here its bytes become a depth image beside it.
+    """
+    import rerun as rr
+    from rerun.chunk import Chunk, DeriveLens, LazyChunkStream, McapReader
+
+    lenses = [
+        DeriveLens("Image:buffer").to_component("DepthImage:buffer", "."),
+        DeriveLens("Image:format").to_component("DepthImage:format", "."),
+    ]
+    streams = []
+    for path in logs:
+        with open_rgbd(path) as log:
+            topic, units_per_metre = topics.DEPTH.of(log.robot), 1.0 / log.depth_scale
+        depth, rest = McapReader(path).stream().split(content=topic)
+        meter = Chunk.from_columns(topic, indexes=[], columns=rr.DepthImage.columns(meter=[units_per_metre]))
+        streams += [
+            depth.lenses(lenses, output_mode="forward_unmatched"),
+            rest,
+            LazyChunkStream.from_iter([meter]),
+        ]
+    partial = out.with_name(out.name + ".part")
+    LazyChunkStream.merge(*streams).write_rrd(
+        partial, application_id=APPLICATION, recording_id=f"recording-{out.stem}"
+    )
+    partial.replace(out)
+    return out
+
+
+# --- windows and pictures ----------------------------------------------------------------------------------------
+
+
+def _open_window(rrd: Path) -> None:
+    """Open a file in a Rerun window and return; the window stays."""
+    import rerun as rr
+
+    rr.init(APPLICATION)
+    rr.spawn(port=_free_port(), memory_limit=VIEWER_MEMORY, connect=True)
+    rr.log_file_from_path(rrd)
+    rr.disconnect()
+
+
+def take_screenshot(rrd: Path, png: Path, timeout_s: float = 60.0) -> None:
+    """Draw a file without a window and save the picture; a software renderer (Mesa lavapipe) is enough.
+
+    Raises:
+        DuagError: there is no graphics driver, or the viewer has not shown the data in time.
+    """
+    from rerun.experimental import ViewerClient
+
+    try:
+        with ViewerClient.spawn(headless=True, port=_free_port(), memory_limit=VIEWER_MEMORY) as viewer:
+            viewer.open(str(rrd))
+            data = _settled_picture(viewer, timeout_s)
+    except Exception as error:  # the client raises RuntimeError and its own kinds, with the viewer's words
+        first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise DuagError(
+            f"{png}: the viewer drew no picture ({first}); it needs a graphics driver, "
+            "for example the package mesa-vulkan-drivers"
+        ) from error
+    partial = png.with_name(png.name + ".part")
+    partial.write_bytes(data)
+    partial.replace(png)
+
+
+def _settled_picture(viewer: Any, timeout_s: float) -> bytes:
+    """The picture once it does not change any more: what is on disk is drawn piece by piece."""
+    end, last = time.monotonic() + timeout_s, b""
+    while time.monotonic() < end:
+        data = viewer.take_screenshot()
+        if data == last:
+            return data
+        last = data
+        time.sleep(1.5)
+    return last
+
+
+def _free_port() -> int:
+    """A port of this machine that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

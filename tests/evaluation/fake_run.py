@@ -1,0 +1,315 @@
+"""A small recording and a finished run of it, written with the real writers; every number in it is known.
+
+A textured wall two metres ahead, seen by robots that move along curved ways. The maps are what the images were
+rendered from, the corrected ways are the true ones, so that the ideal values of most metrics are known.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import schemas
+from converters.base import RecordingWriter
+from pipeline.exchange.wire import PairList, write_pairs
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.trajectory import Trajectory, write_tum
+from pipeline.kernels import Rasterizer
+from pipeline.messages import (
+    CorrectedKeyframes,
+    GaussianInformation,
+    GaussianMap,
+    Keyframe,
+    MapUpdate,
+    Odometry,
+    map_frame,
+    pack_stamp,
+)
+from pipeline.recording import LogWriter
+from pipeline.splat.gaussians import Gaussians
+from schemas import topics
+
+CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
+FRAMES = 21
+INTERVAL_NS = 40_000_000
+WALL_Z_M = 2.0
+SIGMA_M = 0.002  # of every centre across the wall, as the information says, and as it is
+DRIFT_M = 0.02  # of the last pose of the odometry
+HEADER_BYTES = 34
+T_GT_WORLD = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, -0.2, 0.9]))
+KEYFRAMES = (0, 3, 6, 9, 13, 16, 19)
+
+
+@dataclass(frozen=True)
+class FakeRun:
+    """Folders of the run and of its recording."""
+
+    run: Path
+    recording: Path
+
+
+def way(robot: int) -> np.ndarray:
+    """T_world_camera [n, 4, 4] of a robot; the world is the first camera of robot 0."""
+    s = np.linspace(0.0, 1.0, FRAMES)
+    zero = np.zeros(FRAMES)
+    xi = np.stack(
+        [0.8 * s + 0.3 * robot, 0.3 * s**2, 0.1 * np.sin(4 * s) + 0.05 * robot, zero, 0.15 * s, zero], axis=1
+    )
+    return se3.exp(xi)
+
+
+def wall(seed: int = 0) -> Gaussians:
+    """Gaussians on the wall, world frame, smooth random colours, centres off by SIGMA_M across it."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.arange(-2.4, 3.6, 0.06), np.arange(-2.0, 2.4, 0.06))
+    n = x.size
+    colors = 0.5 + 0.4 * np.stack([np.sin(5 * x + 1), np.sin(4 * y), np.sin(3 * x + 6 * y)], axis=-1).reshape(
+        n, 3
+    )
+    z = WALL_Z_M + rng.normal(0.0, SIGMA_M, n)
+    return Gaussians(
+        ids=np.arange(n),
+        anchors=np.zeros(n),
+        means=np.stack([x.ravel(), y.ravel(), z], axis=1),
+        quats_wxyz=np.tile([1.0, 0, 0, 0], (n, 1)),
+        log_scales=np.log(np.tile([0.04, 0.04, 0.002], (n, 1))),
+        colors=colors,
+        opacity_logits=np.full(n, 4.0),
+    )
+
+
+def information(robot: str, gaussians: Gaussians, known: bool = True) -> GaussianInformation:
+    """Position information 1/SIGMA_M^2 across the wall and a hundredth of it along; nothing at all if not known."""
+    n = len(gaussians)
+    geometry = np.zeros((n, 45), dtype=np.float32)
+    if known:
+        geometry[:, 0] = geometry[:, 9] = 0.01 / SIGMA_M**2
+        geometry[:, 17] = 1.0 / SIGMA_M**2
+    return GaussianInformation(
+        stamp_ns=0,
+        robot=robot,
+        kind="gauss_newton",
+        window="all",
+        ids=gaussians.ids,
+        geometry=geometry,
+        color=np.ones((n, 3), dtype=np.float32),
+        opacity=np.ones(n, dtype=np.float32),
+        observations=np.full(n, 3, dtype=np.uint32),
+        color_sigma=0.02,
+        depth_sigma="0.002 z^2",
+    )
+
+
+def make(
+    folder: Path,
+    robots: Sequence[str] = ("alpha", "bravo"),
+    truth: bool = True,
+    joined: bool = True,
+    depth_noise: str = "none",
+) -> FakeRun:
+    """Write the recording and the run.
+
+    truth: with ground truth. joined: whether the robots share a world and talked; otherwise each is alone.
+    """
+    recording, run = folder / "recording", folder / "run"
+    _write_recording(recording, robots, truth, depth_noise)
+    run.mkdir()
+    (run / "config.toml").write_text("seed = 0\n\n[exchange]\ntolerance = 1e-5\n")
+    (run / "timing.json").write_text(
+        '{"stages": {"frontend.alpha": {"stage": "frontend", "robot": "alpha", "wall_s": 3.5, "cpu_s": 6.5, '
+        '"peak_rss_mb": 210.0}, "exchange": {"stage": "exchange", "robot": null, "wall_s": 1.25, "cpu_s": 1.2, '
+        '"peak_rss_mb": 180.0}}}'
+    )
+    for i, robot in enumerate(robots):
+        _write_robot(run / "robots" / robot, robot, i, list(robots) if joined else [robot], joined)
+    _write_exchange(run / "exchange.mcap", robots if joined else [], list(robots))
+    _write_consensus(run / "consensus.mcap", list(robots), joined)
+    return FakeRun(run, recording)
+
+
+def _write_recording(folder: Path, robots: Sequence[str], truth: bool, depth_noise: str) -> None:
+    rasterizer = Rasterizer()
+    with RecordingWriter(folder, "wall", {"made": "by the tests"}, "tests") as recording:
+        for i, robot in enumerate(robots):
+            with recording.robot(robot, CAMERA, 0.001, {"depth_noise": depth_noise}) as log:
+                for k, T_world_camera in enumerate(way(i)):
+                    render = rasterizer.forward(wall(), CAMERA, se3.inverse(T_world_camera))
+                    rgb = np.rint(np.clip(render.color, 0, 1) * 255).astype(np.uint8)
+                    _, png = cv2.imencode(".png", rgb[:, :, ::-1])
+                    depth = np.rint(1000 * render.depth / render.alpha).astype(np.uint16)
+                    depth[:4] = 0  # a strip without measurement
+                    pose = T_GT_WORLD @ T_world_camera if truth else None
+                    exact = depth + 10 if truth and depth_noise != "none" else None
+                    log.add_frame(k * INTERVAL_NS, png.tobytes(), "png", depth, pose, exact)
+        if truth:
+            recording.add_geometry(_write_wall_mesh)
+
+
+def _write_wall_mesh(path: Path) -> None:
+    corners = np.array(
+        [[-9, -9, WALL_Z_M], [9, -9, WALL_Z_M], [9, 9, WALL_Z_M], [-9, 9, WALL_Z_M]], dtype=float
+    )
+    lines = [" ".join(f"{v:.9f}" for v in p) for p in se3.transform(T_GT_WORLD, corners)]
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    path.write_text(header + "\n".join([*lines, "3 0 1 2", "3 0 2 3"]) + "\n")
+
+
+def _write_robot(folder: Path, robot: str, index: int, component: list[str], joined: bool) -> None:
+    folder.mkdir(parents=True)
+    stamps = np.arange(FRAMES, dtype=np.int64) * INTERVAL_NS
+    true = way(index)
+    T_map_world = se3.inverse(true[0])
+    drift = se3.exp(np.outer(np.linspace(0, 1, FRAMES), [0, DRIFT_M, 0, 0, 0, 0]))
+    odometry = T_map_world @ true @ drift
+    after = true if joined else T_map_world @ true
+    write_tum(folder / "odometry.tum", Trajectory(stamps, odometry))
+    write_tum(folder / "trajectory.tum", Trajectory(stamps, after))
+    own, fused = wall().transformed(T_map_world), wall() if joined else wall().transformed(T_map_world)
+    end = int(stamps[-1])
+    with LogWriter(folder / "frontend.mcap", robot) as log:
+        for k in range(FRAMES):
+            status = "lost" if k == 10 else "ok"
+            log.write(topics.ODOMETRY.of(robot), _odometry(robot, k, odometry[k], status), int(stamps[k]))
+            if k in KEYFRAMES:
+                i = KEYFRAMES.index(k)
+                log.write(topics.KEYFRAME.of(robot), _keyframe(robot, i, k, odometry), int(stamps[k]))
+                update = MapUpdate(int(stamps[k]), robot, i, 100, 3, 100 * (i + 1), 0.5, 0.2)
+                log.write(topics.MAP_UPDATE.of(robot), update, int(stamps[k]))
+        log.write(topics.MAP.of(robot), GaussianMap(end, robot, map_frame(robot), own), end)
+    with LogWriter(folder / "information.mcap", robot) as log:
+        log.write(topics.INFORMATION.of(robot), information(robot, own), end)
+    with LogWriter(folder / "fused.mcap", robot) as log:
+        fused_map = GaussianMap(end, robot, "world", fused, information(robot, fused, known=joined))
+        log.write(topics.FUSED_MAP.of(robot), fused_map, end)
+        indices = np.arange(len(KEYFRAMES), dtype=np.int32)
+        corrected = CorrectedKeyframes(end, robot, component, indices, after[list(KEYFRAMES)])
+        log.write(topics.CORRECTED_KEYFRAMES.of(robot), corrected, end)
+
+
+def _odometry(robot: str, k: int, T_map_camera: np.ndarray, status: str) -> Odometry:
+    return Odometry(
+        stamp_ns=k * INTERVAL_NS,
+        robot=robot,
+        frame_index=k,
+        held_out=k % 8 == 4,
+        keyframe_index=0,
+        T_map_camera=T_map_camera,
+        T_keyframe_camera=np.eye(4),
+        information=np.eye(6),
+        status=status,
+        overlap=0.9,
+        rms_depth_m=0.001,
+        rms_color=0.01,
+    )
+
+
+def _keyframe(robot: str, index: int, k: int, odometry: np.ndarray) -> Keyframe:
+    return Keyframe(
+        stamp_ns=k * INTERVAL_NS,
+        robot=robot,
+        keyframe_index=index,
+        frame_index=k,
+        T_map_camera=odometry[k],
+        previous_index=index - 1,
+        T_previous_keyframe=np.eye(4),
+        information=np.eye(6),
+        exposure=(0.0, 0.0),
+    )
+
+
+def _write_exchange(path: Path, talking: Sequence[str], team: list[str]) -> None:
+    """Per ordered pair of robots: three messages in four packets of 100 bytes, the last of them lost."""
+    totals = {"messages": 0, "packets": 0}
+    with LogWriter(path) as log:
+        for sender in talking:
+            for receiver in talking:
+                if sender != receiver:
+                    _write_link(log, sender, receiver, team, totals)
+        summary = schemas.new(
+            "ExchangeSummary",
+            team=team,
+            rounds=10 if talking else 1,
+            converged=True,
+            messages=totals["messages"],
+            packets_sent=totals["packets"],
+            bytes_raw_alternative=123456 if talking else 0,
+        )
+        log.write(topics.EXCHANGE_SUMMARY.pattern, summary, 0)
+
+
+def _write_link(log: LogWriter, sender: str, receiver: str, team: list[str], totals: dict[str, int]) -> None:
+    pairs = PairList(0, 1, 1, np.array([[1, 2], [3, 4], [5, 6]]))
+    first = 10 * team.index(receiver)
+    for i, (kind, payload) in enumerate(
+        (("DESCRIPTORS", b"d"), ("EVIDENCE", b"e"), ("PAIRS", write_pairs(pairs)))
+    ):
+        peer = schemas.new(
+            "PeerMessage",
+            robot=sender,
+            message=first + i,
+            kind_name=kind,
+            length=len(payload),
+            payload=payload,
+        )
+        log.write(topics.PEER_MESSAGE.of(sender), peer, 0)
+        totals["messages"] += 1
+        for k in range(2 if kind == "EVIDENCE" else 1):
+            packet = schemas.new(
+                "PeerPacket",
+                robot=sender,
+                receiver=receiver,
+                sequence=i + k,
+                round=2 * i + k,
+                message=first + i,
+                length=100 - HEADER_BYTES,
+                header=bytes(HEADER_BYTES),
+                delivered=kind != "PAIRS",
+                dropped="lost" if kind == "PAIRS" else "",
+            )
+            log.write(topics.PEER_PACKET.of(sender), packet, 0)
+            totals["packets"] += 1
+
+
+def _write_consensus(path: Path, team: list[str], joined: bool) -> None:
+    """Nine rounds whose change falls by ten in each; agreement in the eighth. One closure counts, three do not."""
+    with LogWriter(path) as log:
+        for k in range(9 if joined else 1):
+            for robot in team:
+                agent = schemas.new(
+                    "AgentRound",
+                    robot=robot,
+                    round=k,
+                    members=team if joined else [robot],
+                    agreed=joined and k >= 7,
+                )
+                pack_stamp(agent, k * 10**8)
+                log.write(topics.AGENT_ROUND.of(robot), agent, k * 10**8)
+                if joined:
+                    change = 0.1 * 10.0**-k
+                    state = schemas.new(
+                        "ConsensusRound", robot=robot, round=k, primal=2 * change, largest_change=change
+                    )
+                    log.write(topics.CONSENSUS_ROUND.of(robot), state, k * 10**8)
+        for i, (verdict, weight) in enumerate(
+            (("kept", 1.0), ("kept", 0.1), ("kept", -1.0), ("few_matches", -1.0))
+        ):
+            if joined:
+                closure = schemas.new(
+                    "ClosureDecision",
+                    robot=team[0],
+                    peer=team[1],
+                    own_keyframe=i,
+                    peer_keyframe=i,
+                    matches=50,
+                    inliers=30,
+                    verdict=verdict,
+                    detail="30 of 50 matches agree",
+                    weight=weight,
+                )
+                log.write(topics.CLOSURE_DECISION.of(team[0]), closure, 10**9)

@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+
+from pipeline.evaluation import trajectory_errors
+from pipeline.evaluation.results import Absent
+from pipeline.evaluation.trajectory_errors import Paired
+from pipeline.geometry import se3
+from pipeline.geometry.trajectory import Trajectory
+
+
+def curved_path(n: int = 50, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    steps = se3.exp(np.concatenate([rng.normal(0.02, 0.02, (n, 3)), rng.normal(0.0, 0.05, (n, 3))], axis=1))
+    poses = [np.eye(4)]
+    for step in steps[1:]:
+        poses.append(poses[-1] @ step)
+    return np.array(poses)
+
+
+STAMPS = np.arange(50, dtype=np.int64) * 33_000_000
+T = se3.exp(np.array([1.0, -2.0, 0.5, 0.3, -0.8, 2.0]))
+
+
+def test_errors_do_not_see_the_choice_of_frame():
+    path = curved_path()
+    pairs = trajectory_errors.pair(Trajectory(STAMPS, path), Trajectory(STAMPS, T @ path))
+    assert len(pairs) == 50
+    assert trajectory_errors.ate_rmse_m(pairs) < 1e-12
+    assert trajectory_errors.rpe(pairs) == pytest.approx((0.0, 0.0), abs=1e-7)  # arccos near one
+
+
+def test_rpe_sees_a_known_wrong_step():
+    path = curved_path()
+    wrong = path.copy()
+    wrong[25:] = path[24] @ se3.exp(np.array([0.1, 0, 0, 0, 0, 0])) @ se3.inverse(path[24]) @ path[25:]
+    trans, rot = trajectory_errors.rpe(Paired(STAMPS, path, wrong))
+    assert trans == pytest.approx(0.1 / np.sqrt(49))
+    assert rot == pytest.approx(0.0, abs=1e-7)
+
+
+def test_frames_without_ground_truth_are_left_out():
+    path = curved_path()
+    true = Trajectory(STAMPS[:20] + 15_000_000, path[:20])
+    pairs = trajectory_errors.pair(true, Trajectory(STAMPS, path))
+    assert pairs.stamps_ns.tolist() == STAMPS[:20].tolist()
+
+
+@pytest.mark.parametrize("n", [0, 2])
+def test_too_few_pairs_are_a_reason_not_a_number(n):
+    path = curved_path()
+    answer = trajectory_errors.ate_rmse_m(Paired(STAMPS[:n], path[:n], path[:n]))
+    assert isinstance(answer, Absent)
+    assert f"found {n}" in answer.reason
+
+
+def test_a_straight_path_is_a_reason_not_a_number():
+    path = np.tile(np.eye(4), (50, 1, 1))
+    path[:, 0, 3] = np.arange(50)
+    answer = trajectory_errors.ate_rmse_m(Paired(STAMPS, path, path))
+    assert isinstance(answer, Absent)
+    assert "one line" in answer.reason
+
+
+def test_only_the_joint_alignment_sees_the_error_between_robots():
+    alpha, bravo = curved_path(seed=1), curved_path(seed=2)
+    shifted = se3.exp(np.array([0.3, 0, 0, 0, 0, 0])) @ bravo
+    pairs_of = {"alpha": Paired(STAMPS, alpha, alpha), "bravo": Paired(STAMPS, bravo, shifted)}
+    assert all(trajectory_errors.ate_rmse_m(p) < 1e-12 for p in pairs_of.values())
+    team = trajectory_errors.team_error(pairs_of)
+    assert not isinstance(team, Absent)
+    assert 0.02 < team.ate_rmse_m < 0.16
+    pooled = np.sqrt(np.mean([team.ate_rmse_m_of["alpha"] ** 2, team.ate_rmse_m_of["bravo"] ** 2]))
+    assert team.ate_rmse_m == pytest.approx(pooled)
+
+
+def test_a_team_of_one_has_no_joint_error():
+    path = curved_path()
+    answer = trajectory_errors.team_error({"alpha": Paired(STAMPS, path, path)})
+    assert isinstance(answer, Absent)
+    assert "only alpha" in answer.reason
