@@ -1,15 +1,19 @@
 """Pose consensus of one robot: relaxed edge-ADMM (Douglas-Rachford form) with per-pair adaptive penalties.
 
 Every closure between two robots is held by one of them, which keeps a *copy* of the other's keyframe beside its own
-poses. For every copied keyframe s there is one edge variable y at each end of the link. Per round a robot
+poses. For every copied keyframe there is one edge variable y at each end of the link. Per round a robot
 
-    1. takes one Gauss-Newton step on  f(x) + 1/2 sum over links |x (-) y|_W^2,   W = penalty * metric,
-    2. sends                           m = x (+) (x (-) y)                        (that is 2 x - y),
-    3. on arrival sets                 y <- y (+) relaxation (m (-) y);
+    1. takes one Gauss-Newton step on  f(x) + 1/2 sum over links |x - y|_W^2,   W = penalty * metric,
+    2. sends                           m = 2 x - y,
+    3. on arrival sets                 y <- y + relaxation (m - y);
 
-a packet that does not arrive changes nothing. At a fixed point x agrees at both ends and the forces W (x (-) y) of
+a packet that does not arrive changes nothing. At a fixed point x agrees at both ends and the forces W (x - y) of
 the two ends cancel, so that x minimises the sum of all robots' costs: the centralised optimum, whatever the
 penalties and the losses on the way were. Source: `docs/consensus.md`; paper eqs. (8), (10), (11), (14), corrected.
+
+On the product group the edge variable is kept as its *offset* d = x - y, a vector of the tangent at x: a step delta
+adds delta to d, m is x (+) d, y is x (+) (-d), and an arrival subtracts relaxation (m (-) y) from d. Unlike the
+logarithm of a pose y, an offset does not wrap at pi, and offsets are large where forces are (d = force / W).
 
 Penalty handshake. The end with the lower name decides. Versions count up from 0, and a packet is used only by a
 receiver of the same version.
@@ -17,13 +21,13 @@ receiver of the same version.
     * Every packet carries the sender's version; the decider's also its penalties; the follower's also its curvature
       once it has received enough in this version.
     * The decider, having received enough itself and holding a curvature of this version, takes new penalties, moves
-      its y so that its force W (x (-) y) stays, and counts the version up.
+      its y so that its force W d stays, and counts the version up.
     * The follower takes over penalties and version from the first newer packet that reaches it, keeping its force
       likewise, and then uses that packet.
 
 So the ends differ by at most one version (the decider cannot decide again before it has heard the follower in the new
 version), a lost packet only delays the follower's change, and what the follower sent before it is dropped by the
-decider, as if lost. Keeping the force keeps every fixed point: there m (-) y = 0 before and after.
+decider, as if lost. Keeping the force keeps every fixed point: there m = y before and after.
 """
 
 from __future__ import annotations
@@ -65,6 +69,8 @@ class PoseConsensusConfig(Config):
     """Adapt the penalties; if not, the first ones stay."""
     relinearise_rad: float = 1e-2
     """The factorisation is kept until rotations moved this much in sum."""
+    step_limit_rad: float = 0.3
+    """A step that turns some keyframe more than this is shortened; nonlinearity makes longer ones worthless."""
     tolerance: float = 1e-5
     """An end is settled when its steps and edge variables change less than this (m, rad)."""
     wire: Literal["float32", "float64"] = "float32"
@@ -148,14 +154,16 @@ class _Link:
     factors: Factors  # the same, between this robot's variables
     weights: Array
     penalties: Array  # [2] translation, rotation
-    y: Array | None = None  # T_world_keyframe [s, 4, 4]
+    offset: Array = field(
+        default_factory=lambda: np.zeros((0, 6))
+    )  # [s, 6] d = x - y (translation, rotation)
     version: int = 0
     sent: int = 0
     received: float = 0.0  # packets since the last change of penalties, parts counted by their share
     received_total: float = 0.0
     newest: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # [s] sequence last used
     newest_header: int = 0
-    change: Array = field(default_factory=lambda: np.zeros(0))  # [s] last change of y (m, rad)
+    change: Array = field(default_factory=lambda: np.zeros(0))  # [s] last change by an arrival (m, rad)
     reference: tuple[Array, Array] | None = None  # force and poses when the curvature window began
     peer_curvature: Array | None = None
     peer_converged: bool = False
@@ -164,6 +172,7 @@ class _Link:
     robust_done: bool = True
 
     def __post_init__(self) -> None:
+        self.offset = np.zeros((len(self.keyframes), 6))
         self.newest = np.zeros(len(self.keyframes), np.int64)
         self.change = np.full(len(self.keyframes), np.inf)
 
@@ -310,8 +319,6 @@ class PoseAgent:
                 count += len(copies)
         self._x = self.T_world_map @ np.concatenate(poses)
         self._factors = Factors.concatenate(parts)
-        for link in self.links.values():
-            link.y = self._x[link.slots]
         self._collect_weights()
 
     def _collect_weights(self) -> None:
@@ -345,7 +352,12 @@ class PoseAgent:
             self._solve, self._moved_rad = pose_factors.factorised(H), 0.0
             self.factorisations += 1
         delta = -self._solve(g.ravel()).reshape(-1, 6)
+        turn_rad = float(np.linalg.norm(delta[:, 3:], axis=1).max())
+        if turn_rad > self.config.step_limit_rad:
+            delta *= self.config.step_limit_rad / turn_rad
         self._x = retract(self._x, delta)
+        for link in self.links.values():
+            link.offset = link.offset + delta[link.slots]
         self._moved_rad += float(np.abs(delta[:, 3:]).max())
         self.step_change = float(np.abs(delta).max())
         self._dual_change = max(
@@ -360,8 +372,7 @@ class PoseAgent:
             self._start()
         link = self.links[peer]
         link.sent += 1
-        x = self._x[link.slots]
-        m = retract(x, difference(x, self._y(link)))
+        m = retract(self._x[link.slots], link.offset)
         curvature = None if link.decides else self._curvature(link)
         return PosePacket(
             sequence=link.sent,
@@ -397,9 +408,9 @@ class PoseAgent:
         m = se3.from_quat_translation(
             packet.quats_wxyz[newer].astype(np.float64), packet.translations[newer].astype(np.float64)
         )
-        y = self._y(link)
-        delta = self.config.relaxation * difference(m, y[at])
-        y[at] = retract(y[at], delta)
+        y = retract(self._x[link.slots[at]], -link.offset[at])
+        delta = self.config.relaxation * difference(m, y)
+        link.offset[at] -= delta
         link.newest[at] = packet.sequence
         link.change[at] = np.abs(delta).max(axis=1)
         share = len(at) / len(link.keyframes)
@@ -409,14 +420,9 @@ class PoseAgent:
 
     # ---- penalties ----
 
-    def _y(self, link: _Link) -> Array:
-        if link.y is None:
-            raise ValueError(f"{self.robot}: the link to {link.peer} has not started")
-        return link.y
-
     def _force(self, link: _Link) -> Array:
-        """W (x (-) y) [s, 6]: the multiplier of this end (dual)."""
-        return link.penalty() * difference(self._x[link.slots], self._y(link))
+        """W (x - y) [s, 6]: the multiplier of this end (dual)."""
+        return link.penalty() * link.offset
 
     def _curvature(self, link: _Link) -> Array | None:
         """Stiffness [2] met on the way since the last change of penalties: |change of force| / |change of pose|.
@@ -462,9 +468,8 @@ class PoseAgent:
         self._change_penalties(link, penalties, link.version + 1)
 
     def _change_penalties(self, link: _Link, penalties: Array, version: int) -> None:
-        """Change W and move y so that the force W (x (-) y) stays."""
-        x = self._x[link.slots]
-        link.y = retract(x, difference(self._y(link), x) * (link.penalties / penalties)[_BLOCK])
+        """Change W and move y so that the force W (x - y) stays."""
+        link.offset = link.offset * (link.penalties / penalties)[_BLOCK]
         link.penalties, link.version = penalties, version
         self._solve = None
         self._mark(link)
@@ -572,7 +577,7 @@ class PoseAgent:
 def graduated_weights(squared: Array, c2: float, mu: float) -> Array:
     """Weights of truncated least squares at control parameter mu (Yang et al. 2020): mu -> infinity truncates at c2."""
     low, high = mu / (mu + 1) * c2, (mu + 1) / mu * c2
-    between = np.sqrt(c2 * mu * (mu + 1) / np.maximum(squared, 1e-300)) - mu
+    between = np.sqrt(c2 * mu * (mu + 1) / np.maximum(squared, low)) - mu
     return np.where(squared <= low, 1.0, np.where(squared >= high, 0.0, between))
 
 

@@ -1,0 +1,132 @@
+"""Closures of a pair: who agrees, on which frame, who holds them, and how frames chain."""
+
+import numpy as np
+
+from pipeline.consensus import factors as pose_factors
+from pipeline.consensus.closures import (
+    Closure,
+    ClosureConfig,
+    chain_frames,
+    closure_factors,
+    consistent,
+    drift,
+    holder,
+    robust_frame,
+)
+from pipeline.consensus.factors import Factors
+from pipeline.geometry import se3
+from tests.consensus.worlds import random_information, random_poses
+
+CONFIG = ClosureConfig()
+
+
+def pair(seed, good=8, bad=6, aliased=0):
+    """Two robots in one room, good closures, random ones, and some that agree on one wrong frame."""
+    rng = np.random.default_rng(seed)
+    own, peer = random_poses(rng, 12), random_poses(rng, 12)
+    T_own_peer, wrong = random_poses(rng, 1, 3.0)[0], random_poses(rng, 1, 3.0)[0]
+    closures = []
+    for frame, count, sigma in ((T_own_peer, good, 0.002), (None, bad, 0.0), (wrong, aliased, 0.002)):
+        for _ in range(count):
+            i, j = int(rng.integers(12)), int(rng.integers(12))
+            T = random_poses(rng, 1)[0] if frame is None else se3.inverse(own[i]) @ frame @ peer[j]
+            closures.append(Closure(i, j, T @ se3.exp(sigma * rng.normal(size=6)), 1e5 * np.eye(6)))
+    chain = Factors(
+        np.arange(11), np.arange(1, 12), se3.inverse(own[:-1]) @ own[1:], np.tile(1e5 * np.eye(6), (11, 1, 1))
+    )
+    truth = np.arange(len(closures)) < good
+    return closures, own, peer, drift(chain, 12, CONFIG), truth, T_own_peer
+
+
+def test_the_consistent_group_is_found_among_outliers():
+    closures, own, peer, grown, truth, T_own_peer = pair(0, good=8, bad=12, aliased=4)
+    found = consistent(closures, own, peer, grown, grown, CONFIG)
+    np.testing.assert_array_equal(found.keep, truth)
+    assert found.support == 8
+    metres, radians = se3.distance(found.T_ownmap_peermap, T_own_peer)
+    assert metres < 0.02
+    assert radians < 0.01
+    assert [reason == "consistent" for reason in found.reasons] == truth.tolist()
+
+
+def test_the_group_does_not_depend_on_the_order_or_the_end():
+    closures, own, peer, grown, truth, _ = pair(1)
+    order = np.random.default_rng(2).permutation(len(closures))
+    found = consistent([closures[k] for k in order], own, peer, grown, grown, CONFIG)
+    np.testing.assert_array_equal(found.keep, truth[order])
+    turned = consistent([c.reversed() for c in closures], peer, own, grown, grown, CONFIG)
+    np.testing.assert_array_equal(turned.keep, truth)
+    both = turned.T_ownmap_peermap @ consistent(closures, own, peer, grown, grown, CONFIG).T_ownmap_peermap
+    np.testing.assert_allclose(both, np.eye(4), atol=0.02)  # the mean is taken in either frame
+
+
+def test_one_closure_alone_is_not_enough():
+    closures, own, peer, grown, _, _ = pair(3, good=1, bad=5)
+    found = consistent(closures, own, peer, grown, grown, CONFIG)
+    assert not found.keep.any()
+    assert found.T_ownmap_peermap is None
+    assert "needs 2" in found.reasons[0]
+    assert consistent([], own, peer, grown, grown, CONFIG).T_ownmap_peermap is None
+
+
+def test_long_odometry_between_closures_forgives_more():
+    """The same disagreement is an outlier between neighbours and drift between far keyframes."""
+    own = np.tile(np.eye(4), (101, 1, 1))
+    offset = se3.exp(np.array([0.1, 0, 0, 0, 0, 0]))
+    near = [Closure(0, 0, np.eye(4), 1e6 * np.eye(6)), Closure(0, 1, offset, 1e6 * np.eye(6))]
+    far = [near[0], Closure(0, 100, offset, 1e6 * np.eye(6))]
+    grown = drift(Factors.empty(), 1, CONFIG)
+    assert grown.tolist() == [[0, 0]]
+    information = np.tile(1e6 * np.eye(6), (100, 1, 1))
+    chain = Factors(np.arange(100), np.arange(1, 101), np.tile(np.eye(4), (100, 1, 1)), information)
+    grown = drift(chain, 101, CONFIG)
+    assert np.all(np.diff(grown, axis=0) > 0)
+    assert not consistent(near, own, own, grown, grown, CONFIG).keep.any()
+    assert consistent(far, own, own, grown, grown, CONFIG).keep.all()
+
+
+def test_unmeasured_steps_count_as_far_drift():
+    grown = drift(Factors.empty(), 3, CONFIG)
+    assert np.all(np.diff(grown, axis=0) >= 1.0)
+
+
+def test_robust_frame_ignores_a_minority():
+    rng = np.random.default_rng(4)
+    T = random_poses(rng, 1)[0]
+    good = T @ se3.exp(0.01 * rng.normal(size=(20, 6)))
+    frame = robust_frame(np.concatenate([random_poses(rng, 12, 3.0), good]), CONFIG)
+    metres, radians = se3.distance(frame, T)
+    assert metres < 0.02
+    assert radians < 0.02
+
+
+def test_a_closure_says_the_same_from_both_ends():
+    rng = np.random.default_rng(5)
+    poses, information = random_poses(rng, 2), random_information(rng, 1)[0]
+    closure = Closure(0, 1, random_poses(rng, 1)[0], information)
+    back = closure.reversed()
+    assert (back.own_keyframe, back.peer_keyframe, back.measured_from_peer) == (1, 0, True)
+    one = pose_factors.cost(closure_factors([closure], [0], [1], CONFIG), poses)
+    other = pose_factors.cost(closure_factors([back], [1], [0], CONFIG), poses)
+    np.testing.assert_allclose(one, other, rtol=1e-12)
+    again = back.reversed()
+    np.testing.assert_allclose(again.T_own_peer, closure.T_own_peer, atol=1e-15)
+    assert not again.measured_from_peer
+
+
+def test_holder_is_the_end_that_copies_fewer_keyframes():
+    star = [Closure(k, 7, np.eye(4), np.eye(6)) for k in range(4)]
+    assert holder("bravo", "alpha", star) == "bravo"
+    assert holder("alpha", "bravo", [c.reversed() for c in star]) == "bravo"
+    assert holder("bravo", "alpha", star[:1]) == "alpha"
+
+
+def test_frames_chain_along_the_best_supported_tree():
+    rng = np.random.default_rng(6)
+    world = dict(zip("abcd", random_poses(rng, 4, 3.0), strict=True))
+    pairs = {(p, q): (se3.inverse(world[p]) @ world[q], 5.0) for p, q in (("a", "b"), ("c", "b"))}
+    pairs["a", "c"] = (random_poses(rng, 1)[0], 1.0)  # weakly supported and wrong
+    frames = chain_frames(pairs, ["d", "c", "b", "a"])
+    for name in "abc":
+        np.testing.assert_allclose(frames[name], se3.inverse(world["a"]) @ world[name], atol=1e-12)
+    np.testing.assert_array_equal(frames["d"], np.eye(4))

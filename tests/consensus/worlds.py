@@ -1,0 +1,223 @@
+"""Small teams with known structure, benchmark graphs, and a network that loses packets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import linalg as sparse_linalg
+
+from pipeline.consensus import factors as pose_factors
+from pipeline.consensus.central import CentralSolution, solve_central, team_graph
+from pipeline.consensus.closures import Closure, ClosureConfig, chain_frames, holder, robust_frame
+from pipeline.consensus.factors import Factors, isotropic_information
+from pipeline.consensus.poses import PoseAgent, PoseConsensusConfig
+from pipeline.geometry import se3, so3
+
+Array = NDArray[np.float64]
+EXACT = ClosureConfig(sigma_floor_m=0, sigma_floor_rad=0, min_support=1, frame_sigma_m=1.0)
+POSE_GRAPHS = Path(__file__).resolve().parents[3] / "shared" / "data" / "pose_graphs"
+
+
+def random_poses(rng: np.random.Generator, n: int, metres: float = 1.0) -> Array:
+    """Poses [n, 4, 4] with any rotation."""
+    quats = rng.normal(size=(n, 4))
+    return se3.from_quat_translation(quats, metres * rng.normal(size=(n, 3)))
+
+
+def random_information(rng: np.random.Generator, n: int) -> Array:
+    """Full, correlated information [n, 6, 6]: standard deviations from 0.3 to 3 cm or hundredths of a radian."""
+    axes = np.linalg.qr(rng.normal(size=(n, 6, 6)))[0]
+    sigma = 10 ** rng.uniform(-2.5, -1.5, size=(n, 1, 6))
+    return axes / sigma**2 @ np.swapaxes(axes, -1, -2)
+
+
+@dataclass
+class TeamWorld:
+    """What the robots of a small team know: maps in frames of their own, odometry, closures by pair (a < b)."""
+
+    maps: dict[str, Array]
+    odometry: dict[str, Factors]
+    closures: dict[tuple[str, str], list[Closure]]
+
+    def agents(
+        self, config: PoseConsensusConfig, keep: dict[tuple[str, str], Sequence[bool]] | None = None
+    ) -> dict[str, PoseAgent]:
+        """Agents with frames chained from their closures, and links."""
+        frames = {}
+        for (a, b), held in self.closures.items():
+            proposals = [
+                self.maps[a][c.own_keyframe] @ c.T_own_peer @ se3.inverse(self.maps[b][c.peer_keyframe])
+                for k, c in enumerate(held)
+                if keep is None or keep[a, b][k]
+            ]
+            frames[a, b] = (robust_frame(np.array(proposals), config.closures), len(proposals))
+        T_world_map = chain_frames(frames, sorted(self.maps))
+        agents = {r: PoseAgent(r, self.maps[r], self.odometry[r], config) for r in sorted(self.maps)}
+        for robot, agent in agents.items():
+            agent.set_frame(T_world_map[robot])
+        for (a, b), held in self.closures.items():
+            start = None if keep is None else keep[a, b]
+            if holder(a, b, held) == a:
+                agents[b].add_link(a, shared=agents[a].add_link(b, held, keep=start))
+            else:
+                turned = [c.reversed() for c in held]
+                agents[a].add_link(b, shared=agents[b].add_link(a, turned, keep=start))
+        return agents
+
+    def optimum(self, agents: dict[str, PoseAgent]) -> tuple[Factors, CentralSolution]:
+        """The same factors in one graph, and their minimum from the same start."""
+        closures = [(a, b, held) for (a, b), held in self.closures.items()]
+        config = next(iter(agents.values())).config.closures
+        starts = {r: agent.T_world_keyframe for r, agent in agents.items()}
+        team = team_graph(starts, {r: agent.odometry for r, agent in agents.items()}, closures, config)
+        return team.factors, solve_central(team.factors, team.T_start)
+
+
+def make_team(
+    seed: int, robots: int = 3, keyframes: int = 8, closures: int = 3, ring: bool = False
+) -> TeamWorld:
+    """Robots on one looping path, with noise of centimetres, each map in an arbitrary frame of its own."""
+    rng = np.random.default_rng(seed)
+    names = ["alpha", "bravo", "charlie", "delta", "echo"][:robots]
+    truth = {name: random_poses(rng, keyframes) for name in names}
+    maps, odometry = {}, {}
+    for name in names:
+        information = random_information(rng, keyframes - 1)
+        noise = np.linalg.solve(
+            np.linalg.cholesky(information).swapaxes(-1, -2), rng.normal(size=(keyframes - 1, 6, 1))
+        )
+        steps = se3.inverse(truth[name][:-1]) @ truth[name][1:] @ se3.exp(noise[..., 0])
+        chain = [random_poses(rng, 1, 5.0)[0]]
+        for step in steps:
+            chain.append(chain[-1] @ step)
+        maps[name] = np.array(chain)
+        odometry[name] = Factors(np.arange(keyframes - 1), np.arange(1, keyframes), steps, information)
+    pairs = [(names[k], names[k + 1]) for k in range(robots - 1)]
+    if ring and robots > 2:
+        pairs.append((names[0], names[-1]))
+    found = {}
+    for a, b in pairs:
+        held = []
+        for _ in range(closures):
+            i, j = int(rng.integers(keyframes)), int(rng.integers(keyframes))
+            information = random_information(rng, 1)[0]
+            noise_ij = np.linalg.solve(np.linalg.cholesky(information).T, rng.normal(size=6))
+            T = se3.inverse(truth[a][i]) @ truth[b][j] @ se3.exp(noise_ij)
+            held.append(Closure(i, j, T, information))
+        found[a, b] = held
+    return TeamWorld(maps, odometry, found)
+
+
+def talk(agents: dict[str, PoseAgent], rounds: int, loss: float = 0.0, seed: int = 0, **faults: float) -> int:
+    """Run rounds until all agree; returns how many. Faults: `twice`, chance that a packet is delivered again later;
+    `cut`, chance that it arrives as two halves of which one may be lost."""
+    rng = np.random.default_rng(seed)
+    late = []
+    for k in range(rounds):
+        sent = []
+        for robot, agent in agents.items():
+            agent.step()
+            sent += [(robot, peer, agent.outgoing(peer)) for peer in agent.links]
+        sent, late = sent + late, []
+        for robot, peer, packet in sent:
+            parts = [packet]
+            if rng.random() < faults.get("cut", 0.0):
+                half = len(packet.keyframes) // 2
+                parts = [packet.part(slice(0, half)), packet.part(slice(half, None))]
+            for part in parts:
+                if len(part.keyframes) and rng.random() >= loss:
+                    agents[peer].receive(robot, part)
+                if rng.random() < faults.get("twice", 0.0):
+                    late.append((robot, peer, part))
+        if all(agent.agreed for agent in agents.values()):
+            return k + 1
+    return rounds
+
+
+def team_poses(agents: dict[str, PoseAgent]) -> Array:
+    """All keyframes one after the other, in order of name, in the root's map frame."""
+    root = agents[min(agents)]
+    for agent in agents.values():
+        agent.apply_gauge(root.gauge_correction())
+    return np.concatenate([agents[r].T_world_keyframe for r in sorted(agents)])
+
+
+def from_first(poses: Array) -> Array:
+    """Poses as seen from the first: what does not depend on the gauge."""
+    return se3.inverse(poses[0]) @ poses
+
+
+# ---- benchmark graphs ----
+
+
+def read_g2o(name: str) -> Factors:
+    """A benchmark graph with SE-Sync's isotropic weights; skips the test if it is not there."""
+    path = POSE_GRAPHS / name
+    if not path.exists():
+        pytest.skip(f"needs {name} in ../shared/data/pose_graphs, which is not distributed with the project")
+    rows = [line.split() for line in path.read_text().splitlines() if line.startswith("EDGE_SE3:QUAT")]
+    values = np.array([[float(x) for x in row[3:]] for row in rows])
+    upper = np.triu_indices(6)
+    full = np.zeros((len(rows), 6, 6))
+    full[:, upper[0], upper[1]] = values[:, 7:28]
+    full[:, upper[1], upper[0]] = values[:, 7:28]
+    tau = 3 / np.trace(np.linalg.inv(full[:, :3, :3]), axis1=1, axis2=2)
+    kappa = 3 / (2 * np.trace(np.linalg.inv(full[:, 3:, 3:]), axis1=1, axis2=2))
+    T = se3.from_quat_translation(values[:, [6, 3, 4, 5]], values[:, :3])
+    i, j = np.array([int(row[1]) for row in rows]), np.array([int(row[2]) for row in rows])
+    return Factors(i, j, T, isotropic_information(kappa, tau))
+
+
+def chordal(factors: Factors, n: int) -> Array:
+    """Chordal start [n, 4, 4] of a connected isotropic graph: linear rotations, then linear translations."""
+    m, R = len(factors), factors.T_i_j[:, :3, :3]
+    root = np.sqrt(factors.information[:, 3, 3] / 2)
+    rows, columns, values = [], [], []
+    for a in range(3):
+        e = 3 * np.arange(m) + a
+        rows += [e] * 4
+        columns += [3 * factors.j + a, *(3 * factors.i + b for b in range(3))]
+        values += [root, *(-root * R[:, b, a] for b in range(3))]
+    index = (np.concatenate(rows), np.concatenate(columns))
+    M = sparse.csc_matrix((np.concatenate(values), index), shape=(3 * m, 3 * n))
+    Y = np.concatenate([np.eye(3), np.zeros((3 * n - 3, 3))])
+    Y[3:] = sparse_linalg.splu((M[:, 3:].T @ M[:, 3:]).tocsc()).solve(-(M[:, 3:].T @ M[:, :3]).toarray())
+    rotations = so3.project(Y.reshape(n, 3, 3).swapaxes(-1, -2))
+    e, root = np.arange(m), np.sqrt(factors.information[:, 0, 0])
+    index = (np.concatenate([e, e]), np.concatenate([factors.j, factors.i]))
+    B = sparse.csc_matrix((np.concatenate([root, -root]), index), shape=(m, n))[:, 1:]
+    right = root[:, None] * (rotations[factors.i] @ factors.T_i_j[:, :3, 3:])[..., 0]
+    t = np.concatenate([np.zeros((1, 3)), sparse_linalg.splu((B.T @ B).tocsc()).solve(B.T @ right)])
+    return se3.from_rotation_translation(rotations, t)
+
+
+def cut(factors: Factors, robots: int) -> TeamWorld:
+    """Cut a graph by vertex number into equal robots, each with its own optimum in its own frame."""
+    n = int(max(factors.i.max(), factors.j.max())) + 1
+    owner = np.minimum(np.arange(n) * robots // n, robots - 1)
+    first = np.searchsorted(owner, np.arange(robots))
+    names = [f"robot{a}" for a in range(robots)]
+    maps, odometry, pairs = {}, {}, {}
+    for a, name in enumerate(names):
+        own = factors.select((owner[factors.i] == a) & (owner[factors.j] == a))
+        odometry[name] = Factors(own.i - first[a], own.j - first[a], own.T_i_j, own.information)
+        maps[name] = solve_central(odometry[name], chordal(odometry[name], int((owner == a).sum()))).poses
+    for k in np.flatnonzero(owner[factors.i] != owner[factors.j]):
+        a, b = int(owner[factors.i[k]]), int(owner[factors.j[k]])
+        i, j = int(factors.i[k] - first[a]), int(factors.j[k] - first[b])
+        closure = Closure(i, j, factors.T_i_j[k], factors.information[k])
+        if a > b:
+            a, b, closure = b, a, closure.reversed()
+        pairs.setdefault((names[a], names[b]), []).append(closure)
+    return TeamWorld(maps, odometry, pairs)
+
+
+def team_cost(factors: Factors, agents: dict[str, PoseAgent]) -> float:
+    """The central cost at the agents' own estimates."""
+    return pose_factors.cost(factors, np.concatenate([agents[r].T_world_keyframe for r in sorted(agents)]))
