@@ -1,0 +1,207 @@
+"""Messages read back bit for bit, and broken ones say what is wrong."""
+
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import schemas
+from pipeline import messages as m
+from pipeline.errors import DuagError
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.splat.gaussians import Gaussians
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def pose(rng: np.random.Generator) -> np.ndarray:
+    return se3.exp(rng.normal(size=6))
+
+
+def information(rng: np.random.Generator) -> np.ndarray:
+    A = rng.normal(size=(6, 6))
+    return A @ A.T
+
+
+def gaussians(rng: np.random.Generator, n: int) -> Gaussians:
+    tails = {"means": (3,), "quats_wxyz": (4,), "log_scales": (3,), "colors": (3,), "opacity_logits": ()}
+    arrays: dict[str, Any] = {
+        name: rng.normal(size=(n, *tail)).astype(np.float32) for name, tail in tails.items()
+    }
+    return Gaussians(ids=rng.permutation(n), anchors=rng.integers(0, 9, n).astype(np.int32), **arrays)
+
+
+def gaussian_information(rng: np.random.Generator, n: int) -> m.GaussianInformation:
+    return m.GaussianInformation(
+        stamp_ns=int(rng.integers(2**62)),
+        robot="alpha",
+        kind="gauss_newton",
+        window="all keyframes",
+        ids=rng.integers(-(2**63), 2**63 - 1, n),
+        geometry=rng.normal(size=(n, 45)).astype(np.float32),
+        color=rng.normal(size=(n, 3)).astype(np.float32),
+        opacity=rng.normal(size=n).astype(np.float32),
+        observations=rng.integers(0, 2**32 - 1, n).astype(np.uint32),
+        color_sigma=0.03,
+        depth_sigma="0.0012 + 0.0019 (z - 0.4)^2",
+        frame_id="alpha/map",
+    )
+
+
+def all_messages(seed: int, n: int) -> list[Any]:
+    rng = np.random.default_rng(seed)
+    stamp = int(rng.integers(2**62))
+    k = n % 5
+    status = ("ok", "lost", "relocalised")[seed % 3]
+    T = np.array([pose(rng) for _ in range(k)]).reshape(k, 4, 4)
+    component = ["alpha", "bravo"]
+    return [
+        m.Odometry(
+            stamp, "alpha", 4, True, 0, pose(rng), pose(rng), information(rng), status, 0.5, 0.01, 0.02
+        ),
+        m.Keyframe(stamp, "alpha", 3, 40, pose(rng), 2, pose(rng), information(rng), (0.1, -0.02)),
+        m.Keyframe(stamp, "alpha", 0, 0, np.eye(4), -1, np.eye(4), np.zeros((6, 6)), (0.0, 0.0)),
+        m.MapUpdate(stamp, "alpha", 3, n, 2, 2**40, 0.1, 0.05),
+        gaussian_information(rng, n),
+        m.GaussianMap(stamp, "alpha", "world", gaussians(rng, n), gaussian_information(rng, n)),
+        m.GaussianMap(stamp, "alpha", "alpha/map", gaussians(rng, n)),
+        m.CorrectedKeyframes(stamp, "alpha", component, np.arange(k, dtype=np.int32), T),
+    ]
+
+
+def assert_same(a: Any, b: Any) -> None:
+    assert type(a) is type(b)
+    if is_dataclass(a):
+        for field in fields(a):
+            assert_same(getattr(a, field.name), getattr(b, field.name))
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype
+        assert a.shape == b.shape
+        assert a.tobytes() == b.tobytes()
+        assert b.flags.writeable
+    else:
+        assert a == b
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=SEEDS, n=st.integers(0, 20))
+def test_messages_read_back_bit_for_bit(seed: int, n: int) -> None:
+    for message in all_messages(seed, n):
+        packed = message.pack()
+        read = type(packed).FromString(packed.SerializeToString(deterministic=True))
+        assert_same(message, m.unpack(read))
+        assert packed.DESCRIPTOR.full_name == message.schema
+
+
+def test_every_dataclass_is_read_by_the_name_of_its_schema() -> None:
+    assert {c.schema for c in (type(x) for x in all_messages(0, 1))} == set(m._UNPACK)
+
+
+def test_a_message_without_dataclass_stays_as_it_is() -> None:
+    proto = schemas.new("Vector3", x=1.0)
+    assert m.unpack(proto) is proto
+
+
+@pytest.mark.parametrize(
+    ("schema", "fields", "words"),
+    [
+        ("Odometry", {}, "status"),
+        ("Odometry", {"status": 1}, "rotation"),
+        ("GaussianArrays", {"count": 2, "ids_int64": b"1234567"}, "ids_int64 has 7 bytes, expected 16"),
+        ("GaussianArrays", {"count": 2**63}, "ids_int64 has 0 bytes"),
+        ("CorrectedKeyframes", {"count": 2**62}, "poses_world_keyframe_float64 has 0 bytes"),
+        (
+            "GaussianInformation",
+            {"count": 1, "ids_int64": b"12345678"},
+            "geometry_float32 has 0 bytes, expected 180",
+        ),
+    ],
+)
+def test_broken_messages_say_what_is_wrong(schema: str, fields: dict[str, Any], words: str) -> None:
+    message = schemas.new(schema, **fields)
+    with pytest.raises(DuagError, match=words):
+        m.unpack_gaussians(message) if schema == "GaussianArrays" else m.unpack(message)
+
+
+def test_wrong_shapes_are_bugs() -> None:
+    rng = np.random.default_rng(0)
+    with pytest.raises(ValueError, match=r"\[4, 4\]"):
+        m.pack_pose(np.eye(3))
+    good = gaussian_information(rng, 3)
+    with pytest.raises(ValueError, match="geometry"):
+        m.GaussianInformation(**{**vars(good), "geometry": good.geometry[:2]})
+
+
+def test_cameras_and_depth_read_back() -> None:
+    camera = PinholeCamera(7, 5, 3.5, 3.25, 2.9, 2.1)
+    assert m.unpack_calibration(m.pack_calibration(5, "alpha", camera)) == camera
+    depth = np.arange(35, dtype=np.uint16).reshape(5, 7) * 1000
+    assert np.array_equal(m.unpack_depth(m.pack_depth(5, "alpha", depth), "here"), depth)
+
+
+def test_rows_of_depth_may_be_padded() -> None:
+    message = m.pack_depth(5, "alpha", np.arange(12, dtype=np.uint16).reshape(3, 4))
+    message.width, message.step = 3, 8
+    assert m.unpack_depth(message, "here").tolist() == [[0, 1, 2], [4, 5, 6], [8, 9, 10]]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"encoding": "32FC1"}, "here is 32FC1, expected 16UC1"),
+        ({"step": 6}, "rows of 6 bytes"),
+        ({"height": 4}, "expected 32"),
+        ({"height": 0}, "4x0"),
+    ],
+)
+def test_other_depth_is_refused(change: dict[str, Any], words: str) -> None:
+    message = m.pack_depth(5, "alpha", np.zeros((3, 4), np.uint16))
+    for name, value in change.items():
+        setattr(message, name, value)
+    with pytest.raises(DuagError, match=words):
+        m.unpack_depth(message, "here")
+
+
+@pytest.mark.parametrize(
+    ("K", "words"),
+    [
+        ([1.0], "1 numbers"),
+        ([np.nan, 0, 1, 0, 1, 1, 0, 0, 1], "finite"),
+        ([-1, 0, 1, 0, 1, 1, 0, 0, 1], "positive"),
+        ([1, 0.1, 1, 0, 1, 1, 0, 0, 1], "skew"),
+        ([1, 0, 1, 0, 1, 1, 0, 0, 2], "skew"),
+    ],
+)
+def test_other_calibrations_are_refused(K: list[float], words: str) -> None:
+    message = m.pack_calibration(5, "alpha", PinholeCamera(4, 3, 2, 2, 1, 1))
+    message.K[:] = K
+    with pytest.raises(DuagError, match=words):
+        m.unpack_calibration(message)
+    message = m.pack_calibration(5, "alpha", PinholeCamera(4, 3, 2, 2, 1, 1))
+    message.D[:] = [0.1]
+    with pytest.raises(DuagError, match="distortion"):
+        m.unpack_calibration(message)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=SEEDS)
+def test_poses_in_frames_read_back(seed: int) -> None:
+    T = pose(np.random.default_rng(seed))
+    message = m.pack_pose_in_frame(123, "world", T)
+    np.testing.assert_allclose(m.unpack_pose_in_frame(message), T, atol=1e-14)  # one unit quaternion away
+    assert m.unpack_stamp(message) == 123
+
+
+def test_poses_that_are_none_are_refused() -> None:
+    message = m.pack_pose_in_frame(123, "world", np.eye(4))
+    message.pose.position.x = np.inf
+    with pytest.raises(DuagError, match="finite"):
+        m.unpack_pose_in_frame(message)
+    message = m.pack_pose_in_frame(123, "world", np.eye(4))
+    message.pose.orientation.w = 0.0
+    with pytest.raises(DuagError, match="rigid"):
+        m.unpack_pose_in_frame(message)
