@@ -1,0 +1,127 @@
+// What every build of the kernels and the Python module share: plain data and scratch memory, no code of the STL
+// (a template compiled here with AVX-512 must never be the one that the linker picks for all builds).
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+namespace raster {
+
+// Out of line on purpose, compiled for the plain machine; both throw std::bad_alloc.
+void* allocate_aligned(size_t bytes);
+void release_aligned(void* memory);
+
+// Growable memory, 64-byte aligned, kept between calls; growing does not keep the content unless asked to.
+template <class T>
+class Scratch {
+public:
+    Scratch() = default;
+    Scratch(const Scratch&) = delete;
+    ~Scratch() { release_aligned(data_); }
+
+    __attribute__((always_inline)) T* need(size_t count) {
+        if (count > capacity_) grow(count, 0);
+        return data_;
+    }
+    __attribute__((always_inline)) T* need_keeping(size_t count, size_t kept) {
+        if (count > capacity_) grow(count, kept);
+        return data_;
+    }
+    __attribute__((always_inline)) T* data() const { return data_; }
+
+private:
+    __attribute__((always_inline)) void grow(size_t count, size_t kept) {
+        const size_t capacity = count + count / 4 + 64;
+        T* memory = static_cast<T*>(allocate_aligned(capacity * sizeof(T)));
+        if (kept) __builtin_memcpy(memory, data_, kept * sizeof(T));
+        release_aligned(data_);
+        data_ = memory;
+        capacity_ = capacity;
+    }
+    T* data_ = nullptr;
+    size_t capacity_ = 0;
+};
+
+// Pinhole camera at its pose; pixel centres are the integers. R, t: T_camera_map, R row by row.
+struct View {
+    float R[9], t[3];
+    float fx, fy, cx, cy;
+    int width, height;
+    float background[3];
+};
+
+// n Gaussians, arrays of the caller, row-major.
+struct GaussianArrays {
+    size_t count;
+    const float *means, *quats_wxyz, *log_scales, *colors, *opacity_logits;
+};
+
+// A Gaussian on the screen, one cache line: log2 alpha(d) = log2_opacity - (A dx^2 + B dx dy + C dy^2).
+struct alignas(64) Splat {
+    float u, v;                // centre, px
+    float A, B, C;             // conic, in powers of two
+    float log2_opacity;
+    float r, g, b, z;          // colour, depth in metres
+    float extent_x, extent_y;  // half size of the box in which alpha >= 1/255, px
+    uint32_t id;               // index in the caller's arrays
+};
+
+// One Gaussian in one tile. Low half of blocks: 4x4 blocks it may touch; high half: blocks where it was blended.
+struct Intersection {
+    uint32_t splat, row, blocks;
+};
+struct BinRecord {
+    uint32_t tile, blocks;
+};
+
+constexpr int TILE = 16;                   // pixels; a tile is 16 blocks of 4x4, a block is one vector
+constexpr int TILE_PIXELS = TILE * TILE;
+constexpr int DEPTH_CHUNKS = 16;           // fixed, so that no result depends on the number of threads
+constexpr int POSE_CHUNKS = 64;
+constexpr int GRADIENT_SUMS = 16;          // one cache line; 10 used
+constexpr int INFORMATION_SUMS = 24;       // 16 + 8
+
+// Everything between the calls of one rasterizer.
+struct Frame {
+    View view;
+    int threads = 1;
+    size_t count = 0, visible = 0, intersection_count = 0;
+    int tiles_x = 0, tiles_y = 0;
+
+    Scratch<Splat> splats_by_id, splats;  // the latter in order of depth
+    Scratch<uint32_t> keys, keys_swap, order, order_swap;
+    Scratch<BinRecord> chunk_records[DEPTH_CHUNKS];
+    Scratch<uint32_t> chunk_tile_counts;
+    Scratch<uint32_t> first_row;          // per splat, visible + 1: its rows are contiguous
+    Scratch<uint32_t> tile_start;         // tiles + 1
+    Scratch<Intersection> intersections;  // by tile, then depth
+    Scratch<float> transmittance, stop;   // per tile, in block order; stop: list position at which a pixel closed
+    Scratch<float> gradient_rows, information_rows16, information_rows8;
+    Scratch<double> pose_parts;
+};
+
+struct GradientArrays {
+    float *means, *quats_wxyz, *log_scales, *colors, *opacity_logits;
+    float* fisher_diagonal;  // [n, 14] or null
+    double* pose;            // [6] or null
+};
+
+struct FisherArrays {
+    double *geometry, *color, *opacity;  // [n, 45], [n, 3], [n], added to
+    uint32_t* observations;              // [n], added to
+};
+
+enum class Status { ok, bad_gaussians, bad_first_image, bad_second_image, bad_third_image, too_many_intersections };
+
+// One build of the kernels for one instruction set.
+struct Kernels {
+    const char* name;
+    Status (*forward)(Frame&, const GaussianArrays&, float* color, float* depth, float* alpha);
+    Status (*backward)(Frame&, const GaussianArrays&, const float* d_color, const float* d_depth,
+                       const float* d_alpha, const GradientArrays&);
+    Status (*fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth,
+                     const FisherArrays&);
+    void (*contributions)(Frame&, float* weights, uint32_t* pixels);
+};
+
+}  // namespace raster

@@ -1,0 +1,267 @@
+// From rows of screen sums to the parameters of every Gaussian, sixteen Gaussians at a time.
+#pragma once
+
+#include "blending.h"
+
+namespace KERNEL_ISA {
+
+// Sixteen neighbours in the order of depth (the last group repeats its first), projected again.
+struct Group {
+    int lanes;
+    size_t first;
+    uint32_t ids[LANES];
+    Parameters16 parameters;
+    Splat16 splat;
+    Group(const Frame& frame, const GaussianArrays& gaussians, size_t group) : first(group * LANES) {
+        lanes = frame.visible - first < LANES ? static_cast<int>(frame.visible - first) : LANES;
+        for (int lane = 0; lane < LANES; lane++) ids[lane] = frame.splats.data()[first + (lane < lanes ? lane : 0)].id;
+        parameters = gather_parameters(gaussians, ids);
+        splat = project16(frame.view, parameters.mean, parameters.quat, parameters.log_scale);
+    }
+    // Sums of the rows of each Gaussian, in order of the rows; sums[k] holds column k of the sixteen.
+    template <int WIDTH>
+    void reduce(const Frame& frame, const float* rows, Vec* sums) const {
+        alignas(64) float columns[WIDTH][LANES];
+        for (int lane = 0; lane < LANES; lane++) {
+            alignas(64) float total[WIDTH] = {};
+            if (lane < lanes) {
+                const size_t i = first + lane;
+                for (uint32_t row = frame.first_row.data()[i]; row < frame.first_row.data()[i + 1]; row++)
+                    for (int k = 0; k < WIDTH; k++) total[k] += rows[static_cast<size_t>(row) * WIDTH + k];
+            }
+            for (int k = 0; k < WIDTH; k++) columns[k][lane] = total[k];
+        }
+        for (int k = 0; k < WIDTH; k++) sums[k] = load(columns[k]);
+    }
+};
+
+// Column k of the rows `ids` of a row-major array becomes values[k].
+template <int WIDTH>
+inline void scatter(const Vec* values, const Group& group, float* array) {
+    alignas(64) float columns[WIDTH][LANES];
+    for (int k = 0; k < WIDTH; k++) store(columns[k], values[k]);
+    for (int lane = 0; lane < group.lanes; lane++)
+        for (int k = 0; k < WIDTH; k++) array[static_cast<size_t>(group.ids[lane]) * WIDTH + k] = columns[k][lane];
+}
+// The same, added to an array of doubles.
+template <int WIDTH>
+inline void scatter_add(const Vec* values, const Group& group, double* array) {
+    alignas(64) float columns[WIDTH][LANES];
+    for (int k = 0; k < WIDTH; k++) store(columns[k], values[k]);
+    for (int lane = 0; lane < group.lanes; lane++)
+        for (int k = 0; k < WIDTH; k++) array[static_cast<size_t>(group.ids[lane]) * WIDTH + k] += columns[k][lane];
+}
+
+// Gram matrix of one pixel sum: entry (k, l) is the sum of w2 m_k m_l over the monomials m = (dx, dy, dx^2, dx dy, dy^2),
+// row and column 5 the direct derivative of depth.
+struct ScreenGram {
+    Vec g[6][6];
+    explicit ScreenGram(const Vec* s) {
+        const InformationSum upper[6][6] = {
+            {INFO_XX, INFO_XY, INFO_XXX, INFO_XXY, INFO_XYY, INFO_ZX},
+            {INFO_XY, INFO_YY, INFO_XXY, INFO_XYY, INFO_YYY, INFO_ZY},
+            {INFO_XXX, INFO_XXY, INFO_XXXX, INFO_XXXY, INFO_XXYY, INFO_ZXX},
+            {INFO_XXY, INFO_XYY, INFO_XXXY, INFO_XXYY, INFO_XYYY, INFO_ZXY},
+            {INFO_XYY, INFO_YYY, INFO_XXYY, INFO_XYYY, INFO_YYYY, INFO_ZYY},
+            {INFO_ZX, INFO_ZY, INFO_ZXX, INFO_ZXY, INFO_ZYY, INFO_ZZ},
+        };
+        for (int k = 0; k < 6; k++)
+            for (int l = 0; l < 6; l++) g[k][l] = s[upper[k][l]];
+    }
+};
+
+// Derivatives of the per-pixel coefficients of (dx, dy, dx^2, dx dy, dy^2, depth) by the centre in the map frame, and
+// the cotangents Y of Sigma in own axes that belong to the three quadratic ones.
+struct ScreenDerivatives {
+    Vec by_mean[6][3];
+    Vec Y[3][6];
+    ScreenDerivatives(const View& view, const Splat16& s) {
+        const Vec zero(0.0f), one(1.0f);
+        Vec centre[3];
+        auto clear = [&] { centre[0] = centre[1] = centre[2] = zero; };
+        clear();
+        add_centre_from_screen(s, s.A, s.B, centre);  // d(-sigma)/d centre = K d
+        to_map_frame(view, centre, by_mean[0]);
+        clear();
+        add_centre_from_screen(s, s.B, s.C, centre);
+        to_map_frame(view, centre, by_mean[1]);
+        for (int k = 0; k < 3; k++) {
+            Vec Q[6], d_J[6];
+            const Symmetric2 c = covariance_cotangent(s, k == 0 ? one : zero, k == 1 ? one : zero, k == 2 ? one : zero);
+            own_axes_cotangent(s, c, Q, Y[k]);
+            jacobian_cotangent(s, Q, d_J);
+            clear();
+            add_centre_from_jacobian(s, d_J, centre);
+            to_map_frame(view, centre, by_mean[2 + k]);
+        }
+        for (int i = 0; i < 3; i++) by_mean[5][i] = Vec(view.R[6 + i]);
+    }
+};
+
+// sum_kl a_k G[first + k][other + l] b_l over ROWS x COLUMNS.
+template <int ROWS, int COLUMNS>
+inline Vec quadratic_form(const ScreenGram& gram, int row, int column, const Vec* a, const Vec* b) {
+    Vec total(0.0f);
+    for (int k = 0; k < ROWS; k++) {
+        Vec inner(0.0f);
+        for (int l = 0; l < COLUMNS; l++) inner = fma(gram.g[row + k][column + l], b[l], inner);
+        total = fma(a[k], inner, total);
+    }
+    return total;
+}
+
+// ---------------------------------------------------------------- gradients
+
+// Diagonal of sum_p (d L_p / d theta)^2, order mean 3, quaternion 4, log-scale 3, colour 3, logit 1.
+inline void empirical_diagonal(const View& view, const Splat16& s, Vec transparency, const Vec* info, Vec* diagonal) {
+    const ScreenGram gram(info);
+    const ScreenDerivatives derivatives(view, s);
+    Vec by_quat[3][4], by_scale[3][3];
+    for (int k = 0; k < 3; k++) {
+        quaternion_cotangent(s, derivatives.Y[k], by_quat[k]);
+        log_scale_cotangent(s, derivatives.Y[k], by_scale[k]);
+    }
+    for (int i = 0; i < 3; i++) {
+        Vec column[6];
+        for (int k = 0; k < 6; k++) column[k] = derivatives.by_mean[k][i];
+        diagonal[i] = quadratic_form<6, 6>(gram, 0, 0, column, column);
+    }
+    for (int i = 0; i < 4; i++) {
+        const Vec column[3] = {by_quat[0][i], by_quat[1][i], by_quat[2][i]};
+        diagonal[3 + i] = quadratic_form<3, 3>(gram, 2, 2, column, column);
+    }
+    for (int i = 0; i < 3; i++) {
+        const Vec column[3] = {by_scale[0][i], by_scale[1][i], by_scale[2][i]};
+        diagonal[7 + i] = quadratic_form<3, 3>(gram, 2, 2, column, column);
+        diagonal[10 + i] = info[INFO_R + i];
+    }
+    diagonal[13] = transparency * transparency * info[INFO_1];
+}
+
+inline void gradient_group(const Frame& frame, const GaussianArrays& gaussians, size_t index, const GradientArrays& out,
+                           double* pose) {
+    const Group group(frame, gaussians, index);
+    const Splat16& s = group.splat;
+    Vec sums[GRADIENT_SUMS];
+    group.reduce<GRADIENT_SUMS>(frame, frame.gradient_rows.data(), sums);
+
+    Vec Q[6], Y[6], d_J[6], centre[3] = {Vec(0.0f), Vec(0.0f), Vec(0.0f)}, mean[3], quat[4], log_scale[3];
+    own_axes_cotangent(s, covariance_cotangent(s, sums[SUM_WXX], sums[SUM_WXY], sums[SUM_WYY]), Q, Y);
+    jacobian_cotangent(s, Q, d_J);
+    add_centre_from_jacobian(s, d_J, centre);
+    add_centre_from_screen(s, fma(s.A, sums[SUM_WX], s.B * sums[SUM_WY]), fma(s.B, sums[SUM_WX], s.C * sums[SUM_WY]), centre);
+    centre[2] += sums[SUM_Z];
+    to_map_frame(frame.view, centre, mean);
+    quaternion_cotangent(s, Y, quat);
+    log_scale_cotangent(s, Y, log_scale);
+    const Vec transparency = sigmoid(-group.parameters.logit), logit = sums[SUM_W] * transparency;
+    scatter<3>(mean, group, out.means);
+    scatter<4>(quat, group, out.quats_wxyz);
+    scatter<3>(log_scale, group, out.log_scales);
+    scatter<3>(sums + SUM_R, group, out.colors);
+    scatter<1>(&logit, group, out.opacity_logits);
+
+    if (out.pose) {
+        Vec by_pose[6];
+        alignas(64) float lanes[LANES];
+        pose_cotangent(s, centre, d_J, by_pose);
+        for (int k = 0; k < 6; k++) {
+            store(lanes, by_pose[k]);
+            for (int lane = 0; lane < group.lanes; lane++) pose[k] += lanes[lane];
+        }
+    }
+    if (out.fisher_diagonal) {
+        Vec info[INFORMATION_SUMS], diagonal[14];
+        group.reduce<16>(frame, frame.information_rows16.data(), info);
+        group.reduce<8>(frame, frame.information_rows8.data(), info + 16);
+        empirical_diagonal(frame.view, s, transparency, info, diagonal);
+        scatter<14>(diagonal, group, out.fisher_diagonal);
+    }
+}
+
+inline size_t group_count(const Frame& frame) { return (frame.visible + LANES - 1) / LANES; }
+
+// Gradients of all drawn Gaussians; the pose sums in 64 fixed chunks, in double, added in order.
+inline void gradients_of_parameters(Frame& frame, const GaussianArrays& gaussians, const GradientArrays& out) {
+    const size_t groups = group_count(frame);
+    double* parts = frame.pose_parts.need(POSE_CHUNKS * 6);
+    std::memset(parts, 0, sizeof(double) * POSE_CHUNKS * 6);
+#pragma omp parallel for schedule(dynamic, 1) num_threads(frame.threads) if (frame.threads > 1)
+    for (int chunk = 0; chunk < POSE_CHUNKS; chunk++) {
+        double pose[6] = {};
+        for (size_t g = groups * chunk / POSE_CHUNKS; g < groups * (chunk + 1) / POSE_CHUNKS; g++)
+            gradient_group(frame, gaussians, g, out, pose);
+        std::memcpy(parts + 6 * chunk, pose, sizeof pose);
+    }
+    if (!out.pose) return;
+    for (int k = 0; k < 6; k++) {
+        double total = 0;
+        for (int chunk = 0; chunk < POSE_CHUNKS; chunk++) total += parts[6 * chunk + k];
+        out.pose[k] = total;
+    }
+}
+
+// ---------------------------------------------------------------- information
+
+// Derivatives by vec log Sigma (xx, yy, zz, sqrt2 xy, sqrt2 xz, sqrt2 yz; map frame). By Daleckii and Krein the derivative of
+// Sigma = exp(L) in the axes R of L is the Hadamard product with the divided differences of exp, so the cotangent of L is
+// R (D o Y) R^T.
+inline void log_covariance_cotangent(const Splat16& s, const Vec* Y, const Vec* differences, Vec* d_log) {
+    Vec X[9], RX[9];
+    for (int k = 0; k < 3; k++) X[4 * k] = s.scale[k] * s.scale[k] * Y[k];
+    X[1] = X[3] = differences[0] * Y[3];
+    X[2] = X[6] = differences[1] * Y[4];
+    X[5] = X[7] = differences[2] * Y[5];
+    for (int i = 0; i < 3; i++)
+        for (int k = 0; k < 3; k++)
+            RX[3 * i + k] = fma(s.R[3 * i], X[k], fma(s.R[3 * i + 1], X[3 + k], s.R[3 * i + 2] * X[6 + k]));
+    auto entry = [&](int i, int j) {
+        return fma(RX[3 * i], s.R[3 * j], fma(RX[3 * i + 1], s.R[3 * j + 1], RX[3 * i + 2] * s.R[3 * j + 2]));
+    };
+    const Vec sqrt2(1.41421356f);
+    d_log[0] = entry(0, 0);
+    d_log[1] = entry(1, 1);
+    d_log[2] = entry(2, 2);
+    d_log[3] = sqrt2 * entry(0, 1);
+    d_log[4] = sqrt2 * entry(0, 2);
+    d_log[5] = sqrt2 * entry(1, 2);
+}
+
+// Upper triangle, row by row, of the 9x9 information in (mean, vec log Sigma), map frame.
+inline void geometry_information(const View& view, const Splat16& s, const Vec* info, Vec* upper) {
+    const ScreenGram gram(info);
+    const ScreenDerivatives derivatives(view, s);
+    auto difference = [&](int i, int k) {
+        return exp2x_divided_difference(s.log_scale[i], s.log_scale[k], s.scale[i], s.scale[k]);
+    };
+    const Vec differences[3] = {difference(0, 1), difference(0, 2), difference(1, 2)};
+    Vec by_log[3][6], mean[3][6], log[6][3];
+    for (int k = 0; k < 3; k++) log_covariance_cotangent(s, derivatives.Y[k], differences, by_log[k]);
+    for (int i = 0; i < 3; i++)
+        for (int k = 0; k < 6; k++) mean[i][k] = derivatives.by_mean[k][i];
+    for (int i = 0; i < 6; i++)
+        for (int k = 0; k < 3; k++) log[i][k] = by_log[k][i];
+    for (int i = 0; i < 3; i++) {
+        for (int j = i; j < 3; j++) *upper++ = quadratic_form<6, 6>(gram, 0, 0, mean[i], mean[j]);
+        for (int j = 0; j < 6; j++) *upper++ = quadratic_form<6, 3>(gram, 0, 2, mean[i], log[j]);
+    }
+    for (int i = 0; i < 6; i++)
+        for (int j = i; j < 6; j++) *upper++ = quadratic_form<3, 3>(gram, 2, 2, log[i], log[j]);
+}
+
+inline void information_group(const Frame& frame, const GaussianArrays& gaussians, size_t index, const FisherArrays& out) {
+    const Group group(frame, gaussians, index);
+    Vec info[INFORMATION_SUMS], upper[45];
+    group.reduce<16>(frame, frame.information_rows16.data(), info);
+    group.reduce<8>(frame, frame.information_rows8.data(), info + 16);
+    geometry_information(frame.view, group.splat, info, upper);
+    const Vec transparency = sigmoid(-group.parameters.logit), opacity = transparency * transparency * info[INFO_1];
+    const Vec color[3] = {info[INFO_R], info[INFO_R], info[INFO_R]};
+    scatter_add<45>(upper, group, out.geometry);
+    scatter_add<3>(color, group, out.color);
+    scatter_add<1>(&opacity, group, out.opacity);
+    const uint32_t observed = bits(Vec(0.0f) < info[INFO_R] + info[INFO_ZZ]);
+    for (int lane = 0; lane < group.lanes; lane++) out.observations[group.ids[lane]] += observed >> lane & 1;
+}
+
+}  // namespace KERNEL_ISA

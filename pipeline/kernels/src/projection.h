@@ -1,0 +1,204 @@
+// Sixteen Gaussians as one camera sees them, and the way back from screen to parameters.
+//
+// With J the derivative of the projection, W the rotation to the camera, R the Gaussian's axes and S its scales:
+//   axes = W R,   P = J axes (2x3),   U = P S,   covariance on the screen = U U^T + BLUR I,   conic K its inverse.
+// No 3x3 covariance is ever formed; the way back needs only the symmetric Y = P^T C P, C the cotangent of the
+// screen covariance: the cotangent of Sigma in the Gaussian's own axes.
+#pragma once
+
+#include "frame.h"
+#include "vector_math.h"
+
+namespace KERNEL_ISA {
+
+using namespace raster;
+
+constexpr float NEAR_M = 0.01f;              // Gaussians whose centre is nearer are not drawn
+constexpr float BLUR_PX2 = 0.3f;             // low-pass added to the screen covariance
+constexpr float FIELD_MARGIN = 1.3f;         // J is linearised no further out than this times the half field
+constexpr float LARGEST_PX2 = 1e12f;         // Gaussians with more variance on the screen are not drawn
+constexpr float LOG2_ALPHA_MIN = -7.99435344f;  // log2(1/255): fainter contributions are skipped
+
+struct Splat16 {
+    Vec x, y, z, inverse_z;          // centre, camera frame
+    Vec slope_x, slope_y;            // x/z, y/z
+    Vec inside_x, inside_y;          // 1 where the slope of J is not clamped
+    Vec quat[4], inverse_norm;       // unit quaternion wxyz, 1/length as given
+    Vec R[9], axes[9];               // R(q), W R(q)
+    Vec log_scale[3], scale[3];
+    Vec J00, J02, J11, J12;          // J = [J00 0 J02; 0 J11 J12]
+    Vec P[6];
+    Vec cov_xx, cov_yy;
+    Vec A, B, C;                     // conic K = [A B; B C], 1/px^2
+    Vec u, v;
+    Mask drawable;
+};
+
+inline void rotation_of_quaternion(const Vec* q, Vec* R) {
+    const Vec w = q[0], x = q[1], y = q[2], z = q[3], one(1.0f), two(2.0f);
+    R[0] = one - two * (y * y + z * z);
+    R[1] = two * (x * y - w * z);
+    R[2] = two * (x * z + w * y);
+    R[3] = two * (x * y + w * z);
+    R[4] = one - two * (x * x + z * z);
+    R[5] = two * (y * z - w * x);
+    R[6] = two * (x * z - w * y);
+    R[7] = two * (y * z + w * x);
+    R[8] = one - two * (x * x + y * y);
+}
+
+inline Splat16 project16(const View& view, const Vec* mean, const Vec* quat, const Vec* log_scale) {
+    Splat16 s;
+    const float *W = view.R, *t = view.t;
+    s.x = fma(Vec(W[0]), mean[0], fma(Vec(W[1]), mean[1], fma(Vec(W[2]), mean[2], Vec(t[0]))));
+    s.y = fma(Vec(W[3]), mean[0], fma(Vec(W[4]), mean[1], fma(Vec(W[5]), mean[2], Vec(t[1]))));
+    s.z = fma(Vec(W[6]), mean[0], fma(Vec(W[7]), mean[1], fma(Vec(W[8]), mean[2], Vec(t[2]))));
+    s.inverse_z = Vec(1.0f) / max(s.z, Vec(NEAR_M));
+    s.slope_x = s.x * s.inverse_z;
+    s.slope_y = s.y * s.inverse_z;
+    s.u = fma(Vec(view.fx), s.slope_x, Vec(view.cx));
+    s.v = fma(Vec(view.fy), s.slope_y, Vec(view.cy));
+
+    const Vec limit_x(FIELD_MARGIN * 0.5f * view.width / view.fx), limit_y(FIELD_MARGIN * 0.5f * view.height / view.fy);
+    const Vec clamped_x = min(max(s.slope_x, -limit_x), limit_x), clamped_y = min(max(s.slope_y, -limit_y), limit_y);
+    s.inside_x = select_or_zero((s.slope_x >= -limit_x) & (s.slope_x <= limit_x), Vec(1.0f));
+    s.inside_y = select_or_zero((s.slope_y >= -limit_y) & (s.slope_y <= limit_y), Vec(1.0f));
+    s.J00 = Vec(view.fx) * s.inverse_z;
+    s.J11 = Vec(view.fy) * s.inverse_z;
+    s.J02 = -(s.J00 * clamped_x);
+    s.J12 = -(s.J11 * clamped_y);
+
+    const Vec norm2 = fma(quat[0], quat[0], fma(quat[1], quat[1], fma(quat[2], quat[2], quat[3] * quat[3])));
+    s.inverse_norm = Vec(1.0f) / sqrt(norm2);
+    for (int k = 0; k < 4; k++) s.quat[k] = quat[k] * s.inverse_norm;
+    rotation_of_quaternion(s.quat, s.R);
+    for (int i = 0; i < 3; i++)
+        for (int k = 0; k < 3; k++)
+            s.axes[3 * i + k] = fma(Vec(W[3 * i]), s.R[k], fma(Vec(W[3 * i + 1]), s.R[3 + k], Vec(W[3 * i + 2]) * s.R[6 + k]));
+
+    Vec U[6];
+    for (int k = 0; k < 3; k++) {
+        s.log_scale[k] = log_scale[k];
+        s.scale[k] = exp(log_scale[k]);
+        s.P[k] = fma(s.J00, s.axes[k], s.J02 * s.axes[6 + k]);
+        s.P[3 + k] = fma(s.J11, s.axes[3 + k], s.J12 * s.axes[6 + k]);
+        U[k] = s.P[k] * s.scale[k];
+        U[3 + k] = s.P[3 + k] * s.scale[k];
+    }
+    const Vec xx = fma(U[0], U[0], fma(U[1], U[1], U[2] * U[2])), yy = fma(U[3], U[3], fma(U[4], U[4], U[5] * U[5]));
+    const Vec xy = fma(U[0], U[3], fma(U[1], U[4], U[2] * U[5])), blur(BLUR_PX2);
+    s.cov_xx = xx + blur;
+    s.cov_yy = yy + blur;
+    // det(U U^T + b I) = sum of the squared 2x2 minors of U + b trace + b^2: nothing cancels for needles
+    const Vec m01 = U[0] * U[4] - U[1] * U[3], m02 = U[0] * U[5] - U[2] * U[3], m12 = U[1] * U[5] - U[2] * U[4];
+    const Vec determinant = fma(m01, m01, fma(m02, m02, fma(m12, m12, fma(blur, xx + yy, blur * blur))));
+    const Vec inverse = Vec(1.0f) / determinant;
+    s.A = s.cov_yy * inverse;
+    s.B = -(xy * inverse);
+    s.C = s.cov_xx * inverse;
+    s.drawable = (s.z >= Vec(NEAR_M)) & (s.cov_xx <= Vec(LARGEST_PX2)) & (s.cov_yy <= Vec(LARGEST_PX2));
+    return s;
+}
+
+inline Vec sigmoid(Vec logit) { return Vec(1.0f) / (Vec(1.0f) + exp(-logit)); }
+inline Vec log2_sigmoid(Vec logit) { return -log2(Vec(1.0f) + exp(-logit)); }
+
+// ---------------------------------------------------------------- screen to parameters
+
+struct Symmetric2 {
+    Vec xx, xy, yy;
+};
+
+// Cotangent of the screen covariance, 1/2 K M K, from the second moments M = sum w d d^T (d: pixel - centre,
+// w: cotangent of -sigma, sigma = d^T K d / 2).
+inline Symmetric2 covariance_cotangent(const Splat16& s, Vec m_xx, Vec m_xy, Vec m_yy) {
+    const Vec k00 = fma(s.A, m_xx, s.B * m_xy), k01 = fma(s.A, m_xy, s.B * m_yy);
+    const Vec k10 = fma(s.B, m_xx, s.C * m_xy), k11 = fma(s.B, m_xy, s.C * m_yy), half(0.5f);
+    return {half * fma(k00, s.A, k01 * s.B), half * fma(k00, s.B, k01 * s.C), half * fma(k10, s.B, k11 * s.C)};
+}
+
+// Q = C P (2x3), and Y = P^T Q as (00, 11, 22, 01, 02, 12).
+inline void own_axes_cotangent(const Splat16& s, const Symmetric2& c, Vec* Q, Vec* Y) {
+    for (int k = 0; k < 3; k++) {
+        Q[k] = fma(c.xx, s.P[k], c.xy * s.P[3 + k]);
+        Q[3 + k] = fma(c.xy, s.P[k], c.yy * s.P[3 + k]);
+    }
+    auto product = [&](int i, int k) { return fma(s.P[i], Q[k], s.P[3 + i] * Q[3 + k]); };
+    Y[0] = product(0, 0);
+    Y[1] = product(1, 1);
+    Y[2] = product(2, 2);
+    Y[3] = product(0, 1);
+    Y[4] = product(0, 2);
+    Y[5] = product(1, 2);
+}
+
+// Cotangent of J, 2x3, from Q: P = J axes and covariance = P S^2 P^T.
+inline void jacobian_cotangent(const Splat16& s, const Vec* Q, Vec* d_J) {
+    Vec d_P[6];
+    for (int k = 0; k < 3; k++) {
+        const Vec twice = s.scale[k] * s.scale[k] * Vec(2.0f);
+        d_P[k] = Q[k] * twice;
+        d_P[3 + k] = Q[3 + k] * twice;
+    }
+    for (int r = 0; r < 2; r++)
+        for (int j = 0; j < 3; j++)
+            d_J[3 * r + j] = fma(d_P[3 * r], s.axes[3 * j],
+                                 fma(d_P[3 * r + 1], s.axes[3 * j + 1], d_P[3 * r + 2] * s.axes[3 * j + 2]));
+}
+
+// Adds what a cotangent of J means for the centre in the camera frame.
+inline void add_centre_from_jacobian(const Splat16& s, const Vec* d_J, Vec* d_centre) {
+    const Vec d_slope_x = -(s.J00 * d_J[2]) * s.inside_x, d_slope_y = -(s.J11 * d_J[5]) * s.inside_y;
+    const Vec d_inverse_z = fma(d_J[0], s.J00, fma(d_J[2], s.J02, fma(d_J[4], s.J11, d_J[5] * s.J12)));  // times z
+    d_centre[0] += d_slope_x * s.inverse_z;
+    d_centre[1] += d_slope_y * s.inverse_z;
+    d_centre[2] = fnma(s.inverse_z, fma(d_slope_x, s.slope_x, fma(d_slope_y, s.slope_y, d_inverse_z)), d_centre[2]);
+}
+
+// Adds what a cotangent of the centre on the screen means for the centre in the camera frame.
+inline void add_centre_from_screen(const Splat16& s, Vec d_u, Vec d_v, Vec* d_centre) {
+    const Vec x = d_u * s.J00, y = d_v * s.J11;
+    d_centre[0] += x;
+    d_centre[1] += y;
+    d_centre[2] = fnma(x, s.slope_x, fnma(y, s.slope_y, d_centre[2]));
+}
+
+// W^T d: a cotangent of the centre from the camera frame to the map frame.
+inline void to_map_frame(const View& view, const Vec* d_centre, Vec* d_mean) {
+    const float* W = view.R;
+    for (int k = 0; k < 3; k++)
+        d_mean[k] = fma(Vec(W[k]), d_centre[0], fma(Vec(W[3 + k]), d_centre[1], Vec(W[6 + k]) * d_centre[2]));
+}
+
+// Cotangents of the log-scales: 2 s_k^2 Y_kk.
+inline void log_scale_cotangent(const Splat16& s, const Vec* Y, Vec* d_log_scale) {
+    for (int k = 0; k < 3; k++) d_log_scale[k] = Vec(2.0f) * s.scale[k] * s.scale[k] * Y[k];
+}
+
+// Cotangent of the quaternion as given. A turn w about the Gaussian's own axes changes Sigma by Y_ik (s_k^2 - s_i^2),
+// and w = 2 vec(conj(q) dq).
+inline void quaternion_cotangent(const Splat16& s, const Vec* Y, Vec* d_quat) {
+    const Vec four(4.0f), v0 = s.scale[0] * s.scale[0], v1 = s.scale[1] * s.scale[1], v2 = s.scale[2] * s.scale[2];
+    const Vec x = four * Y[5] * (v1 - v2) * s.inverse_norm;
+    const Vec y = four * Y[4] * (v2 - v0) * s.inverse_norm;
+    const Vec z = four * Y[3] * (v0 - v1) * s.inverse_norm;
+    const Vec *q = s.quat;
+    d_quat[0] = -fma(q[1], x, fma(q[2], y, q[3] * z));
+    d_quat[1] = fma(q[0], x, q[2] * z - q[3] * y);
+    d_quat[2] = fma(q[0], y, q[3] * x - q[1] * z);
+    d_quat[3] = fma(q[0], z, q[1] * y - q[2] * x);
+}
+
+// Cotangent of the right tangent (translation, rotation) of T_map_camera: the camera frame sees p' = p - v - w x p
+// and axes' = axes - w x axes.
+inline void pose_cotangent(const Splat16& s, const Vec* d_centre, const Vec* d_J, Vec* d_pose) {
+    const Vec *g = d_centre, n02 = s.J00 * d_J[2], n20 = fma(s.J02, d_J[0], s.J12 * d_J[3]);
+    const Vec n12 = s.J11 * d_J[5], n21 = fma(s.J02, d_J[1], s.J12 * d_J[4]);
+    const Vec n10 = s.J11 * d_J[3], n01 = s.J00 * d_J[1];
+    for (int k = 0; k < 3; k++) d_pose[k] = -g[k];
+    d_pose[3] = (s.z * g[1] - s.y * g[2]) + (n12 - n21);
+    d_pose[4] = (s.x * g[2] - s.z * g[0]) + (n20 - n02);
+    d_pose[5] = (s.y * g[0] - s.x * g[1]) + (n01 - n10);
+}
+
+}  // namespace KERNEL_ISA
