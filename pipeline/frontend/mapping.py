@@ -9,61 +9,22 @@ threads. See docs/mapping.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import streams
-from pipeline.config import Config
+from pipeline.frontend.mapping_config import MappingConfig
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import FisherSums, Rasterizer
+from pipeline.kernels import FisherSums, Rasterizer, Render
 from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.losses import Loss, LossConfig, halve, rgbd_loss
-from pipeline.splat.optimiser import Adam, LearningRates
-from pipeline.splat.seeding import SeedingConfig, seed, unexplained
+from pipeline.splat.losses import Loss, halve, rgbd_loss
+from pipeline.splat.optimiser import BETA_1, BETA_2, Adam, LearningRates
+from pipeline.splat.seeding import seed_discs, unexplained
 
 Image = NDArray[np.float32]
-
-
-class MappingConfig(Config):
-    """How the map is grown and optimised."""
-
-    max_gaussians: int = 60_000
-    """Hard cap. When a keyframe would exceed it, the Gaussians whose removal changes the keyframes least go first."""
-    first_share: float = 0.35
-    """Share of the cap that the first keyframe may fill."""
-    keyframe_share: float = 0.12
-    """Share of the cap that any later keyframe may add."""
-    window: int = 8
-    """Keyframes optimised together: the newest and those that see most of what it sees."""
-    random_keyframes: int = 2
-    """Older keyframes added to the window by lot, against forgetting."""
-    iterations: int = 24
-    """Optimisation steps (one view each) at a keyframe; every second one is on the newest keyframe."""
-    iterations_level: int = 1
-    """Image pyramid level of these steps: 0 full size, 1 half size."""
-    final_iterations: int = 30
-    """Steps of the final refinement per keyframe, at full size."""
-    final_densify: bool = True
-    """Seed once more, early in the final refinement, where the map does not explain a keyframe."""
-    rates: LearningRates = LearningRates()
-    final_rate_decay: float = 0.05
-    """The final refinement's learning rates fall exponentially to this share."""
-    loss: LossConfig = LossConfig()
-    seeding: SeedingConfig = SeedingConfig()
-    min_opacity: float = 0.03
-    """Gaussians below are pruned."""
-    max_scale_m: float = 0.5
-    """Gaussians that grew beyond are pruned."""
-    min_contribution: float = 0.25
-    """Gaussians whose removal changes the keyframes by less (squared, in units of the noise below) are pruned."""
-    contribution_color_sigma: float = 0.03
-    contribution_depth_sigma_m: float = 0.02
-    exposure: bool = False
-    """Fit a gain and an offset per keyframe (the first keyframe's stay 1 and 0)."""
-    exposure_rate: float = 2e-3
 
 
 @dataclass(frozen=True)
@@ -88,7 +49,7 @@ class _View:
     half_depth_m: Image
     T_map_camera: NDArray[np.float64]
     exposure: tuple[float, float] = (0.0, 0.0)
-    exposure_moments: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    exposure_moments: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 2)))
     exposure_steps: int = 0
 
     def images(self, level: int) -> tuple[Image, Image]:
@@ -96,16 +57,29 @@ class _View:
             return self.color.astype(np.float32) * np.float32(1 / 255), self.depth_m
         return self.half_color, self.half_depth_m
 
+    def step_exposure(self, gradient: tuple[float, float], rate: float) -> None:
+        """One Adam step of (a, b)."""
+        self.exposure_steps += 1
+        g = np.array(gradient)
+        first, second = self.exposure_moments
+        first, second = BETA_1 * first + (1 - BETA_1) * g, BETA_2 * second + (1 - BETA_2) * g * g
+        self.exposure_moments = np.stack([first, second])
+        unbiased = np.sqrt(second / (1 - BETA_2**self.exposure_steps)) + 1e-12
+        a, b = np.array(self.exposure) - rate * first / (1 - BETA_1**self.exposure_steps) / unbiased
+        self.exposure = (float(a), float(b))
+
 
 class Mapper:
     """Grow and refine the Gaussian map of one robot."""
 
-    def __init__(
-        self, camera: PinholeCamera, config: MappingConfig, seed: int, rasterizer: Rasterizer | None = None
-    ) -> None:
+    def __init__(self, camera: PinholeCamera, config: MappingConfig, seed: int, threads: int = 1) -> None:
+        """Args:
+        seed: of the run; the window's lots and the order of the refinement are drawn from it.
+        threads: of the rasterizer; changes no bit of the map.
+        """
         self.config, self.seed = config, seed
         self.cameras = (camera, camera.halved())
-        self.rasterizer = rasterizer if rasterizer is not None else Rasterizer()
+        self.rasterizer = Rasterizer(threads=threads)
         self._gaussians = Gaussians.empty()
         self._adam = Adam()
         self._views: list[_View] = []
@@ -145,7 +119,9 @@ class Mapper:
         after = self._loss(view, self.config.iterations_level).value
         return MappingStats(inserted, pruned, len(self._gaussians), before, after)
 
-    def set_keyframe_poses(self, T_map_keyframe: Mapping[int, NDArray[np.float64]] | NDArray[np.float64]) -> None:
+    def set_keyframe_poses(
+        self, T_map_keyframe: Mapping[int, NDArray[np.float64]] | NDArray[np.float64]
+    ) -> None:
         """Move keyframes to refined poses, and every Gaussian with the keyframe it hangs on.
 
         T_map_keyframe: [k, 4, 4] for keyframes 0..k-1, or index to [4, 4]; keyframes not named stay.
@@ -153,7 +129,9 @@ class Mapper:
         old = np.stack([view.T_map_camera for view in self._views]) if self._views else np.zeros((0, 4, 4))
         new = old.copy()
         poses = (
-            T_map_keyframe.items() if isinstance(T_map_keyframe, Mapping) else enumerate(np.asarray(T_map_keyframe))
+            T_map_keyframe.items()
+            if isinstance(T_map_keyframe, Mapping)
+            else enumerate(np.asarray(T_map_keyframe))
         )
         for index, T in poses:
             new[index] = T
@@ -174,7 +152,9 @@ class Mapper:
             if done == rounds // 4 and config.final_densify:
                 room = config.max_gaussians - len(self._gaussians)
                 for view in views:
-                    share = max(room, 0) / config.max_gaussians / len(views) + config.keyframe_share / len(views)
+                    share = max(room, 0) / config.max_gaussians / len(views) + config.keyframe_share / len(
+                        views
+                    )
                     new, gone = self._seed(view, share)
                     inserted, pruned = inserted + new, pruned + gone
             rates = config.rates.times(config.final_rate_decay ** (done / max(rounds - 1, 1)))
@@ -187,7 +167,7 @@ class Mapper:
 
     # --- one view -----------------------------------------------------------------------------------------------
 
-    def _render(self, view: _View, level: int) -> tuple[object, Loss]:
+    def _render(self, view: _View, level: int) -> tuple[Render, Loss]:
         color, depth_m = view.images(level)
         render = self.rasterizer.forward(self._gaussians, self.cameras[level], se3.inverse(view.T_map_camera))
         return render, rgbd_loss(render, color, depth_m, self.config.loss, view.exposure)
@@ -202,6 +182,8 @@ class Mapper:
         """One Adam step of all Gaussians in one view."""
         loss = self._loss(view, level)
         gradients = self.rasterizer.backward(loss.d_color, loss.d_depth, loss.d_alpha)
+        if self.config.exposure and view.index > 0:
+            view.step_exposure(loss.d_exposure, self.config.exposure_rate)
         stepped = self._adam.step(self._gaussians, gradients, rates)
         floor = np.float32(np.log(self.config.seeding.thickness_m))
         self._gaussians = stepped.replace(
@@ -218,10 +200,13 @@ class Mapper:
         color, depth_m = view.images(0)
         if len(self._gaussians):
             render = self.rasterizer.forward(self._gaussians, self.cameras[0], se3.inverse(view.T_map_camera))
+            if config.exposure and view.exposure_steps == 0:
+                view.exposure = _first_exposure(render, color)
+            color = (color - np.float32(view.exposure[1])) * np.float32(np.exp(-view.exposure[0]))
             wanted = unexplained(render, color, depth_m, config.seeding)
         else:
             wanted = depth_m > 0
-        new = seed(
+        new = seed_discs(
             color,
             depth_m,
             wanted,
@@ -248,7 +233,9 @@ class Mapper:
         """
         sums = FisherSums(len(self._gaussians))
         camera = self.cameras[1]
-        inverse_color = np.full((camera.height, camera.width), self.config.contribution_color_sigma**-2, np.float32)
+        inverse_color = np.full(
+            (camera.height, camera.width), self.config.contribution_color_sigma**-2, np.float32
+        )
         for view in self._views:
             self.rasterizer.forward(self._gaussians, camera, se3.inverse(view.T_map_camera))
             inverse_depth = (view.half_depth_m > 0) * np.float32(self.config.contribution_depth_sigma_m**-2)
@@ -281,7 +268,10 @@ class Mapper:
     def _window(self, newest: _View) -> list[_View]:
         """The views of this keyframe's iterations: every second one the newest, the others in turn."""
         older = self._views[: newest.index]
-        overlaps = [overlap(newest.depth_m, newest.T_map_camera, v.depth_m, v.T_map_camera, self.cameras[0]) for v in older]
+        overlaps = [
+            overlap(newest.depth_m, newest.T_map_camera, v.depth_m, v.T_map_camera, self.cameras[0])
+            for v in older
+        ]
         ranked = sorted(range(len(older)), key=lambda k: (-overlaps[k], -k))
         chosen, rest = ranked[: self.config.window - 1], sorted(ranked[self.config.window - 1 :])
         draw = streams.generator(self.seed, "mapping.window", keyframe=newest.index)
@@ -330,6 +320,15 @@ def _view(index: int, color: Image, depth_m: Image, T_map_camera: NDArray[np.flo
         half_depth_m=_halve_depth(depth_m),
         T_map_camera=np.array(T_map_camera, dtype=np.float64),
     )
+
+
+def _first_exposure(render: Render, color: Image) -> tuple[float, float]:
+    """Log gain from the medians over the pixels that the map covers; the offset starts at zero."""
+    covered = render.alpha > 0.9
+    if np.count_nonzero(covered) < 1000:
+        return 0.0, 0.0
+    ratio = np.median(color[covered]) / max(float(np.median(render.color[covered])), 0.02)
+    return float(np.log(np.clip(ratio, 0.25, 4.0))), 0.0
 
 
 def _halve_depth(depth_m: Image) -> Image:

@@ -34,7 +34,7 @@ class Rendered(Protocol):
 class LossConfig(Config):
     """Weights of the mapping loss; every term is a mean over its pixels."""
 
-    color_huber: float = 0.05
+    color_huber: float = 0.1
     """Colour residual (0..1) where the loss turns from quadratic to linear; the slope beyond is 1."""
     depth_weight: float = 0.5
     """Weight of one metre of depth error against one unit of colour."""
@@ -107,10 +107,8 @@ def rgbd_loss(
     color_mean = float(np.sum(color_value, dtype=np.float64)) * per_color
     depth_mean = float(np.sum(depth_value, dtype=np.float64)) * per_depth
     missing = float(np.sum(measured * (1 - render.alpha), dtype=np.float64)) * per_depth
-    d_exposure = (0.0, 0.0)
-    if exposure != (0.0, 0.0):
-        pulled = float(np.sum(slope * render.color, dtype=np.float64)) * float(gain) * per_color
-        d_exposure = (pulled, float(np.sum(slope, dtype=np.float64)) * per_color)
+    by_gain = float(np.sum(slope * render.color, dtype=np.float64)) * float(gain) * per_color
+    by_offset = float(np.sum(slope, dtype=np.float64)) * per_color
     return Loss(
         value=color_mean + config.depth_weight * depth_mean + config.alpha_weight * missing,
         color=color_mean,
@@ -118,7 +116,7 @@ def rgbd_loss(
         d_color=slope * np.float32(float(gain) * per_color),
         d_depth=depth_slope,
         d_alpha=d_alpha,
-        d_exposure=d_exposure,
+        d_exposure=(by_gain, by_offset),
     )
 
 

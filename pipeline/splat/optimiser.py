@@ -34,12 +34,12 @@ class GaussianGradients(Protocol):
 class LearningRates(Config):
     """Step lengths of Adam: about the change of a parameter per step while its gradient keeps its sign."""
 
-    means: float = 4e-4
+    means: float = 3e-3
     """Metres."""
-    quats_wxyz: float = 4e-3
+    quats_wxyz: float = 2e-2
     """Of a unit quaternion."""
-    log_scales: float = 1e-2
-    colors: float = 6e-3
+    log_scales: float = 6e-2
+    colors: float = 2e-2
     """RGB in 0..1."""
     opacity_logits: float = 3e-2
 

@@ -40,7 +40,9 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
     table[:, 10:13] = gaussians.log_scales
     table[:, 13:17] = gaussians.quats_wxyz / np.where(norms > 0, norms, 1.0)
     if not np.isfinite(table).all() or not (norms > 0).all():
-        raise DuagError(f"{path.name}: not written, a Gaussian has a value that is not finite or no orientation")
+        raise DuagError(
+            f"{path.name}: not written, a Gaussian has a value that is not finite or no orientation"
+        )
     header = "\n".join(
         [
             "ply",
@@ -102,7 +104,9 @@ def _read_table(path: Path) -> NDArray[np.float32]:
     if len(words) != 3 or words[:2] != ["element", "vertex"] or not words[2].isdigit():
         raise DuagError(f"{path.name}: first element is '{lines[1]}', expected 'element vertex N'")
     if lines[2:] != [f"property float {name}" for name in PROPERTIES]:
-        raise DuagError(f"{path.name}: properties differ from {' '.join(PROPERTIES)}, all float, in this order")
+        raise DuagError(
+            f"{path.name}: properties differ from {' '.join(PROPERTIES)}, all float, in this order"
+        )
     body, row_bytes = data[end + len(b"end_header\n") :], 4 * len(PROPERTIES)
     if len(body) != int(words[2]) * row_bytes:
         raise DuagError(f"{path.name}: {len(body)} bytes of vertices, expected {int(words[2]) * row_bytes}")

@@ -68,7 +68,7 @@ class Cells:
     color: NDArray[np.float64]
 
 
-def seed(
+def seed_discs(
     color: Image,
     depth_m: Image,
     wanted: NDArray[np.bool_],
@@ -92,7 +92,11 @@ def seed(
     cells = quadtree(color, depth_m, wanted & (depth_m > 0), budget, config)
     normals = surface_normals(depth_m, cells, camera)
     rays = np.stack(
-        [(cells.uv[:, 0] - camera.cx) / camera.fx, (cells.uv[:, 1] - camera.cy) / camera.fy, np.ones(len(cells.uv))],
+        [
+            (cells.uv[:, 0] - camera.cx) / camera.fx,
+            (cells.uv[:, 1] - camera.cy) / camera.fy,
+            np.ones(len(cells.uv)),
+        ],
         axis=1,
     )
     cos_tilt = np.abs((normals * rays).sum(axis=1)) / np.linalg.norm(rays, axis=1)
@@ -136,7 +140,12 @@ def quadtree(
         threshold *= np.sqrt(2.0)
         coarsest_only = threshold > 1.0
     parts = [
-        (np.stack([grid.u[mask], grid.v[mask]], axis=1), np.full(mask.sum(), side), grid.z[mask], grid.color[mask])
+        (
+            np.stack([grid.u[mask], grid.v[mask]], axis=1),
+            np.full(mask.sum(), side),
+            grid.z[mask],
+            grid.color[mask],
+        )
         for grid, mask, side in zip(grids, leaves, sides, strict=True)
     ]
     uv, side_px, z, rgb = (np.concatenate([part[k] for part in parts]) for k in range(4))
@@ -212,7 +221,9 @@ def _leaves(grids: list[_Grid], threshold: float) -> list[NDArray[np.bool_]]:
     return leaves
 
 
-def surface_normals(depth_m: Image, cells: Cells, camera: PinholeCamera, radius_px: int = 4) -> NDArray[np.float64]:
+def surface_normals(
+    depth_m: Image, cells: Cells, camera: PinholeCamera, radius_px: int = 4
+) -> NDArray[np.float64]:
     """Unit normals [n, 3] in the camera frame, facing the camera, at the cells' centres.
 
     A plane n . X = 1 has inverse depth 1 / z = n . ray, affine in the pixel: fit that affine function over the
@@ -246,7 +257,8 @@ def surface_normals(depth_m: Image, cells: Cells, camera: PinholeCamera, radius_
     level = q_cell - slope_u * (cells.uv[:, 0] - camera.cx) - slope_v * (cells.uv[:, 1] - camera.cy)
     normal = np.stack([slope_u * camera.fx, slope_v * camera.fy, level], axis=1)
     ray = np.stack(
-        [(cells.uv[:, 0] - camera.cx) / camera.fx, (cells.uv[:, 1] - camera.cy) / camera.fy, np.ones_like(s)], axis=1
+        [(cells.uv[:, 0] - camera.cx) / camera.fx, (cells.uv[:, 1] - camera.cy) / camera.fy, np.ones_like(s)],
+        axis=1,
     )
     normal = np.where(determined[:, None], normal, ray)
     return -normal / np.linalg.norm(normal, axis=1, keepdims=True)

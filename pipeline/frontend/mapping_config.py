@@ -1,0 +1,45 @@
+"""Configuration of the mapping."""
+
+from pipeline.config import Config
+from pipeline.splat.losses import LossConfig
+from pipeline.splat.optimiser import LearningRates
+from pipeline.splat.seeding import SeedingConfig
+
+
+class MappingConfig(Config):
+    """How the map is grown and optimised."""
+
+    max_gaussians: int = 60_000
+    """Hard cap. When a keyframe would exceed it, the Gaussians whose removal changes the keyframes least go first."""
+    first_share: float = 0.35
+    """Share of the cap that the first keyframe may fill."""
+    keyframe_share: float = 0.12
+    """Share of the cap that any later keyframe may add."""
+    window: int = 8
+    """Keyframes optimised together: the newest and those that see most of what it sees."""
+    random_keyframes: int = 2
+    """Older keyframes added to the window by lot, against forgetting."""
+    iterations: int = 24
+    """Optimisation steps (one view each) at a keyframe; every second one is on the newest keyframe."""
+    iterations_level: int = 1
+    """Image pyramid level of these steps: 0 full size, 1 half size."""
+    final_iterations: int = 30
+    """Steps of the final refinement per keyframe, at full size."""
+    final_densify: bool = True
+    """Seed once more, early in the final refinement, where the map does not explain a keyframe."""
+    rates: LearningRates = LearningRates()
+    final_rate_decay: float = 0.05
+    """The final refinement's learning rates fall exponentially to this share."""
+    loss: LossConfig = LossConfig()
+    seeding: SeedingConfig = SeedingConfig()
+    min_opacity: float = 0.03
+    """Gaussians below are pruned."""
+    max_scale_m: float = 0.5
+    """Gaussians that grew beyond are pruned."""
+    min_contribution: float = 0.25
+    """Gaussians whose removal changes the keyframes by less (squared, in units of the noise below) are pruned."""
+    contribution_color_sigma: float = 0.03
+    contribution_depth_sigma_m: float = 0.02
+    exposure: bool = False
+    """Fit a gain and an offset per keyframe (the first keyframe's stay 1 and 0)."""
+    exposure_rate: float = 2e-3

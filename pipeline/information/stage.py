@@ -1,0 +1,246 @@
+"""The information stage: Gauss-Newton Fisher sums of one robot's final map over its own keyframes.
+
+Reads the robot's log (images of keyframes only; held-out frames are never decoded) and its frontend.mcap, writes
+information.mcap. Source: method section 1 and 2, paper eq. (2)-(4) with J^T R^-1 J in place of squared gradients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import DuagError
+from pipeline.geometry import se3, so3, spd
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.information.config import InformationConfig
+from pipeline.kernels import FisherSums, Rasterizer
+from pipeline.messages import GaussianInformation, GaussianMap, Keyframe, Odometry
+from pipeline.recording import LogWriter, open_rgbd, read_log
+from pipeline.splat.gaussians import Gaussians
+from schemas import topics
+
+MAD_TO_SIGMA = 1.4826
+FLOOR_TOLERANCE = 1e-3  # of a log-scale; float32 logs of metres are good to 1e-6
+_UPPER = np.triu_indices(9)
+
+
+@dataclass(frozen=True)
+class View:
+    """One keyframe: colour uint8 [H, W, 3] RGB, depth float32 [H, W] m, pose of the camera in the map."""
+
+    color: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    T_map_camera: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of the images: colour sigma (0..1) and depth sigma(z) = factor (base + quadratic (z - 0.4)^2), m."""
+
+    color_sigma: float
+    depth_factor: float
+    depth_base_m: float
+    depth_quadratic_per_m: float
+
+    def depth_sigma_m(self, depth_m: NDArray) -> NDArray[np.float64]:
+        """Standard deviation of measured depths, metres."""
+        z = np.asarray(depth_m, dtype=np.float64)
+        return self.depth_factor * (self.depth_base_m + self.depth_quadratic_per_m * (z - 0.4) ** 2)
+
+    def depth_formula(self) -> str:
+        """The depth noise in words, for the record."""
+        return f"{self.depth_factor:.6g} * ({self.depth_base_m:.6g} + {self.depth_quadratic_per_m:.6g} * (z - 0.4)^2)"
+
+
+def run_information(
+    log_path: Path, frontend_path: Path, out_path: Path, config: InformationConfig, threads: int = 1
+) -> GaussianInformation:
+    """Write the Fisher information of a robot's final map, from its own keyframes.
+
+    Args:
+        log_path: the robot's sensor log. frontend_path: its frontend.mcap. out_path: information.mcap.
+        threads: of the rasterizer; changes no bit of the result.
+    Returns:
+        What was written, in the order of the map's Gaussians.
+    Raises:
+        DuagError: no map in the front end's log, or a keyframe that is held out or not in the sensor log.
+    """
+    final, keyframes, log_time_ns = read_frontend(frontend_path)
+    with open_rgbd(log_path) as log:
+        if log.robot != final.robot:
+            raise DuagError(f"{frontend_path}: has the map of {final.robot}, expected that of {log.robot}")
+        beyond = [k.frame_index for k in keyframes if k.frame_index >= len(log)]
+        if beyond:
+            raise DuagError(
+                f"{frontend_path}: {topics.KEYFRAME.of(log.robot)} names frame {beyond[0]}, "
+                f"expected less than the {len(log)} frames of {log_path.name}"
+            )
+        views = []
+        for keyframe in keyframes:
+            frame = log.frame(keyframe.frame_index)
+            views.append(View(frame.color, frame.depth, keyframe.T_map_camera))
+        camera = log.camera
+    noise = estimate_noise(final.gaussians, camera, views, config, threads)
+    sums = sum_information(final.gaussians, camera, views, noise, config, threads)
+    result = GaussianInformation(
+        stamp_ns=final.stamp_ns,
+        robot=final.robot,
+        kind="gauss_newton",
+        window=config.window if config.window == "all" else f"{config.window} {config.window_length}",
+        ids=final.gaussians.ids,
+        geometry=without_thickness(sums.geometry, final.gaussians, config.thickness_floor_m).astype(
+            np.float32
+        ),
+        color=sums.color.astype(np.float32),
+        opacity=sums.opacity.astype(np.float32),
+        observations=sums.observations,
+        color_sigma=noise.color_sigma,
+        depth_sigma=noise.depth_formula(),
+    )
+    with LogWriter(out_path, robot=final.robot) as writer:
+        writer.write(topics.INFORMATION.of(final.robot), result, log_time_ns)
+    return result
+
+
+def read_frontend(path: Path) -> tuple[GaussianMap, list[Keyframe], int]:
+    """The last map of a front end's log, the last word on every keyframe in order, and the log time of the map.
+
+    Raises:
+        DuagError: no map, or a keyframe whose frame is held out for evaluation.
+    """
+    final: GaussianMap | None = None
+    log_time_ns = 0
+    keyframes: dict[int, Keyframe] = {}
+    held_out: set[int] = set()
+    for record in read_log(path):
+        row = topics.find(record.topic)
+        if row is None:
+            continue
+        if row[0] is topics.MAP:
+            final, log_time_ns = record.message(), record.log_time_ns
+        elif row[0] is topics.KEYFRAME:
+            keyframe: Keyframe = record.message()
+            keyframes[keyframe.keyframe_index] = keyframe
+        elif row[0] is topics.ODOMETRY:
+            odometry: Odometry = record.message()
+            if odometry.held_out:
+                held_out.add(odometry.frame_index)
+    if final is None:
+        raise DuagError(
+            f"{path}: {topics.MAP.pattern} has no message, expected the map of a finished front end"
+        )
+    ordered = [keyframes[index] for index in sorted(keyframes)]
+    for keyframe in ordered:
+        if keyframe.frame_index in held_out:
+            raise DuagError(
+                f"{path}: {topics.KEYFRAME.of(keyframe.robot)} has frame {keyframe.frame_index}, "
+                "expected no frame that is held out for evaluation"
+            )
+    return final, ordered, log_time_ns
+
+
+def estimate_noise(
+    gaussians: Gaussians,
+    camera: PinholeCamera,
+    views: Sequence[View],
+    config: InformationConfig,
+    threads: int = 1,
+    stride_px: int = 4,
+) -> Noise:
+    """Noise from the residuals of the map's own renders: 1.4826 times the median absolute residual.
+
+    Only pixels that the map covers (alpha above 0.9) count, every `stride_px`-th in both directions. The residuals
+    hold the map's errors beside the sensor's, so that a poor map does not call itself certain. Depth residuals are
+    taken in units of the configured sigma(z); their spread is the factor on it. Without such pixels the colour is at
+    its floor and the factor is 1.
+    """
+    rasterizer = Rasterizer(threads=threads)
+    unit = Noise(1.0, 1.0, config.depth_sigma_base_m, config.depth_sigma_quadratic_per_m)
+    colors, depths = [np.zeros(0)], [np.zeros(0)]
+    every = (slice(stride_px // 2, None, stride_px),) * 2
+    for view in views:
+        render = rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera))
+        alpha, z = render.alpha[every].astype(np.float64), view.depth_m[every].astype(np.float64)
+        covered = alpha > 0.9
+        difference = render.color[every].astype(np.float64) - view.color[every] / 255.0
+        colors.append(np.abs(difference[covered]).ravel())
+        both = covered & (z > 0)
+        residual = render.depth[every][both] / alpha[both] - z[both]
+        depths.append(np.abs(residual) / unit.depth_sigma_m(z[both]))
+    color, depth = np.concatenate(colors), np.concatenate(depths)
+    color_sigma = MAD_TO_SIGMA * float(np.median(color)) if len(color) else 0.0
+    factor = 1.0
+    if config.depth_factor_from_residuals and len(depth):
+        factor = MAD_TO_SIGMA * float(np.median(depth))
+        factor = float(np.clip(factor, config.depth_factor_min, config.depth_factor_max))
+    return Noise(
+        color_sigma=max(color_sigma, config.color_sigma_floor),
+        depth_factor=factor,
+        depth_base_m=config.depth_sigma_base_m,
+        depth_quadratic_per_m=config.depth_sigma_quadratic_per_m,
+    )
+
+
+def sum_information(
+    gaussians: Gaussians,
+    camera: PinholeCamera,
+    views: Sequence[View],
+    noise: Noise,
+    config: InformationConfig,
+    threads: int = 1,
+) -> FisherSums:
+    """One sweep over the views at the current Gaussians; the newest view is the last.
+
+    Where the map or the depth image has a hole the depth brings nothing; a Gaussian that no view saw keeps zero.
+    """
+    rasterizer = Rasterizer(threads=threads)
+    total = FisherSums(len(gaussians))
+    chosen = views[-config.window_length :] if config.window == "rolling" else views
+    inverse_color = np.full((camera.height, camera.width), noise.color_sigma**-2, np.float32)
+    # newest first, so that `per_gaussian` can stop at the latest that saw a Gaussian
+    for view in reversed(chosen):
+        measured = view.depth_m > 0
+        inverse_depth = np.where(measured, noise.depth_sigma_m(view.depth_m) ** -2.0, 0.0).astype(np.float32)
+        rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera))
+        if config.window == "per_gaussian":
+            one = FisherSums(len(gaussians))
+            rasterizer.fisher(inverse_color, inverse_depth, one)
+            wanting = total.observations < config.window_length
+            for name in ("geometry", "color", "opacity", "observations"):
+                getattr(total, name)[wanting] += getattr(one, name)[wanting]
+        else:
+            rasterizer.fisher(inverse_color, inverse_depth, total)
+    return total
+
+
+def without_thickness(
+    geometry: NDArray[np.float64], gaussians: Gaussians, floor_m: float
+) -> NDArray[np.float64]:
+    """Geometry information [n, 45] with the directions of scales at the floor taken out.
+
+    A scale at the floor is held there by the map, not by the images. In the eigenbasis of log Sigma its direction is
+    v = vec(e e^T), e the axis; F becomes P F P with P = 1 - v v^T on the covariance block: what is left is the
+    information given the floor, and v itself has none. The tilt of a disc (e e_t^T + e_t e^T) keeps its information.
+    """
+    at_floor = gaussians.log_scales <= np.float32(np.log(floor_m) + FLOOR_TOLERANCE)
+    if not at_floor.any():
+        return geometry
+    full = np.zeros((len(gaussians), 9, 9))
+    full[:, _UPPER[0], _UPPER[1]] = geometry
+    full[:, _UPPER[1], _UPPER[0]] = geometry
+    axes = so3.from_quat_wxyz(gaussians.quats_wxyz)
+    for k in range(3):
+        rows = np.flatnonzero(at_floor[:, k])
+        e = axes[rows, :, k]
+        v = np.zeros((len(rows), 9))
+        v[:, 3:] = spd.sym_to_vec(e[:, :, None] * e[:, None, :])
+        F = full[rows]
+        Fv = (F * v[:, None, :]).sum(axis=2)
+        vFv = (Fv * v).sum(axis=1)
+        outer = Fv[:, :, None] * v[:, None, :]
+        full[rows] = F - outer - outer.swapaxes(1, 2) + vFv[:, None, None] * (v[:, :, None] * v[:, None, :])
+    return full[:, _UPPER[0], _UPPER[1]]
