@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import socket
+import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -65,10 +66,12 @@ def _as_rrd(path: Path, folder: Path) -> Path:
         return path
     out = folder / f"{path.name or 'view'}.rrd"
     if (path / "robots").is_dir():
+        made = path / "run.rrd"
+        if made.is_file():
+            return made
         from pipeline.replay import recording_of
 
-        made = path / "run.rrd"
-        return made if made.is_file() else write_rrd(path, recording_of(path), out)
+        return write_rrd(path, recording_of(path), out)
     if (path / RECORDING_FILE).is_file():
         recording = Recording(path)
         return recording_to_rrd([recording.log(robot) for robot in recording.robots], out)
@@ -359,7 +362,7 @@ def _open_window(rrd: Path) -> None:
     import rerun as rr
 
     rr.init(APPLICATION)
-    rr.spawn(port=_free_port(), memory_limit=VIEWER_MEMORY, connect=True)
+    rr.spawn(port=_free_port(), memory_limit=VIEWER_MEMORY, executable_path=_executable())
     rr.log_file_from_path(rrd)
     rr.disconnect()
 
@@ -373,7 +376,9 @@ def take_screenshot(rrd: Path, png: Path, timeout_s: float = 60.0) -> None:
     from rerun.experimental import ViewerClient
 
     try:
-        with ViewerClient.spawn(headless=True, port=_free_port(), memory_limit=VIEWER_MEMORY) as viewer:
+        with ViewerClient.spawn(
+            headless=True, port=_free_port(), memory_limit=VIEWER_MEMORY, executable_path=_executable()
+        ) as viewer:
             viewer.open(str(rrd))
             data = _settled_picture(viewer, timeout_s)
     except Exception as error:  # the client raises RuntimeError and its own kinds, with the viewer's words
@@ -397,6 +402,12 @@ def _settled_picture(viewer: Any, timeout_s: float) -> bytes:
         last = data
         time.sleep(1.5)
     return last
+
+
+def _executable() -> str | None:
+    """The viewer that was installed with this Python, active environment or not; None: look in PATH."""
+    beside = Path(sys.executable).with_name("rerun")
+    return str(beside) if beside.is_file() else None
 
 
 def _free_port() -> int:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -46,35 +47,47 @@ def color_of(index: int) -> str:
     return COLORS[index % len(COLORS)]
 
 
+def _styled(draw: Callable[..., Figure]) -> Callable[..., str]:
+    """Make a function that draws a figure one that returns its SVG text, all in the style of the report."""
+
+    @wraps(draw)
+    def styled(*args: Any, **kwargs: Any) -> str:
+        import matplotlib as mpl
+
+        with mpl.rc_context(_STYLE):
+            buffer = io.StringIO()
+            draw(*args, **kwargs).savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+            return buffer.getvalue()
+
+    return styled
+
+
 def _figure(width_in: float, height_in: float) -> tuple[Figure, Any]:
-    """A figure with one set of axes, on the non-interactive canvas, in the style of the report."""
-    import matplotlib as mpl
+    """A figure with one set of axes, on a canvas that needs no screen."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(width_in, height_in), layout="constrained")
-        FigureCanvasAgg(figure)
-        return figure, figure.add_subplot()
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.add_subplot()
 
 
-def _svg(figure: Figure) -> str:
-    import matplotlib as mpl
-
-    buffer = io.StringIO()
-    with mpl.rc_context(_STYLE):
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    return buffer.getvalue()
+def _legend_above(axes: Any, entries: int) -> None:
+    """A legend in one or two lines above the axes, at their left end."""
+    axes.legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=min(4, entries), borderaxespad=0.2)
 
 
-def top_view(ways: Sequence[Mapping[str, Any]]) -> str:
+@_styled
+def top_view(ways: Sequence[Mapping[str, Any]]) -> Figure:
     """Ways seen from above, metres.
 
     Args:
         ways: per robot "robot", "index" (which gives the colour), "before", "after" and "true" [n, 2] in metres; "true"
             may be None.
     """
-    figure, axes = _figure(7.6, 5.2)
+    drawn = np.concatenate([way["after"] for way in ways])
+    wide, high = np.maximum(np.ptp(drawn, axis=0), 1e-9)
+    figure, axes = _figure(9.6, float(np.clip(7.6 * high / wide, 2.4, 6.0)) + 0.6)
     for way in ways:
         i = way["index"]
         color = color_of(i)
@@ -85,22 +98,19 @@ def top_view(ways: Sequence[Mapping[str, Any]]) -> str:
         axes.plot(*way["before"].T, color=color, linewidth=1.2, linestyle=(0, (3, 2)), zorder=2)
         axes.plot(*way["after"].T, color=color, zorder=3, label=way["robot"])
         axes.plot(*way["after"][0], marker=MARKS[i % len(MARKS)], markersize=8, color=color, zorder=4)
-    handles, _ = axes.get_legend_handles_labels()
-    style = {"color": INK}
-    extra = [
-        axes.plot([], [], **style, label="after consensus")[0],
-        axes.plot([], [], **style, linewidth=1.2, linestyle=(0, (3, 2)), label="before")[0],
-    ]
+    axes.plot([], [], color=INK, label="after consensus")
+    axes.plot([], [], color=INK, linewidth=1.2, linestyle=(0, (3, 2)), label="before")
     if any(way["true"] is not None for way in ways):
-        extra.append(axes.plot([], [], color="#9aa7b1", linewidth=4.5, alpha=0.55, label="ground truth")[0])
-    extra.append(axes.plot([], [], linestyle="none", marker="o", color=INK, label="start")[0])
-    axes.legend(handles=handles + extra, loc="center left", bbox_to_anchor=(1.01, 0.5))
+        axes.plot([], [], color="#9aa7b1", linewidth=4.5, alpha=0.55, label="ground truth")
+    axes.plot([], [], linestyle="none", marker="o", color=INK, label="start")
+    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("metres")
     axes.set_ylabel("metres")
-    return _svg(figure)
+    return figure
 
 
+@_styled
 def lines(
     series: Mapping[str, tuple[Array, Array]],
     x_label: str,
@@ -108,25 +118,25 @@ def lines(
     *,
     log: bool = False,
     level: float | None = None,
-) -> str:
+) -> Figure:
     """Curves over a common axis.
 
     Args:
         series: name -> (x, y). log: logarithmic y axis; values that are not positive are left out.
         level: a horizontal line to compare with, for example a tolerance.
     """
-    figure, axes = _figure(7.6, 3.2)
+    figure, axes = _figure(5.4, 3.2)
     for i, (name, (x, y)) in enumerate(series.items()):
         x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
         keep = np.isfinite(y) & ((y > 0) | (not log))
-        few = np.count_nonzero(keep) <= 40
         axes.plot(
             x[keep],
             y[keep],
             color=color_of(i),
             label=name,
-            marker=MARKS[i % len(MARKS)] if few else None,
+            marker=MARKS[i % len(MARKS)] if np.count_nonzero(keep) <= 40 else None,
             markersize=4,
+            linestyle="-" if i == 0 else (0, (4, 1 + i)),  # equal curves stay visible under each other
         )
     if log and any(np.any(np.asarray(y) > 0) for _, y in series.values()):
         axes.set_yscale("log")
@@ -135,13 +145,14 @@ def lines(
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
     if series:
-        axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
-    return _svg(figure)
+        _legend_above(axes, len(series) + (level is not None))
+    return figure
 
 
-def stacked(x: Array, parts: Mapping[str, Array], x_label: str, y_label: str) -> str:
+@_styled
+def stacked(x: Array, parts: Mapping[str, Array], x_label: str, y_label: str) -> Figure:
     """Stacked areas: how a total divides into parts over a common axis."""
-    figure, axes = _figure(7.6, 3.2)
+    figure, axes = _figure(5.4, 3.2)
     if len(x):
         axes.stackplot(
             x,
@@ -152,41 +163,51 @@ def stacked(x: Array, parts: Mapping[str, Array], x_label: str, y_label: str) ->
             step="mid",
             linewidth=0,
         )
-        axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), reverse=True)
+        _legend_above(axes, len(parts))
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
     axes.set_ylim(bottom=0)
-    return _svg(figure)
+    return figure
 
 
-def bars(names: Sequence[str], parts: Mapping[str, Sequence[float]], x_label: str) -> str:
+@_styled
+def bars(names: Sequence[str], parts: Mapping[str, Sequence[float]], x_label: str) -> Figure:
     """Horizontal stacked bars: one bar per name, one colour per part."""
-    figure, axes = _figure(7.6, 0.9 + 0.34 * max(1, len(names)))
+    from matplotlib.ticker import MaxNLocator
+
+    figure, axes = _figure(5.4, 1.1 + 0.34 * max(1, len(names)))
     left = np.zeros(len(names))
     for i, (part, values) in enumerate(parts.items()):
         axes.barh(names, values, left=left, color=color_of(i), label=part, height=0.62)
         left = left + np.asarray(values, dtype=np.float64)
     axes.invert_yaxis()
+    axes.xaxis.set_major_locator(MaxNLocator(6))
     axes.grid(visible=False, axis="y")
     axes.set_xlabel(x_label)
     if len(parts) > 1:
-        axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
-    return _svg(figure)
+        _legend_above(axes, len(parts))
+    return figure
 
 
-def reliability(bins: Mapping[str, Sequence[tuple[float, float]]]) -> str:
+@_styled
+def reliability(bins: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
     """Predicted against observed error per decile, millimetres, both axes logarithmic; the diagonal is right."""
-    figure, axes = _figure(5.6, 4.2)
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
+    figure, axes = _figure(5.4, 4.0)
     values = [1e3 * v for pairs in bins.values() for pair in pairs for v in pair if v > 0]
     if values:
         span = [min(values) / 1.3, max(values) * 1.3]
         axes.plot(span, span, color=FAINT, linewidth=1.0, linestyle=(0, (1, 2)), label="right prediction")
-        axes.set_xscale("log")
-        axes.set_yscale("log")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.set_major_formatter(FormatStrFormatter("%g"))
+            axis.set_minor_formatter(NullFormatter())
     for i, (name, pairs) in enumerate(bins.items()):
         x, y = 1e3 * np.array(pairs).T
         axes.plot(x, y, color=color_of(i), marker=MARKS[i % len(MARKS)], markersize=5, label=name)
     axes.set_xlabel("predicted error (mm, root mean square)")
     axes.set_ylabel("observed error (mm, root mean square)")
-    axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
-    return _svg(figure)
+    _legend_above(axes, len(bins) + bool(values))
+    return figure

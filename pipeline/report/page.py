@@ -430,7 +430,8 @@ def _information_view(
         render = rasterizer.forward(
             gaussians, log.camera, se3.inverse(poses[frame.stamp_ns]), background=(1.0, 1.0, 1.0)
         )
-        shown.append({"caption": f"frame {frame.index}", "uri": _uri(pictures.to_uint8(render.color))})
+        shown.append({"caption": f"image, frame {frame.index}", "uri": _uri(frame.color)})
+        shown.append({"caption": "uncertainty", "uri": _uri(pictures.to_uint8(render.color))})
     scale = _scale(
         "plasma",
         words.metres_text(low_m),

@@ -22,7 +22,10 @@ def bytes_text(count: float) -> str:
 def metres_text(value_m: float) -> str:
     """Metres, or millimetres below a tenth of a metre."""
     if abs(value_m) < 0.1:
-        return f"{1e3 * value_m:.1f} mm" if abs(value_m) >= 1e-3 else f"{1e3 * value_m:.3g} mm"
+        millimetres = 1e3 * abs(value_m)
+        if 0.0 < millimetres < 1e-3:
+            return "< 0.001 mm"
+        return f"{1e3 * value_m:.1f} mm" if millimetres >= 1.0 else f"{1e3 * value_m:.3g} mm"
     return f"{value_m:.3f} m"
 
 

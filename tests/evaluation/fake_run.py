@@ -36,7 +36,7 @@ CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 FRAMES = 21
 INTERVAL_NS = 40_000_000
 WALL_Z_M = 2.0
-SIGMA_M = 0.002  # of every centre across the wall, as the information says, and as it is
+SIGMA_M = (0.001, 0.008)  # of the centres across the wall, as the information says, and as it is
 DRIFT_M = 0.02  # of the last pose of the odometry
 HEADER_BYTES = 34
 T_GT_WORLD = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, -0.2, 0.9]))
@@ -62,14 +62,14 @@ def way(robot: int) -> np.ndarray:
 
 
 def wall(seed: int = 0) -> Gaussians:
-    """Gaussians on the wall, world frame, smooth random colours, centres off by SIGMA_M across it."""
+    """Gaussians on the wall, world frame, smooth colours, centres off by `sigma_m` across it."""
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.arange(-2.4, 3.6, 0.06), np.arange(-2.0, 2.4, 0.06))
     n = x.size
     colors = 0.5 + 0.4 * np.stack([np.sin(5 * x + 1), np.sin(4 * y), np.sin(3 * x + 6 * y)], axis=-1).reshape(
         n, 3
     )
-    z = WALL_Z_M + rng.normal(0.0, SIGMA_M, n)
+    z = WALL_Z_M + rng.normal(0.0, sigma_m(n))
     return Gaussians(
         ids=np.arange(n),
         anchors=np.zeros(n),
@@ -81,13 +81,19 @@ def wall(seed: int = 0) -> Gaussians:
     )
 
 
+def sigma_m(n: int) -> np.ndarray:
+    """Standard deviation of every centre across the wall, spread over SIGMA_M."""
+    share = np.random.default_rng(7).random(n)
+    return SIGMA_M[0] * (SIGMA_M[1] / SIGMA_M[0]) ** share
+
+
 def information(robot: str, gaussians: Gaussians, known: bool = True) -> GaussianInformation:
-    """Position information 1/SIGMA_M^2 across the wall and a hundredth of it along; nothing at all if not known."""
+    """Position information 1/sigma^2 across the wall and a hundredth of it along; nothing at all if not known."""
     n = len(gaussians)
     geometry = np.zeros((n, 45), dtype=np.float32)
     if known:
-        geometry[:, 0] = geometry[:, 9] = 0.01 / SIGMA_M**2
-        geometry[:, 17] = 1.0 / SIGMA_M**2
+        geometry[:, 0] = geometry[:, 9] = 0.01 / sigma_m(n) ** 2
+        geometry[:, 17] = 1.0 / sigma_m(n) ** 2
     return GaussianInformation(
         stamp_ns=0,
         robot=robot,
