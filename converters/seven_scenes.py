@@ -64,7 +64,7 @@ class Options(Config):
     """The colour camera sits this far to the right (+x) of the depth camera; a point shifts by -f b / z pixels."""
     rate_hz: int = Field(30, gt=0)
     """Frames per second; the dataset has no time stamps."""
-    sequences: str = ""
+    sequences: str = Field("", coerce_numbers_to_str=True)
     """Numbers of the sequences to take, for example "1,3"; all if empty. Several make one robot each."""
 
     def depth_camera(self) -> PinholeCamera:
@@ -108,7 +108,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     source = {
         "dataset": "7-Scenes",
         "folder": Path(src).resolve().name,
-        "sequences": sorted({p[0] for p in parts}),
+        "sequences": sorted({p[0] for p in parts if p[0]}),
     }
     parameters = {"robots": robots, **settings.model_dump()}
     with RecordingWriter(out, "", source, "7scenes", parameters, force) as recording:

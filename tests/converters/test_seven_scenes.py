@@ -1,0 +1,388 @@
+"""7-Scenes: a small sequence of a synthetic room in the dataset's own files, and the real one where it is there."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import converters
+from converters import seven_scenes
+from converters.seven_scenes import Options, Registration, convert, list_frames
+from pipeline import messages as m
+from pipeline.errors import DuagError
+from pipeline.geometry import se3, so3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.recording import Recording, content_digest, open_rgbd, read_log
+
+ROOM_HALF_M = np.array([1.6, 1.3, 1.1])
+BOX_HALF_M = np.array([0.25, 0.3, 0.2])
+BOX_CENTRE_M = np.array([0.1, 0.5, 0.1])
+REAL = Path(__file__).parents[3] / "shared" / "data" / "redkitchen"
+FRAMES = 7
+T_DEPTH_COLOR = se3.from_rotation_translation(np.eye(3), [Options().baseline_m, 0, 0])
+
+
+def render(camera: PinholeCamera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Colour uint8 [H, W, 3] and exact z-depth [H, W] of a box in a room, seen from inside the room."""
+    rays = camera.rays().reshape(-1, 3) @ T_world_camera[:3, :3].T
+    origin = T_world_camera[:3, 3]
+    with np.errstate(divide="ignore"):
+        to_walls = np.where(rays > 0, (ROOM_HALF_M - origin) / rays, (-ROOM_HALF_M - origin) / rays).min(
+            axis=1
+        )
+        a, b = ((BOX_CENTRE_M + s * BOX_HALF_M - origin) / rays for s in (-1, 1))
+    enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+    z = np.where((enter < leave) & (enter > 0), enter, to_walls)
+    points = origin + z[:, None] * rays
+    shade = (np.floor(points * 5).sum(axis=1) % 2) * 90 + 80
+    color = np.stack([shade, shade * 0.8, shade * 0.6], axis=-1).astype(np.uint8)
+    return color.reshape(camera.height, camera.width, 3), z.reshape(camera.height, camera.width)
+
+
+def depth_pose(index: int) -> np.ndarray:
+    """T_world_depth of frame `index`: an arc around the box, looking at it (z forward, y down)."""
+    angle = -0.3 + 0.05 * index
+    position = np.array([0.9 * np.sin(angle), -0.8 * np.cos(angle), -0.1])
+    z = BOX_CENTRE_M - position
+    z /= np.linalg.norm(z)
+    x = np.cross(z, [0, 0, 1.0])
+    x /= np.linalg.norm(x)
+    return se3.from_rotation_translation(np.stack([x, np.cross(z, x), z], axis=1), position)
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scene") / "seq-01"
+    folder.mkdir()
+    options = Options()
+    for index in range(FRAMES):
+        pose = depth_pose(index)
+        color, _ = render(options.color_camera(), pose @ T_DEPTH_COLOR)
+        _, depth = render(options.depth_camera(), pose)
+        raw = np.rint(depth * 1000).astype(np.uint16)
+        raw[:20, :30], raw[20:40, :30] = 0, 65535
+        stem = folder / f"frame-{index:06d}"
+        cv2.imwrite(f"{stem}.color.jpg", color)
+        cv2.imwrite(f"{stem}.depth.png", raw, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        pose[:3, :3] += np.random.default_rng(index).uniform(-4e-4, 4e-4, (3, 3))  # as the dataset has it
+        np.savetxt(f"{stem}.pose.txt", pose, delimiter="\t")
+    return folder
+
+
+@pytest.fixture
+def broken(sequence: Path, tmp_path: Path) -> Path:
+    """A copy that a test may damage."""
+    shutil.copytree(sequence, tmp_path / "seq-01")
+    return tmp_path / "seq-01"
+
+
+def poses_of(recording: Recording, robot: str) -> np.ndarray:
+    path = recording.groundtruth(robot)
+    assert path is not None
+    return np.array([m.unpack_pose_in_frame(r.proto()) for r in read_log(path)])
+
+
+# --- conversion -------------------------------------------------------------------------------------------------------
+
+
+def test_one_sequence_becomes_two_robots(sequence: Path, tmp_path: Path) -> None:
+    convert(sequence, tmp_path / "rec", robots=2)
+    recording = Recording(tmp_path / "rec")
+    assert recording.robots == ["alpha", "bravo"]
+    cut = FRAMES // 2
+    for robot, numbers in (("alpha", range(cut)), ("bravo", range(cut, FRAMES))):
+        log = open_rgbd(recording.log(robot))
+        assert (log.camera, log.depth_scale, len(log)) == (Options().color_camera(), 0.001, len(numbers))
+        assert [f.stamp_ns for f in log.frames()] == [i * 10**9 // 30 for i in range(len(numbers))]
+        for record, number in zip(
+            read_log(recording.log(robot), [f"/{robot}/camera/color"]), numbers, strict=True
+        ):
+            assert record.proto().data == (sequence / f"frame-{number:06d}.color.jpg").read_bytes()
+        expected = np.array([depth_pose(n) @ T_DEPTH_COLOR for n in numbers])
+        found = poses_of(recording, robot)
+        np.testing.assert_allclose(found, expected, atol=1e-3)  # the defect of the rotations above
+        np.testing.assert_allclose(
+            found[:, :3, :3] @ np.swapaxes(found[:, :3, :3], 1, 2),
+            np.eye(3)[None].repeat(len(found), 0),
+            atol=1e-12,
+        )
+    description = json.loads((tmp_path / "rec" / "recording.json").read_text())
+    assert description["parameters"]["baseline_m"] == 0.025
+    assert description["source"] == {"dataset": "7-Scenes", "folder": "seq-01", "sequences": []}
+    for check in description["checks"].values():
+        assert check["reprojection_median_m"] < 0.001 * check["median_depth_m"]
+
+
+def test_depth_is_registered_to_colour(sequence: Path, tmp_path: Path) -> None:
+    """Against the depth that the colour camera would have measured."""
+    convert(sequence, tmp_path / "rec")
+    for frame in open_rgbd(Recording(tmp_path / "rec").log("alpha")).frames():
+        _, exact = render(Options().color_camera(), depth_pose(frame.index) @ T_DEPTH_COLOR)
+        seen = frame.depth > 0
+        error = np.abs(frame.depth - exact)[seen]
+        assert np.median(error) < 0.0005  # the millimetre of the source, twice rounded
+        assert np.mean(error > 0.005) < 0.01  # borders of the box, one pixel wide
+        assert seen[60:-60, 80:-80].mean() > 0.97  # the rest is hidden from the depth camera by the box
+        v, u = 240, 560
+        assert seen[v, u]
+        assert frame.depth[v, u] == pytest.approx(exact[v, u], abs=0.002)
+
+
+def test_conversions_are_the_same_every_time(sequence: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        convert(sequence, tmp_path / name / "rec", robots=2)
+    for name in ("alpha.mcap", "bravo.mcap", "alpha.groundtruth.mcap"):
+        assert content_digest(tmp_path / "a" / "rec" / name) == content_digest(tmp_path / "b" / "rec" / name)
+
+
+def test_several_sequences_become_one_robot_each(sequence: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    for number in (1, 3):
+        shutil.copytree(sequence, scene / f"seq-{number:02d}")
+    convert(scene, tmp_path / "both", robots=2)
+    both = Recording(tmp_path / "both")
+    assert [len(open_rgbd(both.log(robot))) for robot in both.robots] == [FRAMES, FRAMES]
+    convert(scene, tmp_path / "one", sequences=3)
+    assert Recording(tmp_path / "one").description["source"]["sequences"] == ["seq-03"]
+    with pytest.raises(DuagError, match="found sequences seq-01, seq-03 for 1 robots"):
+        convert(scene, tmp_path / "rec")
+    with pytest.raises(DuagError, match="found sequences 1, 3, expected '2' among them"):
+        convert(scene, tmp_path / "rec", sequences="2")
+
+
+def test_missing_numbers_are_skipped_and_told(broken: Path, tmp_path: Path) -> None:
+    for path in broken.glob("frame-000002.*"):
+        path.unlink()
+    convert(broken, tmp_path / "rec")
+    recording = Recording(tmp_path / "rec")
+    stamps = [f.stamp_ns for f in open_rgbd(recording.log("alpha")).frames()]
+    assert stamps == [n * 10**9 // 30 for n in (0, 1, 3, 4, 5, 6)]
+    assert "seq-01: 1 frame numbers are missing and were skipped: 2" in recording.description["warnings"]
+
+
+def test_sequences_without_poses_have_no_ground_truth(broken: Path, tmp_path: Path) -> None:
+    for path in broken.glob("*.pose.txt"):
+        path.unlink()
+    convert(broken, tmp_path / "rec")
+    recording = Recording(tmp_path / "rec")
+    assert recording.groundtruth("alpha") is None
+    assert recording.description["checks"]["alpha"]["reprojection_median_m"] is None
+    assert any("no ground truth" in w for w in recording.description["warnings"])
+
+
+# --- broken sources ---------------------------------------------------------------------------------------------------
+
+
+def rewrite_pose(change: Callable[[np.ndarray], object]) -> Callable[[Path], object]:
+    def damage(folder: Path) -> None:
+        path = folder / "frame-000003.pose.txt"
+        T = np.loadtxt(path)
+        change(T)
+        np.savetxt(path, T)
+
+    return damage
+
+
+def write_image(name: str, array: np.ndarray) -> Callable[[Path], object]:
+    return lambda folder: cv2.imwrite(str(folder / name), array)
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda f: (f / "frame-000003.depth.png").unlink(), "frame-000003.color.jpg: has no depth beside it"),
+        (lambda f: (f / "frame-000003.color.jpg").unlink(), "frame-000003.depth.png: has no color beside it"),
+        (lambda f: (f / "frame-000003.pose.txt").unlink(), "frame-000003.color.jpg: has no pose beside it"),
+        (lambda f: (f / "frame-000003.color.png").touch(), "frame-000003.color.png: found beside"),
+        (
+            lambda f: (f / "frame-000003.color.jpg").write_bytes(b""),
+            "frame-000003.color.jpg: 0 bytes that no decoder",
+        ),
+        (
+            lambda f: (f / "frame-000003.depth.png").write_bytes(b"x"),
+            "frame-000003.depth.png: 1 bytes that no decoder",
+        ),
+        (lambda f: (f / "frame-000003.pose.txt").write_text("1 2 3"), "frame-000003.pose.txt: "),
+        (lambda f: (f / "frame-000003.pose.txt").write_bytes(b"\xff\xfe"), "frame-000003.pose.txt: "),
+        (
+            rewrite_pose(lambda T: T.__setitem__((0, 3), np.inf)),
+            "frame-000003.pose.txt: found numbers that are not",
+        ),
+        (rewrite_pose(lambda T: T.__imul__(0)), "frame-000003.pose.txt: its rotation is off by"),
+        (
+            rewrite_pose(lambda T: T.__setitem__((slice(3), 0), -T[:3, 0])),
+            "frame-000003.pose.txt: its rotation is off",
+        ),
+        (
+            write_image("frame-000003.depth.png", np.zeros((480, 640), np.uint8)),
+            "frame-000003.depth.png: is uint8",
+        ),
+        (
+            write_image("frame-000003.depth.png", np.zeros((240, 320), np.uint16)),
+            "is 320x240, expected 640x480",
+        ),
+        (
+            write_image("frame-000003.color.jpg", np.zeros((240, 320, 3), np.uint8)),
+            "is 320x240, expected 640x480",
+        ),
+    ],
+)
+def test_broken_files_are_named(
+    broken: Path, tmp_path: Path, damage: Callable[[Path], object], words: str
+) -> None:
+    damage(broken)
+    with pytest.raises(DuagError) as caught:
+        convert(broken, tmp_path / "rec")
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert [p.name for p in tmp_path.iterdir()] == ["seq-01"], "nothing is left behind"
+
+
+def inverted(T: np.ndarray) -> np.ndarray:
+    return se3.inverse(se3.from_rotation_translation(so3.project(T[:3, :3]), T[:3, 3]))
+
+
+def upside_down(T: np.ndarray) -> np.ndarray:
+    """Axes of OpenGL: y up, z backward."""
+    return T @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@pytest.mark.parametrize("wrong", [inverted, upside_down])
+def test_other_conventions_of_poses_are_caught(
+    broken: Path, tmp_path: Path, wrong: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    for path in broken.glob("*.pose.txt"):
+        np.savetxt(path, wrong(np.loadtxt(path)))
+    with pytest.raises(DuagError, match="poses, intrinsics and depth do not belong together"):
+        convert(broken, tmp_path / "rec")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"focal": 5}, "focal = 5: Extra inputs are not permitted; options are depth_focal_px,"),
+        ({"depth_focal_px": -1}, "depth_focal_px = -1"),
+        ({"depth_focal_px": "wide"}, "depth_focal_px = 'wide'"),
+        ({"robots": 0}, "0 robots, expected 1 to 26"),
+        ({"robots": FRAMES + 1}, f"found {FRAMES} frames, expected at least {FRAMES + 1}"),
+    ],
+)
+def test_options_are_checked(sequence: Path, tmp_path: Path, options: dict[str, Any], words: str) -> None:
+    with pytest.raises(DuagError) as caught:
+        convert(sequence, tmp_path / "rec", **options)
+    assert words in str(caught.value)
+
+
+def test_sources_that_are_none(sequence: Path, tmp_path: Path) -> None:
+    with pytest.raises(DuagError, match="no such folder"):
+        convert(tmp_path / "nothing", tmp_path / "rec")
+    with pytest.raises(DuagError, match="expected a sequence of 7-Scenes"):
+        convert(tmp_path, tmp_path / "rec")
+    (tmp_path / "rec").mkdir()
+    (tmp_path / "rec" / "file").touch()
+    with pytest.raises(DuagError, match="exists already"):
+        convert(sequence, tmp_path / "rec")
+
+
+# --- registration -----------------------------------------------------------------------------------------------------
+
+
+def slanted(camera: PinholeCamera, slope: float) -> np.ndarray:
+    """Depth of the plane z = 1.2 + slope x."""
+    return 1.2 / (1 - slope * camera.rays()[:, :, 0])
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.8, -0.8, 2.0])
+def test_planes_stay_planes(slope: float) -> None:
+    """No moiré, no holes: inside the common view a plane comes out exact and complete."""
+    options = Options()
+    depth = slanted(options.depth_camera(), slope)
+    depth[(depth < 0.3) | (depth > 4)] = 0
+    out = Registration(options.depth_camera(), options.color_camera(), options.baseline_m)(depth)
+    # the plane in the colour camera, which sits baseline_m further along x
+    rays = options.color_camera().rays()[:, :, 0]
+    exact = (1.2 + slope * options.baseline_m) / (1 - slope * rays)
+    seen = out > 0
+    interior = seen.copy()
+    interior[:, 1:-1] &= seen[:, :-2] & seen[:, 2:]  # at a border the last pixel covers half its width
+    np.testing.assert_allclose(out[interior], exact[interior], rtol=1e-9)
+    inside = (exact > 0.35) & (exact < 3.8)
+    inside[:50] = inside[-50:] = False
+    inside[:, :70] = inside[:, -70:] = False
+    assert seen[inside].all()
+
+
+def test_the_nearest_surface_wins_and_edges_stay_sharp() -> None:
+    options = Options()
+    depth = np.full((480, 640), 2.0)
+    depth[:, 300:340] = 0.8
+    out = Registration(options.depth_camera(), options.color_camera(), options.baseline_m)(depth)
+    values = np.unique(np.round(out, 9))
+    assert values.tolist() == [0.0, 0.8, 2.0], "nothing is interpolated across the edge"
+    columns = np.nonzero(out[240] == np.min(out[240][out[240] > 0]))[0]
+    left = 320 + 525 * ((299.5 - 320) / 585 - 0.025 / 0.8)
+    right = 320 + 525 * ((339.5 - 320) / 585 - 0.025 / 0.8)
+    assert abs(columns[0] - left) <= 1
+    assert abs(columns[-1] - right) <= 1
+    shadow = np.nonzero(out[240, columns[-1] :] == 2.0)[0][0]  # what the bar hides from the depth camera
+    assert shadow == pytest.approx(525 * 0.025 * (1 / 0.8 - 1 / 2.0), abs=2)
+
+
+def test_no_depth_stays_none() -> None:
+    options = Options()
+    register = Registration(options.depth_camera(), options.color_camera(), options.baseline_m)
+    assert not register(np.zeros((480, 640))).any()
+    same = Registration(options.depth_camera(), options.depth_camera(), 0.0)
+    depth = slanted(options.depth_camera(), 0.5)
+    depth[100:110, 50:300] = 0
+    np.testing.assert_allclose(same(depth), depth, rtol=1e-12)  # the identity keeps every hole
+
+
+# --- the table of converters ------------------------------------------------------------------------------------------
+
+
+def test_the_command_finds_the_converter(sequence: Path, tmp_path: Path) -> None:
+    converters.convert(
+        "7scenes", sequence, tmp_path / "rec", options=["color_focal_px=520", "baseline_m = 0.03"]
+    )
+    parameters = Recording(tmp_path / "rec").description["parameters"]
+    assert (parameters["color_focal_px"], parameters["baseline_m"]) == (520, 0.03)
+    text = converters.describe()
+    assert "7scenes: Microsoft 7-Scenes" in text
+    assert "--set baseline_m=0.025" in text
+    with pytest.raises(DuagError, match="dataset '8scenes', expected one of: 7scenes"):
+        converters.convert("8scenes", sequence, tmp_path / "other")
+    with pytest.raises(DuagError, match="expected NAME=VALUE"):
+        converters.convert("7scenes", sequence, tmp_path / "other", options=["baseline_m"])
+
+
+def test_every_option_is_documented() -> None:
+    assert all(field.description for field in seven_scenes.Options.model_fields.values())
+
+
+# --- the real thing ---------------------------------------------------------------------------------------------------
+
+
+def test_real_sequence(tmp_path: Path) -> None:
+    """RedKitchen, 24 of its frames: the poses agree with the registered depth to 1 % of it."""
+    if not REAL.is_dir():
+        pytest.skip("needs ../shared/data/redkitchen")
+    source = tmp_path / "redkitchen"
+    source.mkdir()
+    for number in range(24):
+        for path in REAL.glob(f"frame-{number:06d}.*"):
+            shutil.copy(path, source)
+    frames, missing = list_frames(source)
+    assert (len(frames), missing) == (24, [])
+    convert(source, tmp_path / "rec", robots=2)
+    recording = Recording(tmp_path / "rec")
+    for check in recording.description["checks"].values():
+        assert check["reprojection_median_m"] < 0.01 * check["median_depth_m"]
+        assert check["registered_holes"] < 0.005
+    poses = poses_of(recording, "alpha")
+    np.testing.assert_allclose(np.linalg.det(poses[:, :3, :3]), 1.0, atol=1e-12)
