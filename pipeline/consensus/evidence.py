@@ -1,0 +1,164 @@
+"""What a robot's own pixels say about its Gaussians, in the flat chart of method section 1, and how it turns.
+
+theta [13] = mean 3 (m), vec log Sigma 6 (`geometry.spd` order), colour 3 (RGB 0..1), opacity logit 1.
+
+information [31] is block diagonal in that chart: the upper triangles, row by row, of the 3x3 of the mean (xx, xy, xz,
+yy, yz, zz; 1/m^2) and of the 6x6 of vec log Sigma (21), the diagonal of the colour (3), and the opacity (1). The cross
+terms between mean and covariance, which the Fisher sums of the information stage still hold, are dropped: fusion
+works per block. The blocks are then conditional, not marginal, information. Zero is no information.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.geometry import se3, spd
+from pipeline.splat.gaussians import Gaussians
+
+Array = NDArray[np.float64]
+MEAN, LOG_COVARIANCE, COLOR, OPACITY = slice(0, 3), slice(3, 9), slice(9, 12), 12
+"""Places in theta."""
+_POSITION, _SHAPE, _COLOR, _OPACITY = slice(0, 6), slice(6, 27), slice(27, 30), 30
+
+
+class FisherSums(Protocol):
+    """What the information stage hands over, in the map frame: see `messages.GaussianInformation`."""
+
+    ids: NDArray[np.int64]
+    geometry: NDArray[Any]  # [n, 45] upper triangle, row by row, of the 9x9 of (mean, vec log Sigma)
+    color: NDArray[Any]  # [n, 3]
+    opacity: NDArray[Any]  # [n]
+
+
+def unpack_symmetric(upper: ArrayLike, size: int) -> Array:
+    """Symmetric matrices [..., size, size] of their upper triangles, row by row."""
+    upper = np.asarray(upper, dtype=np.float64)
+    rows, columns = np.triu_indices(size)
+    out = np.empty((*upper.shape[:-1], size, size))
+    out[..., rows, columns] = upper
+    out[..., columns, rows] = upper
+    return out
+
+
+def pack_symmetric(matrix: Array) -> Array:
+    """Upper triangles, row by row, of symmetric matrices [..., size, size]."""
+    rows, columns = np.triu_indices(matrix.shape[-1])
+    return matrix[..., rows, columns]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A robot's own evidence on n of its Gaussians. It never contains what came from a neighbour.
+
+    owner: the robot. ids: int64 [n]. anchors: int32 [n], index of the owner's keyframe. theta: float64 [n, 13], in
+    the frame of the anchor (or of the world, after `in_world`). information: float64 [n, 31], likewise.
+    """
+
+    owner: str
+    ids: NDArray[np.int64]
+    anchors: NDArray[np.int32]
+    theta: Array
+    information: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.ids)
+        shapes: dict[str, tuple[type, tuple[int, ...]]] = {
+            "ids": (np.int64, (n,)),
+            "anchors": (np.int32, (n,)),
+            "theta": (np.float64, (n, 13)),
+            "information": (np.float64, (n, 31)),
+        }
+        for name, (dtype, shape) in shapes.items():
+            array: NDArray[Any] = np.ascontiguousarray(getattr(self, name), dtype=dtype)
+            if array.shape != shape:
+                raise ValueError(f"Evidence.{name} has shape {array.shape}, expected {shape}")
+            object.__setattr__(self, name, array)
+
+    @staticmethod
+    def from_map(
+        owner: str, gaussians: Gaussians, information: FisherSums | None, T_map_keyframe: ArrayLike
+    ) -> Evidence:
+        """Evidence of a robot's own map, each Gaussian in the frame of its anchor.
+
+        Args:
+            owner: the robot.
+            gaussians: its map, in its map frame.
+            information: Fisher sums in the map frame, by id; a Gaussian without has no information, nor has any
+                if None.
+            T_map_keyframe: [k, 4, 4], by anchor.
+        """
+        n = len(gaussians)
+        theta = np.concatenate(
+            [
+                gaussians.means.astype(np.float64),
+                spd.log_covariance(gaussians.quats_wxyz, gaussians.log_scales),
+                gaussians.colors.astype(np.float64),
+                gaussians.opacity_logits.astype(np.float64)[:, None],
+            ],
+            axis=1,
+        )
+        packed = np.zeros((n, 31))
+        if information is not None and len(information.ids):
+            order = np.argsort(information.ids, kind="stable")
+            at = np.minimum(np.searchsorted(information.ids[order], gaussians.ids), len(order) - 1)
+            found = information.ids[order[at]] == gaussians.ids
+            row = order[at[found]]
+            geometry = unpack_symmetric(information.geometry[row], 9)
+            packed[found, _POSITION] = pack_symmetric(geometry[:, :3, :3])
+            packed[found, _SHAPE] = pack_symmetric(geometry[:, 3:, 3:])
+            packed[found, _COLOR] = information.color[row]
+            packed[found, _OPACITY] = information.opacity[row]
+        in_map = Evidence(owner, gaussians.ids, gaussians.anchors, theta, packed)
+        return in_map._turned(se3.inverse(T_map_keyframe))
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def select(self, index: NDArray[np.bool_] | NDArray[np.int64] | slice) -> Evidence:
+        """The Gaussians of a mask, a slice or an index array, in that order."""
+        return Evidence(
+            self.owner, self.ids[index], self.anchors[index], self.theta[index], self.information[index]
+        )
+
+    def in_world(self, T_world_keyframe: ArrayLike) -> Evidence:
+        """The same in the world frame, by the owner's keyframe poses [k, 4, 4] (by anchor)."""
+        return self._turned(np.asarray(T_world_keyframe, dtype=np.float64))
+
+    def _turned(self, T_new_anchor: Array) -> Evidence:
+        """theta and information with every anchor's frame moved by its T [k, 4, 4]."""
+        if not len(self):
+            return self
+        R, D = T_new_anchor[:, :3, :3], spd.sym_rotation(T_new_anchor[:, :3, :3])
+        R, D, t = R[self.anchors], D[self.anchors], T_new_anchor[self.anchors, :3, 3]
+        theta = self.theta.copy()
+        theta[:, MEAN] = (R @ theta[:, MEAN, None])[..., 0] + t
+        theta[:, LOG_COVARIANCE] = (D @ theta[:, LOG_COVARIANCE, None])[..., 0]
+        information = self.information.copy()
+        information[:, _POSITION] = pack_symmetric(R @ self.position_information() @ R.swapaxes(-1, -2))
+        information[:, _SHAPE] = pack_symmetric(D @ self.shape_information() @ D.swapaxes(-1, -2))
+        return Evidence(self.owner, self.ids, self.anchors, theta, information)
+
+    def position_information(self) -> Array:
+        """[n, 3, 3], 1/m^2."""
+        return unpack_symmetric(self.information[:, _POSITION], 3)
+
+    def shape_information(self) -> Array:
+        """[n, 6, 6], over vec log Sigma."""
+        return unpack_symmetric(self.information[:, _SHAPE], 6)
+
+    def color_information(self) -> Array:
+        """[n, 3]."""
+        return self.information[:, _COLOR]
+
+    def opacity_information(self) -> Array:
+        """[n], over the logit."""
+        return self.information[:, _OPACITY]
+
+
+def pack_information(position: Array, shape: Array, color: Array, opacity: Array) -> Array:
+    """Information [n, 31] of its blocks [n, 3, 3], [n, 6, 6], [n, 3] and [n]."""
+    return np.concatenate([pack_symmetric(position), pack_symmetric(shape), color, opacity[:, None]], axis=1)

@@ -1,0 +1,222 @@
+"""Which Gaussians of two robots are the same piece of surface: paper eqs. (6)-(7), and tracks over many robots.
+
+The distance of two Gaussians in the flat chart is, with Delta the difference of their theta in one frame,
+
+    d_G^2 = |Delta mean|^2 / l^2 + 0.1 |Delta log Sigma|_F^2 + 1.0 |Delta c|^2 + 0.5 Delta alpha^2
+
+with colours as degree-0 spherical-harmonic coefficients and l = delta, the search radius: (6) adds square metres to
+squares without a unit, which would make the position count for nothing within 5 cm (l = 1 m gives (6) as printed).
+A direction in which a Gaussian is as thin as the mapper lets it be says nothing and is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.spatial import cKDTree
+
+from pipeline.config import Config
+from pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Evidence
+from pipeline.geometry import spd
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Pairs = Mapping[tuple[str, str], Index]
+SH_C0 = 0.28209479177387814  # colour = 0.5 + SH_C0 * coefficient
+_CHUNK = 200_000  # pairs per pass, for memory
+_FLOOR_SLACK = 1e-3  # of a log-scale: float32 and rotations
+
+
+class MatchingConfig(Config):
+    """Matching of Gaussians between two robots."""
+
+    radius_m: float = 0.05
+    """Delta of (6): matches are searched within this distance."""
+    position_scale_m: float = 0.05
+    """l: the distance that counts as one."""
+    beta_log_covariance: float = 0.1
+    """Weight of the squared Log-Euclidean distance of the covariances."""
+    beta_color: float = 1.0
+    """Weight of the squared distance of the colour coefficients."""
+    beta_opacity: float = 0.5
+    """Weight of the squared difference of the opacity logits."""
+    percentile: float = 90.0
+    """tau_G is this percentile, over the own map, of d_G to the nearest neighbour within the radius."""
+    candidates: int = 16
+    """Nearest Gaussians within the radius that are compared, from either side."""
+    thickness_floor_m: float = 1e-3
+    """Standard deviation below which the mapper lets no Gaussian go."""
+
+
+@dataclass(frozen=True)
+class _Chart:
+    """theta with the projections [n, 3, 3] onto the directions in which a Gaussian is not at the thickness floor."""
+
+    theta: Array
+    free: Array
+
+    @staticmethod
+    def of(theta: Array, config: MatchingConfig) -> _Chart:
+        values, vectors = np.linalg.eigh(spd.vec_to_sym(theta[:, LOG_COVARIANCE]))
+        above = 0.5 * values > np.log(config.thickness_floor_m) + _FLOOR_SLACK
+        return _Chart(theta, (vectors * above[:, None, :]) @ vectors.swapaxes(-1, -2))
+
+
+def _distances(a: _Chart, i: Index, b: _Chart, j: Index, config: MatchingConfig) -> Array:
+    """d_G [m] of Gaussians i of a and j of b."""
+    out = np.empty(len(i))
+    for start in range(0, len(i), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        delta = a.theta[i[part]] - b.theta[j[part]]
+        P = a.free[i[part]] @ b.free[j[part]]
+        shape = P.swapaxes(-1, -2) @ spd.vec_to_sym(delta[:, LOG_COVARIANCE]) @ P
+        out[part] = np.sqrt(
+            np.sum(delta[:, MEAN] ** 2, axis=1) / config.position_scale_m**2
+            + config.beta_log_covariance * np.sum(shape**2, axis=(1, 2))
+            + config.beta_color * np.sum((delta[:, COLOR] / SH_C0) ** 2, axis=1)
+            + config.beta_opacity * delta[:, OPACITY] ** 2
+        )
+    return out
+
+
+def gaussian_distance(a: Evidence, i: Index, b: Evidence, j: Index, config: MatchingConfig) -> Array:
+    """d_G [m] between rows i of a and rows j of b, both in the world frame."""
+    used_a, i = np.unique(i, return_inverse=True)
+    used_b, j = np.unique(j, return_inverse=True)
+    return _distances(_Chart.of(a.theta[used_a], config), i, _Chart.of(b.theta[used_b], config), j, config)
+
+
+def threshold(own: Evidence, config: MatchingConfig) -> float:
+    """tau_G of a map: what its own neighbours differ by; 0 if no two are within the radius."""
+    if len(own) < 2:
+        return 0.0
+    means = own.theta[:, MEAN]
+    distance, neighbour = cKDTree(means).query(means, k=2)
+    near = np.flatnonzero(distance[:, 1] <= config.radius_m)
+    if not len(near):
+        return 0.0
+    # of coinciding Gaussians the query may name the Gaussian itself second
+    other = np.where(neighbour[near, 1] == near, neighbour[near, 0], neighbour[near, 1])
+    chart = _Chart.of(own.theta, config)
+    return float(np.percentile(_distances(chart, near, chart, other, config), config.percentile))
+
+
+def match(own: Evidence, peer: Evidence, config: MatchingConfig) -> Index:
+    """Matched Gaussians of two robots: within the radius, d_G below tau_G, and each the other's best.
+
+    Args:
+        own: all evidence of the computing robot, in the world frame; tau_G is taken over it.
+        peer: evidence of the other robot, in the world frame.
+    Returns:
+        int64 [m, 2], ids of (own, peer), ascending; each id at most once.
+    """
+    if not len(own) or not len(peer):
+        return np.zeros((0, 2), np.int64)
+    i, j = _candidates(own.theta[:, MEAN], peer.theta[:, MEAN], config)
+    d = _distances(_Chart.of(own.theta, config), i, _Chart.of(peer.theta, config), j, config)
+    close = d < threshold(own, config)
+    i, j, d = i[close], j[close], d[close]
+    best_of_own = _first_of_each(i, d, peer.ids[j])
+    best_of_peer = _first_of_each(j, d, own.ids[i])
+    mutual = np.intersect1d(best_of_own, best_of_peer)
+    pairs = np.stack([own.ids[i[mutual]], peer.ids[j[mutual]]], axis=1)
+    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+
+
+def _candidates(means_own: Array, means_peer: Array, config: MatchingConfig) -> tuple[Index, Index]:
+    """Rows (own, peer) within the radius: the nearest few of either side, each pair once."""
+    found = []
+    for a, b, turned in ((means_own, means_peer, False), (means_peer, means_own, True)):
+        k = min(config.candidates, len(b))
+        distance, neighbour = cKDTree(b).query(a, k=[*range(1, k + 1)], distance_upper_bound=config.radius_m)
+        row, rank = np.nonzero(np.isfinite(distance))
+        column = neighbour[row, rank]
+        own, peer = (column, row) if turned else (row, column)
+        found.append(own * len(means_peer) + peer)
+    key = np.unique(np.concatenate(found))
+    return key // len(means_peer), key % len(means_peer)
+
+
+def _first_of_each(group: Index, d: Array, tie: Index) -> Index:
+    """Position of the least (d, tie) of every group."""
+    order = np.lexsort((tie, d, group))
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = group[order][1:] != group[order][:-1]
+    return order[first]
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Groups of matched Gaussians over all robots, at most one of each robot in a group.
+
+    robots: names, sorted. track: int64 [r], ascending. robot: int64 [r], index into robots. row: int64 [r], row in
+    that robot's evidence. Rows of a track follow in order of robot.
+    """
+
+    robots: tuple[str, ...]
+    track: Index
+    robot: Index
+    row: Index
+
+
+def tracks(evidence: Mapping[str, Evidence], pairs: Pairs, config: MatchingConfig) -> Tracks:
+    """Connected components of the pairs over all robots.
+
+    A component that holds two Gaussians of one robot loses its pair of largest d_G (ties by ids) until none does.
+
+    Args:
+        evidence: of every robot, in the world frame.
+        pairs: (robot a, robot b) -> ids int64 [m, 2]; pairs of Gaussians that `evidence` lacks are left out, which
+            is what a robot does that has not received them.
+    """
+    robots = tuple(sorted(evidence))
+    first = dict(zip(robots, np.cumsum([0, *(len(evidence[r]) for r in robots)]).tolist(), strict=False))
+    total = sum(len(evidence[r]) for r in robots)
+    owner = np.repeat(np.arange(len(robots)), [len(evidence[r]) for r in robots])
+    parts = []
+    for a, b in sorted(p for p in pairs if p[0] in evidence and p[1] in evidence):
+        i, known_i = _rows(evidence[a], pairs[a, b][:, 0])
+        j, known_j = _rows(evidence[b], pairs[a, b][:, 1])
+        i, j = i[known_i & known_j], j[known_i & known_j]
+        d = gaussian_distance(evidence[a], i, evidence[b], j, config) if len(i) else np.zeros(0)
+        parts.append((first[a] + i, first[b] + j, d))
+    if not parts:
+        none = np.zeros(0, np.int64)
+        return Tracks(robots, none, none, none)
+    i, j, d = (np.concatenate([p[k] for p in parts]) for k in range(3))
+    i, j, d = i.astype(np.int64), j.astype(np.int64), d.astype(np.float64)
+    while True:
+        graph = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(total, total))
+        component = csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
+        touched = np.unique(np.concatenate([i, j]))
+        key = component[touched] * len(robots) + owner[touched]
+        twice, count = np.unique(key, return_counts=True)
+        broken = np.unique(twice[count > 1] // len(robots))
+        if not len(broken):
+            break
+        bad = np.flatnonzero(np.isin(component[i], broken))
+        worst_first = bad[np.lexsort((j[bad], i[bad], -d[bad], component[i[bad]]))]
+        leaders = np.ones(len(worst_first), dtype=bool)
+        leaders[1:] = component[i[worst_first]][1:] != component[i[worst_first]][:-1]
+        keep = np.ones(len(i), dtype=bool)
+        keep[worst_first[leaders]] = False
+        i, j, d = i[keep], j[keep], d[keep]
+    track = np.unique(component[touched], return_inverse=True)[1].astype(np.int64)
+    order = np.lexsort((touched, track))
+    rows, robot = touched[order], owner[touched[order]].astype(np.int64)
+    start = np.array([first[r] for r in robots], dtype=np.int64)
+    return Tracks(robots, track[order], robot, rows - start[robot])
+
+
+def _rows(evidence: Evidence, ids: Index) -> tuple[Index, NDArray[np.bool_]]:
+    """Row of every id, and whether it is there."""
+    if not len(evidence):
+        return np.zeros(len(ids), np.int64), np.zeros(len(ids), dtype=bool)
+    order = np.argsort(evidence.ids, kind="stable")
+    at = np.minimum(np.searchsorted(evidence.ids[order], ids), len(order) - 1)
+    return order[at], evidence.ids[order[at]] == ids
