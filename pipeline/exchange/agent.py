@@ -196,7 +196,7 @@ class Agent:
             if neighbour.frame is None or frame[:2] < neighbour.frame[:2]:
                 neighbour.frame = frame
         elif arrival.kind is Kind.VOXELS:
-            owner, neighbour.voxels = wire.read_voxels(arrival.payload, team)
+            _, neighbour.voxels = wire.read_voxels(arrival.payload, team)
         elif arrival.kind is Kind.ANCHORS:
             self._anchors_told.add((neighbour.index, self.knowledge.take_anchors(arrival.payload)))
         elif arrival.kind is Kind.PAIRS:

@@ -83,7 +83,7 @@ class ExchangeConfig(Config):
 
     period_ns: int = Field(default=100_000_000, ge=1)
     """Length of one round."""
-    max_rounds: int = Field(default=1500, ge=1)
+    max_rounds: int = Field(default=3000, ge=1)
     """The session ends here, whatever has been agreed."""
     coverage: Literal["all", "overlap"] = "all"
     """Send every Gaussian to everybody, or only those in space that the receiver's keyframes saw."""

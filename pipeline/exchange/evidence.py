@@ -32,7 +32,7 @@ def own_records(data: RobotData) -> Records:
 
 def to_records(evidence: Evidence) -> Records:
     """Records of evidence, in the same order."""
-    records = np.zeros(len(evidence.ids), RECORD)
+    records = np.zeros(len(evidence), RECORD)
     records["id"], records["anchor"] = evidence.ids, evidence.anchors
     records["theta"], records["information"] = evidence.theta, evidence.information
     return records

@@ -27,6 +27,8 @@ from pipeline.registration import Reference, ReferenceLevel
 Array = NDArray[np.float64]
 
 MAX_KEYFRAMES = 100_000
+MAX_COORDINATE = 1e6  # m, or units of theta; beyond it positions lose their meaning
+MAX_LOG_COVARIANCE = 60.0  # beyond it exponentials overflow in float32
 ROTATION_TOLERANCE = 1e-6  # of R R' = 1 in a pose that a neighbour sent
 
 
@@ -56,10 +58,10 @@ class Reader:
         T = np.tile(np.eye(4), (n, 1, 1))
         T[:, :3] = self.array("float64", (n, 3, 4))
         R = T[:, :3, :3]
-        if n and (
-            np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max() > ROTATION_TOLERANCE
-            or np.linalg.det(R).min() < 0
-        ):
+        if np.abs(R).max(initial=0.0) > 2.0 or np.abs(T[:, :3, 3]).max(initial=0.0) > MAX_COORDINATE:
+            raise MalformedError(f"{self.what}: a pose is not a rigid motion, or beyond {MAX_COORDINATE:g} m")
+        off = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(initial=0.0)
+        if off > ROTATION_TOLERANCE or np.linalg.det(R).min(initial=1.0) < 0:
             raise MalformedError(f"{self.what}: a pose is not a rigid motion")
         return T
 
@@ -172,7 +174,7 @@ def read_places(data: bytes) -> PlaceBook:
     reader = Reader(data, "descriptors")
     n = _keyframe_count(reader)
     T, drift = reader.poses(n), reader.array("float64", (n, 2))
-    if n and (drift.min() < 0 or np.diff(drift, axis=0).min(initial=0.0) < 0):
+    if n and (drift.min() < 0 or drift.max() > 1e12 or np.diff(drift, axis=0).min(initial=0.0) < 0):
         raise MalformedError("descriptors: the drift of the odometry must grow from zero")
     counts = reader.array("uint16", (n,)).tolist()
     book = PlaceBook([reader.array("uint8", (count, DIMENSIONS)) for count in counts], T, drift)
@@ -300,7 +302,7 @@ def read_poses(data: bytes, shared: NDArray[np.int32]) -> PosePacket:
         raise MalformedError("poses: of keyframes that the link does not share")
     if n and (
         np.abs((quats.astype(np.float64) ** 2).sum(axis=1) - 1).max() > 1e-3
-        or np.abs(translations).max() > 1e6
+        or np.abs(translations).max() > MAX_COORDINATE
     ):
         raise MalformedError("poses: not rigid motions")
     curvature = np.array(numbers[2:], dtype=np.float32) if flags & _CURVATURE else None
@@ -514,7 +516,6 @@ def read_pairs(data: bytes, team: int) -> PairList:
 
 RECORD = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f4", 13), ("information", "<f4", 31)])
 _EVIDENCE = struct.Struct("<HHI")  # owner, version, records of the whole message
-MAX_COORDINATE = 1e6  # of anything in theta; beyond it exponentials overflow or positions lose their meaning
 assert RECORD.itemsize == EVIDENCE_RECORD_BYTES
 assert _EVIDENCE.size == EVIDENCE_HEAD_BYTES
 
@@ -552,9 +553,9 @@ def read_evidence(data: bytes, team: int) -> tuple[int, NDArray[Any]]:
     """
     owner, announced = read_evidence_head(data[:EVIDENCE_HEAD_BYTES], team)
     chunks = -(-len(data) // EVIDENCE_CHUNK_BYTES)
-    rows = np.zeros(chunks * EVIDENCE_CHUNK_BYTES, np.uint8)
-    rows[: len(data)] = np.frombuffer(data, np.uint8)
-    rows = rows.reshape(chunks, EVIDENCE_CHUNK_BYTES)
+    padded = np.zeros(chunks * EVIDENCE_CHUNK_BYTES, np.uint8)
+    padded[: len(data)] = np.frombuffer(data, np.uint8)
+    rows = padded.reshape(chunks, EVIDENCE_CHUNK_BYTES)
     if (rows[:, :EVIDENCE_HEAD_BYTES] != rows[0, :EVIDENCE_HEAD_BYTES]).any():
         raise MalformedError("evidence: chunks of different messages")
     n, odd = divmod(len(data) - chunks * EVIDENCE_HEAD_BYTES, EVIDENCE_RECORD_BYTES)
@@ -570,7 +571,9 @@ def check_evidence(records: NDArray[Any]) -> None:
     theta, information = records["theta"], records["information"]
     if not np.isfinite(theta).all() or not np.isfinite(information).all():
         raise MalformedError("evidence: not a finite number")
-    if len(records) and (np.abs(theta).max() > MAX_COORDINATE or np.abs(theta[:, 3:9]).max() > 60.0):
+    if len(records) and (
+        np.abs(theta).max() > MAX_COORDINATE or np.abs(theta[:, 3:9]).max() > MAX_LOG_COVARIANCE
+    ):
         raise MalformedError("evidence: a Gaussian of impossible place or size")
     if len(records) and records["anchor"].min() < 0:
         raise MalformedError("evidence: a negative keyframe")

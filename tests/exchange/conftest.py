@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from pipeline import streams
@@ -15,6 +17,7 @@ from pipeline.messages import GaussianInformation
 from pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]
+MakeRobot = Callable[..., tuple[RobotData, Array]]
 CAMERA = PinholeCamera(240, 180, 200.0, 200.0, 119.5, 89.5)
 HALF_M = np.array([2.0, 1.3, 2.4])  # half the edges of the room
 
@@ -112,3 +115,9 @@ def information_of(name: str, maps: Gaussians, rng: np.random.Generator) -> Gaus
         0.02,
         "0.0012 + 0.0019 (z - 0.4)^2",
     )
+
+
+@pytest.fixture(scope="session")
+def make_robot() -> MakeRobot:
+    """Gives `robot`: name, first viewing direction (rad), number of keyframes and of Gaussians."""
+    return robot

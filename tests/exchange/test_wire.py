@@ -1,0 +1,167 @@
+"""Messages: what is written is read back, and nothing else is accepted."""
+
+import contextlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.consensus.poses import PosePacket, SharedKeyframes
+from pipeline.exchange import wire
+from pipeline.exchange.packets import MalformedError
+from pipeline.exchange.places import Features
+from pipeline.geometry import se3, so3
+from pipeline.registration import Reference, ReferenceLevel
+
+RNG = np.random.default_rng(5)
+TEAM = 4
+
+
+def poses(n: int) -> np.ndarray:
+    return se3.exp(RNG.normal(size=(n, 6)))
+
+
+def pose_packet(dtype: str) -> PosePacket:
+    T = poses(3)
+    quats = so3.to_quat_wxyz(T[:, :3, :3]).astype(dtype)
+    translations = T[:, :3, 3].astype(dtype)
+    keyframes = np.array([1, 4, 9], np.int32)
+    penalties = np.array([0.1, 0.2], np.float32)
+    return PosePacket(7, 2, keyframes, quats, translations, penalties, np.array([3, 4], np.float32), True)
+
+
+def sample() -> wire.KeyframeSample:
+    points = RNG.uniform(-2, 3, (30, 3)).astype(np.float32)
+    normals = RNG.normal(size=(30, 3))
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    levels = tuple(ReferenceLevel(points, normals, RNG.random(30).astype(np.float32)) for _ in range(3))
+    features = Features(RNG.integers(0, 256, (9, 128)).astype(np.uint8), points[:9])
+    return wire.KeyframeSample(2, features, Reference(levels))
+
+
+def records(n: int) -> np.ndarray:
+    out = np.zeros(n, wire.RECORD)
+    out["id"], out["anchor"] = RNG.permutation(n) + 5, RNG.integers(0, 4, n)
+    out["theta"], out["information"] = RNG.normal(size=(n, 13)), RNG.uniform(0, 1, (n, 31))
+    return out
+
+
+MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
+    "state": (
+        wire.write_state(wire.State(1, 0b1011, 3, 0, True, False, np.array([254, 255, 0, 1], np.uint8))),
+        lambda d: wire.read_state(d, TEAM),
+    ),
+    "places": (
+        wire.write_places(
+            wire.PlaceBook(
+                [RNG.integers(0, 256, (n, 128)).astype(np.uint8) for n in (3, 0, 2)],
+                poses(3),
+                np.array([[0, 0], [1, 1], [1, 3.0]]),
+            )
+        ),
+        wire.read_places,
+    ),
+    "request": (wire.write_indices([1, 5, 6]), lambda d: wire.read_indices(d, 7)),
+    "sample": (wire.write_sample(sample()), lambda d: wire.read_sample(d, 3)),
+    "closures": (
+        wire.write_verdicts(
+            wire.Verdicts(
+                9,
+                5,
+                4,
+                True,
+                poses(1)[0],
+                SharedKeyframes(np.array([2, 6], np.int32), np.ones((2, 6), np.float32)),
+            )
+        ),
+        lambda d: wire.read_verdicts(d, 7),
+    ),
+    "poses": (
+        wire.write_poses(pose_packet("float32")),
+        lambda d: wire.read_poses(d, np.arange(10, dtype=np.int32)),
+    ),
+    "frame": (wire.write_frame(1, 2, poses(1)[0]), lambda d: wire.read_frame(d, TEAM)),
+    "anchors": (
+        wire.write_anchors(wire.Anchors(2, poses(4), poses(1)[0])),
+        lambda d: wire.read_anchors(d, TEAM),
+    ),
+    "voxels": (
+        wire.write_voxels(3, np.cumsum(RNG.integers(1, 1 << 40, 50))),
+        lambda d: wire.read_voxels(d, TEAM),
+    ),
+    "pairs": (
+        wire.write_pairs(wire.PairList(0, 2, 1, np.array([[1, 5], [3, 4]]))),
+        lambda d: wire.read_pairs(d, TEAM),
+    ),
+    "evidence": (wire.write_evidence(1, 1, records(15)), lambda d: wire.read_evidence(d, TEAM)),
+}
+
+
+@given(name=st.sampled_from(sorted(MESSAGES)), data=st.data())
+@settings(max_examples=250, deadline=None)
+def test_readers_refuse_or_read_but_never_fail(name: str, data: st.DataObject) -> None:
+    good, read = MESSAGES[name]
+    read(good)
+    bad = bytearray(good)
+    for _ in range(data.draw(st.integers(1, 4))):
+        bad[data.draw(st.integers(0, len(bad) - 1))] = data.draw(st.integers(0, 255))
+    bad = bad[: data.draw(st.integers(len(bad) // 2, len(bad)))] if data.draw(st.booleans()) else bad
+    with contextlib.suppress(MalformedError):  # the only error it may raise; a warning fails the test
+        read(bytes(bad))
+
+
+@pytest.mark.parametrize(
+    "name", sorted(set(MESSAGES) - {"state"})
+)  # the poses of the round may follow a state
+@pytest.mark.parametrize("change", [-1, 1])
+def test_a_wrong_length_is_refused(name: str, change: int) -> None:
+    good, read = MESSAGES[name]
+    bad = good[:-1] if change < 0 else good + b"\x01"
+    with pytest.raises(MalformedError):
+        read(bad)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_poses_of_a_round_come_back_bit_for_bit(dtype: str) -> None:
+    packet = pose_packet(dtype)
+    back = wire.read_poses(wire.write_poses(packet), np.arange(10, dtype=np.int32))
+    for name in ("keyframes", "quats_wxyz", "translations", "penalties", "curvature"):
+        assert np.array_equal(getattr(back, name), getattr(packet, name))
+        assert getattr(back, name).dtype == getattr(packet, name).dtype
+    assert (back.sequence, back.version, back.converged) == (7, 2, True)
+
+
+def test_final_poses_and_voxels_come_back_bit_for_bit() -> None:
+    anchors = wire.Anchors(2, poses(4), poses(1)[0])
+    back = wire.read_anchors(wire.write_anchors(anchors), TEAM)
+    assert np.array_equal(back.T_common_keyframe, anchors.T_common_keyframe)
+    assert np.array_equal(back.T_map_first, anchors.T_map_first)
+    for keys in (np.zeros(0, np.int64), np.array([0, 1, 127, 128, (1 << 60) - 1])):
+        assert np.array_equal(wire.read_voxels(wire.write_voxels(1, keys), TEAM)[1], keys)
+
+
+def test_a_sample_comes_back_within_its_quantisation() -> None:
+    before = sample()
+    after = wire.read_sample(wire.write_sample(before), 3)
+    assert np.array_equal(after.features.descriptors, before.features.descriptors)
+    assert np.abs(after.features.points - before.features.points).max() < 1e-4  # 3 m / 32767
+    for a, b in zip(after.reference.levels, before.reference.levels, strict=True):
+        assert np.abs(a.points - b.points).max() < 1e-4
+        assert (a.normals * b.normals).sum(axis=1).min() > np.cos(0.01)
+        assert np.abs(a.intensities - b.intensities).max() <= 0.5 / 255 + 1e-6
+
+
+@given(n=st.integers(0, 40))
+@settings(max_examples=20, deadline=None)
+def test_evidence_comes_back_and_every_chunk_is_useful_alone(n: int) -> None:
+    sent = records(n)
+    data = wire.write_evidence(1, 1, sent)
+    owner, back = wire.read_evidence(data, TEAM)
+    assert owner == 1
+    assert np.array_equal(back, sent)
+    chunks = [data[i : i + wire.EVIDENCE_CHUNK_BYTES] for i in range(0, len(data), wire.EVIDENCE_CHUNK_BYTES)]
+    parts = [wire.read_evidence(chunk, TEAM)[1] for chunk in chunks]
+    assert np.array_equal(np.concatenate(parts), sent)
