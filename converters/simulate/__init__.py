@@ -1,0 +1,276 @@
+"""Simulated recordings: a team of robots with RGB-D cameras in a procedural room, with exact ground truth."""
+
+import tempfile
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from converters.base import RecordingWriter, robot_names
+from converters.simulate.scene import SCENES
+from pipeline import numeric, streams
+from pipeline.errors import DuagError
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.progress import track
+
+DEPTH_SCALE_M = 1 / 5000
+FRAME_RATE_HZ = 30
+START_NS = 1_000_000_000
+FOCAL_OF_WIDTH = 0.82  # focal length as a share of the image width: 63 degrees across
+TEXEL_M = 0.004
+GEOMETRY_POINTS = 200_000
+NOISES = ("none", "kinect")
+PNG_LEVEL = 1
+MAX_ROBOTS = 8
+
+
+def simulate(
+    out: Path,
+    robots: int = 2,
+    frames: int = 160,
+    scene: str = "room",
+    size: tuple[int, int] = (480, 360),
+    noise: str = "none",
+    seed: int = 0,
+    overlap: float = 0.6,
+    workers: int = 2,
+    force: bool = False,
+) -> None:
+    """Render a recording of a robot team, with exact depth, poses and geometry as ground truth.
+
+    Args:
+        out: folder of the recording, made here.
+        robots: how many; each follows a path of its own, 22 mm per frame.
+        frames: per robot, at 30 Hz.
+        scene: one of `SCENES`.
+        size: width and height of the images, pixels.
+        noise: "none" or "kinect" (then the exact depth goes to the ground truth).
+        seed: of scene, paths and noise; the same bytes for the same arguments, whatever the workers.
+        overlap: share of what a robot sees that the next one sees as well.
+        workers: processes that render.
+        force: replace a recording that is there.
+    Raises:
+        DuagError: an argument is out of range, or `out` exists.
+    """
+    _check(robots, frames, scene, size, noise, overlap, workers)
+    numeric.settle()
+    numeric.settle_opencv()
+    from converters.simulate import bake, paths
+    from converters.simulate.render import Renderer
+    from converters.simulate.scene import build
+
+    camera = _camera(size)
+    names = robot_names(robots)
+    parameters = {"scene": scene, "robots": robots, "frames": frames, "size": list(size)}
+    parameters |= {"noise": noise, "seed": seed, "overlap": overlap}
+    with RecordingWriter(out, "", {"kind": "simulation"}, "simulate", parameters, force) as recording:
+        room = build(scene, seed)
+        atlas = bake.bake(room, TEXEL_M)
+        ways = paths.plan(room, robots, frames, overlap, camera)
+        small = Renderer(room, None, camera.scaled(*paths.OVERLAP_IMAGE))
+        recording.checks["clearance_m"] = {
+            name: float(room.clearance(way[:, :3, 3]).min()) for name, way in zip(names, ways, strict=True)
+        }
+        recording.checks["shared_view"] = {
+            f"{names[i]}-{names[i + 1]}": paths.shared_view(small, ways[i], ways[i + 1])
+            for i in range(robots - 1)
+        }
+        recording.add_geometry(
+            lambda path: write_points(path, *bake.surface_points(room, atlas, GEOMETRY_POINTS))
+        )
+        jobs = [_Job(name, i, way[i]) for name, way in zip(names, ways, strict=True) for i in range(frames)]
+        with _Studio(room, atlas, camera, noise, workers) as studio:
+            images = track(studio.images(jobs), "simulate", len(jobs))
+            for name, way in zip(names, ways, strict=True):
+                with recording.robot(name, camera, DEPTH_SCALE_M, {"depth_noise": noise}) as robot:
+                    for i in range(frames):
+                        image = next(images)
+                        stamp_ns = START_NS + round(i * 1e9 / FRAME_RATE_HZ)
+                        robot.add_frame(stamp_ns, image.png, "png", image.depth, way[i], image.exact_depth)
+
+
+def _check(
+    robots: int, frames: int, scene: str, size: tuple[int, int], noise: str, overlap: float, workers: int
+) -> None:
+    """Refuse arguments out of range."""
+    for name, value, low, high in (
+        ("robots", robots, 1, MAX_ROBOTS),
+        ("frames", frames, 2, 100_000),
+        ("width", size[0], 32, 4096),
+        ("height", size[1], 32, 4096),
+        ("overlap", overlap, 0.0, 1.0),
+        ("workers", workers, 1, 1024),
+    ):
+        if not low <= value <= high:
+            raise DuagError(f"simulate: {name} is {value}, expected {low} to {high}")
+    if noise not in NOISES:
+        raise DuagError(f"simulate: noise is {noise!r}, expected one of {', '.join(NOISES)}")
+    if scene not in SCENES:
+        raise DuagError(f"simulate: scene is {scene!r}, expected one of {', '.join(sorted(SCENES))}")
+
+
+def _camera(size: tuple[int, int]) -> PinholeCamera:
+    """The camera of all robots."""
+    width, height = size
+    focal = FOCAL_OF_WIDTH * width
+    return PinholeCamera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One frame to render: robot, index, T_world_camera [4, 4]."""
+
+    robot: str
+    index: int
+    pose: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Images:
+    """One frame as it goes into the logs; depths uint16 in units of DEPTH_SCALE_M, 0 = none."""
+
+    png: bytes
+    depth: NDArray[np.uint16]
+    exact_depth: NDArray[np.uint16] | None
+
+
+class _Artist:
+    """Renders, disturbs and encodes frames; what it makes of a job depends on nothing but the job."""
+
+    def __init__(self, scene: Any, atlas: Any, camera: PinholeCamera, noise: str) -> None:
+        from converters.simulate.render import Renderer
+
+        self.renderer, self.camera, self.noise, self.seed = (
+            Renderer(scene, atlas, camera),
+            camera,
+            noise,
+            scene.seed,
+        )
+
+    def draw(self, job: _Job) -> _Images:
+        """The images of one frame."""
+        import cv2
+
+        from converters.simulate import noise
+
+        view = self.renderer.render(job.pose)
+        color, exact = view.color, _units(view.depth)
+        depth = exact
+        if self.noise == "kinect":
+            rng = streams.generator(self.seed, "simulate.noise", robot=job.robot, frame=job.index)
+            depth = _units(noise.kinect_depth(view.depth, self.camera, rng))
+            color = noise.grey_noise(color, rng)
+        settings = [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
+        _, png = cv2.imencode(".png", np.ascontiguousarray(color[..., ::-1]), settings)
+        return _Images(png.tobytes(), depth, exact if self.noise == "kinect" else None)
+
+
+def _units(depth_m: NDArray[np.float64]) -> NDArray[np.uint16]:
+    """Depth in units of DEPTH_SCALE_M; what does not fit is no measurement."""
+    units = np.rint(depth_m / DEPTH_SCALE_M)
+    return np.where(units <= np.iinfo(np.uint16).max, units, 0).astype(np.uint16)
+
+
+class _Studio:
+    """Artists in as many processes as asked for, which share one atlas on disk; one worker paints right here."""
+
+    def __init__(self, scene: Any, atlas: Any, camera: PinholeCamera, noise: str, workers: int) -> None:
+        self.workers = workers
+        self._about = (scene, atlas, camera, noise)
+        self._pool: ProcessPoolExecutor | None = None
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+
+    def __enter__(self) -> "_Studio":
+        scene, atlas, camera, noise = self._about
+        if self.workers > 1:
+            self._folder = tempfile.TemporaryDirectory(prefix="duagc-atlas-")
+            for k, level in enumerate(atlas.levels):
+                np.save(Path(self._folder.name) / f"{k}.npy", level)
+            start = (
+                scene.name,
+                scene.seed,
+                self._folder.name,
+                len(atlas.levels),
+                atlas.origin,
+                camera,
+                noise,
+            )
+            self._pool = ProcessPoolExecutor(self.workers, get_context("spawn"), _start_worker, start)
+        return self
+
+    def images(self, jobs: list[_Job]) -> Iterator[_Images]:
+        """The images of all jobs, in their order; a few are in work ahead of the one that is asked for."""
+        if self._pool is None:
+            artist = _Artist(*self._about)
+            yield from map(artist.draw, jobs)
+            return
+        waiting: deque[Future[_Images]] = deque()
+        for job in jobs:
+            waiting.append(self._pool.submit(_draw, job))
+            if len(waiting) > 4 * self.workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+        if self._folder is not None:
+            self._folder.cleanup()
+
+
+_artist: _Artist | None = None
+
+
+def _start_worker(
+    scene: str,
+    seed: int,
+    folder: str,
+    levels: int,
+    origin: NDArray[np.float64],
+    camera: PinholeCamera,
+    noise: str,
+) -> None:
+    """Set up the artist of a worker process."""
+    global _artist
+    numeric.settle_opencv()
+    from converters.simulate.bake import Atlas
+    from converters.simulate.scene import build
+
+    maps = [np.asarray(np.load(Path(folder) / f"{k}.npy", mmap_mode="r")) for k in range(levels)]
+    _artist = _Artist(build(scene, seed), Atlas(maps, origin, TEXEL_M), camera, noise)
+
+
+def _draw(job: _Job) -> _Images:
+    """One frame, in a worker process."""
+    assert _artist is not None
+    return _artist.draw(job)
+
+
+def write_points(
+    path: Path, points: NDArray[np.float64], normals: NDArray[np.float64], colors: NDArray[np.uint8]
+) -> None:
+    """Write a binary .ply of points (m, world), unit normals and colours, [n, 3] each."""
+    row = np.dtype([("points", "<f4", 3), ("normals", "<f4", 3), ("colors", "u1", 3)])
+    rows = np.zeros(len(points), dtype=row)
+    rows["points"], rows["normals"], rows["colors"] = points, normals, colors
+    properties = [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
+    properties += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(rows)}",
+        *properties,
+        "end_header",
+        "",
+    ]
+    path.write_bytes("\n".join(header).encode() + rows.tobytes())
+
+
+__all__ = ["NOISES", "SCENES", "simulate", "write_points"]

@@ -1,0 +1,342 @@
+"""Ray casting: exact depth at the pixel centres, colour averaged over the pixel's area.
+
+A flat surface seen by a pinhole camera has an inverse depth D = 1/z that is linear in the pixel (u, v), and so are
+s D and t D of its coordinates (s, t). Visibility is a maximum of D over surfaces, in float64, at pixel centres.
+Colour takes 2 x 2 samples of the surface at the centre, or, beside a border between surfaces, 4 x 4 samples of
+whatever each of them hits; textures are read at the mip level whose texels are as large as the samples are apart.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from converters.simulate.bake import Atlas
+from converters.simulate.scene import Ball, Flat, Scene, Side
+from pipeline.geometry.camera import PinholeCamera
+
+Array = NDArray[np.float64]
+
+NEAR_M = 0.05
+EDGE_TOLERANCE_M = 1e-9  # rays that pass exactly between two faces of a box hit one of them
+INSIDE_OFFSETS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
+BORDER_OFFSETS = np.array(
+    [(x, y) for y in (-0.375, -0.125, 0.125, 0.375) for x in (-0.375, -0.125, 0.125, 0.375)]
+)
+
+
+@dataclass(frozen=True)
+class View:
+    """What a camera sees: colour uint8 [h, w, 3] RGB; depth float64 [h, w], z in m, 0 = nothing; surface int16."""
+
+    color: NDArray[np.uint8]
+    depth: Array
+    surface: NDArray[np.int16]
+
+
+class Renderer:
+    """Renders one baked scene with one camera."""
+
+    def __init__(self, scene: Scene, atlas: Atlas | None, camera: PinholeCamera) -> None:
+        self.camera, self.atlas = camera, atlas
+        self.surfaces = scene.surfaces
+        self.flat = np.array([k for k, s in enumerate(self.surfaces) if isinstance(s, Flat)])
+        self.curved = [k for k, s in enumerate(self.surfaces) if not isinstance(s, Flat)]
+        flats = [s for s in self.surfaces if isinstance(s, Flat)]
+        self.corner = np.stack([s.corner for s in flats])
+        self.axis_s = np.stack([s.axis_s for s in flats])
+        self.axis_t = np.stack([s.axis_t for s in flats])
+        self.normal = np.stack([s.normal for s in flats])
+        self.extent = np.zeros((len(self.surfaces), 2))
+        self.extent[self.flat] = [s.size for s in flats]
+        self.round = np.zeros(len(self.surfaces), dtype=bool)
+        self.round[self.flat] = [s.round for s in flats]
+        self.is_curved = np.zeros(len(self.surfaces), dtype=bool)
+        self.is_curved[self.curved] = True
+        self.period = np.zeros(len(self.surfaces))
+        self.period[self.curved] = [self.surfaces[k].size[0] for k in self.curved]
+        self.u = np.arange(camera.width, dtype=np.float64)
+        self.v = np.arange(camera.height, dtype=np.float64)
+
+    def depth(self, T_world_camera: ArrayLike) -> tuple[Array, NDArray[np.int16]]:
+        """Exact depth (z, m, [h, w]; 0 = nothing) and index of the surface seen (-1 = nothing) at pixel centres."""
+        inverse, surface = self._nearest(_Pose(self, T_world_camera))
+        depth = np.zeros_like(inverse)
+        np.divide(1.0, inverse, out=depth, where=inverse > 0)
+        return depth, surface
+
+    def render(self, T_world_camera: ArrayLike) -> View:
+        """Colour and exact depth from a camera pose T_world_camera [4, 4]."""
+        pose = _Pose(self, T_world_camera)
+        inverse, surface = self._nearest(pose)
+        depth = np.zeros_like(inverse)
+        np.divide(1.0, inverse, out=depth, where=inverse > 0)
+        window = np.ones((3, 3), dtype=np.uint8)
+        border = (cv2.dilate(surface, window) != cv2.erode(surface, window)).ravel()
+        seen = surface.ravel()
+        color = np.zeros((seen.size, 3), dtype=np.float32)
+        inside = np.flatnonzero(~border & (seen >= 0))
+        color[inside] = self._inside(pose, inside, seen[inside].astype(np.int64))
+        at = np.flatnonzero(border)
+        if at.size:
+            color[at] = self._border(pose, at, surface)
+        image = np.clip(np.rint(color), 0, 255).astype(np.uint8).reshape(*surface.shape, 3)
+        return View(image, depth, surface)
+
+    def _nearest(self, pose: "_Pose") -> tuple[Array, NDArray[np.int16]]:
+        """Greatest inverse depth and its surface at every pixel centre."""
+        nearest = np.zeros((self.camera.height, self.camera.width))
+        surface = np.full(nearest.shape, -1, dtype=np.int16)
+        u, v = self.u, self.v[:, None]
+        for k, (u0, v0, u1, v1) in pose.flat_windows():
+            win = (slice(v0, v1), slice(u0, u1))
+            inverse, s, t = (c[0] * u[u0:u1] + (c[1] * v[v0:v1] + c[2]) for c in pose.linear[k])
+            hit = inverse > nearest[win]
+            hit &= self._covers(k, inverse, s, t)
+            np.copyto(nearest[win], inverse, where=hit)
+            surface[win][hit] = k
+        for k in self.curved:
+            u0, v0, u1, v1 = pose.curved_window(k)
+            if u0 < u1 and v0 < v1:
+                win = (slice(v0, v1), slice(u0, u1))
+                inverse, _, _ = pose.curved(k, *np.broadcast_arrays(u[u0:u1], v[v0:v1]))
+                hit = inverse > nearest[win]
+                np.copyto(nearest[win], inverse, where=hit)
+                surface[win][hit] = k
+        return nearest, surface
+
+    def _covers(self, k: int, inverse: Array, s_inverse: Array, t_inverse: Array) -> NDArray[np.bool_]:
+        """Whether s D, t D lie on flat surface k."""
+        width, height = self.extent[k]
+        if self.round[k]:
+            r = width / 2
+            return (s_inverse - r * inverse) ** 2 + (t_inverse - r * inverse) ** 2 <= (r * inverse) ** 2
+        slack = EDGE_TOLERANCE_M * inverse
+        hit = s_inverse >= -slack
+        hit &= s_inverse <= width * inverse + slack
+        hit &= t_inverse >= -slack
+        hit &= t_inverse <= height * inverse + slack
+        return hit
+
+    def _inside(
+        self, pose: "_Pose", at: NDArray[np.int64], surface: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        """Mean colours [n, 3] of pixels that one surface fills; `at` are their flat indices."""
+        assert self.atlas is not None
+        v, u = np.divmod(at, self.camera.width)
+        x, y = np.empty((4, at.size), dtype=np.float32), np.empty((4, at.size), dtype=np.float32)
+        straight = np.flatnonzero(~self.is_curved[surface])
+        c = pose.linear[surface[straight]]
+        center = c[:, :, 0] * u[straight, None] + (c[:, :, 1] * v[straight, None] + c[:, :, 2])
+        origin = self.atlas.origin[surface[straight]].T
+        scale = 1 / self.atlas.texel_m
+        for i, (du, dv) in enumerate(INSIDE_OFFSETS):
+            inverse, s, t = (center + (du * c[:, :, 0] + dv * c[:, :, 1])).T
+            z = scale / inverse
+            x[i, straight] = origin[0] + s * z
+            y[i, straight] = origin[1] + t * z
+        for k in self.curved:
+            some = np.flatnonzero(surface == k)
+            if some.size:
+                x[:, some], y[:, some] = self._curved_inside(pose, k, u[some], v[some])
+        return self._filtered(x, y)
+
+    def _curved_inside(
+        self, pose: "_Pose", k: int, u: NDArray[np.int64], v: NDArray[np.int64]
+    ) -> tuple[Array, Array]:
+        """Texels (x, y) [4, n] of the four samples of pixels that curved surface k fills."""
+        assert self.atlas is not None
+        du, dv = np.array(INSIDE_OFFSETS).T[:, :, None]
+        inverse, s, t = pose.curved(k, u + du, v + dv)
+        middle = pose.curved(k, u, v)
+        missed = inverse <= 0
+        s, t = np.where(missed, middle[1], s), np.where(missed, middle[2], t)
+        s = middle[1] + _wrapped(s - middle[1], self.period[k])
+        xy = self.atlas.origin[k][:, None, None] + np.stack([s, t]) / self.atlas.texel_m
+        return xy[0], xy[1]
+
+    def _filtered(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Mean colours [n, 3] of four samples each at texels x, y [4, n], half a pixel apart."""
+        assert self.atlas is not None
+        n = x.shape[1]
+        step = np.maximum((x[1] - x[0]) ** 2 + (y[1] - y[0]) ** 2, (x[2] - x[0]) ** 2 + (y[2] - y[0]) ** 2)
+        mean = np.empty((n, 3), dtype=np.float32)
+        fine = step <= 4.0  # the finest level holds nothing that samples two texels apart would miss
+        near = np.flatnonzero(fine)
+        mean[near] = self._mean_of_four(0, x[:, near], y[:, near])
+        far = np.flatnonzero(~fine)
+        if far.size:
+            level = np.clip(0.5 * np.log2(step[far]) - 1, 0, len(self.atlas.levels) - 1.001).astype(
+                np.float32
+            )
+            whole = level.astype(np.int64)
+            for k in range(len(self.atlas.levels) - 1):
+                some = np.flatnonzero(whole == k)
+                if some.size:
+                    index = far[some]
+                    blend = (level[some] - k)[:, None]
+                    finer = self._mean_of_four(k, x[:, index], y[:, index])
+                    coarser = self._mean_of_four(k + 1, x[:, index], y[:, index])
+                    mean[index] = (1 - blend) * finer + blend * coarser
+        return mean
+
+    def _mean_of_four(
+        self, level: int, x: NDArray[np.float32], y: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Mean colours [n, 3] of four samples each at texels x, y [4, n]."""
+        assert self.atlas is not None
+        samples = self.atlas.sample(level, x.ravel(), y.ravel()).reshape(4, -1, 3)
+        total = np.add(samples[0], samples[1], dtype=np.uint16)
+        total += samples[2]
+        total += samples[3]
+        return total * np.float32(0.25)
+
+    def _border(
+        self, pose: "_Pose", at: NDArray[np.int64], surface: NDArray[np.int16]
+    ) -> NDArray[np.float32]:
+        """Mean colours [n, 3] of pixels near a border: 4 x 4 samples, each of the nearest of the surfaces around."""
+        assert self.atlas is not None
+        v, u = np.divmod(at, self.camera.width)
+        padded = np.pad(surface, 1, mode="edge").astype(np.int64)
+        around = np.stack([padded[v + dv, u + du] for dv in range(3) for du in range(3)], axis=1)
+        around.sort(axis=1)
+        around[:, 1:][around[:, 1:] == around[:, :-1]] = -1
+        pixel, _ = np.nonzero(around >= 0)
+        candidate = around[around >= 0]
+        order = np.argsort(candidate, kind="stable")
+        pixel, candidate = pixel[order], candidate[order]
+        starts = np.flatnonzero(np.diff(candidate, prepend=-1))
+        n = at.size
+        best = np.zeros((n, 16))
+        x, y = np.zeros((n, 16), dtype=np.float32), np.zeros((n, 16), dtype=np.float32)
+        scale = 1 / self.atlas.texel_m
+        for first, last in zip(starts, [*starts[1:].tolist(), len(pixel)], strict=True):
+            k, some = int(candidate[first]), pixel[first:last]
+            us, vs = u[some, None] + BORDER_OFFSETS[:, 0], v[some, None] + BORDER_OFFSETS[:, 1]
+            if self.is_curved[k]:
+                inverse, s, t = pose.curved(k, us, vs)
+                hit = inverse > best[some]
+                sx, ty = scale * s, scale * t
+            else:
+                inverse, s, t = (c[0] * us + (c[1] * vs + c[2]) for c in pose.linear[k])
+                hit = inverse > best[some]
+                hit &= self._covers(k, inverse, s, t)
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    z = scale / inverse
+                    sx, ty = s * z, t * z
+            row, column = np.nonzero(hit)
+            best[some[row], column] = inverse[row, column]
+            x[some[row], column] = self.atlas.origin[k, 0] + sx[row, column]
+            y[some[row], column] = self.atlas.origin[k, 1] + ty[row, column]
+        samples = self.atlas.sample(0, x.ravel(), y.ravel()).reshape(n, 16, 3)
+        found = best > 0
+        total = np.where(found[..., None], samples, 0).sum(axis=1, dtype=np.uint32)
+        return (total / np.maximum(found.sum(axis=1), 1)[:, None]).astype(np.float32)
+
+
+class _Pose:
+    """The surfaces of a renderer seen from one pose.
+
+    linear [n surfaces, 3, 3]: coefficients (of u, of v, constant) of D, s D and t D; flat surfaces only.
+    """
+
+    def __init__(self, renderer: Renderer, T_world_camera: ArrayLike) -> None:
+        T = np.asarray(T_world_camera, dtype=np.float64)
+        self.renderer, self.camera = renderer, renderer.camera
+        self.R, self.center = T[:3, :3], T[:3, 3]
+        self.rays = self.R @ np.linalg.inv(self.camera.matrix())
+        to_corner = renderer.corner - self.center
+        ahead = np.sum(renderer.normal * to_corner, axis=1)
+        self.faces = ahead < -1e-6
+        D = (renderer.normal @ self.rays) / np.where(self.faces, ahead, -1.0)[:, None]
+        s = renderer.axis_s @ self.rays - np.sum(renderer.axis_s * to_corner, axis=1)[:, None] * D
+        t = renderer.axis_t @ self.rays - np.sum(renderer.axis_t * to_corner, axis=1)[:, None] * D
+        self.linear = np.zeros((len(renderer.surfaces), 3, 3))
+        self.linear[renderer.flat] = np.stack([D, s, t], axis=1)
+
+    def flat_windows(self) -> list[tuple[int, tuple[int, int, int, int]]]:
+        """Flat surfaces that may be seen, nearest corner first, with the pixels (u0, v0, u1, v1) that bound them."""
+        r = self.renderer
+        extent = r.extent[r.flat]
+        unit = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+        corners = r.corner[:, None] + (unit[None, :, :1] * extent[:, None, :1]) * r.axis_s[:, None]
+        corners = corners + (unit[None, :, 1:] * extent[:, None, 1:]) * r.axis_t[:, None]
+        low, high, nearest = self._bounds(corners)
+        window = self._window(low, high)
+        seen = self.faces & (window[:, 0] < window[:, 2]) & (window[:, 1] < window[:, 3])
+        order = np.flatnonzero(seen)
+        order = order[np.argsort(nearest[order], kind="stable")]
+        return [(int(r.flat[k]), tuple(window[k].tolist())) for k in order]
+
+    def _bounds(self, corners_world: Array) -> tuple[Array, Array, Array]:
+        """Pixel bounds (low, high, [n, 2]) of convex polygons [n, m, 3] cut at the near plane, and their least z."""
+        p = (corners_world - self.center) @ self.R
+        z = p[..., 2]
+        after = np.roll(p, -1, axis=1)
+        step = after[..., 2] - z
+        q = np.where(step == 0, 0.0, (NEAR_M - z) / np.where(step == 0, 1.0, step))
+        crossing = (z < NEAR_M) != (after[..., 2] < NEAR_M)
+        cut = p + q[..., None] * (after - p)
+        points = np.concatenate([p, cut], axis=1)
+        valid = np.concatenate([z >= NEAR_M, crossing], axis=1)
+        pixels = self.camera.project(np.where(valid[..., None], points, (0.0, 0.0, 1.0)))
+        low = np.where(valid[..., None], pixels, np.inf).min(axis=1)
+        high = np.where(valid[..., None], pixels, -np.inf).max(axis=1)
+        return low, high, z.min(axis=1)
+
+    def _window(self, low: Array, high: Array) -> NDArray[np.int64]:
+        """Pixels (u0, v0, u1, v1) [n, 4], clipped to the image; empty where low > high."""
+        size = np.array([self.camera.width, self.camera.height])
+        first = np.clip(np.ceil(np.clip(low, -1, size) - 1e-6), 0, size)
+        last = np.clip(np.floor(np.clip(high, -1, size) + 1e-6) + 1, 0, size)
+        return np.concatenate([first, last], axis=1).astype(np.int64)
+
+    def curved_window(self, k: int) -> tuple[int, int, int, int]:
+        """Pixels (u0, v0, u1, v1) that bound a curved surface."""
+        surface = self.renderer.surfaces[k]
+        if isinstance(surface, Side):
+            half = np.array([surface.radius, surface.radius, surface.height / 2])
+            center = surface.base + np.array([0, 0, surface.height / 2])
+        else:
+            assert isinstance(surface, Ball)
+            half, center = np.full(3, surface.radius), surface.center
+        # the six faces as polygons, so that the near plane cuts them correctly
+        signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+        faces = [np.insert(signs, axis, side, axis=1) for axis in range(3) for side in (-1, 1)]
+        low, high, _ = self._bounds(center + half * np.stack(faces))
+        u0, v0, u1, v1 = self._window(low.min(axis=0, keepdims=True), high.max(axis=0, keepdims=True))[
+            0
+        ].tolist()
+        return u0, v0, u1, v1
+
+    def curved(self, k: int, u: ArrayLike, v: ArrayLike) -> tuple[Array, Array, Array]:
+        """Inverse depth (0 where missed) and surface coordinates of curved surface k at pixels of any shape."""
+        surface = self.renderer.surfaces[k]
+        pixels = np.stack([np.asarray(u, dtype=np.float64), np.asarray(v), np.ones(np.shape(u))], axis=-1)
+        d = pixels @ self.rays.T
+        if isinstance(surface, Side):
+            p = self.center - surface.base
+            a = d[..., 0] ** 2 + d[..., 1] ** 2
+            b = p[0] * d[..., 0] + p[1] * d[..., 1]
+            c = p[0] ** 2 + p[1] ** 2 - surface.radius**2
+        else:
+            assert isinstance(surface, Ball)
+            p = self.center - surface.center
+            a, b, c = np.sum(d**2, axis=-1), d @ p, p @ p - surface.radius**2
+        root = b**2 - a * c
+        z = (-b - np.sqrt(np.maximum(root, 0.0))) / a
+        q = p + z[..., None] * d
+        s = np.mod(np.arctan2(q[..., 1], q[..., 0]), 2 * np.pi) * surface.radius
+        if isinstance(surface, Side):
+            t = surface.height - q[..., 2]
+            hit = (root > 0) & (z > NEAR_M) & (t >= 0) & (t <= surface.height)
+        else:
+            t = np.arccos(np.clip(q[..., 2] / surface.radius, -1, 1)) * surface.radius
+            hit = (root > 0) & (z > NEAR_M)
+        return np.where(hit, 1 / np.where(hit, z, 1.0), 0.0), s, t
+
+
+def _wrapped(difference: Array, period: float) -> Array:
+    """A difference of positions on a circle, between minus and plus half its length."""
+    return difference - period * np.rint(difference / period)

@@ -1,0 +1,491 @@
+"""Procedural materials: what the surfaces of a simulated scene are painted with.
+
+A material is a function `(rng, width_m, height_m, texel_m) -> albedo`, float32 [h, w, 3] in RGB, 0..255 (more where it
+shines), h = ceil(height_m / texel_m). The first row is the top of the surface and the first column its left side as
+seen from the front. Nothing repeats: every plank, brick and book is drawn anew, so that no two places look alike.
+"""
+
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+Color = Sequence[float]
+Material = Callable[[np.random.Generator, float, float, float], Image]
+
+
+def shape_of(width_m: float, height_m: float, texel_m: float) -> tuple[int, int]:
+    """Rows and columns of texels that cover a surface."""
+    return max(1, int(np.ceil(height_m / texel_m - 1e-6))), max(1, int(np.ceil(width_m / texel_m - 1e-6)))
+
+
+def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], wave_x: float, wave_y: float) -> Image:
+    """Smooth random field [h, w] of about unit variance; `wave_x`, `wave_y` in texels between its random nodes."""
+    h, w = shape
+    nodes = rng.standard_normal((int(np.ceil(h / wave_y)) + 2, int(np.ceil(w / wave_x)) + 2)).astype(
+        np.float32
+    )
+    size = (max(w, round(nodes.shape[1] * wave_x)), max(h, round(nodes.shape[0] * wave_y)))
+    return 1.3 * cv2.resize(nodes, size, interpolation=cv2.INTER_CUBIC)[:h, :w]
+
+
+def cloud(
+    rng: np.random.Generator,
+    shape: tuple[int, int],
+    wave: float,
+    octaves: int = 4,
+    gain: float = 0.6,
+    stretch: float = 1.0,
+) -> Image:
+    """Sum of smooth noises, each with half the wave length and `gain` times the height of the one before."""
+    field = np.zeros(shape, dtype=np.float32)
+    height = norm = 1.0
+    for _ in range(octaves):
+        field += height * smooth_noise(rng, shape, max(1.0, wave * stretch), max(1.0, wave))
+        norm += height**2
+        wave, height = wave / 2, height * gain
+    return field / np.float32(np.sqrt(norm - 1.0))
+
+
+def flat(shape: tuple[int, int], color: Color) -> Image:
+    """One colour everywhere."""
+    return np.broadcast_to(np.array(color, dtype=np.float32), (*shape, 3)).copy()
+
+
+def shaded(rng: np.random.Generator, color: Color, spread: float) -> tuple[float, float, float]:
+    """A colour near `color`: brightness and, less, hue changed at random."""
+    c = np.array(color, dtype=np.float64) * (1 + spread * rng.standard_normal())
+    c = np.clip(c * (1 + 0.2 * spread * rng.standard_normal(3)), 4, 250)
+    return float(c[0]), float(c[1]), float(c[2])
+
+
+def vivid(rng: np.random.Generator, saturation: float = 0.8) -> tuple[float, float, float]:
+    """A random colour, neither black nor white, at most that saturated (0 to 1)."""
+    hue, value = rng.random(), rng.uniform(90, 235)
+    dull = value * (1 - saturation * rng.uniform(0.4, 1.0))
+    r, g, b = (value - (value - dull) * min(1.0, max(0.0, abs((hue * 6 + k) % 6 - 3) - 1)) for k in (0, 4, 2))
+    return float(r), float(g), float(b)
+
+
+def _grain(rng: np.random.Generator, shape: tuple[int, int], texel_m: float) -> Image:
+    """Streaks of wood along the columns' direction (x), [h, w]."""
+    broad = cloud(rng, shape, 0.045 / texel_m, 3, 0.7, stretch=9.0)
+    bend = cloud(rng, shape, 0.25 / texel_m, 2, 0.5, stretch=3.0)
+    y = np.arange(shape[0], dtype=np.float32)[:, None] * np.float32(texel_m)
+    rings = np.sin(y * np.float32(2 * np.pi / 0.055) + 2.5 * bend)
+    return np.asarray(0.55 * broad + 0.6 * rings, dtype=np.float32)
+
+
+def _knots(rng: np.random.Generator, image: Image, texel_m: float, per_m2: float) -> None:
+    """Dark eyes in wood, drawn in place."""
+    h, w = image.shape[:2]
+    for _ in range(rng.poisson(per_m2 * h * w * texel_m**2)):
+        x, y = int(rng.integers(0, w)), int(rng.integers(0, h))
+        size = (
+            max(2, int(rng.uniform(0.010, 0.028) / texel_m)),
+            max(2, int(rng.uniform(0.006, 0.014) / texel_m)),
+        )
+        cv2.ellipse(image, (x, y), size, float(rng.uniform(-20, 20)), 0, 360, (62, 40, 24), -1, cv2.LINE_AA)
+
+
+def wood(color: Color = (168, 120, 78), knots_per_m2: float = 9.0) -> Material:
+    """One board, grain along its longer side."""
+
+    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+        h, w = shape_of(width_m, height_m, texel_m)
+        along_x = w >= h
+        shape = (h, w) if along_x else (w, h)
+        image = flat(shape, shaded(rng, color, 0.06)) * (1 + 0.11 * _grain(rng, shape, texel_m))[..., None]
+        _knots(rng, image, texel_m, knots_per_m2)
+        return image if along_x else np.ascontiguousarray(image.transpose(1, 0, 2))
+
+    return paint
+
+
+def planks(color: Color = (164, 116, 74), plank_m: float = 0.15) -> Material:
+    """A floor of boards of different lengths and tints, along x."""
+
+    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+        h, w = shape_of(width_m, height_m, texel_m)
+        image = flat((h, w), (60, 40, 26))
+        grain = _grain(rng, (h, w), texel_m)
+        rows = np.arange(0, h, plank_m / texel_m)
+        gap = max(1, round(0.004 / texel_m))
+        for top in rows:
+            y0, y1 = round(top), min(h, round(top + plank_m / texel_m) - gap)
+            x = -rng.uniform(0, 1.2) / texel_m
+            while x < w and y1 > y0:
+                length = rng.uniform(0.55, 1.7) / texel_m
+                x0, x1 = max(0, round(x)), min(w, round(x + length) - gap)
+                if x1 > x0:
+                    tone = (1 + 0.12 * np.roll(grain[y0:y1, x0:x1], int(rng.integers(0, 40)), axis=0))[
+                        ..., None
+                    ]
+                    image[y0:y1, x0:x1] = np.array(shaded(rng, color, 0.13), dtype=np.float32) * tone
+                x += length
+        _knots(rng, image, texel_m, 7.0)
+        return image
+
+    return paint
+
+
+def bricks(color: Color = (158, 84, 62), mortar: Color = (186, 178, 166)) -> Material:
+    """A wall of bricks in running bond, each with its own tint."""
+
+    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+        h, w = shape_of(width_m, height_m, texel_m)
+        image = flat((h, w), mortar)
+        joint = max(2, round(0.012 / texel_m))
+        pitch_y, pitch_x = 0.085 / texel_m, 0.25 / texel_m
+        for row in range(int(h / pitch_y) + 1):
+            x = -pitch_x * (0.5 * (row % 2) + 0.1 * rng.random())
+            y0, y1 = round(row * pitch_y), min(h, round((row + 1) * pitch_y) - joint)
+            while x < w and y1 > y0:
+                length = pitch_x * rng.uniform(0.9, 1.1)
+                x0, x1 = max(0, round(x)), min(w, round(x + length) - joint)
+                if x1 > x0:
+                    image[y0:y1, x0:x1] = shaded(rng, color, 0.2)
+                x += length
+        image *= (1 + 0.10 * cloud(rng, (h, w), 0.05 / texel_m, 3, 0.8))[..., None]
+        return image * (1 + 0.08 * smooth_noise(rng, (h, w), 0.7 / texel_m, 0.5 / texel_m))[..., None]
+
+    return paint
+
+
+def plaster(color: Color = (206, 198, 180), contrast: float = 0.06) -> Material:
+    """Rough paint: soft clouds at every scale and a few marks."""
+
+    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+        h, w = shape_of(width_m, height_m, texel_m)
+        tone = contrast * cloud(rng, (h, w), 0.16 / texel_m, 4, 0.85)
+        hue = 0.2 * contrast * smooth_noise(rng, (h, w), 0.5 / texel_m, 0.5 / texel_m)
+        image = flat((h, w), color) * (1 + tone)[..., None]
+        image[..., 0] *= 1 + hue
+        image[..., 2] *= 1 - hue
+        mark = [0.72 * c for c in color]
+        for _ in range(rng.poisson(5 * width_m * height_m)):
+            centre = (int(rng.integers(0, w)), int(rng.integers(0, h)))
+            radius = max(1, int(rng.uniform(0.006, 0.016) / texel_m))
+            cv2.circle(image, centre, radius, shaded(rng, mark, 0.08), -1, cv2.LINE_AA)
+        return image
+
+    return paint
+
+
+def wallpaper(color: Color = (150, 172, 166), motif: Color = (104, 132, 126)) -> Material:
+    """Paper with leaves strewn over it, each of its own size, turn and tint."""
+
+    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+        h, w = shape_of(width_m, height_m, texel_m)
+        image = flat((h, w), color) * (1 + 0.035 * cloud(rng, (h, w), 0.2 / texel_m, 4, 0.7))[..., None]
+        for _ in range(int(26 * width_m * height_m)):
+            x, y = float(rng.uniform(0, w)), float(rng.uniform(0, h))
+            turn, length = float(rng.uniform(0, 360)), rng.uniform(0.03, 0.075) / texel_m
+            tint = shaded(rng, motif, 0.16)
+            for spread in (-38, 0, 38):
+                a = np.deg2rad(turn + spread)
+                centre = (round(x + 0.8 * length * np.cos(a)), round(y + 0.8 * length * np.sin(a)))
+                axes = (max(1, round(0.62 * length)), max(1, round(0.2 * length)))
+                cv2.ellipse(image, centre, axes, turn + spread, 0, 360, tint, -1, cv2.LINE_AA)
+        return image
+
+    return paint
+
+
+def fabric(color: Color = (96, 110, 136), stripe: Color = (146, 128, 96)) -> Material:
+    """Woven cloth: checks of uneven width over clouds."""
+
+    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+        h, w = shape_of(width_m, height_m, texel_m)
+        image = flat((h, w), color)
+        for axis, extent in ((0, h), (1, w)):
+            at = rng.uniform(0.02, 0.1) / texel_m
+            while at < extent:
+                width = max(2, round(rng.uniform(0.008, 0.035) / texel_m))
+                band = [slice(None), slice(None)]
+                band[axis] = slice(int(at), int(at) + width)
+                tint = np.array(shaded(rng, stripe, 0.18), dtype=np.float32)
+                image[tuple(band)] = 0.45 * image[tuple(band)] + 0.55 * tint
+                at += width + rng.uniform(0.03, 0.13) / texel_m
+        return image * (1 + 0.10 * cloud(rng, (h, w), 0.06 / texel_m, 3, 0.8))[..., None]
+
+    return paint
+
+
+def rug(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+    """A woven rug: bands of triangles, diamonds and bars, no two alike."""
+    h, w = shape_of(width_m, height_m, texel_m)
+    ground = [(126, 44, 42), (42, 56, 88), (188, 154, 104), (78, 92, 70), (206, 192, 164)]
+    image = flat((h, w), ground[0])
+    y = 0.0
+    while y < h:
+        band = rng.uniform(0.07, 0.17) / texel_m
+        y0, y1 = round(y), min(h, round(y + band))
+        image[y0:y1] = shaded(rng, ground[int(rng.integers(0, 5))], 0.08)
+        x = -rng.uniform(0, 0.1) / texel_m
+        while x < w and y1 - y0 > 4:
+            width = rng.uniform(0.05, 0.16) / texel_m
+            tint = shaded(rng, ground[int(rng.integers(0, 5))], 0.14)
+            mid, low, high = (y0 + y1) / 2, y0 + 0.12 * band, y1 - 0.12 * band
+            shapes = (
+                [(x, high), (x + width, high), (x + width / 2, low)],
+                [(x, mid), (x + width / 2, low), (x + width, mid), (x + width / 2, high)],
+                [(x, low), (x + 0.6 * width, low), (x + 0.6 * width, high), (x, high)],
+                [(x, low), (x + width, low), (x + width / 2, high)],
+            )
+            polygon = np.round(np.array(shapes[int(rng.integers(0, 4))])).astype(np.int32)
+            cv2.fillPoly(image, [polygon], tint, cv2.LINE_AA)
+            x += width * rng.uniform(1.0, 1.25)
+        y += band
+    edge = max(2, round(0.05 / texel_m))
+    cv2.rectangle(image, (0, 0), (w - 1, h - 1), (206, 192, 164), edge)
+    return image * (1 + 0.07 * cloud(rng, (h, w), 0.03 / texel_m, 2, 0.8))[..., None]
+
+
+def picture(kind: str) -> Material:
+    """Something framed: an "abstract" painting, a "landscape", a "map" or a "page" of text."""
+    painter = {"abstract": _abstract, "landscape": _landscape, "map": _map, "page": _page}[kind]
+
+    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+        h, w = shape_of(width_m, height_m, texel_m)
+        image = painter(rng, h, w, texel_m)
+        frame = max(2, round(0.025 / texel_m))
+        cv2.rectangle(image, (0, 0), (w - 1, h - 1), shaded(rng, (235, 232, 222), 0.02), 3 * frame)
+        cv2.rectangle(image, (0, 0), (w - 1, h - 1), shaded(rng, (72, 54, 40), 0.25), 2 * frame)
+        return image
+
+    return paint
+
+
+def _abstract(rng: np.random.Generator, h: int, w: int, texel_m: float) -> Image:
+    image = flat((h, w), vivid(rng, 0.45))
+    for _ in range(int(rng.integers(16, 28))):
+        x, y, r = rng.uniform(0, w), rng.uniform(0, h), rng.uniform(0.04, 0.2) * min(h, w)
+        kind = rng.integers(0, 3)
+        if kind == 0:
+            cv2.circle(image, (round(x), round(y)), max(2, round(r)), vivid(rng), -1, cv2.LINE_AA)
+        elif kind == 1:
+            angles = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(3, 6))))
+            polygon = np.stack([x + 1.4 * r * np.cos(angles), y + 1.4 * r * np.sin(angles)], axis=1)
+            cv2.fillPoly(image, [np.round(polygon).astype(np.int32)], vivid(rng), cv2.LINE_AA)
+        else:
+            end = (round(x + 4 * r * rng.standard_normal()), round(y + 4 * r * rng.standard_normal()))
+            cv2.line(image, (round(x), round(y)), end, vivid(rng), max(2, round(0.2 * r)), cv2.LINE_AA)
+    return image * (1 + 0.05 * cloud(rng, (h, w), 0.05 / texel_m, 3))[..., None]
+
+
+def _landscape(rng: np.random.Generator, h: int, w: int, texel_m: float) -> Image:
+    sky = np.linspace(0, 1, h, dtype=np.float32)[:, None, None]
+    image = np.ascontiguousarray(
+        (1 - sky) * flat((h, w), (110, 158, 208)) + sky * flat((h, w), (238, 208, 166))
+    )
+    image *= (1 + 0.10 * cloud(rng, (h, w), 0.14 / texel_m, 4, 0.6, stretch=2.0))[..., None]
+    centre = (int(rng.uniform(0.15, 0.85) * w), int(rng.uniform(0.1, 0.35) * h))
+    cv2.circle(image, centre, max(2, int(0.07 * h)), (250, 232, 170), -1, cv2.LINE_AA)
+    rows = np.arange(h, dtype=np.float32)[:, None]
+    for k in range(4):
+        ridge = cloud(rng, (1, w), 0.28 / texel_m / (k + 1), 4, 0.6)[0]
+        top = h * (0.42 + 0.15 * k) + 0.09 * h * ridge
+        hill = np.clip(rows - top[None] + 0.5, 0, 1)[..., None]
+        tint = flat((h, w), shaded(rng, (96 - 14 * k, 124 - 12 * k, 92 - 14 * k), 0.12))
+        tint *= (1 + 0.16 * cloud(rng, (h, w), 0.04 / texel_m, 3, 0.8))[..., None]
+        image = (1 - hill) * image + hill * tint
+    return np.ascontiguousarray(image, dtype=np.float32)
+
+
+def _map(rng: np.random.Generator, h: int, w: int, texel_m: float) -> Image:
+    height = cloud(rng, (h, w), 0.32 / texel_m, 5, 0.6)
+    steps = np.array(
+        [(150, 186, 206), (172, 202, 214), (206, 206, 160), (178, 190, 128), (198, 168, 118), (150, 112, 86)]
+    )
+    image = steps[np.clip(np.floor(1.6 * height + 2.5), 0, 5).astype(np.int64)].astype(np.float32)
+    for _ in range(14):
+        at = (int(rng.integers(0, w)), int(rng.integers(0, h)))
+        cv2.circle(image, at, max(1, round(0.008 / texel_m)), (168, 40, 36), -1, cv2.LINE_AA)
+        name = (at[0] + round(rng.uniform(0.03, 0.11) / texel_m), at[1])
+        cv2.line(
+            image, (at[0] + round(0.014 / texel_m), at[1]), name, (46, 40, 40), max(1, round(0.007 / texel_m))
+        )
+    return image
+
+
+def _page(rng: np.random.Generator, h: int, w: int, texel_m: float) -> Image:
+    image = flat((h, w), shaded(rng, (226, 218, 196), 0.03))
+    x0, y = round(0.18 * w), 0.16 * h
+    cv2.rectangle(
+        image, (x0, round(y)), (round(rng.uniform(0.5, 0.8) * w), round(y + 0.09 * h)), vivid(rng), -1
+    )
+    y += 0.15 * h
+    while y < 0.84 * h:
+        line = max(2, round(rng.uniform(0.010, 0.016) / texel_m))
+        x = float(x0)
+        while x < rng.uniform(0.72, 0.84) * w:
+            word = rng.uniform(0.02, 0.07) / texel_m
+            ink = shaded(rng, (62, 58, 62), 0.25)
+            cv2.rectangle(image, (round(x), round(y)), (round(x + word), round(y) + line), ink, -1)
+            x += word + 0.016 / texel_m
+        y += line + rng.uniform(0.016, 0.024) / texel_m
+    return image
+
+
+BINDINGS = (
+    *((138, 42, 40), (36, 62, 100), (54, 86, 62), (194, 148, 82), (40, 40, 46), (220, 210, 186)),
+    *((116, 70, 104), (182, 92, 52), (96, 128, 150), (206, 196, 170), (86, 56, 40)),
+)
+
+
+def spines(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+    """Books side by side, seen from their backs."""
+    h, w = shape_of(width_m, height_m, texel_m)
+    image = flat((h, w), (24, 20, 18))
+    x = 0.0
+    while x < w:
+        width = rng.uniform(0.018, 0.052) / texel_m
+        x0, x1 = round(x), min(w, max(round(x) + 2, round(x + width) - 1))
+        top = round(rng.uniform(0.0, 0.16) * h)
+        tint = shaded(rng, BINDINGS[int(rng.integers(0, len(BINDINGS)))], 0.15)
+        image[top:, x0:x1] = tint
+        for _ in range(int(rng.integers(1, 4))):
+            y, tall = rng.uniform(0.1, 0.85) * h, rng.uniform(0.03, 0.18) * h
+            inset = 0 if rng.random() < 0.5 else max(1, (x1 - x0) // 4)
+            ink = shaded(rng, (222, 204, 150), 0.1) if sum(tint) < 380 else shaded(rng, (60, 46, 44), 0.2)
+            image[max(top, round(y)) : round(y + tall), x0 + inset : x1 - inset] = ink
+        x += width
+    return image
+
+
+def front(color: Color, columns: int, rows: int, knob: Color = (206, 192, 150)) -> Material:
+    """Doors or drawers of a piece of furniture, with grain, seams and knobs."""
+
+    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+        image = wood(color, 5.0)(rng, width_m, height_m, texel_m)
+        h, w = image.shape[:2]
+        seam = max(2, round(0.007 / texel_m))
+        for i in range(columns):
+            for j in range(rows):
+                x0, x1 = round(i * w / columns) + 2 * seam, round((i + 1) * w / columns) - 2 * seam
+                y0, y1 = round(j * h / rows) + 2 * seam, round((j + 1) * h / rows) - 2 * seam
+                image[y0:y1, x0:x1] *= rng.uniform(0.84, 1.16)
+                cv2.rectangle(image, (x0, y0), (x1, y1), (50, 36, 26), seam)
+                at = (round((x0 + x1) / 2 + 0.3 * (x1 - x0) * (rows < columns)), round(y0 + 0.35 * (y1 - y0)))
+                cv2.circle(image, at, max(2, round(0.016 / texel_m)), tuple(knob), -1, cv2.LINE_AA)
+        return image
+
+    return paint
+
+
+def carton(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+    """Cardboard with tape, a label and print."""
+    h, w = shape_of(width_m, height_m, texel_m)
+    image = flat((h, w), shaded(rng, (178, 140, 98), 0.05))
+    image *= (1 + 0.06 * cloud(rng, (h, w), 0.08 / texel_m, 4, 0.8))[..., None]
+    tape = max(3, round(0.05 / texel_m))
+    image[:, w // 2 - tape // 2 : w // 2 + tape // 2] = shaded(rng, (206, 184, 140), 0.04)
+    x, y = round(rng.uniform(0.05, 0.5) * w), round(rng.uniform(0.1, 0.5) * h)
+    lw, lh = max(6, round(0.34 * w)), max(6, round(0.32 * h))
+    cv2.rectangle(image, (x, y), (x + lw, y + lh), (232, 230, 222), -1)
+    for k in range(4):
+        end = x + round(rng.uniform(0.4, 0.9) * lw)
+        cv2.line(
+            image,
+            (x + 3, y + round((k + 0.7) * lh / 4.4)),
+            (end, y + round((k + 0.7) * lh / 4.4)),
+            (40, 40, 44),
+            2,
+        )
+    cv2.circle(
+        image, (round(0.8 * w), round(0.8 * h)), max(2, round(0.08 * min(h, w))), vivid(rng), -1, cv2.LINE_AA
+    )
+    return image
+
+
+def screen(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+    """A display with windows of text and a chart."""
+    h, w = shape_of(width_m, height_m, texel_m)
+    image = _landscape(rng, h, w, texel_m) * np.float32(0.7)
+    for _ in range(3):
+        x, y = round(rng.uniform(0.05, 0.5) * w), round(rng.uniform(0.08, 0.45) * h)
+        x1, y1 = x + round(rng.uniform(0.3, 0.45) * w), y + round(rng.uniform(0.3, 0.45) * h)
+        cv2.rectangle(image, (x, y), (x1, y1), shaded(rng, (40, 44, 54), 0.2), -1)
+        line = y + 0.02 / texel_m
+        while line < y1 - 0.012 / texel_m:
+            start = x + round(rng.uniform(0.01, 0.05) / texel_m)
+            end = max(start + 2, round(x + rng.uniform(0.3, 0.9) * (x1 - x)))
+            cv2.line(
+                image, (start, round(line)), (end, round(line)), vivid(rng), max(1, round(0.006 / texel_m))
+            )
+            line += 0.018 / texel_m
+    cv2.rectangle(image, (0, 0), (w - 1, h - 1), (22, 22, 24), 2 * max(2, round(0.014 / texel_m)))
+    return image
+
+
+def paint_onto(base: Material, patches: Sequence[tuple[Material, float, float, float, float]]) -> Material:
+    """`base` with patches `(material, left, top, width, height)` in metres laid over it, in their order."""
+
+    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+        image = base(rng, width_m, height_m, texel_m)
+        for material, left, top, patch_w, patch_h in patches:
+            patch = material(rng, patch_w, patch_h, texel_m)
+            x, y = round(left / texel_m), round(top / texel_m)
+            patch = patch[: image.shape[0] - y, : image.shape[1] - x]
+            image[y : y + patch.shape[0], x : x + patch.shape[1]] = patch
+        return image
+
+    return paint
+
+
+def window(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+    """A bright view outside behind the bars of a window."""
+    h, w = shape_of(width_m, height_m, texel_m)
+    image = 1.1 * _landscape(rng, h, w, texel_m) + 60
+    bar = max(3, round(0.05 / texel_m))
+    for x in (0, w // 2, w - 1):
+        cv2.line(image, (x, 0), (x, h - 1), (232, 230, 224), bar if x == w // 2 else 2 * bar)
+    for y in (0, round(0.35 * h), h - 1):
+        cv2.line(image, (0, y), (w - 1, y), (232, 230, 224), bar if 0 < y < h - 1 else 2 * bar)
+    return image
+
+
+def lamp(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+    """A shining panel with a frame."""
+    h, w = shape_of(width_m, height_m, texel_m)
+    image = flat((h, w), (500, 490, 465))
+    cv2.rectangle(image, (0, 0), (w - 1, h - 1), (160, 160, 156), 2 * max(2, round(0.03 / texel_m)))
+    return image
+
+
+def skirting(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+    """A painted board along the foot of a wall."""
+    h, w = shape_of(width_m, height_m, texel_m)
+    image = flat((h, w), (214, 208, 196)) * (1 + 0.04 * cloud(rng, (h, w), 0.08 / texel_m, 3, 0.8))[..., None]
+    image[: max(2, round(0.008 / texel_m))] = (120, 112, 100)
+    return image
+
+
+def foliage(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+    """Leaves over leaves."""
+    h, w = shape_of(width_m, height_m, texel_m)
+    image = flat((h, w), (40, 62, 34))
+    for _ in range(int(900 * width_m * height_m)):
+        centre = (int(rng.integers(0, w)), int(rng.integers(0, h)))
+        axes = (
+            max(2, round(rng.uniform(0.02, 0.05) / texel_m)),
+            max(1, round(rng.uniform(0.008, 0.016) / texel_m)),
+        )
+        tint = shaded(rng, (72, 118, 58), 0.28)
+        cv2.ellipse(image, centre, axes, float(rng.uniform(0, 180)), 0, 360, tint, -1, cv2.LINE_AA)
+    return image
+
+
+def marbled(color: Color, vein: Color, wave_m: float = 0.12) -> Material:
+    """Glazed clay or a globe: two colours in large soft shapes with sharper borders."""
+
+    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+        h, w = shape_of(width_m, height_m, texel_m)
+        mix = np.clip(0.5 + 2.2 * cloud(rng, (h, w), wave_m / texel_m, 4, 0.6), 0, 1)[..., None]
+        image = (1 - mix) * flat((h, w), color) + mix * flat((h, w), vein)
+        return image * (1 + 0.06 * cloud(rng, (h, w), 0.05 / texel_m, 3, 0.8))[..., None]
+
+    return paint

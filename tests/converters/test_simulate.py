@@ -1,0 +1,252 @@
+"""The simulator: exact depth, colours that do not depend on the view, clear and overlapping paths, sensor noise."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+
+from converters.simulate import _camera, bake, noise, paths, simulate, write_points
+from converters.simulate.render import Renderer
+from converters.simulate.scene import Scene, build
+from pipeline import messages, streams
+from pipeline.errors import DuagError
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.recording import Recording, content_digest, open_rgbd, read_log
+from schemas import topics
+
+SIZE = (160, 120)
+
+
+@pytest.fixture(scope="module")
+def room() -> Scene:
+    return build("room", 3)
+
+
+@pytest.fixture(scope="module")
+def atlas(room: Scene) -> bake.Atlas:
+    return bake.bake(room, 0.006)
+
+
+@pytest.fixture(scope="module")
+def camera() -> PinholeCamera:
+    return _camera(SIZE)
+
+
+@pytest.fixture(scope="module")
+def ways(room: Scene, camera: PinholeCamera) -> list[np.ndarray]:
+    return paths.plan(room, 3, 150, 0.6, camera)
+
+
+@pytest.fixture(scope="module")
+def renderer(room: Scene, atlas: bake.Atlas, camera: PinholeCamera) -> Renderer:
+    return Renderer(room, atlas, camera)
+
+
+def some_poses(ways: list[np.ndarray]) -> Iterator[np.ndarray]:
+    for way in ways:
+        yield from way[[0, 60, 149]]
+
+
+def test_depth_ends_on_a_surface_and_passes_through_none(room, renderer, ways):
+    """Solids know their distance to a point by other formulas than those that cast rays."""
+    rays = renderer.camera.rays()[::4, ::4]
+    for T in some_poses(ways):
+        depth, surface = renderer.depth(T)
+        assert (depth > 0).all()
+        assert (surface >= 0).all()
+        sight = rays * depth[::4, ::4, None]
+        assert np.abs(room.clearance(se3.transform(T, sight.reshape(-1, 3)))).max() < 1e-9  # float64, metres
+        on_the_way = np.linspace(0.02, 0.995, 12)[:, None, None, None] * sight
+        assert room.clearance(se3.transform(T, on_the_way.reshape(-1, 3))).min() > 0
+
+
+@pytest.mark.parametrize(("i", "j"), [(0, 1), (0, 25), (70, 110)])
+def test_views_agree_on_depth_and_colour(room, atlas, ways, i, j):
+    """A point seen in view i is, in view j, at the depth and of the colour that view j has there."""
+    camera, T_i, T_j = _camera((480, 360)), ways[0][i], ways[0][j]
+    renderer = Renderer(room, atlas, camera)
+    one, other = renderer.render(T_i), renderer.render(T_j)
+    points = se3.transform(se3.inverse(T_j) @ T_i, camera.back_project(one.depth).reshape(-1, 3))
+    z = points[:, 2]
+    u, v = camera.project(np.where(z[:, None] > 0.1, points, (0, 0, 1))).T
+    inside = (z > 0.1) & (u > 1) & (v > 1) & (u < camera.width - 2) & (v < camera.height - 2)
+    assert inside.mean() > 0.5
+    # inverse depth is linear on planes: interpolating it is exact there
+    inverse = map_coordinates(1 / other.depth, [v, u], order=1, mode="nearest")
+    gap_m = np.abs(1 / inverse - z)
+    same = inside & (gap_m < 1e-4)
+    assert same.sum() > 0.8 * inside.sum()  # the rest is hidden, or interpolated across an edge
+    assert np.median(gap_m[inside]) < 1e-9
+    seen = np.stack(
+        [map_coordinates(other.color[..., k].astype(float), [v, u], order=3) for k in range(3)], axis=1
+    )
+    difference = np.abs((seen - one.color.reshape(-1, 3)).mean(axis=1))[same]
+    assert np.median(difference) < 1.0  # of 255
+
+
+def test_colour_is_the_mean_over_the_pixel(room, atlas, renderer, ways):
+    """The same view at five times the size, averaged in blocks, is the view."""
+    camera = renderer.camera.scaled(5 * SIZE[0], 5 * SIZE[1])
+    for T in (ways[0][20], ways[1][90]):
+        view = renderer.render(T)
+        large = Renderer(room, atlas, camera).render(T)
+        blocks = large.color.reshape(SIZE[1], 5, SIZE[0], 5, 3).mean(axis=(1, 3))
+        difference = np.abs(view.color - blocks).mean(axis=2)
+        assert np.median(difference) < 1.0
+        assert (
+            np.percentile(difference, 95) < 6.0
+        )  # slanted surfaces are blurred a little more than necessary
+        assert np.array_equal(view.depth, renderer.depth(T)[0])
+        assert (
+            np.abs(large.depth[2::5, 2::5] - view.depth).max() < 1e-9
+        )  # the middle of the block is the pixel
+
+
+def test_views_show_many_surfaces_and_many_features(renderer, ways):
+    sift = cv2.SIFT_create()
+    for T in some_poses(ways):
+        view = renderer.render(T)
+        counts = np.bincount(view.surface.ravel())
+        assert (counts > 0.02 * view.surface.size).sum() >= 3
+        assert len(sift.detect(cv2.cvtColor(view.color, cv2.COLOR_RGB2GRAY))) > 80
+
+
+def test_paths_are_smooth_clear_and_long(room, ways):
+    for way in ways:
+        steps, turns = se3.distance(way[:-1], way[1:])
+        assert steps.sum() > 3.0
+        assert steps.min() > 0.020
+        assert steps.max() < 0.025
+        assert np.rad2deg(turns.max()) < 1.3
+        positions = way[:, :3, 3]
+        assert np.abs(np.diff(positions, n=2, axis=0)).max() < 1e-3  # metres per frame^2: no corners
+        assert room.clearance(positions).min() > 0.5
+
+
+@pytest.mark.parametrize("overlap", [0.5, 0.7])
+def test_neighbours_share_as_much_of_the_view_as_asked(room, camera, overlap):
+    small = Renderer(room, None, camera.scaled(*paths.OVERLAP_IMAGE))
+    one, other = paths.plan(room, 2, 150, overlap, camera)
+    assert paths.shared_view(small, one, other) == pytest.approx(overlap, abs=0.04)
+    apart, _ = se3.distance(one[:, None], other[None])
+    assert apart.min(axis=0).max() > 0.2  # and not from the same places
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_every_robot_finds_a_way_in_every_room(seed):
+    scene = build("room", seed)
+    for robot in range(4):
+        way = paths._loop(scene, robot).poses(160, 0.7)
+        assert scene.clearance(way[:, :3, 3]).min() > 0.5
+
+
+def test_kinect_noise_has_the_published_size(camera):
+    """Nguyen et al. 2012, on walls seen straight on; and what is measured is a whole number of disparity steps."""
+    for z in (0.8, 1.5, 3.0, 5.0):
+        rng = streams.generator(0, "test", depth=str(z))
+        exact = np.full((240, 320), z)
+        measured = noise.kinect_depth(exact, camera.scaled(320, 240), rng)
+        assert (measured > 0).mean() > 0.99
+        error = (measured - exact)[measured > 0]
+        assert np.std(error) == pytest.approx(noise.axial_sigma_m(np.array(z)), rel=0.12)
+        assert abs(error.mean()) < 0.1 * np.std(error)
+        steps = 8 * noise.SENSOR_FOCAL_PX * noise.BASELINE_M / measured[measured > 0]
+        assert np.abs(steps - np.rint(steps)).max() < 1e-6
+        field = np.where(measured > 0, measured - exact, 0)
+        neighbours = np.mean(field[:, 1:] * field[:, :-1]) / np.mean(field**2)
+        assert 0.3 < neighbours < 0.95
+
+
+def test_kinect_noise_has_holes_where_the_sensor_is_blind(camera, renderer, ways):
+    step = np.full((120, 160), 3.0)
+    step[:, 60:100] = 1.0  # a board in front of a wall
+    measured = noise.kinect_depth(step, camera, streams.generator(0, "test"))
+    parallax = camera.fx * noise.BASELINE_M * (1 / 1.0 - 1 / 3.0)
+    shadow = measured[:, 100 : 100 + int(parallax) - 1]
+    assert (shadow == 0).all()
+    assert (measured[:, 110:] > 0).all()
+    assert (measured[:, :59] > 0).all()
+    edge = measured[:, 59:61]
+    assert ((edge > 1.2) & (edge < 2.7)).any()  # mixed pixels
+    for T in some_poses(ways):
+        depth, _ = renderer.depth(T)
+        holes = (noise.kinect_depth(depth, camera, streams.generator(0, "test")) == 0).mean()
+        assert 0.0 < holes < 0.15
+
+
+def test_grey_noise_is_one_percent():
+    grey = np.full((200, 200, 3), 128, dtype=np.uint8)
+    noisy = noise.grey_noise(grey, streams.generator(0, "test")).astype(float) - 128
+    assert np.std(noisy) == pytest.approx(2.55, rel=0.05)
+
+
+def test_points_of_the_geometry_lie_on_surfaces(room, atlas, tmp_path):
+    points, normals, colors = bake.surface_points(room, atlas, 5000)
+    assert len(points) > 4000
+    assert np.abs(room.clearance(points)).max() < 1e-6
+    assert room.clearance(points + 0.002 * normals).min() > 0
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-9)
+    assert colors.std() > 20
+    write_points(tmp_path / "points.ply", points, normals, colors)
+    header, _, body = (tmp_path / "points.ply").read_bytes().partition(b"end_header\n")
+    assert f"element vertex {len(points)}\n".encode() in header
+    assert len(body) == 27 * len(points)
+    np.testing.assert_array_equal(np.frombuffer(body[:12], "<f4"), points[0].astype("<f4"))
+
+
+def test_recordings_do_not_depend_on_the_number_of_workers(tmp_path):
+    kind = {"robots": 2, "frames": 5, "size": SIZE, "noise": "kinect", "seed": 7}
+    simulate(tmp_path / "one" / "rec", workers=1, **kind)
+    simulate(tmp_path / "two" / "rec", workers=2, **kind)
+    names = sorted(path.name for path in (tmp_path / "one" / "rec").iterdir())
+    assert len(names) == 6
+    for name in names:
+        assert (tmp_path / "one" / "rec" / name).read_bytes() == (
+            tmp_path / "two" / "rec" / name
+        ).read_bytes(), name
+    check_noisy_recording(tmp_path / "one" / "rec")
+    with pytest.raises(DuagError, match="exists"):
+        simulate(tmp_path / "one" / "rec", workers=1, **kind)
+
+
+def check_noisy_recording(folder: Path) -> None:
+    """The log holds what was measured, the ground truth what was there."""
+    recording = Recording(folder)
+    assert recording.robots == ["alpha", "bravo"]
+    scene, camera = build("room", 7), _camera(SIZE)
+    exact = Renderer(scene, None, camera)
+    for robot in recording.robots:
+        truth = recording.groundtruth(robot)
+        assert truth is not None
+        poses = [
+            messages.unpack_pose_in_frame(r.proto())
+            for r in read_log(truth, [topics.GROUNDTRUTH_POSE.of(robot)])
+        ]
+        depths = [r.proto() for r in read_log(truth, [topics.GROUNDTRUTH_DEPTH.of(robot)])]
+        with open_rgbd(recording.log(robot)) as log:
+            assert log.camera == camera
+            assert len(log) == len(poses) == len(depths) == 5
+            for frame, pose in zip(log.frames(), poses, strict=True):
+                depth, _ = exact.depth(pose)
+                valid = frame.depth > 0
+                error = np.abs(frame.depth - depth)[valid] / noise.axial_sigma_m(depth[valid])
+                assert 0.3 < np.median(error) < 1.1
+    description = json.loads((folder / "recording.json").read_text())
+    assert description["geometry"] == "groundtruth.ply"
+    assert description["parameters"]["seed"] == 7
+    assert content_digest(recording.log("alpha")) != content_digest(recording.log("bravo"))
+
+
+@pytest.mark.parametrize(
+    ("argument", "value"),
+    [("robots", 0), ("frames", 1), ("noise", "rain"), ("scene", "moon"), ("size", (8, 8)), ("overlap", 1.5)],
+)
+def test_arguments_out_of_range_are_refused(tmp_path, argument, value):
+    with pytest.raises(DuagError, match="expected"):
+        simulate(tmp_path / "rec", **{argument: value})
+    assert not (tmp_path / "rec").exists()
