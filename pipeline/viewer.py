@@ -25,6 +25,7 @@ from pipeline.evaluation.results import Absent
 from pipeline.evaluation.run_folder import RobotRun, RunFolder
 from pipeline.evaluation.stage import poses_by_stamp
 from pipeline.geometry import so3
+from pipeline.messages import camera_frame
 from pipeline.recording import RECORDING_FILE, Recording, open_rgbd
 from pipeline.report import words
 from pipeline.report.figures import color_of
@@ -37,7 +38,11 @@ if TYPE_CHECKING:
     import rerun.blueprint as rrb
 
 APPLICATION = "duagc"
-TIME, ROUND = "time", "round"  # timelines: nanoseconds of the recording, rounds of the session
+TIME, ROUND = (
+    "time",
+    "round",
+)  # timelines of a run: time of the recording, then of the session; rounds of the session
+LOG_TIME = "message_log_time"  # timeline that Rerun gives to a log
 VIEWER_MEMORY = "4GiB"
 MIN_OPACITY = 1.0 / 255.0
 
@@ -226,17 +231,25 @@ def _log_keyframes(
 
 
 def _log_rounds(stream: rr.RecordingStream, session: Session) -> None:
-    """What happened in every round, on the timeline of rounds."""
+    """What happened in every round, on the timeline of rounds and, after the end of the logs, on that of time.
+
+    Rerun has no logarithmic axis, so that changes and residuals are logged as their decimal logarithm.
+    """
     import rerun as rr
 
+    end_ns = max(int(robot.trajectory.stamps_ns[-1]) for robot in session.run.robots.values())
     for group, series in session.series_by_round().items():
         for name, (rounds, values) in series.items():
+            if group != "bytes":
+                keep = values > 0
+                rounds, values = rounds[keep], np.log10(values[keep])
             entity = f"rounds/{group}/{name}"
             stream.log(entity, rr.SeriesLines(names=name), static=True)
+            times = np.asarray(end_ns + (rounds + 1) * session.period_ns, dtype="timedelta64[ns]")
             stream.send_columns(
                 entity,
-                indexes=[rr.TimeColumn(ROUND, sequence=np.asarray(rounds, dtype=np.int64))],
-                columns=rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64)),
+                indexes=[rr.TimeColumn(ROUND, sequence=rounds), rr.TimeColumn(TIME, duration=times)],
+                columns=rr.Scalars.columns(scalars=values),
             )
 
 
@@ -277,17 +290,26 @@ def _blueprint(run: RunFolder) -> rrb.Blueprint:
     first = run.largest_component[0]
     world = _world_of(run, run.robots[first].component)
     scene = [f"/{world}/paths/**", f"/{world}/cameras/**"]
+    scene += [f"- /{world}/cameras/{name}/depth" for name in run.robots]
     images = [
-        rrb.Spatial2DView(
-            origin=f"/{_world_of(run, robot.component)}/cameras/{name}",
-            contents=["$origin/image"],
-            name=f"{name}: keyframes",
+        rrb.Tabs(
+            *(
+                rrb.Spatial2DView(
+                    origin=f"/{_world_of(run, robot.component)}/cameras/{name}",
+                    contents=[f"$origin/{what}"],
+                    name=f"{name}: {what}",
+                )
+                for what in ("image", "depth")
+            )
         )
         for name, robot in run.robots.items()
     ]
     charts = [
         rrb.TimeSeriesView(origin=f"/rounds/{group}", name=title)
-        for group, title in (("change", "Change per round"), ("bytes", "Bytes per round"))
+        for group, title in (
+            ("change", "Largest change per round, log10 of m or rad"),
+            ("bytes", "Bytes per round"),
+        )
     ]
     return rrb.Blueprint(
         rrb.Vertical(
@@ -315,9 +337,14 @@ def _blueprint(run: RunFolder) -> rrb.Blueprint:
             row_shares=[2, 1],
         ),
         rrb.TimePanel(timeline=TIME, state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
+        *_closed_panels(),
     )
+
+
+def _closed_panels() -> list[Any]:
+    import rerun.blueprint as rrb
+
+    return [rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")]
 
 
 # --- a recording -------------------------------------------------------------------------------------------------
@@ -332,12 +359,13 @@ def recording_to_rrd(logs: Sequence[Path], out: Path) -> Path:
     from rerun.chunk import Chunk, DeriveLens, LazyChunkStream, McapReader
 
     lenses = [
-        DeriveLens("Image:buffer").to_component("DepthImage:buffer", "."),
-        DeriveLens("Image:format").to_component("DepthImage:format", "."),
+        DeriveLens("Image:buffer").to_component(rr.DepthImage.descriptor_buffer(), "."),
+        DeriveLens("Image:format").to_component(rr.DepthImage.descriptor_format(), "."),
     ]
-    streams = []
+    streams, robots = [], []
     for path in logs:
         with open_rgbd(path) as log:
+            robots.append(log.robot)
             topic, units_per_metre = topics.DEPTH.of(log.robot), 1.0 / log.depth_scale
         depth, rest = McapReader(path).stream().split(content=topic)
         meter = Chunk.from_columns(topic, indexes=[], columns=rr.DepthImage.columns(meter=[units_per_metre]))
@@ -347,11 +375,46 @@ def recording_to_rrd(logs: Sequence[Path], out: Path) -> Path:
             LazyChunkStream.from_iter([meter]),
         ]
     partial = out.with_name(out.name + ".part")
-    LazyChunkStream.merge(*streams).write_rrd(
-        partial, application_id=APPLICATION, recording_id=f"recording-{out.stem}"
-    )
+    recording = rr.RecordingStream(APPLICATION, recording_id=f"recording-{out.stem}")
+    recording.save(partial, default_blueprint=_recording_blueprint(robots))
+    recording.send_chunks(LazyChunkStream.merge(*streams))
+    recording.flush()
+    recording.disconnect()
     partial.replace(out)
     return out
+
+
+def _recording_blueprint(robots: Sequence[str]) -> rrb.Blueprint:
+    """Colour, depth and points of every robot; the views name the frames of the log, which no entity path tells."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    rows = []
+    for robot in robots:
+        frame = camera_frame(robot)
+        color, depth = topics.COLOR.of(robot), topics.DEPTH.of(robot)
+        image_plane = rrb.SpatialInformation(target_frame=f"{frame}_image_plane")
+        rows.append(
+            rrb.Horizontal(
+                rrb.Spatial2DView(
+                    origin=color, contents=[color], name=f"{robot}: colour", spatial_information=image_plane
+                ),
+                rrb.Spatial2DView(
+                    origin=depth, contents=[depth], name=f"{robot}: depth", spatial_information=image_plane
+                ),
+                rrb.Spatial3DView(
+                    origin=f"/{robot}",
+                    contents=[color, depth, topics.CALIBRATION.of(robot)],
+                    name=f"{robot}: points",
+                    spatial_information=rrb.SpatialInformation(
+                        target_frame=frame, axes=rr.ViewCoordinates.RDF, show_axes=True
+                    ),
+                ),
+            )
+        )
+    return rrb.Blueprint(
+        rrb.Vertical(*rows), rrb.TimePanel(timeline=LOG_TIME, state="collapsed"), *_closed_panels()
+    )
 
 
 # --- windows and pictures ----------------------------------------------------------------------------------------

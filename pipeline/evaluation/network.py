@@ -220,6 +220,11 @@ class Session:
             ticks = Absent(f"{late} did not get there in {self.summary.rounds} rounds")
         return {"solver": SOLVER, "converged": self.summary.converged, "rounds_to_tolerance": ticks, **gaps}
 
+    @property
+    def period_ns(self) -> int:
+        """Length of a round."""
+        return int(self.run.config.get("exchange", {}).get("period_ns", 100_000_000))
+
     def series_by_round(self) -> Mapping[str, Series]:
         """Curves over rounds: "change" and "primal" per robot (m and rad), "bytes" per purpose."""
         change: dict[str, list[tuple[int, float, float]]] = {}
