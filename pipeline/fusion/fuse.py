@@ -1,0 +1,332 @@
+"""One robot's fused map from everybody's evidence: method sections 3 and 4, mode `evidence`.
+
+In the flat chart theta = (mean, vec log Sigma, colour, opacity logit) the fused value of a track is, block by block,
+
+    theta* = (sum W_eff)^-1 sum W_eff theta,        W_eff = (W^-1 + Sigma_assoc)^-1 = (I + W Sigma_assoc)^-1 W,
+
+which is the paper's (12) and, as the chart is flat, its log-Euclidean mean (13). Sigma_assoc is the variance of where
+on the surface a robot happened to put its splat, spacing^2 / 12 along the surface and zero across it; it belongs to the
+mean only. Every robot's evidence counts once, however often it arrived and through whom. Where no member of a track
+knows anything, the own value stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
+
+from pipeline.config import Config
+from pipeline.consensus.evidence import (
+    COLOR,
+    LOG_COVARIANCE,
+    MEAN,
+    OPACITY,
+    Evidence,
+    pack_information,
+    unpack_symmetric,
+)
+from pipeline.consensus.factors import inflated
+from pipeline.consensus.matching import MatchingConfig, Pairs, tracks
+from pipeline.geometry import se3, spd
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.splat.gaussians import Gaussians
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+_NEAR_M = 0.05  # points closer to a camera than this are not judged by it
+
+
+class FusionConfig(Config):
+    """From evidence to a robot's fused map."""
+
+    coverage: Literal["all", "overlap"] = "all"
+    """Take over what only neighbours saw (all), or only fuse what is matched (overlap)."""
+    spacing_per_sigma: float = Field(default=1.8, ge=0.0)
+    """Local spacing of splats, in units of their standard deviation along the surface: the mapper seeds discs with a
+    standard deviation of 0.55 cells."""
+    unobserved_below: float = Field(default=1e-6, gt=0.0)
+    """Directions with less than this share of a block's largest information count as unobserved: float32 noise."""
+    explained_m: float = Field(default=0.05, ge=0.0)
+    """A neighbour's Gaussian this far behind a surface that an own keyframe measured still counts as explained..."""
+    explained_relative: float = Field(default=0.02, ge=0.0)
+    """... plus this share of its depth."""
+    added_need_information: bool = True
+    """Take over only Gaussians on whose position their owner's pixels said something."""
+    max_added: int | None = Field(default=None, ge=0)
+    """At most so many Gaussians of neighbours are taken over, those of most position information first."""
+
+
+@dataclass(frozen=True)
+class FusedMap:
+    """A robot's fused map in the world frame: its own Gaussians first, in their order, then those taken over.
+
+    gaussians: ids of own ones are kept; those taken over count on from the largest own id. Anchors are keyframes of
+    the source robot. information: float64 [n, 31] as in `consensus.evidence`, world frame, the sum over members.
+    robots: names. source: int32 [n], index into robots: whose Gaussian it was. source_ids: int64 [n], its id there.
+    members: int32 [n], robots whose evidence is in it. matched: own Gaussians fused with others. added: taken over.
+    """
+
+    gaussians: Gaussians
+    information: Array
+    robots: tuple[str, ...]
+    source: NDArray[np.int32]
+    source_ids: Index
+    members: NDArray[np.int32]
+    matched: int
+    added: int
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Evidence of all robots in the world frame, one after the other, in order of name."""
+
+    theta: Array
+    position: Array
+    shape: Array
+    color: Array
+    opacity: Array
+
+    @staticmethod
+    def of(evidence: list[Evidence]) -> _Rows:
+        return _Rows(
+            np.concatenate([e.theta for e in evidence]),
+            np.concatenate([e.position_information() for e in evidence]),
+            np.concatenate([e.shape_information() for e in evidence]),
+            np.concatenate([e.color_information() for e in evidence]),
+            np.concatenate([e.opacity_information() for e in evidence]),
+        )
+
+    def take(self, rows: Index) -> _Rows:
+        return _Rows(
+            self.theta[rows], self.position[rows], self.shape[rows], self.color[rows], self.opacity[rows]
+        )
+
+
+def association_covariance(vec_log_covariance: Array, spacing_per_sigma: float) -> Array:
+    """Sigma_assoc [n, 3, 3], m^2: spacing^2 / 12 along the two longer axes of each Gaussian, zero along the shortest.
+
+    The spacing is taken from the Gaussian's own extent, so that everybody computes the same from the evidence alone.
+
+    Args:
+        vec_log_covariance: [n, 6], in the frame in which the result is wanted.
+    """
+    values, vectors = np.linalg.eigh(spd.vec_to_sym(vec_log_covariance))
+    variance = spacing_per_sigma**2 * np.exp(values) / 12
+    variance[:, 0] = 0.0
+    return (vectors * variance[:, None, :]) @ vectors.swapaxes(-1, -2)
+
+
+def weighted_move(weights: Array, values: Array, first: Index, unobserved_below: float) -> Array:
+    """(sum W)^+ sum W (value - reference) per group: how far the fused value lies from each group's reference.
+
+    Args:
+        weights: [r, d, d], positive semidefinite; rows of a group follow each other.
+        values: [r, d], differences from the group's reference.
+        first: [g], first row of every group.
+        unobserved_below: share of a group's largest eigenvalue below which a direction is not moved.
+    Returns:
+        [g, d]; zero in directions that nobody knows.
+    """
+    total = np.add.reduceat(weights, first, axis=0)
+    pull = np.add.reduceat((weights @ values[..., None])[..., 0], first, axis=0)
+    eigenvalues, vectors = np.linalg.eigh(total)
+    known = eigenvalues > unobserved_below * np.maximum(eigenvalues[:, -1:], 1e-300)
+    inverse = np.where(known, 1.0 / np.where(known, eigenvalues, 1.0), 0.0)
+    along = (vectors.swapaxes(-1, -2) @ pull[..., None])[..., 0] * inverse
+    return np.asarray((vectors @ along[..., None])[..., 0], dtype=np.float64)
+
+
+def _weighted_move_diagonal(weights: Array, values: Array, first: Index) -> Array:
+    """The same for a diagonal block: weights and values [r, d]."""
+    total = np.add.reduceat(weights, first, axis=0)
+    pull = np.add.reduceat(weights * values, first, axis=0)
+    return np.where(total > 0, pull / np.where(total > 0, total, 1.0), 0.0)
+
+
+def _moves(rows: _Rows, reference: Index, first: Index, config: FusionConfig) -> Array:
+    """Fused minus reference theta [g, 13] of every track."""
+    size = np.diff(np.append(first, len(rows.theta)))
+    delta = rows.theta - np.repeat(rows.theta[reference], size, axis=0)
+    spread = association_covariance(rows.theta[:, LOG_COVARIANCE], config.spacing_per_sigma)
+    move = np.zeros((len(first), 13))
+    move[:, MEAN] = weighted_move(
+        inflated(rows.position, spread), delta[:, MEAN], first, config.unobserved_below
+    )
+    move[:, LOG_COVARIANCE] = weighted_move(
+        rows.shape, delta[:, LOG_COVARIANCE], first, config.unobserved_below
+    )
+    move[:, COLOR] = _weighted_move_diagonal(rows.color, delta[:, COLOR], first)
+    move[:, OPACITY] = _weighted_move_diagonal(rows.opacity[:, None], delta[:, OPACITY, None], first)[:, 0]
+    return move
+
+
+def fuse(
+    robot: str,
+    gaussians: Gaussians,
+    T_map_keyframe: ArrayLike,
+    evidence: Mapping[str, Evidence],
+    T_world_keyframe: Mapping[str, Array],
+    pairs: Pairs,
+    depth_images: Iterable[tuple[int, NDArray[np.float32]]],
+    camera: PinholeCamera,
+    config: FusionConfig,
+    matching: MatchingConfig,
+) -> FusedMap:
+    """Fuse what a robot knows into one map in the world frame.
+
+    Args:
+        robot: the receiver.
+        gaussians: its own map, in its map frame.
+        T_map_keyframe: [k, 4, 4], its keyframes in its own map, by anchor.
+        evidence: by robot, in anchor frames, the receiver's own included (of all its Gaussians, by id).
+        T_world_keyframe: by robot, [k, 4, 4] by anchor, for every robot in `evidence`.
+        pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians.
+        depth_images: (own keyframe index, depth [H, W] in metres, 0 invalid), read once; for `coverage = all`.
+        camera: of these depth images.
+        matching: for the rule that splits tracks which hold two Gaussians of one robot.
+    """
+    own = evidence[robot]
+    if not np.array_equal(np.sort(own.ids), np.sort(gaussians.ids)):
+        raise ValueError(f"{robot}: the own evidence must be on the Gaussians of the own map")
+    own = own.select(np.argsort(own.ids, kind="stable")[_rank(gaussians.ids)])  # in the order of the map
+    names = tuple(sorted(evidence))
+    world = {n: (own if n == robot else evidence[n]).in_world(T_world_keyframe[n]) for n in names}
+    start = np.concatenate([[0], np.cumsum([len(world[n]) for n in names])]).astype(np.int64)
+    rows = _Rows.of([world[n] for n in names])
+    owner = np.repeat(np.arange(len(names)), np.diff(start))
+    me = names.index(robot)
+
+    found = tracks(world, pairs, matching)
+    member = start[found.robot] + found.row
+    first = np.flatnonzero(np.diff(found.track, prepend=-1)).astype(np.int64)
+    track_of_member = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(member))))
+    reference = first.copy()  # the lowest name of a track, or the receiver
+    reference[track_of_member[found.robot == me]] = np.flatnonzero(found.robot == me)
+    representative = member[reference]
+
+    move = np.zeros((len(rows.theta), 13))
+    members = np.ones(len(rows.theta), dtype=np.int32)
+    sums = pack_information(rows.position, rows.shape, rows.color, rows.opacity)
+    if len(first):
+        move[representative] = _moves(rows.take(member), reference, first, config)
+        members[representative] = np.diff(np.append(first, len(member)))
+        sums[representative] = np.add.reduceat(sums[member], first, axis=0)
+
+    own_rows = np.arange(start[me], start[me + 1])
+    absorbed = np.zeros(len(rows.theta), dtype=bool)
+    absorbed[member] = True
+    absorbed[representative] = False
+    foreign = np.flatnonzero((owner != me) & ~absorbed)
+    added = np.zeros(0, np.int64)
+    if config.coverage == "all":
+        added = _to_add(foreign, rows, sums, T_world_keyframe[robot], depth_images, camera, config)
+
+    same_frame = np.array_equal(T_map_keyframe, T_world_keyframe[robot])
+    moved = gaussians if same_frame else gaussians.moved(T_map_keyframe, T_world_keyframe[robot])
+    kept = _applied(moved, move[own_rows], rows.theta[own_rows, LOG_COVARIANCE])
+    ids = np.concatenate([world[n].ids for n in names])
+    anchors = np.concatenate([world[n].anchors for n in names])
+    next_id = int(gaussians.ids.max()) + 1 if len(gaussians) else 0
+    taken = _from_theta(next_id + np.arange(len(added)), anchors[added], rows.theta[added] + move[added])
+    order = np.concatenate([own_rows, added])
+    return FusedMap(
+        gaussians=Gaussians.concatenate([kept, taken]),
+        information=sums[order],
+        robots=names,
+        source=owner[order].astype(np.int32),
+        source_ids=ids[order],
+        members=members[order],
+        matched=int(np.sum(members[own_rows] > 1)),
+        added=len(added),
+    )
+
+
+def _rank(ids: Index) -> Index:
+    """Place of every id in ascending order."""
+    out = np.empty(len(ids), np.int64)
+    out[np.argsort(ids, kind="stable")] = np.arange(len(ids))
+    return out
+
+
+def _applied(gaussians: Gaussians, move: Array, vec_log_covariance: Array) -> Gaussians:
+    """Gaussians moved in the flat chart; what is not moved keeps every bit.
+
+    The shape is only rebuilt from the chart where the shape itself was fused.
+    """
+    means, colors, logits = gaussians.means.copy(), gaussians.colors.copy(), gaussians.opacity_logits.copy()
+    quats, scales = gaussians.quats_wxyz.copy(), gaussians.log_scales.copy()
+    rows = np.flatnonzero(np.any(move[:, MEAN] != 0, axis=1))
+    means[rows] = means[rows] + move[rows, MEAN]
+    rows = np.flatnonzero(np.any(move[:, COLOR] != 0, axis=1))
+    colors[rows] = colors[rows] + move[rows, COLOR]
+    rows = np.flatnonzero(move[:, OPACITY] != 0)
+    logits[rows] = logits[rows] + move[rows, OPACITY]
+    rows = np.flatnonzero(np.any(move[:, LOG_COVARIANCE] != 0, axis=1))
+    quats[rows], scales[rows] = spd.from_log_covariance(vec_log_covariance[rows] + move[rows, LOG_COVARIANCE])
+    return gaussians.replace(
+        means=means, quats_wxyz=quats, log_scales=scales, colors=colors, opacity_logits=logits
+    )
+
+
+def _from_theta(ids: Index, anchors: NDArray[np.int32], theta: Array) -> Gaussians:
+    """Gaussians of theta [n, 13]."""
+    quats, scales = spd.from_log_covariance(theta[:, LOG_COVARIANCE])
+    return Gaussians(
+        ids=ids,
+        anchors=anchors,
+        means=theta[:, MEAN].astype(np.float32),
+        quats_wxyz=quats.astype(np.float32),
+        log_scales=scales.astype(np.float32),
+        colors=theta[:, COLOR].astype(np.float32),
+        opacity_logits=theta[:, OPACITY].astype(np.float32),
+    )
+
+
+def _to_add(
+    foreign: Index,
+    rows: _Rows,
+    sums: Array,
+    T_world_keyframe: Array,
+    depth_images: Iterable[tuple[int, NDArray[np.float32]]],
+    camera: PinholeCamera,
+    config: FusionConfig,
+) -> Index:
+    """Which of the neighbours' Gaussians to take over: those in space that no own keyframe saw."""
+    position = np.trace(unpack_symmetric(sums[foreign, :6], 3), axis1=-2, axis2=-1)
+    if config.added_need_information:
+        foreign, position = foreign[position > 0], position[position > 0]
+    new = ~explained(rows.theta[foreign, MEAN], T_world_keyframe, depth_images, camera, config)
+    foreign, position = foreign[new], position[new]
+    if config.max_added is not None and len(foreign) > config.max_added:
+        foreign = np.sort(foreign[np.lexsort((foreign, -position))[: config.max_added]])
+    return foreign
+
+
+def explained(
+    points_world: Array,
+    T_world_keyframe: Array,
+    depth_images: Iterable[tuple[int, NDArray[np.float32]]],
+    camera: PinholeCamera,
+    config: FusionConfig,
+) -> NDArray[np.bool_]:
+    """Whether some keyframe saw the space at each point [n, 3]: it measured a surface there or behind it.
+
+    A keyframe that measured something nearer says nothing about what is hidden behind.
+    """
+    seen = np.zeros(len(points_world), dtype=bool)
+    for keyframe, depth in depth_images:
+        left = np.flatnonzero(~seen)
+        p = se3.transform(se3.inverse(T_world_keyframe[keyframe]), points_world[left])
+        left, p = left[p[:, 2] > _NEAR_M], p[p[:, 2] > _NEAR_M]
+        column, row = np.rint(camera.project(p)).astype(np.int64).T
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        left, z = left[inside], p[inside, 2]
+        measured = depth[row[inside], column[inside]].astype(np.float64)
+        reach = measured + config.explained_m + config.explained_relative * z
+        seen[left[(measured > 0) & (z <= reach)]] = True
+    return seen

@@ -1,0 +1,125 @@
+"""Evidence: packing, turning with keyframes, zero where nothing was said."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipeline.consensus.evidence import (
+    COLOR,
+    LOG_COVARIANCE,
+    MEAN,
+    OPACITY,
+    Evidence,
+    pack_information,
+    pack_symmetric,
+    unpack_symmetric,
+)
+from pipeline.geometry import se3, spd
+from pipeline.splat.gaussians import Gaussians
+from tests.consensus.worlds import random_poses
+
+
+@dataclass
+class Sums:
+    """The fields of the Fisher sums that evidence reads."""
+
+    ids: NDArray
+    geometry: NDArray
+    color: NDArray
+    opacity: NDArray
+
+
+def random_map(seed, n=20, keyframes=4):
+    rng = np.random.default_rng(seed)
+    gaussians = Gaussians(
+        rng.permutation(1000)[:n],
+        rng.integers(keyframes, size=n),
+        rng.normal(size=(n, 3)),
+        rng.normal(size=(n, 4)),
+        rng.uniform(-5, -3, size=(n, 3)),
+        rng.uniform(size=(n, 3)),
+        rng.normal(size=n),
+    )
+    A = rng.normal(size=(n, 9, 9))
+    geometry = pack_symmetric(A @ A.swapaxes(-1, -2))
+    sums = Sums(gaussians.ids, geometry, rng.uniform(1, 2, (n, 3)), rng.uniform(1, 2, n))
+    return gaussians, sums, random_poses(rng, keyframes)
+
+
+def test_packing_is_undone():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(5, 6, 6))
+    A = A + A.swapaxes(-1, -2)
+    np.testing.assert_array_equal(unpack_symmetric(pack_symmetric(A), 6), A)
+    assert pack_symmetric(np.arange(9.0).reshape(3, 3)).tolist() == [0, 1, 2, 4, 5, 8]  # row by row
+
+
+def test_anchored_and_back_in_the_map_is_what_the_map_said():
+    gaussians, sums, T_map_keyframe = random_map(1)
+    evidence = Evidence.from_map("alpha", gaussians, sums, T_map_keyframe)
+    back = evidence.in_world(T_map_keyframe)
+    # float64 of float32 inputs: a turn and its inverse
+    np.testing.assert_allclose(back.theta[:, MEAN], gaussians.means, atol=1e-12)
+    np.testing.assert_allclose(
+        back.theta[:, LOG_COVARIANCE],
+        spd.log_covariance(gaussians.quats_wxyz, gaussians.log_scales),
+        atol=1e-12,
+    )
+    np.testing.assert_array_equal(back.theta[:, COLOR], gaussians.colors)
+    np.testing.assert_array_equal(back.theta[:, OPACITY], gaussians.opacity_logits)
+    geometry = unpack_symmetric(sums.geometry, 9)
+    np.testing.assert_allclose(back.position_information(), geometry[:, :3, :3], atol=1e-11)
+    np.testing.assert_allclose(back.shape_information(), geometry[:, 3:, 3:], atol=1e-11)
+    np.testing.assert_array_equal(back.color_information(), sums.color)
+    np.testing.assert_array_equal(back.opacity_information(), sums.opacity)
+
+
+def test_a_motion_of_the_world_leaves_every_mahalanobis_distance():
+    """What the evidence says about any hypothesis does not depend on the frame."""
+    gaussians, sums, T_map_keyframe = random_map(2)
+    evidence = Evidence.from_map("alpha", gaussians, sums, T_map_keyframe)
+    rng = np.random.default_rng(3)
+    T = random_poses(rng, 1)[0]
+    here, there = evidence.in_world(T_map_keyframe), evidence.in_world(T @ T_map_keyframe)
+    offset_mean, offset_shape = rng.normal(size=(len(gaussians), 3)), rng.normal(size=(len(gaussians), 6))
+    turned_mean, turned_shape = offset_mean @ T[:3, :3].T, offset_shape @ spd.sym_rotation(T[:3, :3]).T
+    for name, offset, turned in (
+        ("position_information", offset_mean, turned_mean),
+        ("shape_information", offset_shape, turned_shape),
+    ):
+        np.testing.assert_allclose(
+            np.einsum("ni,nij,nj->n", turned, getattr(there, name)(), turned),
+            np.einsum("ni,nij,nj->n", offset, getattr(here, name)(), offset),
+            rtol=1e-9,
+        )
+    np.testing.assert_allclose(there.theta[:, MEAN], se3.transform(T, here.theta[:, MEAN]), atol=1e-12)
+
+
+def test_sums_are_found_by_id_and_absence_is_zero():
+    gaussians, sums, T_map_keyframe = random_map(4)
+    complete = Evidence.from_map("alpha", gaussians, sums, T_map_keyframe)
+    order = np.random.default_rng(5).permutation(len(gaussians))[: len(gaussians) // 2]
+    half = Sums(sums.ids[order], sums.geometry[order], sums.color[order], sums.opacity[order])
+    partial = Evidence.from_map("alpha", gaussians, half, T_map_keyframe)
+    there = np.isin(gaussians.ids, half.ids)
+    np.testing.assert_array_equal(partial.information[there], complete.information[there])
+    np.testing.assert_array_equal(partial.information[~there], 0)
+    np.testing.assert_array_equal(Evidence.from_map("alpha", gaussians, None, T_map_keyframe).information, 0)
+
+
+def test_blocks_pack_as_documented():
+    gaussians, sums, T_map_keyframe = random_map(6)
+    e = Evidence.from_map("alpha", gaussians, sums, T_map_keyframe)
+    packed = pack_information(
+        e.position_information(), e.shape_information(), e.color_information(), e.opacity_information()
+    )
+    np.testing.assert_array_equal(packed, e.information)
+    with pytest.raises(ValueError, match="information"):
+        Evidence("alpha", e.ids, e.anchors, e.theta, e.information[:, :30])
+
+
+def test_no_gaussians_no_evidence():
+    evidence = Evidence.from_map("alpha", Gaussians.empty(), None, np.eye(4)[None])
+    assert len(evidence.in_world(np.eye(4)[None])) == 0

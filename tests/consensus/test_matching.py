@@ -1,0 +1,145 @@
+"""Matching of Gaussians: mutual, symmetric under renaming, blind to what carries no meaning; tracks."""
+
+import numpy as np
+import pytest
+
+from pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, Evidence
+from pipeline.consensus.matching import MatchingConfig, gaussian_distance, match, threshold, tracks
+from pipeline.geometry import so3, spd
+from tests.consensus.worlds import random_poses
+
+CONFIG = MatchingConfig()
+
+
+def surface(owner, seed, n=400, jitter_m=0.004, first_id=0):
+    """A textured wall of flat discs: every owner samples the same wall at its own places, in the world frame."""
+    rng = np.random.default_rng(seed)
+    side = int(np.sqrt(n))
+    grid = 0.02 * np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)
+    grid = grid + jitter_m * rng.normal(size=grid.shape)
+    n = len(grid)
+    theta = np.zeros((n, 13))
+    theta[:, MEAN] = np.concatenate([grid, 0.001 * rng.normal(size=(n, 1))], axis=1)
+    tilt = so3.quat_from_rotvec(0.03 * rng.normal(size=(n, 3)))
+    scales = np.log(np.tile([0.011, 0.011, CONFIG.thickness_floor_m], (n, 1))) + [0.1, 0.1, 0] * rng.normal(
+        size=(n, 3)
+    )
+    theta[:, LOG_COVARIANCE] = spd.log_covariance(tilt, scales)
+    theta[:, COLOR] = 0.5 + 0.3 * np.sin(9 * grid @ [[1, 2, 0], [2, 0, 1]]) + 0.01 * rng.normal(size=(n, 3))
+    theta[:, 12] = 1.5 + 0.1 * rng.normal(size=n)
+    ids = first_id + rng.permutation(10 * n)[:n]
+    return Evidence(owner, ids, np.zeros(n), theta, np.zeros((n, 31)))
+
+
+def test_two_samplings_of_one_wall_match():
+    a, b = surface("alpha", 0), surface("bravo", 1)
+    pairs = match(a, b, CONFIG)
+    assert len(pairs) > 0.5 * len(a)
+    i = np.searchsorted(np.sort(a.ids), pairs[:, 0])
+    row_a, row_b = np.argsort(a.ids)[i], np.argsort(b.ids)[np.searchsorted(np.sort(b.ids), pairs[:, 1])]
+    assert np.linalg.norm(a.theta[row_a, MEAN] - b.theta[row_b, MEAN], axis=1).max() <= CONFIG.radius_m
+    assert gaussian_distance(a, row_a, b, row_b, CONFIG).max() < threshold(a, CONFIG)
+
+
+def test_every_gaussian_is_matched_at_most_once():
+    pairs = match(surface("alpha", 2), surface("bravo", 3), CONFIG)
+    assert len(np.unique(pairs[:, 0])) == len(np.unique(pairs[:, 1])) == len(pairs)
+
+
+def test_matches_do_not_depend_on_the_order_of_rows_or_on_the_world():
+    a, b = surface("alpha", 4), surface("bravo", 5)
+    pairs = match(a, b, CONFIG)
+    rng = np.random.default_rng(6)
+    shuffled = match(a.select(rng.permutation(len(a))), b.select(rng.permutation(len(b))), CONFIG)
+    np.testing.assert_array_equal(shuffled, pairs)
+    T = random_poses(rng, 1)
+    np.testing.assert_array_equal(match(a.in_world(T), b.in_world(T), CONFIG), pairs)
+
+
+def test_matches_are_mutual_bests_of_all_candidates():
+    """Against exhaustive search, with a threshold that both sides share."""
+    a, b = surface("alpha", 7, n=100), surface("bravo", 8, n=100)
+    config = CONFIG.model_copy(update={"candidates": 100})
+    i, j = np.meshgrid(np.arange(len(a)), np.arange(len(b)), indexing="ij")
+    d = gaussian_distance(a, i.ravel(), b, j.ravel(), config).reshape(i.shape)
+    far = np.linalg.norm(a.theta[:, None, MEAN] - b.theta[None, :, MEAN], axis=-1) > config.radius_m
+    d[far | (d >= threshold(a, config))] = np.inf
+    expected = {
+        (int(a.ids[r]), int(b.ids[np.argmin(d[r])]))
+        for r in range(len(a))
+        if np.isfinite(d[r].min()) and np.argmin(d[:, np.argmin(d[r])]) == r
+    }
+    assert {tuple(p) for p in match(a, b, config).tolist()} == expected
+
+
+def test_a_far_wall_or_an_empty_map_matches_nothing():
+    a = surface("alpha", 9)
+    far = Evidence("bravo", a.ids, a.anchors, a.theta + np.eye(13)[2], a.information)
+    assert match(a, far, CONFIG).shape == (0, 2)
+    nobody = a.select(slice(0, 0))
+    assert match(a, nobody, CONFIG).shape == match(nobody, a, CONFIG).shape == (0, 2)
+    assert threshold(a.select(slice(0, 1)), CONFIG) == 0.0
+
+
+def test_thickness_at_the_floor_says_nothing():
+    """Discs at the floor: how thin they are is not compared, nor is a thick one with a thin one across the surface."""
+    scales = np.log([[0.02, 0.02, CONFIG.thickness_floor_m], [0.02, 0.02, 0.9 * CONFIG.thickness_floor_m]])
+    theta = np.zeros((2, 13))
+    theta[:, LOG_COVARIANCE] = spd.log_covariance(np.tile([1.0, 0, 0, 0], (2, 1)), scales)
+    e = Evidence("alpha", np.arange(2), np.zeros(2), theta, np.zeros((2, 31)))
+    zero, one = np.array([0]), np.array([1])
+    assert gaussian_distance(e, zero, e, one, CONFIG)[0] == pytest.approx(0.0, abs=1e-12)
+    thick = scales + np.log(2.0)
+    theta[1, LOG_COVARIANCE] = spd.log_covariance(np.array([1.0, 0, 0, 0]), thick[0])
+    thicker = Evidence("alpha", np.arange(2), np.zeros(2), theta, np.zeros((2, 31)))
+    expected = np.sqrt(0.1 * 2 * (2 * np.log(2)) ** 2)  # two axes along the surface, not the third
+    assert gaussian_distance(thicker, zero, thicker, one, CONFIG)[0] == pytest.approx(expected)
+
+
+def identical(owner, ids):
+    """Evidence on one place, all ids alike but for a growing opacity."""
+    theta = np.zeros((len(ids), 13))
+    theta[:, LOG_COVARIANCE] = -8 * np.array([1, 1, 1, 0, 0, 0])
+    theta[:, 12] = 0.01 * np.arange(len(ids))
+    return Evidence(owner, np.array(ids), np.zeros(len(ids)), theta, np.zeros((len(ids), 31)))
+
+
+def groups(evidence, pairs):
+    found = tracks(evidence, pairs, CONFIG)
+    out = {}
+    for track, robot, row in zip(found.track.tolist(), found.robot.tolist(), found.row.tolist(), strict=True):
+        name = found.robots[robot]
+        out.setdefault(track, set()).add((name, int(evidence[name].ids[row])))
+    return sorted(out.values(), key=sorted)
+
+
+def test_tracks_run_over_all_robots():
+    evidence = {
+        "alpha": identical("alpha", [5, 6]),
+        "bravo": identical("bravo", [7]),
+        "charlie": identical("charlie", [5]),
+    }
+    pairs = {("alpha", "bravo"): np.array([[6, 7]]), ("bravo", "charlie"): np.array([[7, 5]])}
+    assert groups(evidence, pairs) == [{("alpha", 6), ("bravo", 7), ("charlie", 5)}]
+
+
+def test_a_track_with_two_gaussians_of_one_robot_loses_its_worst_pair():
+    evidence = {
+        "alpha": identical("alpha", [0, 1]),
+        "bravo": identical("bravo", [0]),
+        "charlie": identical("charlie", [0]),
+    }
+    # alpha 0 - bravo 0 - charlie 0 - alpha 1, of which the last is the worst (opacity 0.01 against 0)
+    pairs = {
+        ("alpha", "bravo"): np.array([[0, 0]]),
+        ("bravo", "charlie"): np.array([[0, 0]]),
+        ("alpha", "charlie"): np.array([[1, 0]]),
+    }
+    assert groups(evidence, pairs) == [{("alpha", 0), ("bravo", 0), ("charlie", 0)}]
+
+
+def test_pairs_of_gaussians_that_never_arrived_are_left_out():
+    evidence = {"alpha": identical("alpha", [0, 1]), "bravo": identical("bravo", [3])}
+    pairs = {("alpha", "bravo"): np.array([[0, 3], [1, 4]]), ("bravo", "zulu"): np.array([[3, 3]])}
+    assert groups(evidence, pairs) == [{("alpha", 0), ("bravo", 3)}]
+    assert groups(evidence, {}) == []

@@ -1,0 +1,284 @@
+"""Fusion as laws: weighted means, nothing from nothing, every robot counted once, whatever the order; coverage."""
+
+import numpy as np
+import pytest
+
+from pipeline.consensus.evidence import LOG_COVARIANCE, MEAN, Evidence, pack_information
+from pipeline.consensus.matching import MatchingConfig
+from pipeline.fusion.fuse import FusionConfig, association_covariance, explained, fuse, weighted_move
+from pipeline.geometry import se3, spd
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.splat.gaussians import Gaussians
+
+CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
+CONFIG = FusionConfig()
+MATCHING = MatchingConfig()
+NAMES = ("alpha", "bravo", "charlie")
+N = 30
+
+
+def random_pose(rng):
+    return se3.from_quat_translation(rng.normal(size=4), rng.normal(size=3))
+
+
+def information(rng, n):
+    """Blocks of full rank with a contrast of about ten per axis."""
+    blocks = []
+    for d, scale in ((3, 1e5), (6, 10.0)):
+        A = rng.normal(size=(n, d, d)) + 2 * np.eye(d)
+        blocks.append(scale * A @ A.swapaxes(-1, -2))
+    return pack_information(*blocks, rng.uniform(100, 1000, (n, 3)), rng.uniform(1, 10, n))
+
+
+class World:
+    """Robots that each hold one Gaussian per place, in anchor frames, with all places matched."""
+
+    def __init__(self, seed, robots=3, keyframes=3):
+        rng = np.random.default_rng(seed)
+        self.names = NAMES[:robots]
+        truth = rng.normal(size=(N, 3))
+        self.T_world, self.maps, self.T_map, self.evidence = {}, {}, {}, {}
+        for k, name in enumerate(self.names):
+            T_world_map = random_pose(rng)
+            self.T_map[name] = np.array([random_pose(rng) for _ in range(keyframes)])
+            self.T_world[name] = T_world_map @ self.T_map[name]
+            means_world = truth + 0.005 * rng.normal(size=(N, 3))
+            self.maps[name] = Gaussians(
+                100 * k + np.arange(N),
+                rng.integers(keyframes, size=N),
+                se3.transform(se3.inverse(T_world_map), means_world),
+                rng.normal(size=(N, 4)),
+                rng.uniform(-5, -3.5, size=(N, 3)),
+                rng.uniform(size=(N, 3)),
+                rng.normal(size=N),
+            )
+            bare = Evidence.from_map(name, self.maps[name], None, self.T_map[name])
+            self.evidence[name] = Evidence(name, bare.ids, bare.anchors, bare.theta, information(rng, N))
+        self.pairs = {
+            (a, b): np.stack([self.maps[a].ids, self.maps[b].ids], axis=1)
+            for i, a in enumerate(self.names)
+            for b in self.names[i + 1 :]
+        }
+
+    def fuse(self, robot, config=CONFIG, depth_images=(), **changes):
+        given = {"evidence": self.evidence, "pairs": self.pairs, "T_world_keyframe": self.T_world} | changes
+        return fuse(
+            robot,
+            self.maps[robot],
+            self.T_map[robot],
+            given["evidence"],
+            given["T_world_keyframe"],
+            given["pairs"],
+            depth_images,
+            CAMERA,
+            config,
+            MATCHING,
+        )
+
+    def without_information(self, name):
+        e = self.evidence[name]
+        return Evidence(name, e.ids, e.anchors, e.theta, np.zeros_like(e.information))
+
+
+def assert_same_map(a, b, atol=0.0):
+    np.testing.assert_array_equal(a.gaussians.ids, b.gaussians.ids)
+    for name in ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits"):
+        np.testing.assert_allclose(getattr(a.gaussians, name), getattr(b.gaussians, name), rtol=0, atol=atol)
+    np.testing.assert_allclose(a.information, b.information, rtol=0, atol=atol * 1e6)
+
+
+def test_fused_means_minimise_the_sum_of_all_members():
+    """Against the normal equations written out, one place at a time."""
+    world = World(0)
+    fused = world.fuse("alpha")
+    there = {n: world.evidence[n].in_world(world.T_world[n]) for n in world.names}
+    for k in range(N):
+        H, g = np.zeros((3, 3)), np.zeros(3)
+        S, h = np.zeros((6, 6)), np.zeros(6)
+        for e in there.values():
+            spread = association_covariance(e.theta[k : k + 1, LOG_COVARIANCE], CONFIG.spacing_per_sigma)[0]
+            W = np.linalg.inv(np.linalg.inv(e.position_information()[k]) + spread)
+            H, g = H + W, g + W @ e.theta[k, MEAN]
+            W = e.shape_information()[k]
+            S, h = S + W, h + W @ e.theta[k, LOG_COVARIANCE]
+        # float32 maps: 6e-8 of a few metres, and of log-scales of about five
+        np.testing.assert_allclose(fused.gaussians.means[k], np.linalg.solve(H, g), atol=2e-6)
+        shape = spd.log_covariance(fused.gaussians.quats_wxyz[k], fused.gaussians.log_scales[k])
+        np.testing.assert_allclose(shape, np.linalg.solve(S, h), atol=5e-5)
+        color = [e.color_information()[k] for e in there.values()]
+        mean = sum(w * e.theta[k, 9:12] for w, e in zip(color, there.values(), strict=True)) / sum(color)
+        np.testing.assert_allclose(fused.gaussians.colors[k], mean, atol=1e-6)
+    assert (fused.matched, fused.added) == (N, 0)
+    assert np.all(fused.members == 3)
+
+
+def test_all_robots_arrive_at_the_same_gaussians():
+    world = World(1)
+    results = [world.fuse(name) for name in world.names]
+    for other in results[1:]:
+        np.testing.assert_allclose(other.gaussians.means, results[0].gaussians.means, atol=2e-6)
+        np.testing.assert_allclose(
+            other.gaussians.opacity_logits, results[0].gaussians.opacity_logits, atol=2e-6
+        )
+        shapes = [
+            spd.log_covariance(r.gaussians.quats_wxyz, r.gaussians.log_scales) for r in (other, results[0])
+        ]
+        np.testing.assert_allclose(*shapes, atol=5e-5)
+        np.testing.assert_array_equal(other.information, results[0].information)
+
+
+def test_order_of_arrival_does_not_change_a_bit():
+    world = World(2)
+    first = world.fuse("bravo")
+    rng = np.random.default_rng(3)
+    evidence = {}
+    for name in reversed(world.names):
+        evidence[name] = world.evidence[name].select(rng.permutation(N))
+    pairs = {p: world.pairs[p][rng.permutation(N)] for p in reversed(world.pairs)}
+    again = world.fuse("bravo", evidence=evidence, pairs=pairs)
+    assert_same_map(again, first)
+
+
+def test_no_information_is_lost():
+    world = World(4)
+    fused = world.fuse("charlie")
+    total = sum(world.evidence[n].in_world(world.T_world[n]).information for n in world.names)
+    np.testing.assert_allclose(fused.information, total, rtol=1e-12)
+
+
+def test_zero_information_moves_nothing():
+    """Two know, one does not: exactly as if the third was not there."""
+    world = World(5)
+    evidence = world.evidence | {"charlie": world.without_information("charlie")}
+    pair = {("alpha", "bravo"): world.pairs["alpha", "bravo"]}
+    without = {n: world.evidence[n] for n in ("alpha", "bravo")}
+    fused = world.fuse("alpha", evidence=evidence)
+    expected = world.fuse("alpha", evidence=without, pairs=pair)
+    np.testing.assert_array_equal(fused.gaussians.means, expected.gaussians.means)
+    np.testing.assert_array_equal(fused.gaussians.quats_wxyz, expected.gaussians.quats_wxyz)
+    np.testing.assert_array_equal(fused.information, expected.information)
+
+
+def test_where_neighbours_know_nothing_every_bit_stays():
+    world = World(6)
+    blind = {n: world.without_information(n) for n in ("bravo", "charlie")}
+    T_world = world.T_world | {"alpha": world.T_map["alpha"]}  # alpha is the root and did not move
+    fused = world.fuse("alpha", evidence=world.evidence | blind, T_world_keyframe=T_world)
+    for name in ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits"):
+        np.testing.assert_array_equal(getattr(fused.gaussians, name), getattr(world.maps["alpha"], name))
+
+
+def test_nobody_knows_anything_the_own_value_stays():
+    world = World(7)
+    blind = {n: world.without_information(n) for n in world.names}
+    fused = world.fuse("bravo", evidence=blind)
+    moved = world.maps["bravo"].moved(world.T_map["bravo"], world.T_world["bravo"])
+    np.testing.assert_array_equal(fused.gaussians.means, moved.means)
+    np.testing.assert_array_equal(fused.information, 0)
+
+
+def test_alone_a_map_stays_bit_for_bit():
+    world = World(8, robots=1)
+    fused = world.fuse("alpha", T_world_keyframe={"alpha": world.T_map["alpha"]})
+    for name in ("ids", "anchors", "means", "quats_wxyz", "log_scales", "colors", "opacity_logits"):
+        np.testing.assert_array_equal(getattr(fused.gaussians, name), getattr(world.maps["alpha"], name))
+    assert (fused.matched, fused.added) == (0, 0)
+
+
+def test_agreement_is_a_fixed_point():
+    """Members that say the same leave it so, whatever their information: fusing again changes nothing."""
+    world = World(9, robots=2)
+    there = world.evidence["alpha"].in_world(world.T_world["alpha"])
+    copy = Evidence(
+        "bravo", world.maps["bravo"].ids, np.zeros(N), there.theta, world.evidence["bravo"].information
+    )
+    fused = world.fuse(
+        "alpha",
+        evidence={"alpha": world.evidence["alpha"], "bravo": copy},
+        T_world_keyframe={"alpha": world.T_world["alpha"], "bravo": np.eye(4)[None]},
+    )
+    moved = world.maps["alpha"].moved(world.T_map["alpha"], world.T_world["alpha"])
+    np.testing.assert_allclose(fused.gaussians.means, moved.means, atol=1e-6)
+    np.testing.assert_allclose(fused.gaussians.opacity_logits, moved.opacity_logits, atol=1e-6)
+
+
+def test_turning_the_world_turns_the_fused_map():
+    world = World(10)
+    T = random_pose(np.random.default_rng(11))
+    fused = world.fuse("alpha")
+    turned = world.fuse("alpha", T_world_keyframe={n: T @ world.T_world[n] for n in world.names})
+    expected = se3.transform(T, fused.gaussians.means.astype(np.float64))
+    np.testing.assert_allclose(turned.gaussians.means, expected, atol=3e-6)
+
+
+def test_unknown_directions_keep_the_own_value():
+    """One axis known to both, one to the neighbour only, one to nobody."""
+    weights = np.array([np.diag([1.0, 0.0, 0.0]), np.diag([3.0, 2.0, 0.0])])
+    values = np.array([[0.0, 0.0, 0.0], [4.0, 5.0, 6.0]])
+    move = weighted_move(weights, values, np.array([0]), CONFIG.unobserved_below)
+    np.testing.assert_allclose(move, [[3.0, 5.0, 0.0]], atol=1e-12)
+
+
+def test_association_spreads_along_the_surface_only():
+    quat, sigma = np.array([0.9, 0.1, -0.3, 0.2]), np.array([0.02, 0.01, 0.001])
+    spread = association_covariance(spd.log_covariance(quat, np.log(sigma))[None], 2.0)[0]
+    values, vectors = np.linalg.eigh(spread)
+    np.testing.assert_allclose(values, [0.0, 4 * 0.01**2 / 12, 4 * 0.02**2 / 12], atol=1e-15)
+    normal = np.linalg.eigh(spd.vec_to_sym(spd.log_covariance(quat, np.log(sigma))))[1][:, 0]
+    np.testing.assert_allclose(np.abs(vectors[:, 0] @ normal), 1.0, atol=1e-9)
+
+
+def test_neighbours_unmatched_gaussians_fill_only_unseen_space():
+    """An own keyframe at the origin measured a wall 2 m away on the left half of its image, nothing on the right."""
+    world = World(12, robots=2)
+    depth = np.zeros((CAMERA.height, CAMERA.width), np.float32)
+    depth[:, :32] = 2.0
+    points = np.array(
+        [[-0.5, 0, 1.0], [-0.5, 0, 2.03], [-0.5, 0, 2.5], [0.5, 0, 1.0], [0, 0, -1.0], [9, 0, 1.0]]
+    )
+    seen = explained(points, np.eye(4)[None], [(0, depth)], CAMERA, CONFIG)
+    # in front of the wall, at it, behind it, where nothing was measured, behind the camera, beside the image
+    assert seen.tolist() == [True, True, False, False, False, False]
+    theta = np.zeros((6, 13))
+    theta[:, MEAN], theta[:, LOG_COVARIANCE] = points, -8 * np.array([1, 1, 1, 0, 0, 0])
+    rng = np.random.default_rng(13)
+    neighbour = Evidence("bravo", np.arange(6), np.zeros(6), theta, information(rng, 6))
+    given = {
+        "evidence": {"alpha": world.evidence["alpha"], "bravo": neighbour},
+        "pairs": {},
+        "T_world_keyframe": {"alpha": np.tile(np.eye(4), (3, 1, 1)), "bravo": np.eye(4)[None]},
+    }
+    fused = world.fuse("alpha", depth_images=[(0, depth)], **given)
+    assert fused.added == 4
+    new = fused.gaussians.select(slice(N, None))
+    np.testing.assert_allclose(new.means, points[2:], atol=1e-6)
+    np.testing.assert_array_equal(fused.source_ids[N:], [2, 3, 4, 5])
+    assert [fused.robots[s] for s in fused.source[N:]] == ["bravo"] * 4
+    assert len(np.unique(fused.gaussians.ids)) == N + 4
+    overlap = CONFIG.model_copy(update={"coverage": "overlap"})
+    assert world.fuse("alpha", overlap, [(0, depth)], **given).added == 0
+    capped = world.fuse("alpha", CONFIG.model_copy(update={"max_added": 2}), [(0, depth)], **given)
+    assert capped.added == 2
+    assert set(capped.source_ids[N:]) <= {2, 3, 4, 5}
+    unknown = given["evidence"] | {
+        "bravo": Evidence("bravo", np.arange(6), np.zeros(6), theta, np.zeros((6, 31)))
+    }
+    assert world.fuse("alpha", depth_images=[(0, depth)], **(given | {"evidence": unknown})).added == 0
+
+
+def test_what_two_neighbours_share_is_taken_over_once():
+    world = World(14)
+    pair = {("bravo", "charlie"): world.pairs["bravo", "charlie"]}
+    fused = world.fuse("alpha", pairs=pair)
+    assert (fused.matched, fused.added) == (0, N)
+    assert [fused.robots[s] for s in fused.source[N:]] == ["bravo"] * N
+    both = world.fuse("bravo", evidence={n: world.evidence[n] for n in ("bravo", "charlie")}, pairs=pair)
+    np.testing.assert_allclose(fused.gaussians.means[N:], both.gaussians.means, atol=2e-6)
+    np.testing.assert_array_equal(fused.members[N:], 2)
+
+
+def test_evidence_of_other_gaussians_is_refused():
+    world = World(15, robots=2)
+    wrong = world.evidence["alpha"].select(slice(1, None))
+    with pytest.raises(ValueError, match="own evidence"):
+        world.fuse("alpha", evidence=world.evidence | {"alpha": wrong})
