@@ -200,7 +200,7 @@ class Mapper:
         color, depth_m = view.images(0)
         if len(self._gaussians):
             render = self.rasterizer.forward(self._gaussians, self.cameras[0], se3.inverse(view.T_map_camera))
-            if config.exposure and view.exposure_steps == 0:
+            if config.exposure and view.index > 0 and view.exposure_steps == 0:
                 view.exposure = _first_exposure(render, color)
             color = (color - np.float32(view.exposure[1])) * np.float32(np.exp(-view.exposure[0]))
             wanted = unexplained(render, color, depth_m, config.seeding)

@@ -8,6 +8,7 @@ has no division by a small A, and its gradient neither rewards nor punishes opac
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -63,8 +64,8 @@ def huber(residual: Image, delta: float) -> tuple[Image, Image]:
     value = r^2 / (2 delta) for |r| < delta, else |r| - delta / 2; derivative = clip(r / delta, -1, 1).
     delta -> 0 is the L1 loss of the paper's front end.
     """
-    slope = np.clip(residual * np.float32(1.0 / delta), np.float32(-1), np.float32(1))
-    return slope * (residual - np.float32(0.5 * delta) * slope), slope
+    slope = np.clip(residual * (1.0 / delta), -1.0, 1.0)
+    return slope * (residual - (0.5 * delta) * slope), slope
 
 
 def rgbd_loss(
@@ -87,7 +88,7 @@ def rgbd_loss(
     Returns:
         Means over the counted pixels and the cotangents of exactly that mean.
     """
-    gain, offset = np.float32(np.exp(exposure[0])), np.float32(exposure[1])
+    gain, offset = math.exp(exposure[0]), exposure[1]
     shown = render.color if exposure == (0.0, 0.0) else gain * render.color + offset
     color_value, slope = huber(shown - color, config.color_huber)
     measured = depth_m > 0
@@ -99,21 +100,21 @@ def rgbd_loss(
     per_color = 1.0 / max(3 * pixels, 1)
     per_depth = 1.0 / max(int(np.count_nonzero(measured)), 1)
 
-    residual = np.where(measured, render.depth - render.alpha * depth_m, np.float32(0))
+    residual = np.where(measured, render.depth - render.alpha * depth_m, depth_m.dtype.type(0))
     depth_value, depth_slope = huber(residual, config.depth_huber_m)
-    depth_slope = depth_slope * np.float32(config.depth_weight * per_depth)
-    d_alpha = -depth_slope * depth_m - measured * np.float32(config.alpha_weight * per_depth)
+    depth_slope = depth_slope * (config.depth_weight * per_depth)
+    d_alpha = -depth_slope * depth_m - measured * render.alpha.dtype.type(config.alpha_weight * per_depth)
 
     color_mean = float(np.sum(color_value, dtype=np.float64)) * per_color
     depth_mean = float(np.sum(depth_value, dtype=np.float64)) * per_depth
     missing = float(np.sum(measured * (1 - render.alpha), dtype=np.float64)) * per_depth
-    by_gain = float(np.sum(slope * render.color, dtype=np.float64)) * float(gain) * per_color
+    by_gain = float(np.sum(slope * render.color, dtype=np.float64)) * gain * per_color
     by_offset = float(np.sum(slope, dtype=np.float64)) * per_color
     return Loss(
         value=color_mean + config.depth_weight * depth_mean + config.alpha_weight * missing,
         color=color_mean,
         depth=depth_mean,
-        d_color=slope * np.float32(float(gain) * per_color),
+        d_color=slope * (gain * per_color),
         d_depth=depth_slope,
         d_alpha=d_alpha,
         d_exposure=(by_gain, by_offset),

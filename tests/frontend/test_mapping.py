@@ -1,0 +1,191 @@
+"""The mapper on a small room corner whose images are computed exactly."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.frontend.mapping import Mapper, MappingStats, overlap
+from pipeline.frontend.mapping_config import MappingConfig
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.kernels import Rasterizer
+from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.losses import depth_error, psnr
+
+CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
+PLANES = (
+    (np.array([0.0, 0.0, -1.0]), 3.0),
+    (np.array([0.0, -1.0, 0.0]), 1.0),
+    (np.array([-1.0, 0.0, 0.0]), 1.5),
+)
+POSES = [se3.exp(np.array([0.12 * k, -0.02 * k, 0.05 * k, 0.01 * k, 0.03 * k, 0.0])) for k in range(4)]
+QUICK = MappingConfig(max_gaussians=1500, iterations=10, final_iterations=4)
+
+
+def shot(T_map_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Colour and depth of three textured walls, each n . X = -d in the map."""
+    rays = CAMERA.rays() @ T_map_camera[:3, :3].T
+    origin = T_map_camera[:3, 3]
+    with np.errstate(divide="ignore"):
+        hits = np.stack([-(d + origin @ n) / (rays @ n) for n, d in PLANES])
+    hits = np.where(hits > 0, hits, np.inf)
+    z = hits.min(axis=0)
+    points = origin + rays * z[..., None]
+    phase = points @ np.array([[3.0, 1.0, 0.0], [0.0, 2.0, 3.0], [2.0, 0.0, 2.0]])
+    return (0.5 + 0.3 * np.sin(phase)).astype(np.float32), z.astype(np.float32)
+
+
+def build(
+    config: MappingConfig = QUICK, views: int = 3, threads: int = 1
+) -> tuple[Mapper, list[MappingStats]]:
+    mapper = Mapper(CAMERA, config, seed=5, threads=threads)
+    stats = [mapper.add_keyframe(k, *shot(POSES[k]), POSES[k]) for k in range(views)]
+    return mapper, stats
+
+
+def same(a: Gaussians, b: Gaussians) -> bool:
+    names = ("ids", "anchors", "means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
+    return all(np.array_equal(getattr(a, name), getattr(b, name)) for name in names)
+
+
+def drawn(mapper: Mapper, T_map_camera: np.ndarray) -> tuple[float, float, float]:
+    """PSNR, depth error and completeness of a view."""
+    color, depth = shot(T_map_camera)
+    render = Rasterizer().forward(mapper.gaussians, CAMERA, se3.inverse(T_map_camera))
+    return psnr(render.color, color), *depth_error(render, depth)
+
+
+def test_views_that_were_never_mapped_are_drawn_well() -> None:
+    mapper, stats = build(MappingConfig(max_gaussians=4000, iterations=20, final_iterations=15))
+    assert all(s.loss_after < s.loss_before for s in stats)
+    final = mapper.finish()
+    assert final.loss_after < final.loss_before
+    between = POSES[1] @ se3.exp(0.5 * se3.log(se3.inverse(POSES[1]) @ POSES[2]))
+    quality, error_m, completeness = drawn(mapper, between)
+    assert quality > 28.0
+    assert error_m < 0.02
+    assert completeness > 0.97
+
+
+def test_the_same_bits_whatever_the_threads() -> None:
+    first, first_stats = build()
+    second, second_stats = build(threads=3)
+    assert first_stats == second_stats
+    assert first.finish() == second.finish()
+    assert same(first.gaussians, second.gaussians)
+
+
+def test_the_seed_matters_and_nothing_else_drew_from_it() -> None:
+    other = Mapper(CAMERA, QUICK, seed=6)
+    for k in range(3):
+        other.add_keyframe(k, *shot(POSES[k]), POSES[k])
+    mapper, _ = build()
+    assert same(mapper.gaussians, other.gaussians)  # too few keyframes for a lot to be drawn
+    mapper.finish()
+    other.finish()
+    assert not same(mapper.gaussians, other.gaussians)  # the order of the refinement is drawn
+
+
+def test_the_cap_holds_at_every_keyframe_and_ids_are_never_used_twice() -> None:
+    config = QUICK.model_copy(update={"max_gaussians": 400, "keyframe_share": 0.4})
+    mapper = Mapper(CAMERA, config, seed=0)
+    seen: set[int] = set()
+    pruned = 0
+    for k in range(4):
+        before = set(mapper.gaussians.ids.tolist())
+        stats = mapper.add_keyframe(k, *shot(POSES[k]), POSES[k])
+        now = mapper.gaussians.ids
+        assert len(now) == stats.total <= 400
+        assert (np.diff(now) > 0).all()
+        new = set(now.tolist()) - before
+        assert not new & seen
+        assert (mapper.gaussians.anchors[np.isin(now, list(new))] == k).all()
+        assert stats.total == len(before) + stats.inserted - stats.pruned
+        seen |= before | new
+        pruned += stats.pruned
+    assert pruned > 0
+    mapper.finish()
+    assert len(mapper.gaussians) <= 400
+
+
+def test_a_view_that_is_explained_adds_little() -> None:
+    _, stats = build()
+    assert stats[1].inserted < 0.5 * stats[0].inserted
+    mapper, _ = build(MappingConfig(max_gaussians=4000, iterations=40, iterations_level=0), views=1)
+    again = mapper.add_keyframe(1, *shot(POSES[0]), POSES[0])
+    assert again.inserted < 0.05 * len(mapper.gaussians)
+
+
+def test_gaussians_move_with_their_keyframes() -> None:
+    mapper, _ = build(views=2)
+    before = mapper.gaussians
+    change = se3.exp(np.array([0.1, 0.0, -0.05, 0.0, 0.2, 0.0]))
+    mapper.set_keyframe_poses({1: POSES[1] @ change})
+    after = mapper.gaussians
+    first = before.anchors == 0
+    assert (~first).any()
+    np.testing.assert_allclose(after.means[first], before.means[first], atol=1e-6)
+    in_old = se3.transform(se3.inverse(POSES[1]), before.means[~first])
+    in_new = se3.transform(se3.inverse(POSES[1] @ change), after.means[~first])
+    np.testing.assert_allclose(in_new, in_old, atol=1e-6)
+    mapper.set_keyframe_poses(np.stack(POSES[:2]))
+    np.testing.assert_allclose(mapper.gaussians.means, before.means, atol=1e-6)
+
+
+def test_what_contributes_least_goes_first() -> None:
+    mapper, _ = build(views=1)
+    contributions = mapper._contributions()
+    camera = CAMERA.halved()
+
+    def change(index: int) -> float:
+        """Squared change of the view, in units of the noise, when one Gaussian is left out."""
+        T = se3.inverse(POSES[0])
+        whole = Rasterizer().forward(mapper.gaussians, camera, T)
+        rest = mapper.gaussians.select(np.arange(len(mapper.gaussians)) != index)
+        without = Rasterizer().forward(rest, camera, T)
+        config = mapper.config
+        color = np.sum(
+            ((whole.color - without.color) / config.contribution_color_sigma).astype(np.float64) ** 2
+        )
+        measured = mapper._views[0].half_depth_m > 0
+        depth = ((whole.depth - without.depth) / config.contribution_depth_sigma_m)[measured]
+        return float(color + np.sum(depth.astype(np.float64) ** 2))
+
+    for index in (10, 100, 200):  # thresholds of the kernel (1/255, early stop) flip a few pixels
+        assert contributions[index] == pytest.approx(change(index), rel=0.05)
+    keep = np.argsort(contributions, kind="stable")[5:]
+    ids = mapper.gaussians.ids[np.sort(keep)]
+    mapper._prune_least(5)
+    np.testing.assert_array_equal(mapper.gaussians.ids, ids)
+
+
+def test_exposure_is_found() -> None:
+    config = MappingConfig(max_gaussians=2500, iterations=40, exposure=True, final_iterations=10)
+    mapper = Mapper(CAMERA, config, seed=0)
+    for k in range(3):
+        color, depth = shot(POSES[k])
+        mapper.add_keyframe(k, color * (0.8 if k == 1 else 1.0), depth, POSES[k])
+    mapper.finish()
+    assert mapper.exposures[0] == (0.0, 0.0)
+    gains = [np.exp(a) * 0.5 + b for a, b in mapper.exposures.values()]  # at mid grey
+    assert gains[1] / gains[0] == pytest.approx(0.8, abs=0.02)
+    assert gains[2] / gains[0] == pytest.approx(1.0, abs=0.02)
+
+
+def test_overlap_is_a_share_of_the_first_view() -> None:
+    (_, z0), (_, z3) = shot(POSES[0]), shot(POSES[3])
+    assert overlap(z0, POSES[0], z0, POSES[0], CAMERA, stride_px=4) == 1.0
+    assert 0.5 < overlap(z0, POSES[0], z3, POSES[3], CAMERA, stride_px=4) < 1.0
+    away = POSES[0] @ se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
+    assert overlap(z0, POSES[0], z0, away, CAMERA, stride_px=4) == 0.0
+    assert overlap(np.zeros_like(z0), POSES[0], z0, POSES[0], CAMERA) == 0.0
+
+
+@pytest.mark.parametrize("index", [1, -1])
+def test_keyframes_come_in_order(index: int) -> None:
+    mapper = Mapper(CAMERA, QUICK, seed=0)
+    color, depth = shot(POSES[0])
+    arguments: Any = (index, color, depth, POSES[0])
+    with pytest.raises(ValueError, match="after 0 keyframes"):
+        mapper.add_keyframe(*arguments)

@@ -1,0 +1,157 @@
+"""Losses agree with their cotangents; metrics with their definitions."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from pipeline.splat.losses import (
+    LossConfig,
+    depth_error,
+    halve,
+    huber,
+    ms_ssim,
+    psnr,
+    rgbd_loss,
+    ssim,
+)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    color: np.ndarray
+    depth: np.ndarray
+    alpha: np.ndarray
+
+
+def views(seed: int = 0, h: int = 5, w: int = 7) -> tuple[Drawn, np.ndarray, np.ndarray]:
+    """A render and a measured colour and depth; every third depth is missing."""
+    r = np.random.default_rng(seed)
+    alpha = r.uniform(0.3, 1.0, (h, w)).astype(np.float32)
+    z = r.uniform(1.0, 3.0, (h, w)).astype(np.float32)
+    measured = (z + r.normal(0, 0.05, (h, w))).astype(np.float32)
+    measured.ravel()[::3] = 0
+    color = r.uniform(0, 1, (h, w, 3)).astype(np.float32)
+    drawn = Drawn((color + r.normal(0, 0.2, color.shape)).astype(np.float32), alpha * z, alpha)
+    return drawn, color, measured
+
+
+@pytest.mark.parametrize("exposure", [(0.0, 0.0), (0.2, -0.05)])
+@pytest.mark.parametrize("masked", [False, True])
+def test_cotangents_are_derivatives(exposure: tuple[float, float], masked: bool) -> None:
+    drawn, color, depth = views()
+    mask = np.random.default_rng(1).random(depth.shape) > 0.3 if masked else None
+    config = LossConfig(color_huber=0.3, depth_huber_m=0.08)
+
+    def value(d: Drawn, e: tuple[float, float] = exposure) -> float:
+        wide = Drawn(*(x.astype(np.float64) for x in (d.color, d.depth, d.alpha)))
+        return rgbd_loss(wide, color.astype(np.float64), depth.astype(np.float64), config, e, mask).value
+
+    loss = rgbd_loss(drawn, color, depth, config, exposure, mask)
+    assert loss.value == pytest.approx(value(drawn), rel=1e-5)
+    step = 1e-5  # float64 inside `value`: truncation of the quadratic part is exact, of the kinks rare
+    for name, cotangent in (("color", loss.d_color), ("depth", loss.d_depth), ("alpha", loss.d_alpha)):
+        for index in [(1, 2), (3, 4), (4, 6), (0, 0)]:
+            bump = np.zeros_like(getattr(drawn, name), dtype=np.float64)
+            bump[index] = step
+            up = value(replace(drawn, **{name: getattr(drawn, name) + bump}))
+            down = value(replace(drawn, **{name: getattr(drawn, name) - bump}))
+            assert (up - down) / (2 * step) == pytest.approx(float(cotangent[index].sum()), abs=2e-6)
+    a, b = exposure
+    step = 1e-4
+    by_gain = (value(drawn, (a + step, b)) - value(drawn, (a - step, b))) / (2 * step)
+    by_offset = (value(drawn, (a, b + step)) - value(drawn, (a, b - step))) / (2 * step)
+    assert loss.d_exposure == pytest.approx((by_gain, by_offset), abs=2e-6)
+
+
+def test_depth_residual_vanishes_at_the_measured_depth_whatever_the_opacity() -> None:
+    drawn, color, depth = views()
+    z = np.where(depth > 0, depth, np.float32(9.0))
+    loss = rgbd_loss(replace(drawn, depth=drawn.alpha * z), color, depth, LossConfig(alpha_weight=0.0))
+    assert loss.depth == 0.0
+    assert not loss.d_depth.any()
+    assert not loss.d_alpha.any()
+
+
+def test_pixels_outside_the_mask_do_not_count() -> None:
+    drawn, color, depth = views()
+    mask = np.zeros(depth.shape, bool)
+    mask[1:3, 2:5] = True
+    other = color.copy()
+    other[~mask] = 0.5
+    first, second = (rgbd_loss(drawn, c, depth, LossConfig(), mask=mask) for c in (color, other))
+    assert first.value == second.value
+    assert not second.d_color[~mask].any()
+    assert not second.d_alpha[~mask].any()
+
+
+def test_huber_is_quadratic_then_linear_and_continuous() -> None:
+    r = np.array([-3.0, -0.1, 0.0, 0.05, 0.1, 2.0])
+    value, slope = huber(r, 0.1)
+    np.testing.assert_allclose(value, [2.95, 0.05, 0.0, 0.0125, 0.05, 1.95], atol=1e-7)
+    np.testing.assert_allclose(slope, [-1, -1, 0, 0.5, 1, 1], atol=1e-7)
+
+
+def test_psnr_of_a_known_error() -> None:
+    image = np.full((4, 5, 3), 0.5)
+    assert psnr(image + 0.1, image) == pytest.approx(20.0)
+    assert psnr(image, image) == np.inf
+    assert psnr(image + 7.0, np.ones_like(image)) == np.inf  # clipped to the range first
+    mask = np.zeros((4, 5), bool)
+    mask[0, 0] = True
+    noisy = image + 0.1
+    noisy[0, 0] += 0.9
+    assert psnr(np.minimum(noisy, 1.0), image, mask) == pytest.approx(-20 * np.log10(0.5))
+
+
+def test_ssim_agrees_with_its_definition_window_by_window() -> None:
+    r = np.random.default_rng(0)
+    x = r.uniform(0, 1, (14, 13, 3))
+    y = np.clip(x + r.normal(0, 0.1, x.shape), 0, 1)
+    k = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    w = np.outer(k, k)
+    w /= w.sum()
+    values = []
+    for i in range(4):
+        for j in range(3):
+            for c in range(3):
+                p, q = x[i : i + 11, j : j + 11, c], y[i : i + 11, j : j + 11, c]
+                mp, mq = (w * p).sum(), (w * q).sum()
+                vp, vq, cov = (
+                    (w * (p - mp) ** 2).sum(),
+                    (w * (q - mq) ** 2).sum(),
+                    (w * (p - mp) * (q - mq)).sum(),
+                )
+                top = (2 * mp * mq + 1e-4) * (2 * cov + 9e-4)
+                values.append(top / ((mp**2 + mq**2 + 1e-4) * (vp + vq + 9e-4)))
+    assert ssim(x, y) == pytest.approx(np.mean(values), abs=1e-9)
+    assert ssim(x, x) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_ms_ssim_is_another_number_and_needs_room() -> None:
+    r = np.random.default_rng(0)
+    x = np.clip(np.cumsum(r.normal(0, 0.02, (176, 180, 3)), axis=0) + 0.5, 0, 1)
+    y = np.clip(x + r.normal(0, 0.05, x.shape), 0, 1)
+    assert ms_ssim(x, x) == pytest.approx(1.0, abs=1e-9)
+    assert ssim(x, y) < ms_ssim(x, y) < 1.0
+    assert ms_ssim(x, y, weights=(1.0,)) == pytest.approx(ssim(x, y), abs=1e-12)
+    with pytest.raises(ValueError, match="needs 176 pixels"):
+        ms_ssim(x[:175], y[:175])
+
+
+def test_halve_keeps_means() -> None:
+    image = np.arange(5 * 7, dtype=np.float64).reshape(5, 7)
+    assert halve(image).shape == (2, 3)
+    assert halve(image)[1, 2] == np.mean(image[2:4, 4:6])
+
+
+def test_depth_error_counts_what_is_covered() -> None:
+    alpha = np.array([[1.0, 0.5, 0.2, 1.0]], np.float32)
+    depth = np.array([[2.0, 1.0, 1.0, 0.0]], np.float32)
+    drawn = Drawn(
+        np.zeros((1, 4, 3), np.float32), alpha * (np.array([[2.1, 1.2, 5.0, 3.0]], np.float32)), alpha
+    )
+    error, completeness = depth_error(drawn, depth)
+    assert error == pytest.approx(0.15, abs=1e-6)
+    assert completeness == pytest.approx(2 / 3)
+    assert np.isnan(depth_error(drawn, np.zeros_like(depth))[0])
