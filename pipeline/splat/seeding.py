@@ -231,8 +231,8 @@ def surface_normals(
     normal is the viewing ray.
     """
     h, w = depth_m.shape
-    du, dv = np.meshgrid(np.arange(-radius_px, radius_px + 1), np.arange(-radius_px, radius_px + 1))
-    du, dv = du.ravel(), dv.ravel()
+    side = 2 * radius_px + 1
+    du, dv = np.arange(side * side) % side - radius_px, np.arange(side * side) // side - radius_px
     u = np.rint(cells.uv[:, 0]).astype(np.int64)[:, None] + du
     v = np.rint(cells.uv[:, 1]).astype(np.int64)[:, None] + dv
     inside = (u >= 0) & (u < w) & (v >= 0) & (v < h)

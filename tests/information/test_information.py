@@ -1,0 +1,250 @@
+"""The information stage: what is summed, in which units, and what never enters."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline import messages
+from pipeline.errors import DuagError
+from pipeline.geometry import se3, so3, spd
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.information.config import InformationConfig
+from pipeline.information.stage import (
+    Noise,
+    View,
+    estimate_noise,
+    run_information,
+    sum_information,
+    without_thickness,
+)
+from pipeline.kernels import FisherSums, Rasterizer
+from pipeline.recording import LogWriter, read_log
+from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.seeding import THICKNESS_FLOOR_M
+from schemas import topics
+
+CAMERA = PinholeCamera(48, 36, 40.0, 40.0, 23.5, 17.5)
+NOISE = Noise(0.02, 1.0, 0.0012, 0.0019)
+FRAME_NS = 33_333_333
+POSES = [se3.exp(np.array([0.05 * k, 0.0, 0.02 * k, 0.0, 0.02 * k, 0.0])) for k in range(4)]
+
+
+def wall(n: int = 600, seed: int = 0) -> Gaussians:
+    """Discs on the plane z = 2 that fill the view, thin at the floor, and one far behind the camera (the last)."""
+    r = np.random.default_rng(seed)
+    means = np.column_stack([r.uniform(-1.6, 1.6, n), r.uniform(-1.2, 1.2, n), np.full(n, 2.0)])
+    means[-1] = (0, 0, -3)
+    scales = np.column_stack([r.uniform(0.06, 0.1, (n, 2)), np.full(n, THICKNESS_FLOOR_M)])
+    half = 0.5 * r.uniform(0, np.pi, n)
+    return Gaussians(
+        ids=10 * np.arange(n),
+        anchors=np.zeros(n),
+        means=means,
+        quats_wxyz=np.column_stack([np.cos(half), 0 * half, 0 * half, np.sin(half)]),
+        log_scales=np.log(scales),
+        colors=r.uniform(0.2, 0.8, (n, 3)),
+        opacity_logits=np.full(n, 2.0),
+    )
+
+
+def views_of(gaussians: Gaussians, color_noise: float = 0.0, depth_factor: float = 0.0) -> list[View]:
+    """Renders of the Gaussians with noise added: what a perfect map's images would be."""
+    r = np.random.default_rng(1)
+    out = []
+    for T in POSES:
+        render = Rasterizer().forward(gaussians, CAMERA, se3.inverse(T))
+        color = np.clip(render.color + r.normal(0, 1, render.color.shape) * color_noise, 0, 1)
+        z = render.depth / np.maximum(render.alpha, 1e-3)
+        z = z + depth_factor * NOISE.depth_sigma_m(z) * r.normal(0, 1, z.shape)
+        z = np.where(render.alpha > 0.9, z, 0)
+        out.append(View(np.rint(color * 255).astype(np.uint8), z.astype(np.float32), T))
+    return out
+
+
+def test_noise_is_found_in_the_residuals() -> None:
+    gaussians = wall()
+    noisy = estimate_noise(
+        gaussians, CAMERA, views_of(gaussians, 0.05, 2.0), InformationConfig(), stride_px=1
+    )
+    assert noisy.color_sigma == pytest.approx(0.05, rel=0.05)
+    assert noisy.depth_factor == pytest.approx(2.0, rel=0.05)
+    assert noisy.depth_formula() == f"{noisy.depth_factor:.6g} * (0.0012 + 0.0019 * (z - 0.4)^2)"
+    clean = estimate_noise(gaussians, CAMERA, views_of(gaussians), InformationConfig())
+    assert clean.color_sigma == InformationConfig().color_sigma_floor
+    assert clean.depth_factor == InformationConfig().depth_factor_min
+    fixed = InformationConfig(depth_factor_from_residuals=False)
+    assert estimate_noise(gaussians, CAMERA, views_of(gaussians, 0, 2.0), fixed).depth_factor == 1.0
+
+
+def test_a_few_wrong_pixels_do_not_change_the_noise() -> None:
+    gaussians = wall()
+    views = views_of(gaussians, 0.05, 1.0)
+    spoiled = [View(v.color.copy(), v.depth_m.copy(), v.T_map_camera) for v in views]
+    for view in spoiled:
+        view.color[:6] = 255
+        view.depth_m[:6] = 9.0
+    config = InformationConfig()
+    a, b = (estimate_noise(gaussians, CAMERA, v, config, stride_px=1) for v in (views, spoiled))
+    assert b.color_sigma == pytest.approx(a.color_sigma, rel=0.35)
+    assert b.depth_factor == pytest.approx(a.depth_factor, rel=0.35)
+
+
+def test_windows() -> None:
+    gaussians = wall()
+    views = views_of(gaussians)
+
+    def total(window: str, length: int) -> FisherSums:
+        config = InformationConfig.model_validate({"window": window, "window_length": length})
+        return sum_information(gaussians, CAMERA, views, NOISE, config)
+
+    everything, rolling, latest = total("all", 2), total("rolling", 2), total("per_gaussian", 2)
+    assert everything.observations.max() == 4
+    assert rolling.observations.max() == 2
+    np.testing.assert_array_equal(latest.observations, np.minimum(everything.observations, 2))
+    seen_by_both = rolling.observations == 2
+    np.testing.assert_allclose(latest.geometry[seen_by_both], rolling.geometry[seen_by_both], rtol=1e-12)
+    assert (everything.opacity >= latest.opacity).all()
+    early = (rolling.observations == 0) & (everything.observations > 0)
+    assert early.any()  # seen at the beginning only: forgotten by `rolling`, kept by `per_gaussian`
+    assert not rolling.geometry[early].any()
+    assert (latest.observations[early] > 0).all()
+
+
+def test_never_seen_is_zero_and_noise_scales() -> None:
+    gaussians = wall()
+    views = views_of(gaussians)
+    once = sum_information(gaussians, CAMERA, views, NOISE, InformationConfig())
+    assert once.observations[-1] == 0
+    assert not once.geometry[-1].any()
+    assert not once.color[-1].any()
+    assert once.opacity[-1] == 0
+    twice = sum_information(gaussians, CAMERA, views, Noise(0.04, 2.0, 0.0012, 0.0019), InformationConfig())
+    np.testing.assert_allclose(twice.geometry, once.geometry / 4, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(twice.color, once.color / 4, rtol=1e-5)
+
+
+def test_holes_in_the_depth_bring_no_depth_information() -> None:
+    gaussians = wall()
+    views = views_of(gaussians)
+    blind = [View(v.color, np.zeros_like(v.depth_m), v.T_map_camera) for v in views]
+    with_depth = sum_information(gaussians, CAMERA, views, NOISE, InformationConfig())
+    without = sum_information(gaussians, CAMERA, blind, NOISE, InformationConfig())
+    np.testing.assert_array_equal(with_depth.color, without.color)
+    along_z = FisherSums(len(gaussians)).geometry_matrices()[:, 0, 0] * 0  # shape [n]
+    for sums, sign in ((with_depth, 1.0), (without, -1.0)):
+        along_z += sign * sums.geometry_matrices()[:, 2, 2]
+    assert (along_z >= 0).all()
+    assert np.median(along_z[with_depth.observations > 0]) > 100.0
+
+
+def test_thickness_at_the_floor_has_no_information_and_the_rest_is_untouched() -> None:
+    r = np.random.default_rng(0)
+    n = 50
+    quats = r.normal(size=(n, 4))
+    scales = r.uniform(0.01, 0.1, (n, 3))
+    thin = r.integers(0, 3, n)
+    floored = np.arange(n) % 2 == 0
+    scales[floored, thin[floored]] = THICKNESS_FLOOR_M
+    zero = np.zeros((n, 3))
+    gaussians = Gaussians(np.arange(n), np.zeros(n), zero, quats, np.log(scales), zero, np.zeros(n))
+    root = r.normal(size=(n, 9, 9))
+    full = root @ root.swapaxes(1, 2)
+    upper = np.triu_indices(9)
+    result = FisherSums(n)
+    result.geometry[:] = without_thickness(full[:, upper[0], upper[1]], gaussians, THICKNESS_FLOOR_M)
+    after = result.geometry_matrices()
+    np.testing.assert_array_equal(after[~floored], full[~floored])
+    axes = so3.from_quat_wxyz(gaussians.quats_wxyz)
+    for k in np.flatnonzero(floored):
+        basis = []
+        for i in range(3):
+            for j in range(i, 3):
+                S = np.outer(axes[k][:, i], axes[k][:, j])
+                v = np.concatenate([np.zeros(3), spd.sym_to_vec(S + S.T)])
+                basis.append((i == j == thin[k], v / np.linalg.norm(v)))
+        basis += [(False, e) for e in np.eye(9)[:3]]
+        for is_thickness, v in basis:
+            if is_thickness:
+                np.testing.assert_allclose(after[k] @ v, 0, atol=1e-12)
+            else:
+                assert v @ after[k] @ v == pytest.approx(v @ full[k] @ v, rel=1e-9)
+        assert np.linalg.eigvalsh(after[k])[0] > -1e-9
+        assert np.linalg.eigvalsh(after[k])[1] > 1e-6  # nothing else was lost
+
+
+# --- the stage on logs ---------------------------------------------------------------------------------------------
+
+
+def write_logs(
+    folder: Path, held_out: tuple[int, ...] = (2,), keyframes: tuple[int, ...] = (0, 1, 3)
+) -> Gaussians:
+    """A sensor log of four frames and the front end's log of it."""
+    gaussians = wall()
+    with LogWriter(folder / "alpha.mcap", "alpha") as log:
+        log.channel(topics.DEPTH.of("alpha"), topics.DEPTH.schema, {"depth_scale": "0.0001"})
+        log.write(topics.CALIBRATION.of("alpha"), messages.pack_calibration(0, "alpha", CAMERA), 0)
+        for index, view in enumerate(views_of(gaussians, 0.05)):
+            # a held-out frame is black and far away: were it used, it would show
+            color = view.color * (index not in held_out)
+            depth = np.rint(view.depth_m * 1e4).astype(np.uint16)
+            stamp = index * FRAME_NS
+            png = cv2.imencode(".png", color[:, :, ::-1])[1].tobytes()
+            log.write(topics.COLOR.of("alpha"), messages.pack_color(stamp, "alpha", png, "png"), stamp)
+            log.write(topics.DEPTH.of("alpha"), messages.pack_depth(stamp, "alpha", depth), stamp)
+    with LogWriter(folder / "frontend.mcap", "alpha") as log:
+        for index, T in enumerate(POSES):
+            stamp = index * FRAME_NS
+            odometry = messages.Odometry(
+                stamp, "alpha", index, index in held_out, 0, T, T, np.eye(6), "ok", 1.0, 0.0, 0.0
+            )
+            log.write(topics.ODOMETRY.of("alpha"), odometry, stamp)
+            if index in keyframes:
+                number = keyframes.index(index)
+                keyframe = messages.Keyframe(
+                    stamp, "alpha", number, index, T, number - 1, np.eye(4), np.zeros((6, 6)), (0.0, 0.0)
+                )
+                log.write(topics.KEYFRAME.of("alpha"), keyframe, stamp)
+        stamp = 3 * FRAME_NS
+        empty = messages.GaussianMap(stamp, "alpha", "alpha/map", Gaussians.empty())
+        log.write(topics.MAP.of("alpha"), empty, stamp)
+        log.write(topics.MAP.of("alpha"), messages.GaussianMap(stamp, "alpha", "alpha/map", gaussians), stamp)
+    return gaussians
+
+
+def test_the_stage_writes_what_it_returns_and_the_threads_do_not_show(tmp_path: Path) -> None:
+    gaussians = write_logs(tmp_path)
+    paths = [tmp_path / name for name in ("alpha.mcap", "frontend.mcap", "information.mcap")]
+    result = run_information(*paths, InformationConfig())
+    (record,) = read_log(paths[2])
+    assert record.topic == "/alpha/information"
+    back = record.message()
+    np.testing.assert_array_equal(back.ids, gaussians.ids)
+    np.testing.assert_array_equal(back.geometry, result.geometry)
+    assert back.kind == "gauss_newton"
+    assert back.window == "all"
+    assert back.observations.max() == 3
+    assert back.color_sigma == pytest.approx(0.05, rel=0.15)
+    run_information(*paths[:2], tmp_path / "again.mcap", InformationConfig(), threads=3)
+    (again,) = read_log(tmp_path / "again.mcap")
+    assert again.data == record.data
+
+
+def test_held_out_frames_never_enter(tmp_path: Path) -> None:
+    write_logs(tmp_path, held_out=(1,))
+    with pytest.raises(DuagError, match=r"has frame 1, expected no frame that is held out"):
+        run_information(
+            tmp_path / "alpha.mcap", tmp_path / "frontend.mcap", tmp_path / "out.mcap", InformationConfig()
+        )
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_a_front_end_without_a_map_is_one_line(tmp_path: Path) -> None:
+    write_logs(tmp_path)
+    with LogWriter(tmp_path / "unfinished.mcap", "alpha"):
+        pass
+    with pytest.raises(DuagError, match="has no message, expected the map"):
+        run_information(
+            tmp_path / "alpha.mcap", tmp_path / "unfinished.mcap", tmp_path / "out.mcap", InformationConfig()
+        )
