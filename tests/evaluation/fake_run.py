@@ -148,7 +148,11 @@ def _write_recording(folder: Path, robots: Sequence[str], truth: bool, depth_noi
                     depth = np.rint(1000 * render.depth / render.alpha).astype(np.uint16)
                     depth[:4] = 0  # a strip without measurement
                     pose = T_GT_WORLD @ T_world_camera if truth else None
-                    exact = depth + 10 if truth and depth_noise != "none" else None
+                    exact = (
+                        np.where(depth > 0, depth + 10, 0).astype(np.uint16)
+                        if truth and depth_noise != "none"
+                        else None
+                    )
                     log.add_frame(k * INTERVAL_NS, png.tobytes(), "png", depth, pose, exact)
         if truth:
             recording.add_geometry(_write_wall_mesh)

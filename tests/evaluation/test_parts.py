@@ -1,0 +1,140 @@
+"""Parts of the evaluation on small arrays: views, surfaces, ways, the logs of the exchange."""
+
+import numpy as np
+import pytest
+
+import schemas
+from pipeline.errors import DuagError
+from pipeline.evaluation import map_errors, views
+from pipeline.evaluation.groundtruth import Surface
+from pipeline.evaluation.network import Session
+from pipeline.evaluation.paths import top_view_axes
+from pipeline.evaluation.results import Absent
+from pipeline.evaluation.run_folder import RunFolder, is_held_out, position_information
+from pipeline.geometry import se3
+from pipeline.kernels import Render
+from pipeline.recording import LogWriter
+from schemas import topics
+from tests.evaluation.fake_run import make
+
+
+def a_render(value: float = 0.5, depth_m: float = 2.0, alpha: float = 1.0) -> Render:
+    full = np.full((12, 14), alpha, dtype=np.float32)
+    return Render(np.full((12, 14, 3), value, dtype=np.float32), depth_m * full, full)
+
+
+def test_a_view_is_scored_against_image_and_both_depths():
+    color = np.full((12, 14, 3), 102, dtype=np.uint8)  # 0.4 of white
+    recorded = np.full((12, 14), 2.01, dtype=np.float32)
+    recorded[0] = 0.0
+    score = views.score_view(a_render(alpha=0.8), color, recorded, np.full((12, 14), 1.95, dtype=np.float32))
+    assert score.psnr_db == pytest.approx(20.0, abs=1e-4)
+    assert score.depth_l1_m == pytest.approx(0.01, abs=1e-6)
+    assert score.depth_l1_exact_m == pytest.approx(0.05, abs=1e-6)
+    assert score.depth_completeness == 1.0
+    assert isinstance(score.ms_ssim, Absent)
+    assert "12 px" in score.ms_ssim.reason
+
+
+def test_an_equal_image_scores_a_finite_psnr():
+    image = np.full((12, 14, 3), 255, dtype=np.uint8)
+    score = views.score_view(a_render(1.0), image, np.zeros((12, 14), dtype=np.float32), Absent("none"))
+    assert score.psnr_db == views.PSNR_CEILING_DB
+    assert isinstance(score.depth_l1_m, Absent)
+    assert isinstance(score.depth_completeness, Absent)
+
+
+def test_depth_that_is_not_covered_is_incomplete_not_wrong():
+    depth = np.full((12, 14), 2.0, dtype=np.float32)
+    score = views.score_view(
+        a_render(alpha=0.3), np.zeros((12, 14, 3), dtype=np.uint8), depth, Absent("none")
+    )
+    assert isinstance(score.depth_l1_m, Absent)
+    assert score.depth_completeness == 0.0
+    assert not views.surface_depth(a_render(alpha=0.3)).any()
+    assert views.surface_depth(a_render(alpha=0.7)) == pytest.approx(2.0)
+
+
+def test_a_summary_counts_views_without_pose_apart():
+    score = views.score_view(
+        a_render(),
+        np.zeros((12, 14, 3), dtype=np.uint8),
+        np.full((12, 14), 2.0, dtype=np.float32),
+        Absent("none"),
+    )
+    summary = views.summary([score, Absent("no pose")], "none")
+    assert summary["views"] == 1
+    assert summary["views_without_pose"] == 1
+    assert summary["psnr_db"] == score.psnr_db
+    assert summary["depth_l1_exact_m"] == Absent("none")
+    assert views.summary([], "there is no view")["psnr_db"] == Absent("there is no view")
+
+
+def test_distance_from_triangles_is_exact_between_vertices():
+    floor = Surface(
+        np.array([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]], dtype=np.float32),
+        np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32),
+    )
+    points = np.array([[3.3, 4.7, 0.25], [5.0, 2.0, -0.5], [12.0, 5.0, 0.0]])
+    distance, direction = floor.closest(points)
+    assert distance == pytest.approx([0.25, 0.5, 2.0], abs=1e-6)  # float32 inside
+    assert np.abs(direction[:, 2]) == pytest.approx(1.0)
+    cloud = Surface(floor.vertices, np.zeros((0, 3), dtype=np.uint32))
+    assert cloud.closest(points)[0][2] == pytest.approx(np.hypot(2.0, 5.0))
+
+
+def test_position_information_comes_from_the_right_places():
+    F = np.arange(81.0).reshape(9, 9)
+    F = F + F.T
+    packed = F[np.triu_indices(9)][None].astype(np.float32)
+    assert np.array_equal(position_information(packed)[0], F[:3, :3])
+
+
+def test_sigma_is_that_along_the_normal(tmp_path):
+    fused = RunFolder(make(tmp_path).run).robots["alpha"].fused_map
+    along_z = np.tile([0.0, 0.0, 1.0], (len(fused.gaussians), 1))
+    along_x = np.tile([1.0, 0.0, 0.0], (len(fused.gaussians), 1))
+    sigma_z, determined = map_errors.position_sigma_m(fused, along_z)
+    sigma_x, _ = map_errors.position_sigma_m(fused, along_x)
+    assert determined.all()
+    assert sigma_x == pytest.approx(10.0 * sigma_z, rel=1e-5)  # float32 information
+
+
+def test_the_top_view_looks_along_the_vertical_of_the_cameras():
+    """Level cameras that turn and drive on a floor: their down axis must vanish from the picture."""
+    angles = np.linspace(0.0, 3.0, 20)
+    poses = se3.exp(np.stack([0 * angles, 0 * angles, 0 * angles, 0 * angles, angles, 0 * angles], axis=1))
+    poses[:, 0, 3], poses[:, 2, 3] = 3 * np.cos(angles), np.sin(angles)
+    T = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, 0.5, 0.6]))
+    axes = top_view_axes(T @ poses)
+    assert axes @ axes.T == pytest.approx(np.eye(2), abs=1e-12)
+    assert axes @ T[:3, 1] == pytest.approx(np.zeros(2), abs=1e-9)
+    assert abs(axes[0] @ T[:3, 0]) > 0.99  # the longer way lies to the right
+
+
+def test_held_out_frames():
+    assert [i for i in range(30) if is_held_out(i)] == [4, 12, 20, 28]
+
+
+def test_the_largest_component_needs_everybodys_agreement(tmp_path):
+    run = RunFolder(make(tmp_path / "joined_all").run)
+    assert run.largest_component == ("alpha", "bravo")
+    alone = RunFolder(make(tmp_path / "apart", joined=False).run)
+    assert alone.largest_component == ("alpha",)
+
+
+def test_a_packet_without_its_message_is_an_error(tmp_path):
+    fake = make(tmp_path)
+    with LogWriter(fake.run / "exchange.mcap") as log:
+        packet = schemas.new("PeerPacket", robot="alpha", receiver="bravo", message=77, sequence=5)
+        log.write(topics.PEER_PACKET.of("alpha"), packet, 0)
+    session = Session(RunFolder(fake.run))
+    with pytest.raises(DuagError, match="packet 5 of alpha is cut from no message"):
+        _ = session.packets
+    with pytest.raises(DuagError, match="finished session"):
+        _ = session.summary
+
+
+def test_a_folder_that_is_no_run_is_an_error(tmp_path):
+    with pytest.raises(DuagError, match="expected a run"):
+        _ = RunFolder(tmp_path).robots

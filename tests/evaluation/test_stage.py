@@ -1,0 +1,241 @@
+"""The contract of metrics.json, and its numbers on a run whose every number is known."""
+
+import json
+import shutil
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from pipeline.errors import DuagError
+from pipeline.evaluation import evaluate
+from tests.evaluation.fake_run import DRIFT_M, FRAMES, KEYFRAMES, FakeRun, make
+
+NUMBER = (int, float)
+ROBOT = {
+    "frames": int, "tracked": int, "keyframes": int, "gaussians": int, "gaussians_fused": int,
+    "robots_in_component": int, "frames_with_truth": int, "ate_rmse_m": NUMBER,
+    "ate_rmse_m_before_consensus": NUMBER, "ate_rmse_m_keyframes": NUMBER, "ate_rmse_m_joint": NUMBER,
+    "rpe_trans_m": NUMBER, "rpe_rot_rad": NUMBER,
+}  # fmt: skip
+VIEWS = {
+    "views": int, "views_without_pose": int, "psnr_db": NUMBER, "ssim": NUMBER, "ms_ssim": NUMBER, "lpips": NUMBER,
+    "st_lpips": NUMBER, "depth_l1_m": NUMBER, "depth_l1_exact_m": NUMBER, "depth_completeness": NUMBER,
+}  # fmt: skip
+SCHEMA = {
+    "schema": int,
+    "robots": {"alpha": ROBOT, "bravo": ROBOT},
+    "team": {
+        "robots": int, "robots_in_largest_component": int, "ate_rmse_m": NUMBER, "ate_rmse_m_mean_of_robots": NUMBER,
+        "inter_robot_closures": int, "inter_robot_closures_rejected": int,
+    },
+    "rendering": {kind: {"held_out": VIEWS, "training": VIEWS} for kind in ("own", "fused")},
+    "calibration": dict.fromkeys(
+        ("ece_paper", "ece_rank", "ece_rank_shuffled", "spearman", "ause", "nll", "coverage_95", "nll_scaled",
+         "coverage_95_scaled", "sigma_scale", "gaussians", "gaussians_without_information"),
+        NUMBER,
+    ),
+    "exchange": {
+        "sessions": int, "rounds": int, "messages": int, "packets_sent": int, "packets_dropped": int, "bytes_sent": int,
+        "bytes_delivered": int, "bytes_setup": int, "bytes_per_round_per_robot_pair": NUMBER,
+        "bytes_raw_alternative": int, "bytes_paper_accounting": int, "matched_pairs": int,
+    },
+    "consensus": {
+        "solver": str, "converged": bool, "rounds_to_tolerance": int, "gap_to_oracle_sigma": NUMBER,
+        "gap_to_oracle_m": NUMBER, "gap_to_oracle_rad": NUMBER,
+    },
+    "protocol": dict.fromkeys(
+        ("alignment", "ate", "team_ate", "rpe", "initial_relative_poses", "held_out", "training", "poses", "exposure",
+         "background", "psnr", "ssim", "ms_ssim", "depth", "calibration"),
+        str,
+    ),
+}  # fmt: skip
+
+
+def check_against_schema(metrics: dict) -> None:
+    """Exactly the names of the contract, the right type, and a reason for every null and for nothing else."""
+    nulls = set()
+
+    def walk(value, schema, path):
+        if isinstance(schema, dict):
+            assert isinstance(value, dict), path
+            assert set(value) == set(schema), path
+            for key in schema:
+                walk(value[key], schema[key], (*path, key))
+        elif value is None:
+            nulls.add(".".join(path))
+        else:
+            assert isinstance(value, schema), path
+            assert not (isinstance(value, bool) and schema is not bool), path
+
+    walk({k: v for k, v in metrics.items() if k != "reasons"}, SCHEMA, ())
+    assert set(metrics["reasons"]) == nulls
+    assert all(isinstance(reason, str) and len(reason) > 8 for reason in metrics["reasons"].values())
+
+
+@pytest.fixture(scope="module")
+def fake(tmp_path_factory) -> FakeRun:
+    return make(tmp_path_factory.mktemp("fake"))
+
+
+@pytest.fixture(scope="module")
+def metrics(fake) -> dict:
+    return evaluate(fake.run, fake.recording, progress=False)
+
+
+def test_metrics_json_keeps_its_contract(fake, metrics):
+    written = json.loads((fake.run / "metrics.json").read_text())
+    assert written == metrics
+    check_against_schema(written)
+    assert written["schema"] == 1
+    assert written["protocol"]["alignment"] == "se3"
+    assert written["protocol"]["held_out"] == "index % 8 == 4"
+    assert written["protocol"]["initial_relative_poses"] == "unknown"
+
+
+def test_trajectories_are_measured(metrics):
+    for robot in metrics["robots"].values():
+        assert robot["frames"] == robot["frames_with_truth"] == FRAMES
+        assert robot["tracked"] == FRAMES - 1  # one frame is marked lost
+        assert robot["keyframes"] == len(KEYFRAMES)
+        assert robot["ate_rmse_m"] < 1e-12  # written with 17 digits, aligned in float64
+        assert robot["ate_rmse_m_joint"] < 1e-12
+        assert (
+            0.05 * DRIFT_M < robot["ate_rmse_m_before_consensus"] < 0.3 * DRIFT_M
+        )  # alignment takes up most of it
+    assert metrics["team"]["ate_rmse_m"] < 1e-12
+    assert metrics["team"]["robots_in_largest_component"] == 2
+
+
+def test_maps_are_rendered_from_held_out_and_training_views(metrics):
+    fused, own = metrics["rendering"]["fused"], metrics["rendering"]["own"]
+    assert fused["held_out"]["views"] == 2 * 3  # frames 4, 12 and 20 of two robots
+    assert fused["training"]["views"] == 2 * len(KEYFRAMES)
+    for view_set in ("held_out", "training"):
+        assert fused[view_set]["psnr_db"] > 55  # rounding to 8 bits: 20 log10(255 sqrt 12) = 58.9 dB
+        assert fused[view_set]["ssim"] > 0.999
+        assert fused[view_set]["depth_l1_m"] == pytest.approx(
+            0.00025, abs=0.00005
+        )  # rounding to 1 mm: 0.25 mm
+        assert fused[view_set]["depth_completeness"] == 1.0
+        assert own[view_set]["psnr_db"] < fused[view_set]["psnr_db"] - 5  # seen from poses that drift
+
+
+def test_a_noise_free_sensor_is_its_own_exact_depth(metrics):
+    held_out = metrics["rendering"]["fused"]["held_out"]
+    assert held_out["depth_l1_exact_m"] == held_out["depth_l1_m"]
+
+
+def test_calibration_finds_that_the_information_is_right(metrics):
+    calibration = metrics["calibration"]
+    assert calibration["gaussians"] == 2 * 7400
+    assert calibration["coverage_95"] == pytest.approx(0.95, abs=0.01)  # 4 standard errors of 7400 draws
+    assert calibration["sigma_scale"] == pytest.approx(1.0, abs=0.04)
+    assert calibration["spearman"] > 0.5
+    assert calibration["ece_rank"] < 0.15 < 0.22 < calibration["ece_rank_shuffled"]
+
+
+def test_the_exchange_is_counted(metrics):
+    assert metrics["exchange"] == {
+        "sessions": 1,
+        "rounds": 10,
+        "messages": 6,
+        "packets_sent": 8,
+        "packets_dropped": 2,
+        "bytes_sent": 800,
+        "bytes_delivered": 600,
+        "bytes_setup": 400,  # descriptors and pair lists of both, one packet each
+        "bytes_per_round_per_robot_pair": 80.0,
+        "bytes_raw_alternative": 123456,
+        "bytes_paper_accounting": 3 * 224 * 10,
+        "matched_pairs": 3,
+    }
+    assert metrics["consensus"]["converged"] is True
+    assert metrics["consensus"]["rounds_to_tolerance"] == 8
+    assert metrics["team"]["inter_robot_closures"] == 1
+    assert metrics["team"]["inter_robot_closures_rejected"] == 3  # outvoted, unused, and refused
+
+
+def test_the_table_says_what_the_json_says_and_has_every_view(fake, metrics):
+    rows = pq.read_table(fake.run / "metrics.parquet").to_pylist()
+
+    def values(**where):
+        return [r["value"] for r in rows if all(r[k] == v for k, v in where.items())]
+
+    assert values(scope="team", name="ate_rmse_m") == [metrics["team"]["ate_rmse_m"]]
+    assert values(scope="robot", robot="bravo", name="ate_rmse_m_before_consensus") == [
+        metrics["robots"]["bravo"]["ate_rmse_m_before_consensus"]
+    ]
+    per_view = values(scope="view", view_set="fused/held_out", name="psnr_db")
+    assert len(per_view) == 6
+    assert np.mean(per_view) == pytest.approx(metrics["rendering"]["fused"]["held_out"]["psnr_db"], abs=1e-9)
+    absent = [r for r in rows if r["value"] is None]
+    assert absent
+    assert all(r["reason"] for r in absent)
+    assert {r["unit"] for r in rows} <= {"m", "rad", "dB", "B", "nat", "sigma", "1"}
+
+
+def test_threads_change_no_bit(fake, metrics, tmp_path):
+    before = {name: (fake.run / name).read_bytes() for name in ("metrics.json", "metrics.parquet")}
+    evaluate(fake.run, fake.recording, threads=1, progress=False)
+    assert {name: (fake.run / name).read_bytes() for name in before} == before
+
+
+def test_without_ground_truth_there_are_reasons_not_numbers(tmp_path):
+    fake = make(tmp_path, truth=False)
+    metrics = evaluate(fake.run, fake.recording, progress=False)
+    check_against_schema(metrics)
+    assert metrics["team"]["ate_rmse_m"] is None
+    assert metrics["reasons"]["team.ate_rmse_m"] == "the recording has no ground truth of alpha"
+    assert "groundtruth.ply" in metrics["reasons"]["calibration.spearman"]
+    assert metrics["robots"]["alpha"]["ate_rmse_m_before_consensus"] is None
+    assert metrics["rendering"]["fused"]["held_out"]["psnr_db"] > 55
+
+
+def test_a_listed_ground_truth_may_be_gone(tmp_path):
+    fake = make(tmp_path)
+    (fake.recording / "bravo.groundtruth.mcap").unlink()
+    metrics = evaluate(fake.run, fake.recording, progress=False)
+    check_against_schema(metrics)
+    assert metrics["robots"]["alpha"]["ate_rmse_m"] < 1e-12
+    assert metrics["reasons"]["robots.bravo.ate_rmse_m"] == "the recording has no ground truth of bravo"
+    assert metrics["reasons"]["team.ate_rmse_m"] == "the recording has no ground truth of bravo"
+
+
+def test_robots_that_never_met_have_no_team_error(tmp_path):
+    fake = make(tmp_path, joined=False)
+    metrics = evaluate(fake.run, fake.recording, progress=False)
+    check_against_schema(metrics)
+    assert metrics["team"]["robots_in_largest_component"] == 1
+    assert "only alpha" in metrics["reasons"]["team.ate_rmse_m"]
+    assert metrics["robots"]["bravo"]["ate_rmse_m"] < 1e-12
+    assert (
+        "bravo" in metrics["reasons"]["robots.bravo.ate_rmse_m_joint"]
+        or metrics["team"]["ate_rmse_m"] is None
+    )
+    assert metrics["exchange"]["bytes_sent"] == 0
+    assert metrics["reasons"]["exchange.bytes_per_round_per_robot_pair"] == "the robots exchanged nothing"
+    assert metrics["reasons"]["consensus.rounds_to_tolerance"] == "no two robots share a world"
+    assert "full position information" in metrics["reasons"]["calibration.nll"]
+    assert metrics["calibration"]["gaussians_without_information"] == 2 * 7400
+
+
+def test_a_noisy_sensor_is_compared_with_exact_depth_where_there_is_some(tmp_path):
+    fake = make(tmp_path, depth_noise="kinect")
+    held_out = evaluate(fake.run, fake.recording, progress=False)["rendering"]["fused"]["held_out"]
+    assert held_out["depth_l1_exact_m"] == pytest.approx(0.010, abs=2e-3)  # written 10 mm off
+
+
+def test_what_is_missing_is_named(tmp_path):
+    fake = make(tmp_path)
+    (fake.run / "exchange.mcap").rename(tmp_path / "aside")
+    with pytest.raises(DuagError, match=r"exchange\.mcap"):
+        evaluate(fake.run, fake.recording, progress=False)
+    (tmp_path / "aside").rename(fake.run / "exchange.mcap")
+    (fake.run / "robots" / "bravo" / "trajectory.tum").unlink()
+    with pytest.raises(DuagError, match=r"trajectory\.tum"):
+        evaluate(fake.run, fake.recording, progress=False)
+    shutil.move(fake.run / "robots" / "bravo", fake.run / "robots" / "zulu")
+    with pytest.raises(DuagError, match="zulu"):
+        evaluate(fake.run, fake.recording, progress=False)
+    assert not (fake.run / "metrics.json").exists()

@@ -1,0 +1,126 @@
+import re
+
+import numpy as np
+import pytest
+
+from pipeline.errors import DuagError
+from pipeline.evaluation import evaluate
+from pipeline.report import figures, pictures, words, write_report
+from pipeline.report.page import sigma_colors
+from tests.evaluation.fake_run import make
+
+
+@pytest.fixture(scope="module")
+def fake(tmp_path_factory):
+    fake = make(tmp_path_factory.mktemp("fake"))
+    evaluate(fake.run, fake.recording, progress=False)
+    return fake
+
+
+@pytest.fixture(scope="module")
+def html(fake) -> str:
+    return write_report(fake.run, fake.recording).read_text()
+
+
+def test_the_page_needs_no_network(html):
+    sources = re.findall(r"""(?:src|href)=["']([^"']{0,40})""", html)
+    assert sources
+    assert all(s.startswith(("data:", "#")) for s in sources)
+    for word in ("<script", "@import", "url("):
+        assert word not in html
+
+
+def test_the_page_is_the_same_every_time(fake, html):
+    assert write_report(fake.run, fake.recording).read_text() == html
+
+
+def test_the_page_shows_numbers_with_units_pictures_and_reasons(html):
+    text = re.sub(r"<[^>]+>", " ", re.sub(r"(?s)<style>.*?</style>", "", html))
+    for expected in (
+        "wall: 2 robots",
+        "Team ATE",
+        "dB",
+        "800 B",
+        "alpha, frame 4",
+        "bravo, frame 20",
+        "the centralised answer was not computed",
+        "LPIPS needs the weights of a trained network",
+        "tolerance = 1e-5",
+        "index % 8 == 4",
+        "3.5 s",
+        "210 MB",
+        "few_matches",
+    ):
+        assert expected in text, expected
+    assert html.count("data:image/jpeg") > 4 * 9  # nine pictures of each of four views, and more
+    assert html.count("data:image/svg+xml") == 7
+    assert "None" not in text
+    assert "nan" not in text.lower().split()
+
+
+def test_a_run_without_truth_and_without_agreement_has_a_page(tmp_path):
+    fake = make(tmp_path, truth=False, joined=False)
+    evaluate(fake.run, fake.recording, progress=False)
+    (fake.run / "timing.json").unlink()
+    html = write_report(fake.run, fake.recording).read_text()
+    assert "No two robots share a world" in html
+    assert "Not in that world, so not shown: bravo" in html
+    assert "The recording has no ground truth of the paths" in html
+    assert "The run has no timing.json" in html
+
+
+def test_a_run_that_was_not_evaluated_is_an_error(tmp_path):
+    fake = make(tmp_path)
+    with pytest.raises(DuagError, match="duagc evaluate"):
+        write_report(fake.run, fake.recording)
+    assert not (fake.run / "report").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("ate_rmse_m", 0.01234, "12.3 mm"),
+        ("ate_rmse_m", 0.00056789, "0.568 mm"),
+        ("ate_rmse_m", 1.5, "1.500 m"),
+        ("ate_rmse_m", 1e-12, "< 0.001 mm"),
+        ("rpe_rot_rad", np.pi / 180, "1°"),
+        ("psnr_db", 27.123, "27.12 dB"),
+        ("bytes_sent", 2_100_000, "2.1 MB"),
+        ("bytes_sent", 512, "512 B"),
+        ("ssim", 0.9, "0.900"),
+        ("depth_completeness", 0.987, "98.7 %"),
+        ("converged", True, "yes"),
+        ("gap_to_oracle_sigma", 0.05, "0.050 σ"),
+        ("rounds", 12345, "12\u202f345"),
+        ("lpips", None, "–"),
+    ],
+)
+def test_values_are_written_with_their_unit(name, value, text):
+    assert words.text(name, value) == text
+
+
+def test_figures_stay_the_same_and_leave_the_settings_alone():
+    import matplotlib as mpl
+
+    before = mpl.rcParams["svg.hashsalt"]
+    series = {"alpha": (np.arange(5), np.array([1.0, 0.1, 0.0, np.inf, 1e-3]))}
+    first = figures.lines(series, "round", "m", log=True, level=1e-2)
+    assert first == figures.lines(series, "round", "m", log=True, level=1e-2)
+    assert "<dc:date>" not in first
+    assert mpl.rcParams["svg.hashsalt"] == before
+
+
+def test_colours_of_a_scalar_image():
+    values = np.array([[0.0, 1.0, 2.0, 5.0]])
+    rgb = pictures.colored(values, 0.0, 2.0, values < 4)
+    assert rgb.shape == (1, 4, 3)
+    assert tuple(rgb[0, 3]) == pictures.NOTHING
+    assert rgb[0, 0].tolist() == [68, 1, 84]  # the ends of viridis
+    assert rgb[0, 2].tolist() == [253, 231, 37]
+
+
+def test_undetermined_gaussians_are_grey():
+    colors, low, high = sigma_colors(np.array([0.001, 0.01, np.inf]))
+    assert colors[2].tolist() == [0.75] * 3
+    assert 0.001 < low < high < 0.01
+    assert sigma_colors(np.array([np.inf]))[0].tolist() == [[0.75] * 3]

@@ -1,0 +1,124 @@
+"""What reaches Rerun: the content of the files, not how the viewer draws it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline import viewer
+from pipeline.errors import DuagError
+from pipeline.evaluation import evaluate
+from tests.evaluation.fake_run import FRAMES, KEYFRAMES, FakeRun, make, wall
+
+
+@pytest.fixture(scope="module")
+def fake(tmp_path_factory) -> FakeRun:
+    return make(tmp_path_factory.mktemp("fake"))
+
+
+def content(chunks) -> dict[str, dict[str, int]]:
+    """Entity -> component -> rows, without Rerun's own bookkeeping."""
+    out: dict[str, dict[str, int]] = {}
+    for chunk in chunks:
+        components = out.setdefault(chunk.entity_path, {})
+        for name in chunk.to_record_batch().schema.names:
+            components[name] = components.get(name, 0) + chunk.num_rows
+    return out
+
+
+def of_rrd(path: Path) -> dict[str, dict[str, int]]:
+    from rerun.chunk import RrdReader
+
+    return content(RrdReader(path).stream().to_chunks())
+
+
+def test_a_log_opens_in_rerun_as_it_is(fake):
+    from rerun.chunk import McapReader
+
+    found = content(McapReader(fake.recording / "alpha.mcap").stream().to_chunks())
+    assert found["/alpha/camera/color"]["EncodedImage:blob"] == FRAMES
+    assert found["/alpha/camera/depth"]["Image:buffer"] == FRAMES
+    assert found["/alpha/camera/calibration"]["Pinhole:image_from_camera"] >= 1
+
+
+def test_ground_truth_and_results_open_in_rerun_as_they_are(fake):
+    from rerun.chunk import McapReader
+
+    truth = content(McapReader(fake.recording / "alpha.groundtruth.mcap").stream().to_chunks())
+    assert any("Transform3D" in c or "InstancePoses3D" in c for c in truth["/alpha/groundtruth/pose"])
+    frontend = content(McapReader(fake.run / "robots" / "alpha" / "frontend.mcap").stream().to_chunks())
+    assert frontend["/alpha/odometry"]["duagc.v1.Odometry:message"] == FRAMES
+
+
+def test_a_recording_becomes_a_file_with_depth_in_metres(fake, tmp_path):
+    viewer.view(fake.recording, save=tmp_path / "recording.rrd")
+    found = of_rrd(tmp_path / "recording.rrd")
+    for robot in ("alpha", "bravo"):
+        depth = found[f"/{robot}/camera/depth"]
+        assert depth["DepthImage:buffer"] == FRAMES
+        assert depth["DepthImage:meter"] == 1
+        assert "Image:buffer" not in depth
+        assert found[f"/{robot}/camera/color"]["EncodedImage:blob"] == FRAMES
+    assert [p.name for p in tmp_path.iterdir()] == ["recording.rrd"]
+
+
+def test_a_run_becomes_a_file_with_everything_in_it(fake, tmp_path):
+    evaluate(fake.run, fake.recording, progress=False)
+    found = of_rrd(viewer.write_rrd(fake.run, fake.recording, tmp_path / "run.rrd"))
+    for robot in ("alpha", "bravo"):
+        for path in ("before_consensus", "after_consensus", "ground_truth"):
+            assert found[f"/world/paths/{robot}/{path}"]["LineStrips3D:strips"] == 1
+        for colouring in ("fused", "uncertainty"):
+            assert found[f"/world/maps/{robot}/{colouring}"]["GaussianSplats3D:centers"] == 1
+        camera = found[f"/world/cameras/{robot}"]
+        assert camera["Pinhole:image_from_camera"] == 1
+        assert camera["Transform3D:translation"] == len(KEYFRAMES)
+        assert found[f"/world/cameras/{robot}/image"]["EncodedImage:blob"] == len(KEYFRAMES)
+        assert found[f"/world/cameras/{robot}/depth"]["DepthImage:buffer"] == len(KEYFRAMES)
+        assert found[f"/rounds/change/{robot}"]["round"] == 9
+    assert found["/rounds/bytes/Gaussians"]["Scalars:scalars"] == 10
+    assert found["/network"]["GraphEdges:edges"] == 1
+    assert found["/summary"]["TextDocument:text"] == 1
+    assert not (tmp_path / "run.rrd.part").exists()
+
+
+def test_robots_that_never_met_share_no_world(tmp_path):
+    fake = make(tmp_path, joined=False, truth=False)
+    found = of_rrd(viewer.write_rrd(fake.run, fake.recording, tmp_path / "run.rrd"))
+    assert "/world/maps/alpha/fused" in found
+    assert "/world_of_bravo/maps/bravo/fused" in found
+    assert "/world/paths/alpha/ground_truth" not in found
+
+
+def test_thinning_keeps_what_covers_most():
+    gaussians = wall()
+    large = gaussians.log_scales.copy()
+    large[::7] += 1.0
+    chosen = viewer.thinned(gaussians.replace(log_scales=large), len(large[::7]))
+    assert np.array_equal(chosen, np.arange(len(gaussians))[::7])
+    assert np.array_equal(viewer.thinned(gaussians, 10**6), np.arange(len(gaussians)))
+
+
+def test_a_made_file_is_copied_not_made_again(fake, tmp_path):
+    made = fake.run / "run.rrd"
+    made.write_bytes(b"made before")
+    viewer.view(fake.run, save=tmp_path / "copy.rrd")
+    made.unlink()
+    assert (tmp_path / "copy.rrd").read_bytes() == b"made before"
+
+
+def test_what_is_neither_a_run_nor_a_recording_is_an_error(tmp_path):
+    with pytest.raises(DuagError, match="expected a run"):
+        viewer.view(tmp_path, save=tmp_path / "out.rrd")
+
+
+def test_a_machine_that_cannot_draw_says_so(fake, tmp_path, monkeypatch):
+    from rerun.experimental import ViewerClient
+
+    def panic(**_):
+        raise RuntimeError("No graphics adapter was found\nmore")
+
+    monkeypatch.setattr(ViewerClient, "spawn", panic)
+    with pytest.raises(DuagError, match=r"No graphics adapter was found.*mesa-vulkan-drivers"):
+        viewer.view(fake.recording, screenshot=tmp_path / "out.png")
+    assert list(tmp_path.iterdir()) == []
