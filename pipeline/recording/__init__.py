@@ -1,0 +1,38 @@
+"""Logs in, logs out: MCAP files that are checked whole before they are believed, and the recordings made of them.
+
+Order of a log: by log time, then by position in the file. `log_time` is when a message was received, `publish_time`
+when it was produced, `sequence` counts per topic from 0; all in the time of the recording, never the wall clock.
+The identity of a log is its content digest: the bytes of the file depend on the version of the compressor.
+"""
+
+from pipeline.recording.folder import Recording
+from pipeline.recording.names import (
+    DEPTH_SCALE_KEY,
+    RECORDING_FILE,
+    RECORDING_FORMAT,
+    RECORDING_SCHEMA,
+)
+from pipeline.recording.read import Record, content_digest, log_metadata, merge, read_log, verify
+from pipeline.recording.rgbd import RgbdFrame, RgbdLog, open_rgbd
+from pipeline.recording.summary import format_info, info
+from pipeline.recording.write import LogWriter
+
+__all__ = [
+    "DEPTH_SCALE_KEY",
+    "RECORDING_FILE",
+    "RECORDING_FORMAT",
+    "RECORDING_SCHEMA",
+    "LogWriter",
+    "Record",
+    "Recording",
+    "RgbdFrame",
+    "RgbdLog",
+    "content_digest",
+    "format_info",
+    "info",
+    "log_metadata",
+    "merge",
+    "open_rgbd",
+    "read_log",
+    "verify",
+]

@@ -1,0 +1,79 @@
+"""The folder of a recording and its description."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import DuagError
+from pipeline.recording.names import RECORDING_FILE, RECORDING_FORMAT, RECORDING_SCHEMA
+
+
+class Recording:
+    """A folder with one log per robot and a `recording.json` that says what they are."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self.description = _read_description(self.path / RECORDING_FILE)
+        self.name: str = self.description["name"]
+        self._robots: dict[str, dict[str, Any]] = self.description["robots"]
+
+    @property
+    def robots(self) -> list[str]:
+        """Names of the robots, sorted."""
+        return sorted(self._robots)
+
+    def log(self, robot: str) -> Path:
+        """The log of a robot's sensors."""
+        path = self.path / self._robot(robot)["log"]
+        if not path.is_file():
+            raise DuagError(f"{path}: no such file, expected the log of {robot} that {RECORDING_FILE} names")
+        return path
+
+    def groundtruth(self, robot: str) -> Path | None:
+        """The log of a robot's ground truth, for evaluation only; None where there is none, listed or not."""
+        name = self._robot(robot).get("groundtruth")
+        return self.path / name if name and (self.path / name).is_file() else None
+
+    def geometry(self) -> Path | None:
+        """The true geometry of the scene, for evaluation only; None where there is none."""
+        name = self.description.get("geometry")
+        return self.path / name if name and (self.path / name).is_file() else None
+
+    def _robot(self, robot: str) -> dict[str, Any]:
+        if robot not in self._robots:
+            raise DuagError(
+                f"{self.path}: found robots {', '.join(self.robots)}, expected {robot!r} among them"
+            )
+        return self._robots[robot]
+
+
+def _read_description(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise DuagError(f"{path}: no such file, expected a recording (a folder with {RECORDING_FILE})")
+    try:
+        description = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise DuagError(f"{path}: {error}, expected the JSON of a recording") from error
+    if not isinstance(description, dict) or description.get("format") != RECORDING_FORMAT:
+        found = description.get("format") if isinstance(description, dict) else type(description).__name__
+        raise DuagError(f"{path}: format is {found!r}, expected {RECORDING_FORMAT!r}")
+    if description.get("schema") != RECORDING_SCHEMA:
+        raise DuagError(f"{path}: schema is {description.get('schema')!r}, expected {RECORDING_SCHEMA}")
+    robots = description.get("robots")
+    if not isinstance(robots, dict) or not robots or not isinstance(description.get("name"), str):
+        raise DuagError(f"{path}: found no name or no robots, expected both")
+    _check_file_name(path, "geometry", description.get("geometry"))
+    for robot, row in robots.items():
+        if not isinstance(row, dict) or not isinstance(row.get("log"), str):
+            raise DuagError(f"{path}: robot {robot!r} has no log, expected the name of one")
+        _check_file_name(path, f"{robot}.log", row["log"])
+        _check_file_name(path, f"{robot}.groundtruth", row.get("groundtruth"))
+    return description
+
+
+def _check_file_name(path: Path, field: str, name: Any) -> None:
+    """Files of a recording lie in its folder: no path leads out of it."""
+    if name is not None and (not isinstance(name, str) or not name or Path(name).name != name):
+        raise DuagError(f"{path}: {field} is {name!r}, expected the name of a file in the same folder")

@@ -1,0 +1,13 @@
+"""Names and numbers that writers and readers of logs share."""
+
+import pipeline
+
+MAGIC = b"\x89MCAP0\r\n"
+LIBRARY = f"duagc/{pipeline.__version__}"
+DIGEST_RECORD = "duagc.digest"  # metadata record with the content digest; itself not part of it
+LOG_RECORD = "duagc.log"  # metadata record with what the writer was told about the log
+ROBOT_KEY = "robot"
+DEPTH_SCALE_KEY = "depth_scale"
+RECORDING_FILE = "recording.json"
+RECORDING_FORMAT = "duagc.recording"
+RECORDING_SCHEMA = 1

@@ -1,0 +1,131 @@
+"""Writes logs: MCAP, zstd, chunks of 1 MiB, all indexes, checksums of chunks, data and summary."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+from mcap.writer import CompressionType, IndexType, Writer
+
+import schemas
+from pipeline.errors import DuagError
+from pipeline.recording.identity import ContentDigest, channel_identity
+from pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, ROBOT_KEY
+from schemas import topics as topic_table
+
+CHUNK_BYTES = 1 << 20
+
+
+class LogWriter:
+    """Writes one log; use it as a context manager.
+
+    The file has its final name only when it is complete: it is written as `<name>.part`, renamed on a clean exit and
+    removed on any other. `digest` is the content digest once the writer is closed.
+    """
+
+    def __init__(self, path: Path, robot: str = "", metadata: Mapping[str, str] | None = None) -> None:
+        """Args:
+        path: the file.
+        robot: whose log it is; "" if of the whole team.
+        metadata: further text about the log, for example its configuration; part of the content digest.
+        """
+        self.path = Path(path)
+        self.digest = ""
+        self._metadata = {ROBOT_KEY: robot, **(metadata or {})}
+        self._part = self.path.with_name(self.path.name + ".part")
+        self._stream: IO[bytes] | None = None
+        self._channels: dict[str, _OpenChannel] = {}
+        self._schema_ids: dict[str, int] = {}
+        self._content = ContentDigest()
+        self._last_log_time_ns = 0
+
+    def __enter__(self) -> LogWriter:
+        try:
+            self._stream = self._part.open("wb")
+        except OSError as error:
+            raise DuagError(f"{self._part}: {error.strerror or error}, expected to write a log") from error
+        self._writer = Writer(
+            self._stream,
+            chunk_size=CHUNK_BYTES,
+            compression=CompressionType.ZSTD,
+            index_types=IndexType.ALL,
+            enable_crcs=True,
+            enable_data_crcs=True,
+        )
+        self._writer.start(profile="", library=LIBRARY)
+        self._writer.add_metadata(LOG_RECORD, dict(sorted(self._metadata.items())))
+        return self
+
+    def channel(self, topic: str, schema: str, metadata: Mapping[str, str] | None = None) -> None:
+        """Open a topic with channel metadata, before its first message; without metadata this is not needed."""
+        if topic in self._channels:
+            raise ValueError(f"{topic} is open already")
+        row = topic_table.find(topic)
+        if row is None or row[0].schema != schema:
+            expected = row[0].schema if row else "a topic of schemas/topics.py"
+            raise ValueError(f"{topic} carries {schema}, expected {expected}")
+        descriptors = schemas.descriptor_set(schema)
+        if schema not in self._schema_ids:
+            self._schema_ids[schema] = self._writer.register_schema(schema, "protobuf", descriptors)
+        text = dict(sorted((metadata or {}).items()))
+        number = self._writer.register_channel(topic, "protobuf", self._schema_ids[schema], text)
+        identity = channel_identity(topic, schema, descriptors)
+        self._channels[topic] = _OpenChannel(number, schema, identity, text)
+
+    def write(self, topic: str, message: Any, log_time_ns: int, publish_time_ns: int | None = None) -> None:
+        """Append one message.
+
+        Args:
+            topic: a topic of schemas/topics.py.
+            message: a dataclass of `pipeline.messages` or a protobuf message of the topic's schema.
+            log_time_ns: when it was received; never earlier than that of the message before.
+            publish_time_ns: when it was produced; the log time if not given.
+        """
+        proto = message.pack() if hasattr(message, "pack") else message
+        schema = proto.DESCRIPTOR.full_name
+        if topic not in self._channels:
+            self.channel(topic, schema)
+        channel = self._channels[topic]
+        if schema != channel.schema:
+            raise ValueError(f"{topic} carries {schema}, expected {channel.schema}")
+        log_time_ns = int(log_time_ns)
+        publish_time_ns = log_time_ns if publish_time_ns is None else int(publish_time_ns)
+        if log_time_ns < self._last_log_time_ns or publish_time_ns < 0:
+            raise ValueError(
+                f"{topic} at {log_time_ns} ns comes after {self._last_log_time_ns} ns in {self.path.name}"
+            )
+        self._last_log_time_ns = log_time_ns
+        data = proto.SerializeToString(deterministic=True)
+        self._writer.add_message(channel.number, log_time_ns, data, publish_time_ns, channel.sequence)
+        self._content.add(channel.identity, log_time_ns, publish_time_ns, channel.sequence, data)
+        channel.sequence += 1
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        assert self._stream is not None
+        try:
+            if kind is None:
+                channels = [(c.identity, c.metadata) for c in self._channels.values()]
+                log = {LOG_RECORD: self._metadata}
+                self.digest = self._content.finish(channels, sorted(log.items()), [])
+                self._writer.add_metadata(DIGEST_RECORD, {"sha256": self.digest})
+                self._writer.finish()
+                self._stream.close()
+                os.replace(self._part, self.path)
+        finally:
+            self._stream.close()
+            self._part.unlink(missing_ok=True)
+
+
+@dataclass
+class _OpenChannel:
+    number: int
+    schema: str
+    identity: bytes
+    metadata: dict[str, str]
+    sequence: int = 0
