@@ -12,34 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.config import Config
+from pipeline.consensus.config import ClosureConfig
 from pipeline.consensus.factors import Factors, inflated
 from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
 CHI2_3_999 = 16.27  # 99.9 % quantile of chi^2 with 3 degrees of freedom
 _CANDIDATES = 150  # relative frames tried as the start of the mean
-
-
-class ClosureConfig(Config):
-    """Trust in single closures and in their mutual agreement."""
-
-    sigma_floor_m: float = 0.005
-    """Added to every closure's covariance: registration reports only the noise of its pixels, not its bias (m)."""
-    sigma_floor_rad: float = 0.003
-    """The same for its rotation (rad)."""
-    drift_floor_m: float = 0.005
-    """Least assumed drift of the odometry from one keyframe to the next (m)."""
-    drift_floor_rad: float = 0.003
-    """The same for its rotation (rad)."""
-    margin: float = 4.0
-    """Factor on the variances of the pairwise test; fitted on two public data sets (`docs/consensus.md`)."""
-    min_support: int = 2
-    """Closures that must agree before two robots are put into one frame: one alone cannot be checked."""
-    frame_sigma_m: float = 0.1
-    """Scale of the Cauchy weights of the relative frame, translation."""
-    frame_sigma_rad: float = 0.05
-    """Scale of the Cauchy weights of the relative frame, rotation."""
 
 
 @dataclass(frozen=True)

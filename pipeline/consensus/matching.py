@@ -20,7 +20,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
-from pipeline.config import Config
+from pipeline.consensus.config import MatchingConfig
 from pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Evidence
 from pipeline.geometry import spd
 
@@ -30,27 +30,6 @@ Pairs = Mapping[tuple[str, str], Index]
 SH_C0 = 0.28209479177387814  # colour = 0.5 + SH_C0 * coefficient
 _CHUNK = 200_000  # pairs per pass, for memory
 _FLOOR_SLACK = 1e-3  # of a log-scale: float32 and rotations
-
-
-class MatchingConfig(Config):
-    """Matching of Gaussians between two robots."""
-
-    radius_m: float = 0.05
-    """Delta of (6): matches are searched within this distance."""
-    position_scale_m: float = 0.05
-    """l: the distance that counts as one."""
-    beta_log_covariance: float = 0.1
-    """Weight of the squared Log-Euclidean distance of the covariances."""
-    beta_color: float = 1.0
-    """Weight of the squared distance of the colour coefficients."""
-    beta_opacity: float = 0.5
-    """Weight of the squared difference of the opacity logits."""
-    percentile: float = 90.0
-    """tau_G is this percentile, over the own map, of d_G to the nearest neighbour within the radius."""
-    candidates: int = 16
-    """Nearest Gaussians within the radius that are compared, from either side."""
-    thickness_floor_m: float = 1e-3
-    """Standard deviation below which the mapper lets no Gaussian go."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +117,8 @@ def _candidates(means_own: Array, means_peer: Array, config: MatchingConfig) -> 
         column = neighbour[row, rank]
         own, peer = (column, row) if turned else (row, column)
         found.append(own * len(means_peer) + peer)
-    key = np.unique(np.concatenate(found))
+    key = np.sort(np.concatenate(found))
+    key = key[np.diff(key, prepend=-1) > 0]
     return key // len(means_peer), key % len(means_peer)
 
 

@@ -34,65 +34,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.config import Config
 from pipeline.consensus import factors as pose_factors
-from pipeline.consensus.closures import Closure, ClosureConfig, closure_factors
+from pipeline.consensus.closures import Closure, closure_factors
+from pipeline.consensus.config import ClosureConfig, PoseConsensusConfig
 from pipeline.consensus.factors import Factors, difference, inflated, retract
 from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
 _BLOCK = [0, 0, 0, 1, 1, 1]  # translation, rotation -> the six rows of a tangent
 _STEADY = 1e-3  # m, rad: a link that moves less has left its start behind
-
-
-class PoseConsensusConfig(Config):
-    """The decentralised solver of the team's keyframe poses."""
-
-    relaxation: float = 0.9
-    """Share of the way that an edge variable goes to what arrived (0.5 is the textbook's, slower)."""
-    penalty_start: float = 0.1
-    """First penalty, as a multiple of the metric (the information of the pair's closures)."""
-    penalty_min: float = 0.015
-    """Least penalty; below it one Gauss-Newton step per round can diverge."""
-    penalty_max: float = 3.0
-    """Greatest penalty."""
-    penalty_period: int = 5
-    """Packets that both ends must have received between two changes of the penalty."""
-    penalty_decay: float = 20.0
-    """Packets after which the allowed change shrinks: factor 1 + 2 / max(1, received / penalty_decay)."""
-    adaptive: bool = True
-    """Adapt the penalties; if not, the first ones stay."""
-    relinearise_rad: float = 1e-2
-    """The factorisation is kept until rotations moved this much in sum."""
-    step_limit_rad: float = 0.3
-    """A step that turns some keyframe more than this is shortened; nonlinearity makes longer ones worthless."""
-    tolerance: float = 1e-5
-    """An end is settled when its steps and edge variables change less than this (m, rad)."""
-    wire: Literal["float32", "float64"] = "float32"
-    """Precision of poses in a packet."""
-    robust: bool = True
-    """Weigh closures by graduated non-convexity, truncated least squares; if not, `keep` decides alone."""
-    truncation: float = 7.5
-    """A closure whose whitened residual is longer than this counts as an outlier."""
-    robust_warm_up: int = 40
-    """Packets received with the start weights before the graduated weights begin (fewer if the link is steady)."""
-    robust_packets: int = 5
-    """Packets received per step of the graduated weights."""
-    robust_growth: float = 1.4
-    """Factor on the control parameter mu per step; 1.6 freezes robots on wrong weights."""
-    robust_passes: tuple[tuple[float, int], ...] = ((0.01, 25), (0.1, 15))
-    """Passes of the graduated weights: (first mu, steps)."""
-    odometry_floor_m: float = 0.002
-    """Added to the covariance of every odometry factor: registration does not report its bias (m)."""
-    odometry_floor_rad: float = 0.001
-    """The same for rotations (rad)."""
-    closures: ClosureConfig = ClosureConfig()
-    """Trust in closures."""
 
 
 @dataclass(frozen=True)

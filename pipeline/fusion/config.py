@@ -1,0 +1,27 @@
+"""Settings of fusion."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from pipeline.config import Config
+
+
+class FusionConfig(Config):
+    """From evidence to a robot's fused map."""
+
+    coverage: Literal["all", "overlap"] = "all"
+    """Take over what only neighbours saw (all), or only fuse what is matched (overlap)."""
+    spacing_per_sigma: float = Field(default=1.8, ge=0.0)
+    """Local spacing of splats, in units of their standard deviation along the surface: the mapper seeds discs with a
+    standard deviation of 0.55 cells."""
+    unobserved_below: float = Field(default=1e-6, gt=0.0)
+    """Directions with less than this share of a block's largest information count as unobserved: float32 noise."""
+    explained_m: float = Field(default=0.05, ge=0.0)
+    """A neighbour's Gaussian this far behind a surface that an own keyframe measured still counts as explained..."""
+    explained_relative: float = Field(default=0.02, ge=0.0)
+    """... plus this share of its depth."""
+    added_need_information: bool = True
+    """Take over only Gaussians on whose position their owner's pixels said something."""
+    max_added: int | None = Field(default=None, ge=0)
+    """At most so many Gaussians of neighbours are taken over, those of most position information first."""
