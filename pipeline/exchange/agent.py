@@ -104,7 +104,8 @@ class Agent:
         self.neighbours = {self.team.index(name): self._neighbour(name) for name in sorted(neighbours)}
         self.round = -1
         self.refused: Counter[str] = Counter()
-        self.knowledge = Knowledge(self.own, len(self.team))
+        self.evidence_kind = Kind.EVIDENCE if config.evidence_wire == "compact" else Kind.EVIDENCE_EXACT
+        self.knowledge = Knowledge(self.own, len(self.team), self.evidence_kind)
         self.root, self.hops, self.T_world_map = self.own, 0, np.eye(4)
         self.members = 1 << self.own
         self.frames_hops = self.still_hops = 0
@@ -201,7 +202,7 @@ class Agent:
             self._anchors_told.add((neighbour.index, self.knowledge.take_anchors(arrival.payload)))
         elif arrival.kind is Kind.PAIRS:
             self._pairs_told.add((neighbour.index, self.knowledge.take_pairs(arrival.payload)))
-        elif arrival.kind is Kind.EVIDENCE:
+        elif arrival.kind is self.evidence_kind:
             owner = self.knowledge.take_evidence(
                 neighbour.index, arrival.message, arrival.payload, arrival.complete
             )
@@ -382,18 +383,20 @@ class Agent:
             else:
                 payload = self.knowledge.evidence_bytes[owner]
             if payload is not None:
-                n.evidence_sent[owner] = self._send([n], Kind.EVIDENCE, payload)
+                n.evidence_sent[owner] = self._send([n], self.evidence_kind, payload)
 
     def _own_records(self) -> NDArray[Any]:
         """Own evidence as it is sent, best first."""
         if self._records is None:
-            records = own_records(self.data)
+            records = wire.as_sent(self.evidence_kind, own_records(self.data))
             self._records = records[best_first(records)]
         return self._records
 
     def _own_evidence(self) -> bytes:
         if self.own not in self.knowledge.evidence_bytes:
-            self.knowledge.evidence_bytes[self.own] = wire.write_evidence(self.own, 1, self._own_records())
+            self.knowledge.evidence_bytes[self.own] = wire.write_evidence(
+                self.evidence_kind, self.own, 1, self._own_records()
+            )
         return self.knowledge.evidence_bytes[self.own]
 
     def _overlapping(self, n: Neighbour, owner: int) -> bytes | None:
@@ -409,7 +412,7 @@ class Agent:
         else:
             return None
         keep = within(records, T_common, n.voxels, self.config.overlap_voxel_m)
-        return wire.write_evidence(owner, 1, records[keep])
+        return wire.write_evidence(self.evidence_kind, owner, 1, records[keep])
 
     # --- matching
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange import wire
-from pipeline.exchange.packets import MalformedError
+from pipeline.exchange.packets import Kind, MalformedError
 from pipeline.exchange.wire import RECORD, Anchors, PairList
 
 Records = NDArray[Any]
@@ -30,8 +30,9 @@ class Incoming:
 class Knowledge:
     """Evidence, anchors and pairs of the team, as one agent holds them."""
 
-    def __init__(self, own: int, team: int) -> None:
-        self.own, self.team = own, team
+    def __init__(self, own: int, team: int, kind: Kind) -> None:
+        """own: index in the sorted team. team: its size. kind: of the evidence that this team exchanges."""
+        self.own, self.team, self.kind = own, team, kind
         self.evidence: dict[int, Records] = {}  # complete, by owner
         self.evidence_bytes: dict[int, bytes] = {}
         self.incoming: dict[tuple[int, int], Incoming] = {}  # by (provider, message)
@@ -43,7 +44,7 @@ class Knowledge:
     def take_evidence(self, provider: int, message: int, payload: bytes, complete: bool) -> int | None:
         """Take a chunk, or the complete message. Returns the owner if its evidence is here completely."""
         if not complete:
-            owner, _ = wire.read_evidence_head(payload, self.team)
+            owner, _ = wire.read_evidence_head(self.kind, payload, self.team)
             if owner not in self.evidence:
                 entry = self.incoming.setdefault((provider, message), Incoming(owner, provider))
                 if entry.owner != owner:
@@ -51,7 +52,7 @@ class Knowledge:
                 entry.chunks.append(payload)
             return owner if owner in self.evidence else None
         self.incoming.pop((provider, message), None)
-        owner, records = wire.read_evidence(payload, self.team)
+        owner, records = wire.read_evidence(self.kind, payload, self.team)
         if owner == self.own:
             raise MalformedError("evidence: a neighbour speaks for this robot")
         if owner not in self.evidence:
@@ -111,7 +112,7 @@ class Knowledge:
             for key in sorted(k for k, entry in self.incoming.items() if entry.owner == owner):
                 for chunk in self.incoming[key].chunks:
                     try:
-                        parts.append(wire.read_evidence(chunk, self.team)[1])
+                        parts.append(wire.read_evidence(self.kind, chunk, self.team)[1])
                     except MalformedError:
                         continue
             records = np.concatenate(parts) if parts else np.zeros(0, RECORD)

@@ -32,9 +32,7 @@ HEADER_BYTES = _FIELDS.size + _CRC.size
 MAX_PAYLOAD_BYTES = MAX_PACKET_BYTES - HEADER_BYTES
 
 EVIDENCE_HEAD_BYTES = 8
-EVIDENCE_RECORD_BYTES = 188
-EVIDENCE_RECORDS_PER_CHUNK = (MAX_PAYLOAD_BYTES - EVIDENCE_HEAD_BYTES) // EVIDENCE_RECORD_BYTES
-EVIDENCE_CHUNK_BYTES = EVIDENCE_HEAD_BYTES + EVIDENCE_RECORDS_PER_CHUNK * EVIDENCE_RECORD_BYTES
+EVIDENCE_BYTES, EVIDENCE_EXACT_BYTES = 100, 188  # of one record
 
 
 class Kind(IntEnum):
@@ -50,7 +48,8 @@ class Kind(IntEnum):
     VOXELS = 8  # space that the sender's keyframes saw
     ANCHORS = 9  # agreed poses of the keyframes of one robot
     PAIRS = 10  # matched Gaussians of two robots
-    EVIDENCE = 11  # Gaussians of one robot with their information
+    EVIDENCE = 11  # Gaussians of one robot with their information, compact
+    EVIDENCE_EXACT = 12  # the same in float32
 
 
 FIRE_AND_FORGET = frozenset({Kind.ACK, Kind.STATE})
@@ -76,9 +75,26 @@ class Packet:
     payload: bytes
 
 
+EVIDENCE_KINDS = {Kind.EVIDENCE: EVIDENCE_BYTES, Kind.EVIDENCE_EXACT: EVIDENCE_EXACT_BYTES}
+"""Kinds whose packets hold whole records, each useful alone, and the bytes of a record."""
+
+
+def records_per_chunk(kind: Kind) -> int:
+    """Records in a full packet of evidence."""
+    return (MAX_PAYLOAD_BYTES - EVIDENCE_HEAD_BYTES) // EVIDENCE_KINDS[kind]
+
+
+_CHUNK_BYTES = {
+    kind: EVIDENCE_HEAD_BYTES + records_per_chunk(kind) * EVIDENCE_KINDS[kind]
+    if kind in EVIDENCE_KINDS
+    else MAX_PAYLOAD_BYTES
+    for kind in Kind
+}
+
+
 def chunk_bytes(kind: Kind) -> int:
     """Distance between the cuts of a message of this kind."""
-    return EVIDENCE_CHUNK_BYTES if kind is Kind.EVIDENCE else MAX_PAYLOAD_BYTES
+    return _CHUNK_BYTES[kind]
 
 
 def chunk_count(kind: Kind, total_bytes: int) -> int:

@@ -11,7 +11,7 @@ import schemas
 from pipeline.errors import DuagError
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.links import Fate
-from pipeline.exchange.packets import HEADER_BYTES, Kind, MalformedError, parse
+from pipeline.exchange.packets import EVIDENCE_KINDS, HEADER_BYTES, Kind, MalformedError, parse
 from pipeline.exchange.results import AgentResult
 from pipeline.exchange.transport import Outgoing
 from pipeline.messages import map_frame, pack_pose, pack_stamp
@@ -109,7 +109,7 @@ class ExchangeRecorder:
         self.writer.write(topics.EXCHANGE_SUMMARY.pattern, message, now_ns)
 
 
-RUNNING_KINDS = frozenset({Kind.ACK.name, Kind.STATE.name, Kind.EVIDENCE.name})
+RUNNING_KINDS = frozenset(kind.name for kind in (Kind.ACK, Kind.STATE, *EVIDENCE_KINDS))
 """Kinds whose bytes are not set-up."""
 
 

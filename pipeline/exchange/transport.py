@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange.config import TransportConfig
 from pipeline.exchange.packets import (
+    EVIDENCE_KINDS,
     HEADER_BYTES,
     MAX_PAYLOAD_BYTES,
     Kind,
@@ -102,6 +103,7 @@ class Transport:
         self._received: dict[int, tuple[Kind, int]] = {}  # complete messages: kind, total bytes
         self._to_acknowledge: dict[int, _News] = {}
         self._packets_heard = self._highest_sequence = 0
+        self._delay_rounds: int | None = None  # least seen between sending and arrival
 
     # --- outgoing
 
@@ -156,9 +158,13 @@ class Transport:
                 if size > budget_bytes:
                     break
                 budget_bytes -= size
-                entry.due_round[chunk] = round_index + self.config.retransmit_after_rounds
+                entry.due_round[chunk] = round_index + self._retransmit_after()
                 out.append(self._packet(entry.message, chunk, round_index))
         return out
+
+    def _retransmit_after(self) -> int:
+        """Rounds until a packet counts as lost: never less than there and back take."""
+        return max(self.config.retransmit_after_rounds, 2 * (self._delay_rounds or 0) + 2)
 
     def _due(self, round_index: int) -> Iterator[tuple[_Open, int]]:
         for entry in sorted(self._open.values(), key=lambda e: (e.message.kind, e.message.id)):
@@ -234,6 +240,8 @@ class Transport:
         """
         self.last_heard = round_index
         self._packets_heard += 1
+        delay = max(0, round_index - packet.round)
+        self._delay_rounds = delay if self._delay_rounds is None else min(self._delay_rounds, delay)
         self._highest_sequence = max(self._highest_sequence, packet.sequence)
         if packet.kind is Kind.ACK:
             self._take_acknowledgements(packet.payload)
@@ -275,7 +283,7 @@ class Transport:
             return Arrival(
                 packet.kind, packet.message, b"".join(partial.chunks[i] for i in range(n)), complete=True
             )
-        if packet.kind is Kind.EVIDENCE:
+        if packet.kind in EVIDENCE_KINDS:
             return Arrival(packet.kind, packet.message, packet.payload, complete=False)
         return None
 

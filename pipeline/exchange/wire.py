@@ -14,12 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.consensus.poses import PosePacket, SharedKeyframes
+from pipeline.exchange.compact import COMPACT, decode, encode
 from pipeline.exchange.packets import (
-    EVIDENCE_CHUNK_BYTES,
+    EVIDENCE_BYTES,
+    EVIDENCE_EXACT_BYTES,
     EVIDENCE_HEAD_BYTES,
-    EVIDENCE_RECORD_BYTES,
-    EVIDENCE_RECORDS_PER_CHUNK,
+    EVIDENCE_KINDS,
+    Kind,
     MalformedError,
+    chunk_bytes,
+    records_per_chunk,
 )
 from pipeline.exchange.places import DIMENSIONS, Descriptors, Features
 from pipeline.registration import Reference, ReferenceLevel
@@ -516,52 +520,66 @@ def read_pairs(data: bytes, team: int) -> PairList:
 
 RECORD = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f4", 13), ("information", "<f4", 31)])
 _EVIDENCE = struct.Struct("<HHI")  # owner, version, records of the whole message
-assert RECORD.itemsize == EVIDENCE_RECORD_BYTES
+assert RECORD.itemsize == EVIDENCE_EXACT_BYTES
+assert COMPACT.itemsize == EVIDENCE_BYTES
 assert _EVIDENCE.size == EVIDENCE_HEAD_BYTES
 
 
-def write_evidence(owner: int, version: int, records: NDArray[Any]) -> bytes:
-    """Bytes of EVIDENCE: chunks of whole records, each with its own head, as they are cut into packets."""
-    n, per = len(records), EVIDENCE_RECORDS_PER_CHUNK
+def write_evidence(kind: Kind, owner: int, version: int, records: NDArray[Any]) -> bytes:
+    """Bytes of EVIDENCE or EVIDENCE_EXACT: chunks of whole records, each with its own head, as they are cut."""
+    body = encode(records) if kind is Kind.EVIDENCE else records
+    n, per, size = len(body), records_per_chunk(kind), body.itemsize
     head = _EVIDENCE.pack(owner, version, n)
-    chunks = chunk_count_of_records(n)
-    rows = np.zeros((chunks, EVIDENCE_CHUNK_BYTES), np.uint8)
+    chunks = max(1, -(-n // per))
+    rows = np.zeros((chunks, chunk_bytes(kind)), np.uint8)
     rows[:, :EVIDENCE_HEAD_BYTES] = np.frombuffer(head, np.uint8)
-    padded = np.zeros(chunks * per, RECORD)
-    padded[:n] = records
-    rows[:, EVIDENCE_HEAD_BYTES:] = padded.view(np.uint8).reshape(chunks, per * EVIDENCE_RECORD_BYTES)
-    return rows.tobytes()[: chunks * EVIDENCE_HEAD_BYTES + n * EVIDENCE_RECORD_BYTES]
+    padded = np.zeros(chunks * per, body.dtype)
+    padded[:n] = body
+    rows[:, EVIDENCE_HEAD_BYTES:] = padded.view(np.uint8).reshape(chunks, per * size)
+    return rows.tobytes()[: chunks * EVIDENCE_HEAD_BYTES + n * size]
 
 
-def chunk_count_of_records(n: int) -> int:
-    """Packets that n records of evidence need; none need one, to say so."""
-    return max(1, -(-n // EVIDENCE_RECORDS_PER_CHUNK))
+def as_sent(kind: Kind, records: NDArray[Any]) -> NDArray[Any]:
+    """Records as a receiver will read them."""
+    return decode(encode(records), RECORD) if kind is Kind.EVIDENCE else records
 
 
-def read_evidence_head(chunk: bytes, team: int) -> tuple[int, int]:
+def read_evidence_head(kind: Kind, chunk: bytes, team: int) -> tuple[int, int]:
     """Owner of a chunk of evidence and the number of records of the whole message."""
-    owner, _, n = Reader(chunk, "evidence").fields(_EVIDENCE)
-    if owner >= team or (len(chunk) - EVIDENCE_HEAD_BYTES) % EVIDENCE_RECORD_BYTES:
+    owner, _, n = Reader(chunk[:EVIDENCE_HEAD_BYTES], "evidence").fields(_EVIDENCE)
+    if owner >= team or (len(chunk) - EVIDENCE_HEAD_BYTES) % EVIDENCE_KINDS[kind]:
         raise MalformedError("evidence: names a robot outside the team, or holds a part of a record")
     return owner, n
 
 
-def read_evidence(data: bytes, team: int) -> tuple[int, NDArray[Any]]:
+def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any]]:
     """Owner and records of any number of consecutive chunks of one message, each id once.
 
-    A complete message must have the announced number of records; parts of one have fewer.
+    A complete message has the announced number of records; parts of one have fewer.
     """
-    owner, announced = read_evidence_head(data[:EVIDENCE_HEAD_BYTES], team)
-    chunks = -(-len(data) // EVIDENCE_CHUNK_BYTES)
-    padded = np.zeros(chunks * EVIDENCE_CHUNK_BYTES, np.uint8)
+    owner, announced = read_evidence_head(kind, data[:EVIDENCE_HEAD_BYTES], team)
+    step = chunk_bytes(kind)
+    chunks = -(-len(data) // step)
+    padded = np.zeros(chunks * step, np.uint8)
     padded[: len(data)] = np.frombuffer(data, np.uint8)
-    rows = padded.reshape(chunks, EVIDENCE_CHUNK_BYTES)
+    rows = padded.reshape(chunks, step)
     if (rows[:, :EVIDENCE_HEAD_BYTES] != rows[0, :EVIDENCE_HEAD_BYTES]).any():
         raise MalformedError("evidence: chunks of different messages")
-    n, odd = divmod(len(data) - chunks * EVIDENCE_HEAD_BYTES, EVIDENCE_RECORD_BYTES)
+    n, odd = divmod(len(data) - chunks * EVIDENCE_HEAD_BYTES, EVIDENCE_KINDS[kind])
     if odd or n > announced:
         raise MalformedError(f"evidence: {len(data)} bytes are no {announced} records")
-    records = np.ascontiguousarray(rows[:, EVIDENCE_HEAD_BYTES:]).reshape(-1).view(RECORD)[:n].copy()
+    body = np.ascontiguousarray(rows[:, EVIDENCE_HEAD_BYTES:]).reshape(-1)
+    if kind is Kind.EVIDENCE:
+        compact = body.view(COMPACT)[:n]
+        if not all(
+            np.isfinite(compact[name]).all()
+            for name in COMPACT.names or ()
+            if compact[name].dtype.kind == "f"
+        ):
+            raise MalformedError("evidence: not a finite number")
+        records = decode(compact, RECORD)
+    else:
+        records = body.view(RECORD)[:n].copy()
     check_evidence(records)
     return owner, records
 

@@ -89,6 +89,22 @@ def test_evidence_is_handed_on_chunk_by_chunk() -> None:
     assert [x.complete for x in arrivals if x is not None] == [False, False, False, False, True]
 
 
+def test_a_slow_link_is_not_taken_for_a_lossy_one() -> None:
+    a, b = two_ends()
+    a.send(Message(1000, Kind.SAMPLE, bytes(3000)))
+    air: list[tuple[int, Transport, bytes]] = []
+    sent = 0
+    for round_index in range(60):
+        for arrival in [x for x in air if x[0] == round_index]:
+            arrival[1].receive(parse(arrival[2]), round_index)
+        for sender, receiver in ((a, b), (b, a)):
+            for out in sender.burst(round_index, [Message(sender.new_id(), Kind.STATE, b"")], 100_000):
+                sent += parse(out.packet).kind is Kind.SAMPLE
+                air.append((round_index + 10, receiver, out.packet))
+    assert a.idle
+    assert sent == 3
+
+
 def test_the_rest_of_a_message_can_be_declined() -> None:
     a, b = two_ends()
     a.send(Message(1000, Kind.EVIDENCE, bytes(500_000)))

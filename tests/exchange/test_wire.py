@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.consensus.evidence import pack_symmetric, unpack_symmetric
 from pipeline.consensus.poses import PosePacket, SharedKeyframes
 from pipeline.exchange import wire
-from pipeline.exchange.packets import MalformedError
+from pipeline.exchange.packets import EVIDENCE_KINDS, Kind, MalformedError, chunk_bytes
 from pipeline.exchange.places import Features
 from pipeline.geometry import se3, so3
 from pipeline.registration import Reference, ReferenceLevel
@@ -96,7 +97,14 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
         wire.write_pairs(wire.PairList(0, 2, 1, np.array([[1, 5], [3, 4]]))),
         lambda d: wire.read_pairs(d, TEAM),
     ),
-    "evidence": (wire.write_evidence(1, 1, records(15)), lambda d: wire.read_evidence(d, TEAM)),
+    "evidence": (
+        wire.write_evidence(Kind.EVIDENCE, 1, 1, records(15)),
+        lambda d: wire.read_evidence(Kind.EVIDENCE, d, TEAM),
+    ),
+    "exact evidence": (
+        wire.write_evidence(Kind.EVIDENCE_EXACT, 1, 1, records(15)),
+        lambda d: wire.read_evidence(Kind.EVIDENCE_EXACT, d, TEAM),
+    ),
 }
 
 
@@ -154,14 +162,62 @@ def test_a_sample_comes_back_within_its_quantisation() -> None:
         assert np.abs(a.intensities - b.intensities).max() <= 0.5 / 255 + 1e-6
 
 
+@pytest.mark.parametrize("kind", sorted(EVIDENCE_KINDS))
 @given(n=st.integers(0, 40))
 @settings(max_examples=20, deadline=None)
-def test_evidence_comes_back_and_every_chunk_is_useful_alone(n: int) -> None:
+def test_evidence_comes_back_and_every_chunk_is_useful_alone(kind: Kind, n: int) -> None:
     sent = records(n)
-    data = wire.write_evidence(1, 1, sent)
-    owner, back = wire.read_evidence(data, TEAM)
+    data = wire.write_evidence(kind, 1, 1, sent)
+    owner, back = wire.read_evidence(kind, data, TEAM)
     assert owner == 1
-    assert np.array_equal(back, sent)
-    chunks = [data[i : i + wire.EVIDENCE_CHUNK_BYTES] for i in range(0, len(data), wire.EVIDENCE_CHUNK_BYTES)]
-    parts = [wire.read_evidence(chunk, TEAM)[1] for chunk in chunks]
-    assert np.array_equal(np.concatenate(parts), sent)
+    assert np.array_equal(back, wire.as_sent(kind, sent))
+    step = chunk_bytes(kind)
+    parts = [wire.read_evidence(kind, data[i : i + step], TEAM)[1] for i in range(0, len(data), step)]
+    assert np.array_equal(np.concatenate(parts), back)
+
+
+def test_exact_evidence_is_exact() -> None:
+    sent = records(30)
+    assert np.array_equal(wire.as_sent(Kind.EVIDENCE_EXACT, sent), sent)
+
+
+def evidence_with_information(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Records whose blocks of information have contrasts up to 1e4, and those blocks."""
+    sent = records(n)
+    sent["theta"][:, 3:9] = RNG.uniform(-14, 3, (n, 6))
+    blocks = []
+    for size, scale in ((3, 1e6), (6, 1e3)):
+        Q = np.linalg.qr(RNG.normal(size=(n, size, size)))[0]
+        blocks.append((Q * (scale * 10 ** RNG.uniform(-4, 0, (n, 1, size)))) @ Q.swapaxes(1, 2))
+    sent["information"][:, :27] = np.concatenate([pack_symmetric(b) for b in blocks], axis=1)
+    sent["information"][:5] = 0.0
+    return sent, blocks[0], blocks[1]
+
+
+def test_compact_evidence_is_rounded_far_below_its_uncertainty() -> None:
+    sent, *blocks = evidence_with_information(200)
+    back = wire.as_sent(Kind.EVIDENCE, sent)
+    assert np.array_equal(back["id"], sent["id"])
+    assert np.array_equal(back["anchor"], sent["anchor"])
+    assert np.array_equal(back["theta"][:, :3], sent["theta"][:, :3])
+    assert np.abs(back["theta"][:, 3:9] - sent["theta"][:, 3:9]).max() <= 2.0**-11 + 1e-6
+    assert np.abs(back["theta"][:, 9:12] - sent["theta"][:, 9:12]).max() <= 2.0**-14 + 1e-6
+    assert (back["information"][:5] == 0).all()
+    for part, block, size in ((slice(0, 6), blocks[0], 3), (slice(6, 27), blocks[1], 6)):
+        read = unpack_symmetric(back["information"][5:, part], size)
+        whitened = np.linalg.inv(np.linalg.cholesky(block[5:]))
+        ratio = np.linalg.eigvalsh(whitened @ read @ whitened.swapaxes(1, 2))
+        assert ratio.min() > 0.9  # 5 % of a standard deviation in the worst direction of a contrast of 1e4
+        assert ratio.max() < 1.1
+    scalars = back["information"][5:, 27:] / sent["information"][5:, 27:]
+    assert np.abs(scalars - 1).max() < 2e-3
+
+
+def test_compact_information_is_never_negative() -> None:
+    sent = records(100)
+    sent["information"] = RNG.normal(size=(100, 31)) * 100  # not even semidefinite
+    back = wire.as_sent(Kind.EVIDENCE, sent)
+    for part, size in ((slice(0, 6), 3), (slice(6, 27), 6)):
+        values = np.linalg.eigvalsh(unpack_symmetric(back["information"][:, part], size))
+        assert (values[:, 0] >= -1e-5 * np.maximum(values[:, -1], 1e-6)).all()
+    assert (back["information"][:, 27:] >= 0).all()
