@@ -103,9 +103,7 @@ def rgbd_loss(
     residual = np.where(measured, render.depth - render.alpha * depth_m, depth_m.dtype.type(0))
     depth_value, depth_slope = huber(residual, config.depth_huber_m)
     depth_slope = depth_slope * (config.depth_weight * per_depth)
-    missing_slope = np.where(
-        measured, render.alpha.dtype.type(config.alpha_weight * per_depth), 0 * depth_slope
-    )
+    missing_slope = measured.astype(depth_m.dtype) * (config.alpha_weight * per_depth)
     d_alpha = -depth_slope * depth_m - missing_slope
 
     color_mean = float(np.sum(color_value, dtype=np.float64)) * per_color

@@ -11,7 +11,9 @@ from pipeline.config import Config
 from pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float32]
-_PARAMETERS = {"means": (3,), "quats_wxyz": (4,), "log_scales": (3,), "colors": (3,), "opacity_logits": ()}
+_WIDTHS = {"means": 3, "quats_wxyz": 4, "log_scales": 3, "colors": 3, "opacity_logits": 1}
+_COLUMNS = sum(_WIDTHS.values())
+_BLOCK_ROWS = 4096
 BETA_1, BETA_2, EPSILON = 0.9, 0.99, 1e-12
 _LONGEST = 1024  # steps after which both bias corrections are 1 within float32
 
@@ -56,51 +58,75 @@ class Adam:
     """
 
     def __init__(self, n: int = 0) -> None:
-        self.first = {name: np.zeros((n, *tail), np.float32) for name, tail in _PARAMETERS.items()}
-        self.second = {name: np.zeros((n, *tail), np.float32) for name, tail in _PARAMETERS.items()}
-        self.steps = np.zeros(n, np.int64)
+        self._first = np.zeros((n, _COLUMNS), np.float32)
+        self._second = np.zeros((n, _COLUMNS), np.float32)
+        self._steps = np.zeros(n, np.int32)
         # running products, not powers: the same on every machine
-        self._unbias_1 = 1.0 / (1.0 - np.cumprod(np.full(_LONGEST, BETA_1)))
-        self._unbias_2 = 1.0 / (1.0 - np.cumprod(np.full(_LONGEST, BETA_2)))
+        unbias_1 = 1.0 / (1.0 - np.cumprod(np.full(_LONGEST, BETA_1)))
+        unbias_2 = 1.0 / (1.0 - np.cumprod(np.full(_LONGEST, BETA_2)))
+        self._correction = (unbias_1 / np.sqrt(unbias_2)).astype(np.float32)
 
     def __len__(self) -> int:
-        return len(self.steps)
+        return len(self._steps)
 
     def select(self, index: NDArray) -> None:
         """Keep the state of the Gaussians of a mask or an index array, in that order."""
-        for state in (self.first, self.second):
-            for name in state:
-                state[name] = state[name][index]
-        self.steps = self.steps[index]
+        self._first, self._second, self._steps = (
+            state[index] for state in (self._first, self._second, self._steps)
+        )
 
     def extend(self, n: int) -> None:
         """Add n Gaussians at the end that were never optimised."""
-        for state in (self.first, self.second):
-            for name, tail in _PARAMETERS.items():
-                state[name] = np.concatenate([state[name], np.zeros((n, *tail), np.float32)])
-        self.steps = np.concatenate([self.steps, np.zeros(n, np.int64)])
+        new = Adam(n)
+        self._first = np.concatenate([self._first, new._first])
+        self._second = np.concatenate([self._second, new._second])
+        self._steps = np.concatenate([self._steps, new._steps])
 
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, rates: LearningRates) -> Gaussians:
-        """The Gaussians after one step; those with no gradient at all are untouched.
+        """The Gaussians after one step; those without any gradient of colour or opacity are untouched.
 
         Source: Kingma and Ba, ICLR 2015, algorithm 1, with beta_2 = 0.99 (few steps per Gaussian).
         """
-        touched = (gradients.opacity_logits != 0) | (gradients.colors != 0).any(axis=1)
+        touched = gradients.opacity_logits != 0
+        for channel in range(3):
+            touched |= gradients.colors[:, channel] != 0
         rows = np.flatnonzero(touched)
-        if len(rows) == 0:
-            return gaussians
-        self.steps[rows] += 1
-        age = np.minimum(self.steps[rows], _LONGEST) - 1
-        unbias_1 = self._unbias_1[age].astype(np.float32)
-        unbias_2 = self._unbias_2[age].astype(np.float32)
-        updated: dict[str, Array] = {}
-        for name, tail in _PARAMETERS.items():
-            g = getattr(gradients, name)[rows]
-            first = np.float32(BETA_1) * self.first[name][rows] + np.float32(1 - BETA_1) * g
-            second = np.float32(BETA_2) * self.second[name][rows] + np.float32(1 - BETA_2) * (g * g)
-            self.first[name][rows], self.second[name][rows] = first, second
-            c1, c2 = (unbias_1[:, None], unbias_2[:, None]) if tail else (unbias_1, unbias_2)
-            values = getattr(gaussians, name).copy()
-            values[rows] -= (np.float32(getattr(rates, name)) * c1) * first / (np.sqrt(c2 * second) + EPSILON)
-            updated[name] = values
-        return gaussians.replace(**updated)
+        self._steps += touched
+        np.minimum(self._steps, _LONGEST, out=self._steps)
+        correction = self._correction[self._steps[rows] - 1]
+        rate = np.concatenate([np.full(width, getattr(rates, name)) for name, width in _WIDTHS.items()])
+        values = {name: getattr(gaussians, name).copy() for name in _WIDTHS}
+        # blocks of rows that stay in the cache; every element goes its own way, so their size changes no bit
+        for start in range(0, len(rows), _BLOCK_ROWS):
+            block = rows[start : start + _BLOCK_ROWS]
+            change = self._change(block, gradients)
+            change *= rate.astype(np.float32)
+            change *= correction[start : start + _BLOCK_ROWS, None]
+            column = 0
+            for name, width in _WIDTHS.items():
+                value = values[name]
+                part = change[:, column : column + width].reshape(len(block), *value.shape[1:])
+                value[block] = np.take(value, block, axis=0) - part
+                column += width
+        return gaussians.replace(**values)
+
+    def _change(self, block: NDArray, gradients: GaussianGradients) -> Array:
+        """Update the moments of some rows and return first / sqrt(second) [rows, 14], not yet bias-corrected."""
+        g = np.concatenate(
+            [
+                np.take(getattr(gradients, name), block, axis=0).reshape(-1, width)
+                for name, width in _WIDTHS.items()
+            ],
+            axis=1,
+        )
+        first, second = np.take(self._first, block, axis=0), np.take(self._second, block, axis=0)
+        first *= BETA_1
+        first += (1 - BETA_1) * g
+        g *= g
+        second *= BETA_2
+        second += (1 - BETA_2) * g
+        self._first[block], self._second[block] = first, second
+        np.sqrt(second, out=second)
+        second += EPSILON
+        first /= second
+        return first
