@@ -29,7 +29,7 @@ Index = NDArray[np.int64]
 Pairs = Mapping[tuple[str, str], Index]
 SH_C0 = 0.28209479177387814  # colour = 0.5 + SH_C0 * coefficient
 _CHUNK = 200_000  # pairs per pass, for memory
-_FLOOR_SLACK = 1e-3  # of a log-scale: float32 and rotations
+FLOOR_SLACK = 1e-3  # of a log-scale: float32 and rotations
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class _Chart:
     @staticmethod
     def of(theta: Array, config: MatchingConfig) -> _Chart:
         values, vectors = np.linalg.eigh(spd.vec_to_sym(theta[:, LOG_COVARIANCE]))
-        above = 0.5 * values > np.log(config.thickness_floor_m) + _FLOOR_SLACK
+        above = 0.5 * values > np.log(config.thickness_floor_m) + FLOOR_SLACK
         return _Chart(theta, (vectors * above[:, None, :]) @ vectors.swapaxes(-1, -2))
 
 

@@ -5,9 +5,10 @@ In the flat chart theta = (mean, vec log Sigma, colour, opacity logit) the fused
     theta* = (sum W_eff)^-1 sum W_eff theta,        W_eff = (W^-1 + Sigma_assoc)^-1 = (I + W Sigma_assoc)^-1 W,
 
 which is the paper's (12) and, as the chart is flat, its log-Euclidean mean (13). Sigma_assoc is the variance of where
-on the surface a robot happened to put its splat, spacing^2 / 12 along the surface and zero across it; it belongs to the
-mean only. Every robot's evidence counts once, however often it arrived and through whom. Where no member of a track
-knows anything, the own value stays.
+on the surface a robot happened to put its splat, spacing^2 / 12 along the surface and zero across it, plus a small
+isotropic floor for what Fisher information does not know (`FusionConfig.position_floor_m`); it belongs to the mean
+only. A thickness that the mapper holds at its floor is held here too. Every robot's evidence counts once, however
+often it arrived and through whom. Where no member of a track knows anything, the own value stays.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from pipeline.consensus.evidence import (
     unpack_symmetric,
 )
 from pipeline.consensus.factors import inflated
-from pipeline.consensus.matching import Pairs, tracks
+from pipeline.consensus.matching import FLOOR_SLACK, Pairs, tracks
 from pipeline.fusion.config import FusionConfig
 from pipeline.geometry import se3, spd
 from pipeline.geometry.camera import PinholeCamera
@@ -100,7 +101,9 @@ def association_covariance(vec_log_covariance: Array, spacing_per_sigma: float) 
     return (vectors * variance[:, None, :]) @ vectors.swapaxes(-1, -2)
 
 
-def weighted_move(weights: Array, values: Array, first: Index, unobserved_below: float) -> Array:
+def weighted_move(
+    weights: Array, values: Array, first: Index, unobserved_below: float, free: Array | None = None
+) -> Array:
     """(sum W)^+ sum W (value - reference) per group: how far the fused value lies from each group's reference.
 
     Args:
@@ -108,11 +111,14 @@ def weighted_move(weights: Array, values: Array, first: Index, unobserved_below:
         values: [r, d], differences from the group's reference.
         first: [g], first row of every group.
         unobserved_below: share of a group's largest eigenvalue below which a direction is not moved.
+        free: projection [g, d, d] onto the directions in which a group may move at all.
     Returns:
         [g, d]; zero in directions that nobody knows.
     """
     total = np.add.reduceat(weights, first, axis=0)
     pull = np.add.reduceat((weights @ values[..., None])[..., 0], first, axis=0)
+    if free is not None:
+        total, pull = free @ total @ free, (free @ pull[..., None])[..., 0]
     eigenvalues, vectors = np.linalg.eigh(total)
     known = eigenvalues > unobserved_below * np.maximum(eigenvalues[:, -1:], 1e-300)
     inverse = np.where(known, 1.0 / np.where(known, eigenvalues, 1.0), 0.0)
@@ -127,17 +133,33 @@ def _weighted_move_diagonal(weights: Array, values: Array, first: Index) -> Arra
     return np.where(total > 0, pull / np.where(total > 0, total, 1.0), 0.0)
 
 
-def _moves(rows: _Rows, reference: Index, first: Index, config: FusionConfig) -> Array:
+def _without_thickness(vec_log_covariance: Array, floor_m: float) -> Array:
+    """Projection [n, 6, 6] of the chart of covariances onto what is not held at the thickness floor.
+
+    Without it the thickness of one disc would be inferred, badly, from others that are tilted against it a little.
+    """
+    values, vectors = np.linalg.eigh(spd.vec_to_sym(vec_log_covariance))
+    held = 0.5 * values <= np.log(floor_m) + FLOOR_SLACK
+    axes = vectors.swapaxes(-1, -2)  # [n, axis, 3]
+    v = spd.sym_to_vec(axes[..., :, None] * axes[..., None, :]) * held[..., None]
+    return np.asarray(np.eye(6) - v.swapaxes(-1, -2) @ v, dtype=np.float64)
+
+
+def _moves(
+    rows: _Rows, reference: Index, first: Index, config: FusionConfig, thickness_floor_m: float
+) -> Array:
     """Fused minus reference theta [g, 13] of every track."""
     size = np.diff(np.append(first, len(rows.theta)))
     delta = rows.theta - np.repeat(rows.theta[reference], size, axis=0)
     spread = association_covariance(rows.theta[:, LOG_COVARIANCE], config.spacing_per_sigma)
+    spread += config.position_floor_m**2 * np.eye(3)
+    free = _without_thickness(rows.theta[reference, LOG_COVARIANCE], thickness_floor_m)
     move = np.zeros((len(first), 13))
     move[:, MEAN] = weighted_move(
         inflated(rows.position, spread), delta[:, MEAN], first, config.unobserved_below
     )
     move[:, LOG_COVARIANCE] = weighted_move(
-        rows.shape, delta[:, LOG_COVARIANCE], first, config.unobserved_below
+        rows.shape, delta[:, LOG_COVARIANCE], first, config.unobserved_below, free
     )
     move[:, COLOR] = _weighted_move_diagonal(rows.color, delta[:, COLOR], first)
     move[:, OPACITY] = _weighted_move_diagonal(rows.opacity[:, None], delta[:, OPACITY, None], first)[:, 0]
@@ -167,7 +189,7 @@ def fuse(
         pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians.
         depth_images: (own keyframe index, depth [H, W] in metres, 0 invalid), read once; for `coverage = all`.
         camera: of these depth images.
-        matching: for the rule that splits tracks which hold two Gaussians of one robot.
+        matching: as the pairs were found; for splitting tracks that hold two Gaussians of one robot.
     """
     own = evidence[robot]
     if not np.array_equal(np.sort(own.ids), np.sort(gaussians.ids)):
@@ -192,7 +214,7 @@ def fuse(
     members = np.ones(len(rows.theta), dtype=np.int32)
     sums = pack_information(rows.position, rows.shape, rows.color, rows.opacity)
     if len(first):
-        move[representative] = _moves(rows.take(member), reference, first, config)
+        move[representative] = _moves(rows.take(member), reference, first, config, matching.thickness_floor_m)
         members[representative] = np.diff(np.append(first, len(member)))
         sums[representative] = np.add.reduceat(sums[member], first, axis=0)
 

@@ -6,7 +6,7 @@ import pytest
 from pipeline.consensus.evidence import LOG_COVARIANCE, MEAN, Evidence, pack_information
 from pipeline.consensus.matching import MatchingConfig
 from pipeline.fusion.fuse import FusionConfig, association_covariance, explained, fuse, weighted_move
-from pipeline.geometry import se3, spd
+from pipeline.geometry import se3, so3, spd
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.splat.gaussians import Gaussians
 
@@ -97,6 +97,7 @@ def test_fused_means_minimise_the_sum_of_all_members():
         S, h = np.zeros((6, 6)), np.zeros(6)
         for e in there.values():
             spread = association_covariance(e.theta[k : k + 1, LOG_COVARIANCE], CONFIG.spacing_per_sigma)[0]
+            spread = spread + CONFIG.position_floor_m**2 * np.eye(3)
             W = np.linalg.inv(np.linalg.inv(e.position_information()[k]) + spread)
             H, g = H + W, g + W @ e.theta[k, MEAN]
             W = e.shape_information()[k]
@@ -226,6 +227,57 @@ def test_association_spreads_along_the_surface_only():
     np.testing.assert_allclose(values, [0.0, 4 * 0.01**2 / 12, 4 * 0.02**2 / 12], atol=1e-15)
     normal = np.linalg.eigh(spd.vec_to_sym(spd.log_covariance(quat, np.log(sigma))))[1][:, 0]
     np.testing.assert_allclose(np.abs(vectors[:, 0] @ normal), 1.0, atol=1e-9)
+
+
+def tilted_discs(tilt_rad, offset_m, shape_information):
+    """Two discs at the thickness floor, `offset_m` apart along their normals, sure of them to 0.1 mm."""
+    maps, evidence = {}, {}
+    for name, sign in (("alpha", -1.0), ("bravo", 1.0)):
+        quat = so3.quat_from_rotvec([[0.5 * sign * tilt_rad, 0, 0]])
+        scales = np.log([[0.02, 0.02, MATCHING.thickness_floor_m]])
+        mean = np.array([[0, 0, 0.5 * sign * offset_m]])
+        maps[name] = Gaussians([0], [0], mean, quat, scales, np.zeros((1, 3)), [0.0])
+        bare = Evidence.from_map(name, maps[name], None, np.eye(4)[None])
+        R = so3.from_quat_wxyz(quat)
+        position = R @ np.diag([1e4, 1e4, 1e8]) @ R.swapaxes(-1, -2)
+        normal = spd.sym_to_vec(R[:, :, 2, None] * R[:, None, :, 2])
+        P = np.eye(6) - normal[:, :, None] * normal[:, None, :]  # as the information stage hands it over
+        shape = shape_information * P
+        packed = pack_information(position, shape, np.ones((1, 3)), np.ones(1))
+        evidence[name] = Evidence(name, bare.ids, bare.anchors, bare.theta, packed)
+    return maps, evidence
+
+
+def fuse_discs(maps, evidence, config=CONFIG):
+    still = {n: np.eye(4)[None] for n in maps}
+    pairs = {("alpha", "bravo"): np.array([[0, 0]])}
+    return fuse("alpha", maps["alpha"], np.eye(4)[None], evidence, still, pairs, (), CAMERA, config, MATCHING)
+
+
+def test_tilted_discs_do_not_slide_to_where_their_planes_cross():
+    maps, evidence = tilted_discs(0.05, 0.004, 1.0)
+    fused = fuse_discs(maps, evidence)
+    assert np.linalg.norm(fused.gaussians.means[0]) < 0.002  # between the two
+    printed = fuse_discs(maps, evidence, CONFIG.model_copy(update={"position_floor_m": 0.0}))
+    assert np.linalg.norm(printed.gaussians.means[0]) > 0.05  # what the floor is for
+
+
+def test_a_thickness_at_the_floor_stays_there():
+    """However the others are tilted, and however sure of all but their own thickness."""
+    for tilt_rad in (1e-3, 1e-2, 0.1, 0.3):
+        maps, evidence = tilted_discs(tilt_rad, 0.0, 1e4)
+        e = evidence["bravo"]
+        larger = spd.log_covariance(
+            maps["bravo"].quats_wxyz, np.add(maps["bravo"].log_scales, [0.3, 0.3, 0.0])
+        )
+        theta = e.theta.copy()
+        theta[:, LOG_COVARIANCE] = larger
+        fused = fuse_discs(
+            maps, evidence | {"bravo": Evidence("bravo", e.ids, e.anchors, theta, e.information)}
+        )
+        scales = np.sort(fused.gaussians.log_scales[0])
+        assert abs(scales[0] - np.log(MATCHING.thickness_floor_m)) < 0.1
+        np.testing.assert_allclose(scales[1:], np.log(0.02) + 0.15, atol=0.1)
 
 
 def test_neighbours_unmatched_gaussians_fill_only_unseen_space():
