@@ -72,25 +72,53 @@ def _depth_scale(path: Path, topic: str) -> float:
     return scale
 
 
+NEIGHBOURS = 8
+
+
 @dataclass(frozen=True)
 class Surface:
-    """Geometry of the scene in the ground-truth world, as triangles or, where it has none, as points."""
+    """Geometry of the scene in the ground-truth world.
+
+    vertices: float32 [n, 3], metres. triangles: uint32 [m, 3], indices; none for a cloud of points.
+    normals: float32 [n, 3] of the vertices, unit length; none if they are not known.
+    """
 
     vertices: NDArray[np.float32]
     triangles: NDArray[np.uint32]
+    normals: NDArray[np.float32]
 
     def closest(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Distance (m) [n] of every point [n, 3] from the surface, and unit direction [n, 3] from surface to point.
+        """Distance (m) [n] of every point [n, 3] from the surface, and unit normal [n, 3] of the surface there.
 
-        With triangles the distance is exact and the direction is the normal of the nearest triangle. With points
-        alone it is the distance from the nearest point, and the direction that of the difference.
+        Triangles: exact. Points with normals: each stands for a disc as wide as the points are apart, and the
+        nearest disc counts, so that the distance is not blurred by the sampling. Points alone: the nearest point,
+        and the direction from it for a normal.
         """
         if len(self.triangles):
             return self._closest_on_triangles(points)
+        if len(self.normals):
+            return self._closest_on_discs(points)
         from scipy.spatial import cKDTree
 
         distance, index = cKDTree(self.vertices.astype(np.float64)).query(points)
         return distance, _unit(points - self.vertices[index])
+
+    def _closest_on_discs(
+        self, points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        from scipy.spatial import cKDTree
+
+        vertices, normals = self.vertices.astype(np.float64), _unit(self.normals.astype(np.float64))
+        tree = cKDTree(vertices)
+        radius_m = float(np.quantile(tree.query(vertices, k=2)[0][:, 1], 0.95))
+        _, index = tree.query(points, k=min(NEIGHBOURS, len(vertices)))
+        index = index.reshape(len(points), -1)
+        offset = points[:, None, :] - vertices[index]
+        across = np.sum(offset * normals[index], axis=2)
+        along = np.sqrt(np.maximum(np.sum(offset**2, axis=2) - across**2, 0.0))
+        distance = np.hypot(across, np.maximum(along - radius_m, 0.0))
+        best = np.argmin(distance, axis=1)[:, None]
+        return np.take_along_axis(distance, best, 1)[:, 0], normals[np.take_along_axis(index, best, 1)[:, 0]]
 
     def _closest_on_triangles(
         self, points: NDArray[np.float64]
@@ -118,10 +146,21 @@ def surface(recording: Recording) -> Surface | Absent:
         return Absent("the recording has no geometry of the scene (groundtruth.ply)")
     import open3d as o3d
 
-    mesh = o3d.io.read_triangle_mesh(path)
-    vertices = np.asarray(mesh.vertices, dtype=np.float32)
-    if not len(vertices):
-        vertices = np.asarray(o3d.io.read_point_cloud(path).points, dtype=np.float32)
+    none = np.zeros((0, 3))
+    if _has_faces(path):
+        mesh = o3d.io.read_triangle_mesh(path)
+        vertices, triangles, normals = np.asarray(mesh.vertices), np.asarray(mesh.triangles), none
+    else:
+        cloud = o3d.io.read_point_cloud(path)
+        vertices, triangles, normals = np.asarray(cloud.points), none, np.asarray(cloud.normals)
     if not len(vertices):
         raise DuagError(f"{path}: found no vertices, expected a mesh or a point cloud")
-    return Surface(vertices, np.asarray(mesh.triangles, dtype=np.uint32))
+    return Surface(vertices.astype(np.float32), triangles.astype(np.uint32), normals.astype(np.float32))
+
+
+def _has_faces(path: Path) -> bool:
+    """Whether the header of a .ply file announces faces."""
+    with path.open("rb") as file:
+        head = file.read(1 << 16).partition(b"end_header")[0]
+    words = [line.split() for line in head.splitlines()]
+    return any(w[:2] == [b"element", b"face"] and w[2:] != [b"0"] for w in words)

@@ -70,17 +70,39 @@ def test_a_summary_counts_views_without_pose_apart():
     assert views.summary([], "there is no view")["psnr_db"] == Absent("there is no view")
 
 
+NONE = np.zeros((0, 3))
+
+
 def test_distance_from_triangles_is_exact_between_vertices():
     floor = Surface(
         np.array([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]], dtype=np.float32),
         np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32),
+        NONE,
     )
     points = np.array([[3.3, 4.7, 0.25], [5.0, 2.0, -0.5], [12.0, 5.0, 0.0]])
     distance, direction = floor.closest(points)
     assert distance == pytest.approx([0.25, 0.5, 2.0], abs=1e-6)  # float32 inside
     assert np.abs(direction[:, 2]) == pytest.approx(1.0)
-    cloud = Surface(floor.vertices, np.zeros((0, 3), dtype=np.uint32))
+    cloud = Surface(floor.vertices, NONE, NONE)
     assert cloud.closest(points)[0][2] == pytest.approx(np.hypot(2.0, 5.0))
+
+
+def test_distance_from_a_sampled_corner_does_not_feel_the_sampling():
+    """Two walls that meet, sampled every 2 cm: the distance must be right within a small part of that."""
+    rng = np.random.default_rng(0)
+    u, v = (0.02 * a.ravel() for a in np.meshgrid(np.arange(1, 60), np.arange(60)))
+    floor, side = np.stack([u, v, 0 * u], axis=1), np.stack([0 * u, v, u], axis=1)
+    normals = np.repeat([[0.0, 0, 1], [1, 0, 0]], len(u), axis=0)
+    cloud = Surface(np.concatenate([floor, side]).astype(np.float32), NONE, normals.astype(np.float32))
+    points = np.stack(
+        [rng.uniform(0.003, 1, 500), rng.uniform(0.1, 1, 500), rng.uniform(0.001, 0.3, 500)], axis=1
+    )
+    distance, direction = cloud.closest(points)
+    true = np.minimum(points[:, 0], points[:, 2])
+    assert np.abs(distance - true).max() < 1e-6
+    assert np.array_equal(np.argmax(np.abs(direction), axis=1) == 2, points[:, 2] <= points[:, 0])
+    beyond = np.array([[1.5, 0.5, 0.0]])
+    assert cloud.closest(beyond)[0] == pytest.approx(1.5 - 1.18, abs=0.021)
 
 
 def test_position_information_comes_from_the_right_places():
