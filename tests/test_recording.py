@@ -261,7 +261,7 @@ def test_a_file_cut_anywhere_is_an_error(tmp_path: Path) -> None:
             open_rgbd(path)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_files_broken_behind_right_checksums_are_one_line(
     tmp_path_factory: pytest.TempPathFactory, seed: int

@@ -76,7 +76,7 @@ def _class_of(schema: str, schema_data: bytes) -> Any:
 
 
 @contextmanager
-def _parsing(path: Path) -> Iterator[None]:
+def parsing(path: Path) -> Iterator[None]:
     """Turn whatever a reader stumbles over in a broken file into one line."""
     try:
         yield
@@ -111,7 +111,7 @@ def verify(path: Path) -> None:
         DuagError: missing, empty, no MCAP file, cut short, or any byte that differs from what was written.
     """
     path = Path(path)
-    with _parsing(path):
+    with parsing(path):
         status = path.stat()
         key = (str(path.resolve()), status.st_size, status.st_mtime_ns, status.st_ino)
         if key not in _verified:
@@ -165,7 +165,7 @@ class LogFile:
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         verify(self.path)
-        with _parsing(self.path):
+        with parsing(self.path):
             self._stream = self.path.open("rb")
             weakref.finalize(self, self._stream.close)
             self._reader = SeekingReader(self._stream, validate_crcs=True)
@@ -201,7 +201,7 @@ class LogFile:
 
     def records(self, topics: Sequence[str] | None) -> Iterator[Record]:
         """All messages of some topics, or of all, in the order of the log."""
-        with _parsing(self.path):
+        with parsing(self.path):
             for schema, channel, m in self._reader.iter_messages(topics=topics, log_time_order=True):
                 name, data = (schema.name, schema.data) if schema else ("", b"")
                 yield Record(
@@ -210,12 +210,12 @@ class LogFile:
 
     def metadata(self) -> list[tuple[str, dict[str, str]]]:
         """Metadata records: name and text."""
-        with _parsing(self.path):
+        with parsing(self.path):
             return [(m.name, m.metadata) for m in self._reader.iter_metadata()]
 
     def attachments(self) -> list[bytes]:
         """Attachments, each as one string of bytes with its name and times."""
-        with _parsing(self.path):
+        with parsing(self.path):
             return [
                 framed(
                     a.name.encode(),
@@ -232,7 +232,7 @@ class LogFile:
             return []
         number = self.channels[topic].id
         out = []
-        with _parsing(self.path):
+        with parsing(self.path):
             for chunk in self.summary.chunk_indexes:
                 position = chunk.message_index_offsets.get(number)
                 if position is None:
@@ -245,7 +245,7 @@ class LogFile:
     def record_at(self, topic: str, entry: tuple[int, int, int]) -> Record:
         """The message at an entry of `entries(topic)`; the last few chunks are kept unpacked."""
         _, start, offset = entry
-        with _parsing(self.path):
+        with parsing(self.path):
             data = self._chunk(start)
             _, length, number, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, offset)
             channel = self.channels[topic]

@@ -87,8 +87,9 @@ class RgbdLog:
         cameras = []
         for entry in self._log.entries(topic):
             record = self._log.record_at(topic, entry)
+            calibration = record.proto()
             try:
-                cameras.append((record.log_time_ns, messages.unpack_calibration(record.proto())))
+                cameras.append((record.log_time_ns, messages.unpack_calibration(calibration)))
             except DuagError as error:
                 raise DuagError(f"{self.path}: {topic}: {error}") from error
         if not cameras:

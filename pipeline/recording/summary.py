@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.errors import DuagError
 from pipeline.recording.folder import Recording
 from pipeline.recording.names import DIGEST_RECORD, LOG_RECORD, RECORDING_FILE, ROBOT_KEY
-from pipeline.recording.read import LogFile
+from pipeline.recording.read import LogFile, parsing
 from schemas import topics as topic_table
 
 GAP_RATIO = 1.5  # an interval this much longer than the median one is a gap
@@ -36,10 +36,10 @@ def info(path: Path) -> dict[str, Any]:
 
 
 def _log_info(path: Path) -> dict[str, Any]:
-    with LogFile(path) as log:
+    with LogFile(path) as log, parsing(path):
         metadata = dict(log.metadata())
         topics = {topic: _topic_info(log, topic) for topic in sorted(log.channels)}
-        times = [t[key] for t in topics.values() for key in ("start_ns", "end_ns") if t["messages"]]
+        times = [t[key] for t in topics.values() for key in ("start_ns", "end_ns") if t[key] is not None]
         warnings = [f"{topic}: {w}" for topic, t in topics.items() for w in t.pop("warnings")]
         return {
             "robot": metadata.get(LOG_RECORD, {}).get(ROBOT_KEY) or None,

@@ -94,3 +94,11 @@ def test_a_schema_describes_itself(schema: str) -> None:
 def test_unknown_schemas_are_key_errors(schema: str) -> None:
     with pytest.raises(KeyError):
         schemas.message_class(schema)
+
+
+def test_the_documentation_has_every_topic() -> None:
+    text = (build.FOLDER.parent / "docs" / "formats.md").read_text()
+    for row in topics.TOPICS:
+        assert f"| `{row.pattern}` | `{row.schema}` | {row.producer} | {row.scope.value} |" in text, (
+            row.pattern
+        )
