@@ -116,7 +116,7 @@ class Agent:
         self._frame_told: dict[int, tuple[int, int]] = {}
         self._voxels_told: set[int] = set()
         self._anchors_told: set[tuple[int, int]] = set()
-        self._pairs_told: set[tuple[int, tuple[int, int]]] = set()
+        self._pairs_told: dict[tuple[int, tuple[int, int]], int] = {}  # message; 0 = they told this robot
 
     def _neighbour(self, name: str) -> Neighbour:
         index = self.team.index(name)
@@ -201,7 +201,7 @@ class Agent:
         elif arrival.kind is Kind.ANCHORS:
             self._anchors_told.add((neighbour.index, self.knowledge.take_anchors(arrival.payload)))
         elif arrival.kind is Kind.PAIRS:
-            self._pairs_told.add((neighbour.index, self.knowledge.take_pairs(arrival.payload)))
+            self._pairs_told.setdefault((neighbour.index, self.knowledge.take_pairs(arrival.payload)), 0)
         elif arrival.kind is self.evidence_kind:
             owner = self.knowledge.take_evidence(
                 neighbour.index, arrival.message, arrival.payload, arrival.complete
@@ -364,8 +364,8 @@ class Agent:
                     self._send([n], Kind.ANCHORS, self.knowledge.anchors_bytes[owner])
             for pair in sorted(self.knowledge.pairs_bytes):
                 if pair[0] != n.index and (n.index, pair) not in self._pairs_told:
-                    self._pairs_told.add((n.index, pair))
-                    self._send([n], Kind.PAIRS, self.knowledge.pairs_bytes[pair])
+                    message = self._send([n], Kind.PAIRS, self.knowledge.pairs_bytes[pair])
+                    self._pairs_told[n.index, pair] = message
 
     def _tell_evidence(self, n: Neighbour) -> None:
         if n.state is None:
@@ -480,7 +480,7 @@ class Agent:
         pairs = {
             (self.team[p.lower], self.team[p.higher]): p.ids
             for p in self.knowledge.pairs.values()
-            if self.team[p.lower] in names and self.team[p.higher] in names
+            if self.team[p.lower] in names and self.team[p.higher] in names and self._active(p)
         }
         own = self._own_records()
         evidence = {
@@ -501,6 +501,13 @@ class Agent:
             rounds_to_agreement=self.rounds_to_agreement,
             refused=dict(sorted(self.refused.items())),
         )
+
+    def _active(self, pairs: PairList) -> bool:
+        """Whether a pair list counts: at the end that made it, only when the other end is known to have it."""
+        if pairs.lower != self.own or self.done:
+            return True
+        message = self._pairs_told.get((pairs.higher, (pairs.lower, pairs.higher)))
+        return message is not None and not self.neighbours[pairs.higher].transport.is_open(message)
 
     def _gauge(self) -> Array:
         """T_world_common: the root's first keyframe is where its own map has it. Identity before the root said so."""

@@ -5,8 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from pipeline.config import Config
-from pipeline.consensus.matching import MatchingConfig
-from pipeline.consensus.poses import PoseConsensusConfig
+from pipeline.consensus.config import MatchingConfig, PoseConsensusConfig
 from pipeline.registration import RegistrationConfig
 
 

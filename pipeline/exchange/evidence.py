@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.consensus.config import MatchingConfig
 from pipeline.consensus.evidence import Evidence
-from pipeline.consensus.matching import MatchingConfig, match
+from pipeline.consensus.matching import match
 from pipeline.exchange.inputs import RobotData
 from pipeline.exchange.wire import RECORD
 from pipeline.geometry import se3
