@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import socket
+import subprocess
 import sys
 import tempfile
 import time
@@ -421,13 +422,27 @@ def _recording_blueprint(robots: Sequence[str]) -> rrb.Blueprint:
 
 
 def _open_window(rrd: Path) -> None:
-    """Open a file in a Rerun window and return; the window stays."""
-    import rerun as rr
+    """Open a file in a Rerun window and wait until it is closed; the viewer listens on this machine only.
 
-    rr.init(APPLICATION)
-    rr.spawn(port=_free_port(), memory_limit=VIEWER_MEMORY, executable_path=_executable())
-    rr.log_file_from_path(rrd)
-    rr.disconnect()
+    Raises:
+        DuagError: there is no viewer, or it could not open a window.
+    """
+    command = [
+        _executable(),
+        "--bind",
+        "127.0.0.1",
+        "--port",
+        str(_free_port()),
+        "--memory-limit",
+        VIEWER_MEMORY,
+    ]
+    done = subprocess.run([*command, str(rrd)], check=False, stderr=subprocess.PIPE, text=True)
+    if done.returncode != 0:
+        lines = [line for line in done.stderr.splitlines() if line.strip()]
+        raise DuagError(
+            f"{rrd.name}: the viewer ended with {done.returncode} ({lines[-1] if lines else 'no word'}); "
+            "on a machine without a display use --save or --screenshot"
+        )
 
 
 def take_screenshot(rrd: Path, png: Path, timeout_s: float = 60.0) -> None:
@@ -467,10 +482,15 @@ def _settled_picture(viewer: Any, timeout_s: float) -> bytes:
     return last
 
 
-def _executable() -> str | None:
-    """The viewer that was installed with this Python, active environment or not; None: look in PATH."""
+def _executable() -> str:
+    """The viewer that was installed with this Python, else the one in PATH. Raises DuagError if there is none."""
     beside = Path(sys.executable).with_name("rerun")
-    return str(beside) if beside.is_file() else None
+    found = str(beside) if beside.is_file() else shutil.which("rerun")
+    if found is None:
+        raise DuagError(
+            "rerun: no viewer beside this Python or in PATH, expected that of the package rerun-sdk"
+        )
+    return found
 
 
 def _free_port() -> int:

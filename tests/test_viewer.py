@@ -122,3 +122,17 @@ def test_a_machine_that_cannot_draw_says_so(fake, tmp_path, monkeypatch):
     with pytest.raises(DuagError, match=r"No graphics adapter was found.*mesa-vulkan-drivers"):
         viewer.view(fake.recording, screenshot=tmp_path / "out.png")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_window_that_does_not_open_is_an_error(fake, monkeypatch):
+    import subprocess
+
+    def no_display(command, **_):
+        assert "127.0.0.1" in command
+        return subprocess.CompletedProcess(
+            command, 1, stderr="info\nneither WAYLAND_DISPLAY nor DISPLAY is set\n"
+        )
+
+    monkeypatch.setattr(subprocess, "run", no_display)
+    with pytest.raises(DuagError, match=r"DISPLAY is set.*--save"):
+        viewer.view(fake.recording)
