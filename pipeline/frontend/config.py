@@ -1,0 +1,59 @@
+"""Configuration of the front end: tracking, keyframes, mapping."""
+
+from pipeline.config import Config
+from pipeline.frontend.mapping_config import MappingConfig
+from pipeline.registration.align import RegistrationConfig
+
+
+class KeyframeConfig(Config):
+    """When a frame becomes a keyframe, and how keyframe poses are refined together."""
+
+    min_overlap: float = 0.7
+    """A frame that sees less of its keyframe than this becomes the next one."""
+    max_translation_of_depth: float = 0.3
+    """A frame that moved by more than this fraction of the median depth becomes a keyframe."""
+    max_rotation_rad: float = 0.5
+    """A frame that turned by more than this becomes a keyframe."""
+    neighbours: int = 4
+    """Earlier keyframes that a new one is registered to, besides the one it was tracked against."""
+    neighbour_overlap: float = 0.4
+    """Least overlap, predicted and found, of such a registration."""
+    huber_sigmas: float = 3.0
+    """Registrations that disagree by more than this with the refined poses count linearly."""
+
+
+class TrackingConfig(Config):
+    """Tracking of frames against the latest keyframe."""
+
+    registration: RegistrationConfig = RegistrationConfig()
+    """The usual registration, from the motion of the two frames before."""
+    recovery: RegistrationConfig = RegistrationConfig(
+        iterations=(5, 8, 12, 15),
+        depth_gate_m=0.3,
+        depth_gate_relative=0.1,
+        max_translation_m=0.6,
+        max_rotation_rad=0.6,
+    )
+    """The second attempt: one more pyramid level, wider gates; its result is checked by the usual registration."""
+    strides: tuple[int, ...] = (4, 2, 1, 1)
+    """Pixels between samples of a keyframe, per pyramid level, finest first."""
+    relocalisation_keyframes: int = 8
+    """Latest keyframes that a lost camera is compared with."""
+
+
+class FrontendConfig(Config):
+    """Front end of one robot."""
+
+    held_out_period: int = 8
+    """Of this many frames one is held out: tracked, but never a keyframe and never mapped."""
+    held_out_offset: int = 4
+    """Which one: frame index modulo the period."""
+    tracking: TrackingConfig = TrackingConfig()
+    keyframes: KeyframeConfig = KeyframeConfig()
+    mapping_enabled: bool = True
+    """Grow a map; without, the log holds odometry and keyframes and an empty map."""
+    mapping: MappingConfig = MappingConfig()
+
+    def is_held_out(self, frame_index: int) -> bool:
+        """Whether a frame is kept for evaluation."""
+        return frame_index % self.held_out_period == self.held_out_offset

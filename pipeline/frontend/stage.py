@@ -1,0 +1,216 @@
+"""The front-end stage: from one robot's sensor log to its odometry, keyframes and Gaussian map.
+
+Three passes over the log: all frames are tracked; the keyframe poses are refined together; the map is grown at the
+refined poses. Frames hang on keyframes, so their poses are final before the first message is written. The stage is
+offline in this sense; times in the log are those of the recording all the same.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import progress as progress_bar
+from pipeline.errors import DuagError
+from pipeline.frontend.config import FrontendConfig
+from pipeline.frontend.keyframes import refine, relative_information
+from pipeline.frontend.tracking import Status, TrackedFrame, TrackedKeyframe, Tracker
+from pipeline.messages import GaussianMap, Keyframe, MapUpdate, Odometry, map_frame
+from pipeline.recording import LogWriter, RgbdLog, open_rgbd
+from pipeline.splat.gaussians import Gaussians
+from schemas import topics
+
+LATENCY_NS = 30_000_000
+"""Outputs are received this long after the frame that they are about: a constant, never the wall clock."""
+
+Array = NDArray[np.float64]
+
+
+def run_frontend(
+    log_path: Path,
+    out_path: Path,
+    config: FrontendConfig,
+    *,
+    seed: int = 0,
+    threads: int = 1,
+    progress: bool = False,
+) -> dict[str, float]:
+    """Track and map one robot's log.
+
+    Args:
+        log_path: sensor log of the robot. out_path: frontend.mcap to write.
+        seed: of the run, for the mapping. threads: of the rasterizer; changes no bit of the result.
+        progress: show it on standard error.
+    Returns:
+        Wall times in seconds of tracking, refinement, mapping and writing.
+    Raises:
+        DuagError: the log is broken or empty.
+    """
+    _settle_opencv()
+    clock = _Clock()
+    with open_rgbd(log_path) as log:
+        if len(log) == 0:
+            raise DuagError(f"{log_path}: has no image, expected at least one")
+        tracker, frames = _track(log, config, progress)
+        clock.lap("tracking_s")
+        T_map_keyframes, covariance = refine(
+            np.array([k.T_map_keyframe for k in tracker.keyframes]),
+            tracker.pairs,
+            config.keyframes.huber_sigmas,
+        )
+        keyframes = _keyframe_messages(log.robot, tracker.keyframes, T_map_keyframes, covariance)
+        clock.lap("refinement_s")
+        updates, gaussians = _map(log, keyframes, config, seed, threads, progress)
+        clock.lap("mapping_s")
+    odometry = [_odometry(log.robot, frame, T_map_keyframes, config) for frame in frames]
+    _write(out_path, log.robot, odometry, keyframes, updates, gaussians)
+    clock.lap("writing_s")
+    return clock.laps
+
+
+def _track(log: RgbdLog, config: FrontendConfig, progress: bool) -> tuple[Tracker, list[TrackedFrame]]:
+    """Track all frames in order."""
+    tracker = Tracker(log.camera, config)
+    source = log.frames()
+    if progress:
+        source = progress_bar.track(source, f"tracking {log.robot}", len(log))
+    tracked = []
+    for frame in source:
+        image = frame.color.astype(np.float32) * np.float32(1 / 255)
+        tracked.append(tracker.track(frame.index, frame.stamp_ns, image, frame.depth))
+    return tracker, tracked
+
+
+def _keyframe_messages(
+    robot: str, keyframes: Sequence[TrackedKeyframe], T_map_keyframes: Array, covariance: Array
+) -> list[Keyframe]:
+    """Keyframes at their refined poses, with the information of the refined relative motion."""
+    messages = []
+    for keyframe, T in zip(keyframes, T_map_keyframes, strict=True):
+        index, previous = keyframe.keyframe_index, keyframe.previous_index
+        T_previous_keyframe, information = np.eye(4), np.zeros((6, 6))
+        if previous >= 0:
+            T_previous_keyframe = np.linalg.solve(T_map_keyframes[previous], T)
+            information = relative_information(T_map_keyframes, covariance, previous, index)
+        gain, offset = keyframe.exposure
+        messages.append(
+            Keyframe(
+                stamp_ns=keyframe.stamp_ns,
+                robot=robot,
+                keyframe_index=index,
+                frame_index=keyframe.frame_index,
+                T_map_camera=T,
+                previous_index=previous,
+                T_previous_keyframe=T_previous_keyframe,
+                information=information,
+                exposure=(float(np.log(gain)), offset),
+            )
+        )
+    return messages
+
+
+def _map(
+    log: RgbdLog,
+    keyframes: Sequence[Keyframe],
+    config: FrontendConfig,
+    seed: int,
+    threads: int,
+    progress: bool,
+) -> tuple[list[MapUpdate], Gaussians]:
+    """Grow the map at the keyframes' poses; one update per keyframe, and one for the final refinement."""
+    if not config.mapping_enabled:
+        return [], Gaussians.empty()
+    from pipeline.frontend.mapping import Mapper, MappingStats
+
+    def update(keyframe: Keyframe, stats: MappingStats) -> MapUpdate:
+        return MapUpdate(
+            keyframe.stamp_ns,
+            log.robot,
+            keyframe.keyframe_index,
+            stats.inserted,
+            stats.pruned,
+            stats.total,
+            stats.loss_before,
+            stats.loss_after,
+        )
+
+    mapper = Mapper(log.camera, config.mapping, seed, threads=threads)
+    steps = progress_bar.track(keyframes, f"mapping {log.robot}") if progress else keyframes
+    updates = []
+    for keyframe in steps:
+        frame = log.frame(keyframe.frame_index)
+        image = frame.color.astype(np.float32) * np.float32(1 / 255)
+        stats = mapper.add_keyframe(keyframe.keyframe_index, image, frame.depth, keyframe.T_map_camera)
+        updates.append(update(keyframe, stats))
+    updates.append(update(keyframes[-1], mapper.finish()))
+    return updates, mapper.gaussians
+
+
+def _odometry(robot: str, frame: TrackedFrame, T_map_keyframes: Array, config: FrontendConfig) -> Odometry:
+    return Odometry(
+        stamp_ns=frame.stamp_ns,
+        robot=robot,
+        frame_index=frame.frame_index,
+        held_out=config.is_held_out(frame.frame_index),
+        keyframe_index=frame.keyframe_index,
+        T_map_camera=T_map_keyframes[frame.keyframe_index] @ frame.T_keyframe_camera,
+        T_keyframe_camera=frame.T_keyframe_camera,
+        information=frame.information,
+        status=frame.status.value,
+        overlap=frame.overlap,
+        rms_depth_m=frame.rms_depth_m,
+        rms_color=frame.rms_gray,
+    )
+
+
+def _write(
+    out_path: Path,
+    robot: str,
+    odometry: Sequence[Odometry],
+    keyframes: Sequence[Keyframe],
+    updates: Sequence[MapUpdate],
+    gaussians: Gaussians,
+) -> None:
+    """One message per frame, then what its keyframe did, in the order of time; the map at the end."""
+    keyframe_of = {keyframe.frame_index: keyframe for keyframe in keyframes}
+    updates_of: dict[int, list[MapUpdate]] = {}
+    for update in updates:
+        updates_of.setdefault(update.keyframe_index, []).append(update)
+    tracked = sum(message.status != Status.LOST.value for message in odometry)
+    with LogWriter(
+        out_path, robot=robot, metadata={"frames": str(len(odometry)), "tracked": str(tracked)}
+    ) as log:
+        for message in odometry:
+            time_ns = message.stamp_ns + LATENCY_NS
+            log.write(topics.ODOMETRY.of(robot), message, time_ns, message.stamp_ns)
+            keyframe = keyframe_of.get(message.frame_index)
+            if keyframe is not None:
+                log.write(topics.KEYFRAME.of(robot), keyframe, time_ns, message.stamp_ns)
+                for update in updates_of.get(keyframe.keyframe_index, []):
+                    log.write(topics.MAP_UPDATE.of(robot), update, time_ns, message.stamp_ns)
+        last = odometry[-1].stamp_ns
+        final = GaussianMap(last, robot, map_frame(robot), gaussians, None)
+        log.write(topics.MAP.of(robot), final, last + LATENCY_NS, last)
+
+
+def _settle_opencv() -> None:
+    from pipeline import numeric
+
+    numeric.settle_opencv()
+
+
+class _Clock:
+    """Wall times of the parts of a stage."""
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.laps[name] = round(now - self._last, 3)
+        self._last = now
