@@ -1,0 +1,195 @@
+"""The fusion stage on files: alone nothing changes, otherwise everything moves with its keyframe."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from converters.base import RecordingWriter
+from pipeline.consensus.config import MatchingConfig
+from pipeline.consensus.evidence import Evidence
+from pipeline.errors import DuagError
+from pipeline.exchange.inputs import AgentInput
+from pipeline.fusion.config import FusionConfig
+from pipeline.fusion.stage import run_fusion
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.trajectory import read_tum
+from pipeline.messages import (
+    CorrectedKeyframes,
+    GaussianInformation,
+    GaussianMap,
+    Keyframe,
+    Odometry,
+    map_frame,
+)
+from pipeline.recording import LogWriter, read_log
+from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.ply import write_ply
+from schemas import topics
+
+CAMERA = PinholeCamera(32, 24, 25.0, 25.0, 15.5, 11.5)
+FRAMES, KEYFRAMES, N = 6, (0, 3), 12
+
+
+@dataclass
+class Result:
+    """What the stage reads of a session."""
+
+    robot: str
+    component: tuple[str, ...]
+    T_world_keyframe: np.ndarray
+    own_evidence: Evidence
+    evidence: dict[str, Evidence] = field(default_factory=dict)
+    T_world_keyframe_of: dict[str, np.ndarray] = field(default_factory=dict)
+    pairs: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
+
+
+@dataclass
+class Robot:
+    """Files of one robot and what is in them."""
+
+    log: Path
+    frontend: Path
+    information: Path
+    T_map_camera: np.ndarray
+    gaussians: Gaussians
+    sums: GaussianInformation
+
+    @property
+    def T_map_keyframe(self):  # noqa: N802
+        return self.T_map_camera[list(KEYFRAMES)]
+
+    def evidence(self):
+        return Evidence.from_map("bravo", self.gaussians, self.sums, self.T_map_keyframe)
+
+    def alone(self) -> Any:
+        return result_of(self, self.T_map_keyframe)
+
+
+def result_of(robot, T_world_keyframe, **others: Evidence) -> Any:
+    """A session with others that stand at the origin."""
+    poses = {"bravo": T_world_keyframe, **{name: np.eye(4)[None] for name in others}}
+    return Result("bravo", tuple(sorted(poses)), T_world_keyframe, robot.evidence(), others, poses)
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    """Six frames of a wall 2 m away, two keyframes, a map in front of it."""
+    folder = tmp_path_factory.mktemp("robot")
+    rng = np.random.default_rng(0)
+    T_map_camera = se3.exp(np.concatenate([np.zeros((1, 6)), 0.05 * rng.normal(size=(FRAMES - 1, 6))]))
+    _, png = cv2.imencode(".png", np.full((24, 32, 3), 90, np.uint8))
+    with (
+        RecordingWriter(folder / "recording", "wall", {"made": "by the tests"}, "tests") as recording,
+        recording.robot("bravo", CAMERA, 0.001, {"depth_noise": "none"}) as log,
+    ):
+        for k in range(FRAMES):
+            log.add_frame(k * 10**8, png.tobytes(), "png", np.full((24, 32), 2000, np.uint16), None, None)
+    gaussians = Gaussians(
+        np.arange(N),
+        np.arange(N) % 2,
+        np.add(rng.normal(size=(N, 3)), [0, 0, 2]),
+        rng.normal(size=(N, 4)),
+        rng.uniform(-5, -4, (N, 3)),
+        rng.uniform(size=(N, 3)),
+        rng.normal(size=N),
+    )
+    A = rng.normal(size=(N, 9, 9))
+    geometry = (A @ A.swapaxes(-1, -2))[:, *np.triu_indices(9)].astype(np.float32)
+    ones = np.ones((N, 3), np.float32)
+    sums = GaussianInformation(
+        5 * 10**8, "bravo", "gauss_newton", "all", gaussians.ids, geometry, ones, ones[:, 0],
+        np.full(N, 7, np.uint32), 0.02, "0.001",
+    )  # fmt: skip
+    with LogWriter(folder / "frontend.mcap", "bravo") as log:
+        for k in range(FRAMES):
+            at = max(i for i, frame in enumerate(KEYFRAMES) if frame <= k)
+            T_keyframe_camera = se3.inverse(T_map_camera[KEYFRAMES[at]]) @ T_map_camera[k]
+            frame = Odometry(
+                k * 10**8, "bravo", k, k % 8 == 4, at, T_map_camera[k], T_keyframe_camera, np.eye(6),
+                "ok", 1.0, 0.0, 0.0,
+            )  # fmt: skip
+            log.write(topics.ODOMETRY.of("bravo"), frame, k * 10**8)
+            if k in KEYFRAMES:
+                keyframe = Keyframe(
+                    k * 10**8, "bravo", at, k, T_map_camera[k], at - 1, np.eye(4), np.zeros((6, 6)), (1.0, 0.0)
+                )  # fmt: skip
+                log.write(topics.KEYFRAME.of("bravo"), keyframe, k * 10**8)
+        final = GaussianMap(5 * 10**8, "bravo", map_frame("bravo"), gaussians)
+        log.write(topics.MAP.of("bravo"), final, 5 * 10**8)
+    with LogWriter(folder / "information.mcap", "bravo") as log:
+        log.write(topics.INFORMATION.of("bravo"), sums, 5 * 10**8)
+    log_path = folder / "recording" / "bravo.mcap"
+    return Robot(
+        log_path, folder / "frontend.mcap", folder / "information.mcap", T_map_camera, gaussians, sums
+    )
+
+
+def fuse_files(robot, result, folder):
+    source = AgentInput("bravo", robot.log, robot.frontend, robot.information)
+    run_fusion(source, result, folder, FusionConfig(), MatchingConfig())
+    return {type(r.message()): r.message() for r in read_log(folder / "fused.mcap")}
+
+
+def test_alone_everything_stays(robot, tmp_path):
+    said = fuse_files(robot, robot.alone(), tmp_path)
+    write_ply(tmp_path / "own.ply", robot.gaussians)
+    assert (tmp_path / "fused.ply").read_bytes() == (tmp_path / "own.ply").read_bytes()
+    for name in ("odometry.tum", "trajectory.tum"):  # messages hold unit quaternions: a turn of rounding
+        np.testing.assert_allclose(read_tum(tmp_path / name).poses, robot.T_map_camera, atol=1e-14)
+    blocks = [0, 9, 17, 24, 44]  # some of the diagonal, in the upper triangle of 9x9
+    np.testing.assert_allclose(
+        said[GaussianMap].information.geometry[:, blocks], robot.sums.geometry[:, blocks], rtol=1e-5
+    )
+    assert said[CorrectedKeyframes].component == ["bravo"]
+
+
+def test_frames_and_gaussians_move_with_their_keyframes(robot, tmp_path):
+    moves = se3.exp(np.array([[1.0, 0, 0, 0, 0, 0.3], [1.0, 0.1, 0, 0, 0, 0.3]]))
+    T_world = moves @ robot.T_map_keyframe
+    nobody = robot.evidence().select(slice(0, 0))
+    other = Evidence("alpha", nobody.ids, nobody.anchors, nobody.theta, nobody.information)
+    result = result_of(robot, T_world, alpha=other)
+    said = fuse_files(robot, result, tmp_path)
+    poses = read_tum(tmp_path / "trajectory.tum").poses
+    expected = moves[[0, 0, 0, 1, 1, 1]] @ robot.T_map_camera
+    np.testing.assert_allclose(poses, expected, atol=1e-12)
+    np.testing.assert_array_equal(said[CorrectedKeyframes].T_world_keyframe, T_world)
+    fused = said[GaussianMap]
+    assert fused.frame_id == fused.information.frame_id == "world"
+    np.testing.assert_array_equal(fused.gaussians.ids, robot.gaussians.ids)
+    by_anchor = [
+        se3.transform(moves[a], m[None])[0]
+        for a, m in zip(robot.gaussians.anchors, robot.gaussians.means, strict=True)
+    ]
+    np.testing.assert_allclose(fused.gaussians.means, by_anchor, atol=1e-6)
+    trace = [0, 9, 17]  # of the position block in the upper triangle of 9x9: what a turn leaves
+    np.testing.assert_allclose(
+        fused.information.geometry[:, trace].sum(axis=1), robot.sums.geometry[:, trace].sum(axis=1), rtol=1e-5
+    )
+
+
+def test_what_only_a_neighbour_saw_is_taken_over(robot, tmp_path):
+    """A Gaussian of alpha behind bravo's cameras, and one on the wall that they measured."""
+    theta = np.zeros((2, 13))
+    theta[:, :3] = [[0, 0, -3.0], [0, 0, 2.0]]
+    theta[:, 3:9] = -8 * np.array([1, 1, 1, 0, 0, 0])
+    other = Evidence("alpha", np.array([40, 41]), np.zeros(2), theta, np.ones((2, 31)))
+    result = result_of(robot, robot.T_map_keyframe, alpha=other)
+    fused = fuse_files(robot, result, tmp_path)[GaussianMap]
+    assert len(fused.gaussians) == len(fused.information.ids) == N + 1
+    np.testing.assert_allclose(fused.gaussians.means[-1], [0, 0, -3.0])
+
+
+def test_information_of_another_map_is_refused(robot, tmp_path):
+    other = robot.sums.ids + 1
+    with LogWriter(tmp_path / "information.mcap", "bravo") as log:
+        log.write(topics.INFORMATION.of("bravo"), replace(robot.sums, ids=other), 5 * 10**8)
+    source = AgentInput("bravo", robot.log, robot.frontend, tmp_path / "information.mcap")
+    with pytest.raises(DuagError, match="other Gaussians"):
+        run_fusion(source, robot.alone(), tmp_path, FusionConfig(), MatchingConfig())
+    assert [p.name for p in tmp_path.iterdir()] == ["information.mcap"]
