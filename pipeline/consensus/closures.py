@@ -81,23 +81,28 @@ def closure_factors(
 
 
 def drift(odometry: Factors, keyframes: int, config: ClosureConfig) -> Array:
-    """Accumulated variance of the odometry along the chain of keyframes, the input of `consistent`.
+    """Accumulated variance of the odometry along the keyframes, the input of `consistent`.
 
     Args:
-        odometry: factors between own keyframes; those from k to k + 1 count.
+        odometry: factors between own keyframes, each usually to the keyframe that it was tracked against.
         keyframes: how many there are.
     Returns:
-        [keyframes, 2]: translation m^2 and rotation rad^2 per axis, from keyframe 0 to keyframe k. A step that
-        nothing measured counts with one square metre and one square radian.
+        [keyframes, 2], not falling: translation m^2 and rotation rad^2 per axis, from keyframe 0 to keyframe k along
+        the surest earlier keyframe. One that nothing ties to an earlier one counts with one square metre and one
+        square radian.
     """
-    step = np.ones((max(keyframes - 1, 0), 2))
-    chain = np.flatnonzero(odometry.j - odometry.i == 1)
-    covariance = np.linalg.inv(odometry.information[chain] + np.eye(6))  # the identity is that weak prior
+    covariance = np.linalg.inv(odometry.information + np.eye(6))  # the identity is that weak prior
     variances = np.diagonal(covariance, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)
-    for k, variance in zip(odometry.i[chain].tolist(), variances, strict=True):
-        step[k] = np.minimum(step[k], variance)
-    step += [config.drift_floor_m**2, config.drift_floor_rad**2]
-    return np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])[:keyframes]
+    ties: dict[int, list[tuple[int, Array]]] = {}
+    for i, j, variance in zip(odometry.i.tolist(), odometry.j.tolist(), variances, strict=True):
+        ties.setdefault(max(i, j), []).append((min(i, j), variance))
+    floor = np.array([config.drift_floor_m**2, config.drift_floor_rad**2])
+    grown = np.zeros((keyframes, 2))
+    for k in range(1, keyframes):
+        ways = [grown[i] + variance for i, variance in ties.get(k, [])]
+        grown[k] = np.min([grown[k - 1] + 1.0, *ways], axis=0) + floor
+        grown[k] = np.maximum(grown[k], grown[k - 1])
+    return grown
 
 
 def consistent(

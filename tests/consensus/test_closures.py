@@ -85,6 +85,15 @@ def test_long_odometry_between_closures_forgives_more():
     assert consistent(far, own, own, grown, grown, CONFIG).keep.all()
 
 
+def test_drift_follows_the_keyframe_that_was_tracked_against():
+    """Keyframe 2 was tracked against 0, not against 1: it is as sure as its own factor."""
+    information = np.tile(1e6 * np.eye(6), (2, 1, 1))
+    star = Factors([0, 0], [1, 2], np.tile(np.eye(4), (2, 1, 1)), information)
+    grown = drift(star, 3, CONFIG)
+    np.testing.assert_allclose(grown[2], grown[1])
+    assert grown[2, 0] < 1e-3
+
+
 def test_unmeasured_steps_count_as_far_drift():
     grown = drift(Factors.empty(), 3, CONFIG)
     assert np.all(np.diff(grown, axis=0) >= 1.0)
