@@ -292,6 +292,8 @@ def _blueprint(run: RunFolder) -> rrb.Blueprint:
     world = _world_of(run, run.robots[first].component)
     scene = [f"/{world}/paths/**", f"/{world}/cameras/**"]
     scene += [f"- /{world}/cameras/{name}/depth" for name in run.robots]
+    # a little above and behind the first camera of the world, where a room has no wall in the way
+    eye = rrb.EyeControls3D(position=(0.0, -0.3, -0.8), look_target=(0.0, 0.1, 2.0), eye_up=(0.0, -1.0, 0.0))
     images = [
         rrb.Tabs(
             *(
@@ -316,16 +318,15 @@ def _blueprint(run: RunFolder) -> rrb.Blueprint:
         rrb.Vertical(
             rrb.Horizontal(
                 rrb.Tabs(
-                    rrb.Spatial3DView(
-                        origin=f"/{world}",
-                        contents=[*scene, f"/{world}/maps/{first}/fused"],
-                        name="Fused map",
-                    ),
-                    rrb.Spatial3DView(
-                        origin=f"/{world}",
-                        contents=[*scene, f"/{world}/maps/{first}/uncertainty"],
-                        name="Uncertainty",
-                    ),
+                    *(
+                        rrb.Spatial3DView(
+                            origin=f"/{world}",
+                            contents=[*scene, f"/{world}/maps/{first}/{colouring}"],
+                            name=name,
+                            eye_controls=eye,
+                        )
+                        for colouring, name in (("fused", "Fused map"), ("uncertainty", "Uncertainty"))
+                    )
                 ),
                 rrb.Vertical(*images),
                 column_shares=[3, 1],
