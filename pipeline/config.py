@@ -89,6 +89,9 @@ def _fill(table: Any, config: Config) -> None:
         if field.description:
             for line in field.description.strip().splitlines():
                 table.add(tomlkit.comment(line.strip()))
+        if value is None:  # TOML has no null; leaving a setting out means its default, which is None
+            table.add(tomlkit.comment(f"{name} is not set"))
+            continue
         table.add(name, tomlkit.item(list(value) if isinstance(value, tuple) else value))
     for name, section in sections:
         inner = tomlkit.table()

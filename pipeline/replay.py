@@ -13,7 +13,7 @@ from pathlib import Path
 from pipeline.config import load
 from pipeline.digest import digest_file
 from pipeline.errors import DuagError
-from pipeline.runner import RunConfig, agent_input, prepare_robot, threads_per_worker
+from pipeline.runner import RunConfig, agent_input, fuse_robot, prepare_robot, threads_per_worker
 
 COMPARED = ("frontend.mcap", "information.mcap", "fused.mcap", "fused.ply", "trajectory.tum", "odometry.tum")
 
@@ -86,7 +86,6 @@ def _replay_one(
     run: Path, log: Path, robot: str, folder: Path, config: RunConfig, say: Callable[[str], None]
 ) -> list[Comparison]:
     from pipeline.exchange.replay import replay_agent
-    from pipeline.fusion.stage import run_fusion
 
     say(f"{robot}: front end and information")
     prepare_robot(log, robot, folder, config, threads_per_worker(1))
@@ -98,7 +97,7 @@ def _replay_one(
         exchange_path=run / "exchange.mcap",
     )
     say(f"{robot}: fusion")
-    run_fusion(log, folder / "frontend.mcap", folder / "information.mcap", result, folder, config.fusion)
+    fuse_robot(robot, log, folder, result, config)
     comparisons = [Comparison(robot, "packets sent", sent.recorded, sent.recomputed)]
     for name in COMPARED:
         recorded = digest_file(run / "robots" / robot / name)

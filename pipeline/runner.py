@@ -22,6 +22,8 @@ from pipeline.config import Config, dump
 from pipeline.digest import digest_file, result_files
 from pipeline.errors import DuagError
 from pipeline.exchange.config import ExchangeConfig
+from pipeline.exchange.inputs import AgentInput
+from pipeline.exchange.results import AgentResult
 from pipeline.frontend.config import FrontendConfig
 from pipeline.fusion.config import FusionConfig
 from pipeline.information.config import InformationConfig
@@ -143,7 +145,8 @@ def run(
         results = _exchange(logs, folder, config, timing)
         for robot, result in results.items():
             say(f"fusion: {robot}")
-            _fuse(robot, logs[robot], robots[robot], result, config, timing)
+            with timing.stage("fusion", robot):
+                fuse_robot(robot, logs[robot], robots[robot], result, config)
         _write_json(folder / "manifest.json", _manifest(recording, folder, config))
         _write_json(folder / "timing.json", {"stages": timing.stages})
         say("evaluation")
@@ -171,12 +174,13 @@ def new_folder(out: Path, force: bool) -> Iterator[Path]:
         raise
 
 
-def _exchange(logs: dict[str, Path], folder: Path, config: RunConfig, timing: Timing) -> dict[str, Any]:
-    from pipeline.exchange.session import AgentInput, run_session
+def _exchange(
+    logs: dict[str, Path], folder: Path, config: RunConfig, timing: Timing
+) -> dict[str, AgentResult]:
+    from pipeline.exchange.session import run_session
 
     numeric.settle_opencv()
     inputs = [agent_input(robot, log, folder / "robots" / robot) for robot, log in logs.items()]
-    assert all(isinstance(i, AgentInput) for i in inputs)
     with timing.stage("exchange"):
         return run_session(
             inputs,
@@ -187,18 +191,16 @@ def _exchange(logs: dict[str, Path], folder: Path, config: RunConfig, timing: Ti
         )
 
 
-def agent_input(robot: str, log: Path, folder: Path) -> Any:
+def agent_input(robot: str, log: Path, folder: Path) -> AgentInput:
     """What the agent of a robot may know before the first packet: its own log and its own results."""
-    from pipeline.exchange.session import AgentInput
-
     return AgentInput(robot, log, folder / "frontend.mcap", folder / "information.mcap")
 
 
-def _fuse(robot: str, log: Path, folder: Path, result: Any, config: RunConfig, timing: Timing) -> None:
+def fuse_robot(robot: str, log: Path, folder: Path, result: AgentResult, config: RunConfig) -> None:
+    """Fused map and corrected trajectory of one robot, into the folder of its own results."""
     from pipeline.fusion.stage import run_fusion
 
-    with timing.stage("fusion", robot):
-        run_fusion(log, folder / "frontend.mcap", folder / "information.mcap", result, folder, config.fusion)
+    run_fusion(agent_input(robot, log, folder), result, folder, config.fusion, config.exchange.matching)
 
 
 def _evaluate(folder: Path, recording: Path, timing: Timing) -> None:

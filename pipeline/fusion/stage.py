@@ -1,0 +1,117 @@
+"""The fusion stage: what a robot took home from the session becomes its fused map and its corrected trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.consensus.config import MatchingConfig
+from pipeline.consensus.evidence import unpack_symmetric
+from pipeline.errors import DuagError
+from pipeline.exchange.inputs import AgentInput, RobotData, load
+from pipeline.exchange.results import AgentResult
+from pipeline.fusion.config import FusionConfig
+from pipeline.fusion.fuse import FusedMap, fuse
+from pipeline.geometry.trajectory import Trajectory, write_tum
+from pipeline.messages import WORLD_FRAME, CorrectedKeyframes, GaussianInformation, GaussianMap, Odometry
+from pipeline.recording import LogWriter, read_log
+from pipeline.splat.ply import write_ply
+from schemas import topics
+
+FUSED_KIND = "gauss_newton"
+
+
+def run_fusion(
+    source: AgentInput, result: AgentResult, folder: Path, config: FusionConfig, matching: MatchingConfig
+) -> FusedMap:
+    """Write fused.mcap, fused.ply, trajectory.tum and odometry.tum of one robot.
+
+    Args:
+        source: the robot's own files.
+        result: what it took home from the session.
+        folder: where the results go.
+        matching: as the pairs of the session were found.
+    Returns:
+        The fused map, in the world frame.
+    """
+    own = load(source)
+    fused = fuse(
+        own.robot,
+        own.gaussians,
+        own.T_map_keyframe,
+        {own.robot: result.own_evidence, **result.evidence},
+        result.T_world_keyframe_of,
+        result.pairs,
+        _depth_images(own),
+        own.camera,
+        config,
+        matching,
+    )
+    frames = _frames(source)
+    stamp_ns = frames[-1].stamp_ns
+    write_ply(folder / "fused.ply", fused.gaussians)
+    _write_log(folder / "fused.mcap", result, fused, stamp_ns)
+    stamps = np.array([f.stamp_ns for f in frames], dtype=np.int64)
+    before = np.array([f.T_map_camera for f in frames])
+    write_tum(folder / "odometry.tum", Trajectory(stamps, before))
+    hung = np.array([result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera for f in frames])
+    write_tum(folder / "trajectory.tum", Trajectory(stamps, hung))
+    return fused
+
+
+def _depth_images(own: RobotData) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    for keyframe in range(own.keyframes):
+        yield keyframe, own.images(keyframe)[1]
+
+
+def _frames(source: AgentInput) -> list[Odometry]:
+    """Every frame that the front end placed, in order."""
+    topic = topics.ODOMETRY.of(source.robot)
+    frames = [record.message() for record in read_log(source.frontend, (topic,))]
+    placed = [f for f in frames if f.status != "lost"]
+    if not placed:
+        raise DuagError(f"{source.frontend}: {topic} has no tracked frame")
+    return placed
+
+
+def _write_log(path: Path, result: AgentResult, fused: FusedMap, stamp_ns: int) -> None:
+    robot = result.robot
+    keyframes = CorrectedKeyframes(
+        stamp_ns=stamp_ns,
+        robot=robot,
+        component=list(result.component),
+        keyframe_indices=np.arange(len(result.T_world_keyframe), dtype=np.int32),
+        T_world_keyframe=result.T_world_keyframe,
+    )
+    fused_map = GaussianMap(
+        stamp_ns, robot, WORLD_FRAME, fused.gaussians, _information(robot, fused, stamp_ns)
+    )
+    with LogWriter(path, robot) as log:
+        log.write(topics.CORRECTED_KEYFRAMES.of(robot), keyframes, stamp_ns, stamp_ns)
+        log.write(topics.FUSED_MAP.of(robot), fused_map, stamp_ns, stamp_ns)
+
+
+def _information(robot: str, fused: FusedMap, stamp_ns: int) -> GaussianInformation:
+    """The summed information of the fused Gaussians as a message; no cross terms between mean and covariance."""
+    n = len(fused.gaussians)
+    blocks = np.zeros((n, 9, 9))
+    blocks[:, :3, :3] = unpack_symmetric(fused.information[:, :6], 3)
+    blocks[:, 3:, 3:] = unpack_symmetric(fused.information[:, 6:27], 6)
+    rows, columns = np.triu_indices(9)
+    return GaussianInformation(
+        stamp_ns=stamp_ns,
+        robot=robot,
+        kind=FUSED_KIND,
+        window="sum over the robots whose evidence was fused; observations count those robots",
+        ids=fused.gaussians.ids,
+        geometry=blocks[:, rows, columns].astype(np.float32),
+        color=fused.information[:, 27:30].astype(np.float32),
+        opacity=fused.information[:, 30].astype(np.float32),
+        observations=fused.members.astype(np.uint32),
+        color_sigma=0.0,
+        depth_sigma="as each member said",
+        frame_id=WORLD_FRAME,
+    )

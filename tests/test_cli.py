@@ -1,0 +1,81 @@
+"""What a user sees when something is wrong: one line, exit code 1, nothing half-written."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.runner import new_folder
+
+ROOT = Path(__file__).parents[1]
+
+
+def duagc(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", "from pipeline.cli import main; main()", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120, check=False)
+
+
+def assert_one_line(result: subprocess.CompletedProcess[str], *words: str) -> None:
+    assert result.returncode == 1, result.stderr
+    lines = [line for line in result.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("duagc: ")
+    for word in words:
+        assert word in lines[0]
+
+
+def test_help_is_there_for_every_command() -> None:
+    names = "demo simulate run replay digest info evaluate report view convert config bench".split()
+    text = duagc("--help").stdout
+    assert all(name in text for name in names)
+    assert "Example" in duagc("run", "--help").stdout
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("run", "{tmp}/absent", "--out", "{tmp}/out"),
+        ("run", "{tmp}/empty", "--out", "{tmp}/out"),
+        ("convert", "7scenes", "{tmp}/absent", "--out", "{tmp}/out"),
+        ("convert", "7scenes", "{tmp}/empty", "--out", "{tmp}/out"),
+        ("convert", "9scenes", "{tmp}/empty", "--out", "{tmp}/out"),
+        ("info", "{tmp}/absent"),
+        ("digest", "{tmp}/empty"),
+        ("replay", "{tmp}/empty"),
+        ("evaluate", "{tmp}/empty"),
+        ("report", "{tmp}/absent"),
+        ("simulate", "--scene", "moon", "--out", "{tmp}/out"),
+        ("config", "check", "{tmp}/absent.toml"),
+        ("config", "show", "--set", "frontend.no_such_thing=1"),
+    ],
+    ids=" ".join,
+)
+def test_bad_input_is_one_line(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+    (tmp_path / "empty").mkdir()
+    assert_one_line(duagc(*(a.format(tmp=tmp_path) for a in arguments)))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["empty"]
+
+
+def test_an_existing_output_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "keep").write_text("mine")
+    assert_one_line(duagc("demo", "--out", tmp_path / "out"), "exists already")
+    assert (tmp_path / "out" / "keep").read_text() == "mine"
+
+
+def test_usage_errors_exit_with_2() -> None:
+    assert duagc("run").returncode == 2
+    assert duagc("convert", "7scenes").returncode == 2
+
+
+def test_a_folder_appears_only_when_it_is_finished(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(RuntimeError), new_folder(out, force=False) as folder:
+        (folder / "half").write_text("")
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+    with new_folder(out, force=False) as folder:
+        (folder / "whole").write_text("")
+        assert not out.exists()
+    assert [p.name for p in out.iterdir()] == ["whole"]

@@ -1,0 +1,96 @@
+"""The whole job on a tiny team: determinism, firewall, replay, and the effect of what crosses the network."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from converters.simulate import simulate
+from pipeline.config import load
+from pipeline.digest import digest, digest_file, result_files
+from pipeline.replay import replay, robots_of
+from pipeline.runner import RunConfig, run
+
+SMALL = (
+    "frontend.mapping.max_gaussians=3000",
+    "exchange.max_rounds=400",
+)
+
+
+def quiet(line: str) -> None:
+    """Say nothing."""
+
+
+def make_run(recording: Path, out: Path, *overrides: str, workers: int = 2) -> Path:
+    run(recording, out, load(RunConfig, overrides=[*SMALL, *overrides]), workers=workers, say=quiet)
+    return out
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("pipeline")
+
+
+@pytest.fixture(scope="module")
+def recording(folder: Path) -> Path:
+    out = folder / "recording"
+    simulate(out, robots=2, frames=24, size=(192, 144), seed=1, workers=2)
+    return out
+
+
+@pytest.fixture(scope="module")
+def finished(folder: Path, recording: Path) -> Path:
+    return make_run(recording, folder / "run")
+
+
+def robots_digests(run_folder: Path) -> dict[str, str]:
+    return {
+        p.as_posix(): digest_file(run_folder / p) for p in result_files(run_folder) if p.parts[0] == "robots"
+    }
+
+
+def test_the_team_meets_and_everything_is_written(finished: Path) -> None:
+    metrics = json.loads((finished / "metrics.json").read_text())
+    assert metrics["team"]["robots_in_largest_component"] == 2
+    assert metrics["exchange"]["matched_pairs"] > 0
+    assert metrics["exchange"]["bytes_delivered"] > 0
+    assert metrics["team"]["ate_rmse_m"] < 0.01
+    for name in (
+        "report/index.html",
+        "run.rrd",
+        "manifest.json",
+        "timing.json",
+        "config.toml",
+        "metrics.parquet",
+    ):
+        assert (finished / name).stat().st_size > 0
+
+
+def test_neither_workers_nor_ground_truth_change_a_bit(folder: Path, recording: Path, finished: Path) -> None:
+    blind = folder / "blind"
+    shutil.copytree(recording, blind, ignore=shutil.ignore_patterns("*groundtruth*"))
+    other = make_run(blind, folder / "run_blind", workers=1)
+    assert digest(other) == digest(finished)
+    metrics = json.loads((other / "metrics.json").read_text())
+    assert metrics["team"]["ate_rmse_m"] is None
+    assert "team.ate_rmse_m" in metrics["reasons"]
+
+
+def test_each_robot_replays_bit_for_bit(recording: Path, finished: Path) -> None:
+    comparisons = replay(finished, recording, robots_of(finished), quiet)
+    assert {c.robot for c in comparisons} == {"alpha", "bravo"}
+    assert [c.name for c in comparisons if not c.equal] == []
+
+
+def test_nothing_delivered_is_nothing_said(folder: Path, recording: Path, finished: Path) -> None:
+    silent = make_run(recording, folder / "run_silent", "exchange.link.enabled=false")
+    deaf = make_run(recording, folder / "run_deaf", "exchange.link.loss_probability=1.0")
+    assert robots_digests(silent) == robots_digests(deaf)
+    changed = robots_digests(finished)
+    own = robots_digests(silent)
+    for robot in ("alpha", "bravo"):
+        assert changed[f"robots/{robot}/frontend.mcap"] == own[f"robots/{robot}/frontend.mcap"]
+        assert changed[f"robots/{robot}/odometry.tum"] == own[f"robots/{robot}/odometry.tum"]
+        assert changed[f"robots/{robot}/fused.ply"] != own[f"robots/{robot}/fused.ply"]
+    assert changed["robots/bravo/trajectory.tum"] != own["robots/bravo/trajectory.tum"]
