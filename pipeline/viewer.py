@@ -45,7 +45,7 @@ TIME, ROUND = (
 )  # timelines of a run: time of the recording, then of the session; rounds of the session
 LOG_TIME = "message_log_time"  # timeline that Rerun gives to a log
 VIEWER_MEMORY = "4GiB"
-MIN_OPACITY = 1.0 / 255.0
+LARGEST_LOG_SCALE = float(np.log(1e3))  # a kilometre: beyond it numbers overflow and the picture is the same
 
 
 def view(path: Path, save: Path | None = None, screenshot: Path | None = None) -> None:
@@ -190,7 +190,7 @@ def _splats(gaussians: Gaussians, colors: NDArray[np.float32]) -> Any:
     quats = gaussians.quats_wxyz / np.linalg.norm(gaussians.quats_wxyz, axis=1, keepdims=True)
     return rr.GaussianSplats3D(
         gaussians.means,
-        scales=np.exp(gaussians.log_scales),
+        scales=np.exp(np.minimum(gaussians.log_scales, LARGEST_LOG_SCALE)),
         quaternions=quats[:, [1, 2, 3, 0]],
         colors=np.rint(rgba * 255.0).astype(np.uint8),
     )
