@@ -74,7 +74,16 @@ def _figure(width_in: float, height_in: float) -> tuple[Figure, Any]:
 
 def _legend_above(axes: Any, entries: int) -> None:
     """A legend in one or two lines above the axes, at their left end."""
-    axes.legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=min(4, entries), borderaxespad=0.2)
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(-0.01, 1.0),
+        ncols=min(4, entries),
+        borderaxespad=0.2,
+        fontsize=9,
+        columnspacing=1.2,
+        handlelength=1.6,
+        handletextpad=0.5,
+    )
 
 
 @_styled
@@ -125,7 +134,10 @@ def lines(
         series: name -> (x, y). log: logarithmic y axis; values that are not positive are left out.
         level: a horizontal line to compare with, for example a tolerance.
     """
+    from matplotlib.ticker import MaxNLocator
+
     figure, axes = _figure(5.4, 3.2)
+    axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     for i, (name, (x, y)) in enumerate(series.items()):
         x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
         keep = np.isfinite(y) & ((y > 0) | (not log))
@@ -152,7 +164,10 @@ def lines(
 @_styled
 def stacked(x: Array, parts: Mapping[str, Array], x_label: str, y_label: str) -> Figure:
     """Stacked areas: how a total divides into parts over a common axis."""
+    from matplotlib.ticker import MaxNLocator
+
     figure, axes = _figure(5.4, 3.2)
+    axes.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     if len(x):
         axes.stackplot(
             x,

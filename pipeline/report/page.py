@@ -337,7 +337,7 @@ def _scale(palette: str, low: str, high: str, what: str) -> dict[str, str]:
 
 def _agreement_content(session: Session, metrics: dict[str, Any], reasons: dict[str, str]) -> dict[str, Any]:
     series = session.series_by_round()
-    tolerance = session.run.config.get("exchange", {}).get("tolerance")
+    tolerance = session.run.config.get("exchange", {}).get("consensus", {}).get("tolerance")
     charts = [
         {
             "title": title,

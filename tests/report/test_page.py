@@ -124,3 +124,18 @@ def test_undetermined_gaussians_are_grey():
     assert colors[2].tolist() == [0.75] * 3
     assert 0.001 < low < high < 0.01
     assert sigma_colors(np.array([np.inf]))[0].tolist() == [[0.75] * 3]
+
+
+def test_the_charts_name_what_they_show(html):
+    import base64
+
+    charts = [base64.b64decode(c).decode() for c in re.findall(r"data:image/svg\+xml;base64,([^\"]+)", html)]
+    for expected in (
+        "ground truth",
+        "tolerance 1e-05",
+        "alpha to bravo",
+        "set-up",
+        "right prediction",
+        "frontend, alpha",
+    ):
+        assert any(expected in chart for chart in charts), expected
