@@ -172,7 +172,7 @@ class LowerEnd(Meeting):
         """Score all pairs of keyframes and ask for the samples of the best."""
         self.book = book
         c = self.config.places
-        kept, left = places.candidates(
+        choice = places.candidates(
             self.places.features,
             book.descriptors,
             c.ratio,
@@ -180,9 +180,12 @@ class LowerEnd(Meeting):
             c.candidates_per_keyframe,
             c.max_requested_keyframes,
         )
-        for candidate in left:
-            self.tried.append(Tried(candidate, Verified(Verdict.NOT_ASKED_FOR, candidate.score, 0)))
-        for candidate in kept:
+        for candidate in choice.left:
+            self.tried.append(Tried(candidate, Verified(Verdict.NOT_ASKED_FOR, 0, 0)))
+        for candidate in choice.unlike:
+            detail = f"{candidate.score} descriptors match at best, {c.min_score} needed"
+            self.tried.append(Tried(candidate, Verified(Verdict.UNLIKE, 0, 0, detail)))
+        for candidate in choice.kept:
             self.waiting.setdefault(candidate.peer_keyframe, []).append(candidate)
         if self.waiting:
             send(Kind.REQUEST, wire.write_indices(sorted(self.waiting)))
@@ -241,7 +244,7 @@ class LowerEnd(Meeting):
             shared = trial.add_link(self.peer, closures, keep=agreement.keep)
             self.joined = Joined(T, tuple(closures), agreement.keep, shared)
         self.verdicts = Verdicts(
-            candidates=len(self.tried),
+            candidates=sum(t.result.verdict is not Verdict.UNLIKE for t in self.tried),
             verified=len(closures),
             consistent=int(agreement.keep.sum()),
             joined=T is not None,

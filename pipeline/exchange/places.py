@@ -107,6 +107,18 @@ class Candidate:
     score: int
 
 
+@dataclass(frozen=True)
+class Choice:
+    """kept: pairs to verify, best first. left: pairs with enough matches that the budget leaves out, best first.
+
+    unlike: for every keyframe of the neighbour that resembles no own one enough, the pair that comes nearest.
+    """
+
+    kept: list[Candidate]
+    left: list[Candidate]
+    unlike: list[Candidate]
+
+
 def candidates(
     own: list[Features],
     peer: list[Descriptors],
@@ -114,22 +126,21 @@ def candidates(
     min_score: int,
     per_keyframe: int,
     max_keyframes: int,
-) -> tuple[list[Candidate], list[Candidate]]:
+) -> Choice:
     """Pairs of keyframes worth verifying.
 
     Args:
         own: all features of each own keyframe. peer: the compact descriptors of each keyframe of the neighbour.
         min_score: matches from which a pair counts. per_keyframe: pairs kept per keyframe of the neighbour.
         max_keyframes: keyframes of the neighbour that may be asked for, best scores first.
-    Returns:
-        The pairs to verify, best first, and those with enough matches that were left out.
     """
     scored: list[Candidate] = []
+    unlike: list[Candidate] = []
     for j, theirs in enumerate(peer):
-        for i, ours in enumerate(own):
-            score = len(matches(ours.descriptors, theirs, ratio))
-            if score >= min_score:
-                scored.append(Candidate(i, j, score))
+        scores = [Candidate(i, j, len(matches(o.descriptors, theirs, ratio))) for i, o in enumerate(own)]
+        scored += [c for c in scores if c.score >= min_score]
+        if scores and max(c.score for c in scores) < min_score:
+            unlike.append(max(scores, key=lambda c: (c.score, -c.own_keyframe)))
     scored.sort(key=lambda c: (-c.score, c.peer_keyframe, c.own_keyframe))
     taken: dict[int, int] = {}
     kept, left = [], []
@@ -140,4 +151,4 @@ def candidates(
             kept.append(c)
         else:
             left.append(c)
-    return kept, left
+    return Choice(kept, left, unlike)

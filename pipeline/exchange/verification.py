@@ -22,6 +22,7 @@ class Verdict(Enum):
     """What became of a candidate."""
 
     KEPT = "kept"
+    UNLIKE = "the neighbour's keyframe resembles no own one"
     NOT_ASKED_FOR = "enough matches, but better pairs used up the budget"
     FEW_MATCHES = "too few matches between all features of the two keyframes"
     FEW_INLIERS = "too few matches agree on one motion"

@@ -81,12 +81,17 @@ def test_different_places_are_refused(robots: dict, make_robot: Any) -> None:
 def test_candidates_keep_to_the_budget_and_say_what_was_left(robots: dict) -> None:
     (alpha, _), (bravo, _) = robots["alpha"], robots["bravo"]
     peer = [f.descriptors[:80] for f in bravo.features]
-    kept, left = places.candidates(alpha.features, peer, 0.8, 8, per_keyframe=1, max_keyframes=2)
-    everything, nothing = places.candidates(alpha.features, peer, 0.8, 8, per_keyframe=9, max_keyframes=9)
-    assert len(kept) <= 2
-    assert nothing == []
-    assert sorted(kept + left, key=lambda c: (-c.score, c.peer_keyframe, c.own_keyframe)) == everything
-    assert kept[0] == everything[0]
+    few = places.candidates(alpha.features, peer, 0.8, 8, per_keyframe=1, max_keyframes=2)
+    every = places.candidates(alpha.features, peer, 0.8, 8, per_keyframe=9, max_keyframes=9)
+    assert 0 < len(few.kept) <= 2
+    assert every.left == []
+    assert (
+        sorted(few.kept + few.left, key=lambda c: (-c.score, c.peer_keyframe, c.own_keyframe)) == every.kept
+    )
+    assert few.kept[0] == every.kept[0]
+    none = places.candidates(alpha.features, peer, 0.8, 1000, per_keyframe=9, max_keyframes=9)
+    assert none.kept == []
+    assert [c.peer_keyframe for c in none.unlike] == [0, 1, 2]  # a word about each
 
 
 def test_information_of_the_inverse_motion() -> None:

@@ -193,6 +193,27 @@ def test_robots_that_saw_different_places_stay_apart(make_robot: Any, tmp_path: 
         assert results[d.robot].component == (d.robot,)
         assert results[d.robot].converged
         assert np.array_equal(results[d.robot].T_world_keyframe, d.T_map_keyframe)
+    assert len(results["alpha"].closures) >= 2  # why not, for every keyframe of bravo
+    assert all(c.verdict != "kept" for c in results["alpha"].closures)
+
+
+def test_a_robot_without_a_map_keeps_nobody_waiting(team: Any, tmp_path: Path) -> None:
+    empty = dataclasses.replace(
+        team["bravo"][0],
+        T_map_keyframe=np.zeros((0, 4, 4)),
+        odometry=[],
+        gaussians=team["bravo"][0].gaussians.select(slice(0, 0)),
+    )
+    results = run_session_of(
+        [team["alpha"][0], empty],
+        ExchangeConfig(),
+        seed=0,
+        exchange_path=tmp_path / "exchange.mcap",
+        consensus_path=tmp_path / "consensus.mcap",
+    )
+    assert results["bravo"].component == ("bravo",)
+    assert results["bravo"].converged
+    assert results["bravo"].rounds < 20
 
 
 def test_an_end_by_rounds_leaves_the_own_map_usable(team: Any, tmp_path: Path) -> None:
