@@ -62,7 +62,7 @@ class RobotData:
 
 
 def load(source: AgentInput) -> RobotData:
-    """Read one robot's files.
+    """One robot's files in memory; its sensor log is opened again for every image that is asked for.
 
     Raises:
         DuagError: a file lacks what it should hold, or two files do not belong together.
@@ -92,17 +92,20 @@ def load(source: AgentInput) -> RobotData:
         raise DuagError(
             f"{source.information}: is about other Gaussians than {source.frontend}, expected the same ids"
         )
-    log = open_rgbd(source.log)
-    frames = [k.frame_index for k in keyframes]
-
-    def images(keyframe: int) -> Images:
-        frame = log.frame(frames[keyframe])
-        return frame.color, frame.depth
-
     steps = [
         Step(k.previous_index, k.keyframe_index, k.T_previous_keyframe, k.information)
         for k in keyframes
         if k.previous_index >= 0
     ]
     poses = np.array([k.T_map_camera for k in keyframes], dtype=np.float64).reshape(-1, 4, 4)
-    return RobotData(robot, log.camera, poses, steps, images, gaussian_map.gaussians, information)
+    with open_rgbd(source.log) as log:
+        camera = log.camera
+        if log.robot != robot:
+            raise DuagError(f"{source.log}: is the log of {log.robot}, expected that of {robot}")
+
+    def images(keyframe: int) -> Images:
+        with open_rgbd(source.log) as log:
+            frame = log.frame(keyframes[keyframe].frame_index)
+        return frame.color, frame.depth
+
+    return RobotData(robot, camera, poses, steps, images, gaussian_map.gaussians, information)
