@@ -6,7 +6,8 @@ The distance of two Gaussians in the flat chart is, with Delta the difference of
 
 with colours as degree-0 spherical-harmonic coefficients and l = delta, the search radius: (6) adds square metres to
 squares without a unit, which would make the position count for nothing within 5 cm (l = 1 m gives (6) as printed).
-A direction in which a Gaussian is as thin as the mapper lets it be says nothing and is left out.
+How thin a Gaussian is says nothing where it is as thin as the mapper lets it be: against one that is thicker, that
+component of log Sigma, e e' with e the axis, is left out; two at the floor are equally thin. Tilts stay in.
 """
 
 from __future__ import annotations
@@ -29,34 +30,51 @@ Index = NDArray[np.int64]
 Pairs = Mapping[tuple[str, str], Index]
 SH_C0 = 0.28209479177387814  # colour = 0.5 + SH_C0 * coefficient
 _CHUNK = 200_000  # pairs per pass, for memory
-FLOOR_SLACK = 1e-3  # of a log-scale: float32 and rotations
+_FLOOR_SLACK = 1e-3  # of a log-scale: float32 and rotations
+
+
+def held_thickness(vec_log_covariance: Array, floor_m: float) -> Array:
+    """Unit vectors v = vec(e e') [n, 3, 6] of the axes at the thickness floor; zero for the others."""
+    values, vectors = np.linalg.eigh(spd.vec_to_sym(vec_log_covariance))
+    held = 0.5 * values <= np.log(floor_m) + _FLOOR_SLACK
+    axes = vectors.swapaxes(-1, -2)  # [n, axis, 3]
+    return spd.sym_to_vec(axes[..., :, None] * axes[..., None, :]) * held[..., None]
+
+
+def _without(delta: Array, v: Array) -> Array:
+    """delta [m, 6] without its components along the unit vectors v [m, 3, 6]."""
+    along = np.sum(v * delta[:, None, :], axis=-1)
+    return delta - np.sum(v * along[..., None], axis=1)
 
 
 @dataclass(frozen=True)
 class _Chart:
-    """theta with the projections [n, 3, 3] onto the directions in which a Gaussian is not at the thickness floor."""
+    """theta [n, 13] with thicknesses no less than the floor, and the held components of log Sigma [n, 3, 6]."""
 
     theta: Array
-    free: Array
+    held: Array
 
     @staticmethod
     def of(theta: Array, config: MatchingConfig) -> _Chart:
         values, vectors = np.linalg.eigh(spd.vec_to_sym(theta[:, LOG_COVARIANCE]))
-        above = 0.5 * values > np.log(config.thickness_floor_m) + FLOOR_SLACK
-        return _Chart(theta, (vectors * above[:, None, :]) @ vectors.swapaxes(-1, -2))
+        values = np.maximum(values, 2 * np.log(config.thickness_floor_m))
+        clamped = theta.copy()
+        clamped[:, LOG_COVARIANCE] = spd.sym_to_vec((vectors * values[:, None, :]) @ vectors.swapaxes(-1, -2))
+        return _Chart(clamped, held_thickness(theta[:, LOG_COVARIANCE], config.thickness_floor_m))
 
 
 def _distances(a: _Chart, i: Index, b: _Chart, j: Index, config: MatchingConfig) -> Array:
     """d_G [m] of Gaussians i of a and j of b."""
     out = np.empty(len(i))
+    thick_a, thick_b = (~np.any(x.held != 0, axis=(1, 2)) for x in (a, b))
     for start in range(0, len(i), _CHUNK):
         part = slice(start, start + _CHUNK)
         delta = a.theta[i[part]] - b.theta[j[part]]
-        P = a.free[i[part]] @ b.free[j[part]]
-        shape = P.swapaxes(-1, -2) @ spd.vec_to_sym(delta[:, LOG_COVARIANCE]) @ P
+        shape = _without(delta[:, LOG_COVARIANCE], a.held[i[part]] * thick_b[j[part], None, None])
+        shape = _without(shape, b.held[j[part]] * thick_a[i[part], None, None])
         out[part] = np.sqrt(
             np.sum(delta[:, MEAN] ** 2, axis=1) / config.position_scale_m**2
-            + config.beta_log_covariance * np.sum(shape**2, axis=(1, 2))
+            + config.beta_log_covariance * np.sum(shape**2, axis=1)
             + config.beta_color * np.sum((delta[:, COLOR] / SH_C0) ** 2, axis=1)
             + config.beta_opacity * delta[:, OPACITY] ** 2
         )

@@ -19,6 +19,8 @@ class FusionConfig(Config):
     """Standard deviation added to every position, in all directions. Fisher information knows the noise of pixels but
     not the bias of a map: two discs a few millimetres apart, slightly tilted and each sure to a tenth of a millimetre,
     would meet centimetres away, where their planes cross. 0 is the method as printed."""
+    shape_floor: float = Field(default=0.1, ge=0.0)
+    """The same for every coordinate of vec log Sigma; 0.1 is 5 % of a scale."""
     unobserved_below: float = Field(default=1e-6, gt=0.0)
     """Directions with less than this share of a block's largest information count as unobserved: float32 noise."""
     explained_m: float = Field(default=0.05, ge=0.0)

@@ -6,9 +6,9 @@ In the flat chart theta = (mean, vec log Sigma, colour, opacity logit) the fused
 
 which is the paper's (12) and, as the chart is flat, its log-Euclidean mean (13). Sigma_assoc is the variance of where
 on the surface a robot happened to put its splat, spacing^2 / 12 along the surface and zero across it, plus a small
-isotropic floor for what Fisher information does not know (`FusionConfig.position_floor_m`); it belongs to the mean
-only. A thickness that the mapper holds at its floor is held here too. Every robot's evidence counts once, however
-often it arrived and through whom. Where no member of a track knows anything, the own value stays.
+isotropic floor for what Fisher information does not know; it belongs to the mean, the covariance has a floor of its
+own. A thickness that the mapper holds at its floor is held here too. Every robot's evidence counts once, however often
+it arrived and through whom. Where no member of a track knows anything, the own value stays.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from pipeline.consensus.evidence import (
     unpack_symmetric,
 )
 from pipeline.consensus.factors import inflated
-from pipeline.consensus.matching import FLOOR_SLACK, Pairs, tracks
+from pipeline.consensus.matching import Pairs, held_thickness, tracks
 from pipeline.fusion.config import FusionConfig
 from pipeline.geometry import se3, spd
 from pipeline.geometry.camera import PinholeCamera
@@ -106,6 +106,10 @@ def weighted_move(
 ) -> Array:
     """(sum W)^+ sum W (value - reference) per group: how far the fused value lies from each group's reference.
 
+    A matrix-weighted mean may lie far outside its members if they are sure of different directions and contradict
+    each other there: two planes that are nearly parallel cross far away. Where it lies farther from the members'
+    centre than every member, the mean with the traces of the weights, which cannot, takes its place.
+
     Args:
         weights: [r, d, d], positive semidefinite; rows of a group follow each other.
         values: [r, d], differences from the group's reference.
@@ -122,8 +126,19 @@ def weighted_move(
     eigenvalues, vectors = np.linalg.eigh(total)
     known = eigenvalues > unobserved_below * np.maximum(eigenvalues[:, -1:], 1e-300)
     inverse = np.where(known, 1.0 / np.where(known, eigenvalues, 1.0), 0.0)
-    along = (vectors.swapaxes(-1, -2) @ pull[..., None])[..., 0] * inverse
-    return np.asarray((vectors @ along[..., None])[..., 0], dtype=np.float64)
+    along = (vectors.swapaxes(-1, -2) @ pull[..., None])[..., 0]
+    move = (vectors @ (along * inverse)[..., None])[..., 0]
+
+    trace = np.maximum(np.trace(weights, axis1=-2, axis2=-1), 0.0)
+    informed = trace > 0  # a member without information does not stake out where the others may go
+    count = np.maximum(np.add.reduceat(informed.astype(np.float64), first), 1.0)
+    size = np.diff(np.append(first, len(values)))
+    centre = np.add.reduceat(values * informed[:, None], first, axis=0) / count[:, None]
+    reach = np.linalg.norm(values - np.repeat(centre, size, axis=0), axis=1) * informed
+    far = np.linalg.norm(move - centre, axis=1) > np.maximum.reduceat(reach, first) * (1 + 1e-9)
+    by_trace = _weighted_move_diagonal(trace[:, None], values, first)
+    within = (vectors @ ((vectors.swapaxes(-1, -2) @ by_trace[..., None])[..., 0] * known)[..., None])[..., 0]
+    return np.asarray(np.where(far[:, None], within, move), dtype=np.float64)
 
 
 def _weighted_move_diagonal(weights: Array, values: Array, first: Index) -> Array:
@@ -131,18 +146,6 @@ def _weighted_move_diagonal(weights: Array, values: Array, first: Index) -> Arra
     total = np.add.reduceat(weights, first, axis=0)
     pull = np.add.reduceat(weights * values, first, axis=0)
     return np.where(total > 0, pull / np.where(total > 0, total, 1.0), 0.0)
-
-
-def _without_thickness(vec_log_covariance: Array, floor_m: float) -> Array:
-    """Projection [n, 6, 6] of the chart of covariances onto what is not held at the thickness floor.
-
-    Without it the thickness of one disc would be inferred, badly, from others that are tilted against it a little.
-    """
-    values, vectors = np.linalg.eigh(spd.vec_to_sym(vec_log_covariance))
-    held = 0.5 * values <= np.log(floor_m) + FLOOR_SLACK
-    axes = vectors.swapaxes(-1, -2)  # [n, axis, 3]
-    v = spd.sym_to_vec(axes[..., :, None] * axes[..., None, :]) * held[..., None]
-    return np.asarray(np.eye(6) - v.swapaxes(-1, -2) @ v, dtype=np.float64)
 
 
 def _moves(
@@ -153,13 +156,18 @@ def _moves(
     delta = rows.theta - np.repeat(rows.theta[reference], size, axis=0)
     spread = association_covariance(rows.theta[:, LOG_COVARIANCE], config.spacing_per_sigma)
     spread += config.position_floor_m**2 * np.eye(3)
-    free = _without_thickness(rows.theta[reference, LOG_COVARIANCE], thickness_floor_m)
+    held = held_thickness(rows.theta[reference, LOG_COVARIANCE], thickness_floor_m)
+    free = np.eye(6) - held.swapaxes(-1, -2) @ held
     move = np.zeros((len(first), 13))
     move[:, MEAN] = weighted_move(
         inflated(rows.position, spread), delta[:, MEAN], first, config.unobserved_below
     )
     move[:, LOG_COVARIANCE] = weighted_move(
-        rows.shape, delta[:, LOG_COVARIANCE], first, config.unobserved_below, free
+        inflated(rows.shape, config.shape_floor**2 * np.eye(6)),
+        delta[:, LOG_COVARIANCE],
+        first,
+        config.unobserved_below,
+        free,
     )
     move[:, COLOR] = _weighted_move_diagonal(rows.color, delta[:, COLOR], first)
     move[:, OPACITY] = _weighted_move_diagonal(rows.opacity[:, None], delta[:, OPACITY, None], first)[:, 0]

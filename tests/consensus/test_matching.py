@@ -143,3 +143,15 @@ def test_pairs_of_gaussians_that_never_arrived_are_left_out():
     pairs = {("alpha", "bravo"): np.array([[0, 3], [1, 4]]), ("bravo", "zulu"): np.array([[3, 3]])}
     assert groups(evidence, pairs) == [{("alpha", 0), ("bravo", 3)}]
     assert groups(evidence, {}) == []
+
+
+def test_a_tilt_counts_even_between_discs_at_the_floor():
+    """Two walls that meet at an edge are not one surface."""
+    scales = np.log([0.02, 0.02, CONFIG.thickness_floor_m])
+    quats = so3.quat_from_rotvec(np.array([[0, 0, 0], [0, 0.1, 0], [0, np.pi / 2, 0]]))
+    theta = np.zeros((3, 13))
+    theta[:, LOG_COVARIANCE] = spd.log_covariance(quats, scales)
+    e = Evidence("alpha", np.arange(3), np.zeros(3), theta, np.zeros((3, 31)))
+    little, corner = gaussian_distance(e, np.array([0, 0]), e, np.array([1, 2]), CONFIG)
+    assert little < 0.3
+    assert corner > 1.0

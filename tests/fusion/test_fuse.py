@@ -88,27 +88,37 @@ def assert_same_map(a, b, atol=0.0):
 
 
 def test_fused_means_minimise_the_sum_of_all_members():
-    """Against the normal equations written out, one place at a time."""
+    """Against the normal equations written out, one place at a time, where these stay among their members."""
     world = World(0)
     fused = world.fuse("alpha")
     there = {n: world.evidence[n].in_world(world.T_world[n]) for n in world.names}
+    shapes = spd.log_covariance(fused.gaussians.quats_wxyz, fused.gaussians.log_scales)
+    compared = 0
     for k in range(N):
-        H, g = np.zeros((3, 3)), np.zeros(3)
-        S, h = np.zeros((6, 6)), np.zeros(6)
+        means, weights, forms, form_weights = [], [], [], []
         for e in there.values():
             spread = association_covariance(e.theta[k : k + 1, LOG_COVARIANCE], CONFIG.spacing_per_sigma)[0]
             spread = spread + CONFIG.position_floor_m**2 * np.eye(3)
-            W = np.linalg.inv(np.linalg.inv(e.position_information()[k]) + spread)
-            H, g = H + W, g + W @ e.theta[k, MEAN]
-            W = e.shape_information()[k]
-            S, h = S + W, h + W @ e.theta[k, LOG_COVARIANCE]
+            means.append(e.theta[k, MEAN])
+            weights.append(np.linalg.inv(np.linalg.inv(e.position_information()[k]) + spread))
+            forms.append(e.theta[k, LOG_COVARIANCE])
+            form_weights.append(
+                np.linalg.inv(np.linalg.inv(e.shape_information()[k]) + CONFIG.shape_floor**2 * np.eye(6))
+            )
         # float32 maps: 6e-8 of a few metres, and of log-scales of about five
-        np.testing.assert_allclose(fused.gaussians.means[k], np.linalg.solve(H, g), atol=2e-6)
-        shape = spd.log_covariance(fused.gaussians.quats_wxyz[k], fused.gaussians.log_scales[k])
-        np.testing.assert_allclose(shape, np.linalg.solve(S, h), atol=5e-5)
+        for actual, values, W, atol in (
+            (fused.gaussians.means[k], means, weights, 2e-6),
+            (shapes[k], forms, form_weights, 5e-5),
+        ):
+            expected = np.linalg.solve(sum(W), sum(w @ v for w, v in zip(W, values, strict=True)))
+            centre = np.mean(values, axis=0)
+            if np.linalg.norm(expected - centre) < 0.99 * np.linalg.norm(values - centre, axis=1).max():
+                np.testing.assert_allclose(actual, expected, atol=atol)
+                compared += 1
         color = [e.color_information()[k] for e in there.values()]
         mean = sum(w * e.theta[k, 9:12] for w, e in zip(color, there.values(), strict=True)) / sum(color)
         np.testing.assert_allclose(fused.gaussians.colors[k], mean, atol=1e-6)
+    assert compared > N
     assert (fused.matched, fused.added) == (N, 0)
     assert np.all(fused.members == 3)
 
@@ -258,8 +268,27 @@ def test_tilted_discs_do_not_slide_to_where_their_planes_cross():
     maps, evidence = tilted_discs(0.05, 0.004, 1.0)
     fused = fuse_discs(maps, evidence)
     assert np.linalg.norm(fused.gaussians.means[0]) < 0.002  # between the two
-    printed = fuse_discs(maps, evidence, CONFIG.model_copy(update={"position_floor_m": 0.0}))
-    assert np.linalg.norm(printed.gaussians.means[0]) > 0.05  # what the floor is for
+    sure = fuse_discs(maps, evidence, CONFIG.model_copy(update={"position_floor_m": 0.0}))
+    assert np.linalg.norm(sure.gaussians.means[0]) < 0.002
+    e = evidence["alpha"], evidence["bravo"]
+    W = [x.position_information()[0] for x in e]
+    crossing = np.linalg.solve(sum(W), sum(w @ x.theta[0, MEAN] for w, x in zip(W, e, strict=True)))
+    assert np.linalg.norm(crossing) > 0.05  # where they would meet otherwise
+
+
+def test_a_fused_value_never_leaves_its_members():
+    """Farther from their centre than all of them; hostile weights: rank one, contradicting each other."""
+    rng = np.random.default_rng(16)
+    for d in (3, 6):
+        axes, values = rng.normal(size=(4000, d, 1)), rng.normal(size=(4000, d))
+        weights = 1e6 * axes @ axes.swapaxes(-1, -2) + 1e-3 * np.eye(d)
+        first = np.arange(0, 4000, 4)
+        values[first] = 0.0
+        move = weighted_move(weights, values, first, CONFIG.unobserved_below)
+        groups = values.reshape(-1, 4, d)
+        centre = groups.mean(axis=1)
+        reach = np.linalg.norm(groups - centre[:, None], axis=-1).max(axis=1)
+        assert np.all(np.linalg.norm(move - centre, axis=1) <= reach * (1 + 1e-6))
 
 
 def test_a_thickness_at_the_floor_stays_there():
