@@ -6,6 +6,7 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline import numeric
 from pipeline.exchange import links
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.config import ExchangeConfig
@@ -46,6 +47,7 @@ def replay_agent_of(
     data: RobotData, config: ExchangeConfig, *, seed: int, exchange_path: Path
 ) -> tuple[AgentResult, SentPackets]:
     """`replay_agent` on data in memory."""
+    numeric.settle_opencv()
     session = read_session(exchange_path)
     waiting: list[Delivery] = []
     recorded, recomputed = hashlib.sha256(), hashlib.sha256()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from pipeline import numeric
 from pipeline.errors import DuagError
 from pipeline.exchange import links
 from pipeline.exchange.agent import Agent
@@ -54,6 +55,7 @@ def run_session_of(
     consensus_path: Path,
 ) -> dict[str, AgentResult]:
     """`run_session` on data in memory, one entry per robot."""
+    numeric.settle_opencv()
     agents = team_of(data, config, seed)
     model = LinkModel(config.link, seed)
     waiting: dict[str, list[Delivery]] = {robot: [] for robot in agents}

@@ -310,7 +310,7 @@ def read_poses(data: bytes, shared: NDArray[np.int32]) -> PosePacket:
     ):
         raise MalformedError("poses: not rigid motions")
     curvature = np.array(numbers[2:], dtype=np.float32) if flags & _CURVATURE else None
-    if curvature is not None and curvature.min() <= 0:
+    if curvature is not None and curvature.min() < 1e-12:
         raise MalformedError("poses: the curvature must be positive")
     return PosePacket(
         sequence,
