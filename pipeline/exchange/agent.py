@@ -110,8 +110,9 @@ class Agent:
         self.members = 1 << self.own
         self.frames_hops = self.still_hops = 0
         self.poses: PoseAgent | None = None
-        self.agreed = self.done = False
+        self.agreed = self.done = self.converged = False
         self.rounds_to_agreement: int | None = None
+        self._body: NDArray[Any] | None = None
         self._records: NDArray[Any] | None = None
         self._frame_told: dict[int, tuple[int, int]] = {}
         self._voxels_told: set[int] = set()
@@ -385,34 +386,45 @@ class Agent:
             if payload is not None:
                 n.evidence_sent[owner] = self._send([n], self.evidence_kind, payload)
 
-    def _own_records(self) -> NDArray[Any]:
+    def _own_body(self) -> NDArray[Any]:
         """Own evidence as it is sent, best first."""
+        if self._body is None:
+            records = own_records(self.data)
+            self._body = wire.to_body(self.evidence_kind, records[best_first(records)])
+        return self._body
+
+    def _own_records(self) -> NDArray[Any]:
+        """Own evidence as the others read it, best first."""
         if self._records is None:
-            records = wire.as_sent(self.evidence_kind, own_records(self.data))
-            self._records = records[best_first(records)]
+            self._records = wire.from_body(self.evidence_kind, self._own_body())
         return self._records
 
     def _own_evidence(self) -> bytes:
-        if self.own not in self.knowledge.evidence_bytes:
-            self.knowledge.evidence_bytes[self.own] = wire.write_evidence(
-                self.evidence_kind, self.own, 1, self._own_records()
+        k = self.knowledge
+        if self.own not in k.evidence_bytes:
+            k.evidence_bytes[self.own] = wire.write_evidence(
+                self.evidence_kind, self.own, 1, self._own_body()
             )
-        return self.knowledge.evidence_bytes[self.own]
+        return k.evidence_bytes[self.own]
 
     def _overlapping(self, n: Neighbour, owner: int) -> bytes | None:
         """Evidence of an owner in the space that a neighbour saw; None until that can be told."""
+        k = self.knowledge
         if n.voxels is None or self.poses is None:
             return None
         if owner == self.own:
-            records, T_common = self._own_records(), self.T_world_map @ self.data.T_map_keyframe
-        elif owner in self.knowledge.anchors:
-            records = self.knowledge.evidence[owner]
-            T_common = self.knowledge.anchors[owner].T_common_keyframe
-            records = records[records["anchor"] < len(T_common)]
+            records, body, T_common = (
+                self._own_records(),
+                self._own_body(),
+                self.T_world_map @ self.data.T_map_keyframe,
+            )
+        elif owner in k.anchors:
+            records, body, T_common = k.evidence[owner], k.bodies[owner], k.anchors[owner].T_common_keyframe
         else:
             return None
-        keep = within(records, T_common, n.voxels, self.config.overlap_voxel_m)
-        return wire.write_evidence(self.evidence_kind, owner, 1, records[keep])
+        known = records["anchor"] < len(T_common)
+        keep = within(records[known], T_common, n.voxels, self.config.overlap_voxel_m)
+        return wire.write_evidence(self.evidence_kind, owner, 1, body[known][keep])
 
     # --- matching
 
@@ -448,7 +460,8 @@ class Agent:
         if self.done:
             return
         if self.frames_hops == EVERYWHERE and not self._joined():
-            self.done = True
+            self.done = True  # alone from the start, or whoever it met has gone
+            self.converged = self.poses is None
             return
         k, everyone = self.knowledge, sorted([self.own, *self._others()])
         complete = (
@@ -459,6 +472,7 @@ class Agent:
         )
         if complete:
             self.done = all(n.transport.idle and self._supplied(n, everyone) for n in self._joined())
+            self.converged = self.done
 
     @staticmethod
     def _supplied(n: Neighbour, everyone: list[int]) -> bool:
@@ -496,7 +510,7 @@ class Agent:
             pairs=pairs,
             closures=tuple(self._closures()),
             agreed=self.agreed or not others,
-            converged=self.done,
+            converged=self.converged,
             rounds=self.round + 1,
             rounds_to_agreement=self.rounds_to_agreement,
             refused=dict(sorted(self.refused.items())),

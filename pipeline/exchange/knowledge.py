@@ -34,6 +34,7 @@ class Knowledge:
         """own: index in the sorted team. team: its size. kind: of the evidence that this team exchanges."""
         self.own, self.team, self.kind = own, team, kind
         self.evidence: dict[int, Records] = {}  # complete, by owner
+        self.bodies: dict[int, Records] = {}  # the same as they were sent
         self.evidence_bytes: dict[int, bytes] = {}
         self.incoming: dict[tuple[int, int], Incoming] = {}  # by (provider, message)
         self.anchors: dict[int, Anchors] = {}
@@ -52,11 +53,12 @@ class Knowledge:
                 entry.chunks.append(payload)
             return owner if owner in self.evidence else None
         self.incoming.pop((provider, message), None)
-        owner, records = wire.read_evidence(self.kind, payload, self.team)
+        owner, body, records = wire.read_evidence(self.kind, payload, self.team)
         if owner == self.own:
             raise MalformedError("evidence: a neighbour speaks for this robot")
         if owner not in self.evidence:
-            self.evidence[owner], self.evidence_bytes[owner] = records, payload
+            self.evidence[owner], self.bodies[owner] = records, body
+            self.evidence_bytes[owner] = payload
         return owner
 
     def forget_incoming(self, owner: int) -> list[tuple[int, int]]:
@@ -112,7 +114,7 @@ class Knowledge:
             for key in sorted(k for k, entry in self.incoming.items() if entry.owner == owner):
                 for chunk in self.incoming[key].chunks:
                     try:
-                        parts.append(wire.read_evidence(self.kind, chunk, self.team)[1])
+                        parts.append(wire.read_evidence(self.kind, chunk, self.team)[2])
                     except MalformedError:
                         continue
             records = np.concatenate(parts) if parts else np.zeros(0, RECORD)

@@ -103,12 +103,7 @@ def chunk_count(kind: Kind, total_bytes: int) -> int:
 
 
 def serialise(packet: Packet) -> bytes:
-    """Bytes of a packet, header and payload."""
-    return b"".join(header_and_payload(packet))
-
-
-def header_and_payload(packet: Packet) -> tuple[bytes, bytes]:
-    """Header, with its CRC over header and payload, and payload."""
+    """Bytes of a packet: header, with its CRC over all else, and payload."""
     if len(packet.payload) > MAX_PAYLOAD_BYTES:
         raise ValueError(f"payload of {len(packet.payload)} bytes, at most {MAX_PAYLOAD_BYTES} fit")
     fields = _FIELDS.pack(
@@ -124,7 +119,7 @@ def header_and_payload(packet: Packet) -> tuple[bytes, bytes]:
         packet.total,
         len(packet.payload),
     )
-    return fields + _CRC.pack(zlib.crc32(packet.payload, zlib.crc32(fields))), packet.payload
+    return fields + _CRC.pack(zlib.crc32(packet.payload, zlib.crc32(fields))) + packet.payload
 
 
 def parse(data: bytes) -> Packet:

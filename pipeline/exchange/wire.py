@@ -525,9 +525,18 @@ assert COMPACT.itemsize == EVIDENCE_BYTES
 assert _EVIDENCE.size == EVIDENCE_HEAD_BYTES
 
 
-def write_evidence(kind: Kind, owner: int, version: int, records: NDArray[Any]) -> bytes:
+def to_body(kind: Kind, records: NDArray[Any]) -> NDArray[Any]:
+    """Records as they stand in a packet of this kind. Rounding happens here, once: a body is handed on as it is."""
+    return encode(records) if kind is Kind.EVIDENCE else records
+
+
+def from_body(kind: Kind, body: NDArray[Any]) -> NDArray[Any]:
+    """Records as every receiver reads them."""
+    return decode(body, RECORD) if kind is Kind.EVIDENCE else body
+
+
+def write_evidence(kind: Kind, owner: int, version: int, body: NDArray[Any]) -> bytes:
     """Bytes of EVIDENCE or EVIDENCE_EXACT: chunks of whole records, each with its own head, as they are cut."""
-    body = encode(records) if kind is Kind.EVIDENCE else records
     n, per, size = len(body), records_per_chunk(kind), body.itemsize
     head = _EVIDENCE.pack(owner, version, n)
     chunks = max(1, -(-n // per))
@@ -539,11 +548,6 @@ def write_evidence(kind: Kind, owner: int, version: int, records: NDArray[Any]) 
     return rows.tobytes()[: chunks * EVIDENCE_HEAD_BYTES + n * size]
 
 
-def as_sent(kind: Kind, records: NDArray[Any]) -> NDArray[Any]:
-    """Records as a receiver will read them."""
-    return decode(encode(records), RECORD) if kind is Kind.EVIDENCE else records
-
-
 def read_evidence_head(kind: Kind, chunk: bytes, team: int) -> tuple[int, int]:
     """Owner of a chunk of evidence and the number of records of the whole message."""
     owner, _, n = Reader(chunk[:EVIDENCE_HEAD_BYTES], "evidence").fields(_EVIDENCE)
@@ -552,8 +556,8 @@ def read_evidence_head(kind: Kind, chunk: bytes, team: int) -> tuple[int, int]:
     return owner, n
 
 
-def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any]]:
-    """Owner and records of any number of consecutive chunks of one message, each id once.
+def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any], NDArray[Any]]:
+    """Owner, body and records of any number of consecutive chunks of one message, each id once.
 
     A complete message has the announced number of records; parts of one have fewer.
     """
@@ -568,27 +572,19 @@ def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any]
     n, odd = divmod(len(data) - chunks * EVIDENCE_HEAD_BYTES, EVIDENCE_KINDS[kind])
     if odd or n > announced:
         raise MalformedError(f"evidence: {len(data)} bytes are no {announced} records")
-    body = np.ascontiguousarray(rows[:, EVIDENCE_HEAD_BYTES:]).reshape(-1)
-    if kind is Kind.EVIDENCE:
-        compact = body.view(COMPACT)[:n]
-        if not all(
-            np.isfinite(compact[name]).all()
-            for name in COMPACT.names or ()
-            if compact[name].dtype.kind == "f"
-        ):
+    flat = np.ascontiguousarray(rows[:, EVIDENCE_HEAD_BYTES:]).reshape(-1)
+    body: NDArray[Any] = flat.view(COMPACT if kind is Kind.EVIDENCE else RECORD)[:n].copy()
+    for name in body.dtype.names or ():
+        if body[name].dtype.kind == "f" and not np.isfinite(body[name]).all():
             raise MalformedError("evidence: not a finite number")
-        records = decode(compact, RECORD)
-    else:
-        records = body.view(RECORD)[:n].copy()
+    records = from_body(kind, body)
     check_evidence(records)
-    return owner, records
+    return owner, body, records
 
 
 def check_evidence(records: NDArray[Any]) -> None:
     """Refuse records with impossible numbers. Raises MalformedError."""
-    theta, information = records["theta"], records["information"]
-    if not np.isfinite(theta).all() or not np.isfinite(information).all():
-        raise MalformedError("evidence: not a finite number")
+    theta = records["theta"]
     if len(records) and (
         np.abs(theta).max() > MAX_COORDINATE or np.abs(theta[:, 3:9]).max() > MAX_LOG_COVARIANCE
     ):

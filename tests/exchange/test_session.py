@@ -216,6 +216,25 @@ def test_a_robot_without_a_map_keeps_nobody_waiting(team: Any, tmp_path: Path) -
     assert results["bravo"].rounds < 20
 
 
+def test_a_neighbour_that_falls_silent_ends_the_session(team: Any) -> None:
+    """Whoever it met has gone: the agent stops waiting, keeps what it has, and does not call that agreement."""
+    config = ExchangeConfig(transport=TransportConfig(silent_after_rounds=15))
+    agents = {n: Agent(team[n][0], NAMES[:2], set(NAMES[:2]) - {n}, config, seed=0) for n in NAMES[:2]}
+    air: dict[str, list[bytes]] = {n: [] for n in NAMES[:2]}
+    for round_index in range(60):
+        if round_index == 20:  # the poses move by now; bravo is switched off
+            assert agents["alpha"].poses is not None
+            assert not agents["alpha"].agreed
+            del agents["bravo"]
+        sent = {n: agent.tick(round_index, round_index, air[n]) for n, agent in agents.items()}
+        air = {n: [o.packet for s in sent.values() for o in s if o.receiver == n] for n in NAMES[:2]}
+    assert agents["alpha"].done
+    result = agents["alpha"].result()
+    assert not result.converged
+    assert not result.agreed
+    assert np.isfinite(result.T_world_keyframe).all()
+
+
 def test_an_end_by_rounds_leaves_the_own_map_usable(team: Any, tmp_path: Path) -> None:
     results = meet(team, 2, tmp_path, max_rounds=16)
     for name, result in results.items():

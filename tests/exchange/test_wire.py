@@ -34,6 +34,11 @@ def pose_packet(dtype: str) -> PosePacket:
     return PosePacket(7, 2, keyframes, quats, translations, penalties, np.array([3, 4], np.float32), True)
 
 
+def as_sent(kind: Kind, sent: np.ndarray) -> np.ndarray:
+    """Records as a receiver reads them."""
+    return wire.from_body(kind, wire.to_body(kind, sent))
+
+
 def sample() -> wire.KeyframeSample:
     points = RNG.uniform(-2, 3, (30, 3)).astype(np.float32)
     normals = RNG.normal(size=(30, 3))
@@ -98,7 +103,7 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
         lambda d: wire.read_pairs(d, TEAM),
     ),
     "evidence": (
-        wire.write_evidence(Kind.EVIDENCE, 1, 1, records(15)),
+        wire.write_evidence(Kind.EVIDENCE, 1, 1, wire.to_body(Kind.EVIDENCE, records(15))),
         lambda d: wire.read_evidence(Kind.EVIDENCE, d, TEAM),
     ),
     "exact evidence": (
@@ -167,18 +172,19 @@ def test_a_sample_comes_back_within_its_quantisation() -> None:
 @settings(max_examples=20, deadline=None)
 def test_evidence_comes_back_and_every_chunk_is_useful_alone(kind: Kind, n: int) -> None:
     sent = records(n)
-    data = wire.write_evidence(kind, 1, 1, sent)
-    owner, back = wire.read_evidence(kind, data, TEAM)
+    data = wire.write_evidence(kind, 1, 1, wire.to_body(kind, sent))
+    owner, body, back = wire.read_evidence(kind, data, TEAM)
     assert owner == 1
-    assert np.array_equal(back, wire.as_sent(kind, sent))
+    assert np.array_equal(back, as_sent(kind, sent))
+    assert wire.write_evidence(kind, 1, 1, body) == data  # handed on unchanged
     step = chunk_bytes(kind)
-    parts = [wire.read_evidence(kind, data[i : i + step], TEAM)[1] for i in range(0, len(data), step)]
+    parts = [wire.read_evidence(kind, data[i : i + step], TEAM)[2] for i in range(0, len(data), step)]
     assert np.array_equal(np.concatenate(parts), back)
 
 
 def test_exact_evidence_is_exact() -> None:
     sent = records(30)
-    assert np.array_equal(wire.as_sent(Kind.EVIDENCE_EXACT, sent), sent)
+    assert np.array_equal(as_sent(Kind.EVIDENCE_EXACT, sent), sent)
 
 
 def evidence_with_information(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -196,7 +202,7 @@ def evidence_with_information(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 def test_compact_evidence_is_rounded_far_below_its_uncertainty() -> None:
     sent, *blocks = evidence_with_information(200)
-    back = wire.as_sent(Kind.EVIDENCE, sent)
+    back = as_sent(Kind.EVIDENCE, sent)
     assert np.array_equal(back["id"], sent["id"])
     assert np.array_equal(back["anchor"], sent["anchor"])
     assert np.array_equal(back["theta"][:, :3], sent["theta"][:, :3])
@@ -216,7 +222,7 @@ def test_compact_evidence_is_rounded_far_below_its_uncertainty() -> None:
 def test_compact_information_is_never_negative() -> None:
     sent = records(100)
     sent["information"] = RNG.normal(size=(100, 31)) * 100  # not even semidefinite
-    back = wire.as_sent(Kind.EVIDENCE, sent)
+    back = as_sent(Kind.EVIDENCE, sent)
     for part, size in ((slice(0, 6), 3), (slice(6, 27), 6)):
         values = np.linalg.eigvalsh(unpack_symmetric(back["information"][:, part], size))
         assert (values[:, 0] >= -1e-5 * np.maximum(values[:, -1], 1e-6)).all()
