@@ -12,6 +12,10 @@ class FusionConfig(Config):
 
     coverage: Literal["all", "overlap"] = "all"
     """Take over what only neighbours saw (all), or only fuse what is matched (overlap)."""
+    association: Literal["neighbours", "members"] = "neighbours"
+    """Whose values carry the variance of where a robot happened to put its splats: only the neighbours', so that a
+    robot estimates its own splat at its own place, or every member's alike, so that all robots end with one and the
+    same Gaussian, as method and paper have it (see `docs/consensus.md` for what that costs)."""
     spacing_per_sigma: float = Field(default=1.8, ge=0.0)
     """Local spacing of splats, in units of their standard deviation along the surface: the mapper seeds discs with a
     standard deviation of 0.55 cells."""
@@ -21,6 +25,13 @@ class FusionConfig(Config):
     would meet centimetres away, where their planes cross. 0 is the method as printed."""
     shape_floor: float = Field(default=0.1, ge=0.0)
     """The same for every coordinate of vec log Sigma; 0.1 is 5 % of a scale."""
+    sampling_log_covariance: float = Field(default=0.5, ge=0.0)
+    """Standard deviation by which two robots' splats of one place differ in a coordinate of vec log Sigma because they
+    are cut differently (association = neighbours)."""
+    sampling_color: float = Field(default=0.1, ge=0.0)
+    """The same for colour channels, 0..1."""
+    sampling_opacity: float = Field(default=1.0, ge=0.0)
+    """The same for opacity logits."""
     unobserved_below: float = Field(default=1e-6, gt=0.0)
     """Directions with less than this share of a block's largest information count as unobserved: float32 noise."""
     explained_m: float = Field(default=0.05, ge=0.0)

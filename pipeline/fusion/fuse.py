@@ -7,8 +7,9 @@ In the flat chart theta = (mean, vec log Sigma, colour, opacity logit) the fused
 which is the paper's (12) and, as the chart is flat, its log-Euclidean mean (13). Sigma_assoc is the variance of where
 on the surface a robot happened to put its splat, spacing^2 / 12 along the surface and zero across it, plus a small
 isotropic floor for what Fisher information does not know; it belongs to the mean, the covariance has a floor of its
-own. A thickness that the mapper holds at its floor is held here too. Every robot's evidence counts once, however often
-it arrived and through whom. Where no member of a track knows anything, the own value stays.
+own. `association` says whose values carry it. A thickness that the mapper holds at its floor is held here too. Every
+robot's evidence counts once, however often it arrived and through whom. Where no member of a track knows anything, the
+own value stays.
 """
 
 from __future__ import annotations
@@ -123,6 +124,8 @@ def weighted_move(
     pull = np.add.reduceat((weights @ values[..., None])[..., 0], first, axis=0)
     if free is not None:
         total, pull = free @ total @ free, (free @ pull[..., None])[..., 0]
+        size = np.diff(np.append(first, len(values)))
+        values = (np.repeat(free, size, axis=0) @ values[..., None])[..., 0]
     eigenvalues, vectors = np.linalg.eigh(total)
     known = eigenvalues > unobserved_below * np.maximum(eigenvalues[:, -1:], 1e-300)
     inverse = np.where(known, 1.0 / np.where(known, eigenvalues, 1.0), 0.0)
@@ -148,29 +151,56 @@ def _weighted_move_diagonal(weights: Array, values: Array, first: Index) -> Arra
     return np.where(total > 0, pull / np.where(total > 0, total, 1.0), 0.0)
 
 
+@dataclass(frozen=True)
+class _Spread:
+    """Covariance that each of r members gets on top of its own: position [r, 3, 3], the others [r] per coordinate."""
+
+    position: Array
+    shape: Array
+    color: Array
+    opacity: Array
+
+    @staticmethod
+    def of(rows: _Rows, reference: Index, config: FusionConfig) -> _Spread:
+        """By `config.association`. References are the receiver's own rows, or a track's lowest name."""
+        n = len(rows.theta)
+        assigned = association_covariance(rows.theta[:, LOG_COVARIANCE], config.spacing_per_sigma)
+        position = assigned + config.position_floor_m**2 * np.eye(3)
+        other = np.zeros(n)
+        if config.association == "neighbours":
+            normal = np.linalg.eigh(spd.vec_to_sym(rows.theta[reference, LOG_COVARIANCE]))[1][:, :, 0]
+            # where on the surface its own splat stands is no estimate: the floor is across only
+            position[reference] = config.position_floor_m**2 * normal[:, :, None] * normal[:, None, :]
+            other[:] = 1.0
+            other[reference] = 0.0
+        return _Spread(
+            position,
+            config.shape_floor**2 + other * config.sampling_log_covariance**2,
+            other * config.sampling_color**2,
+            other * config.sampling_opacity**2,
+        )
+
+
 def _moves(
     rows: _Rows, reference: Index, first: Index, config: FusionConfig, thickness_floor_m: float
 ) -> Array:
     """Fused minus reference theta [g, 13] of every track."""
     size = np.diff(np.append(first, len(rows.theta)))
     delta = rows.theta - np.repeat(rows.theta[reference], size, axis=0)
-    spread = association_covariance(rows.theta[:, LOG_COVARIANCE], config.spacing_per_sigma)
-    spread += config.position_floor_m**2 * np.eye(3)
+    spread = _Spread.of(rows, reference, config)
     held = held_thickness(rows.theta[reference, LOG_COVARIANCE], thickness_floor_m)
     free = np.eye(6) - held.swapaxes(-1, -2) @ held
+    position = inflated(rows.position, spread.position)
+    shape = inflated(rows.shape, spread.shape[:, None, None] * np.eye(6))
+    color = rows.color / (1 + rows.color * spread.color[:, None])
+    opacity = rows.opacity / (1 + rows.opacity * spread.opacity)
     move = np.zeros((len(first), 13))
-    move[:, MEAN] = weighted_move(
-        inflated(rows.position, spread), delta[:, MEAN], first, config.unobserved_below
-    )
+    move[:, MEAN] = weighted_move(position, delta[:, MEAN], first, config.unobserved_below)
     move[:, LOG_COVARIANCE] = weighted_move(
-        inflated(rows.shape, config.shape_floor**2 * np.eye(6)),
-        delta[:, LOG_COVARIANCE],
-        first,
-        config.unobserved_below,
-        free,
+        shape, delta[:, LOG_COVARIANCE], first, config.unobserved_below, free
     )
-    move[:, COLOR] = _weighted_move_diagonal(rows.color, delta[:, COLOR], first)
-    move[:, OPACITY] = _weighted_move_diagonal(rows.opacity[:, None], delta[:, OPACITY, None], first)[:, 0]
+    move[:, COLOR] = _weighted_move_diagonal(color, delta[:, COLOR], first)
+    move[:, OPACITY] = _weighted_move_diagonal(opacity[:, None], delta[:, OPACITY, None], first)[:, 0]
     return move
 
 

@@ -12,6 +12,7 @@ from pipeline.splat.gaussians import Gaussians
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 CONFIG = FusionConfig()
+ALIKE = FusionConfig(association="members")  # every robot ends with the same Gaussian
 MATCHING = MatchingConfig()
 NAMES = ("alpha", "bravo", "charlie")
 N = 30
@@ -90,7 +91,7 @@ def assert_same_map(a, b, atol=0.0):
 def test_fused_means_minimise_the_sum_of_all_members():
     """Against the normal equations written out, one place at a time, where these stay among their members."""
     world = World(0)
-    fused = world.fuse("alpha")
+    fused = world.fuse("alpha", ALIKE)
     there = {n: world.evidence[n].in_world(world.T_world[n]) for n in world.names}
     shapes = spd.log_covariance(fused.gaussians.quats_wxyz, fused.gaussians.log_scales)
     compared = 0
@@ -125,7 +126,7 @@ def test_fused_means_minimise_the_sum_of_all_members():
 
 def test_all_robots_arrive_at_the_same_gaussians():
     world = World(1)
-    results = [world.fuse(name) for name in world.names]
+    results = [world.fuse(name, ALIKE) for name in world.names]
     for other in results[1:]:
         np.testing.assert_allclose(other.gaussians.means, results[0].gaussians.means, atol=2e-6)
         np.testing.assert_allclose(
@@ -148,6 +149,24 @@ def test_order_of_arrival_does_not_change_a_bit():
     pairs = {p: world.pairs[p][rng.permutation(N)] for p in reversed(world.pairs)}
     again = world.fuse("bravo", evidence=evidence, pairs=pairs)
     assert_same_map(again, first)
+
+
+def test_by_default_a_well_known_splat_keeps_its_place_on_the_surface():
+    """Partners 8 mm along and 4 mm across the surface: the own one yields across, hardly along, unless it is vague."""
+    maps, evidence = tilted_discs(0.0, 0.004, 100.0)
+    lifted = evidence["bravo"].theta.copy()
+    lifted[:, MEAN] += [0.008, 0, 0]
+    e = evidence["bravo"]
+    evidence["bravo"] = Evidence("bravo", e.ids, e.anchors, lifted, e.information)
+    own = np.array([0, 0, -0.002])
+    along, _, across = fuse_discs(maps, evidence).gaussians.means[0] - own
+    assert 0 <= along < 0.004
+    np.testing.assert_allclose(across, 0.002, atol=3e-4)
+    alike = fuse_discs(maps, evidence, ALIKE).gaussians.means[0] - own
+    np.testing.assert_allclose(alike, [0.004, 0, 0.002], atol=3e-4)
+    a = evidence["alpha"]
+    vague = evidence | {"alpha": Evidence("alpha", a.ids, a.anchors, a.theta, 1e-6 * a.information)}
+    np.testing.assert_allclose(fuse_discs(maps, vague).gaussians.means[0] - own, [0.008, 0, 0.004], atol=3e-4)
 
 
 def test_no_information_is_lost():
@@ -302,7 +321,7 @@ def test_a_thickness_at_the_floor_stays_there():
         theta = e.theta.copy()
         theta[:, LOG_COVARIANCE] = larger
         fused = fuse_discs(
-            maps, evidence | {"bravo": Evidence("bravo", e.ids, e.anchors, theta, e.information)}
+            maps, evidence | {"bravo": Evidence("bravo", e.ids, e.anchors, theta, e.information)}, ALIKE
         )
         scales = np.sort(fused.gaussians.log_scales[0])
         assert abs(scales[0] - np.log(MATCHING.thickness_floor_m)) < 0.1
@@ -350,7 +369,7 @@ def test_neighbours_unmatched_gaussians_fill_only_unseen_space():
 def test_what_two_neighbours_share_is_taken_over_once():
     world = World(14)
     pair = {("bravo", "charlie"): world.pairs["bravo", "charlie"]}
-    fused = world.fuse("alpha", pairs=pair)
+    fused = world.fuse("alpha", pairs=pair)  # bravo's, with what charlie says about them
     assert (fused.matched, fused.added) == (0, N)
     assert [fused.robots[s] for s in fused.source[N:]] == ["bravo"] * N
     both = world.fuse("bravo", evidence={n: world.evidence[n] for n in ("bravo", "charlie")}, pairs=pair)
