@@ -28,6 +28,7 @@ from pipeline.frontend.config import FrontendConfig
 from pipeline.fusion.config import FusionConfig
 from pipeline.information.config import InformationConfig
 
+OURS = ("manifest.json", "run/manifest.json")  # a run, a demo
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
 
 
@@ -106,7 +107,7 @@ def prepare_robots(
             for job in jobs:
                 stages.update(job.result())
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(cancel_futures=True)
             raise
     return stages
 
@@ -160,6 +161,8 @@ def new_folder(out: Path, force: bool) -> Iterator[Path]:
     """A folder beside `out` that takes its name when the block ends well, and is removed when it does not."""
     if out.exists() and not force:
         raise DuagError(f"{out}: exists already; choose another --out or give --force")
+    if out.exists() and any(out.iterdir()) and not any((out / mark).is_file() for mark in OURS):
+        raise DuagError(f"{out}: is not a run; --force replaces only what an earlier run has written")
     partial = out.with_name(out.name + ".part")
     if partial.exists():
         shutil.rmtree(partial)

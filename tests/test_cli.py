@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.errors import DuagError
 from pipeline.runner import new_folder
 
 ROOT = Path(__file__).parents[1]
@@ -62,6 +63,19 @@ def test_an_existing_output_is_refused(tmp_path: Path) -> None:
     (tmp_path / "out" / "keep").write_text("mine")
     assert_one_line(duagc("demo", "--out", tmp_path / "out"), "exists already")
     assert (tmp_path / "out" / "keep").read_text() == "mine"
+
+
+def test_force_replaces_only_what_a_run_has_written(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "thesis.tex").write_text("mine")
+    with pytest.raises(DuagError, match="is not a run"), new_folder(out, force=True):
+        pass
+    assert (out / "thesis.tex").read_text() == "mine"
+    (out / "thesis.tex").rename(out / "manifest.json")
+    with new_folder(out, force=True) as folder:
+        (folder / "new").write_text("")
+    assert [p.name for p in out.iterdir()] == ["new"]
 
 
 def test_usage_errors_exit_with_2() -> None:
