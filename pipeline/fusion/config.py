@@ -23,6 +23,9 @@ class FusionConfig(Config):
     """Standard deviation added to every position, in all directions. Fisher information knows the noise of pixels but
     not the bias of a map: two discs a few millimetres apart, slightly tilted and each sure to a tenth of a millimetre,
     would meet centimetres away, where their planes cross. 0 is the method as printed."""
+    slope: float = Field(default=0.2, ge=0.0)
+    """Two splats some distance apart lie on one plane only up to this slope: (slope * distance)^2 is added to the
+    position's covariance in all directions. 0 is the method as printed."""
     shape_floor: float = Field(default=0.1, ge=0.0)
     """The same for every coordinate of vec log Sigma; 0.1 is 5 % of a scale."""
     sampling_log_covariance: float = Field(default=0.5, ge=0.0)

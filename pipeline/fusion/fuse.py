@@ -6,10 +6,10 @@ In the flat chart theta = (mean, vec log Sigma, colour, opacity logit) the fused
 
 which is the paper's (12) and, as the chart is flat, its log-Euclidean mean (13). Sigma_assoc is the variance of where
 on the surface a robot happened to put its splat, spacing^2 / 12 along the surface and zero across it, plus a small
-isotropic floor for what Fisher information does not know; it belongs to the mean, the covariance has a floor of its
-own. `association` says whose values carry it. A thickness that the mapper holds at its floor is held here too. Every
-robot's evidence counts once, however often it arrived and through whom. Where no member of a track knows anything, the
-own value stays.
+isotropic part for what Fisher information does not know (bias, slope); it belongs to the mean, the covariance has a
+floor of its own. `association` says whose values carry it. A thickness that the mapper holds at its floor is held here
+too. Every robot's evidence counts once, however often it arrived and through whom. Where no member of a track knows
+anything, the own value stays.
 """
 
 from __future__ import annotations
@@ -161,11 +161,19 @@ class _Spread:
     opacity: Array
 
     @staticmethod
-    def of(rows: _Rows, reference: Index, config: FusionConfig) -> _Spread:
+    def of(rows: _Rows, reference: Index, first: Index, config: FusionConfig) -> _Spread:
         """By `config.association`. References are the receiver's own rows, or a track's lowest name."""
         n = len(rows.theta)
+        size = np.diff(np.append(first, n))
         assigned = association_covariance(rows.theta[:, LOG_COVARIANCE], config.spacing_per_sigma)
-        position = assigned + config.position_floor_m**2 * np.eye(3)
+        if config.association == "neighbours":
+            apart = rows.theta[:, MEAN] - np.repeat(rows.theta[reference, MEAN], size, axis=0)
+        else:
+            informed = (np.trace(rows.position, axis1=-2, axis2=-1) > 0).astype(np.float64)[:, None]
+            centre = _weighted_move_diagonal(informed, rows.theta[:, MEAN], first)
+            apart = rows.theta[:, MEAN] - np.repeat(centre, size, axis=0)
+        bias = config.position_floor_m**2 + config.slope**2 * np.sum(apart**2, axis=1)
+        position = assigned + bias[:, None, None] * np.eye(3)
         other = np.zeros(n)
         if config.association == "neighbours":
             normal = np.linalg.eigh(spd.vec_to_sym(rows.theta[reference, LOG_COVARIANCE]))[1][:, :, 0]
@@ -187,7 +195,7 @@ def _moves(
     """Fused minus reference theta [g, 13] of every track."""
     size = np.diff(np.append(first, len(rows.theta)))
     delta = rows.theta - np.repeat(rows.theta[reference], size, axis=0)
-    spread = _Spread.of(rows, reference, config)
+    spread = _Spread.of(rows, reference, first, config)
     held = held_thickness(rows.theta[reference, LOG_COVARIANCE], thickness_floor_m)
     free = np.eye(6) - held.swapaxes(-1, -2) @ held
     position = inflated(rows.position, spread.position)

@@ -12,7 +12,7 @@ from pipeline.splat.gaussians import Gaussians
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 CONFIG = FusionConfig()
-ALIKE = FusionConfig(association="members")  # every robot ends with the same Gaussian
+ALIKE = FusionConfig(association="members", slope=0.0)  # every robot ends with the same Gaussian
 MATCHING = MatchingConfig()
 NAMES = ("alpha", "bravo", "charlie")
 N = 30
@@ -161,7 +161,7 @@ def test_by_default_a_well_known_splat_keeps_its_place_on_the_surface():
     own = np.array([0, 0, -0.002])
     along, _, across = fuse_discs(maps, evidence).gaussians.means[0] - own
     assert 0 <= along < 0.004
-    np.testing.assert_allclose(across, 0.002, atol=3e-4)
+    np.testing.assert_allclose(across, 0.002, atol=5e-4)  # the neighbour counts a little less: slope
     alike = fuse_discs(maps, evidence, ALIKE).gaussians.means[0] - own
     np.testing.assert_allclose(alike, [0.004, 0, 0.002], atol=3e-4)
     a = evidence["alpha"]
