@@ -8,7 +8,7 @@ threads. See docs/mapping.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -83,6 +83,7 @@ class Mapper:
         self._gaussians = Gaussians.empty()
         self._adam = Adam()
         self._views: list[_View] = []
+        self._support: list[tuple[_View, NDArray[np.float64]]] = []  # with T_keyframe_camera
         self._next_id = 0
 
     @property
@@ -136,34 +137,44 @@ class Mapper:
         for index, T in poses:
             new[index] = T
             self._views[index].T_map_camera = new[index]
+        for view, T_keyframe_camera in self._support:
+            view.T_map_camera = new[view.index] @ T_keyframe_camera
         self._gaussians = self._gaussians.moved(old, new)
 
+    def add_view(
+        self, keyframe_index: int, color: Image, depth_m: Image, T_keyframe_camera: NDArray[np.float64]
+    ) -> None:
+        """Let a tracked frame that is no keyframe take part in `finish`; it moves with its keyframe.
+
+        It seeds no Gaussians. Never give a frame that is held out for evaluation.
+        """
+        T_map_camera = self._views[keyframe_index].T_map_camera @ T_keyframe_camera
+        self._support.append((_view(keyframe_index, color, depth_m, T_map_camera), T_keyframe_camera))
+
     def finish(self) -> MappingStats:
-        """Refine geometry and colour over all keyframes, `final_iterations` steps for each.
+        """Refine geometry and colour over all views: `final_iterations` steps for each keyframe, at full size.
+
+        The views come in random order, each once before any comes again. Halfway, what contributes nothing goes.
 
         Returns:
             Counts of the whole refinement, losses as means over all keyframes at full size.
         """
-        config, views = self.config, self._views
+        config = self.config
+        views = [*self._views, *(view for view, _ in self._support)]
         before = self._mean_loss()
-        inserted = pruned = 0
-        rounds = config.final_iterations
-        for done in range(rounds):
-            if done == rounds // 4 and config.final_densify:
-                room = config.max_gaussians - len(self._gaussians)
-                for view in views:
-                    share = max(room, 0) / config.max_gaussians / len(views) + config.keyframe_share / len(
-                        views
-                    )
-                    new, gone = self._seed(view, share)
-                    inserted, pruned = inserted + new, pruned + gone
-            rates = config.rates.times(config.final_rate_decay ** (done / max(rounds - 1, 1)))
-            order = streams.generator(self.seed, "mapping.finish", round=done).permutation(len(views))
-            for index in order:
-                self._optimise(views[index], 0, rates)
-            if done == rounds // 2:
-                pruned += self._prune_degenerate()
-        return MappingStats(inserted, pruned, len(self._gaussians), before, self._mean_loss())
+        pruned = 0
+        steps = min(config.final_iterations * len(self._views), config.final_iterations_max)
+        order = np.zeros(0, np.int64)
+        for step in range(steps):
+            position = step % len(views)
+            if position == 0:
+                order = streams.generator(self.seed, "mapping.finish", start=step).permutation(len(views))
+            if step == steps // 2:
+                pruned += self._keep(self._contributions() >= config.min_contribution)
+            rates = config.rates.times(config.final_rate_decay ** (step / max(steps - 1, 1)))
+            self._optimise(views[order[position]], 0, rates)
+        pruned += self._prune_degenerate()
+        return MappingStats(0, pruned, len(self._gaussians), before, self._mean_loss())
 
     # --- one view -----------------------------------------------------------------------------------------------
 
@@ -182,7 +193,7 @@ class Mapper:
         """One Adam step of all Gaussians in one view."""
         loss = self._loss(view, level)
         gradients = self.rasterizer.backward(loss.d_color, loss.d_depth, loss.d_alpha)
-        if self.config.exposure and view.index > 0:
+        if self.config.exposure and view is not self._views[0]:
             view.step_exposure(loss.d_exposure, self.config.exposure_rate)
         stepped = self._adam.step(self._gaussians, gradients, rates)
         floor = np.float32(np.log(self.config.seeding.thickness_m))
@@ -200,7 +211,7 @@ class Mapper:
         color, depth_m = view.images(0)
         if len(self._gaussians):
             render = self.rasterizer.forward(self._gaussians, self.cameras[0], se3.inverse(view.T_map_camera))
-            if config.exposure and view.index > 0 and view.exposure_steps == 0:
+            if config.exposure:
                 view.exposure = _first_exposure(render, color)
             color = (color - np.float32(view.exposure[1])) * np.float32(np.exp(-view.exposure[0]))
             wanted = unexplained(render, color, depth_m, config.seeding)
@@ -281,6 +292,13 @@ class Mapper:
         if not others:
             return [newest] * steps
         return [newest if k % 2 == 0 else others[(k // 2) % len(others)] for k in range(steps)]
+
+
+def support_frames(candidates: Sequence[int], count: int) -> list[int]:
+    """At most `count` of the candidates (frame indices in order), evenly spread."""
+    if len(candidates) <= count:
+        return list(candidates)
+    return [candidates[(2 * k + 1) * len(candidates) // (2 * count)] for k in range(count)]
 
 
 def overlap(

@@ -19,14 +19,16 @@ class MappingConfig(Config):
     """Keyframes optimised together: the newest and those that see most of what it sees."""
     random_keyframes: int = 2
     """Older keyframes added to the window by lot, against forgetting."""
-    iterations: int = 24
+    iterations: int = 16
     """Optimisation steps (one view each) at a keyframe; every second one is on the newest keyframe."""
     iterations_level: int = 1
     """Image pyramid level of these steps: 0 full size, 1 half size."""
-    final_iterations: int = 30
-    """Steps of the final refinement per keyframe, at full size."""
-    final_densify: bool = True
-    """Seed once more, early in the final refinement, where the map does not explain a keyframe."""
+    final_iterations: int = 50
+    """Steps of the final refinement for every keyframe, at full size, shared by all views."""
+    final_iterations_max: int = 2000
+    """Most steps of the final refinement in all."""
+    support_views: int = 40
+    """Most tracked frames between keyframes that take part in the final refinement; 0: keyframes only."""
     rates: LearningRates = LearningRates()
     final_rate_decay: float = 0.05
     """The final refinement's learning rates fall exponentially to this share."""
@@ -37,7 +39,8 @@ class MappingConfig(Config):
     max_scale_m: float = 0.5
     """Gaussians that grew beyond are pruned."""
     min_contribution: float = 0.25
-    """Gaussians whose removal changes the keyframes by less (squared, in units of the noise below) are pruned."""
+    """Gaussians whose removal changes all keyframes together by less are pruned, halfway through the final
+    refinement: the squared change of half-size images, in units of the noise below."""
     contribution_color_sigma: float = 0.03
     contribution_depth_sigma_m: float = 0.02
     exposure: bool = False

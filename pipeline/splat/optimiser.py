@@ -40,7 +40,7 @@ class LearningRates(Config):
     """Metres."""
     quats_wxyz: float = 2e-2
     """Of a unit quaternion."""
-    log_scales: float = 6e-2
+    log_scales: float = 0.12
     colors: float = 2e-2
     """RGB in 0..1."""
     opacity_logits: float = 3e-2

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.frontend.mapping import Mapper, MappingStats, overlap
+from pipeline.frontend.mapping import Mapper, MappingStats, overlap, support_frames
 from pipeline.frontend.mapping_config import MappingConfig
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
@@ -20,7 +20,7 @@ PLANES = (
     (np.array([-1.0, 0.0, 0.0]), 1.5),
 )
 POSES = [se3.exp(np.array([0.12 * k, -0.02 * k, 0.05 * k, 0.01 * k, 0.03 * k, 0.0])) for k in range(4)]
-QUICK = MappingConfig(max_gaussians=1500, iterations=10, final_iterations=4)
+QUICK = MappingConfig(max_gaussians=1500, iterations=10, final_iterations=5)
 
 
 def shot(T_map_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -131,6 +131,38 @@ def test_gaussians_move_with_their_keyframes() -> None:
     np.testing.assert_allclose(in_new, in_old, atol=1e-6)
     mapper.set_keyframe_poses(np.stack(POSES[:2]))
     np.testing.assert_allclose(mapper.gaussians.means, before.means, atol=1e-6)
+
+
+def test_views_between_keyframes_help_and_move_with_their_keyframe() -> None:
+    config = MappingConfig(max_gaussians=4000, iterations=8, final_iterations=20)
+    between = POSES[0] @ se3.exp(0.5 * se3.log(se3.inverse(POSES[0]) @ POSES[3]))
+    alone, _ = build(config, views=1)
+    alone.finish()
+    helped, _ = build(config, views=1)
+    offset = np.array([0.2, 0.0, 0.1, 0.0, 0.0, 0.0])
+    helped.set_keyframe_poses({0: POSES[0] @ se3.exp(offset)})
+    helped.add_view(0, *shot(between), se3.inverse(POSES[0]) @ between)
+    helped.set_keyframe_poses({0: POSES[0]})
+    helped.finish()
+    assert drawn(helped, between)[0] > drawn(alone, between)[0] + 1.0
+
+
+def test_a_map_without_anything_stays_empty() -> None:
+    mapper = Mapper(CAMERA, QUICK, seed=0)
+    assert mapper.finish() == MappingStats(0, 0, 0, 0.0, 0.0)
+    color, depth = shot(POSES[0])
+    stats = mapper.add_keyframe(0, color, np.zeros_like(depth), POSES[0])
+    assert (stats.inserted, stats.total) == (0, 0)
+    assert mapper.finish().total == 0
+
+
+def test_support_frames_are_spread_evenly() -> None:
+    assert support_frames([3, 5, 9], 5) == [3, 5, 9]
+    assert support_frames([], 4) == []
+    assert support_frames(list(range(100)), 0) == []
+    chosen = support_frames(list(range(0, 300, 3)), 10)
+    assert len(chosen) == 10
+    assert set(np.diff(chosen)) == {30}
 
 
 def test_what_contributes_least_goes_first() -> None:
