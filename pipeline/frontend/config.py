@@ -8,7 +8,7 @@ from pipeline.registration.align import RegistrationConfig
 class KeyframeConfig(Config):
     """When a frame becomes a keyframe, and how keyframe poses are refined together."""
 
-    min_overlap: float = 0.7
+    min_overlap: float = 0.8
     """A frame that sees less of its keyframe than this becomes the next one."""
     max_translation_of_depth: float = 0.3
     """A frame that moved by more than this fraction of the median depth becomes a keyframe."""

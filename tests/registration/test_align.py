@@ -1,0 +1,170 @@
+"""Registration finds known motions, states its uncertainty, and does not call a failure a success."""
+
+import numpy as np
+import pytest
+
+from pipeline.geometry import se3
+from pipeline.registration import (
+    Outcome,
+    Reference,
+    ReferenceLevel,
+    RegistrationConfig,
+    RgbdPyramid,
+    register,
+)
+from tests.registration.room import CAMERA, pose, render
+
+START, END = pose(yaw=0.3), pose(x=0.06, y=-0.03, z=-0.75, yaw=0.34, pitch=-0.02)
+T_START_END = se3.inverse(START) @ END
+STRIDES = (2, 1, 1)
+
+
+def pyramid(T_world_camera, **noise) -> RgbdPyramid:
+    return RgbdPyramid.build(*render(T_world_camera, **noise), CAMERA)
+
+
+@pytest.fixture(scope="module")
+def start() -> RgbdPyramid:
+    return pyramid(START)
+
+
+@pytest.fixture(scope="module")
+def end() -> RgbdPyramid:
+    return pyramid(END)
+
+
+@pytest.fixture(scope="module")
+def reference(start) -> Reference:
+    return Reference.from_pyramid(start, STRIDES)
+
+
+def test_inverse_depth_and_normals_are_exact_on_planes_at_every_level():
+    # straight at the far wall, 2.5 m away, whose normal is (0, 0, -1); the box begins below the centre
+    for level in pyramid(pose(z=-0.5)).levels:
+        h, w = level.camera.height, level.camera.width
+        wall = slice(4, h // 2), slice(w // 3, -w // 3)
+        np.testing.assert_allclose(level.inverse_depth[wall], 1 / 2.5, rtol=1e-6)
+        np.testing.assert_allclose(level.normals[wall] @ [0, 0, -1], 1, atol=1e-6)
+
+
+def test_recovers_a_known_motion_from_a_poor_guess(reference, end):
+    result = register(reference, end, np.eye(4))  # 8 cm and 2.6 degrees away
+    assert result.ok
+    moved_m, turned_rad = se3.distance(T_START_END, result.T_reference_target)
+    assert moved_m < 3e-4  # measured 1e-4: images interpolated linearly, 1 pixel = 15 mm on the far wall
+    assert turned_rad < 2e-4
+    assert result.overlap > 0.85
+    assert result.conflict < 0.02
+
+
+def test_forward_and_backward_are_inverse(reference, end, start):
+    forward = register(reference, end, np.eye(4)).T_reference_target
+    backward = register(Reference.from_pyramid(end, STRIDES), start, np.eye(4)).T_reference_target
+    moved_m, turned_rad = se3.distance(forward, se3.inverse(backward))
+    assert moved_m < 5e-4
+    assert turned_rad < 3e-4
+
+
+def test_brightness_is_estimated_and_does_not_move_the_pose(reference):
+    gray, depth = render(END)
+    darker = RgbdPyramid.build(0.7 * gray + 0.05, depth, CAMERA)
+    result = register(reference, darker, np.eye(4))
+    assert result.ok
+    np.testing.assert_allclose(result.exposure, (0.7, 0.05), atol=0.02)
+    assert se3.distance(T_START_END, result.T_reference_target)[0] < 1e-3
+
+
+def test_sparse_reference_works_across_a_wide_baseline(start):
+    T = pose(x=0.4, z=-0.6, yaw=-0.1)
+    sparse = Reference.sample(start, 1000)
+    assert 700 <= len(sparse.levels[0]) <= 1200
+    for level in sparse.levels[1:]:
+        np.testing.assert_array_equal(level.points, sparse.levels[0].points)
+    truth = se3.inverse(START) @ T
+    guess = truth @ se3.exp(np.array([0.012, -0.012, 0.01, 0.01, -0.01, 0.01]))  # 2 cm, 1 degree
+    result = register(sparse, pyramid(T), guess)
+    moved_m, turned_rad = se3.distance(truth, result.T_reference_target)
+    assert result.ok
+    assert moved_m < 1e-3
+    assert turned_rad < 1e-3
+    assert 0.3 < result.overlap < 0.75
+
+
+def test_reference_is_plain_arrays(reference, end):
+    rebuilt = Reference(
+        tuple(ReferenceLevel(level.points, level.normals, level.intensities) for level in reference.levels)
+    )
+    np.testing.assert_array_equal(
+        register(rebuilt, end, np.eye(4)).T_reference_target,
+        register(reference, end, np.eye(4)).T_reference_target,
+    )
+
+
+def test_information_matches_the_scatter_over_noise_draws():
+    # the grey floor models calibration errors that this scene does not have
+    config = RegistrationConfig(gray_sigma_floor=0.002)
+    chi2 = []
+    for seed in range(12):
+        noise = np.random.default_rng(seed)
+        first = Reference.from_pyramid(pyramid(START, noise=noise), STRIDES)
+        result = register(first, pyramid(END, noise=noise), T_START_END, config)
+        assert result.ok
+        error = se3.log(se3.inverse(result.T_reference_target) @ T_START_END)
+        chi2.append(error @ result.information @ error)
+    # expected 6; the mean of 12 draws has a standard deviation of 1, the model errs by a factor of up to 3
+    assert 2 < np.mean(chi2) < 18
+
+
+def test_information_is_in_the_right_tangent(reference, end):
+    information = register(reference, end, T_START_END).information
+    np.testing.assert_allclose(information, information.T)
+    values = np.linalg.eigvalsh(information)
+    assert values[0] > 0
+    # the cost rises by the information: moving along depth (z of the target) is better known than along x, y
+    assert information[2, 2] > 0.2 * information[0, 0]
+
+
+def test_prior_pulls_towards_the_guess(reference, end):
+    guess = T_START_END @ se3.exp(np.array([0.01, 0, 0, 0, 0, 0]))
+    free = register(reference, end, guess)
+    held = register(reference, end, guess, prior_information=1e12 * np.eye(6))
+    assert se3.distance(guess, held.T_reference_target)[0] < 1e-4
+    assert se3.distance(guess, free.T_reference_target)[0] > 5e-3
+
+
+def test_untextured_wall_is_ill_conditioned():
+    depth = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32)
+    gray = np.full_like(depth, 0.5)
+    wall = RgbdPyramid.build(gray, depth, CAMERA)
+    result = register(Reference.from_pyramid(wall, STRIDES), wall, np.eye(4))
+    assert result.outcome is Outcome.ILL_CONDITIONED
+
+
+def test_no_depth_is_low_overlap_and_carries_no_information(reference):
+    gray, depth = render(END)
+    result = register(reference, RgbdPyramid.build(gray, np.zeros_like(depth), CAMERA), np.eye(4))
+    assert result.outcome is Outcome.LOW_OVERLAP
+    np.testing.assert_array_equal(result.information, 0)
+
+
+def test_black_image_over_good_depth_is_a_failure(reference):
+    gray, depth = render(END)
+    result = register(reference, RgbdPyramid.build(np.zeros_like(gray), depth, CAMERA), np.eye(4))
+    assert result.outcome is Outcome.RESIDUAL
+
+
+def test_a_foreign_view_is_a_failure(reference):
+    foreign = RgbdPyramid.build(*render(pose(z=0.5, yaw=np.pi), texture_seed=5), CAMERA)
+    assert not register(reference, foreign, np.eye(4)).ok
+
+
+def test_a_large_correction_is_a_jump(reference, end):
+    config = RegistrationConfig(max_translation_m=0.01)
+    assert register(reference, end, np.eye(4), config).outcome is Outcome.JUMP
+
+
+def test_equal_input_gives_equal_bits(start, end):
+    a = register(Reference.from_pyramid(start, STRIDES), end, np.eye(4))
+    b = register(Reference.from_pyramid(pyramid(START), STRIDES), pyramid(END), np.eye(4))
+    np.testing.assert_array_equal(a.T_reference_target, b.T_reference_target)
+    np.testing.assert_array_equal(a.information, b.information)
