@@ -1,0 +1,114 @@
+"""The front-end stage on a small log: what it writes, and that it writes it again."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from converters.base import RecordingWriter
+from pipeline.errors import DuagError
+from pipeline.frontend.config import FrontendConfig, TrackingConfig
+from pipeline.frontend.mapping_config import MappingConfig
+from pipeline.frontend.stage import LATENCY_NS, run_frontend
+from pipeline.geometry import se3
+from pipeline.geometry.trajectory import ate_rmse_m
+from pipeline.recording import content_digest, read_log
+from schemas import topics
+from tests.registration.room import CAMERA, pose, render
+
+FRAMES = 13
+FRAME_NS = 33_333_333
+TRACKING = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)), mapping_enabled=False)
+
+
+def walk(k: int) -> np.ndarray:
+    return pose(x=-0.4 + 0.04 * k, y=0.01 * k * (k % 3), z=-0.9, yaw=0.5 - 0.03 * k)
+
+
+@pytest.fixture(scope="module")
+def sensor_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("stage") / "room"
+    with RecordingWriter(out) as recording, recording.robot("alpha", CAMERA, 0.0005) as robot:
+        for k in range(FRAMES):
+            gray, depth = render(walk(k))
+            image = np.repeat(np.rint(np.clip(gray, 0, 1) * 255).astype(np.uint8)[..., None], 3, axis=2)
+            png = cv2.imencode(".png", image)[1].tobytes()
+            robot.add_frame(k * FRAME_NS, png, "png", np.rint(depth / 0.0005).astype(np.uint16))
+    return out / "alpha.mcap"
+
+
+def messages(path: Path, topic: topics.Topic) -> list:
+    return [record.message() for record in read_log(path, [topic.of("alpha")])]
+
+
+@pytest.fixture(scope="module")
+def frontend_log(sensor_log: Path) -> Path:
+    out = sensor_log.with_name("frontend.mcap")
+    run_frontend(sensor_log, out, TRACKING)
+    return out
+
+
+def test_every_frame_has_its_final_pose(frontend_log: Path) -> None:
+    odometry = messages(frontend_log, topics.ODOMETRY)
+    keyframes = messages(frontend_log, topics.KEYFRAME)
+    assert [m.frame_index for m in odometry] == list(range(FRAMES))
+    assert [m.status for m in odometry] == ["ok"] * FRAMES
+    assert [m.frame_index for m in odometry if m.held_out] == [4, 12]
+    for m in odometry:
+        hangs = keyframes[m.keyframe_index].T_map_camera @ m.T_keyframe_camera
+        np.testing.assert_allclose(m.T_map_camera, hangs, atol=1e-12)
+    truth = np.array([walk(k)[:3, 3] for k in range(FRAMES)])
+    assert ate_rmse_m(truth, np.array([m.T_map_camera[:3, 3] for m in odometry])) < 1.5e-3
+
+
+def test_keyframes_chain_by_their_refined_motion(frontend_log: Path) -> None:
+    keyframes = messages(frontend_log, topics.KEYFRAME)
+    assert len(keyframes) >= 2
+    assert [m.keyframe_index for m in keyframes] == list(range(len(keyframes)))
+    assert keyframes[0].previous_index == -1
+    np.testing.assert_array_equal(keyframes[0].T_map_camera, np.eye(4))
+    np.testing.assert_array_equal(keyframes[0].information, 0)
+    for m in keyframes[1:]:
+        assert m.previous_index < m.keyframe_index
+        chained = keyframes[m.previous_index].T_map_camera @ m.T_previous_keyframe
+        assert se3.distance(chained, m.T_map_camera)[0] < 1e-12
+        assert np.linalg.eigvalsh(m.information)[0] > 0
+        assert m.frame_index % 8 != 4
+
+
+def test_times_are_those_of_the_recording(frontend_log: Path) -> None:
+    for record in read_log(frontend_log):
+        assert record.log_time_ns == record.publish_time_ns + LATENCY_NS
+        assert record.publish_time_ns % FRAME_NS == 0
+    assert len(messages(frontend_log, topics.MAP)[0].gaussians) == 0
+
+
+def test_two_runs_write_the_same_log(sensor_log: Path, frontend_log: Path) -> None:
+    again = sensor_log.with_name("again.mcap")
+    timing = run_frontend(sensor_log, again, TRACKING)
+    assert content_digest(again) == content_digest(frontend_log)
+    assert set(timing) == {"tracking_s", "refinement_s", "mapping_s", "writing_s"}
+
+
+def test_map_is_grown_at_the_refined_keyframes(sensor_log: Path) -> None:
+    out = sensor_log.with_name("mapped.mcap")
+    small = MappingConfig(max_gaussians=300, iterations=2, final_iterations=1)
+    run_frontend(sensor_log, out, TRACKING.model_copy(update={"mapping_enabled": True, "mapping": small}))
+    final = messages(out, topics.MAP)
+    updates = messages(out, topics.MAP_UPDATE)
+    keyframes = messages(out, topics.KEYFRAME)
+    assert len(final) == 1
+    assert final[0].frame_id == "alpha/map"
+    assert 50 < len(final[0].gaussians) <= 300
+    assert set(final[0].gaussians.anchors.tolist()) <= {m.keyframe_index for m in keyframes}
+    assert sorted(m.keyframe_index for m in updates) == sorted(
+        [m.keyframe_index for m in keyframes] + [keyframes[-1].keyframe_index]
+    )
+    assert updates[-1].total == len(final[0].gaussians)
+
+
+def test_a_missing_log_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DuagError, match=r"none\.mcap"):
+        run_frontend(tmp_path / "none.mcap", tmp_path / "frontend.mcap", TRACKING)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,178 @@
+"""Tracking of a camera that walks through an exact room, and what happens when the images fail it."""
+
+import numpy as np
+import pytest
+
+from pipeline.frontend.config import FrontendConfig, KeyframeConfig, TrackingConfig
+from pipeline.frontend.keyframes import KeyframePair, refine, relative_information
+from pipeline.frontend.tracking import Status, TrackedFrame, Tracker
+from pipeline.geometry import se3
+from pipeline.geometry.trajectory import ate_rmse_m
+from tests.registration.room import CAMERA, pose, render
+
+CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)))
+STEPS = 36
+
+
+def walk(step: float) -> np.ndarray:
+    """T_world_camera of a slow turn with a sideways step, 2 cm and 1 degree a frame."""
+    t = step / STEPS
+    return pose(
+        x=-0.4 + 0.8 * t,
+        y=0.1 * np.sin(3 * t),
+        z=-0.9 + 0.3 * t,
+        yaw=0.5 - 0.7 * t,
+        pitch=0.05 * np.sin(5 * t),
+    )
+
+
+def positions(tracker: Tracker, frames: list[TrackedFrame]) -> np.ndarray:
+    return np.array(
+        [(tracker.keyframes[f.keyframe_index].T_map_keyframe @ f.T_keyframe_camera)[:3, 3] for f in frames]
+    )
+
+
+@pytest.fixture(scope="module")
+def walked() -> tuple[Tracker, list[TrackedFrame], list[np.ndarray]]:
+    tracker = Tracker(CAMERA, CONFIG)
+    truth = [walk(k) for k in range(STEPS)]
+    frames = [tracker.track(k, 100 * k, *render(T)) for k, T in enumerate(truth)]
+    return tracker, frames, truth
+
+
+def test_walk_is_tracked_to_less_than_a_millimetre(walked) -> None:
+    tracker, frames, truth = walked
+    assert [f.status for f in frames] == [Status.OK] * STEPS
+    assert ate_rmse_m(np.array(truth)[:, :3, 3], positions(tracker, frames)) < 1e-3
+    np.testing.assert_array_equal(frames[0].T_keyframe_camera, np.eye(4))
+    assert all(np.linalg.eigvalsh(f.information)[0] > 0 for f in frames[1:])
+
+
+def test_keyframes_are_made_and_are_never_held_out(walked) -> None:
+    tracker, frames, _ = walked
+    assert 3 <= len(tracker.keyframes) <= 12
+    for keyframe in tracker.keyframes:
+        assert not CONFIG.is_held_out(keyframe.frame_index)
+        tracked = frames[keyframe.frame_index]
+        assert tracked.keyframe_index == keyframe.keyframe_index
+        np.testing.assert_array_equal(tracked.T_keyframe_camera, np.eye(4))
+    assert {pair.second for pair in tracker.pairs} == set(range(1, len(tracker.keyframes)))
+
+
+def test_refinement_does_not_spoil_exact_tracking(walked) -> None:
+    tracker = walked[0]
+    start = np.array([k.T_map_keyframe for k in tracker.keyframes])
+    refined, covariance = refine(start, tracker.pairs, 3.0)
+    np.testing.assert_array_equal(refined[0], np.eye(4))
+    assert np.max(se3.distance(start, refined)[0]) < 2e-3
+    assert np.linalg.eigvalsh(covariance[6:, 6:])[0] > 0
+
+
+def covered(gray: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros_like(gray), np.zeros_like(depth)
+
+
+def black(gray: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros_like(gray), depth
+
+
+def foreign(gray: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return render(pose(x=0.5, z=0.5, yaw=np.pi), texture_seed=3)
+
+
+@pytest.mark.parametrize("spoil", [covered, black, foreign])
+def test_failed_images_are_lost_and_the_camera_is_found_again(spoil) -> None:
+    tracker = Tracker(CAMERA, CONFIG)
+    frames = []
+    for k in range(12):
+        images = render(walk(0.5 * k))
+        frames.append(tracker.track(k, 100 * k, *(spoil(*images) if 5 <= k < 8 else images)))
+    status = [f.status for f in frames]
+    assert status[5:8] == [Status.LOST] * 3
+    for frame in frames[5:8]:
+        np.testing.assert_array_equal(frame.information, 0)
+        np.testing.assert_array_equal(frame.T_keyframe_camera, frames[4].T_keyframe_camera)
+    assert status[8] is Status.RELOCALISED
+    assert status[9:] == [Status.OK] * 3
+    truth = np.array([walk(0.5 * k)[:3, 3] for k in range(12)])
+    seen = [k for k in range(12) if not 5 <= k < 8]
+    assert ate_rmse_m(truth[seen], positions(tracker, frames)[seen]) < 1e-3
+
+
+def test_too_large_a_motion_is_not_called_tracked() -> None:
+    tracker = Tracker(CAMERA, CONFIG)
+    tracker.track(0, 0, *render(walk(0)))
+    turned = tracker.track(1, 100, *render(pose(x=0.9, z=0.3, yaw=-1.2)))
+    assert turned.status is Status.LOST
+
+
+def test_equal_frames_give_equal_bits(walked) -> None:
+    _, frames, truth = walked
+    again = Tracker(CAMERA, CONFIG)
+    for k in range(8):
+        repeated = again.track(k, 100 * k, *render(truth[k]))
+        np.testing.assert_array_equal(repeated.T_keyframe_camera, frames[k].T_keyframe_camera)
+        np.testing.assert_array_equal(repeated.information, frames[k].information)
+
+
+def test_keyframe_rules_can_be_loosened() -> None:
+    rare = KeyframeConfig(min_overlap=0.3, max_translation_of_depth=9, max_rotation_rad=9)
+    tracker = Tracker(CAMERA, CONFIG.model_copy(update={"keyframes": rare}))
+    for k in range(0, STEPS, 4):
+        tracker.track(k, 100 * k, *render(walk(k)))
+    assert len(tracker.keyframes) == 1
+
+
+def chain(k: int, rng: np.random.Generator) -> np.ndarray:
+    """Poses [k, 4, 4] of a random walk that starts at the origin."""
+    poses = [np.eye(4)]
+    for _ in range(k - 1):
+        poses.append(poses[-1] @ se3.exp(rng.normal(scale=0.3, size=6)))
+    return np.array(poses)
+
+
+def test_refine_finds_poses_and_their_covariance() -> None:
+    rng = np.random.default_rng(0)
+    sigma = np.array([0.01, 0.02, 0.01, 0.005, 0.01, 0.02])
+    information = np.diag(sigma**-2.0)
+    truth = chain(6, rng)
+    ends = [(i, j) for i in range(6) for j in range(i + 1, min(i + 4, 6))]
+
+    def draw() -> list[KeyframePair]:
+        return [
+            KeyframePair(
+                i, j, se3.inverse(truth[i]) @ truth[j] @ se3.exp(sigma * rng.standard_normal(6)), information
+            )
+            for i, j in ends
+        ]
+
+    exact = [KeyframePair(i, j, se3.inverse(truth[i]) @ truth[j], information) for i, j in ends]
+    start = truth @ se3.exp(np.concatenate([np.zeros((1, 6)), 0.05 * rng.standard_normal((5, 6))]))
+    np.testing.assert_allclose(refine(start, exact, 3.0)[0], truth, atol=1e-8)
+    chi2 = []
+    for _ in range(30):
+        T, covariance = refine(truth, draw(), 1e9)
+        error = se3.log(se3.inverse(se3.inverse(T[2]) @ T[5]) @ se3.inverse(truth[2]) @ truth[5])
+        chi2.append(error @ relative_information(T, covariance, 2, 5) @ error)
+    # expected 6 with a standard deviation of 0.6 over 30 draws; contradiction only ever enlarges the covariance
+    assert 3.5 < np.mean(chi2) < 7.5
+
+
+def test_refine_withstands_a_wrong_pair() -> None:
+    rng = np.random.default_rng(1)
+    truth = chain(5, rng)
+    information = np.eye(6) * 1e4
+    pairs = [
+        KeyframePair(i, j, se3.inverse(truth[i]) @ truth[j], information)
+        for i in range(5)
+        for j in range(i + 1, 5)
+    ]
+    wrong = pairs[3].T_first_second @ se3.exp(np.array([0.3, 0, 0, 0, 0.2, 0]))
+    pairs[3] = KeyframePair(pairs[3].first, pairs[3].second, wrong, information)
+    robust, covariance = refine(truth, pairs, 1.0)
+    plain, _ = refine(truth, pairs, 1e9)
+    assert se3.distance(truth, robust)[0].max() < 0.3 * se3.distance(truth, plain)[0].max()
+    clean, _ = refine(truth, pairs[:3] + pairs[4:], 1.0)
+    np.testing.assert_allclose(clean, truth, atol=1e-8)
+    # the contradiction shows in the covariance: the first pose's neighbour is known worse than by one pair alone
+    assert covariance[6, 6] > 1e-4 / len(pairs)
