@@ -42,10 +42,12 @@ from pipeline.exchange.meeting import HigherEnd, LowerEnd, Meeting, OwnPlaces, S
 from pipeline.exchange.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError, Packet, parse
 from pipeline.exchange.results import AgentResult, ClosureRecord
 from pipeline.exchange.transport import Arrival, Message, Outgoing, Transport
+from pipeline.exchange.verification import Verdict
 from pipeline.exchange.wire import Anchors, PairList, State
 from pipeline.geometry import se3
 
 Array = NDArray[np.float64]
+HALF = 0.5  # robust weight from which a closure counts as kept
 EVERYWHERE = 255  # a hop count that has reached the whole component, for good
 MEETING_KINDS = frozenset({Kind.DESCRIPTORS, Kind.REQUEST, Kind.SAMPLE, Kind.CLOSURES})
 
@@ -534,17 +536,21 @@ class Agent:
         for n in self.neighbours.values():
             for t in n.meeting.tried:
                 r = t.result
+                weight = None if r.closure is None else self._weight(n, r.closure)
+                verdict = r.verdict
+                if weight is not None:  # the graduated weights have the last word
+                    verdict = Verdict.KEPT if weight >= HALF else Verdict.OUTWEIGHED
                 yield ClosureRecord(
                     self.data.robot,
                     n.name,
                     t.candidate.own_keyframe,
                     t.candidate.peer_keyframe,
                     t.candidate.score,
-                    r.verdict.value,
+                    verdict.value,
                     r.matches,
                     r.inliers,
                     r.detail,
-                    None if r.closure is None else self._weight(n, r.closure),
+                    weight,
                     None if r.closure is None else r.closure.T_own_peer,
                 )
 

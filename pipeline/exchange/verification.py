@@ -28,6 +28,7 @@ class Verdict(Enum):
     FEW_INLIERS = "too few matches agree on one motion"
     NOT_REGISTERED = "registration of the two views failed"
     MOVED = "registration moved far from what the matches say"
+    OUTWEIGHED = "lost its weight in the pose consensus"
     INCONSISTENT = "disagrees with the other closures of this pair of robots"
 
 
