@@ -97,17 +97,21 @@ class Rasterizer:
         """
         gaussians, (height, width) = self._last_forward()
         n = len(gaussians)
+        nothing = np.zeros((0, 0), dtype=np.float32)
         images = (
             _checked_image("d_color", d_color, (height, width, 3)),
-            _checked_image("d_depth", d_depth, (height, width)),
-            _checked_image("d_alpha", d_alpha, (height, width)),
+            nothing if d_depth is None else _checked_image("d_depth", d_depth, (height, width)),
+            nothing if d_alpha is None else _checked_image("d_alpha", d_alpha, (height, width)),
         )
         out = [np.zeros_like(array) for array in _arrays(gaussians)]
         by_pose = np.zeros(6 if pose else 0)
         diagonal = np.zeros((n if fisher else 0, FISHER_DIAGONAL_COLUMNS), dtype=np.float32)
         status = self._raster.backward(*_arrays(gaussians), *images, *out, diagonal, by_pose)
         _refuse_bad_image(status, ("d_color", "d_depth", "d_alpha"), "a NaN or an infinity")
-        return Gradients(*out, pose=by_pose if pose else None, fisher_diagonal=diagonal if fisher else None)
+        means, quats, log_scales, colors, logits = out
+        return Gradients(
+            means, quats, log_scales, colors, logits, by_pose if pose else None, diagonal if fisher else None
+        )
 
     def fisher(self, inv_var_color: Image, inv_var_depth: Image, sums: FisherSums) -> None:
         """Add the `gauss_newton` information of the last view, sum over pixels of J^T R^-1 J, to `sums`.
@@ -191,7 +195,7 @@ def _checked_pose(name: str, T: ArrayLike) -> NDArray[np.float32]:
 def _checked_background(background: ArrayLike) -> NDArray[np.float32]:
     color = np.asarray(background, dtype=np.float32)
     if color.shape != (3,) or not np.isfinite(color).all():
-        raise ValueError(f"background is {background}, expected three finite numbers")
+        raise ValueError(f"background is {background!r}, expected three finite numbers")
     return np.ascontiguousarray(color)
 
 
@@ -206,8 +210,6 @@ def _check_array(name: str, array: object, shape: tuple[int, ...], dtype: type) 
 
 
 def _checked_image(name: str, image: object, shape: tuple[int, ...]) -> Image:
-    if image is None:
-        return np.zeros(shape, dtype=np.float32)
     if not isinstance(image, np.ndarray) or image.dtype != np.float32:
         found = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
         raise ValueError(f"{name} is {found}, expected an array of float32")

@@ -30,6 +30,7 @@ FIELD_MARGIN = 1.3
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
+JACOBIAN_ROWS = 64  # pixels differentiated at once
 
 _PARAMETERS = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
 
@@ -84,12 +85,15 @@ class ReferenceRasterizer:
             + cotangent(d_alpha, alpha) * alpha
         ).ravel()
         inputs = [*self._parameters.values(), self._xi]
-        *gradients, by_pose = _gradients(per_pixel.sum(), inputs)
+        *gradients, by_pose = torch.autograd.grad(per_pixel.sum(), inputs, retain_graph=True)
         diagonal = None
         if fisher:
-            rows = _jacobian(per_pixel, inputs[:-1])
-            diagonal = np.concatenate([(J**2).sum(0).reshape(self._n, -1) for J in rows], axis=1)
-        return Gradients(*gradients, pose=by_pose if pose else None, fisher_diagonal=diagonal)
+            squares = [(J**2).sum(0) for J in _jacobian(per_pixel, inputs[:-1])]
+            diagonal = np.concatenate([s[:, None] if s.ndim == 1 else s for s in squares], axis=1)
+        means, quats, log_scales, colors, logits = (gradient.numpy() for gradient in gradients)
+        return Gradients(
+            means, quats, log_scales, colors, logits, by_pose.numpy() if pose else None, diagonal
+        )
 
     def fisher(self, inv_var_color: ArrayLike, inv_var_depth: ArrayLike, sums: FisherSums) -> None:
         """Add sum over pixels of J^T R^-1 J in (mean, vec log Sigma, colour, logit); see `Rasterizer.fisher`."""
@@ -97,15 +101,19 @@ class ReferenceRasterizer:
 
         p = self._parameters
         log_covariances = torch.tensor(self._log_covariances, requires_grad=True)
-        color, depth, alpha = self._draw(
-            p["means"], _matrix_exp(log_covariances), p["colors"], p["opacity_logits"]
-        )
+        covariances = _matrix_exp(log_covariances)
+        sigma = covariances.detach().requires_grad_()
+        color, depth, _ = self._draw(p["means"], sigma, p["colors"], p["opacity_logits"])
         measured = torch.cat([color, depth[..., None]], dim=-1).reshape(-1)
         of_color = np.asarray(inv_var_color, dtype=np.float64)[..., None].repeat(3, axis=-1)
         of_depth = np.asarray(inv_var_depth, dtype=np.float64)[..., None]
         weight = np.concatenate([of_color, of_depth], axis=-1).reshape(-1)
-        inputs = [p["means"], log_covariances, p["colors"], p["opacity_logits"]]
-        by_mean, by_log, by_color, by_logit = _jacobian(measured, inputs)
+        inputs = [p["means"], sigma, p["colors"], p["opacity_logits"]]
+        by_mean, by_sigma, by_color, by_logit = _jacobian(measured, inputs)
+        (sigma_by_log,) = _jacobian(
+            covariances.sum(0).reshape(9), [log_covariances]
+        )  # each Sigma has its own log
+        by_log = np.einsum("mnij,ijnk->mnk", by_sigma, sigma_by_log.reshape(3, 3, self._n, 6))
         geometry = np.concatenate([by_mean, by_log], axis=-1)
         blocks = np.einsum("m,mni,mnj->nij", weight, geometry, geometry)
         rows, columns = np.triu_indices(9)
@@ -212,20 +220,15 @@ def _hat(w: Any) -> Any:
     return torch.stack([torch.stack([zero, -z, y]), torch.stack([z, zero, -x]), torch.stack([-y, x, zero])])
 
 
-def _gradients(scalar: Any, inputs: list[Any]) -> list[NDArray[np.float64]]:
-    import torch
-
-    gradients = torch.autograd.grad(scalar, inputs, retain_graph=True, materialize_grads=True)
-    return [gradient.numpy() for gradient in gradients]
-
-
 def _jacobian(outputs: Any, inputs: list[Any]) -> list[NDArray[np.float64]]:
     """Derivatives [m, ...] of every one of the outputs [m] by each input [...]."""
     import torch
 
-    rows = [_gradients(output, inputs) for output in outputs.unbind()]
-    del torch
-    return [np.stack(columns) for columns in zip(*rows, strict=True)]
+    rows = [
+        torch.autograd.grad(outputs, inputs, grad_outputs=seeds, is_grads_batched=True, retain_graph=True)
+        for seeds in torch.eye(len(outputs), dtype=torch.float64).split(JACOBIAN_ROWS)
+    ]
+    return [torch.cat(columns).numpy() for columns in zip(*rows, strict=True)]
 
 
 def _margin(raw: NDArray[np.float64], left: NDArray[np.float64]) -> float:

@@ -54,6 +54,12 @@ inline void read_tile(const float* image, const Tile& tile, const View& view, fl
         for_each_pixel(tile, view, [&](int k, size_t p) { out[k] = image[p]; });
     }
 }
+inline void read_tile_or_zero(const float* image, const Tile& tile, const View& view, float* out) {
+    if (image)
+        read_tile(image, tile, view, out);
+    else
+        fill_tile(out, 0.0f);
+}
 // The three planes of an interleaved image [H, W, 3].
 inline void read_tile_rgb(const float* image, const Tile& tile, const View& view, float* r, float* g, float* b) {
     if (tile.whole)
@@ -84,17 +90,18 @@ inline bool all_finite_not_negative(const float* tile) {
 
 // A splat broadcast over the lanes, relative to the pixels of one tile.
 struct WideSplat {
-    Vec A, B, C, log2_opacity;
+    Vec M11, M12, M22, log2_opacity;
     float u, v;
     WideSplat(const Splat& s, const Tile& tile)
-        : A(s.A), B(s.B), C(s.C), log2_opacity(s.log2_opacity), u(tile.x - s.u), v(tile.y - s.v) {}
+        : M11(s.M11), M12(s.M12), M22(s.M22), log2_opacity(s.log2_opacity), u(tile.x - s.u), v(tile.y - s.v) {}
 
-    // Pixel minus centre for the 16 pixels of a block.
-    Vec dx(int block) const { return load(PIXEL_OF_BLOCK.x) + Vec(u + block_x(block)); }
-    Vec dy(int block) const { return load(PIXEL_OF_BLOCK.y) + Vec(v + block_y(block)); }
-    Vec log2_alpha(Vec dx, Vec dy) const {
-        return fnma(dy * C, dy, fnma(dx, fma(A, dx, B * dy), log2_opacity));
+    // e = M (pixel - centre) for the 16 pixels of a block.
+    void place(int block, Vec& x, Vec& y) const {
+        const Vec dx = load(PIXEL_OF_BLOCK.x) + Vec(u + block_x(block)), dy = load(PIXEL_OF_BLOCK.y) + Vec(v + block_y(block));
+        x = fma(M11, dx, M12 * dy);
+        y = M22 * dy;
     }
+    Vec log2_alpha(Vec x, Vec y) const { return fnma(y, y, fnma(x, x, log2_opacity)); }
 };
 
 // ---------------------------------------------------------------- front to back
@@ -134,7 +141,9 @@ inline void blend_tile(Frame& frame, int index, float* color, float* depth, floa
         while (todo) {
             const int block = __builtin_ctz(todo), k = block * LANES;
             todo &= todo - 1;
-            const Vec log2_alpha = wide.log2_alpha(wide.dx(block), wide.dy(block));
+            Vec x, y;
+            wide.place(block, x, y);
+            const Vec log2_alpha = wide.log2_alpha(x, y);
             const Mask seen = log2_alpha >= load(threshold + k);
             if (!any(seen)) continue;
             blended |= 1u << block;
@@ -169,19 +178,21 @@ inline void blend_tile(Frame& frame, int index, float* color, float* depth, floa
         store(B + k, fma(left, back_b, load(B + k)));
         store(T + k, Vec(1.0f) - left);
     }
-    auto write = [&](int k, size_t p) {
-        color[3 * p] = R[k];
-        color[3 * p + 1] = G[k];
-        color[3 * p + 2] = B[k];
-        depth[p] = D[k];
-        alpha[p] = T[k];
-    };
     if (tile.whole)
         for_each_row(tile, view.width, [&](int k, size_t p) {
-            for (int i = 0; i < 4; i++) write(k + i, p + i);
+            for (int i = 0; i < 4; i++) {
+                color[3 * (p + i)] = R[k + i];
+                color[3 * (p + i) + 1] = G[k + i];
+                color[3 * (p + i) + 2] = B[k + i];
+            }
+            std::memcpy(depth + p, D + k, 4 * sizeof(float));
+            std::memcpy(alpha + p, T + k, 4 * sizeof(float));
         });
     else
-        for_each_pixel(tile, view, write);
+        for_each_pixel(tile, view, [&](int k, size_t p) {
+            color[3 * p] = R[k], color[3 * p + 1] = G[k], color[3 * p + 2] = B[k];
+            depth[p] = D[k], alpha[p] = T[k];
+        });
 }
 
 // ---------------------------------------------------------------- back to front
@@ -189,13 +200,12 @@ inline void blend_tile(Frame& frame, int index, float* color, float* depth, floa
 // What every backward sweep repeats for one block of one intersection: the same alpha as in front, and the
 // transmittance before the Gaussian, from the one behind it.
 struct BlockReplay {
-    Vec dx, dy, alpha, weight;
+    Vec x, y, alpha, weight;  // x, y: e
     Mask unclamped;  // alpha moves with the parameters only below ALPHA_MAX
     BlockReplay(const WideSplat& wide, int block, Vec position, const float* stop, float* T) {
         const int k = block * LANES;
-        dx = wide.dx(block);
-        dy = wide.dy(block);
-        const Vec log2_alpha = wide.log2_alpha(dx, dy);
+        wide.place(block, x, y);
+        const Vec log2_alpha = wide.log2_alpha(x, y);
         const Mask seen = (log2_alpha >= Vec(LOG2_ALPHA_MIN)) & (position < load(stop + k));
         const Vec raw = select_or_zero(seen, exp2(log2_alpha));
         alpha = min(raw, Vec(ALPHA_MAX));
@@ -230,55 +240,58 @@ struct TileReplay {
     }
 };
 
-// Sums of a gradient row, over the pixels of one intersection; w: cotangent of -sigma, d: pixel - centre.
+// Sums of a gradient row, over the pixels of one intersection; w: cotangent of ln alpha, (X, Y) = e.
 enum GradientSum { SUM_W, SUM_WX, SUM_WY, SUM_WXX, SUM_WXY, SUM_WYY, SUM_R, SUM_G, SUM_B, SUM_Z };
 
-// Sums of an information row. w2: square of the derivative by -sigma, over channels; cross: weight times that of depth.
+// Sums of an information row. w2: square of the derivative by ln alpha, over channels; Z: with depth's own.
 enum InformationSum {
     INFO_XX, INFO_XY, INFO_YY, INFO_XXX, INFO_XXY, INFO_XYY, INFO_YYY,
     INFO_XXXX, INFO_XXXY, INFO_XXYY, INFO_XYYY, INFO_YYYY, INFO_1, INFO_R, INFO_G, INFO_B,
     INFO_ZX, INFO_ZY, INFO_ZXX, INFO_ZXY, INFO_ZYY, INFO_ZZ,
 };
 
-// Adds the twelve distinct monomials of the Gram matrix of (dx, dy, dx^2, dx dy, dy^2), and w2 itself.
-inline void add_screen_moments(Vec w2, Vec dx, Vec dy, Vec* sums) {
-    const Vec x = w2 * dx, y = w2 * dy, xx = x * dx, xy = x * dy, yy = y * dy;
-    const Vec dxx = dx * dx, dxy = dx * dy, dyy = dy * dy;
+// Adds the twelve distinct monomials of the Gram matrix of (x, y, x^2, x y, y^2), and w2 itself.
+inline void add_screen_moments(Vec w2, Vec x, Vec y, Vec* sums) {
+    const Vec x2 = x * x, xy = x * y, y2 = y * y, w2xx = w2 * x2, w2yy = w2 * y2;
     sums[INFO_1] += w2;
-    sums[INFO_XX] += xx;
-    sums[INFO_XY] += xy;
-    sums[INFO_YY] += yy;
-    sums[INFO_XXX] = fma(xx, dx, sums[INFO_XXX]);
-    sums[INFO_XXY] = fma(xx, dy, sums[INFO_XXY]);
-    sums[INFO_XYY] = fma(yy, dx, sums[INFO_XYY]);
-    sums[INFO_YYY] = fma(yy, dy, sums[INFO_YYY]);
-    sums[INFO_XXXX] = fma(xx, dxx, sums[INFO_XXXX]);
-    sums[INFO_XXXY] = fma(xx, dxy, sums[INFO_XXXY]);
-    sums[INFO_XXYY] = fma(xx, dyy, sums[INFO_XXYY]);
-    sums[INFO_XYYY] = fma(yy, dxy, sums[INFO_XYYY]);
-    sums[INFO_YYYY] = fma(yy, dyy, sums[INFO_YYYY]);
+    sums[INFO_XX] += w2xx;
+    sums[INFO_XY] = fma(w2, xy, sums[INFO_XY]);
+    sums[INFO_YY] += w2yy;
+    sums[INFO_XXX] = fma(w2xx, x, sums[INFO_XXX]);
+    sums[INFO_XXY] = fma(w2xx, y, sums[INFO_XXY]);
+    sums[INFO_XYY] = fma(w2yy, x, sums[INFO_XYY]);
+    sums[INFO_YYY] = fma(w2yy, y, sums[INFO_YYY]);
+    sums[INFO_XXXX] = fma(w2xx, x2, sums[INFO_XXXX]);
+    sums[INFO_XXXY] = fma(w2xx, xy, sums[INFO_XXXY]);
+    sums[INFO_XXYY] = fma(w2xx, y2, sums[INFO_XXYY]);
+    sums[INFO_XYYY] = fma(w2yy, xy, sums[INFO_XYYY]);
+    sums[INFO_YYYY] = fma(w2yy, y2, sums[INFO_YYYY]);
 }
-// Adds the moments that pair the direct derivative of depth, weight dz, with that through sigma.
-inline void add_depth_moments(Vec cross, Vec square, Vec dx, Vec dy, Vec* sums) {
-    const Vec x = cross * dx, y = cross * dy;
-    sums[INFO_ZX] += x;
-    sums[INFO_ZY] += y;
-    sums[INFO_ZXX] = fma(x, dx, sums[INFO_ZXX]);
-    sums[INFO_ZXY] = fma(x, dy, sums[INFO_ZXY]);
-    sums[INFO_ZYY] = fma(y, dy, sums[INFO_ZYY]);
+// Adds the moments of the direct derivative of depth by z: its square, and its product with that by ln alpha.
+inline void add_depth_moments(Vec cross, Vec square, Vec x, Vec y, Vec* sums) {
+    const Vec cross_x = cross * x, cross_y = cross * y;
+    sums[INFO_ZX] += cross_x;
+    sums[INFO_ZY] += cross_y;
+    sums[INFO_ZXX] = fma(cross_x, x, sums[INFO_ZXX]);
+    sums[INFO_ZXY] = fma(cross_x, y, sums[INFO_ZXY]);
+    sums[INFO_ZYY] = fma(cross_y, y, sums[INFO_ZYY]);
     sums[INFO_ZZ] += square;
 }
 
-// Gradient rows, and with FISHER the rows of the squared per-pixel gradients of the same cotangents.
-template <bool FISHER>
+// Which squared per-pixel gradients are summed beside the gradient itself. Depth enters the derivative by ln alpha in any case;
+// its direct derivative by z costs six sums more, needed only where depth has a cotangent.
+enum Squares { NO_SQUARES, COLOR_SQUARES, COLOR_AND_DEPTH_SQUARES };
+
+// Gradient rows, and the information rows of the same cotangents.
+template <Squares SQUARES>
 inline Status gradient_tile(Frame& frame, int index, const float* d_color, const float* d_depth, const float* d_alpha) {
     alignas(64) float d_r[TILE_PIXELS], d_g[TILE_PIXELS], d_b[TILE_PIXELS], d_z[TILE_PIXELS], d_a[TILE_PIXELS];
     alignas(64) float behind[TILE_PIXELS];  // cotangent times what lies behind, composited
     TileReplay replay(frame, index);
     const View& view = frame.view;
     read_tile_rgb(d_color, replay.tile, view, d_r, d_g, d_b);
-    read_tile(d_depth, replay.tile, view, d_z);
-    read_tile(d_alpha, replay.tile, view, d_a);
+    read_tile_or_zero(d_depth, replay.tile, view, d_z);
+    read_tile_or_zero(d_alpha, replay.tile, view, d_a);
     if (!(all_finite(d_r) && all_finite(d_g) && all_finite(d_b))) return Status::bad_first_image;
     if (!all_finite(d_z)) return Status::bad_second_image;
     if (!all_finite(d_a)) return Status::bad_third_image;
@@ -289,18 +302,15 @@ inline Status gradient_tile(Frame& frame, int index, const float* d_color, const
     float *rows = frame.gradient_rows.data(), *rows16 = frame.information_rows16.data(), *rows8 = frame.information_rows8.data();
     replay.walk(frame, [&](const Intersection& intersection, const Splat& splat, uint32_t blocks, Vec position) {
         const size_t row = intersection.row;
-        Vec sums[GRADIENT_SUMS], info[INFORMATION_SUMS];
-        for (Vec& sum : sums) sum = Vec(0.0f);
-        if (FISHER)
-            for (Vec& sum : info) sum = Vec(0.0f);
         if (!blocks) {
             store(rows + row * GRADIENT_SUMS, Vec(0.0f));
-            if (FISHER) {
-                store(rows16 + row * 16, Vec(0.0f));
-                std::memset(rows8 + row * 8, 0, 8 * sizeof(float));
-            }
+            if (SQUARES != NO_SQUARES) store(rows16 + row * 16, Vec(0.0f));
+            if (SQUARES == COLOR_AND_DEPTH_SQUARES) std::memset(rows8 + row * 8, 0, 8 * sizeof(float));
             return;
         }
+        Vec sums[GRADIENT_SUMS], info[INFORMATION_SUMS];
+        for (Vec& sum : sums) sum = Vec(0.0f);
+        for (Vec& sum : info) sum = Vec(0.0f);
         const WideSplat wide(splat, replay.tile);
         const Vec r(splat.r), g(splat.g), b(splat.b), z(splat.z);
         while (blocks) {
@@ -312,31 +322,32 @@ inline Status gradient_tile(Frame& frame, int index, const float* d_color, const
             const Vec old = load(behind + k), gain = own - old;
             store(behind + k, fma(pixel.alpha, gain, old));
             const Vec w = select_or_zero(pixel.unclamped, pixel.weight * gain);
-            const Vec x = w * pixel.dx, y = w * pixel.dy;
+            const Vec x = w * pixel.x, y = w * pixel.y;
             sums[SUM_W] += w;
             sums[SUM_WX] += x;
             sums[SUM_WY] += y;
-            sums[SUM_WXX] = fma(x, pixel.dx, sums[SUM_WXX]);
-            sums[SUM_WXY] = fma(x, pixel.dy, sums[SUM_WXY]);
-            sums[SUM_WYY] = fma(y, pixel.dy, sums[SUM_WYY]);
+            sums[SUM_WXX] = fma(x, pixel.x, sums[SUM_WXX]);
+            sums[SUM_WXY] = fma(x, pixel.y, sums[SUM_WXY]);
+            sums[SUM_WYY] = fma(y, pixel.y, sums[SUM_WYY]);
             sums[SUM_R] = fma(pixel.weight, v_r, sums[SUM_R]);
             sums[SUM_G] = fma(pixel.weight, v_g, sums[SUM_G]);
             sums[SUM_B] = fma(pixel.weight, v_b, sums[SUM_B]);
             sums[SUM_Z] = fma(pixel.weight, v_z, sums[SUM_Z]);
-            if (FISHER) {
-                const Vec by_z = pixel.weight * v_z, weight2 = pixel.weight * pixel.weight;
-                add_screen_moments(w * w, pixel.dx, pixel.dy, info);
-                add_depth_moments(by_z * w, by_z * by_z, pixel.dx, pixel.dy, info);
+            if (SQUARES != NO_SQUARES) {
+                const Vec weight2 = pixel.weight * pixel.weight;
+                add_screen_moments(w * w, pixel.x, pixel.y, info);
                 info[INFO_R] = fma(weight2, v_r * v_r, info[INFO_R]);
                 info[INFO_G] = fma(weight2, v_g * v_g, info[INFO_G]);
                 info[INFO_B] = fma(weight2, v_b * v_b, info[INFO_B]);
             }
+            if (SQUARES == COLOR_AND_DEPTH_SQUARES) {
+                const Vec by_z = pixel.weight * v_z;
+                add_depth_moments(by_z * w, by_z * by_z, pixel.x, pixel.y, info);
+            }
         }
         store_sums16(rows + row * GRADIENT_SUMS, sums);
-        if (FISHER) {
-            store_sums16(rows16 + row * 16, info);
-            store_sums8(rows8 + row * 8, info + 16);
-        }
+        if (SQUARES != NO_SQUARES) store_sums16(rows16 + row * 16, info);
+        if (SQUARES == COLOR_AND_DEPTH_SQUARES) store_sums8(rows8 + row * 8, info + 16);
     });
     return Status::ok;
 }
@@ -373,7 +384,7 @@ inline Status information_tile(Frame& frame, int index, const float* inv_var_col
             const int block = __builtin_ctz(blocks), k = block * LANES;
             blocks &= blocks - 1;
             const BlockReplay pixel(wide, block, position, replay.stop, replay.T);
-            // d channel / d(-sigma) = weight (own value - composited value behind)
+            // d channel / d ln alpha = weight (own value - composited value behind)
             auto gain_over = [&](float* behind, Vec own) {
                 const Vec old = load(behind + k), gain = own - old;
                 store(behind + k, fma(pixel.alpha, gain, old));
@@ -385,8 +396,8 @@ inline Status information_tile(Frame& frame, int index, const float* inv_var_col
             const Vec weight2 = pixel.weight * pixel.weight, moving2 = select_or_zero(pixel.unclamped, weight2);
             const Vec color2 = fma(gain_r, gain_r, fma(gain_g, gain_g, gain_b * gain_b));
             const Vec depth_gain = of_depth * gain_z;
-            add_screen_moments(moving2 * fma(of_color, color2, depth_gain * gain_z), pixel.dx, pixel.dy, info);
-            add_depth_moments(moving2 * depth_gain, of_depth * weight2, pixel.dx, pixel.dy, info);
+            add_screen_moments(moving2 * fma(of_color, color2, depth_gain * gain_z), pixel.x, pixel.y, info);
+            add_depth_moments(moving2 * depth_gain, of_depth * weight2, pixel.x, pixel.y, info);
             info[INFO_R] = fma(weight2, of_color, info[INFO_R]);  // the same for green and blue
         }
         store_sums16(rows16 + row * 16, info);

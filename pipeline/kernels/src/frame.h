@@ -56,14 +56,14 @@ struct GaussianArrays {
     const float *means, *quats_wxyz, *log_scales, *colors, *opacity_logits;
 };
 
-// A Gaussian on the screen, one cache line: log2 alpha(d) = log2_opacity - (A dx^2 + B dx dy + C dy^2).
+// A Gaussian on the screen, one cache line. With e = M d, M = [M11 M12; 0 M22] and d = pixel - centre,
+// log2 alpha = log2_opacity - |e|^2: a sum of squares, in which nothing cancels even for long needles.
 struct alignas(64) Splat {
     float u, v;                // centre, px
-    float A, B, C;             // conic, in powers of two
+    float M11, M12, M22;       // 1/px
     float log2_opacity;
     float r, g, b, z;          // colour, depth in metres
     float extent_x, extent_y;  // half size of the box in which alpha >= 1/255, px
-    uint32_t id;               // index in the caller's arrays
 };
 
 // One Gaussian in one tile. Low half of blocks: 4x4 blocks it may touch; high half: blocks where it was blended.
@@ -89,7 +89,7 @@ struct Frame {
     int tiles_x = 0, tiles_y = 0;
 
     Scratch<Splat> splats_by_id, splats;  // the latter in order of depth
-    Scratch<uint32_t> keys, keys_swap, order, order_swap;
+    Scratch<uint32_t> keys, keys_swap, order, order_swap;  // order: index in the caller's arrays, by depth
     Scratch<BinRecord> chunk_records[DEPTH_CHUNKS];
     Scratch<uint32_t> chunk_tile_counts;
     Scratch<uint32_t> first_row;          // per splat, visible + 1: its rows are contiguous
@@ -116,6 +116,7 @@ enum class Status { ok, bad_gaussians, bad_first_image, bad_second_image, bad_th
 // One build of the kernels for one instruction set.
 struct Kernels {
     const char* name;
+    // Images other than color may be null in the backward pass: zero.
     Status (*forward)(Frame&, const GaussianArrays&, float* color, float* depth, float* alpha);
     Status (*backward)(Frame&, const GaussianArrays&, const float* d_color, const float* d_depth,
                        const float* d_alpha, const GradientArrays&);

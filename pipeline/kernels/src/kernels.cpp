@@ -17,6 +17,11 @@ static Status forward(Frame& frame, const GaussianArrays& gaussians, float* colo
     return Status::ok;
 }
 
+template <Squares S>
+struct Constant {
+    static constexpr Squares value = S;
+};
+
 // Runs a kernel over all tiles; reports the complaint about the first image before the second, whatever ran first.
 template <class TileKernel>
 static Status over_tiles(Frame& frame, TileKernel kernel) {
@@ -36,14 +41,19 @@ static Status over_tiles(Frame& frame, TileKernel kernel) {
 static Status backward(Frame& frame, const GaussianArrays& gaussians, const float* d_color, const float* d_depth,
                        const float* d_alpha, const GradientArrays& out) {
     frame.gradient_rows.need(frame.intersection_count * GRADIENT_SUMS);
-    Status status;
     if (out.fisher_diagonal) {
         frame.information_rows16.need(frame.intersection_count * 16);
-        frame.information_rows8.need(frame.intersection_count * 8);
-        status = over_tiles(frame, [&](int tile) { return gradient_tile<true>(frame, tile, d_color, d_depth, d_alpha); });
-    } else
-        status = over_tiles(frame, [&](int tile) { return gradient_tile<false>(frame, tile, d_color, d_depth, d_alpha); });
-    if (status == Status::ok) gradients_of_parameters(frame, gaussians, out);
+        if (d_depth) frame.information_rows8.need(frame.intersection_count * 8);
+    }
+    const auto run = [&](auto squares) {
+        return over_tiles(frame, [&](int tile) {
+            return gradient_tile<decltype(squares)::value>(frame, tile, d_color, d_depth, d_alpha);
+        });
+    };
+    const Status status = !out.fisher_diagonal ? run(Constant<NO_SQUARES>())
+                          : d_depth            ? run(Constant<COLOR_AND_DEPTH_SQUARES>())
+                                               : run(Constant<COLOR_SQUARES>());
+    if (status == Status::ok) gradients_of_parameters(frame, gaussians, d_depth != nullptr, out);
     return status;
 }
 
@@ -74,8 +84,8 @@ static void contributions(Frame& frame, float* weights, uint32_t* pixels) {
             weight += rows[static_cast<size_t>(row) * GRADIENT_SUMS];
             count += static_cast<uint32_t>(rows[static_cast<size_t>(row) * GRADIENT_SUMS + 1]);
         }
-        weights[frame.splats.data()[i].id] = weight;
-        pixels[frame.splats.data()[i].id] = count;
+        weights[frame.order.data()[i]] = weight;
+        pixels[frame.order.data()[i]] = count;
     }
 }
 

@@ -101,7 +101,8 @@ public:
                                     fisher.size() ? fisher.data() : nullptr, pose.size() ? pose.data() : nullptr};
         const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
         const nb::gil_scoped_release unlocked;
-        return static_cast<int>(kernels_->backward(frame_, gaussians, d_color.data(), d_depth.data(), d_alpha.data(), out));
+        const float *depth = d_depth.size() ? d_depth.data() : nullptr, *alpha = d_alpha.size() ? d_alpha.data() : nullptr;
+        return static_cast<int>(kernels_->backward(frame_, gaussians, d_color.data(), depth, alpha, out));
     }
 
     int fisher(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,

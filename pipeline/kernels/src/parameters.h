@@ -5,33 +5,48 @@
 
 namespace KERNEL_ISA {
 
-// Sixteen neighbours in the order of depth (the last group repeats its first), projected again.
-struct Group {
-    int lanes;
+// Sixteen neighbours in the order of depth; the last group repeats its first.
+struct Members {
     size_t first;
+    int lanes;
     uint32_t ids[LANES];
-    Parameters16 parameters;
-    Splat16 splat;
-    Group(const Frame& frame, const GaussianArrays& gaussians, size_t group) : first(group * LANES) {
+    Members(const Frame& frame, size_t group) : first(group * LANES) {
         lanes = frame.visible - first < LANES ? static_cast<int>(frame.visible - first) : LANES;
-        for (int lane = 0; lane < LANES; lane++) ids[lane] = frame.splats.data()[first + (lane < lanes ? lane : 0)].id;
-        parameters = gather_parameters(gaussians, ids);
-        splat = project16(frame.view, parameters.mean, parameters.quat, parameters.log_scale);
+        const uint32_t* order = frame.order.data() + first;
+        for (int lane = 0; lane < LANES; lane++) ids[lane] = order[lane < lanes ? lane : 0];
     }
-    // Sums of the rows of each Gaussian, in order of the rows; sums[k] holds column k of the sixteen.
-    template <int WIDTH>
+};
+struct Group : Members {
+    const Parameters16 parameters;
+    const Splat16 splat;  // projected once more: cheaper than to keep it
+    Group(const Frame& frame, const GaussianArrays& gaussians, size_t group)
+        : Members(frame, group), parameters(gather_parameters(gaussians, ids)),
+          splat(project16(frame.view, parameters.mean, parameters.quat, parameters.log_scale)) {}
+
+    // Sums of the rows of each Gaussian, in order of the rows; sums[k] holds column k < USED of the sixteen.
+    template <int WIDTH, int USED>
     void reduce(const Frame& frame, const float* rows, Vec* sums) const {
-        alignas(64) float columns[WIDTH][LANES];
+        alignas(64) float columns[USED][LANES];
+        const uint32_t* first_row = frame.first_row.data() + first;
         for (int lane = 0; lane < LANES; lane++) {
-            alignas(64) float total[WIDTH] = {};
-            if (lane < lanes) {
-                const size_t i = first + lane;
-                for (uint32_t row = frame.first_row.data()[i]; row < frame.first_row.data()[i + 1]; row++)
-                    for (int k = 0; k < WIDTH; k++) total[k] += rows[static_cast<size_t>(row) * WIDTH + k];
-            }
-            for (int k = 0; k < WIDTH; k++) columns[k][lane] = total[k];
+            alignas(64) float total[LANES];
+            const int member = lane < lanes ? lane : 0;
+            sum_rows<WIDTH>(rows, first_row[member], first_row[member + 1], total);
+            for (int k = 0; k < USED; k++) columns[k][lane] = total[k];
         }
-        for (int k = 0; k < WIDTH; k++) sums[k] = load(columns[k]);
+        for (int k = 0; k < USED; k++) sums[k] = load(columns[k]);
+    }
+    template <int WIDTH>
+    static void sum_rows(const float* rows, uint32_t begin, uint32_t end, float* total) {
+        if (WIDTH == LANES) {
+            Vec sum(0.0f);
+            for (uint32_t row = begin; row < end; row++) sum += load(rows + static_cast<size_t>(row) * WIDTH);
+            store(total, sum);
+            return;
+        }
+        for (int k = 0; k < WIDTH; k++) total[k] = 0.0f;
+        for (uint32_t row = begin; row < end; row++)
+            for (int k = 0; k < WIDTH; k++) total[k] += rows[static_cast<size_t>(row) * WIDTH + k];
     }
 };
 
@@ -52,7 +67,7 @@ inline void scatter_add(const Vec* values, const Group& group, double* array) {
         for (int k = 0; k < WIDTH; k++) array[static_cast<size_t>(group.ids[lane]) * WIDTH + k] += columns[k][lane];
 }
 
-// Gram matrix of one pixel sum: entry (k, l) is the sum of w2 m_k m_l over the monomials m = (dx, dy, dx^2, dx dy, dy^2),
+// Gram matrix of one pixel sum: entry (k, l) is the sum of w2 m_k m_l over the monomials m = (x, y, x^2, x y, y^2) of e,
 // row and column 5 the direct derivative of depth.
 struct ScreenGram {
     Vec g[6][6];
@@ -70,7 +85,7 @@ struct ScreenGram {
     }
 };
 
-// Derivatives of the per-pixel coefficients of (dx, dy, dx^2, dx dy, dy^2, depth) by the centre in the map frame, and
+// Derivatives of the per-pixel coefficients of (x, y, x^2, x y, y^2, depth) by the centre in the map frame, and
 // the cotangents Y of Sigma in own axes that belong to the three quadratic ones.
 struct ScreenDerivatives {
     Vec by_mean[6][3];
@@ -80,10 +95,10 @@ struct ScreenDerivatives {
         Vec centre[3];
         auto clear = [&] { centre[0] = centre[1] = centre[2] = zero; };
         clear();
-        add_centre_from_screen(s, s.A, s.B, centre);  // d(-sigma)/d centre = K d
+        add_centre_from_moments(s, one, zero, centre);
         to_map_frame(view, centre, by_mean[0]);
         clear();
-        add_centre_from_screen(s, s.B, s.C, centre);
+        add_centre_from_moments(s, zero, one, centre);
         to_map_frame(view, centre, by_mean[1]);
         for (int k = 0; k < 3; k++) {
             Vec Q[6], d_J[6];
@@ -138,18 +153,18 @@ inline void empirical_diagonal(const View& view, const Splat16& s, Vec transpare
     diagonal[13] = transparency * transparency * info[INFO_1];
 }
 
-inline void gradient_group(const Frame& frame, const GaussianArrays& gaussians, size_t index, const GradientArrays& out,
-                           double* pose) {
+inline void gradient_group(const Frame& frame, const GaussianArrays& gaussians, size_t index, bool has_depth,
+                           const GradientArrays& out, double* pose) {
     const Group group(frame, gaussians, index);
     const Splat16& s = group.splat;
     Vec sums[GRADIENT_SUMS];
-    group.reduce<GRADIENT_SUMS>(frame, frame.gradient_rows.data(), sums);
+    group.reduce<GRADIENT_SUMS, SUM_Z + 1>(frame, frame.gradient_rows.data(), sums);
 
     Vec Q[6], Y[6], d_J[6], centre[3] = {Vec(0.0f), Vec(0.0f), Vec(0.0f)}, mean[3], quat[4], log_scale[3];
     own_axes_cotangent(s, covariance_cotangent(s, sums[SUM_WXX], sums[SUM_WXY], sums[SUM_WYY]), Q, Y);
     jacobian_cotangent(s, Q, d_J);
     add_centre_from_jacobian(s, d_J, centre);
-    add_centre_from_screen(s, fma(s.A, sums[SUM_WX], s.B * sums[SUM_WY]), fma(s.B, sums[SUM_WX], s.C * sums[SUM_WY]), centre);
+    add_centre_from_moments(s, sums[SUM_WX], sums[SUM_WY], centre);
     centre[2] += sums[SUM_Z];
     to_map_frame(frame.view, centre, mean);
     quaternion_cotangent(s, Y, quat);
@@ -172,8 +187,9 @@ inline void gradient_group(const Frame& frame, const GaussianArrays& gaussians, 
     }
     if (out.fisher_diagonal) {
         Vec info[INFORMATION_SUMS], diagonal[14];
-        group.reduce<16>(frame, frame.information_rows16.data(), info);
-        group.reduce<8>(frame, frame.information_rows8.data(), info + 16);
+        group.reduce<16, 16>(frame, frame.information_rows16.data(), info);
+        for (int k = 16; k < INFORMATION_SUMS; k++) info[k] = Vec(0.0f);
+        if (has_depth) group.reduce<8, INFO_ZZ + 1 - 16>(frame, frame.information_rows8.data(), info + 16);
         empirical_diagonal(frame.view, s, transparency, info, diagonal);
         scatter<14>(diagonal, group, out.fisher_diagonal);
     }
@@ -182,7 +198,8 @@ inline void gradient_group(const Frame& frame, const GaussianArrays& gaussians, 
 inline size_t group_count(const Frame& frame) { return (frame.visible + LANES - 1) / LANES; }
 
 // Gradients of all drawn Gaussians; the pose sums in 64 fixed chunks, in double, added in order.
-inline void gradients_of_parameters(Frame& frame, const GaussianArrays& gaussians, const GradientArrays& out) {
+inline void gradients_of_parameters(Frame& frame, const GaussianArrays& gaussians, bool has_depth,
+                                    const GradientArrays& out) {
     const size_t groups = group_count(frame);
     double* parts = frame.pose_parts.need(POSE_CHUNKS * 6);
     std::memset(parts, 0, sizeof(double) * POSE_CHUNKS * 6);
@@ -190,7 +207,7 @@ inline void gradients_of_parameters(Frame& frame, const GaussianArrays& gaussian
     for (int chunk = 0; chunk < POSE_CHUNKS; chunk++) {
         double pose[6] = {};
         for (size_t g = groups * chunk / POSE_CHUNKS; g < groups * (chunk + 1) / POSE_CHUNKS; g++)
-            gradient_group(frame, gaussians, g, out, pose);
+            gradient_group(frame, gaussians, g, has_depth, out, pose);
         std::memcpy(parts + 6 * chunk, pose, sizeof pose);
     }
     if (!out.pose) return;
@@ -252,8 +269,8 @@ inline void geometry_information(const View& view, const Splat16& s, const Vec* 
 inline void information_group(const Frame& frame, const GaussianArrays& gaussians, size_t index, const FisherArrays& out) {
     const Group group(frame, gaussians, index);
     Vec info[INFORMATION_SUMS], upper[45];
-    group.reduce<16>(frame, frame.information_rows16.data(), info);
-    group.reduce<8>(frame, frame.information_rows8.data(), info + 16);
+    group.reduce<16, 16>(frame, frame.information_rows16.data(), info);
+    group.reduce<8, INFO_ZZ + 1 - 16>(frame, frame.information_rows8.data(), info + 16);
     geometry_information(frame.view, group.splat, info, upper);
     const Vec transparency = sigmoid(-group.parameters.logit), opacity = transparency * transparency * info[INFO_1];
     const Vec color[3] = {info[INFO_R], info[INFO_R], info[INFO_R]};

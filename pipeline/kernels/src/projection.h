@@ -1,9 +1,9 @@
 // Sixteen Gaussians as one camera sees them, and the way back from screen to parameters.
 //
 // With J the derivative of the projection, W the rotation to the camera, R the Gaussian's axes and S its scales:
-//   axes = W R,   P = J axes (2x3),   U = P S,   covariance on the screen = U U^T + BLUR I,   conic K its inverse.
-// No 3x3 covariance is ever formed; the way back needs only the symmetric Y = P^T C P, C the cotangent of the
-// screen covariance: the cotangent of Sigma in the Gaussian's own axes.
+//   axes = W R,   P = J axes (2x3),   U = P S,   covariance on the screen C = U U^T + BLUR I.
+// The pixel loops work in e = M d, d = pixel - centre, with M^T M = C^-1 log2(e)/2, so that alpha = opacity 2^-|e|^2.
+// No 3x3 covariance is ever formed; the way back needs only the symmetric Y = P^T G P, G the cotangent of C: the cotangent of Sigma in the Gaussian's own axes.
 #pragma once
 
 #include "frame.h"
@@ -17,6 +17,7 @@ constexpr float NEAR_M = 0.01f;              // Gaussians whose centre is nearer
 constexpr float BLUR_PX2 = 0.3f;             // low-pass added to the screen covariance
 constexpr float FIELD_MARGIN = 1.3f;         // J is linearised no further out than this times the half field
 constexpr float LARGEST_PX2 = 1e12f;         // Gaussians with more variance on the screen are not drawn
+constexpr float SQRT_HALF_LOG2_E = 0.84932180f;  // sqrt(log2(e) / 2)
 constexpr float LOG2_ALPHA_MIN = -7.99435344f;  // log2(1/255): fainter contributions are skipped
 
 struct Splat16 {
@@ -29,7 +30,7 @@ struct Splat16 {
     Vec J00, J02, J11, J12;          // J = [J00 0 J02; 0 J11 J12]
     Vec P[6];
     Vec cov_xx, cov_yy;
-    Vec A, B, C;                     // conic K = [A B; B C], 1/px^2
+    Vec M11, M12, M22;               // M = [M11 M12; 0 M22], 1/px
     Vec u, v;
     Mask drawable;
 };
@@ -92,10 +93,10 @@ inline Splat16 project16(const View& view, const Vec* mean, const Vec* quat, con
     // det(U U^T + b I) = sum of the squared 2x2 minors of U + b trace + b^2: nothing cancels for needles
     const Vec m01 = U[0] * U[4] - U[1] * U[3], m02 = U[0] * U[5] - U[2] * U[3], m12 = U[1] * U[5] - U[2] * U[4];
     const Vec determinant = fma(m01, m01, fma(m02, m02, fma(m12, m12, fma(blur, xx + yy, blur * blur))));
-    const Vec inverse = Vec(1.0f) / determinant;
-    s.A = s.cov_yy * inverse;
-    s.B = -(xy * inverse);
-    s.C = s.cov_xx * inverse;
+    const Vec scale(SQRT_HALF_LOG2_E);
+    s.M11 = scale * sqrt(s.cov_yy / determinant);
+    s.M12 = -(xy / s.cov_yy) * s.M11;
+    s.M22 = scale / sqrt(s.cov_yy);
     s.drawable = (s.z >= Vec(NEAR_M)) & (s.cov_xx <= Vec(LARGEST_PX2)) & (s.cov_yy <= Vec(LARGEST_PX2));
     return s;
 }
@@ -109,15 +110,24 @@ struct Symmetric2 {
     Vec xx, xy, yy;
 };
 
-// Cotangent of the screen covariance, 1/2 K M K, from the second moments M = sum w d d^T (d: pixel - centre,
-// w: cotangent of -sigma, sigma = d^T K d / 2).
-inline Symmetric2 covariance_cotangent(const Splat16& s, Vec m_xx, Vec m_xy, Vec m_yy) {
-    const Vec k00 = fma(s.A, m_xx, s.B * m_xy), k01 = fma(s.A, m_xy, s.B * m_yy);
-    const Vec k10 = fma(s.B, m_xx, s.C * m_xy), k11 = fma(s.B, m_xy, s.C * m_yy), half(0.5f);
-    return {half * fma(k00, s.A, k01 * s.B), half * fma(k00, s.B, k01 * s.C), half * fma(k10, s.B, k11 * s.C)};
+// Cotangent of the screen covariance from the second moments sum w e e^T; w: cotangent of ln alpha. For
+// ln alpha = -d^T C^-1 d / 2 it is C^-1 (sum w d d^T) C^-1 / 2, and C^-1 = 2 ln2 M^T M.
+inline Symmetric2 covariance_cotangent(const Splat16& s, Vec w_xx, Vec w_xy, Vec w_yy) {
+    const Vec factor(2.0f * LN_2 * LN_2);
+    const Vec top = fma(w_xx, s.M12, w_xy * s.M22), bottom = fma(w_xy, s.M12, w_yy * s.M22);
+    return {factor * (s.M11 * s.M11 * w_xx), factor * (s.M11 * top), factor * fma(s.M12, top, s.M22 * bottom)};
 }
 
-// Q = C P (2x3), and Y = P^T Q as (00, 11, 22, 01, 02, 12).
+// Adds what the first moments sum w e mean for the centre in the camera frame: d ln alpha / d centre = 2 ln2 M^T e.
+inline void add_centre_from_moments(const Splat16& s, Vec w_x, Vec w_y, Vec* d_centre) {
+    const Vec factor(2.0f * LN_2);
+    const Vec x = factor * (s.M11 * w_x) * s.J00, y = factor * fma(s.M12, w_x, s.M22 * w_y) * s.J11;
+    d_centre[0] += x;
+    d_centre[1] += y;
+    d_centre[2] = fnma(x, s.slope_x, fnma(y, s.slope_y, d_centre[2]));
+}
+
+// Q = G P (2x3), and Y = P^T Q as (00, 11, 22, 01, 02, 12).
 inline void own_axes_cotangent(const Splat16& s, const Symmetric2& c, Vec* Q, Vec* Y) {
     for (int k = 0; k < 3; k++) {
         Q[k] = fma(c.xx, s.P[k], c.xy * s.P[3 + k]);
@@ -153,14 +163,6 @@ inline void add_centre_from_jacobian(const Splat16& s, const Vec* d_J, Vec* d_ce
     d_centre[0] += d_slope_x * s.inverse_z;
     d_centre[1] += d_slope_y * s.inverse_z;
     d_centre[2] = fnma(s.inverse_z, fma(d_slope_x, s.slope_x, fma(d_slope_y, s.slope_y, d_inverse_z)), d_centre[2]);
-}
-
-// Adds what a cotangent of the centre on the screen means for the centre in the camera frame.
-inline void add_centre_from_screen(const Splat16& s, Vec d_u, Vec d_v, Vec* d_centre) {
-    const Vec x = d_u * s.J00, y = d_v * s.J11;
-    d_centre[0] += x;
-    d_centre[1] += y;
-    d_centre[2] = fnma(x, s.slope_x, fnma(y, s.slope_y, d_centre[2]));
 }
 
 // W^T d: a cotangent of the centre from the camera frame to the map frame.

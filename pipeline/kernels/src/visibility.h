@@ -32,23 +32,22 @@ inline void gather(const float* array, const uint32_t* ids, Vec* out) {
 }
 
 struct Parameters16 {
-    Vec mean[3], quat[4], log_scale[3], color[3], logit;
+    Vec mean[3], quat[4], log_scale[3], logit;
 };
 inline Parameters16 gather_parameters(const GaussianArrays& gaussians, const uint32_t* ids) {
     Parameters16 p;
     gather<3>(gaussians.means, ids, p.mean);
     gather<4>(gaussians.quats_wxyz, ids, p.quat);
     gather<3>(gaussians.log_scales, ids, p.log_scale);
-    gather<3>(gaussians.colors, ids, p.color);
     gather<1>(gaussians.opacity_logits, ids, &p.logit);
     return p;
 }
 
 // All numbers finite, all quaternions of a length whose square is neither 0 nor infinite.
-inline bool usable(const Parameters16& p) {
+inline bool usable(const Parameters16& p, const Vec* color) {
     const Vec zero(0.0f);
     Vec sum = p.logit * zero;
-    for (int k = 0; k < 3; k++) sum = sum + (p.mean[k] * zero + p.log_scale[k] * zero) + p.color[k] * zero;
+    for (int k = 0; k < 3; k++) sum = sum + (p.mean[k] * zero + p.log_scale[k] * zero) + color[k] * zero;
     Vec norm2 = zero;
     for (int k = 0; k < 4; k++) norm2 = fma(p.quat[k], p.quat[k], norm2);
     return bits((sum >= zero) & (norm2 >= Vec(1e-30f)) & (norm2 <= Vec(1e30f))) == 0xffffu;
@@ -67,7 +66,9 @@ inline bool project_all(Frame& frame, const GaussianArrays& gaussians) {
         uint32_t ids[LANES];
         for (int lane = 0; lane < LANES; lane++) ids[lane] = first + (lane < lanes ? lane : 0);
         const Parameters16 p = gather_parameters(gaussians, ids);
-        if (!usable(p)) unusable++;
+        Vec color[3];
+        gather<3>(gaussians.colors, ids, color);
+        if (!usable(p, color)) unusable++;
         const Splat16 s = project16(view, p.mean, p.quat, p.log_scale);
 
         const Vec log2_opacity = log2_sigmoid(p.logit);
@@ -82,9 +83,9 @@ inline bool project_all(Frame& frame, const GaussianArrays& gaussians) {
         alignas(64) float field[9][LANES];
         store(field[0], s.u);
         store(field[1], s.v);
-        store(field[2], s.A * Vec(0.5f * LOG2_E));
-        store(field[3], s.B * Vec(LOG2_E));
-        store(field[4], s.C * Vec(0.5f * LOG2_E));
+        store(field[2], s.M11);
+        store(field[3], s.M12);
+        store(field[4], s.M22);
         store(field[5], log2_opacity);
         store(field[6], s.z);
         store(field[7], extent_x);
@@ -99,9 +100,9 @@ inline bool project_all(Frame& frame, const GaussianArrays& gaussians) {
             Splat& splat = splats[id];
             splat.u = field[0][lane];
             splat.v = field[1][lane];
-            splat.A = field[2][lane];
-            splat.B = field[3][lane];
-            splat.C = field[4][lane];
+            splat.M11 = field[2][lane];
+            splat.M12 = field[3][lane];
+            splat.M22 = field[4][lane];
             splat.log2_opacity = field[5][lane];
             splat.r = color[0];
             splat.g = color[1];
@@ -109,7 +110,6 @@ inline bool project_all(Frame& frame, const GaussianArrays& gaussians) {
             splat.z = field[6][lane];
             splat.extent_x = field[7][lane];
             splat.extent_y = field[8][lane];
-            splat.id = id;
             std::memcpy(&keys[id], &splat.z, sizeof(float));  // positive floats order like their bits
         }
     }
@@ -153,23 +153,27 @@ inline void sort_by_depth(Frame& frame, size_t count) {
 }
 
 // Bit b is set if some pixel of 4x4 block b of the tile can lie inside the ellipse alpha >= 1/255. Exact but for a
-// slack of 1e-4: the quadratic's minimum over the box of a block's pixel centres lies on the edges nearest the centre.
+// slack of 1e-4: the minimum of |e|^2 over the box of a block's pixel centres lies on the edges nearest the centre.
 struct BlockTest {
-    Vec A, B, C, slope_x, slope_y, reach;
+    Vec M11, M12, M22, best_x_per_y, best_y_per_x, reach;  // where |e|^2 is least along a row, along a column
     float u, v;
     explicit BlockTest(const Splat& s)
-        : A(s.A), B(s.B), C(s.C), slope_x(-0.5f * s.B / s.A), slope_y(-0.5f * s.B / s.C),
+        : M11(s.M11), M12(s.M12), M22(s.M22), best_x_per_y(-s.M12 / s.M11),
+          best_y_per_x(-s.M11 * s.M12 / (s.M12 * s.M12 + s.M22 * s.M22)),
           reach(s.log2_opacity - LOG2_ALPHA_MIN + 1e-4f), u(s.u), v(s.v) {}
+
+    Vec squared_distance(Vec dx, Vec dy) const {
+        const Vec x = fma(M11, dx, M12 * dy), y = M22 * dy;
+        return fma(x, x, y * y);
+    }
 
     uint32_t operator()(int tile_x, int tile_y) const {
         const Vec zero(0.0f), side(3.0f);
         const Vec x0 = load(BLOCK_OF_TILE.x) + Vec(tile_x * TILE - u), x1 = x0 + side;
         const Vec y0 = load(BLOCK_OF_TILE.y) + Vec(tile_y * TILE - v), y1 = y0 + side;
         const Vec near_x = min(max(zero, x0), x1), near_y = min(max(zero, y0), y1);
-        const Vec best_y = min(max(slope_y * near_x, y0), y1), best_x = min(max(slope_x * near_y, x0), x1);
-        const Vec on_x = fma(near_x, fma(A, near_x, B * best_y), C * best_y * best_y);
-        const Vec on_y = fma(best_x, fma(A, best_x, B * near_y), C * near_y * near_y);
-        return bits(min(on_x, on_y) <= reach);
+        const Vec best_x = min(max(best_x_per_y * near_y, x0), x1), best_y = min(max(best_y_per_x * near_x, y0), y1);
+        return bits(min(squared_distance(near_x, best_y), squared_distance(best_x, near_y)) <= reach);
     }
 };
 
