@@ -37,10 +37,14 @@ class FusionConfig(Config):
     """The same for opacity logits."""
     unobserved_below: float = Field(default=1e-6, gt=0.0)
     """Directions with less than this share of a block's largest information count as unobserved: float32 noise."""
-    explained_m: float = Field(default=0.05, ge=0.0)
+    explained_m: float = Field(default=0.10, ge=0.0)
     """A neighbour's Gaussian this far behind a surface that an own keyframe measured still counts as explained..."""
-    explained_relative: float = Field(default=0.02, ge=0.0)
+    explained_relative: float = Field(default=0.03, ge=0.0)
     """... plus this share of its depth."""
+    explained_px: int = Field(default=4, ge=0)
+    """The farthest surface within so many pixels decides: at outlines the two robots' poses and depths never agree."""
+    explained_opacity: float = Field(default=0.5, ge=0.0, le=1.0)
+    """Where a keyframe has no depth but the own map renders more opaque than this, the rendered depth stands in."""
     added_need_information: bool = True
     """Take over only Gaussians on whose position their owner's pixels said something."""
     max_added: int | None = Field(default=None, ge=0)

@@ -14,7 +14,7 @@ anything, the own value stays.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -269,12 +269,13 @@ def fuse(
     absorbed[member] = True
     absorbed[representative] = False
     foreign = np.flatnonzero((owner != me) & ~absorbed)
-    added = np.zeros(0, np.int64)
-    if config.coverage == "all":
-        added = _to_add(foreign, rows, sums, T_world_keyframe[robot], depth_images, camera, config)
-
     same_frame = np.array_equal(T_map_keyframe, T_world_keyframe[robot])
     moved = gaussians if same_frame else gaussians.moved(T_map_keyframe, T_world_keyframe[robot])
+    added = np.zeros(0, np.int64)
+    if config.coverage == "all" and len(foreign):
+        surfaces = _surfaces(moved, T_world_keyframe[robot], depth_images, camera, config)
+        added = _to_add(foreign, rows, sums, T_world_keyframe[robot], surfaces, camera, config)
+
     kept = _applied(moved, move[own_rows], rows.theta[own_rows, LOG_COVARIANCE])
     ids = np.concatenate([world[n].ids for n in names])
     anchors = np.concatenate([world[n].anchors for n in names])
@@ -352,6 +353,26 @@ def _to_add(
     if config.max_added is not None and len(foreign) > config.max_added:
         foreign = np.sort(foreign[np.lexsort((foreign, -position))[: config.max_added]])
     return foreign
+
+
+def _surfaces(
+    own_world: Gaussians,
+    T_world_keyframe: Array,
+    depth_images: Iterable[tuple[int, NDArray[np.float32]]],
+    camera: PinholeCamera,
+    config: FusionConfig,
+) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """What own keyframes know of surfaces: measured depth, rendered where it is missing, the farthest close by."""
+    from scipy.ndimage import maximum_filter
+
+    from pipeline.kernels import Rasterizer
+
+    rasterizer = Rasterizer()
+    for keyframe, depth in depth_images:
+        render = rasterizer.forward(own_world, camera, se3.inverse(T_world_keyframe[keyframe]))
+        stands_in = (depth <= 0) & (render.alpha > config.explained_opacity)
+        filled = np.where(stands_in, render.depth / np.maximum(render.alpha, np.float32(1e-3)), depth)
+        yield keyframe, maximum_filter(filled, 2 * config.explained_px + 1)
 
 
 def explained(

@@ -334,7 +334,7 @@ def test_neighbours_unmatched_gaussians_fill_only_unseen_space():
     depth = np.zeros((CAMERA.height, CAMERA.width), np.float32)
     depth[:, :32] = 2.0
     points = np.array(
-        [[-0.5, 0, 1.0], [-0.5, 0, 2.03], [-0.5, 0, 2.5], [0.5, 0, 1.0], [0, 0, -1.0], [9, 0, 1.0]]
+        [[-0.5, 0, 1.0], [-0.5, 0, 2.1], [-0.5, 0, 2.5], [0.5, 0, 1.0], [0, 0, -1.0], [9, 0, 1.0]]
     )
     seen = explained(points, np.eye(4)[None], [(0, depth)], CAMERA, CONFIG)
     # in front of the wall, at it, behind it, where nothing was measured, behind the camera, beside the image
@@ -355,6 +355,15 @@ def test_neighbours_unmatched_gaussians_fill_only_unseen_space():
     np.testing.assert_array_equal(fused.source_ids[N:], [2, 3, 4, 5])
     assert [fused.robots[s] for s in fused.source[N:]] == ["bravo"] * 4
     assert len(np.unique(fused.gaussians.ids)) == N + 4
+    beside = np.array([[0.05, 0, 1.0], [0.3, 0, 1.0]])  # 2 and 15 pixels beside the wall's outline
+    for px, count in ((4, 1), (0, 2)):
+        taken = theta[:2].copy()
+        taken[:, MEAN] = beside
+        near = given["evidence"] | {
+            "bravo": Evidence("bravo", np.arange(2), np.zeros(2), taken, information(rng, 2))
+        }
+        config = CONFIG.model_copy(update={"explained_px": px})
+        assert world.fuse("alpha", config, [(0, depth)], **(given | {"evidence": near})).added == count
     overlap = CONFIG.model_copy(update={"coverage": "overlap"})
     assert world.fuse("alpha", overlap, [(0, depth)], **given).added == 0
     capped = world.fuse("alpha", CONFIG.model_copy(update={"max_added": 2}), [(0, depth)], **given)
@@ -364,6 +373,40 @@ def test_neighbours_unmatched_gaussians_fill_only_unseen_space():
         "bravo": Evidence("bravo", np.arange(6), np.zeros(6), theta, np.zeros((6, 31)))
     }
     assert world.fuse("alpha", depth_images=[(0, depth)], **(given | {"evidence": unknown})).added == 0
+
+
+def test_the_own_map_explains_where_depth_is_missing():
+    """A wall of own splats at 2 m without depth: a neighbour's splats at and before it are no news."""
+    grid = np.stack(np.meshgrid(np.linspace(-1.5, 1.5, 40), np.linspace(-1.2, 1.2, 40)), axis=-1).reshape(
+        -1, 2
+    )
+    n = len(grid)
+    own = Gaussians(
+        np.arange(n),
+        np.zeros(n),
+        np.concatenate([grid, np.full((n, 1), 2.0)], axis=1),
+        np.tile([1.0, 0, 0, 0], (n, 1)),
+        np.log(np.tile([0.06, 0.06, 0.001], (n, 1))),
+        np.full((n, 3), 0.5),
+        np.full(n, 4.0),
+    )
+    theta = np.zeros((3, 13))
+    theta[:, MEAN] = [[0, 0, 1.0], [0.1, 0, 2.05], [0, 0.1, 3.0]]
+    theta[:, LOG_COVARIANCE] = -8 * np.array([1, 1, 1, 0, 0, 0])
+    origin = np.eye(4)[None]
+    evidence = {
+        "alpha": Evidence.from_map("alpha", own, None, origin),
+        "bravo": Evidence("bravo", np.arange(3), np.zeros(3), theta, np.ones((3, 31))),
+    }
+    poses, nothing = {"alpha": origin, "bravo": origin}, np.zeros((CAMERA.height, CAMERA.width), np.float32)
+    taken = {
+        opacity: fuse(
+            "alpha", own, origin, evidence, poses, {}, [(0, nothing)], CAMERA,
+            CONFIG.model_copy(update={"explained_opacity": opacity}), MATCHING,
+        ).source_ids[n:].tolist()
+        for opacity in (0.5, 1.0)
+    }  # fmt: skip
+    assert taken == {0.5: [2], 1.0: [0, 1, 2]}
 
 
 def test_what_two_neighbours_share_is_taken_over_once():
