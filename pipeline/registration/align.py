@@ -64,7 +64,7 @@ class RegistrationConfig(Config):
     """Grey gradient (1/px) below which a sample's grey value is not used."""
     min_samples: int = 100
     """Fewer agreeing samples are LOW_OVERLAP."""
-    min_overlap: float = 0.25
+    min_overlap: float = 0.3
     """Smaller overlap is LOW_OVERLAP."""
     max_conflict: float = 0.3
     """Largest fraction of seen samples that lie in space which the target saw to be free."""
