@@ -23,7 +23,7 @@ class MappingConfig(Config):
     """Optimisation steps (one view each) at a keyframe; every second one is on the newest keyframe."""
     iterations_level: int = 1
     """Image pyramid level of these steps: 0 full size, 1 half size."""
-    final_iterations: int = 50
+    final_iterations: int = 60
     """Steps of the final refinement for every keyframe, at full size, shared by all views."""
     final_iterations_max: int = 2000
     """Most steps of the final refinement in all."""
