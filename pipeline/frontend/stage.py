@@ -64,7 +64,7 @@ def run_frontend(
         )
         keyframes = _keyframe_messages(log.robot, tracker.keyframes, T_map_keyframes, covariance)
         clock.lap("refinement_s")
-        updates, gaussians = _map(log, keyframes, config, seed, threads, progress)
+        updates, gaussians = _map(log, keyframes, frames, config, seed, threads, progress)
         clock.lap("mapping_s")
     odometry = [_odometry(log.robot, frame, T_map_keyframes, config) for frame in frames]
     _write(out_path, log.robot, odometry, keyframes, updates, gaussians)
@@ -116,12 +116,16 @@ def _keyframe_messages(
 def _map(
     log: RgbdLog,
     keyframes: Sequence[Keyframe],
+    frames: Sequence[TrackedFrame],
     config: FrontendConfig,
     seed: int,
     threads: int,
     progress: bool,
 ) -> tuple[list[MapUpdate], Gaussians]:
-    """Grow the map at the keyframes' poses; one update per keyframe, and one for the final refinement."""
+    """Grow the map at the keyframes' poses; one update per keyframe, and one for the final refinement.
+
+    Other tracked frames support that refinement; held-out frames are not even decoded.
+    """
     if not config.mapping_enabled:
         return [], Gaussians.empty()
     from pipeline.frontend.mapping import Mapper, MappingStats
@@ -146,8 +150,29 @@ def _map(
         image = frame.color.astype(np.float32) * np.float32(1 / 255)
         stats = mapper.add_keyframe(keyframe.keyframe_index, image, frame.depth, keyframe.T_map_camera)
         updates.append(update(keyframe, stats))
+    for supporting in _support(frames, keyframes, config):
+        frame = log.frame(supporting.frame_index)
+        image = frame.color.astype(np.float32) * np.float32(1 / 255)
+        mapper.add_view(supporting.keyframe_index, image, frame.depth, supporting.T_keyframe_camera)
     updates.append(update(keyframes[-1], mapper.finish()))
     return updates, mapper.gaussians
+
+
+def _support(
+    frames: Sequence[TrackedFrame], keyframes: Sequence[Keyframe], config: FrontendConfig
+) -> list[TrackedFrame]:
+    """Frames for the final refinement of the map: tracked, no keyframes, not held out; evenly spread over the log."""
+    taken = {keyframe.frame_index for keyframe in keyframes}
+    candidates = [
+        frame
+        for frame in frames
+        if frame.status is not Status.LOST
+        and frame.frame_index not in taken
+        and not config.is_held_out(frame.frame_index)
+    ]
+    count = min(config.mapping.support_views, len(candidates))
+    # the middle of each of `count` equal parts
+    return [candidates[(2 * k + 1) * len(candidates) // (2 * count)] for k in range(count)]
 
 
 def _odometry(robot: str, frame: TrackedFrame, T_map_keyframes: Array, config: FrontendConfig) -> Odometry:

@@ -10,7 +10,8 @@ from converters.base import RecordingWriter
 from pipeline.errors import DuagError
 from pipeline.frontend.config import FrontendConfig, TrackingConfig
 from pipeline.frontend.mapping_config import MappingConfig
-from pipeline.frontend.stage import LATENCY_NS, run_frontend
+from pipeline.frontend.stage import LATENCY_NS, _support, run_frontend
+from pipeline.frontend.tracking import Status, TrackedFrame
 from pipeline.geometry import se3
 from pipeline.geometry.trajectory import ate_rmse_m
 from pipeline.recording import content_digest, read_log
@@ -106,6 +107,22 @@ def test_map_is_grown_at_the_refined_keyframes(sensor_log: Path) -> None:
         [m.keyframe_index for m in keyframes] + [keyframes[-1].keyframe_index]
     )
     assert updates[-1].total == len(final[0].gaussians)
+
+
+def test_held_out_and_lost_frames_never_support_the_map(frontend_log: Path) -> None:
+    keyframes = messages(frontend_log, topics.KEYFRAME)
+    nothing = np.zeros((6, 6))
+    frames = [
+        TrackedFrame(k, k, 0, np.eye(4), nothing, Status.LOST if k == 7 else Status.OK, 1.0, 0.0, 0.0)
+        for k in range(FRAMES)
+    ]
+    forbidden = {4, 7, 12, *(m.frame_index for m in keyframes)}
+    for count in (0, 3, 100):
+        config = TRACKING.model_copy(update={"mapping": MappingConfig(support_views=count)})
+        chosen = [f.frame_index for f in _support(frames, keyframes, config)]
+        assert chosen == sorted(set(chosen))
+        assert not forbidden & set(chosen)
+        assert len(chosen) == min(count, FRAMES - len(forbidden))
 
 
 def test_a_missing_log_is_named(tmp_path: Path) -> None:
