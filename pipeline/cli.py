@@ -86,7 +86,6 @@ def demo(
     Example: `duagc demo --out outputs/demo`
     """
     from converters.simulate import simulate as simulate_recording
-
     from pipeline.runner import RunConfig, new_folder
     from pipeline.runner import run as run_stages
 
@@ -100,11 +99,14 @@ def demo(
 @app.command()
 def simulate(
     out: Out,
-    robots: Annotated[int, typer.Option(min=1, help="Number of robots.")] = 2,
+    robots: Annotated[int, typer.Option(min=1, max=8, help="Number of robots.")] = 2,
     frames: Annotated[int, typer.Option(min=2, help="Frames per robot.")] = 160,
     scene: Annotated[str, typer.Option(help="Name of a procedural scene.")] = "room",
     width: Annotated[int, typer.Option(min=32, help="Pixels.")] = 480,
     height: Annotated[int, typer.Option(min=32, help="Pixels.")] = 360,
+    overlap: Annotated[
+        float, typer.Option(min=0, max=1, help="Share of the view that neighbours see.")
+    ] = 0.6,
     noise: Annotated[str, typer.Option(help="none or kinect.")] = "none",
     seed: Annotated[int, typer.Option(help="Seed of scene, paths and noise.")] = 0,
     workers: Workers = 2,
@@ -122,6 +124,7 @@ def simulate(
         frames=frames,
         scene=scene,
         size=(width, height),
+        overlap=overlap,
         noise=noise,
         seed=seed,
         workers=workers,

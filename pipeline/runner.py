@@ -22,11 +22,10 @@ from pipeline.config import Config, dump
 from pipeline.digest import digest_file, result_files
 from pipeline.errors import DuagError
 from pipeline.exchange.config import ExchangeConfig
-from pipeline.exchange.inputs import AgentInput
-from pipeline.exchange.results import AgentResult
 from pipeline.frontend.config import FrontendConfig
 from pipeline.fusion.config import FusionConfig
 from pipeline.information.config import InformationConfig
+from pipeline.robot import AgentInput, AgentResult
 
 OURS = ("manifest.json", "run/manifest.json")  # a run, a demo
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")

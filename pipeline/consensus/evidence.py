@@ -28,10 +28,20 @@ _POSITION, _SHAPE, _COLOR, _OPACITY = slice(0, 6), slice(6, 27), slice(27, 30), 
 class FisherSums(Protocol):
     """What the information stage hands over, in the map frame: see `messages.GaussianInformation`."""
 
-    ids: NDArray[np.int64]
-    geometry: NDArray[Any]  # [n, 45] upper triangle, row by row, of the 9x9 of (mean, vec log Sigma)
-    color: NDArray[Any]  # [n, 3]
-    opacity: NDArray[Any]  # [n]
+    @property
+    def ids(self) -> NDArray[np.int64]: ...
+
+    @property
+    def geometry(self) -> NDArray[Any]:
+        """[n, 45], upper triangle, row by row, of the 9x9 of (mean, vec log Sigma)."""
+
+    @property
+    def color(self) -> NDArray[Any]:
+        """[n, 3]."""
+
+    @property
+    def opacity(self) -> NDArray[Any]:
+        """[n]."""
 
 
 def unpack_symmetric(upper: ArrayLike, size: int) -> Array:

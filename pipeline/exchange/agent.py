@@ -36,15 +36,14 @@ from pipeline.exchange.evidence import (
     to_evidence,
     within,
 )
-from pipeline.exchange.inputs import RobotData
 from pipeline.exchange.knowledge import Knowledge
 from pipeline.exchange.meeting import HigherEnd, LowerEnd, Meeting, OwnPlaces, Send
 from pipeline.exchange.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError, Packet, parse
-from pipeline.exchange.results import AgentResult, ClosureRecord
 from pipeline.exchange.transport import Arrival, Message, Outgoing, Transport
 from pipeline.exchange.verification import Verdict
 from pipeline.exchange.wire import Anchors, PairList, State
 from pipeline.geometry import se3
+from pipeline.robot import AgentResult, ClosureRecord, RobotData
 
 Array = NDArray[np.float64]
 HALF = 0.5  # robust weight from which a closure counts as kept

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from pipeline.consensus.config import MatchingConfig
 from pipeline.consensus.evidence import Evidence
 from pipeline.consensus.matching import match
-from pipeline.exchange.inputs import RobotData
 from pipeline.exchange.wire import RECORD
 from pipeline.geometry import se3
+from pipeline.robot import RobotData
 from pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]

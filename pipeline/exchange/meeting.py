@@ -25,13 +25,13 @@ from pipeline.consensus.factors import Factors
 from pipeline.consensus.poses import PoseAgent, SharedKeyframes
 from pipeline.exchange import places, wire
 from pipeline.exchange.config import ExchangeConfig
-from pipeline.exchange.inputs import RobotData
 from pipeline.exchange.packets import Kind, MalformedError
 from pipeline.exchange.places import Candidate, Features
 from pipeline.exchange.verification import Verdict, Verified, verify
 from pipeline.exchange.wire import KeyframeSample, PlaceBook, Verdicts
 from pipeline.geometry import se3
 from pipeline.registration import Reference, RgbdPyramid
+from pipeline.robot import RobotData
 
 Array = NDArray[np.float64]
 Send = Callable[[Kind, bytes], None]

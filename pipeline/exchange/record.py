@@ -12,10 +12,10 @@ from pipeline.errors import DuagError
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.links import Fate
 from pipeline.exchange.packets import EVIDENCE_KINDS, HEADER_BYTES, Kind, MalformedError, parse
-from pipeline.exchange.results import AgentResult
 from pipeline.exchange.transport import Outgoing
 from pipeline.messages import map_frame, pack_pose, pack_stamp
 from pipeline.recording import LogWriter, read_log
+from pipeline.robot import AgentResult
 from schemas import topics
 
 

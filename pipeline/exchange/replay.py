@@ -10,10 +10,9 @@ from pipeline import numeric
 from pipeline.exchange import links
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.config import ExchangeConfig
-from pipeline.exchange.inputs import AgentInput, RobotData, load
 from pipeline.exchange.record import read_session
-from pipeline.exchange.results import AgentResult
 from pipeline.exchange.session import Delivery, due
+from pipeline.robot import AgentInput, AgentResult, RobotData, load
 
 
 @dataclass(frozen=True)

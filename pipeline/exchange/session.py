@@ -10,13 +10,12 @@ from pipeline.errors import DuagError
 from pipeline.exchange import links
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.config import ExchangeConfig
-from pipeline.exchange.inputs import AgentInput, RobotData, load
 from pipeline.exchange.links import LinkModel
 from pipeline.exchange.record import ConsensusRecorder, ExchangeRecorder
-from pipeline.exchange.results import AgentResult
 from pipeline.exchange.wire import MAX_TEAM
 from pipeline.progress import track
 from pipeline.recording import LogWriter
+from pipeline.robot import AgentInput, AgentResult, RobotData, load
 
 __all__ = ["AgentInput", "run_session", "run_session_of"]
 

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from pipeline.consensus.config import MatchingConfig
 from pipeline.consensus.evidence import unpack_symmetric
 from pipeline.errors import DuagError
-from pipeline.exchange.inputs import AgentInput, RobotData, load
-from pipeline.exchange.results import AgentResult
 from pipeline.fusion.config import FusionConfig
 from pipeline.fusion.fuse import FusedMap, fuse
 from pipeline.geometry.trajectory import Trajectory, write_tum
 from pipeline.messages import WORLD_FRAME, CorrectedKeyframes, GaussianInformation, GaussianMap, Odometry
 from pipeline.recording import LogWriter, read_log
+from pipeline.robot import AgentInput, AgentResult, RobotData, load
 from pipeline.splat.ply import write_ply
 from schemas import topics
 

@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline import streams
-from pipeline.exchange.inputs import RobotData, Step
 from pipeline.geometry import se3, so3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.messages import GaussianInformation
+from pipeline.robot import RobotData, Step
 from pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]

@@ -12,14 +12,13 @@ import pytest
 
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.config import ExchangeConfig, LinkConfig, TransportConfig
-from pipeline.exchange.inputs import RobotData
 from pipeline.exchange.packets import Kind, Packet, chunk_bytes, parse, serialise
 from pipeline.exchange.record import read_session
 from pipeline.exchange.replay import replay_agent_of
-from pipeline.exchange.results import AgentResult
 from pipeline.exchange.session import run_session_of
 from pipeline.geometry import se3
 from pipeline.recording import content_digest, read_log
+from pipeline.robot import AgentResult, RobotData
 
 NAMES = ("alpha", "bravo", "charlie")
 

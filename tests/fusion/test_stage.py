@@ -12,7 +12,6 @@ from converters.base import RecordingWriter
 from pipeline.consensus.config import MatchingConfig
 from pipeline.consensus.evidence import Evidence
 from pipeline.errors import DuagError
-from pipeline.exchange.inputs import AgentInput
 from pipeline.fusion.config import FusionConfig
 from pipeline.fusion.stage import run_fusion
 from pipeline.geometry import se3
@@ -27,6 +26,7 @@ from pipeline.messages import (
     map_frame,
 )
 from pipeline.recording import LogWriter, read_log
+from pipeline.robot import AgentInput
 from pipeline.splat.gaussians import Gaussians
 from pipeline.splat.ply import write_ply
 from schemas import topics

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pipeline.errors import DuagError
-from pipeline.exchange.inputs import AgentInput, load
 from pipeline.messages import GaussianMap, Keyframe
 from pipeline.recording import LogWriter
+from pipeline.robot import AgentInput, load
 from schemas import topics
 
 
