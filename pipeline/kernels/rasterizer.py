@@ -13,6 +13,7 @@ from pipeline.splat.gaussians import Gaussians
 MAX_SIDE_PX = 16384
 MAX_THREADS = 1024
 MAX_GAUSSIANS = 2**30
+LARGEST_LOG_SCALE = 40.0  # of metres; as in visibility.h
 ROTATION_TOLERANCE = 1e-4  # of R^T R - I; a pose read from six decimals passes
 
 Image = NDArray[np.float32]
@@ -230,6 +231,12 @@ def _complaint_about(gaussians: Gaussians) -> str:
         bad = np.flatnonzero(~np.isfinite(array.reshape(len(gaussians), -1)).all(axis=1))
         if len(bad):
             return f"gaussians.{name} holds a NaN or an infinity, first in row {bad[0]}"
+    largest = gaussians.log_scales.max(axis=1)
+    if largest.max() > LARGEST_LOG_SCALE:
+        row = int(np.argmax(largest))
+        return (
+            f"gaussians.log_scales is {largest[row]:.3g} in row {row}, expected at most {LARGEST_LOG_SCALE}"
+        )
     norm2 = (gaussians.quats_wxyz.astype(np.float64) ** 2).sum(axis=1)
     row = int(np.argmax(np.maximum(norm2, 1.0 / np.maximum(norm2, 1e-300))))
     return f"gaussians.quats_wxyz has length {np.sqrt(norm2[row]):.3g} in row {row}, expected 1e-15 to 1e15"

@@ -30,7 +30,7 @@ FIELD_MARGIN = 1.3
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
-JACOBIAN_ROWS = 64  # pixels differentiated at once
+JACOBIAN_ROWS = 16  # pixels differentiated at once
 
 _PARAMETERS = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
 

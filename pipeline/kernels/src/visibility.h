@@ -43,14 +43,19 @@ inline Parameters16 gather_parameters(const GaussianArrays& gaussians, const uin
     return p;
 }
 
+constexpr float LARGEST_LOG_SCALE = 40.0f;  // of metres; the square of a scale beyond would overflow
+
 // All numbers finite, all quaternions of a length whose square is neither 0 nor infinite.
 inline bool usable(const Parameters16& p, const Vec* color) {
     const Vec zero(0.0f);
-    Vec sum = p.logit * zero;
-    for (int k = 0; k < 3; k++) sum = sum + (p.mean[k] * zero + p.log_scale[k] * zero) + color[k] * zero;
-    Vec norm2 = zero;
+    Vec sum = p.logit * zero, norm2 = zero, largest = p.log_scale[0];
+    for (int k = 0; k < 3; k++) {
+        sum = sum + (p.mean[k] * zero + p.log_scale[k] * zero) + color[k] * zero;
+        largest = max(p.log_scale[k], largest);
+    }
     for (int k = 0; k < 4; k++) norm2 = fma(p.quat[k], p.quat[k], norm2);
-    return bits((sum >= zero) & (norm2 >= Vec(1e-30f)) & (norm2 <= Vec(1e30f))) == 0xffffu;
+    return bits((sum >= zero) & (norm2 >= Vec(1e-30f)) & (norm2 <= Vec(1e30f)) & (largest <= Vec(LARGEST_LOG_SCALE))) ==
+           0xffffu;
 }
 
 // One Splat and one depth key per Gaussian; false if a parameter is not usable.
@@ -72,7 +77,7 @@ inline bool project_all(Frame& frame, const GaussianArrays& gaussians) {
         const Splat16 s = project16(view, p.mean, p.quat, p.log_scale);
 
         const Vec log2_opacity = log2_sigmoid(p.logit);
-        // sigma <= ln(255 opacity) is an ellipse in a box of half size sqrt(2 ln(255 opacity) cov_ii)
+        // alpha >= 1/255 is an ellipse in a box of half size sqrt(2 ln(255 opacity) cov_ii)
         const Vec reach = max(log2_opacity - Vec(LOG2_ALPHA_MIN), Vec(0.0f)) * Vec(2.0f * LN_2);
         const Vec extent_x = sqrt(reach * s.cov_xx), extent_y = sqrt(reach * s.cov_yy), zero(0.0f);
         const Mask drawn = s.drawable & (log2_opacity >= Vec(LOG2_ALPHA_MIN)) & (s.u + extent_x >= zero) &

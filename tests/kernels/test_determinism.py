@@ -1,0 +1,65 @@
+"""The same bits for any number of threads, any instruction set, any history of the scratch memory."""
+
+import hashlib
+from functools import cache
+
+import numpy as np
+import pytest
+
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.kernels import FisherSums, Rasterizer, available_isas
+from tests.kernels.scenes import make_scene, random_gaussians
+
+CAMERA = PinholeCamera(203, 117, 90.0, 92.0, 101.2, 57.1)
+CALLS = [(isa, threads) for isa in available_isas() for threads in (1, 2, 3, 5)]
+
+
+def digest(rasterizer: Rasterizer) -> str:
+    """SHA-256 over every output of one view of 3000 Gaussians."""
+    gaussians = random_gaussians(3000, seed=1)
+    rng, shape = np.random.default_rng(2), (CAMERA.height, CAMERA.width)
+    d_color, d_depth, d_alpha = (rng.normal(size=s).astype(np.float32) for s in ((*shape, 3), shape, shape))
+    of_color, of_depth = (rng.uniform(0, 1e3, shape).astype(np.float32) for _ in range(2))
+    sums = FisherSums(len(gaussians))
+    render = rasterizer.forward(gaussians, CAMERA, np.eye(4), (0.1, 0.2, 0.3))
+    gradients = rasterizer.backward(d_color, d_depth, d_alpha, pose=True, fisher=True)
+    rasterizer.fisher(of_color, of_depth, sums)
+    arrays = [
+        *vars(render).values(),
+        *vars(gradients).values(),
+        *vars(sums).values(),
+        *rasterizer.contributions(),
+    ]
+    assert len(arrays) == 16
+    return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
+
+
+@cache
+def one_digest() -> str:
+    return digest(Rasterizer(*CALLS[0]))
+
+
+@pytest.mark.parametrize(("isa", "threads"), CALLS)
+def test_one_digest_for_threads_and_instruction_sets(isa, threads):
+    assert digest(Rasterizer(isa, threads)) == one_digest()
+
+
+def test_scratch_of_other_views_leaves_no_trace():
+    rasterizer = Rasterizer(threads=2)
+    for kind in ("wide", "opaque", "behind"):
+        scene = make_scene(kind)
+        rasterizer.forward(scene.gaussians, scene.camera, scene.T_camera_map)
+        rasterizer.backward(scene.image(0, 3), fisher=True)
+        assert digest(rasterizer) == one_digest()
+
+
+def test_order_of_the_arrays_does_not_matter():
+    gaussians = random_gaussians(500, seed=4)  # all depths differ
+    order = np.random.default_rng(5).permutation(500)
+    rasterizer, d_color = Rasterizer(), np.ones((CAMERA.height, CAMERA.width, 3), dtype=np.float32)
+    first = rasterizer.forward(gaussians, CAMERA, np.eye(4))
+    gradients = rasterizer.backward(d_color)
+    second = rasterizer.forward(gaussians.select(order), CAMERA, np.eye(4))
+    permuted = rasterizer.backward(d_color)
+    np.testing.assert_array_equal(first.color, second.color)
+    np.testing.assert_array_equal(gradients.means[order], permuted.means)
