@@ -16,7 +16,7 @@ class KeyframeConfig(Config):
     """A frame that turned by more than this becomes a keyframe."""
     neighbours: int = 4
     """Earlier keyframes that a new one is registered to, besides the one it was tracked against."""
-    neighbour_overlap: float = 0.4
+    neighbour_overlap: float = 0.5
     """Least overlap, predicted and found, of such a registration."""
     huber_sigmas: float = 3.0
     """Registrations that disagree by more than this with the refined poses count linearly."""
