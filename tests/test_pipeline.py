@@ -9,6 +9,7 @@ import pytest
 from converters.simulate import simulate
 from pipeline.config import load
 from pipeline.digest import digest, digest_file, result_files
+from pipeline.errors import DuagError
 from pipeline.replay import replay, robots_of
 from pipeline.runner import RunConfig, run
 
@@ -35,7 +36,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def recording(folder: Path) -> Path:
     out = folder / "recording"
-    simulate(out, robots=2, frames=24, size=(192, 144), seed=1, workers=2)
+    simulate(out, robots=2, frames=24, size=(240, 180), seed=1, overlap=0.9, workers=2)
     return out
 
 
@@ -83,6 +84,19 @@ def test_each_robot_replays_bit_for_bit(recording: Path, finished: Path) -> None
     assert [c.name for c in comparisons if not c.equal] == []
 
 
+def test_a_damaged_log_stops_the_run_with_one_line(folder: Path, recording: Path) -> None:
+    damaged = folder / "damaged"
+    shutil.copytree(recording, damaged)
+    log = damaged / "bravo.mcap"
+    content = bytearray(log.read_bytes())
+    content[len(content) // 2] ^= 1
+    log.write_bytes(content)
+    with pytest.raises(DuagError, match=r"bravo\.mcap") as caught:
+        make_run(damaged, folder / "run_damaged")
+    assert "\n" not in str(caught.value)
+    assert not list(folder.glob("run_damaged*"))
+
+
 def test_nothing_delivered_is_nothing_said(folder: Path, recording: Path, finished: Path) -> None:
     silent = make_run(recording, folder / "run_silent", "exchange.link.enabled=false")
     deaf = make_run(recording, folder / "run_deaf", "exchange.link.loss_probability=1.0")
@@ -90,6 +104,7 @@ def test_nothing_delivered_is_nothing_said(folder: Path, recording: Path, finish
     changed = robots_digests(finished)
     own = robots_digests(silent)
     for robot in ("alpha", "bravo"):
+        assert own[f"robots/{robot}/trajectory.tum"] == own[f"robots/{robot}/odometry.tum"]
         assert changed[f"robots/{robot}/frontend.mcap"] == own[f"robots/{robot}/frontend.mcap"]
         assert changed[f"robots/{robot}/odometry.tum"] == own[f"robots/{robot}/odometry.tum"]
         assert changed[f"robots/{robot}/fused.ply"] != own[f"robots/{robot}/fused.ply"]
