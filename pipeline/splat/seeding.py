@@ -36,7 +36,7 @@ class SeedingConfig(Config):
     depth_error_m: float = 0.04
     """Depth error above which a pixel is not explained, plus depth_error_relative times the depth."""
     depth_error_relative: float = 0.02
-    opacity: float = 0.8
+    opacity: float = 0.7
     """Initial opacity."""
     spread: float = 0.55
     """Standard deviation of a disc in units of its cell's side on the surface."""
