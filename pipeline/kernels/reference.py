@@ -57,8 +57,8 @@ class ReferenceRasterizer:
         self._log_covariances = spd.log_covariance(gaussians.quats_wxyz, gaussians.log_scales)
         self._xi = torch.zeros(6, dtype=torch.float64, requires_grad=True)
         p = self._parameters
-        covariances = _covariances(p["quats_wxyz"], p["log_scales"])
-        self._images = self._draw(p["means"], covariances, p["colors"], p["opacity_logits"])
+        sigma = sigma_of(p["quats_wxyz"], p["log_scales"])
+        self._images = self._draw(p["means"], sigma, p["colors"], p["opacity_logits"])
         return Render(*(image.detach().numpy() for image in self._images))
 
     def backward(
@@ -143,44 +143,10 @@ class ReferenceRasterizer:
         # T_map_camera exp(xi): the camera sees exp(-xi) p; first order is exact for derivatives at xi = 0
         turn = torch.eye(3, dtype=torch.float64) - _hat(w)
         W, t = turn @ self._T[:3, :3], turn @ self._T[:3, 3] - v
-        p = means @ W.T + t
-        x, y, z = p.unbind(-1)
-        order = torch.argsort(z.detach(), stable=True)
-        order = order[z.detach()[order] >= NEAR_M]
-        x, y, z = x[order], y[order], z[order]
-
-        limit_x, limit_y = (
-            FIELD_MARGIN * camera.width / 2 / camera.fx,
-            FIELD_MARGIN * camera.height / 2 / camera.fy,
-        )
-        zero = torch.zeros_like(z)
-        J = torch.stack(
-            [
-                torch.stack([camera.fx / z, zero, -camera.fx * (x / z).clamp(-limit_x, limit_x) / z], -1),
-                torch.stack([zero, camera.fy / z, -camera.fy * (y / z).clamp(-limit_y, limit_y) / z], -1),
-            ],
-            dim=-2,
-        )
-        JW = J @ W
-        screen = JW @ covariances[order] @ JW.mT + BLUR_PX2 * torch.eye(2, dtype=torch.float64)
-        conic = torch.linalg.inv(screen)
-
+        order, z, centres, conics = project(means, covariances, W, t, camera)
         rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
-        pixels = torch.stack([columns, rows], -1).reshape(-1, 1, 2).to(torch.float64)
-        centres = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
-        d = pixels - centres
-        raw = torch.sigmoid(opacity_logits[order]) * torch.exp(
-            -0.5 * torch.einsum("pni,nij,pnj->pn", d, conic, d)
-        )
-        alpha = torch.where(raw.detach() >= ALPHA_MIN, raw.clamp(max=ALPHA_MAX), torch.zeros_like(raw))
-        left = torch.cumprod(1 - alpha.detach(), dim=1)
-        drawn = torch.cumprod((left >= TRANSMITTANCE_MIN).long(), dim=1).bool()
-        self._margin = _margin(raw.detach().numpy(), left.numpy())
-        alpha = torch.where(drawn, alpha, torch.zeros_like(alpha))
-        left = torch.cumprod(1 - alpha, dim=1)
-        before = torch.cat([torch.ones_like(left[:, :1]), left[:, :-1]], dim=1)[:, : len(order)]
-        weights = alpha * before
-
+        pixels = torch.stack([columns, rows], -1).reshape(-1, 2).to(torch.float64)
+        weights, self._margin = blend(pixels, centres, conics, torch.sigmoid(opacity_logits[order]))
         total = weights.sum(1)
         self._weights = torch.zeros(len(total), self._n, dtype=torch.float64).index_copy(1, order, weights)
         shape = (camera.height, camera.width)
@@ -188,7 +154,50 @@ class ReferenceRasterizer:
         return color.reshape(*shape, 3), (weights @ z).reshape(shape), total.reshape(shape)
 
 
-def _covariances(quats_wxyz: Any, log_scales: Any) -> Any:
+def project(means: Any, covariances: Any, W: Any, t: Any, camera: PinholeCamera) -> tuple[Any, Any, Any, Any]:
+    """Gaussians in front of the camera (rotation W, translation t of T_camera_map), nearest first.
+
+    Returns their indices [k], depths z [k], centres [k, 2] in pixels and inverse screen covariances [k, 2, 2].
+    """
+    import torch
+
+    x, y, z = (means @ W.T + t).unbind(-1)
+    order = torch.argsort(z.detach(), stable=True)
+    order = order[z.detach()[order] >= NEAR_M]
+    x, y, z = x[order], y[order], z[order]
+    limit_x = FIELD_MARGIN * camera.width / 2 / camera.fx
+    limit_y = FIELD_MARGIN * camera.height / 2 / camera.fy
+    zero = torch.zeros_like(z)
+    J = torch.stack(
+        [
+            torch.stack([camera.fx / z, zero, -camera.fx * (x / z).clamp(-limit_x, limit_x) / z], -1),
+            torch.stack([zero, camera.fy / z, -camera.fy * (y / z).clamp(-limit_y, limit_y) / z], -1),
+        ],
+        dim=-2,
+    )
+    JW = J @ W
+    screen = JW @ covariances[order] @ JW.mT + BLUR_PX2 * torch.eye(2, dtype=z.dtype)
+    centres = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
+    return order, z, centres, torch.linalg.inv(screen)
+
+
+def blend(pixels: Any, centres: Any, conics: Any, opacities: Any) -> tuple[Any, float]:
+    """Blending weights [m, k] of k Gaussians, nearest first, at m pixels, and their `gate_margin`."""
+    import torch
+
+    x, y = (pixels[:, None] - centres).unbind(-1)
+    power = conics[:, 0, 0] * x * x + 2 * conics[:, 0, 1] * x * y + conics[:, 1, 1] * y * y  # d^T C^-1 d
+    raw = opacities * torch.exp(-0.5 * power)
+    alpha = torch.where(raw.detach() >= ALPHA_MIN, raw.clamp(max=ALPHA_MAX), torch.zeros_like(raw))
+    left = torch.cumprod(1 - alpha.detach(), dim=1)
+    drawn = torch.cumprod((left >= TRANSMITTANCE_MIN).long(), dim=1).bool()
+    margin = _margin(raw.detach().numpy(), left.numpy())
+    alpha = torch.where(drawn, alpha, torch.zeros_like(alpha))
+    before = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], dim=1), dim=1)[:, :-1]
+    return alpha * before, margin
+
+
+def sigma_of(quats_wxyz: Any, log_scales: Any) -> Any:
     """Sigma [n, 3, 3] of quaternions of any length and log-scales."""
     import torch
 
