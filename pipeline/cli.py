@@ -179,11 +179,12 @@ def replay(
 
     Exit code 3 if anything differs. Example: `duagc replay outputs/demo/run`
     """
-    from pipeline.replay import recording_of, robots_of
     from pipeline.replay import replay as replay_robots
+    from pipeline.run_folder import RunFolder
 
-    robots = [robot] if robot else robots_of(run_folder)
-    comparisons = replay_robots(run_folder, recording or recording_of(run_folder), robots, say)
+    run = RunFolder(run_folder)
+    robots = [robot] if robot else list(run.robots)
+    comparisons = replay_robots(run_folder, recording or run.recording, robots, say)
     for c in comparisons:
         verdict = (
             "equal" if c.equal else f"DIFFERS: recorded {c.recorded[:12]}, recomputed {c.recomputed[:12]}"
@@ -232,10 +233,12 @@ def evaluate(
     Example: `duagc evaluate outputs/demo/run --json`
     """
     from pipeline.evaluation import evaluate as evaluate_run
-    from pipeline.replay import recording_of
+    from pipeline.run_folder import RunFolder
     from pipeline.runner import threads_per_worker
 
-    metrics = evaluate_run(run_folder, recording or recording_of(run_folder), threads=threads_per_worker(1))
+    metrics = evaluate_run(
+        run_folder, recording or RunFolder(run_folder).recording, threads=threads_per_worker(1)
+    )
     print(json.dumps(metrics, indent=2) if as_json else run_folder / "metrics.json")
 
 
@@ -248,10 +251,10 @@ def report(
 
     Example: `duagc report outputs/demo/run`
     """
-    from pipeline.replay import recording_of
     from pipeline.report import write_report
+    from pipeline.run_folder import RunFolder
 
-    print(write_report(run_folder, recording or recording_of(run_folder)))
+    print(write_report(run_folder, recording or RunFolder(run_folder).recording))
 
 
 @app.command()

@@ -3,7 +3,6 @@
 This is the proof of decentralisation: nothing of the other robots' logs, maps or memory is read.
 """
 
-import json
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -13,6 +12,7 @@ from pathlib import Path
 from pipeline.config import load
 from pipeline.digest import digest_file
 from pipeline.errors import DuagError
+from pipeline.run_folder import RunFolder
 from pipeline.runner import RunConfig, agent_input, fuse_robot, prepare_robot, threads_per_worker
 
 COMPARED = ("frontend.mcap", "information.mcap", "fused.mcap", "fused.ply", "trajectory.tum", "odometry.tum")
@@ -52,34 +52,16 @@ def replay(
     logs = Recording(recording)
     out = []
     for robot in robots:
-        if not (run / "robots" / robot).is_dir():
-            raise DuagError(f"{run}: robot {robot} not found, expected one of {', '.join(robots_of(run))}")
+        if robot not in RunFolder(run).robots:
+            raise DuagError(
+                f"{run}: robot {robot} not found, expected one of {', '.join(RunFolder(run).robots)}"
+            )
         folder = Path(tempfile.mkdtemp(prefix=f"duagc-replay-{robot}-"))
         try:
             out += _replay_one(run, logs.log(robot), robot, folder, config, say)
         finally:
             shutil.rmtree(folder)
     return out
-
-
-def robots_of(run: Path) -> list[str]:
-    """Names of the robots of a run."""
-    if not (run / "robots").is_dir():
-        raise DuagError(f"{run}: expected a finished run, found no folder robots/")
-    return sorted(p.name for p in (run / "robots").iterdir() if p.is_dir())
-
-
-def recording_of(run: Path) -> Path:
-    """Where a run says that its recording is. Raises DuagError if it is not there."""
-    try:
-        recording = run / json.loads((run / "manifest.json").read_text())["recording"]
-    except (OSError, ValueError, KeyError) as error:
-        raise DuagError(
-            f"{run / 'manifest.json'}: unreadable ({error}), expected that of a finished run"
-        ) from error
-    if not recording.is_dir():
-        raise DuagError(f"{run / 'manifest.json'}: recording {recording} not found; give --recording")
-    return recording.resolve()
 
 
 def _replay_one(

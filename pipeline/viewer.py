@@ -23,7 +23,6 @@ from pipeline.errors import DuagError
 from pipeline.evaluation.network import Session
 from pipeline.evaluation.paths import Path3, paths
 from pipeline.evaluation.results import Absent
-from pipeline.evaluation.run_folder import RobotRun, RunFolder
 from pipeline.evaluation.stage import poses_by_stamp
 from pipeline.geometry import so3
 from pipeline.messages import camera_frame
@@ -31,6 +30,7 @@ from pipeline.recording import RECORDING_FILE, Recording, open_rgbd
 from pipeline.report import words
 from pipeline.report.figures import color_of
 from pipeline.report.page import position_sigma_m, sigma_colors
+from pipeline.run_folder import RobotRun, RunFolder
 from pipeline.splat.gaussians import Gaussians
 from schemas import topics
 
@@ -75,9 +75,7 @@ def _as_rrd(path: Path, folder: Path) -> Path:
         made = path / "run.rrd"
         if made.is_file():
             return made
-        from pipeline.replay import recording_of
-
-        return write_rrd(path, recording_of(path), out)
+        return write_rrd(path, RunFolder(path).recording, out)
     if (path / RECORDING_FILE).is_file():
         recording = Recording(path)
         return recording_to_rrd([recording.log(robot) for robot in recording.robots], out)

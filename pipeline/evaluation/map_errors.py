@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pipeline.evaluation import calibration
 from pipeline.evaluation.groundtruth import Surface
 from pipeline.evaluation.results import Absent
-from pipeline.evaluation.run_folder import position_information
 from pipeline.geometry import se3
 from pipeline.messages import GaussianMap
+from pipeline.run_folder import position_information
 
 Array = NDArray[np.float64]
 WORST_CONDITION = 1e12

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import DuagError
 from pipeline.evaluation.results import Absent
-from pipeline.evaluation.run_folder import RunFolder
 from pipeline.recording import read_log
+from pipeline.run_folder import RunFolder
 from schemas import topics
 
 Series = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]

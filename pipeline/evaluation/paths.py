@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from pipeline.evaluation import groundtruth, trajectory_errors
 from pipeline.evaluation.results import Absent
-from pipeline.evaluation.run_folder import RunFolder
 from pipeline.geometry import se3
 from pipeline.geometry.trajectory import Trajectory
 from pipeline.recording import Recording
+from pipeline.run_folder import RunFolder
 
 Array = NDArray[np.float64]
 

@@ -23,11 +23,11 @@ from pipeline.evaluation.results import (
     write_json,
     write_parquet,
 )
-from pipeline.evaluation.run_folder import RobotRun, RunFolder, is_held_out
 from pipeline.evaluation.trajectory_errors import Paired, TeamError
 from pipeline.geometry.trajectory import Trajectory
 from pipeline.progress import track
 from pipeline.recording import Recording, RgbdLog, open_rgbd
+from pipeline.run_folder import RobotRun, RunFolder, is_held_out
 
 SCHEMA = 1
 MAPS = ("own", "fused")

@@ -14,12 +14,12 @@ from pipeline.errors import DuagError
 from pipeline.evaluation.network import Session
 from pipeline.evaluation.paths import Path3, paths, top_view_axes
 from pipeline.evaluation.results import Absent
-from pipeline.evaluation.run_folder import RobotRun, RunFolder, is_held_out, position_information
 from pipeline.evaluation.stage import poses_by_stamp
 from pipeline.evaluation.views import score_view, surface_depth
 from pipeline.geometry import se3
 from pipeline.recording import Recording, open_rgbd
 from pipeline.report import figures, pictures, words
+from pipeline.run_folder import RobotRun, RunFolder, is_held_out, position_information
 
 if TYPE_CHECKING:
     from pipeline.kernels import Rasterizer, Render

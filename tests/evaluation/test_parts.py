@@ -10,10 +10,10 @@ from pipeline.evaluation.groundtruth import Surface
 from pipeline.evaluation.network import Session
 from pipeline.evaluation.paths import top_view_axes
 from pipeline.evaluation.results import Absent
-from pipeline.evaluation.run_folder import RunFolder, is_held_out, position_information
 from pipeline.geometry import se3
 from pipeline.kernels import Render
 from pipeline.recording import LogWriter
+from pipeline.run_folder import RunFolder, is_held_out, position_information
 from schemas import topics
 from tests.evaluation.fake_run import make
 

@@ -133,6 +133,21 @@ class RunFolder:
         return min(members.values(), key=lambda names: (-len(names), names))
 
     @property
+    def recording(self) -> Path:
+        """Where the manifest says that the recording of this run is.
+
+        Raises:
+            DuagError: this is not a finished run, or the recording is no longer there.
+        """
+        path = self.path / "manifest.json"
+        named = self._json(path.name).get("recording")
+        if named is None:
+            raise DuagError(f"{path}: names no recording, expected the manifest of a finished run")
+        if not (self.path / named).is_dir():
+            raise DuagError(f"{path}: recording {named} not found; give --recording")
+        return (self.path / named).resolve()
+
+    @property
     def config_text(self) -> str:
         """The resolved configuration as TOML, empty if the run has none."""
         path = self.path / "config.toml"
