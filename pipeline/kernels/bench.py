@@ -80,7 +80,7 @@ def format_table(result: dict[str, Any]) -> str:
         lines.append(f"{size:>10} {row['implementation']:>15} {row['threads']:>7}{cells}")
         if "slower_than_fastest" in row:
             ratios = ", ".join(f"{name} x{value:.0f}" for name, value in row["slower_than_fastest"].items())
-            lines.append(f"  plain torch against the fastest build with as many threads: {ratios}")
+            lines.append(f"  plain torch against the fastest build, one thread each: {ratios}")
     return "\n".join(lines)
 
 
@@ -149,23 +149,25 @@ def _torch_row(room: Gaussians, width: int, height: int, rows: list[dict[str, An
     import torch
 
     camera = PinholeCamera(width, height, width / 2, width / 2, width / 2 - 0.5, height / 2 - 0.5)
-    threads = torch.get_num_threads()
+    threads_before = torch.get_num_threads()
+    torch.set_num_threads(1)
     parameters = _torch_parameters(room)
     times: dict[str, list[float]] = {"forward": [], "backward": []}
     for _ in range(TORCH_ROUNDS):
         forward = partial(torch_tiles, parameters, camera, view_of_room())
-        milliseconds, image = _timed(forward, wall=threads > 1)
+        milliseconds, image = _timed(forward, wall=False)
         times["forward"].append(milliseconds)
-        times["backward"].append(_timed(image.sum().backward, wall=threads > 1)[0])
+        times["backward"].append(_timed(image.sum().backward, wall=False)[0])
         del image
+    torch.set_num_threads(threads_before)
     row: dict[str, Any] = {
         "width": width,
         "height": height,
         "implementation": "plain torch",
-        "threads": threads,
+        "threads": 1,
         **{name: statistics.median(values) for name, values in times.items()},
     }
-    same = [r for r in rows if (r["width"], r["height"], r["threads"]) == (width, height, threads)]
+    same = [r for r in rows if (r["width"], r["height"], r["threads"]) == (width, height, 1)]
     if same:
         row["slower_than_fastest"] = {
             name: row[name] / min(r[name] for r in same) for name in ("forward", "backward")
