@@ -8,7 +8,7 @@ threads. See docs/mapping.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -292,13 +292,6 @@ class Mapper:
         if not others:
             return [newest] * steps
         return [newest if k % 2 == 0 else others[(k // 2) % len(others)] for k in range(steps)]
-
-
-def support_frames(candidates: Sequence[int], count: int) -> list[int]:
-    """At most `count` of the candidates (frame indices in order), evenly spread."""
-    if len(candidates) <= count:
-        return list(candidates)
-    return [candidates[(2 * k + 1) * len(candidates) // (2 * count)] for k in range(count)]
 
 
 def overlap(

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.frontend.mapping import Mapper, MappingStats, overlap, support_frames
+from pipeline.frontend.mapping import Mapper, MappingStats, overlap
 from pipeline.frontend.mapping_config import MappingConfig
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
@@ -154,15 +154,6 @@ def test_a_map_without_anything_stays_empty() -> None:
     stats = mapper.add_keyframe(0, color, np.zeros_like(depth), POSES[0])
     assert (stats.inserted, stats.total) == (0, 0)
     assert mapper.finish().total == 0
-
-
-def test_support_frames_are_spread_evenly() -> None:
-    assert support_frames([3, 5, 9], 5) == [3, 5, 9]
-    assert support_frames([], 4) == []
-    assert support_frames(list(range(100)), 0) == []
-    chosen = support_frames(list(range(0, 300, 3)), 10)
-    assert len(chosen) == 10
-    assert set(np.diff(chosen)) == {30}
 
 
 def test_what_contributes_least_goes_first() -> None:
