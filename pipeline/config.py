@@ -50,6 +50,8 @@ def load(model: type[Model], path: Path | None = None, overrides: Sequence[str] 
         name = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             raise DuagError(f"{source}: {name} is not a known setting; see `duagc config show`") from error
+        if first["type"] == "value_error":
+            raise DuagError(f"{source}: {first['ctx']['error']}") from error
         raise DuagError(f"{source}: {name} = {first['input']!r}: {first['msg']}") from error
 
 

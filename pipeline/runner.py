@@ -15,7 +15,9 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
+
+from pydantic import model_validator
 
 from pipeline import __version__, numeric
 from pipeline.config import Config, dump
@@ -41,6 +43,20 @@ class RunConfig(Config):
     information: InformationConfig = InformationConfig()
     exchange: ExchangeConfig = ExchangeConfig()
     fusion: FusionConfig = FusionConfig()
+
+    @model_validator(mode="after")
+    def _one_thickness(self) -> Self:
+        """The information stage and the matching must know the floor that the map was made with."""
+        floor_m = self.frontend.mapping.seeding.thickness_m
+        for name, other_m in (
+            ("information.thickness_floor_m", self.information.thickness_floor_m),
+            ("exchange.matching.thickness_floor_m", self.exchange.matching.thickness_floor_m),
+        ):
+            if other_m != floor_m:
+                raise ValueError(
+                    f"{name} = {other_m}, expected frontend.mapping.seeding.thickness_m = {floor_m}"
+                )
+        return self
 
 
 class Timing:
