@@ -67,9 +67,7 @@ class Rasterizer:
         if len(gaussians) > MAX_GAUSSIANS:
             raise ValueError(f"gaussians are {len(gaussians)}, expected at most {MAX_GAUSSIANS}")
         self._gaussians = None
-        color = np.empty((height, width, 3), dtype=np.float32)
-        depth = np.empty((height, width), dtype=np.float32)
-        alpha = np.empty((height, width), dtype=np.float32)
+        color, depth, alpha = _empty(height, width, 3), _empty(height, width), _empty(height, width)
         status = self._raster.forward(
             *_arrays(gaussians), pose, intrinsics, behind, width, height, self.threads, color, depth, alpha
         )
@@ -104,9 +102,9 @@ class Rasterizer:
             nothing if d_depth is None else _checked_image("d_depth", d_depth, (height, width)),
             nothing if d_alpha is None else _checked_image("d_alpha", d_alpha, (height, width)),
         )
-        out = [np.zeros_like(array) for array in _arrays(gaussians)]
+        out = [_zeros(*array.shape) for array in _arrays(gaussians)]
         by_pose = np.zeros(6 if pose else 0)
-        diagonal = np.zeros((n if fisher else 0, FISHER_DIAGONAL_COLUMNS), dtype=np.float32)
+        diagonal = _zeros(n if fisher else 0, FISHER_DIAGONAL_COLUMNS)
         status = self._raster.backward(*_arrays(gaussians), *images, *out, diagonal, by_pose)
         _refuse_bad_image(status, ("d_color", "d_depth", "d_alpha"), "a NaN or an infinity")
         means, quats, log_scales, colors, logits = out
@@ -151,6 +149,17 @@ class Rasterizer:
         if self._gaussians is None:
             raise RuntimeError("forward has not drawn anything yet")
         return self._gaussians, self._size
+
+
+def _empty(*shape: int) -> NDArray[np.float32]:
+    """An array in memory that earlier outputs gave back, holding anything."""
+    return _raster.empty(int(np.prod(shape))).reshape(shape)
+
+
+def _zeros(*shape: int) -> NDArray[np.float32]:
+    array = _empty(*shape)
+    array.fill(0.0)
+    return array
 
 
 def _arrays(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:

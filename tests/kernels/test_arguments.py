@@ -196,3 +196,19 @@ def test_rasterizers_do_not_share_state():
     expected.forward(a.gaussians, a.camera, a.T_camera_map)
     np.testing.assert_array_equal(first.backward(d_color).means, expected.backward(d_color).means)
     np.testing.assert_array_equal(image, first.forward(a.gaussians, a.camera, a.T_camera_map).color)
+
+
+def test_outputs_outlive_their_rasterizer_and_are_never_shared():
+    """Output memory is handed out again, but only after numpy let go of it."""
+    gaussians, d_color = random_gaussians(50, 0), np.ones((10, 20, 3), np.float32)
+    rasterizer = Rasterizer()
+    kept = [
+        rasterizer.forward(gaussians, CAMERA, np.eye(4)).color[2:] for _ in range(40)
+    ]  # views count as holding
+    means = [rasterizer.backward(scale * d_color).means for scale in (np.float32(1), np.float32(2))]
+    wanted = kept[0].copy()
+    del rasterizer
+    for _ in range(5):
+        drawn(50)
+    assert all(np.array_equal(image, wanted) for image in kept)
+    np.testing.assert_array_equal(means[1], 2 * means[0])

@@ -6,6 +6,7 @@
 
 #include <atomic>
 #include <cstdlib>
+#include <mutex>
 #include <new>
 #include <stdexcept>
 #include <string>
@@ -31,6 +32,55 @@ void* allocate_aligned(size_t bytes) {
     return memory;
 }
 void release_aligned(void* memory) { std::free(memory); }
+
+// Memory of output arrays, handed out again when numpy lets go of it: fresh memory costs a page fault per 4 KiB,
+// which at small images is a tenth of a pass.
+class OutputPool {
+public:
+    static OutputPool& instance() {
+        static OutputPool* pool = new OutputPool;  // never destroyed: arrays may outlive the module
+        return *pool;
+    }
+    float* take(size_t capacity) {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        for (size_t i = 0; i < free_.size(); i++)
+            if (free_[i].capacity == capacity) {
+                float* memory = free_[i].memory;
+                free_.erase(free_.begin() + static_cast<std::ptrdiff_t>(i));
+                return memory;
+            }
+        return static_cast<float*>(allocate_aligned(capacity * sizeof(float)));
+    }
+    void give_back(float* memory, size_t capacity) {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        free_.push_back({memory, capacity});
+        if (free_.size() > KEPT) {
+            release_aligned(free_.front().memory);
+            free_.erase(free_.begin());
+        }
+    }
+    // An array of `count` floats, holding anything.
+    static nb::ndarray<nb::numpy, float, nb::ndim<1>> array(size_t count) {
+        size_t capacity = 1024;
+        while (capacity < count) capacity *= 2;
+        auto* loan = new Loan{instance().take(capacity), capacity};
+        const nb::capsule owner(loan, [](void* p) noexcept {
+            auto* loan = static_cast<Loan*>(p);
+            instance().give_back(loan->memory, loan->capacity);
+            delete loan;
+        });
+        return nb::ndarray<nb::numpy, float, nb::ndim<1>>(loan->memory, {count}, owner);
+    }
+
+private:
+    struct Loan {
+        float* memory;
+        size_t capacity;
+    };
+    static constexpr size_t KEPT = 24;
+    std::mutex mutex_;
+    std::vector<Loan> free_;
+};
 
 // The builds that this processor can run, fastest first.
 static std::vector<const Kernels*> usable_kernels() {
@@ -151,6 +201,7 @@ NB_MODULE(_raster, m) {
         .def("backward", &Raster::backward)
         .def("fisher", &Raster::fisher)
         .def("contributions", &Raster::contributions);
+    m.def("empty", &raster::OutputPool::array);
     m.def("available_isas", [] {
         std::vector<std::string> names;
         for (const raster::Kernels* kernels : raster::usable_kernels()) names.push_back(kernels->name);
