@@ -85,7 +85,7 @@ constexpr int INFORMATION_SUMS = 24;       // 16 + 8
 struct Frame {
     View view;
     int threads = 1;
-    size_t count = 0, visible = 0, intersection_count = 0;
+    size_t visible = 0, intersection_count = 0;
     int tiles_x = 0, tiles_y = 0;
 
     Scratch<Splat> splats_by_id, splats;  // the latter in order of depth

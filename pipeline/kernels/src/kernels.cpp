@@ -4,7 +4,6 @@
 namespace KERNEL_ISA {
 
 static Status forward(Frame& frame, const GaussianArrays& gaussians, float* color, float* depth, float* alpha) {
-    frame.count = gaussians.count;
     if (!project_all(frame, gaussians)) return Status::bad_gaussians;
     sort_by_depth(frame, gaussians.count);
     const Status status = bin(frame);

@@ -3,7 +3,8 @@
 // With J the derivative of the projection, W the rotation to the camera, R the Gaussian's axes and S its scales:
 //   axes = W R,   P = J axes (2x3),   U = P S,   covariance on the screen C = U U^T + BLUR I.
 // The pixel loops work in e = M d, d = pixel - centre, with M^T M = C^-1 log2(e)/2, so that alpha = opacity 2^-|e|^2.
-// No 3x3 covariance is ever formed; the way back needs only the symmetric Y = P^T G P, G the cotangent of C: the cotangent of Sigma in the Gaussian's own axes.
+// No 3x3 covariance is ever formed; the way back needs only the symmetric Y = P^T G P, G the cotangent of C: it is the
+// cotangent of Sigma in the Gaussian's own axes.
 #pragma once
 
 #include "frame.h"
@@ -60,8 +61,10 @@ inline Splat16 project16(const View& view, const Vec* mean, const Vec* quat, con
     s.u = fma(Vec(view.fx), s.slope_x, Vec(view.cx));
     s.v = fma(Vec(view.fy), s.slope_y, Vec(view.cy));
 
-    const Vec limit_x(FIELD_MARGIN * 0.5f * view.width / view.fx), limit_y(FIELD_MARGIN * 0.5f * view.height / view.fy);
-    const Vec clamped_x = min(max(s.slope_x, -limit_x), limit_x), clamped_y = min(max(s.slope_y, -limit_y), limit_y);
+    const Vec limit_x(FIELD_MARGIN * 0.5f * view.width / view.fx);
+    const Vec limit_y(FIELD_MARGIN * 0.5f * view.height / view.fy);
+    const Vec clamped_x = min(max(s.slope_x, -limit_x), limit_x);
+    const Vec clamped_y = min(max(s.slope_y, -limit_y), limit_y);
     s.inside_x = select_or_zero((s.slope_x >= -limit_x) & (s.slope_x <= limit_x), Vec(1.0f));
     s.inside_y = select_or_zero((s.slope_y >= -limit_y) & (s.slope_y <= limit_y), Vec(1.0f));
     s.J00 = Vec(view.fx) * s.inverse_z;
