@@ -1,7 +1,8 @@
 """Speed of the rasterizer on a synthetic room, beside a plain torch tile rasterizer in the same run.
 
-Rounds of all candidates alternate, so that other load on the machine hits them alike. Time with one thread is process
-CPU time, with more threads wall time; the median over the rounds is reported.
+Rounds of all candidates alternate, so that other load on the machine hits them alike. Time with one thread is the
+thread's own CPU time (that of the process would count idle helpers that still spin), with more threads wall time; the
+median over the rounds is reported.
 """
 
 from __future__ import annotations
@@ -124,7 +125,7 @@ def view_of_room() -> np.ndarray:
 
 def _timed(step: Callable[[], Any], wall: bool) -> tuple[float, Any]:
     """Milliseconds of a step, and what it returned."""
-    clock = time.perf_counter if wall else time.process_time
+    clock = time.perf_counter if wall else time.thread_time
     start = clock()
     result = step()
     return 1e3 * (clock() - start), result
