@@ -28,10 +28,11 @@ from pipeline.geometry.trajectory import Trajectory
 from pipeline.progress import track
 from pipeline.recording import Recording, RgbdLog, open_rgbd
 from pipeline.run_folder import RobotRun, RunFolder, is_held_out
+from pipeline.splat.gaussians import Gaussians
 
 SCHEMA = 1
 MAPS = ("own", "fused")
-VIEW_SETS = ("held_out", "training")
+VIEW_SETS = ("held_out", "training", "peers")
 
 PROTOCOL = {
     "alignment": "se3",
@@ -41,6 +42,7 @@ PROTOCOL = {
     "initial_relative_poses": "unknown",
     "held_out": "index % 8 == 4",
     "training": "keyframes",
+    "peers": "held-out views of the other robots of the component, at their own poses; own map moved into the world",
     "poses": "own: odometry.tum in the robot's map frame; fused: trajectory.tum in the world frame",
     "exposure": "none fitted",
     "background": "black",
@@ -189,45 +191,69 @@ def _team_section(run: RunFolder, truth: TruePaths) -> dict[str, Any]:
 def _rendering_section(
     run: RunFolder, source: Recording, threads: int, progress: bool, rows: list[Row]
 ) -> dict[str, Any]:
-    """Scores of both maps of all robots over held-out and training views; one row per view and score."""
+    """Scores of both maps of all robots over all sets of views; one row per view and score."""
     scores: dict[tuple[str, str], list[Any]] = {(m, s): [] for m in MAPS for s in VIEW_SETS}
     for name, robot in run.robots.items():
+        mates = [
+            run.robots[r] for r in robot.component if r != name and run.robots[r].component == robot.component
+        ]
+        for camera_robot in (robot, *mates):
+            of_peer = camera_robot is not robot
+            maps = _maps_in_world(robot) if of_peer else _maps(robot)
+            poses = dict.fromkeys(MAPS, camera_robot.trajectory) if of_peer else _own_poses(robot)
+            for kind in MAPS:
+                task = _RenderTask(maps[kind], camera_robot, poses[kind], keyframes=not of_peer)
+                title = f"render {kind} map of {name}" + (f" from {camera_robot.robot}" if of_peer else "")
+                for index, score in task.scores(source, threads, title if progress else None):
+                    view_set = "peers" if of_peer else "held_out" if is_held_out(index) else "training"
+                    scores[kind, view_set].append(score)
+                    rows += _view_rows(name, f"{kind}/{view_set}", index, score)
+    reasons = dict.fromkeys(VIEW_SETS, "there is no such view") | {"peers": "no two robots met"}
+    return {m: {s: views.summary(scores[m, s], reasons[s]) for s in VIEW_SETS} for m in MAPS}
+
+
+def _maps(robot: RobotRun) -> dict[str, Gaussians]:
+    """The own map in the robot's map frame, the fused one in the world."""
+    return {"own": robot.own_map.gaussians, "fused": robot.fused_map.gaussians}
+
+
+def _own_poses(robot: RobotRun) -> dict[str, Trajectory]:
+    """The robot's own poses in the frames of `_maps`."""
+    return {"own": robot.odometry, "fused": robot.trajectory}
+
+
+def _maps_in_world(robot: RobotRun) -> dict[str, Gaussians]:
+    """Both maps in the world: Gaussians of the own map move with their keyframes."""
+    T_map_keyframe = np.array([k.T_map_camera for k in robot.keyframes])
+    own = robot.own_map.gaussians.moved(T_map_keyframe, robot.corrected.T_world_keyframe)
+    return {"own": own, "fused": robot.fused_map.gaussians}
+
+
+@dataclass(frozen=True)
+class _RenderTask:
+    """A map to be rendered where one robot's camera stood: at its held-out frames, and at its keyframes if asked."""
+
+    gaussians: Gaussians
+    camera_robot: RobotRun
+    trajectory: Trajectory
+    keyframes: bool
+
+    def scores(
+        self, source: Recording, threads: int, title: str | None
+    ) -> Iterator[tuple[int, views.ViewScore | Absent]]:
+        """Frame index and score of every view, in order; progress under `title`."""
+        name, robot = self.camera_robot.robot, self.camera_robot
         with open_rgbd(source.log(name)) as log:
-            indices = _view_indices(robot, len(log))
-            for kind, found in _robot_views(robot, log, source, indices, threads, progress):
-                view_set = "held_out" if is_held_out(found[0]) else "training"
-                scores[kind, view_set].append(found[1])
-                rows += _view_rows(name, f"{kind}/{view_set}", *found)
-    return {
-        m: {s: views.summary(scores[m, s], f"there is no {s.replace('_', '-')} view") for s in VIEW_SETS}
-        for m in MAPS
-    }
-
-
-def _view_indices(robot: RobotRun, frames: int) -> list[int]:
-    """Frames to render: all held-out ones and all keyframes."""
-    return sorted({i for i in range(frames) if is_held_out(i)} | {k.frame_index for k in robot.keyframes})
-
-
-def _robot_views(
-    robot: RobotRun, log: RgbdLog, source: Recording, indices: list[int], threads: int, progress: bool
-) -> Iterator[tuple[str, tuple[int, Any]]]:
-    """("own" | "fused", (frame index, score)) of every view of one robot."""
-    maps = {
-        "own": (robot.own_map.gaussians, poses_by_stamp(robot.odometry)),
-        "fused": (robot.fused_map.gaussians, poses_by_stamp(robot.trajectory)),
-    }
-    stamps = {frame.stamp_ns for frame in robot.frames if frame.frame_index in set(indices)}
-    exact = groundtruth.exact_depths(source, robot.robot, stamps)
-    recorded_is_exact = groundtruth.recorded_depth_is_exact(source, robot.robot)
-    for kind, (gaussians, poses) in maps.items():
-        found = views.score_map(
-            gaussians, log.camera, _views(log, indices, exact, recorded_is_exact), poses, threads
-        )
-        if progress:
-            found = track(found, f"render {kind} map of {robot.robot}", total=len(indices))
-        for scored in found:
-            yield kind, scored
+            chosen = {i for i in range(len(log)) if is_held_out(i)}
+            if self.keyframes:
+                chosen |= {k.frame_index for k in robot.keyframes}
+            stamps = {f.stamp_ns for f in robot.frames if f.frame_index in chosen}
+            exact = groundtruth.exact_depths(source, name, stamps)
+            frames = _views(log, sorted(chosen), exact, groundtruth.recorded_depth_is_exact(source, name))
+            found = views.score_map(
+                self.gaussians, log.camera, frames, poses_by_stamp(self.trajectory), threads
+            )
+            yield from track(found, title, total=len(chosen)) if title else found
 
 
 def _views(

@@ -223,7 +223,7 @@ def _rendering_rows(metrics: dict[str, Any]) -> list[dict[str, Any]]:
             ],
         }
         for kind in ("own", "fused")
-        for view_set in ("held_out", "training")
+        for view_set in ("held_out", "training", "peers")
     ]
 
 

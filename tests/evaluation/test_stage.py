@@ -29,7 +29,7 @@ SCHEMA = {
         "robots": int, "robots_in_largest_component": int, "ate_rmse_m": NUMBER, "ate_rmse_m_mean_of_robots": NUMBER,
         "inter_robot_closures": int, "inter_robot_closures_rejected": int,
     },
-    "rendering": {kind: {"held_out": VIEWS, "training": VIEWS} for kind in ("own", "fused")},
+    "rendering": {kind: {"held_out": VIEWS, "training": VIEWS, "peers": VIEWS} for kind in ("own", "fused")},
     "calibration": dict.fromkeys(
         ("ece_paper", "ece_rank", "ece_rank_shuffled", "spearman", "ause", "nll", "coverage_95", "nll_scaled",
          "coverage_95_scaled", "sigma_scale", "gaussians", "gaussians_without_information"),
@@ -45,7 +45,7 @@ SCHEMA = {
         "gap_to_oracle_m": NUMBER, "gap_to_oracle_rad": NUMBER,
     },
     "protocol": dict.fromkeys(
-        ("alignment", "ate", "team_ate", "rpe", "initial_relative_poses", "held_out", "training", "poses", "exposure",
+        ("alignment", "ate", "team_ate", "rpe", "initial_relative_poses", "held_out", "peers", "training", "poses", "exposure",
          "background", "psnr", "ssim", "ms_ssim", "depth", "calibration"),
         str,
     ),
@@ -119,6 +119,12 @@ def test_maps_are_rendered_from_held_out_and_training_views(metrics):
         )  # rounding to 1 mm: 0.25 mm
         assert fused[view_set]["depth_completeness"] == 1.0
         assert own[view_set]["psnr_db"] < fused[view_set]["psnr_db"] - 5  # seen from poses that drift
+
+
+def test_a_fused_map_shows_what_a_peer_sees(metrics):
+    fused = metrics["rendering"]["fused"]["peers"]
+    assert fused["views"] == 2 * 3
+    assert fused["psnr_db"] > metrics["rendering"]["own"]["peers"]["psnr_db"]
 
 
 def test_a_noise_free_sensor_is_its_own_exact_depth(metrics):
