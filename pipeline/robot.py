@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,8 +66,9 @@ class RobotData:
 class ClosureRecord:
     """One candidate for a closure between two keyframes, and what became of it.
 
-    robot: the end that decided. score: matches of compact descriptors. T_own_peer: [4, 4] if it was measured.
-    weight: robust weight at the end; None if it took no part in the pose consensus.
+    robot: the end that decided. score: matches of compact descriptors. T_own_peer: [4, 4] if it was measured,
+    with its information [6, 6] (right tangent, as measured, without floor). weight: robust weight at the end, 0 on a
+    link that was parted; None if it took no part in the pose consensus.
     """
 
     robot: str
@@ -81,6 +82,7 @@ class ClosureRecord:
     detail: str
     weight: float | None
     T_own_peer: Array | None
+    information: Array | None
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,15 @@ class AgentResult:
     rounds: int
     rounds_to_agreement: int | None
     refused: dict[str, int]
+
+
+def steps_of(keyframes: Sequence[Keyframe]) -> list[Step]:
+    """Odometry of a robot, in order of its keyframes: each to the one that it was registered to."""
+    return [
+        Step(k.previous_index, k.keyframe_index, k.T_previous_keyframe, k.information)
+        for k in keyframes
+        if k.previous_index >= 0
+    ]
 
 
 def load(source: AgentInput) -> RobotData:
@@ -143,11 +154,6 @@ def load(source: AgentInput) -> RobotData:
         raise DuagError(
             f"{source.information}: is about other Gaussians than {source.frontend}, expected the same ids"
         )
-    steps = [
-        Step(k.previous_index, k.keyframe_index, k.T_previous_keyframe, k.information)
-        for k in keyframes
-        if k.previous_index >= 0
-    ]
     poses = np.array([k.T_map_camera for k in keyframes], dtype=np.float64).reshape(-1, 4, 4)
     with open_rgbd(source.log) as log:
         camera = log.camera
@@ -159,4 +165,4 @@ def load(source: AgentInput) -> RobotData:
             frame = log.frame(keyframes[keyframe].frame_index)
         return frame.color, frame.depth
 
-    return RobotData(robot, camera, poses, steps, images, gaussian_map.gaussians, information)
+    return RobotData(robot, camera, poses, steps_of(keyframes), images, gaussian_map.gaussians, information)

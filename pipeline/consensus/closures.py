@@ -156,6 +156,41 @@ def consistent(
     return Consistency(keep, robust_frame(frames[keep], config), reasons, support)
 
 
+def plausible(
+    closures: Sequence[Closure],
+    T_world_keyframe_own: Array,
+    T_world_keyframe_peer: Array,
+    drift_own: Array,
+    drift_peer: Array,
+    config: ClosureConfig,
+) -> NDArray[np.bool_]:
+    """Which closures fit to where the frames of the component put the two robots.
+
+    They need not have been put there by these closures: frames follow the best supported links. A closure is
+    implausible if it is farther from that than its own variance and the whole odometry of both robots explain (times
+    `margin`). Like the pairwise test this only chooses the start of the robust weights.
+
+    Args:
+        closures: of one pair. T_world_keyframe_own, T_world_keyframe_peer: [n, 4, 4], by keyframe index.
+        drift_own, drift_peer: [n, 2] from `drift`.
+    Returns:
+        bool [m].
+    """
+    i = np.array([c.own_keyframe for c in closures], dtype=np.int64)
+    j = np.array([c.peer_keyframe for c in closures], dtype=np.int64)
+    own, peer = np.asarray(T_world_keyframe_own), np.asarray(T_world_keyframe_peer)
+    measured = own[i] @ np.array([c.T_own_peer for c in closures], dtype=np.float64).reshape(-1, 4, 4)
+    translation_m = np.linalg.norm(measured[:, :3, 3] - peer[j, :3, 3], axis=1)
+    rotation_rad = np.linalg.norm(so3.log(np.swapaxes(measured[:, :3, :3], 1, 2) @ peer[j, :3, :3]), axis=1)
+    covariance = np.linalg.inv(closure_factors(closures, i, j, config).information + np.eye(6))
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)
+    variance = config.margin * (variance + drift_own[-1] + drift_peer[-1])
+    reach_m = max(float(_distances(poses[:, :3, 3]).max()) for poses in (own, peer))
+    return (rotation_rad**2 < CHI2_3_999 * variance[:, 1]) & (
+        translation_m**2 < CHI2_3_999 * (variance[:, 0] + variance[:, 1] * reach_m**2 / 3)
+    )
+
+
 def robust_frame(frames: Array, config: ClosureConfig) -> Array:
     """One motion [4, 4] from many proposals [m, 4, 4]: the best supported one, then a Cauchy-weighted mean."""
     tried = np.unique(np.linspace(0, len(frames) - 1, _CANDIDATES).round().astype(np.int64))

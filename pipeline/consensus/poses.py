@@ -47,6 +47,8 @@ from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
 _BLOCK = [0, 0, 0, 1, 1, 1]  # translation, rotation -> the six rows of a tangent
+COUNTS = 0.5
+"""Robust weight from which a closure counts as kept."""
 _STEADY = 1e-3  # m, rad: a link that moves less has left its start behind
 
 
@@ -508,6 +510,15 @@ class PoseAgent:
     def weights(self, peer: str) -> Array:
         """Weight [m] of every closure held with a neighbour, in the order given."""
         return self.links[peer].weights.copy()
+
+    def refuted(self, peer: str) -> bool:
+        """Whether the closures held with a neighbour join nobody any more: final weights, too few of which count.
+
+        It takes `closures.min_support` to join two robots, and as many to keep them joined.
+        """
+        link = self.links[peer]
+        kept = int(np.count_nonzero(link.weights >= COUNTS))
+        return link.holds and link.robust_done and kept < self.config.closures.min_support
 
     def residuals(self) -> dict[str, Any]:
         """What a round looked like, for the record.

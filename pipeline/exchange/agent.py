@@ -11,6 +11,11 @@ whole component before an agent goes on: that everybody has decided on all its l
 everybody holds still (after). Each is found by counting hops: an agent for which it holds itself says one more than
 the least of its neighbours, and whoever reaches the size of the team knows that it holds everywhere.
 
+A link may turn out to be false during the pose rounds: the graduated weights leave too few of its closures. The end
+that holds them parts it for good, and whoever hears of that begins again with frames, without the link. The set of
+parted links only grows; it stands in every state and labels everything that depends on it. Nobody can be agreed
+before the whole component knows the same set, because a holder does not hold still before its weights are final.
+
 An agent knows its own data, its configuration and the packets it was given. It never raises because of a packet.
 """
 
@@ -24,8 +29,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.closures import Closure
-from pipeline.consensus.poses import PoseAgent
+from pipeline.consensus.closures import Closure, plausible
+from pipeline.consensus.poses import COUNTS, PoseAgent
 from pipeline.exchange import wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.evidence import (
@@ -41,12 +46,11 @@ from pipeline.exchange.meeting import HigherEnd, LowerEnd, Meeting, OwnPlaces, S
 from pipeline.exchange.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError, Packet, parse
 from pipeline.exchange.transport import Arrival, Message, Outgoing, Transport
 from pipeline.exchange.verification import Verdict
-from pipeline.exchange.wire import Anchors, PairList, State
+from pipeline.exchange.wire import Anchors, Frame, PairList, State, pair_bit
 from pipeline.geometry import se3
 from pipeline.robot import AgentResult, ClosureRecord, RobotData
 
 Array = NDArray[np.float64]
-HALF = 0.5  # robust weight from which a closure counts as kept
 EVERYWHERE = 255  # a hop count that has reached the whole component, for good
 MEETING_KINDS = frozenset({Kind.DESCRIPTORS, Kind.REQUEST, Kind.SAMPLE, Kind.CLOSURES})
 
@@ -60,10 +64,14 @@ class Neighbour:
     transport: Transport
     meeting: Meeting
     state: State | None = None
-    frame: tuple[int, int, Array] | None = None  # root, hops, its T_world_map
+    frame: Frame | None = (
+        None  # the one that counts: without most parted links, then nearest to the lowest root
+    )
     voxels: NDArray[np.int64] | None = None
     verdict_message: int | None = None
     gone: bool = False  # silent for too long
+    parted: bool = False  # its closures were refuted: as if never met
+    last_weights: list[float] = field(default_factory=list)  # of the closures held, when the link was parted
     evidence_sent: dict[int, int] = field(default_factory=dict)  # owner: message
 
     @property
@@ -77,7 +85,7 @@ class Neighbour:
     @property
     def joined(self) -> bool:
         """Whether the two robots share a frame, and the neighbour knows it."""
-        return not self.gone and self.decided and self.meeting.joined is not None
+        return not self.gone and not self.parted and self.decided and self.meeting.joined is not None
 
 
 class Agent:
@@ -107,15 +115,16 @@ class Agent:
         self.refused: Counter[str] = Counter()
         self.evidence_kind = Kind.EVIDENCE if config.evidence_wire == "compact" else Kind.EVIDENCE_EXACT
         self.knowledge = Knowledge(self.own, len(self.team), self.evidence_kind)
-        self.root, self.hops, self.T_world_map = self.own, 0, np.eye(4)
+        self.frame = Frame(self.own, wire.WHOLE, 0, np.eye(4))
         self.members = 1 << self.own
+        self.parted = 0  # links known to have been parted, a mask of pair_bit
         self.frames_hops = self.still_hops = 0
         self.poses: PoseAgent | None = None
         self.agreed = self.done = self.converged = False
         self.rounds_to_agreement: int | None = None
         self._body: NDArray[Any] | None = None
         self._records: NDArray[Any] | None = None
-        self._frame_told: dict[int, tuple[int, int]] = {}
+        self._frame_told: dict[int, tuple[Frame, int]] = {}  # what, in which message
         self._voxels_told: set[int] = set()
         self._anchors_told: set[tuple[int, int]] = set()
         self._pairs_told: dict[tuple[int, tuple[int, int]], int] = {}  # message; 0 = they told this robot
@@ -143,6 +152,7 @@ class Agent:
         for neighbour in self._living():
             if neighbour.transport.last_heard is not None and not neighbour.meeting.begun:
                 neighbour.meeting.begin(self._sender(neighbour))
+        self._hear_of_partings()
         self._settle_frames()
         self._settle_poses()
         self._tell()
@@ -152,6 +162,16 @@ class Agent:
 
     def _living(self) -> list[Neighbour]:
         return [n for n in self.neighbours.values() if not n.gone]
+
+    @property
+    def root(self) -> int:
+        """Lowest-named robot known to be in the component."""
+        return self.frame.root
+
+    @property
+    def T_world_map(self) -> Array:  # noqa: N802 (a transform)
+        """Own map frame in the root's, as it was placed before the pose rounds."""
+        return self.frame.T_world_map
 
     def _joined(self) -> list[Neighbour]:
         return [n for n in self.neighbours.values() if n.joined]
@@ -196,7 +216,7 @@ class Agent:
             neighbour.meeting.take(arrival.kind, arrival.payload, self._sender(neighbour))
         elif arrival.kind is Kind.FRAME:
             frame = wire.read_frame(arrival.payload, team)
-            if neighbour.frame is None or frame[:2] < neighbour.frame[:2]:
+            if neighbour.frame is None or _rank(frame) < _rank(neighbour.frame):
                 neighbour.frame = frame
         elif arrival.kind is Kind.VOXELS:
             _, neighbour.voxels = wire.read_voxels(arrival.payload, team)
@@ -215,6 +235,8 @@ class Agent:
 
     def _take_state(self, neighbour: Neighbour, payload: bytes) -> None:
         neighbour.state, poses = wire.read_state(payload, len(self.team))
+        if neighbour.state.parted != self.parted:
+            return
         if poses and self.poses is not None and neighbour.name in self.poses.links:
             shared = self.poses.links[neighbour.name].keyframes
             self.poses.receive(neighbour.name, wire.read_poses(poses, shared))
@@ -256,7 +278,8 @@ class Agent:
                 self.still_hops,
                 self.agreed,
                 self.done,
-                self.knowledge.sources(direct, {n.index for n in self._living()}),
+                self.knowledge.sources(direct, {n.index for n in self._living() if not n.parted}),
+                self.parted,
             )
         )
         payloads = [state]
@@ -273,30 +296,67 @@ class Agent:
     def _all_agreed(self) -> bool:
         return self.agreed and all(n.state is not None and n.state.agreed for n in self._joined())
 
+    # --- parted links
+
+    def _hear_of_partings(self) -> None:
+        """Take over what joined neighbours know of parted links. Once poses are agreed there is nothing to hear."""
+        known = self.parted
+        for n in self._joined():
+            if n.state is not None:
+                known |= n.state.parted
+        if known != self.parted and not self.agreed:
+            self._part(known)
+
+    def _part(self, known: int) -> None:
+        """Begin again with frames, without the links of this mask; forget what depended on them."""
+        self.parted = known
+        for n in self.neighbours.values():
+            if not n.parted and known & pair_bit(self.own, n.index):
+                n.parted = True
+                if self.poses is not None and n.name in self.poses.links:
+                    n.last_weights = self.poses.weights(n.name).tolist()
+                n.transport.cancel_all()
+                n.evidence_sent.clear()
+        self.frame = Frame(self.own, wire.WHOLE, 0, np.eye(4), known)
+        self.members = 1 << self.own
+        self.frames_hops = self.still_hops = 0
+        self.poses = None
+        self._frame_told.clear()
+
+    def _same_links(self, n: Neighbour) -> bool:
+        """Whether a neighbour's last state is about the team without the same parted links."""
+        return n.state is not None and n.state.parted == self.parted
+
     # --- frames
 
     def _settle_frames(self) -> None:
-        """Adopt the lowest root and its frame, tell it on, and count how far around everybody has decided."""
+        """Adopt the lowest root and its frame, tell it on, and count how far around everybody has decided.
+
+        To have decided is also that the neighbours have the own frame: when everybody has, no frame changes any more.
+        """
         joined = self._joined()
         for n in joined:
-            if (
-                n.frame is not None
-                and (n.frame[0], n.frame[1] + 1) < (self.root, self.hops)
-                and not self.poses
-            ):
-                assert n.meeting.joined is not None
-                self.root, self.hops = n.frame[0], n.frame[1] + 1
-                self.T_world_map = n.frame[2] @ se3.inverse(n.meeting.joined.T_own_peer)
+            frame = n.frame
+            if frame is None or frame.parted != self.parted or self.poses is not None:
+                continue
+            assert n.meeting.joined is not None
+            assert n.meeting.verdicts is not None
+            support = min(frame.support, n.meeting.verdicts.consistent)
+            T_world_map = frame.T_world_map @ se3.inverse(n.meeting.joined.T_own_peer)
+            way = Frame(frame.root, support, frame.hops + 1, T_world_map, self.parted)
+            if way.rank < self.frame.rank:
+                self.frame = way
         for n in joined:
-            if self._frame_told.get(n.index) != (self.root, self.hops):
-                self._frame_told[n.index] = (self.root, self.hops)
-                self._send([n], Kind.FRAME, wire.write_frame(self.root, self.hops, self.T_world_map))
-            if n.state is not None and n.state.root == self.root:
+            if n.index not in self._frame_told or self._frame_told[n.index][0] is not self.frame:
+                message = self._send([n], Kind.FRAME, wire.write_frame(self.frame, len(self.team)))
+                self._frame_told[n.index] = (self.frame, message)
+            if n.state is not None and self._same_links(n) and n.state.root == self.root:
                 self.members |= n.state.members
         if self.frames_hops == EVERYWHERE:
             return
         self.frames_hops = 0
-        if all(n.decided for n in self.neighbours.values()):
+        told = not any(n.transport.is_open(self._frame_told[n.index][1]) for n in joined)
+        if told and all(n.decided for n in self.neighbours.values()):
             least = min((self._frames_hops_of(n) for n in joined), default=EVERYWHERE - 1)
             self.frames_hops = min(least + 1, EVERYWHERE)
         if self.frames_hops >= len(self.team):
@@ -304,7 +364,9 @@ class Agent:
 
     def _frames_hops_of(self, neighbour: Neighbour) -> int:
         state = neighbour.state
-        if state is None or state.root != self.root or state.members != self.members:
+        if state is None or not self._same_links(neighbour):
+            return 0
+        if state.root != self.root or state.members != self.members:
             return 0
         return min(state.frames_hops, EVERYWHERE - 1)
 
@@ -322,9 +384,13 @@ class Agent:
             self.poses.step()
         if self.agreed:
             return
+        refuted = sum(pair_bit(self.own, n.index) for n in joined if self.poses.refuted(n.name))
+        if refuted:
+            self._part(self.parted | refuted)
+            return
         self.still_hops = 0
         if self.poses.settled:
-            least = min((0 if n.state is None else n.state.still_hops) for n in joined)
+            least = min((n.state.still_hops if n.state and self._same_links(n) else 0) for n in joined)
             self.still_hops = min(least + 1, EVERYWHERE)
         if self.still_hops > len(self.team):
             self.agreed, self.still_hops = True, EVERYWHERE
@@ -341,8 +407,24 @@ class Agent:
         for n in self._joined():
             meeting = n.meeting.joined
             assert meeting is not None
-            if meeting.closures:
-                self.poses.add_link(n.name, meeting.closures, keep=meeting.keep)
+            if isinstance(n.meeting, LowerEnd):
+                assert n.meeting.book is not None
+                assert n.frame is not None
+                T_world_peer = n.frame.T_world_map @ n.meeting.book.T_map_keyframe
+                placed = plausible(
+                    meeting.closures,
+                    self.T_world_map @ self.data.T_map_keyframe,
+                    T_world_peer,
+                    self.places.drift,
+                    n.meeting.book.drift,
+                    self.config.consensus.closures,
+                )
+                self.poses.add_link(
+                    n.name,
+                    meeting.closures,
+                    keep=meeting.keep & placed,
+                    T_world_keyframe_peer=dict(enumerate(T_world_peer)),
+                )
             else:
                 self.poses.add_link(n.name, shared=meeting.shared)
 
@@ -351,11 +433,7 @@ class Agent:
     def _tell(self) -> None:
         """Evidence to whoever lacks it; space seen, agreed poses and pair lists to everybody."""
         for n in self._joined():
-            if (
-                self.config.coverage == "overlap"
-                and self.poses is not None
-                and n.index not in self._voxels_told
-            ):
+            if self.config.coverage == "overlap" and self.agreed and n.index not in self._voxels_told:
                 self._voxels_told.add(n.index)
                 keys = seen_voxels(self.data.gaussians, self.T_world_map, self.config.overlap_voxel_m)
                 self._send([n], Kind.VOXELS, wire.write_voxels(self.own, keys))
@@ -373,6 +451,8 @@ class Agent:
         if n.state is None:
             return
         for owner in [self.own, *sorted(self.knowledge.evidence)]:
+            if not self.members >> owner & 1:
+                continue
             wanted = owner != n.index and n.state.sources[owner] in (wire.NOBODY, self.own)
             if not wanted and owner in n.evidence_sent:  # it is there, or somebody else brings it
                 n.transport.cancel(n.evidence_sent.pop(owner))
@@ -536,9 +616,12 @@ class Agent:
             for t in n.meeting.tried:
                 r = t.result
                 weight = None if r.closure is None else self._weight(n, r.closure)
-                verdict = r.verdict
-                if weight is not None:  # the graduated weights have the last word
-                    verdict = Verdict.KEPT if weight >= HALF else Verdict.OUTWEIGHED
+                verdict, detail = r.verdict, r.detail
+                if weight is not None and n.parted:
+                    verdict = Verdict.ALONE if weight >= COUNTS else Verdict.OUTWEIGHED
+                    detail, weight = f"weight {weight:.2f} when the link was parted; {detail}", 0.0
+                elif weight is not None:  # the graduated weights have the last word
+                    verdict = Verdict.KEPT if weight >= COUNTS else Verdict.OUTWEIGHED
                 yield ClosureRecord(
                     self.data.robot,
                     n.name,
@@ -548,15 +631,26 @@ class Agent:
                     verdict.value,
                     r.matches,
                     r.inliers,
-                    r.detail,
+                    detail,
                     weight,
                     None if r.closure is None else r.closure.T_own_peer,
+                    None if r.closure is None else r.closure.information,
                 )
 
     def _weight(self, n: Neighbour, closure: Closure) -> float | None:
-        """Robust weight of a closure at the end; None if it took no part."""
-        if self.poses is None or n.name not in self.poses.links or n.meeting.joined is None:
+        """Robust weight of a closure at the end, or when its link was parted; None if it took no part."""
+        if n.meeting.joined is None:
             return None
-        weights = self.poses.weights(n.name).tolist()
+        if n.parted:
+            weights = n.last_weights
+        elif self.poses is not None and n.name in self.poses.links:
+            weights = self.poses.weights(n.name).tolist()
+        else:
+            return None
         held = n.meeting.joined.closures
         return next((w for w, other in zip(weights, held, strict=True) if other is closure), None)
+
+
+def _rank(frame: Frame) -> tuple[int, tuple[int, int, int]]:
+    """Order in which a neighbour's frames count: its parted links only become more."""
+    return -frame.parted.bit_count(), frame.rank

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,30 @@ from pipeline.exchange.packets import EVIDENCE_KINDS, HEADER_BYTES, Kind, Malfor
 from pipeline.exchange.transport import Outgoing
 from pipeline.messages import map_frame, pack_pose, pack_stamp
 from pipeline.recording import LogWriter, read_log
-from pipeline.robot import AgentResult
+from pipeline.robot import AgentResult, RobotData
 from schemas import topics
+
+
+@dataclass(frozen=True)
+class RawAlternative:
+    """Bytes of sending everything to every other robot once, without any protocol.
+
+    maps_and_information: every Gaussian (14 float32) with the part of its information that fusion needs (31 float32),
+    and every factor of the pose graph (40 bytes): the least that would allow the same fusion. maps_only: without the
+    information, which allows to look at the neighbours' maps and not to fuse them.
+    """
+
+    maps_and_information: int
+    maps_only: int
+
+    @staticmethod
+    def of(data: Sequence[RobotData]) -> RawAlternative:
+        """What it takes for a team."""
+        others = len(data) - 1
+        gaussians, factors = sum(len(d.gaussians) for d in data), sum(len(d.odometry) for d in data)
+        return RawAlternative(
+            others * (4 * (14 + 31) * gaussians + 40 * factors), others * (4 * 14 * gaussians + 40 * factors)
+        )
 
 
 class ExchangeRecorder:
@@ -79,7 +102,7 @@ class ExchangeRecorder:
         self.writer.write(topics.PEER_MESSAGE.of(sender), message, send_ns)
 
     def summary(
-        self, team: list[str], rounds: int, converged: bool, bytes_raw_alternative: int, now_ns: int
+        self, team: list[str], rounds: int, converged: bool, raw: RawAlternative, now_ns: int
     ) -> None:
         """Record what the session cost."""
         message = schemas.new(
@@ -88,7 +111,8 @@ class ExchangeRecorder:
             rounds=rounds,
             converged=converged,
             messages=len(self._known),
-            bytes_raw_alternative=bytes_raw_alternative,
+            bytes_raw_alternative=raw.maps_and_information,
+            bytes_raw_alternative_maps_only=raw.maps_only,
         )
         for (sender, receiver, kind), (packets, dropped, size, arrived) in sorted(self._totals.items()):
             message.links.add(
@@ -229,6 +253,7 @@ class ConsensusRecorder:
             evidence_owners=len(agent.knowledge.evidence),
             pair_lists=len(agent.knowledge.pairs),
             open_messages=sum(n.transport.open_messages for n in neighbours),
+            parted_links=sum(n.parted for n in neighbours),
             agreed=agent.agreed,
             done=agent.done,
             packets_refused=sum(agent.refused.values()),
@@ -281,5 +306,7 @@ class ConsensusRecorder:
             )
             if c.T_own_peer is not None:
                 message.pose_own_peer.CopyFrom(pack_pose(c.T_own_peer))
+            if c.information is not None:
+                message.information.extend(c.information.ravel().tolist())
             pack_stamp(message, now_ns)
             self.writer.write(topics.CLOSURE_DECISION.of(c.robot), message, now_ns)

@@ -11,7 +11,7 @@ from pipeline.exchange import links
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.links import LinkModel
-from pipeline.exchange.record import ConsensusRecorder, ExchangeRecorder
+from pipeline.exchange.record import ConsensusRecorder, ExchangeRecorder, RawAlternative
 from pipeline.exchange.wire import MAX_TEAM
 from pipeline.progress import track
 from pipeline.recording import LogWriter
@@ -88,7 +88,7 @@ def run_session_of(
             list(agents),
             round_index + 1,
             all(result.converged for result in results.values()),
-            bytes_raw_alternative(data),
+            RawAlternative.of(data),
             now_ns,
         )
     return results
@@ -111,11 +111,3 @@ def due(waiting: list[Delivery], now_ns: int) -> list[bytes]:
     arrived = [d[3] for d in waiting[:count]]
     del waiting[:count]
     return arrived
-
-
-def bytes_raw_alternative(data: Sequence[RobotData]) -> int:
-    """Bytes of sending every map and pose graph to every other robot once, without any protocol.
-
-    A Gaussian is 14 float32 and the 31 of its information that fusion needs; a factor of the graph is 40 bytes.
-    """
-    return (len(data) - 1) * sum(4 * (14 + 31) * len(d.gaussians) + 40 * len(d.odometry) for d in data)

@@ -116,6 +116,10 @@ class Transport:
         """Stop sending a message, if it is still open."""
         self._open.pop(message, None)
 
+    def cancel_all(self) -> None:
+        """Stop sending whatever is still open."""
+        self._open.clear()
+
     def is_open(self, message: int) -> bool:
         """Whether a message is not yet fully acknowledged."""
         return message in self._open

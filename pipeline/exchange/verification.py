@@ -29,6 +29,7 @@ class Verdict(Enum):
     NOT_REGISTERED = "registration of the two views failed"
     MOVED = "registration moved far from what the matches say"
     OUTWEIGHED = "lost its weight in the pose consensus"
+    ALONE = "kept its weight, but too few others of this pair of robots did"
     INCONSISTENT = "disagrees with the other closures of this pair of robots"
 
 

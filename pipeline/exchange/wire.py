@@ -100,6 +100,8 @@ class State:
     """Where an agent stands, as it tells its neighbours in every round.
 
     root: index of the lowest-named robot that it knows to be in its component. members: bit mask over the team.
+    parted: links that it knows to have been parted, bit mask over the pairs of the team (`pair_bit`); what else is
+    told holds for the team without them.
     frames_hops, still_hops: how many hops around it everybody has decided on all links, and holds still; 0 = not
     itself. agreed: its poses are final. done: it needs nothing more. sources: uint8 [team], for each owner of
     evidence where it comes from: a neighbour's index, COMPLETE or NOBODY.
@@ -112,11 +114,34 @@ class State:
     agreed: bool
     done: bool
     sources: NDArray[np.uint8]
+    parted: int = 0
 
 
 COMPLETE, NOBODY = 254, 255
 MAX_TEAM = 64
 _STATE = struct.Struct("<HQBBBB")
+
+
+def pair_bit(a: int, b: int) -> int:
+    """The bit of a pair of robots, by index, in a mask over all pairs."""
+    lower, higher = min(a, b), max(a, b)
+    return 1 << (higher * (higher - 1) // 2 + lower)
+
+
+def _pairs_bytes(pairs: int, team: int) -> bytes:
+    return pairs.to_bytes(_pairs_size(team), "little")
+
+
+def _pairs_size(team: int) -> int:
+    return -(-(team * (team - 1) // 2) // 8)
+
+
+def _read_pairs(reader: Reader, team: int) -> int:
+    """A mask over the pairs of the team."""
+    pairs = int.from_bytes(reader.array("uint8", (_pairs_size(team),)).tobytes(), "little")
+    if pairs >> (team * (team - 1) // 2):
+        raise MalformedError(f"{reader.what}: names a pair outside the team")
+    return pairs
 
 
 def write_state(state: State) -> bytes:
@@ -125,7 +150,7 @@ def write_state(state: State) -> bytes:
     head = _STATE.pack(
         state.root, state.members, state.frames_hops, state.still_hops, flags, len(state.sources)
     )
-    return head + array_bytes(state.sources, "uint8")
+    return head + array_bytes(state.sources, "uint8") + _pairs_bytes(state.parted, len(state.sources))
 
 
 def read_state(data: bytes, team: int) -> tuple[State, bytes]:
@@ -137,7 +162,8 @@ def read_state(data: bytes, team: int) -> tuple[State, bytes]:
     if flags > 3 or root >= team or members >> team:
         raise MalformedError("state: names a robot outside the team, or has unknown flags")
     sources = reader.array("uint8", (n,))
-    state = State(root, members, frames_hops, still_hops, bool(flags & 1), bool(flags & 2), sources)
+    parted = _read_pairs(reader, team)
+    state = State(root, members, frames_hops, still_hops, bool(flags & 1), bool(flags & 2), sources, parted)
     return state, data[reader.position :]
 
 
@@ -396,23 +422,48 @@ def _shorts(points: NDArray[np.float32]) -> tuple[float, bytes]:
 # --- frames and final poses
 
 
-_FRAME = struct.Struct("<HH")
+_FRAME = struct.Struct("<HIH")
+WHOLE = 0xFFFFFFFF
+"""Support of a robot's frame in itself."""
 
 
-def write_frame(root: int, hops: int, T_world_map: Array) -> bytes:
-    """Bytes of FRAME: lowest robot of the component, distance to it, own map frame in the root's."""
-    return _FRAME.pack(root, hops) + pose_bytes(T_world_map)
+@dataclass(frozen=True)
+class Frame:
+    """Where the sender's map lies in the component.
+
+    root: lowest robot of the component. support: closures that agree on the weakest link of the way to it (WHOLE at
+    the root itself). hops: length of that way. T_world_map: [4, 4], own map frame in the root's. parted: links known
+    to have been parted, as in `State`; the frame holds for the team without them.
+    """
+
+    root: int
+    support: int
+    hops: int
+    T_world_map: Array
+    parted: int = 0
+
+    @property
+    def rank(self) -> tuple[int, int, int]:
+        """The lowest rank counts: lowest root, then the way with the strongest weakest link, then the shortest."""
+        return self.root, -self.support, self.hops
 
 
-def read_frame(data: bytes, team: int) -> tuple[int, int, Array]:
-    """From FRAME: root, hops, T_world_map of the sender."""
+def write_frame(frame: Frame, team: int) -> bytes:
+    """Bytes of FRAME in a team of so many."""
+    head = _FRAME.pack(frame.root, frame.support, frame.hops)
+    return head + _pairs_bytes(frame.parted, team) + pose_bytes(frame.T_world_map)
+
+
+def read_frame(data: bytes, team: int) -> Frame:
+    """From FRAME."""
     reader = Reader(data, "frame")
-    root, hops = reader.fields(_FRAME)
+    root, support, hops = reader.fields(_FRAME)
+    parted = _read_pairs(reader, team)
     T = reader.poses(1)[0]
     reader.done()
     if root >= team or hops >= team:
         raise MalformedError("frame: names a robot outside the team")
-    return root, hops, T
+    return Frame(root, support, hops, T, parted)
 
 
 @dataclass(frozen=True)

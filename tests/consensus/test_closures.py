@@ -11,6 +11,7 @@ from pipeline.consensus.closures import (
     consistent,
     drift,
     holder,
+    plausible,
     robust_frame,
 )
 from pipeline.consensus.factors import Factors
@@ -139,3 +140,16 @@ def test_frames_chain_along_the_best_supported_tree():
     for name in "abc":
         np.testing.assert_allclose(frames[name], se3.inverse(world["a"]) @ world[name], atol=1e-12)
     np.testing.assert_array_equal(frames["d"], np.eye(4))
+
+
+def test_plausible_is_what_fits_to_where_frames_put_the_robots():
+    """The wrong group is large enough to be consistent by itself; frames from elsewhere say that it is wrong."""
+    closures, own, peer, grown, truth, T_own_peer = pair(3, good=4, bad=0, aliased=8)
+    assert consistent(closures, own, peer, grown, grown, CONFIG).keep.tolist() == (~truth).tolist()
+    T_world_own = random_poses(np.random.default_rng(4), 1)[0]
+    found = plausible(closures, T_world_own @ own, T_world_own @ T_own_peer @ peer, grown, grown, CONFIG)
+    np.testing.assert_array_equal(found, truth)
+    drifted = T_own_peer @ se3.exp([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])  # well within eleven steps of odometry
+    assert plausible(closures, T_world_own @ own, T_world_own @ drifted @ peer, grown, grown, CONFIG)[
+        truth
+    ].all()

@@ -57,7 +57,9 @@ def records(n: int) -> np.ndarray:
 
 MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
     "state": (
-        wire.write_state(wire.State(1, 0b1011, 3, 0, True, False, np.array([254, 255, 0, 1], np.uint8))),
+        wire.write_state(
+            wire.State(1, 0b1011, 3, 0, True, False, np.array([254, 255, 0, 1], np.uint8), 0b101)
+        ),
         lambda d: wire.read_state(d, TEAM),
     ),
     "places": (
@@ -89,7 +91,10 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
         wire.write_poses(pose_packet("float32")),
         lambda d: wire.read_poses(d, np.arange(10, dtype=np.int32)),
     ),
-    "frame": (wire.write_frame(1, 2, poses(1)[0]), lambda d: wire.read_frame(d, TEAM)),
+    "frame": (
+        wire.write_frame(wire.Frame(1, 7, 2, poses(1)[0], 0b1010), TEAM),
+        lambda d: wire.read_frame(d, TEAM),
+    ),
     "anchors": (
         wire.write_anchors(wire.Anchors(2, poses(4), poses(1)[0])),
         lambda d: wire.read_anchors(d, TEAM),

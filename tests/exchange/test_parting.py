@@ -1,0 +1,148 @@
+"""A link whose closures are all false must not join two robots: it is parted, and they end as if they had not met."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.consensus.config import PoseConsensusConfig
+from pipeline.exchange.config import ExchangeConfig, LinkConfig
+from pipeline.exchange.meeting import LowerEnd
+from pipeline.exchange.replay import replay_agent_of
+from pipeline.exchange.session import run_session_of
+from pipeline.geometry import se3
+from pipeline.recording import read_log
+from pipeline.robot import AgentResult, RobotData
+
+NAMES = ("alpha", "bravo", "charlie")
+Team = dict[str, tuple[RobotData, np.ndarray]]
+
+
+@pytest.fixture(scope="module")
+def team(make_robot: Any) -> Team:
+    return {name: make_robot(name, 0.6 * i, keyframes=4) for i, name in enumerate(NAMES)}
+
+
+def falsify(
+    monkeypatch: pytest.MonkeyPatch, pair: tuple[str, str], frame_of: Callable[[int], np.ndarray | None]
+) -> None:
+    """Replace every closure of a pair: number k says that the peer's map lies at frame_of(k); None takes it away."""
+    decide = LowerEnd._decide
+
+    def decide_falsely(self: LowerEnd, send: Any) -> None:
+        if (self.own, self.peer) == pair:
+            assert self.book is not None
+            count = 0
+            for at, t in enumerate(self.tried):
+                closure = t.result.closure
+                if closure is None:
+                    continue
+                frame = frame_of(count)
+                count += 1
+                own = self.places.data.T_map_keyframe[closure.own_keyframe]
+                peer = self.book.T_map_keyframe[closure.peer_keyframe]
+                if frame is not None:
+                    T_own_peer = se3.inverse(own) @ frame @ peer
+                    closure = dataclasses.replace(closure, T_own_peer=T_own_peer)
+                result = dataclasses.replace(t.result, closure=None if frame is None else closure)
+                self.tried[at] = dataclasses.replace(t, result=result)
+            assert count >= 2, "the test needs two closures to make false ones of"
+        decide(self, send)
+
+    monkeypatch.setattr(LowerEnd, "_decide", decide_falsely)
+
+
+def meet(team: Team, names: tuple[str, ...], folder: Path, **config: Any) -> dict[str, AgentResult]:
+    return run_session_of(
+        [team[name][0] for name in names],
+        ExchangeConfig(**config),
+        seed=0,
+        exchange_path=folder / "exchange.mcap",
+        consensus_path=folder / "consensus.mcap",
+    )
+
+
+def is_alone(result: AgentResult, data: RobotData) -> bool:
+    """Whether a robot ended as if it had met nobody, bit for bit."""
+    return (
+        result.component == (data.robot,)
+        and np.array_equal(result.T_world_keyframe, data.T_map_keyframe)
+        and list(result.T_world_keyframe_of) == [data.robot]
+        and result.evidence == {}
+        and result.pairs == {}
+        and result.agreed
+        and result.converged
+    )
+
+
+STRICT = PoseConsensusConfig(truncation=2.0)
+"""Closures that lie 3.5 standard deviations from their mean pass the pairwise test, and the weights refuse them."""
+
+
+def two_opinions(k: int) -> np.ndarray | None:
+    """Two closures that name nearly the same wrong place, 35 mm apart: 3.5 times the floor of either, from the mean."""
+    wrong, apart = se3.exp([5.0, 0.0, 0.0, 0.0, 0.4, 0.0]), [0.0175, 0.0, 0.0, 0.0, 0.0, 0.0]
+    return wrong @ se3.exp(np.array(apart) * (1 - 2 * k)) if k < 2 else None
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.5])
+def test_two_robots_with_false_closures_only_end_as_if_they_had_not_met(
+    team: Team, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, loss: float
+) -> None:
+    falsify(monkeypatch, ("alpha", "bravo"), two_opinions)
+    link = LinkConfig(loss_probability=loss)
+    results = meet(team, NAMES[:2], tmp_path, link=link, consensus=STRICT)
+    rounds = [r.message() for r in read_log(tmp_path / "consensus.mcap", ["/alpha/consensus/agent"])]
+    assert any(m.joined_links for m in rounds), "the test needs them to be joined first"
+    assert rounds[-1].parted_links == 1
+    for name in NAMES[:2]:
+        assert is_alone(results[name], team[name][0])
+        again, sent = replay_agent_of(
+            team[name][0],
+            ExchangeConfig(link=link, consensus=STRICT),
+            seed=0,
+            exchange_path=tmp_path / "exchange.mcap",
+        )
+        assert sent.equal
+        assert again.component == (name,)
+    measured = [c for c in results["alpha"].closures if c.T_own_peer is not None]
+    assert len(measured) == 2
+    assert all(c.weight == 0.0 and c.verdict != "kept" for c in measured)
+
+
+@pytest.mark.parametrize(("topology", "wrong_m"), [("full", 3.0), ("full", 0.3), ("chain", 5.0)])
+def test_a_false_link_is_parted_and_the_others_stay(
+    team: Team, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, topology: str, wrong_m: float
+) -> None:
+    """Full: alpha and charlie meet through bravo. Chain: bravo and charlie without alpha, in the frame of bravo."""
+    false_pair = ("alpha", "charlie") if topology == "full" else ("alpha", "bravo")
+    wrong = se3.exp([wrong_m, 0.0, 0.0, 0.0, 0.5, 0.0])
+    if topology == "full":
+        falsify(monkeypatch, false_pair, lambda k: wrong if k < 2 else None)
+    else:
+        falsify(monkeypatch, false_pair, two_opinions)
+    consensus = PoseConsensusConfig() if topology == "full" else STRICT
+    link = LinkConfig(topology=topology, loss_probability=0.2)
+    results = meet(team, NAMES, tmp_path, link=link, consensus=consensus)
+    together = NAMES if topology == "full" else NAMES[1:]
+    root = together[0]
+    for name in together:
+        result = results[name]
+        assert result.component == together
+        assert result.agreed
+        assert result.converged
+        T_true = se3.inverse(team[root][1][0]) @ team[name][1]
+        assert se3.distance(T_true, result.T_world_keyframe)[0].max() < 0.01
+        assert set(result.evidence) == set(together) - {name}
+    if topology == "chain":
+        assert is_alone(results["alpha"], team["alpha"][0])
+    false = [c for c in results["alpha"].closures if c.peer == false_pair[1] and c.T_own_peer is not None]
+    assert false
+    assert all(c.weight == 0.0 and c.verdict != "kept" for c in false)
+    rounds = [r.message() for r in read_log(tmp_path / "consensus.mcap", ["/alpha/consensus/agent"])]
+    assert rounds[-1].parted_links == 1
