@@ -130,6 +130,11 @@ def _known(metrics: dict[str, Any]) -> str:
     ]
 
 
+def _own_at_peers(metrics: dict[str, Any]) -> str:
+    value = metrics["rendering"]["own"]["peers"]["psnr_db"]
+    return "none" if value is None else words.text("psnr_db", value)
+
+
 def _cards(metrics: dict[str, Any], reasons: dict[str, str]) -> list[dict[str, str]]:
     """The few numbers to look at first."""
     fused, meaning = "rendering.fused.held_out", "fused maps, views never mapped"
@@ -137,7 +142,11 @@ def _cards(metrics: dict[str, Any], reasons: dict[str, str]) -> list[dict[str, s
         ("team.ate_rmse_m", *words.TEAM["ate_rmse_m"]),
         ("team.ate_rmse_m_mean_of_robots", *words.TEAM["ate_rmse_m_mean_of_robots"]),
         (f"{fused}.psnr_db", "PSNR", meaning),
-        (f"{fused}.ssim", "SSIM", meaning),
+        (
+            "rendering.fused.peers.psnr_db",
+            "PSNR, peers' views",
+            f"fused maps, where the other robots stood; own maps there: {_own_at_peers(metrics)}",
+        ),
         (f"{fused}.depth_l1_m", "Depth L1", f"{meaning}; against the recorded depth"),
         ("team.inter_robot_closures", *words.TEAM["inter_robot_closures"]),
         ("exchange.bytes_sent", *words.EXCHANGE["bytes_sent"]),

@@ -45,8 +45,8 @@ SCHEMA = {
         "gap_to_oracle_m": NUMBER, "gap_to_oracle_rad": NUMBER,
     },
     "protocol": dict.fromkeys(
-        ("alignment", "ate", "team_ate", "rpe", "initial_relative_poses", "held_out", "peers", "training", "poses", "exposure",
-         "background", "psnr", "ssim", "ms_ssim", "depth", "calibration"),
+        ("alignment", "ate", "team_ate", "rpe", "initial_relative_poses", "held_out", "peers", "training", "poses",
+         "exposure", "background", "psnr", "ssim", "ms_ssim", "depth", "calibration"),
         str,
     ),
 }  # fmt: skip
