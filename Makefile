@@ -1,5 +1,7 @@
 # `make demo` and `make test` are all a fresh clone needs; both set up .venv first.
 PYTHON ?= python3
+# Options for installing torch, for example an index that has the smaller CPU-only build; any build will do.
+TORCH_OPTIONS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
@@ -25,7 +27,7 @@ $(STAMP): $(SOURCES)
 	@command -v c++ >/dev/null || { echo "setup: no C++ compiler found; on Debian: apt-get install g++" >&2; exit 1; }
 	@$(PYTHON) -c 'import os, sys, sysconfig; sys.exit(not os.path.exists(os.path.join(sysconfig.get_paths()["include"], "Python.h")))' || { echo "setup: Python.h not found; on Debian: apt-get install python3-dev" >&2; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check "torch==2.13.0"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(TORCH_OPTIONS) "torch==2.13.0"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[test,lint,dev]"
 	touch $(STAMP)
 
