@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.consensus.evidence import Evidence
+from pipeline.consensus.factors import Factors
 from pipeline.errors import DuagError
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.messages import GaussianInformation, GaussianMap, Keyframe
@@ -121,6 +122,16 @@ def steps_of(keyframes: Sequence[Keyframe]) -> list[Step]:
         for k in keyframes
         if k.previous_index >= 0
     ]
+
+
+def factors_of(steps: Sequence[Step]) -> Factors:
+    """Odometry as factors between keyframes, in the same order."""
+    return Factors(
+        np.array([s.i for s in steps], dtype=np.int64),
+        np.array([s.j for s in steps], dtype=np.int64),
+        np.array([s.T_i_j for s in steps], dtype=np.float64).reshape(-1, 4, 4),
+        np.array([s.information for s in steps], dtype=np.float64).reshape(-1, 6, 6),
+    )
 
 
 def load(source: AgentInput) -> RobotData:

@@ -57,6 +57,8 @@ def test_the_team_meets_and_everything_is_written(finished: Path) -> None:
     assert metrics["exchange"]["matched_pairs"] > 0
     assert metrics["exchange"]["bytes_delivered"] > 0
     assert metrics["team"]["ate_rmse_m"] < 0.01
+    assert metrics["consensus"]["gap_to_oracle_m"] < 1e-4  # ten times the tolerance at which the robots stop
+    assert metrics["consensus"]["gap_to_oracle_rad"] < 1e-4
     for name in (
         "report/index.html",
         "run.rrd",

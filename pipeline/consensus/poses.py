@@ -166,8 +166,7 @@ class PoseAgent:
         """
         self.robot, self.config = robot, config
         self.T_map_keyframe = np.array(T_map_keyframe, dtype=np.float64)
-        floor = np.repeat([config.odometry_floor_m**2, config.odometry_floor_rad**2], 3) * np.eye(6)
-        self.odometry = Factors(odometry.i, odometry.j, odometry.T_i_j, inflated(odometry.information, floor))
+        self.odometry = with_floor(odometry, config)
         self.T_world_map = np.eye(4)
         self.gauge = np.eye(4)
         self.links: dict[str, _Link] = {}
@@ -538,6 +537,12 @@ class PoseAgent:
             "weights": {peer: link.weights.tolist() for peer, link in self.links.items() if link.holds},
             "factorisations": self.factorisations,
         }
+
+
+def with_floor(odometry: Factors, config: PoseConsensusConfig) -> Factors:
+    """Odometry as it counts in the objective: its covariance plus the floor of the settings."""
+    floor = np.repeat([config.odometry_floor_m**2, config.odometry_floor_rad**2], 3) * np.eye(6)
+    return Factors(odometry.i, odometry.j, odometry.T_i_j, inflated(odometry.information, floor))
 
 
 def graduated_weights(squared: Array, c2: float, mu: float) -> Array:

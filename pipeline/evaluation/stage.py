@@ -49,6 +49,7 @@ PROTOCOL = {
     "psnr": "render clamped to 0..1, mean over views, at most 100 dB",
     "ssim": "one scale, 11x11 Gaussian window of sigma 1.5, windows inside the image",
     "ms_ssim": "five scales, weights of Wang et al. 2003",
+    "oracle": "same factors and final closure weights solved in one place, from the robots' answer downhill",
     "depth": "blended depth / alpha where alpha >= 0.5; mean over pixels with both depths, then over views",
     "calibration": "distance of fused Gaussians from the true surface against sigma along its normal; mean of robots",
 }

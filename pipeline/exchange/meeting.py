@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from pipeline import streams
 from pipeline.consensus.closures import Closure, consistent, drift
-from pipeline.consensus.factors import Factors
 from pipeline.consensus.poses import PoseAgent, SharedKeyframes
 from pipeline.exchange import places, wire
 from pipeline.exchange.config import ExchangeConfig
@@ -31,7 +30,7 @@ from pipeline.exchange.verification import Verdict, Verified, verify
 from pipeline.exchange.wire import KeyframeSample, PlaceBook, Verdicts
 from pipeline.geometry import se3
 from pipeline.registration import Reference, RgbdPyramid
-from pipeline.robot import RobotData
+from pipeline.robot import RobotData, factors_of
 
 Array = NDArray[np.float64]
 Send = Callable[[Kind, bytes], None]
@@ -45,12 +44,7 @@ class OwnPlaces:
         self.data, self.config = data, config
         self._pyramid = lru_cache(maxsize=PYRAMIDS_KEPT)(self._build_pyramid)
         self._features: list[Features] | None = None
-        self.odometry = Factors(
-            np.array([s.i for s in data.odometry]),
-            np.array([s.j for s in data.odometry]),
-            np.array([s.T_i_j for s in data.odometry]).reshape(-1, 4, 4),
-            np.array([s.information for s in data.odometry]).reshape(-1, 6, 6),
-        )
+        self.odometry = factors_of(data.odometry)
 
     @property
     def features(self) -> list[Features]:

@@ -61,7 +61,7 @@ TEAM = {
     "robots": ("Robots", "robots in this run"),
     "robots_in_largest_component": ("Largest component", "robots that agree on one common world"),
     "inter_robot_closures": ("Closures between robots", "places that two robots recognised, counted in the end"),
-    "inter_robot_closures_rejected": ("Closures rejected", "candidates that failed a check or were outvoted"),
+    "inter_robot_closures_rejected": ("Closures rejected", "measured, then refused by geometry or outvoted"),
 }  # fmt: skip
 
 ROBOT = {
@@ -98,7 +98,8 @@ EXCHANGE = {
     "bytes_delivered": ("Bytes delivered", "what arrived, headers included"),
     "bytes_setup": ("Set-up bytes", "descriptors, samples, closures, frames, agreed poses, pair lists"),
     "bytes_per_round_per_robot_pair": ("Bytes per round and pair", "both directions, mean over the session"),
-    "bytes_raw_alternative": ("Raw alternative", "every map and pose graph uncompressed to every other robot, once"),
+    "bytes_raw_alternative": ("Raw alternative", "maps with information and pose graphs to every other robot, once"),
+    "bytes_raw_alternative_maps_only": ("Raw maps", "the same without the information: to look at, not to fuse"),
     "bytes_paper_accounting": ("Paper's accounting", "28 float32 per matched pair, both ways, in every round"),
     "matched_pairs": ("Matched Gaussians", "pairs of Gaussians of two robots that show the same piece of surface"),
 }  # fmt: skip

@@ -26,6 +26,7 @@ from pipeline.messages import (
     MapUpdate,
     Odometry,
     map_frame,
+    pack_pose,
     pack_stamp,
 )
 from pipeline.recording import LogWriter
@@ -188,7 +189,7 @@ def _write_robot(folder: Path, robot: str, index: int, component: list[str], joi
             log.write(topics.ODOMETRY.of(robot), _odometry(robot, k, odometry[k], status), int(stamps[k]))
             if k in KEYFRAMES:
                 i = KEYFRAMES.index(k)
-                log.write(topics.KEYFRAME.of(robot), _keyframe(robot, i, k, odometry), int(stamps[k]))
+                log.write(topics.KEYFRAME.of(robot), _keyframe(robot, i, k, odometry, true), int(stamps[k]))
                 update = MapUpdate(int(stamps[k]), robot, i, 100, 3, 100 * (i + 1), 0.5, 0.2)
                 log.write(topics.MAP_UPDATE.of(robot), update, int(stamps[k]))
         log.write(topics.MAP.of(robot), GaussianMap(end, robot, map_frame(robot), own), end)
@@ -219,7 +220,8 @@ def _odometry(robot: str, k: int, T_map_camera: np.ndarray, status: str) -> Odom
     )
 
 
-def _keyframe(robot: str, index: int, k: int, odometry: np.ndarray) -> Keyframe:
+def _keyframe(robot: str, index: int, k: int, odometry: np.ndarray, true: np.ndarray) -> Keyframe:
+    """Measured without error from the keyframe before, though the pose in the map drifts."""
     return Keyframe(
         stamp_ns=k * INTERVAL_NS,
         robot=robot,
@@ -227,8 +229,8 @@ def _keyframe(robot: str, index: int, k: int, odometry: np.ndarray) -> Keyframe:
         frame_index=k,
         T_map_camera=odometry[k],
         previous_index=index - 1,
-        T_previous_keyframe=np.eye(4),
-        information=np.eye(6),
+        T_previous_keyframe=se3.inverse(true[KEYFRAMES[max(index - 1, 0)]]) @ true[k],
+        information=1e6 * np.eye(6),
         exposure=(0.0, 0.0),
     )
 
@@ -249,6 +251,7 @@ def _write_exchange(path: Path, talking: Sequence[str], team: list[str]) -> None
             messages=totals["messages"],
             packets_sent=totals["packets"],
             bytes_raw_alternative=123456 if talking else 0,
+            bytes_raw_alternative_maps_only=45678 if talking else 0,
         )
         log.write(topics.EXCHANGE_SUMMARY.pattern, summary, 0)
 
@@ -287,7 +290,10 @@ def _write_link(log: LogWriter, sender: str, receiver: str, team: list[str], tot
 
 
 def _write_consensus(path: Path, team: list[str], joined: bool) -> None:
-    """Nine rounds whose change falls by ten in each; agreement in the eighth. One closure counts, three do not."""
+    """Nine rounds whose change falls by ten in each; agreement in the eighth.
+
+    One closure counts, one is outvoted, one is not consistent, one has too few matches to be measured.
+    """
     with LogWriter(path) as log:
         for k in range(9 if joined else 1):
             for robot in team:
@@ -306,8 +312,8 @@ def _write_consensus(path: Path, team: list[str], joined: bool) -> None:
                         "ConsensusRound", robot=robot, round=k, primal=2 * change, largest_change=change
                     )
                     log.write(topics.CONSENSUS_ROUND.of(robot), state, k * 10**8)
-        for i, (verdict, weight) in enumerate(
-            (("kept", 1.0), ("kept", 0.1), ("kept", -1.0), ("few_matches", -1.0))
+        for i, (verdict, weight, inliers) in enumerate(
+            (("outvoted", 0.1, 30), ("kept", 1.0, 30), ("inconsistent", -1.0, 30), ("few_matches", -1.0, 0))
         ):
             if joined:
                 closure = schemas.new(
@@ -317,9 +323,15 @@ def _write_consensus(path: Path, team: list[str], joined: bool) -> None:
                     own_keyframe=i,
                     peer_keyframe=i,
                     matches=50,
-                    inliers=30,
+                    inliers=inliers,
                     verdict=verdict,
-                    detail="30 of 50 matches agree",
+                    detail=f"{inliers} of 50 matches agree",
+                    measured=weight >= 0,
                     weight=weight,
                 )
+                if weight >= 0:  # the outvoted one is wrong by 5 cm
+                    wrong = se3.exp([0.05 * (verdict == "outvoted"), 0, 0, 0, 0, 0])
+                    T_own_peer = se3.inverse(way(0)[KEYFRAMES[i]]) @ way(1)[KEYFRAMES[i]] @ wrong
+                    closure.pose_own_peer.CopyFrom(pack_pose(T_own_peer))
+                    closure.information.extend(np.diag([1e6] * 6).ravel().tolist())
                 log.write(topics.CLOSURE_DECISION.of(team[0]), closure, 10**9)

@@ -38,7 +38,8 @@ SCHEMA = {
     "exchange": {
         "sessions": int, "rounds": int, "messages": int, "packets_sent": int, "packets_dropped": int, "bytes_sent": int,
         "bytes_delivered": int, "bytes_setup": int, "bytes_per_round_per_robot_pair": NUMBER,
-        "bytes_raw_alternative": int, "bytes_paper_accounting": int, "matched_pairs": int,
+        "bytes_raw_alternative": int, "bytes_raw_alternative_maps_only": int, "bytes_paper_accounting": int,
+        "matched_pairs": int,
     },
     "consensus": {
         "solver": str, "converged": bool, "rounds_to_tolerance": int, "gap_to_oracle_sigma": NUMBER,
@@ -46,7 +47,8 @@ SCHEMA = {
     },
     "protocol": dict.fromkeys(
         ("alignment", "ate", "team_ate", "rpe", "initial_relative_poses", "held_out", "peers", "training", "poses",
-         "exposure", "background", "psnr", "ssim", "ms_ssim", "depth", "calibration"),
+         "exposure", "background", "psnr", "ssim", "ms_ssim", "depth", "calibration",
+         "oracle"),
         str,
     ),
 }  # fmt: skip
@@ -153,13 +155,20 @@ def test_the_exchange_is_counted(metrics):
         "bytes_setup": 400,  # descriptors and pair lists of both, one packet each
         "bytes_per_round_per_robot_pair": 80.0,
         "bytes_raw_alternative": 123456,
+        "bytes_raw_alternative_maps_only": 45678,
         "bytes_paper_accounting": 3 * 224 * 10,
         "matched_pairs": 3,
     }
     assert metrics["consensus"]["converged"] is True
     assert metrics["consensus"]["rounds_to_tolerance"] == 8
+    assert (
+        1e-4 < metrics["consensus"]["gap_to_oracle_m"] < 0.05
+    )  # what the outvoted closure's weight of 0.1 pulls
+    assert metrics["consensus"]["gap_to_oracle_rad"] < 0.05
     assert metrics["team"]["inter_robot_closures"] == 1
-    assert metrics["team"]["inter_robot_closures_rejected"] == 3  # outvoted, unused, and refused
+    assert (
+        metrics["team"]["inter_robot_closures_rejected"] == 2
+    )  # outvoted, inconsistent; one was not measured
 
 
 def test_the_table_says_what_the_json_says_and_has_every_view(fake, metrics):

@@ -1,0 +1,82 @@
+"""The gap to the centralised answer: zero at the answer, whatever the gauge, and as large as what was moved."""
+
+import numpy as np
+import pytest
+
+from pipeline.consensus.config import PoseConsensusConfig
+from pipeline.consensus.factors import Factors
+from pipeline.consensus.poses import with_floor
+from pipeline.evaluation.oracle import Gap, WeightedClosure, gap_of_component, gap_to_oracle
+from pipeline.evaluation.results import Absent
+from pipeline.geometry import se3
+from pipeline.run_folder import RunFolder
+from tests.consensus.worlds import make_team, talk
+from tests.evaluation.fake_run import make
+
+CONFIG = PoseConsensusConfig(wire="float64", tolerance=1e-9)
+
+
+@pytest.fixture(scope="module")
+def agreed():
+    """Three robots that have agreed: their poses, odometry and closures with final weights."""
+    world = make_team(0, robots=3, closures=6)
+    agents = world.agents(CONFIG)
+    talk(agents, 400)
+    poses = {name: agent.T_world_keyframe for name, agent in agents.items()}
+    odometry = {name: agent.odometry for name, agent in agents.items()}
+    closures = [
+        WeightedClosure(agent.robot, link.peer, closure, weight)
+        for agent in agents.values()
+        for link in agent.links.values()
+        for closure, weight in zip(link.closures, link.weights.tolist(), strict=True)
+    ]
+    return poses, odometry, closures
+
+
+def test_robots_that_agreed_are_at_the_centralised_answer(agreed):
+    poses, odometry, closures = agreed
+    gap = gap_of_component(poses, odometry, closures, CONFIG)
+    assert isinstance(gap, Gap)
+    assert (
+        gap.metres < 1e-6
+    )  # they stop when nothing moves by more than the tolerance, a little before they are there
+    assert gap.radians < 1e-6
+
+
+def test_the_gauge_does_not_count(agreed):
+    poses, odometry, closures = agreed
+    T = se3.exp(np.array([3.0, -2.0, 1.0, 0.3, 0.8, -0.4]))
+    gap = gap_of_component({name: T @ p for name, p in poses.items()}, odometry, closures, CONFIG)
+    assert gap.metres < 1e-6
+
+
+def test_a_moved_keyframe_is_the_gap(agreed):
+    poses, odometry, closures = agreed
+    moved = {name: p.copy() for name, p in poses.items()}
+    moved["bravo"][3] = moved["bravo"][3] @ se3.exp(np.array([0.01, 0.0, 0.0, 0.0, 0.002, 0.0]))
+    gap = gap_of_component(moved, odometry, closures, CONFIG)
+    assert gap.metres == pytest.approx(0.01, abs=1e-5)
+    assert gap.radians == pytest.approx(0.002, abs=1e-5)
+
+
+def test_other_weights_have_another_answer(agreed):
+    """The final weights count: with one closure left out, the robots are not at the answer."""
+    poses, odometry, closures = agreed
+    assert sum(c.weight > 0 for c in closures) > 2
+    used = next(k for k, c in enumerate(closures) if c.weight > 0)
+    less = [c for k, c in enumerate(closures) if k != used]
+    assert gap_of_component(poses, odometry, less, CONFIG).metres > 1e-5
+
+
+def test_without_information_or_company_there_is_no_gap(tmp_path):
+    apart = RunFolder(make(tmp_path / "apart", joined=False).run)
+    found = gap_to_oracle(apart, [])
+    assert isinstance(found, Absent)
+    assert "share" in found.reason
+
+
+def test_the_floor_is_that_of_the_agents():
+    one = Factors(np.array([0]), np.array([1]), np.eye(4)[None], 1e12 * np.eye(6)[None])
+    information = with_floor(one, CONFIG).information[0]
+    assert information[0, 0] == pytest.approx(1 / CONFIG.odometry_floor_m**2, rel=1e-4)
+    assert information[5, 5] == pytest.approx(1 / CONFIG.odometry_floor_rad**2, rel=1e-4)
