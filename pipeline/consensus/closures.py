@@ -185,7 +185,7 @@ def plausible(
     covariance = np.linalg.inv(closure_factors(closures, i, j, config).information + np.eye(6))
     variance = np.diagonal(covariance, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)
     variance = config.margin * (variance + drift_own[-1] + drift_peer[-1])
-    reach_m = max(float(_distances(poses[:, :3, 3]).max()) for poses in (own, peer))
+    reach_m = max(float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0))) for poses in (own, peer))
     return (rotation_rad**2 < CHI2_3_999 * variance[:, 1]) & (
         translation_m**2 < CHI2_3_999 * (variance[:, 0] + variance[:, 1] * reach_m**2 / 3)
     )
