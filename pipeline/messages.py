@@ -216,6 +216,54 @@ class Keyframe:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class KeyframeFactor:
+    """A registration between two keyframes, with the weight that the refinement of their poses gave it.
+
+    stamp_ns: time of the later keyframe. first_index, second_index: keyframes i < j. T_first_second: [4, 4] as
+    registered. information: [6, 6] of it, right tangent (translation m, rotation rad), without the weight, lowered
+    if the registrations contradict each other. weight: robust weight, 0..1.
+    """
+
+    schema: ClassVar[str] = "duagc.v1.KeyframeFactor"
+
+    stamp_ns: int
+    robot: str
+    first_index: int
+    second_index: int
+    T_first_second: Array
+    information: Array
+    weight: float
+
+    def pack(self) -> Any:
+        """duagc.v1.KeyframeFactor."""
+        message = schemas.new(
+            "KeyframeFactor",
+            frame_id=map_frame(self.robot),
+            robot=self.robot,
+            first_index=int(self.first_index),
+            second_index=int(self.second_index),
+            pose_first_second=pack_pose(self.T_first_second),
+            information=_pack_information(self.information),
+            weight=float(self.weight),
+        )
+        pack_stamp(message, self.stamp_ns)
+        return message
+
+    @staticmethod
+    def unpack(m: Any) -> KeyframeFactor:
+        """From duagc.v1.KeyframeFactor."""
+        return KeyframeFactor(
+            stamp_ns=unpack_stamp(m),
+            robot=m.robot,
+            first_index=m.first_index,
+            second_index=m.second_index,
+            T_first_second=unpack_pose(m.pose_first_second, "KeyframeFactor.pose_first_second"),
+            information=_numbers(m.information, (6, 6), "KeyframeFactor.information"),
+            weight=m.weight,
+        )
+
+
 @dataclass(frozen=True)
 class MapUpdate:
     """What the mapping of one keyframe did: Gaussians inserted, pruned and then present; loss before and after."""
@@ -455,7 +503,15 @@ class CorrectedKeyframes:
 
 _UNPACK: dict[str, Callable[[Any], Any]] = {
     c.schema: c.unpack
-    for c in (Odometry, Keyframe, MapUpdate, GaussianMap, GaussianInformation, CorrectedKeyframes)
+    for c in (
+        Odometry,
+        Keyframe,
+        KeyframeFactor,
+        MapUpdate,
+        GaussianMap,
+        GaussianInformation,
+        CorrectedKeyframes,
+    )
 }
 
 

@@ -13,7 +13,7 @@ from pipeline.consensus.evidence import Evidence
 from pipeline.consensus.factors import Factors
 from pipeline.errors import DuagError
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.messages import GaussianInformation, GaussianMap, Keyframe
+from pipeline.messages import GaussianInformation, GaussianMap, Keyframe, KeyframeFactor
 from pipeline.splat.gaussians import Gaussians
 from schemas import topics
 
@@ -33,7 +33,7 @@ class AgentInput:
 
 @dataclass(frozen=True)
 class Step:
-    """Odometry between two own keyframes: T_i_j [4, 4] and its information [6, 6] (right tangent)."""
+    """A motion between two own keyframes: T_i_j [4, 4] and its information [6, 6] (right tangent)."""
 
     i: int
     j: int
@@ -45,14 +45,17 @@ class Step:
 class RobotData:
     """One robot's own results in memory.
 
-    T_map_keyframe: [n, 4, 4] by keyframe index. images: gives colour uint8 RGB [h, w, 3] and depth float32 [h, w]
-    (m, 0 = unknown) of a keyframe. information: of the Gaussians, in the map frame, by the same ids.
+    T_map_keyframe: [n, 4, 4] by keyframe index. odometry: from the keyframe that each was tracked against, refined,
+    with its marginal information. registrations: the measurements behind it, independent of each other. images: gives
+    colour uint8 RGB [h, w, 3] and depth float32 [h, w] (m, 0 = unknown) of a keyframe. information: of the Gaussians,
+    in the map frame, by the same ids.
     """
 
     robot: str
     camera: PinholeCamera
     T_map_keyframe: Array
     odometry: list[Step]
+    registrations: list[Step]
     images: Callable[[int], Images]
     gaussians: Gaussians
     information: GaussianInformation
@@ -124,8 +127,27 @@ def steps_of(keyframes: Sequence[Keyframe]) -> list[Step]:
     ]
 
 
+def registrations_of(
+    frontend: Path, keyframes: Sequence[Keyframe], factors: Sequence[KeyframeFactor]
+) -> list[Step]:
+    """Registrations between a robot's keyframes as its refinement weighed them, in order of the log.
+
+    Args:
+        frontend: file that both come from, for the complaint. keyframes: in order of their index.
+    Raises:
+        DuagError: a keyframe that no registration ties to an earlier one, or a registration of none.
+    """
+    tied = {f.second_index for f in factors if 0 <= f.first_index < f.second_index}
+    expected = {k.keyframe_index for k in keyframes[1:]}
+    if tied != expected:
+        raise DuagError(
+            f"{frontend}: registrations tie keyframes {sorted(tied)} to earlier ones, expected {sorted(expected)}"
+        )
+    return [Step(f.first_index, f.second_index, f.T_first_second, f.weight * f.information) for f in factors]
+
+
 def factors_of(steps: Sequence[Step]) -> Factors:
-    """Odometry as factors between keyframes, in the same order."""
+    """Steps as factors between keyframes, in the same order."""
     return Factors(
         np.array([s.i for s in steps], dtype=np.int64),
         np.array([s.j for s in steps], dtype=np.int64),
@@ -143,13 +165,16 @@ def load(source: AgentInput) -> RobotData:
     from pipeline.recording import open_rgbd, read_log
 
     robot = source.robot
-    wanted = (topics.KEYFRAME.of(robot), topics.MAP.of(robot))
+    wanted = (topics.KEYFRAME.of(robot), topics.MAP.of(robot), topics.KEYFRAME_FACTOR.of(robot))
     keyframes: list[Keyframe] = []
+    factors: list[KeyframeFactor] = []
     gaussian_map: GaussianMap | None = None
     for record in read_log(source.frontend, wanted):
         message = record.message()
         if isinstance(message, Keyframe):
             keyframes.append(message)
+        elif isinstance(message, KeyframeFactor):
+            factors.append(message)
         else:
             gaussian_map = message
     if gaussian_map is None:
@@ -165,6 +190,7 @@ def load(source: AgentInput) -> RobotData:
         raise DuagError(
             f"{source.information}: is about other Gaussians than {source.frontend}, expected the same ids"
         )
+    registrations = registrations_of(source.frontend, keyframes, factors)
     poses = np.array([k.T_map_camera for k in keyframes], dtype=np.float64).reshape(-1, 4, 4)
     with open_rgbd(source.log) as log:
         camera = log.camera
@@ -176,4 +202,13 @@ def load(source: AgentInput) -> RobotData:
             frame = log.frame(keyframes[keyframe].frame_index)
         return frame.color, frame.depth
 
-    return RobotData(robot, camera, poses, steps_of(keyframes), images, gaussian_map.gaussians, information)
+    return RobotData(
+        robot,
+        camera,
+        poses,
+        steps_of(keyframes),
+        registrations,
+        images,
+        gaussian_map.gaussians,
+        information,
+    )

@@ -66,6 +66,13 @@ GROUNDTRUTH_DEPTH = Topic(
 )
 ODOMETRY = Topic("/<robot>/odometry", "duagc.v1.Odometry", "frontend", Scope.ROBOT, "pose of every frame")
 KEYFRAME = Topic("/<robot>/keyframe", "duagc.v1.Keyframe", "frontend", Scope.ROBOT, "pose of every keyframe")
+KEYFRAME_FACTOR = Topic(
+    "/<robot>/keyframe_factor",
+    "duagc.v1.KeyframeFactor",
+    "frontend",
+    Scope.ROBOT,
+    "every registration between keyframes",
+)
 MAP_UPDATE = Topic(
     "/<robot>/map_update", "duagc.v1.MapUpdate", "frontend", Scope.ROBOT, "what one keyframe did to the map"
 )
@@ -132,6 +139,7 @@ TOPICS: tuple[Topic, ...] = (
     GROUNDTRUTH_DEPTH,
     ODOMETRY,
     KEYFRAME,
+    KEYFRAME_FACTOR,
     MAP_UPDATE,
     MAP,
     INFORMATION,

@@ -64,6 +64,7 @@ def all_messages(seed: int, n: int) -> list[Any]:
             stamp, "alpha", 4, True, 0, pose(rng), pose(rng), information(rng), status, 0.5, 0.01, 0.02
         ),
         m.Keyframe(stamp, "alpha", 3, 40, pose(rng), 2, pose(rng), information(rng), (0.1, -0.02)),
+        m.KeyframeFactor(stamp, "alpha", 2, 5, pose(rng), information(rng), 0.75),
         m.Keyframe(stamp, "alpha", 0, 0, np.eye(4), -1, np.eye(4), np.zeros((6, 6)), (0.0, 0.0)),
         m.MapUpdate(stamp, "alpha", 3, n, 2, 2**40, 0.1, 0.05),
         gaussian_information(rng, n),

@@ -1,7 +1,8 @@
 """How far the robots' poses are from the centralised answer: the same objective, solved in one place.
 
-The objective is rebuilt from what the run recorded: odometry from every frontend.mcap, closures with their information
-and final robust weights from consensus.mcap, noise floors from config.toml. Only who computes differs.
+The objective is rebuilt from what the run recorded: registrations between own keyframes from every frontend.mcap,
+closures with their information and final robust weights from consensus.mcap, noise floors from config.toml. Only who
+computes differs.
 """
 
 from __future__ import annotations
@@ -23,8 +24,10 @@ from pipeline.errors import DuagError
 from pipeline.evaluation.results import Absent
 from pipeline.geometry import se3
 from pipeline.messages import unpack_pose
-from pipeline.robot import factors_of, steps_of
-from pipeline.run_folder import RunFolder
+from pipeline.recording import read_log
+from pipeline.robot import Step, factors_of, registrations_of
+from pipeline.run_folder import RobotRun, RunFolder
+from schemas import topics
 
 Array = NDArray[np.float64]
 NOBODY = Absent("no two robots share a world")
@@ -68,7 +71,7 @@ def gap_to_oracle(run: RunFolder, decisions: Sequence[Any]) -> Gap | Absent:
             return closures
         poses = {name: run.robots[name].corrected.T_world_keyframe for name in members}
         odometry = {
-            name: with_floor(factors_of(steps_of(run.robots[name].keyframes)), config) for name in members
+            name: with_floor(factors_of(_registrations(run.robots[name])), config) for name in members
         }
         gaps.append(gap_of_component(poses, odometry, closures, config))
     found = [gap for gap in gaps if isinstance(gap, Gap)]
@@ -107,6 +110,13 @@ def gap_of_component(
     gauge = team.T_start[root] @ se3.inverse(solution.poses[root])
     metres, radians = se3.distance(gauge @ solution.poses, team.T_start)
     return Gap(float(np.max(metres)), float(np.max(radians)))
+
+
+def _registrations(robot: RobotRun) -> list[Step]:
+    """A robot's own registrations, as its agent reads them."""
+    path = robot.folder / "frontend.mcap"
+    factors = [record.message() for record in read_log(path, [topics.KEYFRAME_FACTOR.of(robot.robot)])]
+    return registrations_of(path, robot.keyframes, factors)
 
 
 def _closures(members: Sequence[str], decisions: Sequence[Any]) -> list[WeightedClosure] | Absent:

@@ -401,7 +401,7 @@ class Agent:
 
     def _start_poses(self) -> None:
         self.poses = PoseAgent(
-            self.data.robot, self.data.T_map_keyframe, self.places.odometry, self.config.consensus
+            self.data.robot, self.data.T_map_keyframe, self.places.registrations, self.config.consensus
         )
         self.poses.set_frame(self.T_world_map)
         for n in self._joined():

@@ -44,7 +44,7 @@ class OwnPlaces:
         self.data, self.config = data, config
         self._pyramid = lru_cache(maxsize=PYRAMIDS_KEPT)(self._build_pyramid)
         self._features: list[Features] | None = None
-        self.odometry = factors_of(data.odometry)
+        self.registrations = factors_of(data.registrations)
 
     @property
     def features(self) -> list[Features]:
@@ -68,7 +68,7 @@ class OwnPlaces:
     @property
     def drift(self) -> Array:
         """Accumulated variance of the own odometry, [n, 2]."""
-        return drift(self.odometry, self.data.keyframes, self.config.consensus.closures)
+        return drift(factors_of(self.data.odometry), self.data.keyframes, self.config.consensus.closures)
 
     def book(self) -> PlaceBook:
         """What a neighbour gets to recognise places."""
@@ -233,7 +233,7 @@ class LowerEnd(Meeting):
         shared = SharedKeyframes(np.zeros(0, np.int32), np.zeros((0, 6), np.float32))
         if T is not None:
             trial = PoseAgent(
-                self.own, self.places.data.T_map_keyframe, self.places.odometry, self.config.consensus
+                self.own, self.places.data.T_map_keyframe, self.places.registrations, self.config.consensus
             )
             shared = trial.add_link(self.peer, closures, keep=agreement.keep)
             self.joined = Joined(T, tuple(closures), agreement.keep, shared)

@@ -36,7 +36,7 @@ class RawAlternative:
     def of(data: Sequence[RobotData]) -> RawAlternative:
         """What it takes for a team."""
         others = len(data) - 1
-        gaussians, factors = sum(len(d.gaussians) for d in data), sum(len(d.odometry) for d in data)
+        gaussians, factors = sum(len(d.gaussians) for d in data), sum(len(d.registrations) for d in data)
         return RawAlternative(
             others * (4 * (14 + 31) * gaussians + 40 * factors), others * (4 * 14 * gaussians + 40 * factors)
         )

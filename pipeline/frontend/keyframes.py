@@ -27,6 +27,21 @@ class KeyframePair:
     information: Array
 
 
+@dataclass(frozen=True)
+class Refined:
+    """Keyframe poses after the refinement.
+
+    T_map_keyframe: [k, 4, 4]. covariance: [6k, 6k] of their right tangents, zero for the first. weights: [m], robust
+    weight of every pair, 0..1. contradiction: factor >= 1 on the covariance, by which the pairs contradict each
+    other more than their information says.
+    """
+
+    T_map_keyframe: Array
+    covariance: Array
+    weights: Array
+    contradiction: float
+
+
 def becomes_keyframe(result: Registration, pyramid: RgbdPyramid, config: KeyframeConfig) -> bool:
     """Whether a tracked frame sees too little of its keyframe, or moved or turned too far from it.
 
@@ -57,7 +72,7 @@ def predicted_overlap(reference: Reference, pyramid: RgbdPyramid, T_reference_ta
     return float(np.count_nonzero(same)) / len(samples)
 
 
-def refine(T_map_keyframes: Array, pairs: Sequence[KeyframePair], huber_sigmas: float) -> tuple[Array, Array]:
+def refine(T_map_keyframes: Array, pairs: Sequence[KeyframePair], huber_sigmas: float) -> Refined:
     """Keyframe poses that agree best with all registrations between them; the first keyframe stays.
 
     Gauss-Newton on sum |log(T_first_second^-1 T_map_first^-1 T_map_second)|^2 weighted by the information, with
@@ -66,17 +81,14 @@ def refine(T_map_keyframes: Array, pairs: Sequence[KeyframePair], huber_sigmas: 
     Args:
         T_map_keyframes: [k, 4, 4], start.
         pairs: registrations; every keyframe is connected to the first through them.
-    Returns:
-        Poses [k, 4, 4], and the covariance [6k, 6k] of their right tangents, zero for the first. If the pairs
-        contradict each other by more than their information says, the covariance is larger by that factor.
     """
     T = np.array(T_map_keyframes, dtype=np.float64)
     k = len(T)
     if k < 2:
-        return T, np.zeros((6 * k, 6 * k))
-    H, squares = np.eye(6 * k), np.zeros(0)
+        return Refined(T, np.zeros((6 * k, 6 * k)), np.zeros(0), 1.0)
+    H, squares, weights = np.eye(6 * k), np.zeros(0), np.zeros(0)
     for _ in range(MAX_STEPS):
-        H, gradient, squares = _normal_equations(T, pairs, huber_sigmas)
+        H, gradient, squares, weights = _normal_equations(T, pairs, huber_sigmas)
         step = -np.linalg.solve(H, gradient).reshape(k, 6)
         T = T @ se3.exp(step)
         if np.max(np.abs(step)) < STEP_TOLERANCE:
@@ -85,15 +97,16 @@ def refine(T_map_keyframes: Array, pairs: Sequence[KeyframePair], huber_sigmas: 
     contradiction = max(1.0, float(squares.sum()) / redundant) if redundant > 0 else 1.0
     covariance = np.zeros((6 * k, 6 * k))
     covariance[6:, 6:] = np.linalg.inv(H[6:, 6:]) * contradiction
-    return T, covariance
+    return Refined(T, covariance, weights, contradiction)
 
 
 def _normal_equations(
     T: Array, pairs: Sequence[KeyframePair], huber_sigmas: float
-) -> tuple[Array, Array, Array]:
-    """H [6k, 6k] and gradient [6k] with the first pose held, and every pair's weighted square."""
+) -> tuple[Array, Array, Array, Array]:
+    """H [6k, 6k] and gradient [6k] with the first pose held, every pair's weighted square, and its weight."""
     k = len(T)
-    H, gradient, squares = np.zeros((6 * k, 6 * k)), np.zeros(6 * k), np.zeros(len(pairs))
+    H, gradient = np.zeros((6 * k, 6 * k)), np.zeros(6 * k)
+    squares, weights = np.zeros(len(pairs)), np.zeros(len(pairs))
     for row, pair in enumerate(pairs):
         i, j = slice(6 * pair.first, 6 * pair.first + 6), slice(6 * pair.second, 6 * pair.second + 6)
         T_first_second = se3.inverse(T[pair.first]) @ T[pair.second]
@@ -102,7 +115,7 @@ def _normal_equations(
         J_first, information = -se3.adjoint(se3.inverse(T_first_second)), pair.information
         square = float(residual @ information @ residual)
         weight = min(1.0, huber_sigmas * np.sqrt(6) / np.sqrt(square)) if square > 0 else 1.0
-        squares[row] = weight * square
+        squares[row], weights[row] = weight * square, weight
         W = weight * information
         H[i, i] += J_first.T @ W @ J_first
         H[i, j] += J_first.T @ W
@@ -112,7 +125,7 @@ def _normal_equations(
         gradient[j] += W @ residual
     H[:6], H[:, :6], gradient[:6] = 0.0, 0.0, 0.0
     H[:6, :6] = np.eye(6)
-    return H, gradient, squares
+    return H, gradient, squares, weights
 
 
 def relative_information(T: Array, covariance: Array, first: int, second: int) -> Array:

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from pipeline import progress as progress_bar
 from pipeline.errors import DuagError
 from pipeline.frontend.config import FrontendConfig
-from pipeline.frontend.keyframes import refine, relative_information
+from pipeline.frontend.keyframes import KeyframePair, Refined, refine, relative_information
 from pipeline.frontend.tracking import Status, TrackedFrame, TrackedKeyframe, Tracker
-from pipeline.messages import GaussianMap, Keyframe, MapUpdate, Odometry, map_frame
+from pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
 from pipeline.recording import LogWriter, RgbdLog, open_rgbd
 from pipeline.splat.gaussians import Gaussians
 from schemas import topics
@@ -57,17 +57,18 @@ def run_frontend(
             raise DuagError(f"{log_path}: has no image, expected at least one")
         tracker, frames = _track(log, config, progress)
         clock.lap("tracking_s")
-        T_map_keyframes, covariance = refine(
+        refined = refine(
             np.array([k.T_map_keyframe for k in tracker.keyframes]),
             tracker.pairs,
             config.keyframes.huber_sigmas,
         )
-        keyframes = _keyframe_messages(log.robot, tracker.keyframes, T_map_keyframes, covariance)
+        keyframes = _keyframe_messages(log.robot, tracker.keyframes, refined)
+        factors = _factor_messages(log.robot, tracker.keyframes, tracker.pairs, refined)
         clock.lap("refinement_s")
         updates, gaussians = _map(log, keyframes, frames, config, seed, threads, progress)
         clock.lap("mapping_s")
-    odometry = [_odometry(log.robot, frame, T_map_keyframes, config) for frame in frames]
-    _write(out_path, log.robot, odometry, keyframes, updates, gaussians)
+    odometry = [_odometry(log.robot, frame, refined.T_map_keyframe, config) for frame in frames]
+    _write(out_path, log.robot, odometry, keyframes, factors, updates, gaussians)
     clock.lap("writing_s")
     return clock.laps
 
@@ -85,17 +86,16 @@ def _track(log: RgbdLog, config: FrontendConfig, progress: bool) -> tuple[Tracke
     return tracker, tracked
 
 
-def _keyframe_messages(
-    robot: str, keyframes: Sequence[TrackedKeyframe], T_map_keyframes: Array, covariance: Array
-) -> list[Keyframe]:
+def _keyframe_messages(robot: str, keyframes: Sequence[TrackedKeyframe], refined: Refined) -> list[Keyframe]:
     """Keyframes at their refined poses, with the information of the refined relative motion."""
     messages = []
+    T_map_keyframes = refined.T_map_keyframe
     for keyframe, T in zip(keyframes, T_map_keyframes, strict=True):
         index, previous = keyframe.keyframe_index, keyframe.previous_index
         T_previous_keyframe, information = np.eye(4), np.zeros((6, 6))
         if previous >= 0:
             T_previous_keyframe = np.linalg.solve(T_map_keyframes[previous], T)
-            information = relative_information(T_map_keyframes, covariance, previous, index)
+            information = relative_information(T_map_keyframes, refined.covariance, previous, index)
         gain, offset = keyframe.exposure
         messages.append(
             Keyframe(
@@ -111,6 +111,24 @@ def _keyframe_messages(
             )
         )
     return messages
+
+
+def _factor_messages(
+    robot: str, keyframes: Sequence[TrackedKeyframe], pairs: Sequence[KeyframePair], refined: Refined
+) -> list[KeyframeFactor]:
+    """Every registration that the refinement used, in the order of the later keyframes."""
+    return [
+        KeyframeFactor(
+            stamp_ns=keyframes[pair.second].stamp_ns,
+            robot=robot,
+            first_index=pair.first,
+            second_index=pair.second,
+            T_first_second=pair.T_first_second,
+            information=pair.information / refined.contradiction,
+            weight=float(weight),
+        )
+        for pair, weight in zip(pairs, refined.weights, strict=True)
+    ]
 
 
 def _map(
@@ -197,11 +215,15 @@ def _write(
     robot: str,
     odometry: Sequence[Odometry],
     keyframes: Sequence[Keyframe],
+    factors: Sequence[KeyframeFactor],
     updates: Sequence[MapUpdate],
     gaussians: Gaussians,
 ) -> None:
     """One message per frame, then what its keyframe did, in the order of time; the map at the end."""
     keyframe_of = {keyframe.frame_index: keyframe for keyframe in keyframes}
+    factors_of: dict[int, list[KeyframeFactor]] = {}
+    for factor in factors:
+        factors_of.setdefault(factor.second_index, []).append(factor)
     updates_of: dict[int, list[MapUpdate]] = {}
     for update in updates:
         updates_of.setdefault(update.keyframe_index, []).append(update)
@@ -215,6 +237,8 @@ def _write(
             keyframe = keyframe_of.get(message.frame_index)
             if keyframe is not None:
                 log.write(topics.KEYFRAME.of(robot), keyframe, time_ns, message.stamp_ns)
+                for factor in factors_of.get(keyframe.keyframe_index, []):
+                    log.write(topics.KEYFRAME_FACTOR.of(robot), factor, time_ns, message.stamp_ns)
                 for update in updates_of.get(keyframe.keyframe_index, []):
                     log.write(topics.MAP_UPDATE.of(robot), update, time_ns, message.stamp_ns)
         last = odometry[-1].stamp_ns

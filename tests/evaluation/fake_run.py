@@ -23,6 +23,7 @@ from pipeline.messages import (
     GaussianInformation,
     GaussianMap,
     Keyframe,
+    KeyframeFactor,
     MapUpdate,
     Odometry,
     map_frame,
@@ -190,6 +191,9 @@ def _write_robot(folder: Path, robot: str, index: int, component: list[str], joi
             if k in KEYFRAMES:
                 i = KEYFRAMES.index(k)
                 log.write(topics.KEYFRAME.of(robot), _keyframe(robot, i, k, odometry, true), int(stamps[k]))
+                if i > 0:
+                    factor = _factor(robot, i, k, true)
+                    log.write(topics.KEYFRAME_FACTOR.of(robot), factor, int(stamps[k]))
                 update = MapUpdate(int(stamps[k]), robot, i, 100, 3, 100 * (i + 1), 0.5, 0.2)
                 log.write(topics.MAP_UPDATE.of(robot), update, int(stamps[k]))
         log.write(topics.MAP.of(robot), GaussianMap(end, robot, map_frame(robot), own), end)
@@ -233,6 +237,12 @@ def _keyframe(robot: str, index: int, k: int, odometry: np.ndarray, true: np.nda
         information=1e6 * np.eye(6),
         exposure=(0.0, 0.0),
     )
+
+
+def _factor(robot: str, index: int, k: int, true: np.ndarray) -> KeyframeFactor:
+    """The registration that `_keyframe` tells of."""
+    T = se3.inverse(true[KEYFRAMES[index - 1]]) @ true[k]
+    return KeyframeFactor(k * INTERVAL_NS, robot, index - 1, index, T, 1e6 * np.eye(6), 1.0)
 
 
 def _write_exchange(path: Path, talking: Sequence[str], team: list[str]) -> None:

@@ -91,7 +91,7 @@ def robot(
         rng.normal(size=gaussians),
     )
     return RobotData(
-        name, CAMERA, poses, steps, images.__getitem__, maps, information_of(name, maps, rng)
+        name, CAMERA, poses, steps, steps, images.__getitem__, maps, information_of(name, maps, rng)
     ), truth
 
 

@@ -9,14 +9,19 @@ import numpy as np
 import pytest
 
 from pipeline.errors import DuagError
-from pipeline.messages import GaussianMap, Keyframe
+from pipeline.messages import GaussianMap, Keyframe, KeyframeFactor
 from pipeline.recording import LogWriter
-from pipeline.robot import AgentInput, load
+from pipeline.robot import AgentInput, load, registrations_of
 from schemas import topics
 
 
 def write(
-    folder: Path, data: Any, numbers: tuple[int, ...] = (0, 1), with_map: bool = True, first: int = 0
+    folder: Path,
+    data: Any,
+    numbers: tuple[int, ...] = (0, 1),
+    with_map: bool = True,
+    first: int = 0,
+    ties: tuple[tuple[int, int], ...] = ((0, 1),),
 ) -> AgentInput:
     """A robot's frontend.mcap and information.mcap; its sensor log does not exist."""
     source = AgentInput("alpha", folder / "alpha.mcap", folder / "frontend.mcap", folder / "information.mcap")
@@ -26,6 +31,9 @@ def write(
                 number, "alpha", number, 8 * number, np.eye(4), number - 1, np.eye(4), np.eye(6), (1, 0)
             )
             log.write(topics.KEYFRAME.of("alpha"), keyframe, number)
+        for i, j in ties:
+            factor = KeyframeFactor(j, "alpha", i, j, np.eye(4), np.eye(6), 0.5)
+            log.write(topics.KEYFRAME_FACTOR.of("alpha"), factor, 2)
         if with_map:
             log.write(
                 topics.MAP.of("alpha"),
@@ -43,6 +51,8 @@ def write(
         ({"with_map": False}, r"frontend.mcap: /alpha/map not found"),
         ({"numbers": (0, 2)}, r"frontend.mcap: /alpha/keyframe is not numbered"),
         ({"first": 1}, r"information.mcap: is about other Gaussians"),
+        ({"ties": ()}, r"frontend.mcap: registrations tie keyframes \[\] to earlier ones, expected \[1\]"),
+        ({"ties": ((0, 1), (1, 2))}, r"frontend.mcap: registrations tie keyframes \[1, 2\]"),
         ({}, r"alpha.mcap"),  # the sensor log itself
     ],
 )
@@ -52,3 +62,12 @@ def test_files_that_do_not_belong_together(
     data, _ = make_robot("alpha", 0.0, 1, 20)
     with pytest.raises(DuagError, match=complaint):
         load(write(tmp_path, data, **changes))
+
+
+def test_registrations_count_by_their_robust_weight() -> None:
+    T = np.eye(4)
+    keyframes = [Keyframe(k, "alpha", k, 8 * k, T, k - 1, T, np.eye(6), (0, 0)) for k in range(3)]
+    ends = [(0, 1, 1.0), (1, 2, 0.5), (0, 2, 0.25)]
+    factors = [KeyframeFactor(j, "alpha", i, j, T, 8 * np.eye(6), weight) for i, j, weight in ends]
+    steps = registrations_of(Path("frontend.mcap"), keyframes, factors)
+    assert [(s.i, s.j, s.information[0, 0]) for s in steps] == [(0, 1, 8.0), (1, 2, 4.0), (0, 2, 2.0)]

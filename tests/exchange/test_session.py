@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.consensus.config import PoseConsensusConfig
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.config import ExchangeConfig, LinkConfig, TransportConfig
 from pipeline.exchange.packets import Kind, Packet, chunk_bytes, parse, serialise
@@ -18,7 +19,7 @@ from pipeline.exchange.replay import replay_agent_of
 from pipeline.exchange.session import run_session_of
 from pipeline.geometry import se3
 from pipeline.recording import content_digest, read_log
-from pipeline.robot import AgentResult, RobotData
+from pipeline.robot import AgentResult, RobotData, Step
 
 NAMES = ("alpha", "bravo", "charlie")
 
@@ -201,6 +202,7 @@ def test_a_robot_without_a_map_keeps_nobody_waiting(team: Any, tmp_path: Path) -
         team["bravo"][0],
         T_map_keyframe=np.zeros((0, 4, 4)),
         odometry=[],
+        registrations=[],
         gaussians=team["bravo"][0].gaussians.select(slice(0, 0)),
     )
     results = run_session_of(
@@ -284,3 +286,22 @@ def test_an_agent_can_reach_nothing_but_its_own() -> None:
             assert not any(
                 n.startswith(("pipeline.recording", "pipeline.exchange.session")) for n in names
             ), path.name
+
+
+def test_every_registration_counts_in_the_consensus(team: Any, tmp_path: Path) -> None:
+    """A sure registration that the odometry does not tell of holds the last keyframe where it says."""
+    alpha, truth = team["alpha"]
+    last = alpha.keyframes - 1
+    T_first_last = se3.inverse(alpha.T_map_keyframe[0]) @ alpha.T_map_keyframe[last]
+    T_first_last = T_first_last @ se3.exp(np.array([0.03, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    sure = Step(0, last, T_first_last, 1e10 * np.eye(6))
+    consensus = PoseConsensusConfig(odometry_floor_m=1e-5, odometry_floor_rad=1e-5)
+    away_m = []
+    for more in ([], [sure]):
+        told = dataclasses.replace(alpha, registrations=[*alpha.registrations, *more])
+        result = meet({**team, "alpha": (told, truth)}, 2, tmp_path, consensus=consensus)["alpha"]
+        assert result.component == ("alpha", "bravo")
+        T = result.T_world_keyframe
+        away_m.append(float(se3.distance(T_first_last, se3.inverse(T[0]) @ T[last])[0]))
+    assert away_m[0] > 0.01
+    assert away_m[1] < 1e-3

@@ -8,7 +8,8 @@ import pytest
 
 from converters.base import RecordingWriter
 from pipeline.errors import DuagError
-from pipeline.frontend.config import FrontendConfig, TrackingConfig
+from pipeline.frontend.config import FrontendConfig, KeyframeConfig, TrackingConfig
+from pipeline.frontend.keyframes import KeyframePair, refine, relative_information
 from pipeline.frontend.mapping_config import MappingConfig
 from pipeline.frontend.stage import LATENCY_NS, _support, run_frontend
 from pipeline.frontend.tracking import Status, TrackedFrame
@@ -76,6 +77,29 @@ def test_keyframes_chain_by_their_refined_motion(frontend_log: Path) -> None:
         assert se3.distance(chained, m.T_map_camera)[0] < 1e-12
         assert np.linalg.eigvalsh(m.information)[0] > 0
         assert m.frame_index % 8 != 4
+
+
+def test_registrations_in_the_log_give_the_keyframe_poses(sensor_log: Path, tmp_path: Path) -> None:
+    """The logged factors, as weighed, are all that the refinement knew: its answer and its information follow."""
+    often = TRACKING.model_copy(update={"keyframes": KeyframeConfig(min_overlap=0.95)})
+    run_frontend(sensor_log, tmp_path / "frontend.mcap", often)
+    keyframes = messages(tmp_path / "frontend.mcap", topics.KEYFRAME)
+    factors = messages(tmp_path / "frontend.mcap", topics.KEYFRAME_FACTOR)
+    assert len(factors) > len(keyframes) - 1  # some keyframe is registered to more than the one before
+    pairs = [
+        KeyframePair(f.first_index, f.second_index, f.T_first_second, f.weight * f.information)
+        for f in factors
+    ]
+    poses = np.array([m.T_map_camera for m in keyframes])
+    again = refine(poses, pairs, 1e9)
+    np.testing.assert_allclose(again.T_map_keyframe, poses, atol=1e-7)
+    for m in keyframes[1:]:
+        relative = relative_information(
+            poses, again.covariance / again.contradiction, m.previous_index, m.keyframe_index
+        )
+        np.testing.assert_allclose(
+            relative, m.information, rtol=1e-4, atol=1e-4 * np.abs(m.information).max()
+        )
 
 
 def test_times_are_those_of_the_recording(frontend_log: Path) -> None:

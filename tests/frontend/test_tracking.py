@@ -62,7 +62,8 @@ def test_keyframes_are_made_and_are_never_held_out(walked) -> None:
 def test_refinement_does_not_spoil_exact_tracking(walked) -> None:
     tracker = walked[0]
     start = np.array([k.T_map_keyframe for k in tracker.keyframes])
-    refined, covariance = refine(start, tracker.pairs, 3.0)
+    result = refine(start, tracker.pairs, 3.0)
+    refined, covariance = result.T_map_keyframe, result.covariance
     np.testing.assert_array_equal(refined[0], np.eye(4))
     assert np.max(se3.distance(start, refined)[0]) < 2e-3
     assert np.linalg.eigvalsh(covariance[6:, 6:])[0] > 0
@@ -148,10 +149,11 @@ def test_refine_finds_poses_and_their_covariance() -> None:
 
     exact = [KeyframePair(i, j, se3.inverse(truth[i]) @ truth[j], information) for i, j in ends]
     start = truth @ se3.exp(np.concatenate([np.zeros((1, 6)), 0.05 * rng.standard_normal((5, 6))]))
-    np.testing.assert_allclose(refine(start, exact, 3.0)[0], truth, atol=1e-8)
+    np.testing.assert_allclose(refine(start, exact, 3.0).T_map_keyframe, truth, atol=1e-8)
     chi2 = []
     for _ in range(30):
-        T, covariance = refine(truth, draw(), 1e9)
+        drawn = refine(truth, draw(), 1e9)
+        T, covariance = drawn.T_map_keyframe, drawn.covariance
         error = se3.log(se3.inverse(se3.inverse(T[2]) @ T[5]) @ se3.inverse(truth[2]) @ truth[5])
         chi2.append(error @ relative_information(T, covariance, 2, 5) @ error)
     # expected 6 with a standard deviation of 0.6 over 30 draws; contradiction only ever enlarges the covariance
@@ -169,10 +171,14 @@ def test_refine_withstands_a_wrong_pair() -> None:
     ]
     wrong = pairs[3].T_first_second @ se3.exp(np.array([0.3, 0, 0, 0, 0.2, 0]))
     pairs[3] = KeyframePair(pairs[3].first, pairs[3].second, wrong, information)
-    robust, covariance = refine(truth, pairs, 1.0)
-    plain, _ = refine(truth, pairs, 1e9)
-    assert se3.distance(truth, robust)[0].max() < 0.3 * se3.distance(truth, plain)[0].max()
-    clean, _ = refine(truth, pairs[:3] + pairs[4:], 1.0)
-    np.testing.assert_allclose(clean, truth, atol=1e-8)
+    robust, plain = refine(truth, pairs, 1.0), refine(truth, pairs, 1e9)
+    far = se3.distance(truth, plain.T_map_keyframe)[0].max()
+    assert se3.distance(truth, robust.T_map_keyframe)[0].max() < 0.3 * far
+    assert np.argmin(robust.weights) == 3
+    assert robust.weights[3] < 0.2
+    np.testing.assert_array_equal(plain.weights, 1)
+    assert plain.contradiction > robust.contradiction > 1
+    clean = refine(truth, pairs[:3] + pairs[4:], 1.0)
+    np.testing.assert_allclose(clean.T_map_keyframe, truth, atol=1e-8)
     # the contradiction shows in the covariance: the first pose's neighbour is known worse than by one pair alone
-    assert covariance[6, 6] > 1e-4 / len(pairs)
+    assert robust.covariance[6, 6] > 1e-4 / len(pairs)

@@ -22,6 +22,7 @@ from pipeline.messages import (
     GaussianInformation,
     GaussianMap,
     Keyframe,
+    KeyframeFactor,
     Odometry,
     map_frame,
 )
@@ -119,6 +120,9 @@ def robot(tmp_path_factory):
                     k * 10**8, "bravo", at, k, T_map_camera[k], at - 1, np.eye(4), np.zeros((6, 6)), (1.0, 0.0)
                 )  # fmt: skip
                 log.write(topics.KEYFRAME.of("bravo"), keyframe, k * 10**8)
+                if at > 0:
+                    tie = KeyframeFactor(k * 10**8, "bravo", at - 1, at, np.eye(4), np.eye(6), 1.0)
+                    log.write(topics.KEYFRAME_FACTOR.of("bravo"), tie, k * 10**8)
         final = GaussianMap(5 * 10**8, "bravo", map_frame("bravo"), gaussians)
         log.write(topics.MAP.of("bravo"), final, 5 * 10**8)
     with LogWriter(folder / "information.mcap", "bravo") as log:
