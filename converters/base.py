@@ -237,6 +237,8 @@ class RecordingWriter:
         parameters: the settings it was made with.
         """
         self.out = Path(out)
+        if not self.out.name:
+            raise DuagError(f"{self.out}: found a path without a name, expected the name of a new folder")
         self.name = name or self.out.resolve().name
         self.warnings: list[str] = []
         self.parameters = dict(parameters or {})

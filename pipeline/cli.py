@@ -11,6 +11,7 @@ from pipeline import __version__, numeric
 from pipeline.errors import DuagError
 
 EXIT_FAILED, EXIT_DIFFERENT = 1, 3
+TYPER_INTERRUPTED = 130  # what typer makes of Ctrl-C, without a word
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -44,7 +45,9 @@ def main() -> None:
     except DuagError as error:
         print(f"duagc: {error}", file=sys.stderr)
         sys.exit(EXIT_FAILED)
-    except KeyboardInterrupt:
+    except SystemExit as stop:
+        if stop.code != TYPER_INTERRUPTED:
+            raise
         print("duagc: interrupted", file=sys.stderr)
         sys.exit(EXIT_FAILED)
 

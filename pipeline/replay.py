@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.config import load
-from pipeline.digest import digest_file
+from pipeline.digest import ROBOT_RESULTS, digest_file
 from pipeline.errors import DuagError
 from pipeline.run_folder import RunFolder
 from pipeline.runner import RunConfig, agent_input, fuse_robot, prepare_robot, threads_per_worker
-
-COMPARED = ("frontend.mcap", "information.mcap", "fused.mcap", "fused.ply", "trajectory.tum", "odometry.tum")
 
 
 @dataclass(frozen=True)
@@ -81,7 +79,7 @@ def _replay_one(
     say(f"{robot}: fusion")
     fuse_robot(robot, log, folder, result, config)
     comparisons = [Comparison(robot, "packets sent", sent.recorded, sent.recomputed)]
-    for name in COMPARED:
+    for name in ROBOT_RESULTS:
         recorded = digest_file(run / "robots" / robot / name)
         comparisons.append(Comparison(robot, name, recorded, digest_file(folder / name)))
     return comparisons

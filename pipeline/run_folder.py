@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import tomllib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.digest import digest_file
 from pipeline.errors import DuagError
 from pipeline.geometry.trajectory import Trajectory, read_tum
 from pipeline.messages import (
@@ -39,16 +41,18 @@ class RobotRun:
 
     robot: str
     folder: Path
+    digests: Mapping[str, str] = field(default_factory=dict)
+    """Digest of every result file by its name, as the manifest has it; empty while the run is being made."""
 
     @cached_property
     def odometry(self) -> Trajectory:
         """T_map_camera of all frames, before consensus, in the robot's own map frame."""
-        return read_tum(self.folder / "odometry.tum")
+        return self._trajectory("odometry.tum")
 
     @cached_property
     def trajectory(self) -> Trajectory:
         """T_world_camera of all frames, after consensus, by the robot's own estimate."""
-        return read_tum(self.folder / "trajectory.tum")
+        return self._trajectory("trajectory.tum")
 
     @cached_property
     def frames(self) -> list[Odometry]:
@@ -90,6 +94,16 @@ class RobotRun:
         """Names of the robots that share this robot's world frame, itself among them."""
         return tuple(sorted({*self.corrected.component, self.robot}))
 
+    def _trajectory(self, file: str) -> Trajectory:
+        """A log has checksums of its own; of a text file only the manifest knows what was written."""
+        path = self.folder / file
+        trajectory = read_tum(path)
+        if file in self.digests and (found := digest_file(path)) != self.digests[file]:
+            raise DuagError(
+                f"{path}: has digest {found[:12]}, expected {self.digests[file][:12]} as in manifest.json"
+            )
+        return trajectory
+
     def _all(self, file: str, topic: topics.Topic) -> list[Any]:
         path = self.folder / file
         if not path.is_file():
@@ -118,7 +132,7 @@ class RunFolder:
         names = sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
         if not names:
             raise DuagError(f"{self.path}: found no folder robots/<robot>, expected a run")
-        return {name: RobotRun(name, folder / name) for name in names}
+        return {name: RobotRun(name, folder / name, self._digests(name)) for name in names}
 
     @cached_property
     def largest_component(self) -> tuple[str, ...]:
@@ -171,14 +185,22 @@ class RunFolder:
         """metrics.json; empty if the run was not evaluated."""
         return self._json("metrics.json")
 
+    def _digests(self, robot: str) -> dict[str, str]:
+        outputs = self._json("manifest.json").get("outputs", {})
+        start = f"robots/{robot}/"
+        return {name.removeprefix(start): d for name, d in outputs.items() if name.startswith(start)}
+
     def _json(self, name: str) -> dict[str, Any]:
         path = self.path / name
         if not path.is_file():
             return {}
         try:
-            return json.loads(path.read_text(encoding="utf-8"))
+            content = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise DuagError(f"{path}: not valid JSON: {error}") from error
+        if not isinstance(content, dict):
+            raise DuagError(f"{path}: found a {type(content).__name__}, expected a JSON object")
+        return content
 
 
 def position_information(geometry: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -4,15 +4,14 @@ Robots are prepared in parallel processes; the exchange is one ordered stage in 
 written into a folder beside the output, which gets its final name when all is done.
 """
 
+import fcntl
 import json
-import multiprocessing
 import os
 import resource
 import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
@@ -28,6 +27,7 @@ from pipeline.frontend.config import FrontendConfig
 from pipeline.fusion.config import FusionConfig
 from pipeline.information.config import InformationConfig
 from pipeline.robot import AgentInput, AgentResult
+from pipeline.workers import worker_pool
 
 OURS = ("manifest.json", "run/manifest.json")  # a run, a demo
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
@@ -94,8 +94,12 @@ def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, thread
     """
     from pipeline.frontend.stage import run_frontend
     from pipeline.information.stage import run_information
+    from pipeline.recording import open_rgbd
 
     numeric.settle_opencv()
+    with open_rgbd(log) as camera:
+        if camera.robot != robot:
+            raise DuagError(f"{log}: is the log of {camera.robot}, expected that of {robot}")
     timing = Timing()
     with timing.stage("frontend", robot):
         parts = run_frontend(
@@ -112,18 +116,13 @@ def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, thread
 def prepare_robots(
     logs: dict[str, Path], folders: dict[str, Path], config: RunConfig, workers: int
 ) -> dict[str, Any]:
-    """`prepare_robot` for every robot, `workers` at a time, each in a fresh process."""
+    """`prepare_robot` for every robot, `workers` at a time, in processes of their own."""
     threads = threads_per_worker(workers)
-    spawn = multiprocessing.get_context("spawn")
     stages: dict[str, Any] = {}
-    with ProcessPoolExecutor(workers, mp_context=spawn, max_tasks_per_child=1) as pool:
+    with worker_pool(workers) as pool:
         jobs = [pool.submit(prepare_robot, logs[r], r, folders[r], config, threads) for r in logs]
-        try:
-            for job in jobs:
-                stages.update(job.result())
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+        for job in jobs:
+            stages.update(job.result())
     return stages
 
 
@@ -174,22 +173,57 @@ def run(
 @contextmanager
 def new_folder(out: Path, force: bool) -> Iterator[Path]:
     """A folder beside `out` that takes its name when the block ends well, and is removed when it does not."""
-    if out.exists() and not force:
-        raise DuagError(f"{out}: exists already; choose another --out or give --force")
-    if out.exists() and any(out.iterdir()) and not any((out / mark).is_file() for mark in OURS):
-        raise DuagError(f"{out}: is not a run; --force replaces only what an earlier run has written")
+    _check_out(out, force)
     partial = out.with_name(out.name + ".part")
-    if partial.exists():
-        shutil.rmtree(partial)
-    partial.mkdir(parents=True)
+    with _locked(partial):
+        try:
+            yield partial
+            _check_out(out, force)  # it may have appeared meanwhile
+            if out.exists():
+                shutil.rmtree(out)
+            partial.rename(out)
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """An empty folder that is this process's alone; what a killed one has left in it is removed."""
     try:
-        yield partial
-        if out.exists():
-            shutil.rmtree(out)
-        partial.rename(out)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise DuagError(f"{folder}: {error.strerror or error}, expected to write a folder") from error
+    try:
+        _take(lock, folder)
+        for path in folder.iterdir():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+        yield
+    finally:
+        os.close(lock)
+
+
+def _take(lock: int, folder: Path) -> None:
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the kernel gives it up with the process
+    except BlockingIOError as error:
+        raise DuagError(f"{folder}: another process is writing it; wait, or choose another --out") from error
+
+
+def _check_out(out: Path, force: bool) -> None:
+    """Refuse to replace what is there, unless `force` and only a run would be lost."""
+    if not out.name:
+        raise DuagError(f"{out}: found a path without a name, expected the name of a new folder")
+    if not out.exists():
+        return
+    if not force:
+        raise DuagError(f"{out}: exists already; choose another --out or give --force")
+    if not out.is_dir() or (any(out.iterdir()) and not any((out / mark).is_file() for mark in OURS)):
+        raise DuagError(f"{out}: is not a run; --force replaces only what an earlier run has written")
 
 
 def _exchange(

@@ -1,7 +1,10 @@
 """What a user sees when something is wrong: one line, exit code 1, nothing half-written."""
 
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -52,6 +55,8 @@ def test_help_is_there_for_every_command() -> None:
         ("simulate", "--scene", "moon", "--out", "{tmp}/out"),
         ("config", "check", "{tmp}/absent.toml"),
         ("config", "show", "--set", "frontend.no_such_thing=1"),
+        ("simulate", "--out", "/"),
+        ("demo", "--out", "/", "--force"),
     ],
     ids=" ".join,
 )
@@ -79,6 +84,55 @@ def test_force_replaces_only_what_a_run_has_written(tmp_path: Path) -> None:
     with new_folder(out, force=True) as folder:
         (folder / "new").write_text("")
     assert [p.name for p in out.iterdir()] == ["new"]
+
+
+def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    for command in (("demo",), ("simulate",)):
+        assert_one_line(duagc(*command, "--out", tmp_path / "file", "--force"), "file")
+        assert_one_line(duagc(*command, "--out", tmp_path / "file" / "out"), "Not a directory")
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_two_processes_do_not_write_one_output(tmp_path: Path) -> None:
+    with new_folder(tmp_path / "out", force=False) as folder:
+        (folder / "mine").write_text("")
+        assert_one_line(duagc("demo", "--out", tmp_path / "out"), "out.part", "another process")
+        assert (folder / "mine").exists()
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_what_a_killed_run_left_is_removed(tmp_path: Path) -> None:
+    (tmp_path / "out.part" / "robots").mkdir(parents=True)
+    (tmp_path / "out.part" / "config.toml").write_text("")
+    with new_folder(tmp_path / "out", force=False) as folder:
+        (folder / "new").write_text("")
+    assert [p.name for p in tmp_path.rglob("*")] == ["out", "new"]
+
+
+def test_an_output_that_appeared_meanwhile_is_kept(tmp_path: Path) -> None:
+    def write_beside_another() -> None:
+        with new_folder(tmp_path / "out", force=False):
+            (tmp_path / "out").mkdir()
+            (tmp_path / "out" / "keep").write_text("mine")
+
+    with pytest.raises(DuagError, match="exists already"):
+        write_beside_another()
+    assert [p.name for p in tmp_path.rglob("*")] == ["out", "keep"]
+
+
+def test_an_interrupted_command_is_one_line(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", "from pipeline.cli import main; main()", "simulate", "--out"]
+    process = subprocess.Popen(
+        [*command, str(tmp_path / "out")], stderr=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True
+    )
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: parent and workers
+    assert process.communicate(timeout=60)[1].splitlines() == ["duagc: interrupted"]
+    assert process.returncode == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_usage_errors_exit_with_2() -> None:

@@ -10,6 +10,7 @@ from converters.simulate import simulate
 from pipeline.config import load
 from pipeline.digest import digest, digest_file, result_files
 from pipeline.errors import DuagError
+from pipeline.evaluation import evaluate
 from pipeline.replay import replay
 from pipeline.runner import RunConfig, run
 
@@ -97,6 +98,38 @@ def test_a_damaged_log_stops_the_run_with_one_line(folder: Path, recording: Path
         make_run(damaged, folder / "run_damaged")
     assert "\n" not in str(caught.value)
     assert not list(folder.glob("run_damaged*"))
+
+
+def test_a_run_without_one_of_its_results_has_no_digest(folder: Path, finished: Path) -> None:
+    damaged = folder / "incomplete"
+    shutil.copytree(finished, damaged)
+    for name in ("exchange.mcap", "robots/bravo/odometry.tum"):
+        (damaged / name).rename(folder / "aside")
+        with pytest.raises(DuagError, match=name):
+            digest(damaged)
+        (folder / "aside").rename(damaged / name)
+    assert digest(damaged) == digest(finished)
+
+
+def test_a_trajectory_that_was_changed_is_not_evaluated(
+    folder: Path, finished: Path, recording: Path
+) -> None:
+    changed = folder / "changed"
+    shutil.copytree(finished, changed)
+    path = changed / "robots" / "alpha" / "trajectory.tum"
+    path.write_text(path.read_text().replace("0.", "0.1", 1))
+    with pytest.raises(DuagError, match=r"trajectory\.tum: has digest .* as in manifest\.json"):
+        evaluate(changed, recording, threads=1)
+    assert (changed / "metrics.json").read_bytes() == (finished / "metrics.json").read_bytes()
+
+
+def test_the_log_of_another_robot_is_refused(folder: Path, recording: Path) -> None:
+    mixed = folder / "mixed"
+    shutil.copytree(recording, mixed)
+    shutil.copyfile(mixed / "alpha.mcap", mixed / "bravo.mcap")
+    with pytest.raises(DuagError, match=r"bravo\.mcap: is the log of alpha, expected that of bravo"):
+        make_run(mixed, folder / "run_mixed")
+    assert not list(folder.glob("run_mixed*"))
 
 
 def test_nothing_delivered_is_nothing_said(folder: Path, recording: Path, finished: Path) -> None:

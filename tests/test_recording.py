@@ -529,6 +529,7 @@ def test_bugs_of_converters_are_errors(tmp_path: Path) -> None:
         ({"schema": 99}, "schema is 99, expected 1"),
         ({"robots": {}}, "no robots"),
         ({"robots": {"alpha": {}}}, "'alpha' has no log"),
+        ({"robots": {"../alpha": {"log": "alpha.mcap"}}}, "robot '../alpha'"),
         ({"robots": {"alpha": {"log": "../alpha.mcap"}}}, "alpha.log is '../alpha.mcap'"),
         ({"robots": {"alpha": {"log": "a.mcap", "groundtruth": 5}}}, "alpha.groundtruth is 5"),
         ({"geometry": "/etc/passwd"}, "geometry is '/etc/passwd'"),

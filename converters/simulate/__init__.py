@@ -4,9 +4,10 @@ import tempfile
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from pipeline import numeric, streams
 from pipeline.errors import DuagError
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.progress import track
+from pipeline.workers import worker_pool
 
 DEPTH_SCALE_M = 1 / 5000
 FRAME_RATE_HZ = 30
@@ -184,24 +186,24 @@ class _Studio:
         self.workers = workers
         self._about = (scene, atlas, camera, noise)
         self._pool: ProcessPoolExecutor | None = None
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._open = ExitStack()
 
     def __enter__(self) -> "_Studio":
         scene, atlas, camera, noise = self._about
         if self.workers > 1:
-            self._folder = tempfile.TemporaryDirectory(prefix="duagc-atlas-")
+            folder = self._open.enter_context(tempfile.TemporaryDirectory(prefix="duagc-atlas-"))
             for k, level in enumerate(atlas.levels):
-                np.save(Path(self._folder.name) / f"{k}.npy", level)
+                np.save(Path(folder) / f"{k}.npy", level)
             start = (
                 scene.name,
                 scene.seed,
-                self._folder.name,
+                folder,
                 len(atlas.levels),
                 atlas.origin,
                 camera,
                 noise,
             )
-            self._pool = ProcessPoolExecutor(self.workers, get_context("spawn"), _start_worker, start)
+            self._pool = self._open.enter_context(worker_pool(self.workers, _start_worker, start))
         return self
 
     def images(self, jobs: list[_Job]) -> Iterator[_Images]:
@@ -218,11 +220,10 @@ class _Studio:
         while waiting:
             yield waiting.popleft().result()
 
-    def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-        if self._folder is not None:
-            self._folder.cleanup()
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._open.__exit__(kind, error, trace)
 
 
 _artist: _Artist | None = None

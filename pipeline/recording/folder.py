@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import DuagError
 from pipeline.recording.names import RECORDING_FILE, RECORDING_FORMAT, RECORDING_SCHEMA
+from schemas import topics
 
 
 class Recording:
@@ -66,6 +68,12 @@ def _read_description(path: Path) -> dict[str, Any]:
         raise DuagError(f"{path}: found no name or no robots, expected both")
     _check_file_name(path, "geometry", description.get("geometry"))
     for robot, row in robots.items():
+        if not re.fullmatch(
+            topics.ROBOT_NAME, robot
+        ):  # it becomes the name of a folder and part of every topic
+            raise DuagError(
+                f"{path}: found a robot {robot!r}, expected lower-case letters, digits and underscores"
+            )
         if not isinstance(row, dict) or not isinstance(row.get("log"), str):
             raise DuagError(f"{path}: robot {robot!r} has no log, expected the name of one")
         _check_file_name(path, f"{robot}.log", row["log"])

@@ -1,0 +1,74 @@
+"""Worker processes end with their task, with their parent, and never silently."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import DuagError
+from pipeline.workers import worker_pool
+
+ROOT = Path(__file__).parents[1]
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; a zombie does not."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+def wait_until_gone(pid: int) -> bool:
+    deadline = time.monotonic() + 20
+    while alive(pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return not alive(pid)
+
+
+def test_a_killed_worker_is_one_line() -> None:
+    with pytest.raises(DuagError, match="worker process ended"), worker_pool(1) as pool:
+        pool.submit(os.kill, pool.submit(os.getpid).result(), signal.SIGKILL).result()
+
+
+def test_an_error_ends_the_tasks_of_the_others() -> None:
+    class BadRobotError(Exception):
+        pass
+
+    pids = []
+
+    def one_fails_while_another_works() -> None:
+        with worker_pool(1) as pool:
+            pids.append(pool.submit(os.getpid).result())
+            pool.submit(time.sleep, 100)
+            raise BadRobotError
+
+    start = time.monotonic()
+    with pytest.raises(BadRobotError):
+        one_fails_while_another_works()
+    assert wait_until_gone(pids[0])
+    assert time.monotonic() - start < 60
+
+
+def test_workers_end_with_a_killed_parent() -> None:
+    code = """
+import os, time
+from pipeline.workers import worker_pool
+if __name__ == "__main__":
+    with worker_pool(1) as pool:
+        print(pool.submit(os.getpid).result(), flush=True)
+        pool.submit(time.sleep, 100).result()
+"""
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    assert parent.stdout is not None
+    with parent.stdout as lines:
+        pid = int(lines.readline())
+        assert alive(pid)
+        parent.kill()
+        parent.wait(20)
+    assert wait_until_gone(pid)
