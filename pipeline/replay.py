@@ -46,7 +46,7 @@ def replay(
     """
     from pipeline.recording import Recording
 
-    config = load(RunConfig, run / "config.toml")
+    config = load(RunConfig, RunFolder(run).config_file)
     logs = Recording(recording)
     out = []
     for robot in robots:

@@ -162,10 +162,24 @@ class RunFolder:
         return (self.path / named).resolve()
 
     @property
-    def config_text(self) -> str:
-        """The resolved configuration as TOML, empty if the run has none."""
+    def config_file(self) -> Path:
+        """config.toml, checked against the manifest where there is one.
+
+        Raises:
+            DuagError: it is missing, or not what the run was made with.
+        """
         path = self.path / "config.toml"
-        return path.read_text(encoding="utf-8") if path.is_file() else ""
+        if not path.is_file():
+            raise DuagError(f"{path}: no such file, expected the configuration of the run")
+        told = self._json("manifest.json").get("config")
+        if told is not None and (found := digest_file(path)) != told:
+            raise DuagError(f"{path}: has digest {found[:12]}, expected {told[:12]} as in manifest.json")
+        return path
+
+    @property
+    def config_text(self) -> str:
+        """The resolved configuration as TOML."""
+        return self.config_file.read_text(encoding="utf-8")
 
     @property
     def config(self) -> dict[str, Any]:

@@ -103,7 +103,7 @@ def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, thread
     timing = Timing()
     with timing.stage("frontend", robot):
         parts = run_frontend(
-            log, folder / "frontend.mcap", config.frontend, seed=config.seed, threads=threads
+            log, folder / "frontend.mcap", config.frontend, seed=config.seed, threads=threads, progress=True
         )
     timing.stages[f"frontend.{robot}"]["parts"] = parts
     with timing.stage("information", robot):
@@ -144,13 +144,20 @@ def run(
     Raises:
         DuagError: what a user can fix; nothing is left under the name `out`.
     """
-    from pipeline.recording import Recording
+    from pipeline.evaluation import check_ground_truth
+    from pipeline.recording import Recording, content_digest
 
     recording = Recording(recording_path)
     with new_folder(out, force) as folder:
+        check_ground_truth(recording)
         timing = Timing()
         (folder / "config.toml").write_text(dump(config))
         logs = {robot: recording.log(robot) for robot in recording.robots}
+        for log in logs.values():
+            if (found := content_digest(log)) != (told := recording.digest(log.name)):
+                say(
+                    f"warning: {log}: has digest {found[:12]}, recording.json tells {told[:12]}; it was changed"
+                )
         robots = {robot: folder / "robots" / robot for robot in recording.robots}
         for path in robots.values():
             path.mkdir(parents=True)
@@ -283,6 +290,7 @@ def _manifest(recording: Any, folder: Path, config: RunConfig) -> dict[str, Any]
         "duagc": __version__,
         "libraries": {name: version(name) for name in LIBRARIES},
         "recording": os.path.relpath(recording.path, folder),
+        "config": digest_file(folder / "config.toml"),
         "inputs": {robot: digest_file(recording.log(robot)) for robot in recording.robots},
         "outputs": {p.as_posix(): digest_file(folder / p) for p in result_files(folder)},
     }

@@ -87,6 +87,16 @@ def test_each_robot_replays_bit_for_bit(recording: Path, finished: Path) -> None
     assert [c.name for c in comparisons if not c.equal] == []
 
 
+def test_a_changed_log_is_mentioned(folder: Path, recording: Path) -> None:
+    changed = folder / "other_log"
+    shutil.copytree(recording, changed)
+    shutil.copy(changed / "alpha.mcap", changed / "bravo.mcap")  # a sound log, but another one
+    said: list[str] = []
+    with pytest.raises(DuagError, match="is the log of alpha, expected that of bravo"):
+        run(changed, folder / "run_changed", load(RunConfig, overrides=SMALL), say=said.append)
+    assert [line for line in said if "warning" in line and "bravo.mcap" in line]
+
+
 def test_a_damaged_log_stops_the_run_with_one_line(folder: Path, recording: Path) -> None:
     damaged = folder / "damaged"
     shutil.copytree(recording, damaged)
@@ -114,7 +124,7 @@ def test_a_run_without_one_of_its_results_has_no_digest(folder: Path, finished: 
 def test_a_trajectory_that_was_changed_is_not_evaluated(
     folder: Path, finished: Path, recording: Path
 ) -> None:
-    changed = folder / "changed"
+    changed = folder / "changed_run"
     shutil.copytree(finished, changed)
     path = changed / "robots" / "alpha" / "trajectory.tum"
     path.write_text(path.read_text().replace("0.", "0.1", 1))

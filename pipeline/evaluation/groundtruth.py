@@ -16,7 +16,7 @@ from pipeline.errors import DuagError
 from pipeline.evaluation.results import Absent
 from pipeline.geometry.trajectory import Trajectory
 from pipeline.messages import unpack_depth, unpack_pose_in_frame
-from pipeline.recording import DEPTH_SCALE_KEY, Recording, read_log
+from pipeline.recording import DEPTH_SCALE_KEY, Recording, read_log, verify
 from schemas import topics
 
 
@@ -73,94 +73,90 @@ def _depth_scale(path: Path, topic: str) -> float:
 
 
 NEIGHBOURS = 8
+PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4", "uint": "<u4"}
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Geometry of the scene in the ground-truth world.
+    """Geometry of the scene in the ground-truth world: points on the surfaces, each standing for a disc.
 
-    vertices: float32 [n, 3], metres. triangles: uint32 [m, 3], indices; none for a cloud of points.
-    normals: float32 [n, 3] of the vertices, unit length; none if they are not known.
+    points: float64 [n, 3], metres. normals: float64 [n, 3], unit length.
     """
 
-    vertices: NDArray[np.float32]
-    triangles: NDArray[np.uint32]
-    normals: NDArray[np.float32]
+    points: NDArray[np.float64]
+    normals: NDArray[np.float64]
 
-    def closest(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Distance (m) [n] of every point [n, 3] from the surface, and unit normal [n, 3] of the surface there.
+    def closest(self, queries: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Distance (m) [m] of every query [m, 3] from the surface, and unit normal [m, 3] of the surface there.
 
-        Triangles: exact. Points with normals: each stands for a disc as wide as the points are apart, and the
-        nearest disc counts, so that the distance is not blurred by the sampling. Points alone: the nearest point,
-        and the direction from it for a normal.
+        A disc is as wide as the points are apart, and the nearest disc counts, so that the distance is not blurred
+        by the sampling.
         """
-        if len(self.triangles):
-            return self._closest_on_triangles(points)
-        if len(self.normals):
-            return self._closest_on_discs(points)
         from scipy.spatial import cKDTree
 
-        distance, index = cKDTree(self.vertices.astype(np.float64)).query(points)
-        return distance, _unit(points - self.vertices[index])
-
-    def _closest_on_discs(
-        self, points: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        from scipy.spatial import cKDTree
-
-        vertices, normals = self.vertices.astype(np.float64), _unit(self.normals.astype(np.float64))
-        tree = cKDTree(vertices)
-        radius_m = float(np.quantile(tree.query(vertices, k=2)[0][:, 1], 0.95))
-        _, index = tree.query(points, k=min(NEIGHBOURS, len(vertices)))
-        index = index.reshape(len(points), -1)
-        offset = points[:, None, :] - vertices[index]
-        across = np.sum(offset * normals[index], axis=2)
+        tree = cKDTree(self.points)
+        radius_m = float(np.quantile(tree.query(self.points, k=2)[0][:, 1], 0.95))
+        _, index = tree.query(queries, k=min(NEIGHBOURS, len(self.points)))
+        index = index.reshape(len(queries), -1)
+        offset = queries[:, None, :] - self.points[index]
+        across = np.sum(offset * self.normals[index], axis=2)
         along = np.sqrt(np.maximum(np.sum(offset**2, axis=2) - across**2, 0.0))
         distance = np.hypot(across, np.maximum(along - radius_m, 0.0))
         best = np.argmin(distance, axis=1)[:, None]
-        return np.take_along_axis(distance, best, 1)[:, 0], normals[np.take_along_axis(index, best, 1)[:, 0]]
-
-    def _closest_on_triangles(
-        self, points: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        import open3d as o3d
-
-        tensor = o3d.core.Tensor.from_numpy
-        scene = o3d.t.geometry.RaycastingScene(nthreads=1)
-        scene.add_triangles(tensor(self.vertices), tensor(self.triangles))
-        answer = scene.compute_closest_points(tensor(points.astype(np.float32)))
-        distance = np.linalg.norm(points - answer["points"].numpy().astype(np.float64), axis=1)
-        return distance, _unit(answer["primitive_normals"].numpy().astype(np.float64))
-
-
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vectors of length one; z for a vector of no length."""
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.where(length > 0, vectors / np.where(length > 0, length, 1.0), np.array([0.0, 0.0, 1.0]))
+        nearest = np.take_along_axis(index, best, 1)[:, 0]
+        return np.take_along_axis(distance, best, 1)[:, 0], self.normals[nearest]
 
 
 def surface(recording: Recording) -> Surface | Absent:
-    """The geometry of the scene, from groundtruth.ply beside the logs."""
+    """The geometry of the scene, from groundtruth.ply beside the logs.
+
+    Raises:
+        DuagError: not a binary .ply of points with normals, cut short, or values that are not finite.
+    """
     path = recording.geometry()
     if path is None:
         return Absent("the recording has no geometry of the scene (groundtruth.ply)")
-    import open3d as o3d
-
-    none = np.zeros((0, 3))
-    if _has_faces(path):
-        mesh = o3d.io.read_triangle_mesh(path)
-        vertices, triangles, normals = np.asarray(mesh.vertices), np.asarray(mesh.triangles), none
-    else:
-        cloud = o3d.io.read_point_cloud(path)
-        vertices, triangles, normals = np.asarray(cloud.points), none, np.asarray(cloud.normals)
-    if not len(vertices):
-        raise DuagError(f"{path}: found no vertices, expected a mesh or a point cloud")
-    return Surface(vertices.astype(np.float32), triangles.astype(np.uint32), normals.astype(np.float32))
+    rows = _read_points(path)
+    normals = np.stack([rows[name] for name in ("nx", "ny", "nz")], axis=1).astype(np.float64)
+    points = np.stack([rows[name] for name in ("x", "y", "z")], axis=1).astype(np.float64)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    if len(points) < 2 or not (
+        np.isfinite(points).all() and np.isfinite(normals).all() and (length > 0).all()
+    ):
+        raise DuagError(f"{path}: {len(points)} vertices, expected two or more, finite, each with a normal")
+    return Surface(points, normals / length)
 
 
-def _has_faces(path: Path) -> bool:
-    """Whether the header of a .ply file announces faces."""
-    with path.open("rb") as file:
-        head = file.read(1 << 16).partition(b"end_header")[0]
-    words = [line.split() for line in head.splitlines()]
-    return any(w[:2] == [b"element", b"face"] and w[2:] != [b"0"] for w in words)
+def check(recording: Recording) -> None:
+    """Look at every file of ground truth once, before hours are spent on a run that could not be evaluated.
+
+    Raises:
+        DuagError: a file that is there is damaged.
+    """
+    for robot in recording.robots:
+        path = recording.groundtruth(robot)
+        if path is not None:
+            verify(path)
+    surface(recording)
+
+
+def _read_points(path: Path) -> NDArray[np.void]:
+    """Vertices of a binary little-endian .ply whose only element is `vertex`, by name of the property."""
+    data = path.read_bytes()
+    head, mark, body = data.partition(b"end_header\n")
+    lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
+    lines = [words for words in lines if words and words[0] not in ("comment", "obj_info")]
+    if not mark or lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
+        raise DuagError(f"{path}: not a binary little-endian .ply, expected points with normals")
+    elements = [words[1:] for words in lines if words[0] == "element"]
+    properties = [words[1:] for words in lines if words[0] == "property"]
+    if len(elements) != 1 or elements[0][0] != "vertex" or not elements[0][-1].isdigit():
+        raise DuagError(f"{path}: has elements {elements}, expected only 'vertex N'")
+    missing = {"x", "y", "z", "nx", "ny", "nz"} - {words[-1] for words in properties}
+    if missing or any(words[0] not in PLY_TYPES for words in properties):
+        raise DuagError(f"{path}: has properties {properties}, expected scalars with x, y, z, nx, ny, nz")
+    row = np.dtype([(words[-1], PLY_TYPES[words[0]]) for words in properties])
+    expected = int(elements[0][-1]) * row.itemsize
+    if len(body) != expected:
+        raise DuagError(f"{path}: {len(body)} bytes of vertices, expected {expected}")
+    return np.frombuffer(body, dtype=row)

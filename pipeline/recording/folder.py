@@ -33,6 +33,14 @@ class Recording:
             raise DuagError(f"{path}: no such file, expected the log of {robot} that {RECORDING_FILE} names")
         return path
 
+    def digest(self, name: str) -> str:
+        """Content digest of a log of the recording as it was written, by the log's file name; "nothing" if not told."""
+        rows = self._robots.values()
+        told = next(
+            (d[name] for r in rows if isinstance(d := r.get("digests"), dict) and name in d), "nothing"
+        )
+        return str(told)
+
     def groundtruth(self, robot: str) -> Path | None:
         """The log of a robot's ground truth, for evaluation only; None where there is none, listed or not."""
         name = self._robot(robot).get("groundtruth")

@@ -13,6 +13,7 @@ import numpy as np
 
 import schemas
 from converters.base import RecordingWriter
+from converters.simulate import write_points
 from pipeline.exchange.wire import PairList, write_pairs
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
@@ -157,19 +158,15 @@ def _write_recording(folder: Path, robots: Sequence[str], truth: bool, depth_noi
                     )
                     log.add_frame(k * INTERVAL_NS, png.tobytes(), "png", depth, pose, exact)
         if truth:
-            recording.add_geometry(_write_wall_mesh)
+            recording.add_geometry(_write_wall)
 
 
-def _write_wall_mesh(path: Path) -> None:
-    corners = np.array(
-        [[-9, -9, WALL_Z_M], [9, -9, WALL_Z_M], [9, 9, WALL_Z_M], [-9, 9, WALL_Z_M]], dtype=float
-    )
-    lines = [" ".join(f"{v:.9f}" for v in p) for p in se3.transform(T_GT_WORLD, corners)]
-    header = (
-        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
-        "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    path.write_text(header + "\n".join([*lines, "3 0 1 2", "3 0 2 3"]) + "\n")
+def _write_wall(path: Path) -> None:
+    """Points on the wall, 5 cm apart."""
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(-5, 5, 0.05), np.arange(-5, 5, 0.05)))
+    points = se3.transform(T_GT_WORLD, np.stack([x, y, np.full(len(x), WALL_Z_M)], axis=1))
+    normals = np.tile(T_GT_WORLD[:3, 2], (len(x), 1))
+    write_points(path, points, normals, np.zeros((len(x), 3), np.uint8))
 
 
 def _write_robot(folder: Path, robot: str, index: int, component: list[str], joined: bool) -> None:

@@ -1,12 +1,17 @@
 """Parts of the evaluation on small arrays: views, surfaces, ways, the logs of the exchange."""
 
+import json
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import schemas
+from converters.simulate import write_points
+from pipeline.digest import digest_file
 from pipeline.errors import DuagError
 from pipeline.evaluation import map_errors, views
-from pipeline.evaluation.groundtruth import Surface
+from pipeline.evaluation.groundtruth import Surface, surface
 from pipeline.evaluation.network import Session
 from pipeline.evaluation.paths import top_view_axes
 from pipeline.evaluation.results import Absent
@@ -70,30 +75,13 @@ def test_a_summary_counts_views_without_pose_apart():
     assert views.summary([], "there is no view")["psnr_db"] == Absent("there is no view")
 
 
-NONE = np.zeros((0, 3))
-
-
-def test_distance_from_triangles_is_exact_between_vertices():
-    floor = Surface(
-        np.array([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0]], dtype=np.float32),
-        np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32),
-        NONE,
-    )
-    points = np.array([[3.3, 4.7, 0.25], [5.0, 2.0, -0.5], [12.0, 5.0, 0.0]])
-    distance, direction = floor.closest(points)
-    assert distance == pytest.approx([0.25, 0.5, 2.0], abs=1e-6)  # float32 inside
-    assert np.abs(direction[:, 2]) == pytest.approx(1.0)
-    cloud = Surface(floor.vertices, NONE, NONE)
-    assert cloud.closest(points)[0][2] == pytest.approx(np.hypot(2.0, 5.0))
-
-
 def test_distance_from_a_sampled_corner_does_not_feel_the_sampling():
     """Two walls that meet, sampled every 2 cm: the distance must be right within a small part of that."""
     rng = np.random.default_rng(0)
     u, v = (0.02 * a.ravel() for a in np.meshgrid(np.arange(1, 60), np.arange(60)))
     floor, side = np.stack([u, v, 0 * u], axis=1), np.stack([0 * u, v, u], axis=1)
     normals = np.repeat([[0.0, 0, 1], [1, 0, 0]], len(u), axis=0)
-    cloud = Surface(np.concatenate([floor, side]).astype(np.float32), NONE, normals.astype(np.float32))
+    cloud = Surface(np.concatenate([floor, side]), normals)
     points = np.stack(
         [rng.uniform(0.003, 1, 500), rng.uniform(0.1, 1, 500), rng.uniform(0.001, 0.3, 500)], axis=1
     )
@@ -103,6 +91,39 @@ def test_distance_from_a_sampled_corner_does_not_feel_the_sampling():
     assert np.array_equal(np.argmax(np.abs(direction), axis=1) == 2, points[:, 2] <= points[:, 0])
     beyond = np.array([[1.5, 0.5, 0.0]])
     assert cloud.closest(beyond)[0] == pytest.approx(1.5 - 1.18, abs=0.021)
+
+
+@pytest.mark.parametrize("damage", ["cut", "ascii", "not finite", "no normals", "empty"])
+def test_damaged_geometry_is_one_line(tmp_path, damage):
+    path = tmp_path / "groundtruth.ply"
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    write_points(path, points, np.tile([0.0, 0, 1], (50, 1)), np.zeros((50, 3), np.uint8))
+    whole = path.read_bytes()
+    damaged = {
+        "cut": whole[:-7],
+        "ascii": whole.replace(b"binary_little_endian", b"ascii"),
+        "not finite": whole[:-27] + np.full(6, np.nan, "<f4").tobytes() + whole[-3:],
+        "no normals": whole.replace(b" nx", b" ax"),
+        "empty": b"",
+    }
+    recording = SimpleNamespace(geometry=lambda: path)
+    assert len(surface(recording).points) == 50
+    path.write_bytes(damaged[damage])
+    with pytest.raises(DuagError, match=r"groundtruth\.ply") as caught:
+        surface(recording)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_changed_configuration_is_noticed(tmp_path):
+    path = tmp_path / "config.toml"
+    with pytest.raises(DuagError, match=r"config\.toml: no such file"):
+        _ = RunFolder(tmp_path).config
+    path.write_text("seed = 3\n")
+    (tmp_path / "manifest.json").write_text(json.dumps({"config": digest_file(path)}))
+    assert RunFolder(tmp_path).config == {"seed": 3}
+    path.write_text("seed = 4\n")
+    with pytest.raises(DuagError, match="as in manifest"):
+        _ = RunFolder(tmp_path).config
 
 
 def test_position_information_comes_from_the_right_places():
