@@ -89,7 +89,8 @@ def demo(
     Example: `duagc demo --out outputs/demo`
     """
     from converters.simulate import simulate as simulate_recording
-    from pipeline.runner import RunConfig, new_folder
+    from pipeline.new_folder import new_folder
+    from pipeline.runner import RunConfig
     from pipeline.runner import run as run_stages
 
     with new_folder(out, force) as folder:

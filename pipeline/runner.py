@@ -4,11 +4,9 @@ Robots are prepared in parallel processes; the exchange is one ordered stage in 
 written into a folder beside the output, which gets its final name when all is done.
 """
 
-import fcntl
 import json
 import os
 import resource
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -26,10 +24,10 @@ from pipeline.exchange.config import ExchangeConfig
 from pipeline.frontend.config import FrontendConfig
 from pipeline.fusion.config import FusionConfig
 from pipeline.information.config import InformationConfig
+from pipeline.new_folder import new_folder
 from pipeline.robot import AgentInput, AgentResult
 from pipeline.workers import worker_pool
 
-OURS = ("manifest.json", "run/manifest.json")  # a run, a demo
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
 
 
@@ -175,62 +173,6 @@ def run(
         _evaluate(folder, recording_path, timing)
         say("report and view")
         _present(folder, recording_path, timing)
-
-
-@contextmanager
-def new_folder(out: Path, force: bool) -> Iterator[Path]:
-    """A folder beside `out` that takes its name when the block ends well, and is removed when it does not."""
-    _check_out(out, force)
-    partial = out.with_name(out.name + ".part")
-    with _locked(partial):
-        try:
-            yield partial
-            _check_out(out, force)  # it may have appeared meanwhile
-            if out.exists():
-                shutil.rmtree(out)
-            partial.rename(out)
-        except BaseException:
-            shutil.rmtree(partial, ignore_errors=True)
-            raise
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """An empty folder that is this process's alone; what a killed one has left in it is removed."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = os.open(folder, os.O_RDONLY)
-    except OSError as error:
-        raise DuagError(f"{folder}: {error.strerror or error}, expected to write a folder") from error
-    try:
-        _take(lock, folder)
-        for path in folder.iterdir():
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
-        yield
-    finally:
-        os.close(lock)
-
-
-def _take(lock: int, folder: Path) -> None:
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the kernel gives it up with the process
-    except BlockingIOError as error:
-        raise DuagError(f"{folder}: another process is writing it; wait, or choose another --out") from error
-
-
-def _check_out(out: Path, force: bool) -> None:
-    """Refuse to replace what is there, unless `force` and only a run would be lost."""
-    if not out.name:
-        raise DuagError(f"{out}: found a path without a name, expected the name of a new folder")
-    if not out.exists():
-        return
-    if not force:
-        raise DuagError(f"{out}: exists already; choose another --out or give --force")
-    if not out.is_dir() or (any(out.iterdir()) and not any((out / mark).is_file() for mark in OURS)):
-        raise DuagError(f"{out}: is not a run; --force replaces only what an earlier run has written")
 
 
 def _exchange(

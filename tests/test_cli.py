@@ -11,7 +11,7 @@ import pytest
 
 from pipeline import cli
 from pipeline.errors import DuagError
-from pipeline.runner import new_folder
+from pipeline.new_folder import new_folder
 
 ROOT = Path(__file__).parents[1]
 

@@ -21,9 +21,6 @@ class Absent:
     reason: str
 
 
-Value = float | int | bool | str | Absent
-
-
 def split_reasons(tree: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
     """Replace every Absent leaf of nested mappings by None and collect its reason under its dotted path.
 

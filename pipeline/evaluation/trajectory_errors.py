@@ -13,7 +13,6 @@ from pipeline.geometry.trajectory import Trajectory, align, associate, rpe_rmse
 
 Array = NDArray[np.float64]
 ASSOCIATION_TOLERANCE_NS = 20_000_000  # that of the TUM tools
-MIN_PAIRS = 3
 
 
 @dataclass(frozen=True)
