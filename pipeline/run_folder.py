@@ -27,13 +27,6 @@ from pipeline.messages import (
 from pipeline.recording import read_log
 from schemas import topics
 
-HELD_OUT_EVERY, HELD_OUT_AT = 8, 4
-
-
-def is_held_out(frame_index: int) -> bool:
-    """Frames that are tracked but never mapped: index % 8 == 4."""
-    return frame_index % HELD_OUT_EVERY == HELD_OUT_AT
-
 
 @dataclass(frozen=True)
 class RobotRun:
@@ -58,6 +51,11 @@ class RobotRun:
     def frames(self) -> list[Odometry]:
         """Every frame of the log, in order, as the front end tracked it."""
         return self._all("frontend.mcap", topics.ODOMETRY)
+
+    @cached_property
+    def held_out(self) -> frozenset[int]:
+        """Indices of the frames that the front end kept for evaluation."""
+        return frozenset(f.frame_index for f in self.frames if f.held_out)
 
     @cached_property
     def keyframes(self) -> list[Keyframe]:

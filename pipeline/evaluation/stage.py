@@ -27,7 +27,7 @@ from pipeline.evaluation.trajectory_errors import Paired, TeamError
 from pipeline.geometry.trajectory import Trajectory
 from pipeline.progress import track
 from pipeline.recording import Recording, RgbdLog, open_rgbd
-from pipeline.run_folder import RobotRun, RunFolder, is_held_out
+from pipeline.run_folder import RobotRun, RunFolder
 from pipeline.splat.gaussians import Gaussians
 
 SCHEMA = 1
@@ -206,7 +206,7 @@ def _rendering_section(
                 task = _RenderTask(maps[kind], camera_robot, poses[kind], keyframes=not of_peer)
                 title = f"render {kind} map of {name}" + (f" from {camera_robot.robot}" if of_peer else "")
                 for index, score in task.scores(source, threads, title if progress else None):
-                    view_set = "peers" if of_peer else "held_out" if is_held_out(index) else "training"
+                    view_set = "peers" if of_peer else "held_out" if index in robot.held_out else "training"
                     scores[kind, view_set].append(score)
                     rows += _view_rows(name, f"{kind}/{view_set}", index, score)
     reasons = dict.fromkeys(VIEW_SETS, "there is no such view") | {"peers": "no two robots met"}
@@ -245,7 +245,7 @@ class _RenderTask:
         """Frame index and score of every view, in order; progress under `title`."""
         name, robot = self.camera_robot.robot, self.camera_robot
         with open_rgbd(source.log(name)) as log:
-            chosen = {i for i in range(len(log)) if is_held_out(i)}
+            chosen = set(robot.held_out)
             if self.keyframes:
                 chosen |= {k.frame_index for k in robot.keyframes}
             stamps = {f.stamp_ns for f in robot.frames if f.frame_index in chosen}

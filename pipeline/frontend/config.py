@@ -4,6 +4,15 @@ from pipeline.config import Config
 from pipeline.frontend.mapping_config import MappingConfig
 from pipeline.registration.align import RegistrationConfig
 
+# Not settings: the files of a run and their readers promise this rule.
+HELD_OUT_PERIOD = 8
+HELD_OUT_OFFSET = 4
+
+
+def is_held_out(frame_index: int) -> bool:
+    """Whether a frame is kept for evaluation: tracked, but never a keyframe and never mapped."""
+    return frame_index % HELD_OUT_PERIOD == HELD_OUT_OFFSET
+
 
 class KeyframeConfig(Config):
     """When a frame becomes a keyframe, and how keyframe poses are refined together."""
@@ -44,16 +53,8 @@ class TrackingConfig(Config):
 class FrontendConfig(Config):
     """Front end of one robot."""
 
-    held_out_period: int = 8
-    """Of this many frames one is held out: tracked, but never a keyframe and never mapped."""
-    held_out_offset: int = 4
-    """Which one: frame index modulo the period."""
     tracking: TrackingConfig = TrackingConfig()
     keyframes: KeyframeConfig = KeyframeConfig()
     mapping_enabled: bool = True
     """Grow a map; without, the log holds odometry and keyframes and an empty map."""
     mapping: MappingConfig = MappingConfig()
-
-    def is_held_out(self, frame_index: int) -> bool:
-        """Whether a frame is kept for evaluation."""
-        return frame_index % self.held_out_period == self.held_out_offset

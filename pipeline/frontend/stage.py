@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline import progress as progress_bar
 from pipeline.errors import DuagError
-from pipeline.frontend.config import FrontendConfig
+from pipeline.frontend.config import FrontendConfig, is_held_out
 from pipeline.frontend.keyframes import KeyframePair, Refined, refine, relative_information
 from pipeline.frontend.tracking import Status, TrackedFrame, TrackedKeyframe, Tracker
 from pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
@@ -67,7 +67,7 @@ def run_frontend(
         clock.lap("refinement_s")
         updates, gaussians = _map(log, keyframes, frames, config, seed, threads, progress)
         clock.lap("mapping_s")
-    odometry = [_odometry(log.robot, frame, refined.T_map_keyframe, config) for frame in frames]
+    odometry = [_odometry(log.robot, frame, refined.T_map_keyframe) for frame in frames]
     _write(out_path, log.robot, odometry, keyframes, factors, updates, gaussians)
     clock.lap("writing_s")
     return clock.laps
@@ -186,19 +186,19 @@ def _support(
         for frame in frames
         if frame.status is not Status.LOST
         and frame.frame_index not in taken
-        and not config.is_held_out(frame.frame_index)
+        and not is_held_out(frame.frame_index)
     ]
     count = min(config.mapping.support_views, len(candidates))
     # the middle of each of `count` equal parts
     return [candidates[(2 * k + 1) * len(candidates) // (2 * count)] for k in range(count)]
 
 
-def _odometry(robot: str, frame: TrackedFrame, T_map_keyframes: Array, config: FrontendConfig) -> Odometry:
+def _odometry(robot: str, frame: TrackedFrame, T_map_keyframes: Array) -> Odometry:
     return Odometry(
         stamp_ns=frame.stamp_ns,
         robot=robot,
         frame_index=frame.frame_index,
-        held_out=config.is_held_out(frame.frame_index),
+        held_out=is_held_out(frame.frame_index),
         keyframe_index=frame.keyframe_index,
         T_map_camera=T_map_keyframes[frame.keyframe_index] @ frame.T_keyframe_camera,
         T_keyframe_camera=frame.T_keyframe_camera,

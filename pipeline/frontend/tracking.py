@@ -14,7 +14,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.frontend.config import FrontendConfig
+from pipeline.frontend.config import FrontendConfig, is_held_out
 from pipeline.frontend.keyframes import KeyframePair, becomes_keyframe, predicted_overlap
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
@@ -99,9 +99,7 @@ class Tracker:
             se3.inverse(self._T_keyframe_camera) @ result.T_reference_target if followed else np.eye(4)
         )
         self._current, self._T_keyframe_camera, self._lost = keyframe_index, result.T_reference_target, False
-        if not self.config.is_held_out(frame_index) and becomes_keyframe(
-            result, pyramid, self.config.keyframes
-        ):
+        if not is_held_out(frame_index) and becomes_keyframe(result, pyramid, self.config.keyframes):
             return self._promote(frame_index, stamp_ns, pyramid, keyframe_index, result, status)
         return _tracked(frame_index, stamp_ns, keyframe_index, result, status)
 

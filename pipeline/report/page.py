@@ -19,7 +19,7 @@ from pipeline.evaluation.views import score_view, surface_depth
 from pipeline.geometry import se3
 from pipeline.recording import Recording, open_rgbd
 from pipeline.report import figures, pictures, words
-from pipeline.run_folder import RobotRun, RunFolder, is_held_out, position_information
+from pipeline.run_folder import RobotRun, RunFolder, position_information
 
 if TYPE_CHECKING:
     from pipeline.kernels import Rasterizer, Render
@@ -259,10 +259,7 @@ def _chosen_frames(robot: RobotRun, frames: int) -> list[int]:
     able = [
         f.frame_index
         for f in robot.frames
-        if is_held_out(f.frame_index)
-        and f.frame_index < frames
-        and f.stamp_ns in before
-        and f.stamp_ns in after
+        if f.held_out and f.frame_index < frames and f.stamp_ns in before and f.stamp_ns in after
     ]
     places = [(2 * i + 1) * len(able) // (2 * VIEWS_PER_ROBOT) for i in range(VIEWS_PER_ROBOT)]
     return sorted({able[place] for place in places}) if able else []

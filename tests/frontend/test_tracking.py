@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.frontend.config import FrontendConfig, KeyframeConfig, TrackingConfig
+from pipeline.frontend.config import FrontendConfig, KeyframeConfig, TrackingConfig, is_held_out
 from pipeline.frontend.keyframes import KeyframePair, refine, relative_information
 from pipeline.frontend.tracking import Status, TrackedFrame, Tracker
 from pipeline.geometry import se3
@@ -52,7 +52,7 @@ def test_keyframes_are_made_and_are_never_held_out(walked) -> None:
     tracker, frames, _ = walked
     assert 3 <= len(tracker.keyframes) <= 12
     for keyframe in tracker.keyframes:
-        assert not CONFIG.is_held_out(keyframe.frame_index)
+        assert not is_held_out(keyframe.frame_index)
         tracked = frames[keyframe.frame_index]
         assert tracked.keyframe_index == keyframe.keyframe_index
         np.testing.assert_array_equal(tracked.T_keyframe_camera, np.eye(4))
@@ -182,3 +182,7 @@ def test_refine_withstands_a_wrong_pair() -> None:
     np.testing.assert_allclose(clean.T_map_keyframe, truth, atol=1e-8)
     # the contradiction shows in the covariance: the first pose's neighbour is known worse than by one pair alone
     assert robust.covariance[6, 6] > 1e-4 / len(pairs)
+
+
+def test_the_rule_of_held_out_frames() -> None:
+    assert [i for i in range(30) if is_held_out(i)] == [4, 12, 20, 28]
