@@ -128,16 +128,15 @@ inline void blend_tile(Frame& frame, int index, float* color, float* depth, floa
     fill_tile(D, 0.0f);
 
     const uint32_t first = frame.tile_start.data()[index], last = frame.tile_start.data()[index + 1];
-    Intersection* intersections = frame.intersections.data();
+    const uint32_t* list = frame.list_splats.data();
     const Splat* splats = frame.splats.data();
     uint32_t open_blocks = 0xffff;
     for (uint32_t e = first; e < last && open_blocks; e++) {
-        Intersection& intersection = intersections[e];
-        __builtin_prefetch(&splats[intersections[e + 8 < last ? e + 8 : last - 1].splat]);
-        const Splat& splat = splats[intersection.splat];
+        __builtin_prefetch(&splats[list[e + 8]]);
+        const Splat& splat = splats[list[e]];
         const WideSplat wide(splat, tile);
         const Vec r(splat.r), g(splat.g), b(splat.b), z(splat.z);
-        uint32_t todo = intersection.blocks & open_blocks, blended = 0;
+        uint32_t todo = frame.list_blocks.data()[e] & open_blocks;
         while (todo) {
             const int block = __builtin_ctz(todo), k = block * LANES;
             todo &= todo - 1;
@@ -146,7 +145,6 @@ inline void blend_tile(Frame& frame, int index, float* color, float* depth, floa
             const Vec log2_alpha = wide.log2_alpha(x, y);
             const Mask seen = log2_alpha >= load(threshold + k);
             if (!any(seen)) continue;
-            blended |= 1u << block;
             const Vec a = select_or_zero(seen, min(exp2(log2_alpha), Vec(ALPHA_MAX)));
             const Vec before = load(T + k);
             Vec weight = a * before, after = before - weight;
@@ -165,7 +163,6 @@ inline void blend_tile(Frame& frame, int index, float* color, float* depth, floa
             store(B + k, fma(weight, b, load(B + k)));
             store(D + k, fma(weight, z, load(D + k)));
         }
-        intersection.blocks |= blended << 16;
     }
 
     const Vec back_r(view.background[0]), back_g(view.background[1]), back_b(view.background[2]);
@@ -227,15 +224,15 @@ struct TileReplay {
           stop(frame.stop.data() + static_cast<size_t>(index) * TILE_PIXELS) {
         std::memcpy(T, frame.transmittance.data() + static_cast<size_t>(index) * TILE_PIXELS, sizeof T);
     }
-    // Calls visit(intersection, splat, blocks blended, position in the list) from back to front.
+    // Calls visit(row, splat, blocks, position in the list) from back to front.
     template <class Visit>
     void walk(const Frame& frame, Visit visit) {
-        const Intersection* intersections = frame.intersections.data();
+        const uint32_t* list = frame.list_splats.data();
         const Splat* splats = frame.splats.data();
         for (uint32_t e = last; e-- > first;) {
-            __builtin_prefetch(&splats[intersections[e > first + 8 ? e - 8 : first].splat]);
-            const Intersection intersection = intersections[e];
-            visit(intersection, splats[intersection.splat], intersection.blocks >> 16, Vec(static_cast<float>(e - first)));
+            __builtin_prefetch(&splats[list[e > first + 8 ? e - 8 : first]]);
+            visit(static_cast<size_t>(frame.list_rows.data()[e]), splats[list[e]], frame.list_blocks.data()[e],
+                  Vec(static_cast<float>(e - first)));
         }
     }
 };
@@ -300,8 +297,7 @@ inline Status gradient_tile(Frame& frame, int index, const float* d_color, const
         store(behind + k, fma(back_r, load(d_r + k), fma(back_g, load(d_g + k), back_b * load(d_b + k))));
 
     float *rows = frame.gradient_rows.data(), *rows16 = frame.information_rows16.data(), *rows8 = frame.information_rows8.data();
-    replay.walk(frame, [&](const Intersection& intersection, const Splat& splat, uint32_t blocks, Vec position) {
-        const size_t row = intersection.row;
+    replay.walk(frame, [&](size_t row, const Splat& splat, uint32_t blocks, Vec position) {
         if (!blocks) {
             store(rows + row * GRADIENT_SUMS, Vec(0.0f));
             if (SQUARES != NO_SQUARES) store(rows16 + row * 16, Vec(0.0f));
@@ -369,8 +365,7 @@ inline Status information_tile(Frame& frame, int index, const float* inv_var_col
     fill_tile(behind_z, 0.0f);
 
     float *rows16 = frame.information_rows16.data(), *rows8 = frame.information_rows8.data();
-    replay.walk(frame, [&](const Intersection& intersection, const Splat& splat, uint32_t blocks, Vec position) {
-        const size_t row = intersection.row;
+    replay.walk(frame, [&](size_t row, const Splat& splat, uint32_t blocks, Vec position) {
         if (!blocks) {
             store(rows16 + row * 16, Vec(0.0f));
             std::memset(rows8 + row * 8, 0, 8 * sizeof(float));
@@ -410,7 +405,7 @@ inline Status information_tile(Frame& frame, int index, const float* inv_var_col
 inline void contribution_tile(Frame& frame, int index) {
     TileReplay replay(frame, index);
     float* rows = frame.gradient_rows.data();
-    replay.walk(frame, [&](const Intersection& intersection, const Splat& splat, uint32_t blocks, Vec position) {
+    replay.walk(frame, [&](size_t row, const Splat& splat, uint32_t blocks, Vec position) {
         Vec sums[8];
         for (Vec& sum : sums) sum = Vec(0.0f);
         const WideSplat wide(splat, replay.tile);
@@ -421,7 +416,7 @@ inline void contribution_tile(Frame& frame, int index) {
             sums[0] += pixel.weight;
             sums[1] += select_or_zero(Vec(0.0f) < pixel.weight, Vec(1.0f));
         }
-        store_sums8(rows + static_cast<size_t>(intersection.row) * GRADIENT_SUMS, sums);
+        store_sums8(rows + row * GRADIENT_SUMS, sums);
     });
 }
 

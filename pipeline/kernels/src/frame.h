@@ -66,16 +66,13 @@ struct alignas(64) Splat {
     float extent_x, extent_y;  // half size of the box in which alpha >= 1/255, px
 };
 
-// One Gaussian in one tile. Low half of blocks: 4x4 blocks it may touch; high half: blocks where it was blended.
-struct Intersection {
-    uint32_t splat, row, blocks;
-};
 struct BinRecord {
     uint32_t tile, blocks;
 };
 
 constexpr int TILE = 16;                   // pixels; a tile is 16 blocks of 4x4, a block is one vector
 constexpr int TILE_PIXELS = TILE * TILE;
+constexpr int LIST_SPARE = 16;             // zeros behind the lists of tiles: readers load whole vectors
 constexpr int DEPTH_CHUNKS = 16;           // fixed, so that no result depends on the number of threads
 constexpr int POSE_CHUNKS = 64;
 constexpr int GRADIENT_SUMS = 16;          // one cache line; 10 used
@@ -94,7 +91,9 @@ struct Frame {
     Scratch<uint32_t> chunk_tile_counts;
     Scratch<uint32_t> first_row;          // per splat, visible + 1: its rows are contiguous
     Scratch<uint32_t> tile_start;         // tiles + 1
-    Scratch<Intersection> intersections;  // by tile, then depth
+    // Gaussians of each tile, by tile, then depth: place in `splats`, row of sums, bit b: may touch 4x4 block b.
+    Scratch<uint32_t> list_splats, list_rows;
+    Scratch<uint16_t> list_blocks;
     Scratch<float> transmittance, stop;   // per tile, in block order; stop: list position at which a pixel closed
     Scratch<float> gradient_rows, information_rows16, information_rows8;
     Scratch<double> pose_parts;

@@ -268,16 +268,22 @@ inline Status bin(Frame& frame) {
     }
     rows[frame.visible] = row;
 
-    Intersection* intersections = frame.intersections.need(total + 1);
+    uint32_t *list_splats = frame.list_splats.need(total + LIST_SPARE), *list_rows = frame.list_rows.need(total + LIST_SPARE);
+    uint16_t* list_blocks = frame.list_blocks.need(total + LIST_SPARE);
 #pragma omp parallel for schedule(dynamic, 1) num_threads(frame.threads) if (frame.threads > 1)
     for (int chunk = 0; chunk < DEPTH_CHUNKS; chunk++) {
         const size_t first = frame.visible * chunk / DEPTH_CHUNKS, last = frame.visible * (chunk + 1) / DEPTH_CHUNKS;
         uint32_t* place = counts + static_cast<size_t>(chunk) * tiles;
         const BinRecord* record = frame.chunk_records[chunk].data();
         for (size_t i = first; i < last; i++)
-            for (uint32_t r = rows[i]; r < rows[i + 1]; r++, record++)
-                intersections[place[record->tile]++] = {static_cast<uint32_t>(i), r, record->blocks};
+            for (uint32_t r = rows[i]; r < rows[i + 1]; r++, record++) {
+                const uint32_t p = place[record->tile]++;
+                list_splats[p] = static_cast<uint32_t>(i);
+                list_rows[p] = r;
+                list_blocks[p] = static_cast<uint16_t>(record->blocks);
+            }
     }
+    for (size_t p = total; p < total + LIST_SPARE; p++) list_splats[p] = list_rows[p] = list_blocks[p] = 0;
     frame.intersection_count = total;
     return Status::ok;
 }
