@@ -48,6 +48,7 @@ struct View {
     float fx, fy, cx, cy;
     int width, height;
     float background[3];
+    const uint8_t* mask = nullptr;  // [height, width], 0: not drawn; or null: all drawn
 };
 
 // n Gaussians, arrays of the caller, row-major.
@@ -64,16 +65,25 @@ struct alignas(64) Splat {
     float log2_opacity;
     float r, g, b, z;          // colour, depth in metres
     float extent_x, extent_y;  // half size of the box in which alpha >= 1/255, px
+    float skew, upright;       // correlation c of x and y on the screen, sqrt(1 - c^2)
+    float unused[2];
 };
 
-struct BinRecord {
-    uint32_t tile, blocks;
+// Where the rows of sums of one Gaussian lie while the lists are made.
+struct RowRange {
+    uint32_t offset, count;
+};
+// Intersections of one stretch of the depth order, as they are found.
+struct StretchRecords {
+    Scratch<uint32_t> tiles, splats;
+    Scratch<uint16_t> blocks;
+    size_t count = 0, opened = 0;
 };
 
 constexpr int TILE = 16;                   // pixels; a tile is 16 blocks of 4x4, a block is one vector
 constexpr int TILE_PIXELS = TILE * TILE;
 constexpr int LIST_SPARE = 16;             // zeros behind the lists of tiles: readers load whole vectors
-constexpr int DEPTH_CHUNKS = 16;           // fixed, so that no result depends on the number of threads
+constexpr int MOST_STRETCHES = 64;         // of the depth order, for as many threads; the lists do not depend on it
 constexpr int POSE_CHUNKS = 64;
 constexpr int GRADIENT_SUMS = 16;          // one cache line; 10 used
 constexpr int INFORMATION_SUMS = 24;       // 16 + 8
@@ -82,16 +92,22 @@ constexpr int INFORMATION_SUMS = 24;       // 16 + 8
 struct Frame {
     View view;
     int threads = 1;
-    size_t visible = 0, intersection_count = 0;
+    size_t drawn_count = 0, visible = 0, intersection_count = 0;
     int tiles_x = 0, tiles_y = 0;
 
-    Scratch<Splat> splats_by_id, splats;  // the latter in order of depth
-    Scratch<uint32_t> keys, keys_swap, order, order_swap;  // order: index in the caller's arrays, by depth
-    Scratch<BinRecord> chunk_records[DEPTH_CHUNKS];
-    Scratch<uint32_t> chunk_tile_counts;
-    Scratch<uint32_t> first_row;          // per splat, visible + 1: its rows are contiguous
-    Scratch<uint32_t> tile_start;         // tiles + 1
-    // Gaussians of each tile, by tile, then depth: place in `splats`, row of sums, bit b: may touch 4x4 block b.
+    Scratch<Splat> splats;                   // by index in the caller's arrays; holds anything where not visible
+    Scratch<uint64_t> depth_keys, depth_keys_swap;  // depth above, index below
+    Scratch<uint32_t> radix_counts;
+    Scratch<uint32_t> chunk_start;           // of the drawn Gaussians of every projection chunk
+    Scratch<uint32_t> drawn, depth_order;    // indices of the drawn Gaussians, ascending and by depth
+    Scratch<uint32_t> visible_ids;           // indices of those that touch a tile, ascending
+    Scratch<uint32_t> first_row;             // per visible Gaussian, visible + 1: its rows are contiguous
+    Scratch<RowRange> row_ranges;            // by index in the caller's arrays
+    StretchRecords stretches[MOST_STRETCHES];
+    Scratch<uint32_t> stretch_tile_counts;
+    Scratch<uint16_t> wanted_blocks;         // per tile: bit b: block b has a pixel of the image that is to be drawn
+    Scratch<uint32_t> tile_start;            // tiles + 1
+    // Gaussians of each tile, by tile, then depth: index in `splats`, row of sums, bit b: may touch 4x4 block b.
     Scratch<uint32_t> list_splats, list_rows;
     Scratch<uint16_t> list_blocks;
     Scratch<float> transmittance, stop;   // per tile, in block order; stop: list position at which a pixel closed

@@ -83,8 +83,8 @@ static void contributions(Frame& frame, float* weights, uint32_t* pixels) {
             weight += rows[static_cast<size_t>(row) * GRADIENT_SUMS];
             count += static_cast<uint32_t>(rows[static_cast<size_t>(row) * GRADIENT_SUMS + 1]);
         }
-        weights[frame.order.data()[i]] = weight;
-        pixels[frame.order.data()[i]] = count;
+        weights[frame.visible_ids.data()[i]] = weight;
+        pixels[frame.visible_ids.data()[i]] = count;
     }
 }
 

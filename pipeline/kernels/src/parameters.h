@@ -5,14 +5,14 @@
 
 namespace KERNEL_ISA {
 
-// Sixteen neighbours in the order of depth; the last group repeats its first.
+// Sixteen neighbours of the visible ones; the last group repeats its first.
 struct Members {
     size_t first;
     int lanes;
     uint32_t ids[LANES];
     Members(const Frame& frame, size_t group) : first(group * LANES) {
         lanes = frame.visible - first < LANES ? static_cast<int>(frame.visible - first) : LANES;
-        const uint32_t* order = frame.order.data() + first;
+        const uint32_t* order = frame.visible_ids.data() + first;
         for (int lane = 0; lane < LANES; lane++) ids[lane] = order[lane < lanes ? lane : 0];
     }
 };

@@ -1,0 +1,239 @@
+// Sixteen rows of an array to one vector per column, and back.
+#pragma once
+
+#include "simd.h"
+
+namespace KERNEL_ISA {
+
+#if !defined(KERNEL_PORTABLE) && defined(__AVX512F__)
+
+template <int WIDTH>
+struct ColumnIndices {  // where column k of sixteen rows of WIDTH floats lies, in their first two vectors and in the third
+    alignas(64) int32_t first[WIDTH][LANES], then[WIDTH][LANES];
+    constexpr ColumnIndices() : first(), then() {
+        for (int k = 0; k < WIDTH; k++)
+            for (int lane = 0; lane < LANES; lane++) {
+                const int place = WIDTH * lane + k;
+                first[k][lane] = place % (2 * LANES);
+                then[k][lane] = place < 2 * LANES ? lane : LANES + place % LANES;
+            }
+    }
+};
+alignas(64) static constexpr ColumnIndices<3> COLUMNS_OF_3;
+
+inline __m512i load_indices(const int32_t* p) { return _mm512_load_si512(p); }
+
+inline void load_rows3(const float* rows, Vec* columns) {
+    const __m512 a = _mm512_loadu_ps(rows), b = _mm512_loadu_ps(rows + 16), c = _mm512_loadu_ps(rows + 32);
+    for (int k = 0; k < 3; k++)
+        columns[k] = _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, load_indices(COLUMNS_OF_3.first[k]), b),
+                                            load_indices(COLUMNS_OF_3.then[k]), c);
+}
+// 4x4 transposes of floats within 128 bits, then of the 128-bit parts
+inline void transpose_quads(__m512 a, __m512 b, __m512 c, __m512 d, __m512* out) {
+    const __m512d ab_low = _mm512_castps_pd(_mm512_unpacklo_ps(a, b)), ab_high = _mm512_castps_pd(_mm512_unpackhi_ps(a, b));
+    const __m512d cd_low = _mm512_castps_pd(_mm512_unpacklo_ps(c, d)), cd_high = _mm512_castps_pd(_mm512_unpackhi_ps(c, d));
+    out[0] = _mm512_castpd_ps(_mm512_unpacklo_pd(ab_low, cd_low));
+    out[1] = _mm512_castpd_ps(_mm512_unpackhi_pd(ab_low, cd_low));
+    out[2] = _mm512_castpd_ps(_mm512_unpacklo_pd(ab_high, cd_high));
+    out[3] = _mm512_castpd_ps(_mm512_unpackhi_pd(ab_high, cd_high));
+}
+inline void transpose_parts(__m512 a, __m512 b, __m512 c, __m512 d, __m512* out) {
+    const __m512 ab_even = _mm512_shuffle_f32x4(a, b, 0x88), ab_odd = _mm512_shuffle_f32x4(a, b, 0xdd);
+    const __m512 cd_even = _mm512_shuffle_f32x4(c, d, 0x88), cd_odd = _mm512_shuffle_f32x4(c, d, 0xdd);
+    out[0] = _mm512_shuffle_f32x4(ab_even, cd_even, 0x88);
+    out[1] = _mm512_shuffle_f32x4(ab_odd, cd_odd, 0x88);
+    out[2] = _mm512_shuffle_f32x4(ab_even, cd_even, 0xdd);
+    out[3] = _mm512_shuffle_f32x4(ab_odd, cd_odd, 0xdd);
+}
+inline void load_rows4(const float* rows, Vec* columns) {
+    __m512 parts[4], out[4];
+    transpose_parts(_mm512_loadu_ps(rows), _mm512_loadu_ps(rows + 16), _mm512_loadu_ps(rows + 32), _mm512_loadu_ps(rows + 48), parts);
+    transpose_quads(parts[0], parts[1], parts[2], parts[3], out);
+    for (int k = 0; k < 4; k++) columns[k] = out[k];
+}
+inline void store_rows16(float* rows, const Vec* columns) {
+    __m512 quads[4][4];  // [k][r]: part p holds columns 4k.. of row 4p + r
+    for (int k = 0; k < 4; k++) transpose_quads(columns[4 * k].v, columns[4 * k + 1].v, columns[4 * k + 2].v, columns[4 * k + 3].v, quads[k]);
+    for (int r = 0; r < 4; r++) {
+        __m512 out[4];
+        transpose_parts(quads[0][r], quads[1][r], quads[2][r], quads[3][r], out);
+        for (int p = 0; p < 4; p++) _mm512_store_ps(rows + 16 * (4 * p + r), out[p]);
+    }
+}
+
+#elif !defined(KERNEL_PORTABLE) && defined(__AVX2__)
+
+inline __m256 load_parts(const float* low, const float* high) {
+    return _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(low)), _mm_loadu_ps(high), 1);
+}
+inline void load_rows3(const float* rows, __m256& x, __m256& y, __m256& z) {
+    const __m256 a = load_parts(rows, rows + 12), b = load_parts(rows + 4, rows + 16), c = load_parts(rows + 8, rows + 20);
+    const __m256 xy = _mm256_shuffle_ps(b, c, _MM_SHUFFLE(2, 1, 3, 2)), yz = _mm256_shuffle_ps(a, b, _MM_SHUFFLE(1, 0, 2, 1));
+    x = _mm256_shuffle_ps(a, xy, _MM_SHUFFLE(2, 0, 3, 0));
+    y = _mm256_shuffle_ps(yz, xy, _MM_SHUFFLE(3, 1, 2, 0));
+    z = _mm256_shuffle_ps(yz, c, _MM_SHUFFLE(3, 0, 3, 1));
+}
+inline void load_rows3(const float* rows, Vec* columns) {
+    load_rows3(rows, columns[0].a, columns[1].a, columns[2].a);
+    load_rows3(rows + 24, columns[0].b, columns[1].b, columns[2].b);
+}
+// 4x4 transposes within 128 bits
+inline void transpose_quads(__m256 a, __m256 b, __m256 c, __m256 d, __m256* out) {
+    const __m256d ab_low = _mm256_castps_pd(_mm256_unpacklo_ps(a, b)), ab_high = _mm256_castps_pd(_mm256_unpackhi_ps(a, b));
+    const __m256d cd_low = _mm256_castps_pd(_mm256_unpacklo_ps(c, d)), cd_high = _mm256_castps_pd(_mm256_unpackhi_ps(c, d));
+    out[0] = _mm256_castpd_ps(_mm256_unpacklo_pd(ab_low, cd_low));
+    out[1] = _mm256_castpd_ps(_mm256_unpackhi_pd(ab_low, cd_low));
+    out[2] = _mm256_castpd_ps(_mm256_unpacklo_pd(ab_high, cd_high));
+    out[3] = _mm256_castpd_ps(_mm256_unpackhi_pd(ab_high, cd_high));
+}
+inline void load_rows4(const float* rows, Vec* columns) {
+    __m256 low[4], high[4];
+    transpose_quads(load_parts(rows, rows + 16), load_parts(rows + 4, rows + 20), load_parts(rows + 8, rows + 24),
+                    load_parts(rows + 12, rows + 28), low);
+    transpose_quads(load_parts(rows + 32, rows + 48), load_parts(rows + 36, rows + 52), load_parts(rows + 40, rows + 56),
+                    load_parts(rows + 44, rows + 60), high);
+    for (int k = 0; k < 4; k++) columns[k] = Vec(low[k], high[k]);
+}
+// Columns k..k+7 of eight rows.
+inline void store_rows8(float* rows, const __m256* columns) {
+    __m256 left[4], right[4];  // of rows r and 4 + r
+    transpose_quads(columns[0], columns[1], columns[2], columns[3], left);
+    transpose_quads(columns[4], columns[5], columns[6], columns[7], right);
+    for (int r = 0; r < 4; r++) {
+        _mm256_store_ps(rows + 16 * r, _mm256_permute2f128_ps(left[r], right[r], 0x20));
+        _mm256_store_ps(rows + 16 * (r + 4), _mm256_permute2f128_ps(left[r], right[r], 0x31));
+    }
+}
+inline void store_rows16(float* rows, const Vec* columns) {
+    for (int k = 0; k < 16; k += 8) {
+        __m256 low[8], high[8];
+        for (int i = 0; i < 8; i++) low[i] = columns[k + i].a, high[i] = columns[k + i].b;
+        store_rows8(rows + k, low);
+        store_rows8(rows + 16 * 8 + k, high);
+    }
+}
+
+#else
+
+template <int WIDTH>
+inline void load_rows(const float* rows, Vec* columns) {
+    for (int lane = 0; lane < LANES; lane++)
+        for (int k = 0; k < WIDTH; k++) columns[k].v[lane] = rows[WIDTH * lane + k];
+}
+inline void load_rows3(const float* rows, Vec* columns) { load_rows<3>(rows, columns); }
+inline void load_rows4(const float* rows, Vec* columns) { load_rows<4>(rows, columns); }
+inline void store_rows16(float* rows, const Vec* columns) {
+    for (int lane = 0; lane < LANES; lane++)
+        for (int k = 0; k < 16; k++) rows[16 * lane + k] = columns[k].v[lane];
+}
+
+#endif
+
+inline Vec load_unaligned(const float* p) {
+    Vec r;
+    std::memcpy(&r, p, sizeof r);
+    return r;
+}
+
+// Eight counts of bits, right, and eight, left, to eight words of 16 bits: the bits left[i] .. right[i] - 1 of word i.
+// Then, for each half of the words, the transpose of a 4x4 matrix of four-bit numbers.
+#if !defined(KERNEL_PORTABLE)
+typedef __m128i Words8;
+
+#if defined(__AVX512F__)
+inline Words8 bits_between(Vec counts) {
+    const __m512i one = _mm512_set1_epi32(1);
+    const __m256i below = _mm512_cvtepi32_epi16(_mm512_sub_epi32(_mm512_sllv_epi32(one, _mm512_cvttps_epi32(counts.v)), one));
+    return _mm_andnot_si128(_mm256_extracti128_si256(below, 1), _mm256_castsi256_si128(below));
+}
+#else
+inline Words8 bits_between(Vec counts) {
+    const __m256i one = _mm256_set1_epi32(1);
+    const __m256i right = _mm256_sub_epi32(_mm256_sllv_epi32(one, _mm256_cvttps_epi32(counts.a)), one);
+    const __m256i left = _mm256_sub_epi32(_mm256_sllv_epi32(one, _mm256_cvttps_epi32(counts.b)), one);
+    const __m256i words = _mm256_andnot_si256(left, right);
+    return _mm_packus_epi32(_mm256_castsi256_si128(words), _mm256_extracti128_si256(words, 1));
+}
+#endif
+inline Words8 transpose_nibbles(Words8 x) {
+    __m128i t = _mm_and_si128(_mm_xor_si128(x, _mm_srli_epi64(x, 12)), _mm_set1_epi64x(0x0000f0f00000f0f0));
+    x = _mm_xor_si128(x, _mm_xor_si128(t, _mm_slli_epi64(t, 12)));
+    t = _mm_and_si128(_mm_xor_si128(x, _mm_srli_epi64(x, 24)), _mm_set1_epi64x(0x00000000ff00ff00));
+    return _mm_xor_si128(x, _mm_xor_si128(t, _mm_slli_epi64(t, 24)));
+}
+inline Words8 masked(Words8 x, const uint16_t* low, const uint16_t* high) {
+    return _mm_and_si128(x, _mm_unpacklo_epi64(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(low)), _mm_loadl_epi64(reinterpret_cast<const __m128i*>(high))));
+}
+// Stores the words that are not zero, and tile + 0, 1, 2, 3, next_row + 0, 1, 2, 3 for those; returns how many. Writes all eight.
+#if defined(__AVX512F__)
+inline uint32_t store_nonzero(Words8 x, uint32_t tile, uint32_t stride, uint16_t* words, uint32_t* tiles) {
+    const __mmask8 some = _mm_test_epi16_mask(x, x);
+    const __m256i of_row = _mm256_add_epi32(_mm256_setr_epi32(0, 1, 2, 3, 0, 1, 2, 3), _mm256_set1_epi32(tile));
+    const __m256i all = _mm256_mask_add_epi32(of_row, 0xf0, of_row, _mm256_set1_epi32(stride));
+    _mm256_storeu_si256(reinterpret_cast<__m256i*>(tiles), _mm256_maskz_compress_epi32(some, all));
+    const __m256i wide = _mm256_maskz_compress_epi32(some, _mm256_cvtepu16_epi32(x));
+    _mm_storeu_si128(reinterpret_cast<__m128i*>(words), _mm256_cvtepi32_epi16(wide));
+    return __builtin_popcount(some);
+}
+#else
+struct Compress8 {  // for every set of bits, their numbers
+    alignas(32) uint32_t lanes[256][8];
+    constexpr Compress8() : lanes() {
+        for (int set = 0; set < 256; set++)
+            for (int bit = 0, n = 0; bit < 8; bit++)
+                if (set >> bit & 1) lanes[set][n++] = bit;
+    }
+};
+alignas(64) static constexpr Compress8 COMPRESS8;
+inline uint32_t store_nonzero(Words8 x, uint32_t tile, uint32_t stride, uint16_t* words, uint32_t* tiles) {
+    const __m256i wide = _mm256_cvtepu16_epi32(x);
+    const uint32_t some = 0xff & ~_mm256_movemask_ps(_mm256_castsi256_ps(_mm256_cmpeq_epi32(wide, _mm256_setzero_si256())));
+    const __m256i lanes = _mm256_load_si256(reinterpret_cast<const __m256i*>(COMPRESS8.lanes[some]));
+    const __m256i all = _mm256_add_epi32(_mm256_set1_epi32(tile), _mm256_setr_epi32(0, 1, 2, 3, stride, stride + 1, stride + 2, stride + 3));
+    _mm256_storeu_si256(reinterpret_cast<__m256i*>(tiles), _mm256_permutevar8x32_epi32(all, lanes));
+    const __m256i kept = _mm256_permutevar8x32_epi32(wide, lanes);
+    _mm_storeu_si128(reinterpret_cast<__m128i*>(words), _mm_packus_epi32(_mm256_castsi256_si128(kept), _mm256_extracti128_si256(kept, 1)));
+    return __builtin_popcount(some);
+}
+#endif
+
+#else
+struct Words8 {
+    uint64_t half[2];
+};
+inline Words8 bits_between(Vec counts) {
+    uint16_t words[8];
+    for (int i = 0; i < 8; i++)
+        words[i] = static_cast<uint16_t>(((1u << static_cast<int>(counts.v[i])) - 1) & ~((1u << static_cast<int>(counts.v[8 + i])) - 1));
+    Words8 r;
+    std::memcpy(&r, words, sizeof r);
+    return r;
+}
+inline Words8 transpose_nibbles(Words8 r) {
+    for (uint64_t& x : r.half) {
+        uint64_t t = (x ^ x >> 12) & 0x0000f0f00000f0f0u;
+        x ^= t ^ t << 12;
+        t = (x ^ x >> 24) & 0x00000000ff00ff00u;
+        x ^= t ^ t << 24;
+    }
+    return r;
+}
+inline Words8 masked(Words8 r, const uint16_t* low, const uint16_t* high) {
+    uint64_t a, b;
+    std::memcpy(&a, low, sizeof a);
+    std::memcpy(&b, high, sizeof b);
+    return {{r.half[0] & a, r.half[1] & b}};
+}
+inline uint32_t store_nonzero(Words8 x, uint32_t tile, uint32_t stride, uint16_t* words, uint32_t* tiles) {
+    uint32_t n = 0;
+    for (int i = 0; i < 8; i++) {
+        const uint16_t word = static_cast<uint16_t>(x.half[i / 4] >> i % 4 * 16);
+        words[n] = word, tiles[n] = tile + i % 4 + (i / 4 ? stride : 0);
+        n += word != 0;
+    }
+    return n;
+}
+#endif
+
+}  // namespace KERNEL_ISA
