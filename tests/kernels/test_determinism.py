@@ -27,10 +27,10 @@ def digest(rasterizer: Rasterizer) -> str:
     arrays = [
         *vars(render).values(),
         *vars(gradients).values(),
-        *vars(sums).values(),
+        *sums.arrays().values(),
         *rasterizer.contributions(),
     ]
-    assert len(arrays) == 16
+    assert len(arrays) == 18
     return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
 
 
