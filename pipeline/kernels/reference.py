@@ -285,13 +285,13 @@ class ReferenceRasterizer:
         """Derivatives [c, m, k, s] of the channels of every pixel by the screen numbers of the k Gaussians."""
         import torch
 
-        m, k = len(self._pixels), len(screen.depths)
+        m = len(self._pixels)
         copies = [numbers.detach().expand(m, *numbers.shape).clone().requires_grad_() for numbers in screen]
         values = channels(paint(self._pixels, Screen(*copies), self._background))
         rows = []
         for value in values:
             parts = torch.autograd.grad(value.sum(), copies, retain_graph=True, materialize_grads=True)
-            rows.append(torch.cat([part.reshape(m, k, -1) for part in parts], dim=-1))
+            rows.append(torch.cat([_columns(part, 2) for part in parts], dim=2))
         return torch.stack(rows).numpy()
 
     def _jacobian(self, channels: _Channels, screen: Screen, inputs: list[Any]) -> NDArray[np.float64]:
@@ -487,16 +487,20 @@ def _by_inputs(screen: Screen, inputs: list[Any], order: NDArray[np.int64]) -> N
     """Derivatives [k, s, p] of the screen numbers of every Gaussian by its own inputs [n, ...]; order: which [k]."""
     import torch
 
-    k, n = len(screen.depths), len(inputs[0])
-    columns = torch.cat([numbers.reshape(k, -1) for numbers in screen], dim=1).unbind(1)
+    columns = torch.cat([_columns(numbers, 1) for numbers in screen], dim=1).unbind(1)
     out = []
     for column in columns:
         # every Gaussian depends on its own inputs only: the derivative of the sum is that of each
         parts = torch.autograd.grad(
             column.sum(), inputs, retain_graph=True, allow_unused=True, materialize_grads=True
         )
-        out.append(torch.cat([part.reshape(n, -1) for part in parts], dim=1))
+        out.append(torch.cat([_columns(part, 1) for part in parts], dim=1))
     return torch.stack(out, dim=1).numpy()[order]
+
+
+def _columns(values: Any, axes: int) -> Any:
+    """All axes but the first few as one."""
+    return values.reshape(*values.shape[:axes], int(np.prod(values.shape[axes:])))
 
 
 def _tensor(array: ArrayLike) -> Any:
