@@ -192,20 +192,20 @@ class ReferenceRasterizer:
         out[self._drawn] = (self._margins() > UNSURE_ALPHA) & ~mixed_up & ~at_clamp
         return out
 
-    def gradient_terms(
+    def empirical_terms(
         self, d_color: ArrayLike, d_depth: ArrayLike | None = None, d_alpha: ArrayLike | None = None
-    ) -> Gradients:
-        """What `backward` adds up, with all signs taken away: over pixels, and over screen numbers.
+    ) -> NDArray[np.float64]:
+        """What `backward` adds up to its fisher_diagonal [n, 14], with all signs taken away.
 
-        A gradient that is much smaller than this cancels, and float32 cannot know it better than its rounding
-        times this.
+        The squared derivative by a parameter is the square of a sum over screen numbers; where that sum cancels,
+        rounding leaves an error in proportion to this.
         """
-        by_screen = np.abs(self._by_screen(self._dot(d_color, d_depth, d_alpha), self._screen)).sum((0, 1))
-        inputs = [*self._parameters.values(), self._xi]
-        by_parameter = np.abs(_by_inputs(self._screen, inputs, self._order))
-        terms = self._by_gaussian(np.einsum("ks,ksp->kp", by_screen, by_parameter))
-        of_parameters: dict[str, Any] = {name: terms[:, columns] for name, columns in _COLUMNS.items()}
-        return Gradients(**of_parameters, pose=terms[:, _POSE].sum(axis=0))
+        return (self._terms(self._dot(d_color, d_depth, d_alpha)) ** 2).sum((0, 1))
+
+    def information_terms(self, inv_var_color: ArrayLike, inv_var_depth: ArrayLike) -> NDArray[np.float64]:
+        """The same of the diagonal that `fisher` adds up."""
+        precision = self._precision(inv_var_color, inv_var_depth)
+        return np.einsum("cm,cmni->ni", precision, self._terms(_color_and_depth) ** 2)
 
     # ------------------------------------------------------------ drawing
 
@@ -299,6 +299,22 @@ class ReferenceRasterizer:
         by_screen, by_inputs = self._by_screen(channels, screen), _by_inputs(screen, inputs, self._order)
         return self._by_gaussian(np.einsum("cmks,ksp->cmkp", by_screen, by_inputs))
 
+    def _terms(self, channels: _Channels) -> NDArray[np.float64]:
+        """The Jacobian [c, m, n, 14] with every product of the chain rule taken as positive.
+
+        Through screen numbers that know no long and short directions: M centre, M^-T C^-1 M^-1 (which is 1) and
+        M^-T slope, with C^-1 = M^T M.
+        """
+        M = np.swapaxes(np.linalg.cholesky(self._screen.conics.detach().numpy()), 1, 2)
+        back = np.swapaxes(np.linalg.inv(M), 1, 2)
+        change = np.tile(np.eye(_SCREEN_NUMBERS), (len(M), 1, 1))
+        change[:, 0:2, 0:2], change[:, 7:9, 7:9] = M, back
+        change[:, 2:6, 2:6] = np.einsum("kij,klm->kiljm", back, back).reshape(-1, 4, 4)
+        by_screen = self._by_screen(channels, self._screen)
+        by_inputs = _by_inputs(self._screen, list(self._parameters.values()), self._order)
+        by_screen = np.abs(np.einsum("cmks,kst->cmkt", by_screen, np.linalg.inv(change)))
+        return self._by_gaussian(np.einsum("cmks,ksp->cmkp", by_screen, np.abs(change @ by_inputs)))
+
     def _by_gaussian(self, of_screen: NDArray[np.float64]) -> NDArray[np.float64]:
         """[..., k, p] in the order of the screen as [..., n, p]; what is not on the screen is zero."""
         out = np.zeros((*of_screen.shape[:-2], self._n, of_screen.shape[-1]))
@@ -311,16 +327,6 @@ class ReferenceRasterizer:
             np.asarray(image, dtype=np.float64)[self._drawn] for image in (inv_var_color, inv_var_depth)
         )
         return np.stack([of_color, of_color, of_color, of_depth])
-
-
-_COLUMNS: dict[str, slice | int] = {
-    "means": slice(0, 3),
-    "quats_wxyz": slice(3, 7),
-    "log_scales": slice(7, 10),
-    "colors": slice(10, 13),
-    "opacity_logits": 13,
-}
-_POSE = slice(14, 20)
 
 
 class Screen(NamedTuple):
@@ -336,6 +342,9 @@ class Screen(NamedTuple):
     slopes: Any
     opacities: Any
     colors: Any
+
+
+_SCREEN_NUMBERS = 2 + 4 + 1 + 2 + 1 + 3  # of one Gaussian
 
 
 class Painting(NamedTuple):
@@ -408,9 +417,7 @@ def blend(pixels: Any, centres: Any, conics: Any, opacities: Any) -> tuple[Any, 
     import torch
 
     x, y = (pixels[:, None] - centres).unbind(-1)
-    power = (
-        conics[..., 0, 0] * x * x + 2 * conics[..., 0, 1] * x * y + conics[..., 1, 1] * y * y
-    )  # d^T C^-1 d
+    power = conics[..., 0, 0] * x * x + 2 * conics[..., 0, 1] * x * y + conics[..., 1, 1] * y * y
     raw = opacities * torch.exp(-0.5 * power)
     alpha = torch.where(raw.detach() >= ALPHA_MIN, raw.clamp(max=ALPHA_MAX), torch.zeros_like(raw))
     left = torch.cumprod(1 - alpha.detach(), dim=1)
