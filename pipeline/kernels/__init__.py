@@ -1,6 +1,24 @@
 """Drawing Gaussians, and the derivatives and information of what was drawn."""
 
 from pipeline.kernels.rasterizer import Rasterizer, available_isas
-from pipeline.kernels.types import FisherSums, Gradients, Render
+from pipeline.kernels.types import (
+    DepthKind,
+    FisherSums,
+    Gradients,
+    LossWeights,
+    Render,
+    Statistics,
+    ViewLoss,
+)
 
-__all__ = ["FisherSums", "Gradients", "Rasterizer", "Render", "available_isas"]
+__all__ = [
+    "DepthKind",
+    "FisherSums",
+    "Gradients",
+    "LossWeights",
+    "Rasterizer",
+    "Render",
+    "Statistics",
+    "ViewLoss",
+    "available_isas",
+]

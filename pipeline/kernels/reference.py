@@ -9,28 +9,47 @@ and centre p of the Gaussian in the camera frame, J the derivative of the projec
                         TRANSMITTANCE_MIN closes the pixel and is not drawn
     colour = sum w c + (1 - sum w) background,  depth = sum w z,  alpha = sum w
 
-Derivatives come from automatic differentiation, information from the Jacobian of every pixel.
+z is the depth of the centre ("blended"), or z + k^T C^-1 d with k = J W Sigma W^T e_z, the covariance of screen
+position and depth ("ray_plane"): in the affine approximation the mean depth of the Gaussian along the ray of the
+pixel, which for a flat disc is where the ray meets its plane.
+
+Derivatives come from automatic differentiation. Information comes from the Jacobian of every pixel: each pixel is
+drawn from its own copy of the screen numbers (centre, C^-1, depth, ...), so that one differentiation per channel gives
+the rows of all pixels, and each Gaussian's screen numbers depend on its own parameters only.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.geometry import spd
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels.types import FisherSums, Gradients, Render
+from pipeline.kernels.types import (
+    DEPTH_KINDS,
+    DepthKind,
+    FisherSums,
+    Gradients,
+    LossWeights,
+    Render,
+    ViewLoss,
+)
 from pipeline.splat.gaussians import Gaussians
 
 NEAR_M = 0.01
 BLUR_PX2 = 0.3
 FIELD_MARGIN = 1.3
+LARGEST_PX2 = 1e12
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
-JACOBIAN_ROWS = 16  # pixels differentiated at once
+
+# Relative distance from a threshold within which float32 may decide otherwise; see `decided`.
+UNSURE_ALPHA = 1e-4  # alpha and transmittance
+UNSURE_PLACE = 1e-6  # depths and directions
 
 _PARAMETERS = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
 
@@ -44,22 +63,27 @@ class ReferenceRasterizer:
         camera: PinholeCamera,
         T_camera_map: ArrayLike,
         background: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        depth: DepthKind = "blended",
+        mask: NDArray[np.bool_] | None = None,
     ) -> Render:
-        """Draw the Gaussians (frame map) into the camera at T_camera_map [4, 4]."""
+        """Draw the Gaussians (frame map) into the camera at T_camera_map [4, 4]; see `Rasterizer.forward`."""
         import torch
 
-        def tensor(array: ArrayLike) -> Any:
-            return torch.tensor(np.asarray(array, dtype=np.float64))
-
-        self._camera, self._n = camera, len(gaussians)
-        self._T, self._background = tensor(T_camera_map), tensor(background)
-        self._parameters = {name: tensor(getattr(gaussians, name)).requires_grad_() for name in _PARAMETERS}
+        if depth not in DEPTH_KINDS:
+            raise ValueError(f"depth is {depth!r}, expected one of {', '.join(DEPTH_KINDS)}")
+        n, shape = len(gaussians), (camera.height, camera.width)
+        self._camera, self._n, self._depth = camera, n, depth
+        self._drawn = np.ones(shape, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
+        self._pixels = _tensor(np.argwhere(self._drawn)[:, ::-1].copy())  # x, y
+        self._T, self._background = _tensor(T_camera_map), _tensor(background)
+        self._parameters = {name: _tensor(getattr(gaussians, name)).requires_grad_() for name in _PARAMETERS}
         self._log_covariances = spd.log_covariance(gaussians.quats_wxyz, gaussians.log_scales)
-        self._xi = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+        self._xi = torch.zeros((n, 6), dtype=torch.float64, requires_grad=True)  # a copy for every Gaussian
         p = self._parameters
-        sigma = sigma_of(p["quats_wxyz"], p["log_scales"])
-        self._images = self._draw(p["means"], sigma, p["colors"], p["opacity_logits"])
-        return Render(*(image.detach().numpy() for image in self._images))
+        self._screen = self._project(sigma_of(p["quats_wxyz"], p["log_scales"]))
+        self._painting = paint(self._pixels, self._screen, self._background)
+        return Render(*(self._image(values) for values in self._painting[:3]))
 
     def backward(
         self,
@@ -68,103 +92,300 @@ class ReferenceRasterizer:
         d_alpha: ArrayLike | None = None,
         pose: bool = False,
         fisher: bool = False,
+        parameters: bool = True,
     ) -> Gradients:
         """Derivatives of <d_color, color> + <d_depth, depth> + <d_alpha, alpha>; see `Rasterizer.backward`."""
-        import torch
+        per_pixel = self._dot(d_color, d_depth, d_alpha)
+        gradients = self._gradients(per_pixel(self._painting).sum(), pose, parameters)
+        if not fisher:
+            return gradients
+        jacobian = self._jacobian(per_pixel, self._screen, list(self._parameters.values()))
+        return Gradients(**{**vars(gradients), "fisher_diagonal": (jacobian**2).sum((0, 1))})
 
-        color, depth, alpha = self._images
-
-        def cotangent(image: ArrayLike | None, like: Any) -> Any:
-            return (
-                torch.zeros_like(like) if image is None else torch.tensor(np.asarray(image, dtype=np.float64))
-            )
-
-        per_pixel = (
-            (cotangent(d_color, color) * color).sum(-1)
-            + cotangent(d_depth, depth) * depth
-            + cotangent(d_alpha, alpha) * alpha
-        ).ravel()
-        inputs = [*self._parameters.values(), self._xi]
-        *gradients, by_pose = torch.autograd.grad(per_pixel.sum(), inputs, retain_graph=True)
-        diagonal = None
-        if fisher:
-            squares = [(J**2).sum(0) for J in _jacobian(per_pixel, inputs[:-1])]
-            diagonal = np.concatenate([s[:, None] if s.ndim == 1 else s for s in squares], axis=1)
-        means, quats, log_scales, colors, logits = (gradient.numpy() for gradient in gradients)
-        return Gradients(
-            means, quats, log_scales, colors, logits, by_pose.numpy() if pose else None, diagonal
-        )
-
-    def fisher(self, inv_var_color: ArrayLike, inv_var_depth: ArrayLike, sums: FisherSums) -> None:
+    def fisher(
+        self,
+        inv_var_color: ArrayLike,
+        inv_var_depth: ArrayLike,
+        sums: FisherSums,
+        residual: ArrayLike | None = None,
+    ) -> None:
         """Add sum over pixels of J^T R^-1 J in (mean, vec log Sigma, colour, logit); see `Rasterizer.fisher`."""
+        p = self._parameters
+        log_covariances = _tensor(self._log_covariances).requires_grad_()
+        screen = self._project(_matrix_exp(log_covariances))
+        inputs = [p["means"], log_covariances, p["colors"], p["opacity_logits"]]
+        jacobian = self._jacobian(_color_and_depth, screen, inputs)
+        precision = self._precision(inv_var_color, inv_var_depth)
+        information = np.einsum("cm,cmni,cmnj->nij", precision, jacobian, jacobian)
+        rows, columns = np.triu_indices(9)
+        sums.geometry += information[:, rows, columns]
+        sums.color += np.diagonal(information, axis1=1, axis2=2)[:, 9:12]
+        sums.opacity += information[:, 12, 12]
+        weights = self._weights()[(precision > 0).any(axis=0)]
+        sums.observations += (weights > 0).any(axis=0).astype(np.uint32)
+        sums.weight += weights.sum(axis=0)
+        if residual is not None:
+            of_pixel = np.asarray(residual, dtype=np.float64)[self._drawn][(precision > 0).any(axis=0)]
+            sums.residual += of_pixel @ weights
+        if sums.diagonal is not None:
+            full = self.full_fisher(inv_var_color, inv_var_depth)
+            sums.diagonal += np.diagonal(full, axis1=1, axis2=2)
+
+    def full_fisher(self, inv_var_color: ArrayLike, inv_var_depth: ArrayLike) -> NDArray[np.float64]:
+        """J^T R^-1 J [n, 14, 14] of the last view; see `Rasterizer.full_fisher`."""
+        jacobian = self._jacobian(_color_and_depth, self._screen, list(self._parameters.values()))
+        precision = self._precision(inv_var_color, inv_var_depth)
+        return np.einsum("cm,cmni,cmnj->nij", precision, jacobian, jacobian)
+
+    def view_gradients(
+        self,
+        gaussians: Gaussians,
+        camera: PinholeCamera,
+        T_camera_map: ArrayLike,
+        color: ArrayLike,
+        depth_m: ArrayLike,
+        loss: LossWeights,
+        *,
+        exposure: tuple[float, float] = (0.0, 0.0),
+        background: ArrayLike = (0.0, 0.0, 0.0),
+        mask: NDArray[np.bool_] | None = None,
+        depth: DepthKind = "blended",
+        pose: bool = False,
+        parameters: bool = True,
+    ) -> tuple[ViewLoss, Gradients]:
+        """Draw, compare with a measured image, differentiate; see `Rasterizer.view_gradients`."""
         import torch
 
-        p = self._parameters
-        log_covariances = torch.tensor(self._log_covariances, requires_grad=True)
-        covariances = _matrix_exp(log_covariances)
-        sigma = covariances.detach().requires_grad_()
-        color, depth, _ = self._draw(p["means"], sigma, p["colors"], p["opacity_logits"])
-        measured = torch.cat([color, depth[..., None]], dim=-1).reshape(-1)
-        of_color = np.asarray(inv_var_color, dtype=np.float64)[..., None].repeat(3, axis=-1)
-        of_depth = np.asarray(inv_var_depth, dtype=np.float64)[..., None]
-        weight = np.concatenate([of_color, of_depth], axis=-1).reshape(-1)
-        inputs = [p["means"], sigma, p["colors"], p["opacity_logits"]]
-        by_mean, by_sigma, by_color, by_logit = _jacobian(measured, inputs)
-        (sigma_by_log,) = _jacobian(
-            covariances.sum(0).reshape(9), [log_covariances]
-        )  # each Sigma has its own log
-        by_log = np.einsum("mnij,ijnk->mnk", by_sigma, sigma_by_log.reshape(3, 3, self._n, 6))
-        geometry = np.concatenate([by_mean, by_log], axis=-1)
-        blocks = np.einsum("m,mni,mnj->nij", weight, geometry, geometry)
-        rows, columns = np.triu_indices(9)
-        sums.geometry += blocks[:, rows, columns]
-        sums.color += np.einsum("m,mni->ni", weight, by_color**2)
-        sums.opacity += np.einsum("m,mn->n", weight, by_logit**2)
-        used = ((of_color[..., 0] > 0) | (of_depth[..., 0] > 0)).reshape(-1)
-        sums.observations += (self._weights[used].detach().numpy() > 0).any(axis=0).astype(np.uint32)
+        self.forward(gaussians, camera, T_camera_map, background, depth=depth, mask=mask)
+        of_color, of_depth = (_tensor(np.asarray(image)[self._drawn]) for image in (color, depth_m))
+        gain_and_offset = _tensor(exposure).requires_grad_()
+        value, of_color, of_depth = view_loss(self._painting, of_color, of_depth, loss, gain_and_offset)
+        (by_exposure,) = torch.autograd.grad(value, [gain_and_offset], retain_graph=True)
+        a, b = by_exposure.tolist()
+        summary = ViewLoss(float(value.detach()), float(of_color.detach()), float(of_depth.detach()), (a, b))
+        return summary, self._gradients(value, pose, parameters)
 
     def contributions(self) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
         """Sum of the blending weights [n] of each Gaussian and number of its pixels [n]."""
-        weights = self._weights.detach().numpy()
+        weights = self._weights()
         return weights.sum(axis=0), (weights > 0).sum(axis=0).astype(np.uint32)
 
     def gate_margin(self) -> float:
-        """Smallest relative distance of any pair of pixel and Gaussian from the thresholds of the definition.
+        """Smallest relative distance of any pair of pixel and Gaussian from the thresholds of alpha and transmittance.
 
         Near zero, rounding decides whether the pair is drawn, and another precision may differ visibly.
         """
-        return self._margin
+        return float(self._margins().min(initial=1.0))
 
-    def _draw(self, means: Any, covariances: Any, colors: Any, opacity_logits: Any) -> tuple[Any, Any, Any]:
-        """Colour, depth and alpha of covariances [n, 3, 3]; leaves the weights [H W, n] behind."""
+    def decided(self) -> NDArray[np.bool_]:
+        """Pixels [H, W] in which no threshold of the definition is so near that float32 may decide otherwise.
+
+        The thresholds are those of `gate_margin`, the order of two depths, and the clamp of J. At each of them the
+        image or its derivative jumps, so that no precision makes two implementations agree there.
+        """
+        seen, z = self._painting.weights.detach().numpy() > 0, self._screen.depths.detach().numpy()
+        nearer = np.maximum.accumulate(np.where(seen, z, 0.0), axis=1)[:, :-1]  # the last one seen before
+        gap = 1 - nearer / z[1:]
+        mixed_up = (seen[:, 1:] & (gap > 0) & (gap < UNSURE_PLACE)).any(axis=1)
+        at_clamp = (seen & (self._from_clamp.numpy() < UNSURE_PLACE)).any(axis=1)
+        out = np.zeros(self._drawn.shape, dtype=bool)
+        out[self._drawn] = (self._margins() > UNSURE_ALPHA) & ~mixed_up & ~at_clamp
+        return out
+
+    def empirical_terms(
+        self, d_color: ArrayLike, d_depth: ArrayLike | None = None, d_alpha: ArrayLike | None = None
+    ) -> NDArray[np.float64]:
+        """What `backward` adds up to its fisher_diagonal [n, 14], with all signs taken away.
+
+        The squared derivative by a parameter is the square of a sum over screen numbers; where that sum cancels,
+        rounding leaves an error in proportion to this.
+        """
+        return (self._terms(self._dot(d_color, d_depth, d_alpha)) ** 2).sum((0, 1))
+
+    def information_terms(self, inv_var_color: ArrayLike, inv_var_depth: ArrayLike) -> NDArray[np.float64]:
+        """The same of the diagonal that `fisher` adds up."""
+        precision = self._precision(inv_var_color, inv_var_depth)
+        return np.einsum("cm,cmni->ni", precision, self._terms(_color_and_depth) ** 2)
+
+    # ------------------------------------------------------------ drawing
+
+    def _project(self, sigma: Any) -> Screen:
+        """What the Gaussians, of covariance sigma [n, 3, 3] here, are on the screen."""
         import torch
 
-        camera, v, w = self._camera, self._xi[:3], self._xi[3:]
+        camera, p, v, w = self._camera, self._parameters, self._xi[:, :3], self._xi[:, 3:]
         # T_map_camera exp(xi): the camera sees exp(-xi) p; first order is exact for derivatives at xi = 0
         turn = torch.eye(3, dtype=torch.float64) - _hat(w)
         W, t = turn @ self._T[:3, :3], turn @ self._T[:3, 3] - v
-        order, z, centres, conics = project(means, covariances, W, t, camera)
-        rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
-        pixels = torch.stack([columns, rows], -1).reshape(-1, 2).to(torch.float64)
-        weights, self._margin = blend(pixels, centres, conics, torch.sigmoid(opacity_logits[order]))
-        total = weights.sum(1)
-        self._weights = torch.zeros(len(total), self._n, dtype=torch.float64).index_copy(1, order, weights)
-        shape = (camera.height, camera.width)
-        color = weights @ colors[order] + (1 - total)[:, None] * self._background
-        return color.reshape(*shape, 3), (weights @ z).reshape(shape), total.reshape(shape)
+        order, z, centres, conics = project(p["means"], sigma, W, t, camera)
+        self._order = order.numpy()
+        places = (W @ p["means"][..., None])[order, :, 0] + t[order]
+        JW, self._from_clamp = _linearised(places, W[order], camera)
+        along_z = JW @ sigma[order] @ W[order, 2, :, None]  # k, covariance of screen position and depth
+        slopes = (conics @ along_z)[..., 0]
+        if self._depth == "blended":
+            slopes = torch.zeros_like(slopes)
+        return Screen(
+            centres, conics, z, slopes, torch.sigmoid(p["opacity_logits"])[order], p["colors"][order]
+        )
+
+    def _image(self, values: Any) -> NDArray[np.float64]:
+        """Values [m, ...] of the drawn pixels as an image, zero elsewhere."""
+        image = np.zeros((*self._drawn.shape, *values.shape[1:]))
+        image[self._drawn] = values.detach().numpy()
+        return image
+
+    def _weights(self) -> NDArray[np.float64]:
+        """Blending weights [m, n] of the drawn pixels."""
+        weights = np.zeros((len(self._pixels), self._n))
+        weights[:, self._order] = self._painting.weights.detach().numpy()
+        return weights
+
+    def _margins(self) -> NDArray[np.float64]:
+        """The `gate_margin` of every drawn pixel [m], over the Gaussians up to the one that closes it."""
+        raw, left = (gate.numpy() for gate in self._painting.gates)
+        closed = np.logical_or.accumulate(left < TRANSMITTANCE_MIN, axis=1)
+        mattering = np.ones_like(closed)
+        mattering[:, 1:] = ~closed[:, :-1]
+        margins = np.ones(len(raw))
+        for distance in (raw / ALPHA_MIN - 1, raw / ALPHA_MAX - 1, left / TRANSMITTANCE_MIN - 1):
+            margins = np.minimum(margins, np.where(mattering, np.abs(distance), 1.0).min(axis=1, initial=1.0))
+        return margins
+
+    # ------------------------------------------------------------ derivatives
+
+    def _dot(self, d_color: ArrayLike, d_depth: ArrayLike | None, d_alpha: ArrayLike | None) -> _Channels:
+        """The function that gives <d_color, color> + d_depth depth + d_alpha alpha of every drawn pixel, [1, m]."""
+
+        def cotangent(image: ArrayLike | None) -> Any:
+            return 0.0 if image is None else _tensor(np.asarray(image)[self._drawn])
+
+        by_color, by_depth, by_alpha = cotangent(d_color), cotangent(d_depth), cotangent(d_alpha)
+
+        def dot(drawn: Painting) -> Any:
+            value = (by_color * drawn.color).sum(-1) + by_depth * drawn.depth + by_alpha * drawn.alpha
+            return value[None]
+
+        return dot
+
+    def _gradients(self, scalar: Any, pose: bool, parameters: bool) -> Gradients:
+        import torch
+
+        if not parameters and not pose:
+            raise ValueError("parameters is False, expected pose to be True then")
+        inputs = [*self._parameters.values(), self._xi]
+        *by_parameter, by_xi = torch.autograd.grad(scalar, inputs, retain_graph=True)
+        arrays: dict[str, Any] = {
+            name: by.numpy() if parameters else None
+            for name, by in zip(_PARAMETERS, by_parameter, strict=True)
+        }
+        return Gradients(**arrays, pose=by_xi.sum(0).numpy() if pose else None)
+
+    def _by_screen(self, channels: _Channels, screen: Screen) -> NDArray[np.float64]:
+        """Derivatives [c, m, k, s] of the channels of every pixel by the screen numbers of the k Gaussians."""
+        import torch
+
+        m = len(self._pixels)
+        copies = [numbers.detach().expand(m, *numbers.shape).clone().requires_grad_() for numbers in screen]
+        values = channels(paint(self._pixels, Screen(*copies), self._background))
+        rows = []
+        for value in values:
+            parts = torch.autograd.grad(value.sum(), copies, retain_graph=True, materialize_grads=True)
+            rows.append(torch.cat([_columns(part, 2) for part in parts], dim=2))
+        return torch.stack(rows).numpy()
+
+    def _jacobian(self, channels: _Channels, screen: Screen, inputs: list[Any]) -> NDArray[np.float64]:
+        """Derivatives [c, m, n, p] of the channels of every pixel by the inputs [n, ...] of every Gaussian."""
+        by_screen, by_inputs = self._by_screen(channels, screen), _by_inputs(screen, inputs, self._order)
+        return self._by_gaussian(np.einsum("cmks,ksp->cmkp", by_screen, by_inputs))
+
+    def _terms(self, channels: _Channels) -> NDArray[np.float64]:
+        """The Jacobian [c, m, n, 14] with every product of the chain rule taken as positive.
+
+        Through screen numbers that know no long and short directions: M centre, M^-T C^-1 M^-1 (which is 1) and
+        M^-T slope, with C^-1 = M^T M.
+        """
+        M = np.swapaxes(np.linalg.cholesky(self._screen.conics.detach().numpy()), 1, 2)
+        back = np.swapaxes(np.linalg.inv(M), 1, 2)
+        change = np.tile(np.eye(_SCREEN_NUMBERS), (len(M), 1, 1))
+        change[:, 0:2, 0:2], change[:, 7:9, 7:9] = M, back
+        change[:, 2:6, 2:6] = np.einsum("kij,klm->kiljm", back, back).reshape(-1, 4, 4)
+        by_screen = self._by_screen(channels, self._screen)
+        by_inputs = _by_inputs(self._screen, list(self._parameters.values()), self._order)
+        by_screen = np.abs(np.einsum("cmks,kst->cmkt", by_screen, np.linalg.inv(change)))
+        return self._by_gaussian(np.einsum("cmks,ksp->cmkp", by_screen, np.abs(change @ by_inputs)))
+
+    def _by_gaussian(self, of_screen: NDArray[np.float64]) -> NDArray[np.float64]:
+        """[..., k, p] in the order of the screen as [..., n, p]; what is not on the screen is zero."""
+        out = np.zeros((*of_screen.shape[:-2], self._n, of_screen.shape[-1]))
+        out[..., self._order, :] = of_screen
+        return out
+
+    def _precision(self, inv_var_color: ArrayLike, inv_var_depth: ArrayLike) -> NDArray[np.float64]:
+        """R^-1 of red, green, blue and depth of every drawn pixel, [4, m]."""
+        of_color, of_depth = (
+            np.asarray(image, dtype=np.float64)[self._drawn] for image in (inv_var_color, inv_var_depth)
+        )
+        return np.stack([of_color, of_color, of_color, of_depth])
+
+
+class Screen(NamedTuple):
+    """k Gaussians as the camera sees them, nearest first; each array may have the pixels [m] in front.
+
+    centres: [k, 2], px. conics: C^-1 [k, 2, 2], 1/px^2. depths: [k], m. slopes: [k, 2], m/px, of the depth over the
+    screen; zero unless "ray_plane". opacities: [k]. colors: [k, 3].
+    """
+
+    centres: Any
+    conics: Any
+    depths: Any
+    slopes: Any
+    opacities: Any
+    colors: Any
+
+
+_SCREEN_NUMBERS = 2 + 4 + 1 + 2 + 1 + 3  # of one Gaussian
+
+
+class Painting(NamedTuple):
+    """m pixels. color: [m, 3]. depth: [m]. alpha: [m]. weights: [m, k]. gates: see `blend`."""
+
+    color: Any
+    depth: Any
+    alpha: Any
+    weights: Any
+    gates: tuple[Any, Any]
+
+
+_Channels = Callable[[Painting], Any]  # to values [c, m]
 
 
 def project(means: Any, covariances: Any, W: Any, t: Any, camera: PinholeCamera) -> tuple[Any, Any, Any, Any]:
     """Gaussians in front of the camera (rotation W, translation t of T_camera_map), nearest first.
 
     Returns their indices [k], depths z [k], centres [k, 2] in pixels and inverse screen covariances [k, 2, 2].
+    W and t may be one for each Gaussian, [n, 3, 3] and [n, 3].
     """
     import torch
 
-    x, y, z = (means @ W.T + t).unbind(-1)
-    order = torch.argsort(z.detach(), stable=True)
-    order = order[z.detach()[order] >= NEAR_M]
-    x, y, z = x[order], y[order], z[order]
+    places = (means[:, None] @ W.mT)[:, 0] + t
+    z = places.detach()[:, 2]
+    order = torch.argsort(z, stable=True)
+    order = order[z[order] >= NEAR_M]
+    JW, _ = _linearised(places[order], W.expand(len(means), 3, 3)[order], camera)
+    C = JW @ covariances[order] @ JW.mT + BLUR_PX2 * torch.eye(2, dtype=z.dtype)
+    small = C.detach().diagonal(dim1=-2, dim2=-1).amax(-1) <= LARGEST_PX2
+    order = order[small]
+    x, y, z = places[order].unbind(-1)
+    centres = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
+    return order, z, centres, torch.linalg.inv(C[small])
+
+
+def _linearised(places: Any, W: Any, camera: PinholeCamera) -> tuple[Any, Any]:
+    """J W [k, 2, 3] of places [k, 3] in the camera, and how far [k], relatively, they are from where J is clamped."""
+    import torch
+
+    x, y, z = places.unbind(-1)
     limit_x = FIELD_MARGIN * camera.width / 2 / camera.fx
     limit_y = FIELD_MARGIN * camera.height / 2 / camera.fy
     zero = torch.zeros_like(z)
@@ -175,26 +396,51 @@ def project(means: Any, covariances: Any, W: Any, t: Any, camera: PinholeCamera)
         ],
         dim=-2,
     )
-    JW = J @ W
-    screen = JW @ covariances[order] @ JW.mT + BLUR_PX2 * torch.eye(2, dtype=z.dtype)
-    centres = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
-    return order, z, centres, torch.linalg.inv(screen)
+    from_clamp = torch.minimum(((x / z).abs() / limit_x - 1).abs(), ((y / z).abs() / limit_y - 1).abs())
+    return J @ W, from_clamp.detach()
 
 
-def blend(pixels: Any, centres: Any, conics: Any, opacities: Any) -> tuple[Any, float]:
-    """Blending weights [m, k] of k Gaussians, nearest first, at m pixels, and their `gate_margin`."""
+def paint(pixels: Any, screen: Screen, background: Any) -> Painting:
+    """Colour, depth and alpha of pixels [m, 2]."""
+    weights, gates = blend(pixels, screen.centres, screen.conics, screen.opacities)
+    total = weights.sum(-1)
+    color = (weights[..., None] * screen.colors).sum(-2) + (1 - total)[:, None] * background
+    along_ray = screen.depths + (screen.slopes * (pixels[:, None] - screen.centres)).sum(-1)
+    return Painting(color, (weights * along_ray).sum(-1), total, weights, gates)
+
+
+def blend(pixels: Any, centres: Any, conics: Any, opacities: Any) -> tuple[Any, tuple[Any, Any]]:
+    """Blending weights [m, k] of k Gaussians, nearest first, at pixels [m, 2].
+
+    Also what the thresholds decide on: alpha before its clamp and the light left after each Gaussian, [m, k] both.
+    """
     import torch
 
     x, y = (pixels[:, None] - centres).unbind(-1)
-    power = conics[:, 0, 0] * x * x + 2 * conics[:, 0, 1] * x * y + conics[:, 1, 1] * y * y  # d^T C^-1 d
+    power = conics[..., 0, 0] * x * x + 2 * conics[..., 0, 1] * x * y + conics[..., 1, 1] * y * y
     raw = opacities * torch.exp(-0.5 * power)
     alpha = torch.where(raw.detach() >= ALPHA_MIN, raw.clamp(max=ALPHA_MAX), torch.zeros_like(raw))
     left = torch.cumprod(1 - alpha.detach(), dim=1)
     drawn = torch.cumprod((left >= TRANSMITTANCE_MIN).long(), dim=1).bool()
-    margin = _margin(raw.detach().numpy(), left.numpy())
     alpha = torch.where(drawn, alpha, torch.zeros_like(alpha))
     before = torch.cumprod(torch.cat([torch.ones_like(alpha[:, :1]), 1 - alpha], dim=1), dim=1)[:, :-1]
-    return alpha * before, margin
+    return alpha * before, (raw.detach(), left)
+
+
+def view_loss(
+    drawn: Painting, color: Any, depth_m: Any, loss: LossWeights, exposure: Any
+) -> tuple[Any, Any, Any]:
+    """The loss of m pixels and its means of colour and depth, as `splat.losses.rgbd_loss` defines them.
+
+    color [m, 3], depth_m [m]: measured. exposure: a, b [2].
+    """
+    measured = depth_m > 0
+    shown = exposure[0].exp() * drawn.color + exposure[1]
+    per_depth = 1.0 / max(int(measured.sum()), 1)
+    color_mean = _huber(shown - color, loss.color_huber).sum() / max(color.numel(), 1)
+    depth_mean = _huber((drawn.depth - drawn.alpha * depth_m)[measured], loss.depth_huber_m).sum() * per_depth
+    missing = (1 - drawn.alpha)[measured].sum() * per_depth
+    return color_mean + loss.depth_weight * depth_mean + loss.alpha_weight * missing, color_mean, depth_mean
 
 
 def sigma_of(quats_wxyz: Any, log_scales: Any) -> Any:
@@ -222,28 +468,49 @@ def _matrix_exp(vec_log: Any) -> Any:
 
 
 def _hat(w: Any) -> Any:
+    """Cross product matrices [n, 3, 3] of w [n, 3]."""
     import torch
 
-    zero = torch.zeros((), dtype=w.dtype)
-    x, y, z = w
-    return torch.stack([torch.stack([zero, -z, y]), torch.stack([z, zero, -x]), torch.stack([-y, x, zero])])
+    x, y, z = w.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(-1, 3, 3)
 
 
-def _jacobian(outputs: Any, inputs: list[Any]) -> list[NDArray[np.float64]]:
-    """Derivatives [m, ...] of every one of the outputs [m] by each input [...]."""
+def _huber(residual: Any, delta: float) -> Any:
     import torch
 
-    rows = [
-        torch.autograd.grad(outputs, inputs, grad_outputs=seeds, is_grads_batched=True, retain_graph=True)
-        for seeds in torch.eye(len(outputs), dtype=torch.float64).split(JACOBIAN_ROWS)
-    ]
-    return [torch.cat(columns).numpy() for columns in zip(*rows, strict=True)]
+    size = residual.abs()
+    return torch.where(size < delta, residual**2 / (2 * delta), size - delta / 2)
 
 
-def _margin(raw: NDArray[np.float64], left: NDArray[np.float64]) -> float:
-    distances = [
-        np.abs(raw / ALPHA_MIN - 1),
-        np.abs(raw / ALPHA_MAX - 1),
-        np.abs(left / TRANSMITTANCE_MIN - 1),
-    ]
-    return float(min((d.min() for d in distances if d.size), default=1.0))
+def _color_and_depth(drawn: Painting) -> Any:
+    """The measured channels [4, m]: red, green, blue, depth."""
+    import torch
+
+    return torch.cat([drawn.color.T, drawn.depth[None]])
+
+
+def _by_inputs(screen: Screen, inputs: list[Any], order: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Derivatives [k, s, p] of the screen numbers of every Gaussian by its own inputs [n, ...]; order: which [k]."""
+    import torch
+
+    columns = torch.cat([_columns(numbers, 1) for numbers in screen], dim=1).unbind(1)
+    out = []
+    for column in columns:
+        # every Gaussian depends on its own inputs only: the derivative of the sum is that of each
+        parts = torch.autograd.grad(
+            column.sum(), inputs, retain_graph=True, allow_unused=True, materialize_grads=True
+        )
+        out.append(torch.cat([_columns(part, 1) for part in parts], dim=1))
+    return torch.stack(out, dim=1).numpy()[order]
+
+
+def _columns(values: Any, axes: int) -> Any:
+    """All axes but the first few as one."""
+    return values.reshape(*values.shape[:axes], int(np.prod(values.shape[axes:])))
+
+
+def _tensor(array: ArrayLike) -> Any:
+    import torch
+
+    return torch.tensor(np.asarray(array, dtype=np.float64))

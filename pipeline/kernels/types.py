@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 FISHER_DIAGONAL_COLUMNS = 14
 GEOMETRY_COLUMNS = 45
+SMALLEST_HUBER = 1e-9  # its inverse, in float32, must leave room for residuals
+LARGEST_LOSS_WEIGHT = 1e9
+
+DepthKind: TypeAlias = Literal["blended", "ray_plane"]
+"""Depth of a Gaussian at a pixel: that of its centre, or of its mean along the ray (a flat disc: of its plane)."""
+DEPTH_KINDS: tuple[DepthKind, ...] = ("blended", "ray_plane")
+
+MaybeNone: TypeAlias = Any
+"""Marks what is None on request only, so that the many who never ask need not check."""
 
 
 @dataclass(frozen=True)
 class Render:
     """One view. color: [H, W, 3], RGB; depth: [H, W], metres, blended sum of weight * z, not divided by alpha;
-    alpha: [H, W], sum of the weights. float32 (float64 from the reference)."""
+    alpha: [H, W], sum of the weights. float32 (float64 from the reference). All zero where a mask is False."""
 
     color: NDArray[np.floating]
     depth: NDArray[np.floating]
@@ -25,15 +36,16 @@ class Render:
 class Gradients:
     """Derivatives of a scalar by the Gaussians, shapes and types as in `Gaussians`; zero where nothing was drawn.
 
-    pose: [6] float64, by the right tangent (translation m, rotation rad) of T_map_camera. fisher_diagonal: [n, 14],
-    sum over pixels of the squared per-pixel derivative, order mean 3, quaternion 4, log-scale 3, colour 3, logit 1.
+    All five are None if only the pose was asked for (parameters=False). pose: [6] float64, by the right tangent
+    (translation m, rotation rad) of T_map_camera. fisher_diagonal: [n, 14], sum over pixels of the squared per-pixel
+    derivative, order mean 3, quaternion 4, log-scale 3, colour 3, logit 1.
     """
 
-    means: NDArray[np.floating]
-    quats_wxyz: NDArray[np.floating]
-    log_scales: NDArray[np.floating]
-    colors: NDArray[np.floating]
-    opacity_logits: NDArray[np.floating]
+    means: NDArray[np.floating] | MaybeNone
+    quats_wxyz: NDArray[np.floating] | MaybeNone
+    log_scales: NDArray[np.floating] | MaybeNone
+    colors: NDArray[np.floating] | MaybeNone
+    opacity_logits: NDArray[np.floating] | MaybeNone
     pose: NDArray[np.float64] | None = None
     fisher_diagonal: NDArray[np.floating] | None = None
 
@@ -43,17 +55,28 @@ class FisherSums:
 
     geometry: float64 [n, 45], upper triangle, row by row, of the 9x9 information in (mean 3, vec log Sigma 6) in the
     frame of the Gaussians; 1/m^2 for the mean. color: float64 [n, 3]. opacity: float64 [n], of the logit.
-    observations: uint32 [n], views in which a pixel of non-zero weight saw the Gaussian.
+    observations: uint32 [n], views in which a pixel of non-zero precision saw the Gaussian. Over the pixels of
+    non-zero precision: weight: float64 [n], sum of the blending weights; residual: float64 [n], sum of weight times
+    the residual image, in its unit, so that residual / weight is the mean residual that the Gaussian answers for.
+    diagonal: float64 [n, 14] or None, of the information in (mean 3, quaternion 4 as given, log-scale 3, colour 3,
+    logit 1), the vector of paper eq. (3); summed on request only.
     """
 
-    def __init__(self, n: int) -> None:
+    def __init__(self, n: int, diagonal: bool = False) -> None:
         self.geometry = np.zeros((n, GEOMETRY_COLUMNS))
         self.color = np.zeros((n, 3))
         self.opacity = np.zeros(n)
         self.observations = np.zeros(n, dtype=np.uint32)
+        self.weight = np.zeros(n)
+        self.residual = np.zeros(n)
+        self.diagonal = np.zeros((n, FISHER_DIAGONAL_COLUMNS)) if diagonal else None
 
     def __len__(self) -> int:
         return len(self.opacity)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The sums by name, [n, ...] each; `diagonal` only if it was asked for."""
+        return {name: array for name, array in vars(self).items() if array is not None}
 
     def geometry_matrices(self) -> NDArray[np.float64]:
         """The symmetric 9x9 matrices [n, 9, 9]."""
@@ -62,3 +85,55 @@ class FisherSums:
         full[:, rows, columns] = self.geometry
         full[:, columns, rows] = self.geometry
         return full
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the loss of one view; the loss itself is `splat.losses.rgbd_loss`.
+
+    color_huber: colour residual (0..1) where the loss turns from quadratic to linear of slope 1. depth_huber_m: the
+    same of depth, metres. depth_weight: of one metre of depth against one unit of colour. alpha_weight: of missing
+    opacity where a depth was measured.
+    """
+
+    color_huber: float
+    depth_weight: float
+    depth_huber_m: float
+    alpha_weight: float
+
+    def __post_init__(self) -> None:
+        for name, least in (
+            ("color_huber", SMALLEST_HUBER),
+            ("depth_weight", 0.0),
+            ("depth_huber_m", SMALLEST_HUBER),
+            ("alpha_weight", 0.0),
+        ):
+            value = getattr(self, name)
+            if not (isinstance(value, Real) and least <= float(value) <= LARGEST_LOSS_WEIGHT):
+                raise ValueError(
+                    f"loss.{name} is {value!r}, expected a number from {least:g} to {LARGEST_LOSS_WEIGHT:g}"
+                )
+
+
+@dataclass(frozen=True)
+class ViewLoss:
+    """Loss of one view: value, the weighted sum of its terms; color (0..1) and depth (metres), the means of those
+    two terms before their weights; d_exposure, the derivatives of value by the exposure (a, b)."""
+
+    value: float
+    color: float
+    depth: float
+    d_exposure: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Work of the last view. visible: Gaussians on the screen. intersections: entries of all tile lists.
+    evaluated_pairs: pairs of pixel and Gaussian whose alpha was computed. blended_pairs: those that were drawn.
+    scratch_bytes: memory held between calls."""
+
+    visible: int
+    intersections: int
+    evaluated_pairs: int
+    blended_pairs: int
+    scratch_bytes: int

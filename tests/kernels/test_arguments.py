@@ -98,7 +98,7 @@ def test_precisions_that_cannot_be(name, bad):
     sums = FisherSums(5)
     with pytest.raises(ValueError, match=name):
         drawn().fisher(**images, sums=sums)
-    assert not any(np.any(array) for array in vars(sums).values())  # a refused view adds nothing
+    assert not any(np.any(array) for array in sums.arrays().values())  # a refused view adds nothing
 
 
 def test_sums_of_another_map():
@@ -137,7 +137,7 @@ def everything(gaussians: Gaussians, camera: PinholeCamera, isa: str) -> list[np
     return [
         *vars(render).values(),
         *vars(gradients).values(),
-        *vars(sums).values(),
+        *sums.arrays().values(),
         *rasterizer.contributions(),
     ]
 

@@ -1,6 +1,7 @@
-"""The same bits for any number of threads, any instruction set, any history of the scratch memory."""
+"""The same bits for any number of threads, any instruction set, any process, any load, any history of the memory."""
 
 import hashlib
+import multiprocessing
 from functools import cache
 
 import numpy as np
@@ -27,10 +28,10 @@ def digest(rasterizer: Rasterizer) -> str:
     arrays = [
         *vars(render).values(),
         *vars(gradients).values(),
-        *vars(sums).values(),
+        *sums.arrays().values(),
         *rasterizer.contributions(),
     ]
-    assert len(arrays) == 16
+    assert len(arrays) == 18
     return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
 
 
@@ -42,6 +43,39 @@ def one_digest() -> str:
 @pytest.mark.parametrize(("isa", "threads"), CALLS)
 def test_one_digest_for_threads_and_instruction_sets(isa, threads):
     assert digest(Rasterizer(isa, threads)) == one_digest()
+
+
+def digest_of(call: tuple[str, int]) -> str:
+    return digest(Rasterizer(*call))
+
+
+def test_one_digest_for_processes():
+    """Fresh processes, each with addresses and hash seeds of its own."""
+    with multiprocessing.get_context("spawn").Pool(2) as pool:
+        assert set(pool.map(digest_of, CALLS * 2, chunksize=len(CALLS))) == {one_digest()}
+
+
+def be_busy() -> None:
+    """Work without end, with caches and vector units."""
+    block = np.random.default_rng(0).random((400, 400))
+    while True:
+        block = block @ block / 200.0
+
+
+@pytest.mark.slow
+def test_one_digest_under_load():
+    """Two busy processes take the cores away in the middle of parallel sections."""
+    busy = [multiprocessing.get_context("spawn").Process(target=be_busy, daemon=True) for _ in range(2)]
+    for process in busy:
+        process.start()
+    try:
+        digests = {digest_of(call) for _ in range(12) for call in CALLS}
+        assert all(process.is_alive() for process in busy)
+    finally:
+        for process in busy:
+            process.terminate()
+            process.join()
+    assert digests == {one_digest()}
 
 
 def test_scratch_of_other_views_leaves_no_trace():

@@ -107,7 +107,7 @@ def test_information_is_positive_semidefinite(scene):
 def test_pixels_without_precision_say_nothing(plain):
     nothing = np.zeros((plain.camera.height, plain.camera.width), dtype=np.float32)
     sums = sums_of(plain, (nothing, nothing))
-    assert not any(np.any(array) for array in vars(sums).values())
+    assert not any(np.any(array) for array in sums.arrays().values())
 
 
 @pytest.mark.parametrize("kind", ["plain", "discs", "spheres"])
