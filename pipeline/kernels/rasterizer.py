@@ -2,12 +2,26 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels import _raster
-from pipeline.kernels.types import FISHER_DIAGONAL_COLUMNS, GEOMETRY_COLUMNS, FisherSums, Gradients, Render
+from pipeline.kernels.types import (
+    DEPTH_KINDS,
+    FISHER_DIAGONAL_COLUMNS,
+    GEOMETRY_COLUMNS,
+    DepthKind,
+    FisherSums,
+    Gradients,
+    LossWeights,
+    Render,
+    Statistics,
+    ViewLoss,
+)
 from pipeline.splat.gaussians import Gaussians
 
 MAX_SIDE_PX = 16384
@@ -17,6 +31,10 @@ LARGEST_LOG_SCALE = 40.0  # of metres; as in visibility.h
 ROTATION_TOLERANCE = 1e-4  # of R^T R - I; a pose read from six decimals passes
 
 Image = NDArray[np.float32]
+
+_NOTHING = np.zeros(0, dtype=np.float32)  # an optional array that is not given
+_NO_DOUBLES = np.zeros(0)
+_NO_MASK = np.zeros(0, dtype=np.uint8)
 
 _OK, _BAD_GAUSSIANS, _BAD_FIRST, _BAD_SECOND, _BAD_THIRD, _TOO_MANY = range(6)  # enum Status of frame.h
 
@@ -55,30 +73,100 @@ class Rasterizer:
         camera: PinholeCamera,
         T_camera_map: ArrayLike,
         background: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        depth: DepthKind = "blended",
+        mask: NDArray[np.bool_] | None = None,
     ) -> Render:
         """Draw the Gaussians (frame map) into the camera at T_camera_map [4, 4].
 
-        background: RGB seen where the Gaussians let light through; its depth is 0.
+        background: RGB seen where the Gaussians let light through; its depth is 0. depth: of a Gaussian at a pixel,
+        that of its centre ("blended") or its mean along the pixel's ray ("ray_plane": of a flat disc, that of its
+        plane). mask: bool [H, W]; where it is False nothing is drawn, all images are 0, and no derivative or
+        information is taken later.
         Raises ValueError, naming the argument, for what no camera or Gaussian can be.
         """
+        height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth)
+        color, depths, alpha = _empty(height, width, 3), _empty(height, width), _empty(height, width)
+        self._finish(gaussians, (height, width), self._raster.forward(*_arrays(gaussians), *view, color, depths, alpha))
+        return Render(color, depths, alpha)
+
+    def view_gradients(
+        self,
+        gaussians: Gaussians,
+        camera: PinholeCamera,
+        T_camera_map: ArrayLike,
+        color: Image,
+        depth_m: Image,
+        loss: LossWeights,
+        *,
+        exposure: tuple[float, float] = (0.0, 0.0),
+        background: ArrayLike = (0.0, 0.0, 0.0),
+        mask: NDArray[np.bool_] | None = None,
+        depth: DepthKind = "blended",
+        pose: bool = False,
+        parameters: bool = True,
+    ) -> tuple[ViewLoss, Gradients]:
+        """Forward, loss and backward of one view in one pass: `splat.losses.rgbd_loss` and its derivatives.
+
+        color: measured, float32 [H, W, 3], compared with exp(a) * rendered + b for exposure (a, b). depth_m: measured,
+        float32 [H, W], 0 where there is none. The rest as in `forward` and `backward`; `fisher` and the others may
+        follow as after a `forward`.
+        """
+        height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth)
+        measured = (
+            _checked_image("color", color, (height, width, 3), "the camera"),
+            _checked_image("depth_m", depth_m, (height, width), "the camera"),
+        )
+        gain, offset = _checked_exposure(exposure)
+        if not isinstance(loss, LossWeights):
+            raise ValueError(f"loss is {type(loss).__name__}, expected LossWeights")
+        weights = np.array(
+            [loss.color_huber, loss.depth_weight, loss.depth_huber_m, loss.alpha_weight, gain, offset], np.float32
+        )
+        _check_wanted(pose, parameters, fisher=False)
+        out = _outputs(gaussians, parameters)
+        by_pose, values = np.zeros(6 if pose else 0), np.zeros(5)
+        status = self._raster.fit(*_arrays(gaussians), *view, *measured, weights, values, *out, by_pose)
+        self._gaussians = None
+        _refuse_bad_image(status, ("color", "depth_m"), "a NaN or an infinity")
+        self._finish(gaussians, (height, width), status)
+        of_color, of_depth, missing, by_gain, by_offset = (float(value) for value in values)
+        value = of_color + loss.depth_weight * of_depth + loss.alpha_weight * missing
+        return (
+            ViewLoss(value, of_color, of_depth, (by_gain, by_offset)),
+            Gradients(*(out if parameters else [None] * 5), by_pose if pose else None),
+        )
+
+    def _view(
+        self,
+        gaussians: Gaussians,
+        camera: PinholeCamera,
+        T_camera_map: ArrayLike,
+        background: ArrayLike,
+        mask: NDArray[np.bool_] | None,
+        depth: DepthKind,
+    ) -> tuple[int, int, tuple[Any, ...]]:
+        """Height, width, and what the kernels take of a view, checked."""
         height, width, intrinsics = _checked_camera(camera)
         pose = _checked_pose("T_camera_map", T_camera_map)
         behind = _checked_background(background)
+        if depth not in DEPTH_KINDS:
+            raise ValueError(f"depth is {depth!r}, expected one of {', '.join(DEPTH_KINDS)}")
         if len(gaussians) > MAX_GAUSSIANS:
             raise ValueError(f"gaussians are {len(gaussians)}, expected at most {MAX_GAUSSIANS}")
+        wanted = _NO_MASK if mask is None else _checked_mask(mask, (height, width))
+        return height, width, (pose, intrinsics, behind, wanted, width, height, self.threads)
+
+    def _finish(self, gaussians: Gaussians, size: tuple[int, int], status: int) -> None:
+        """Remember what was drawn, or refuse what could not be."""
         self._gaussians = None
-        color, depth, alpha = _empty(height, width, 3), _empty(height, width), _empty(height, width)
-        status = self._raster.forward(
-            *_arrays(gaussians), pose, intrinsics, behind, width, height, self.threads, color, depth, alpha
-        )
         if status == _BAD_GAUSSIANS:
             raise ValueError(_complaint_about(gaussians))
         if status == _TOO_MANY:
             raise ValueError(
                 f"gaussians: {len(gaussians)} are so large on the screen that their tiles do not fit into memory"
             )
-        self._gaussians, self._size = gaussians, (height, width)
-        return Render(color, depth, alpha)
+        self._gaussians, self._size = gaussians, size
 
     def backward(
         self,
@@ -87,36 +175,39 @@ class Rasterizer:
         d_alpha: Image | None = None,
         pose: bool = False,
         fisher: bool = False,
+        parameters: bool = True,
     ) -> Gradients:
         """Derivatives of L from those of L by the images: float32 [H, W, 3], [H, W], [H, W]; None is zero.
 
         pose: also by the right tangent of T_map_camera. fisher: also the `empirical` diagonal, the sum over pixels
         of (d L_p / d theta)^2 with L_p = <d_color_p, color_p> + d_depth_p depth_p + d_alpha_p alpha_p: pass
-        cotangents without a 1/N in front.
+        cotangents without a 1/N in front. parameters: False takes the pose alone, which is cheaper.
         """
+        _check_wanted(pose, parameters, fisher)
         gaussians, (height, width) = self._last_forward()
         n = len(gaussians)
-        nothing = np.zeros((0, 0), dtype=np.float32)
         images = (
             _checked_image("d_color", d_color, (height, width, 3)),
-            nothing if d_depth is None else _checked_image("d_depth", d_depth, (height, width)),
-            nothing if d_alpha is None else _checked_image("d_alpha", d_alpha, (height, width)),
+            _NOTHING if d_depth is None else _checked_image("d_depth", d_depth, (height, width)),
+            _NOTHING if d_alpha is None else _checked_image("d_alpha", d_alpha, (height, width)),
         )
-        out = [_zeros(*array.shape) for array in _arrays(gaussians)]
+        out = _outputs(gaussians, parameters)
         by_pose = np.zeros(6 if pose else 0)
-        diagonal = _zeros(n if fisher else 0, FISHER_DIAGONAL_COLUMNS)
+        diagonal = _zeros(n, FISHER_DIAGONAL_COLUMNS) if fisher else _NOTHING
         status = self._raster.backward(*_arrays(gaussians), *images, *out, diagonal, by_pose)
         _refuse_bad_image(status, ("d_color", "d_depth", "d_alpha"), "a NaN or an infinity")
-        means, quats, log_scales, colors, logits = out
         return Gradients(
-            means, quats, log_scales, colors, logits, by_pose if pose else None, diagonal if fisher else None
+            *(out if parameters else [None] * 5), by_pose if pose else None, diagonal if fisher else None
         )
 
-    def fisher(self, inv_var_color: Image, inv_var_depth: Image, sums: FisherSums) -> None:
+    def fisher(
+        self, inv_var_color: Image, inv_var_depth: Image, sums: FisherSums, residual: Image | None = None
+    ) -> None:
         """Add the `gauss_newton` information of the last view, sum over pixels of J^T R^-1 J, to `sums`.
 
         inv_var_color: float32 [H, W], 1/sigma^2 of every colour channel; 0 leaves the pixel out.
-        inv_var_depth: float32 [H, W], 1/sigma^2 of the blended depth, 1/m^2; 0 leaves it out.
+        inv_var_depth: float32 [H, W], 1/sigma^2 of the depth as drawn, 1/m^2; 0 leaves it out.
+        residual: float32 [H, W], not negative; summed by weight into sums.residual.
         """
         gaussians, size = self._last_forward()
         n = len(gaussians)
@@ -126,15 +217,29 @@ class Rasterizer:
             "geometry": ((n, GEOMETRY_COLUMNS), np.float64),
             "color": ((n, 3), np.float64),
             "opacity": ((n,), np.float64),
+            "weight": ((n,), np.float64),
+            "residual": ((n,), np.float64),
             "observations": ((n,), np.uint32),
         }
+        if sums.diagonal is not None:
+            expected["diagonal"] = ((n, FISHER_DIAGONAL_COLUMNS), np.float64)
         for name, (shape, dtype) in expected.items():
             _check_array(f"sums.{name}", getattr(sums, name), shape, dtype)
         status = self._raster.fisher(
-            *_arrays(gaussians), color, depth, sums.geometry, sums.color, sums.opacity, sums.observations
+            *_arrays(gaussians),
+            color,
+            depth,
+            _NOTHING if residual is None else _checked_image("residual", residual, size),
+            sums.geometry,
+            sums.color,
+            sums.opacity,
+            sums.weight,
+            sums.residual,
+            _NO_DOUBLES if sums.diagonal is None else sums.diagonal,
+            sums.observations,
         )
         _refuse_bad_image(
-            status, ("inv_var_color", "inv_var_depth"), "a NaN, an infinity or a negative number"
+            status, ("inv_var_color", "inv_var_depth", "residual"), "a NaN, an infinity or a negative number"
         )
 
     def contributions(self) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
@@ -144,6 +249,14 @@ class Rasterizer:
         pixels = np.zeros(len(gaussians), dtype=np.uint32)
         self._raster.contributions(weights, pixels)
         return weights, pixels
+
+    def statistics(self) -> Statistics:
+        """The work of the last view."""
+        self._last_forward()
+        evaluated, blended = self._raster.pairs
+        return Statistics(
+            self._raster.visible, self._raster.intersections, evaluated, blended, self._raster.scratch_bytes
+        )
 
     def _last_forward(self) -> tuple[Gaussians, tuple[int, int]]:
         if self._gaussians is None:
@@ -160,6 +273,15 @@ def _zeros(*shape: int) -> NDArray[np.float32]:
     array = _empty(*shape)
     array.fill(0.0)
     return array
+
+
+def _outputs(gaussians: Gaussians, parameters: bool) -> list[NDArray[np.float32]]:
+    return [_zeros(*array.shape) if parameters else _NOTHING for array in _arrays(gaussians)]
+
+
+def _check_wanted(pose: bool, parameters: bool, fisher: bool) -> None:
+    if not parameters and (fisher or not pose):
+        raise ValueError("parameters is False, expected pose=True and fisher=False with it")
 
 
 def _arrays(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:
@@ -209,6 +331,23 @@ def _checked_background(background: ArrayLike) -> NDArray[np.float32]:
     return np.ascontiguousarray(color)
 
 
+def _checked_mask(mask: object, shape: tuple[int, int]) -> NDArray[np.uint8]:
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+        found = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise ValueError(f"mask is {found}, expected an array of bool")
+    if mask.shape != shape:
+        raise ValueError(f"mask has shape {mask.shape}, expected {shape}, the size of the camera")
+    return np.ascontiguousarray(mask).view(np.uint8)
+
+
+def _checked_exposure(exposure: tuple[float, float]) -> tuple[float, float]:
+    """Gain and offset of an exposure (a, b)."""
+    pair = np.asarray(exposure, dtype=np.float64)
+    if pair.shape != (2,) or not np.isfinite(pair).all() or abs(pair[0]) > 80:
+        raise ValueError(f"exposure is {exposure!r}, expected two finite numbers, the first within +-80")
+    return math.exp(pair[0]), float(pair[1])
+
+
 def _check_array(name: str, array: object, shape: tuple[int, ...], dtype: type) -> None:
     if not isinstance(array, np.ndarray) or array.dtype != dtype:
         found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
@@ -219,12 +358,14 @@ def _check_array(name: str, array: object, shape: tuple[int, ...], dtype: type) 
         raise ValueError(f"{name} is not a contiguous, writeable array")
 
 
-def _checked_image(name: str, image: object, shape: tuple[int, ...]) -> Image:
+def _checked_image(
+    name: str, image: object, shape: tuple[int, ...], given_by: str = "the last forward"
+) -> Image:
     if not isinstance(image, np.ndarray) or image.dtype != np.float32:
         found = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
         raise ValueError(f"{name} is {found}, expected an array of float32")
     if image.shape != shape:
-        raise ValueError(f"{name} has shape {image.shape}, expected {shape}, the size of the last forward")
+        raise ValueError(f"{name} has shape {image.shape}, expected {shape}, the size of {given_by}")
     return np.ascontiguousarray(image)
 
 

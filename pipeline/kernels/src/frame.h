@@ -81,12 +81,10 @@ struct StretchRecords {
 };
 
 constexpr int TILE = 16;                   // pixels; a tile is 16 blocks of 4x4, a block is one vector
-constexpr int TILE_PIXELS = TILE * TILE;
+constexpr int BLOCKS = 16;                 // of a tile
 constexpr int LIST_SPARE = 16;             // zeros behind the lists of tiles: readers load whole vectors
 constexpr int MOST_STRETCHES = 64;         // of the depth order, for as many threads; the lists do not depend on it
 constexpr int POSE_CHUNKS = 64;
-constexpr int GRADIENT_SUMS = 16;          // one cache line; 10 used
-constexpr int INFORMATION_SUMS = 24;       // 16 + 8
 
 // Everything between the calls of one rasterizer.
 struct Frame {
@@ -110,20 +108,41 @@ struct Frame {
     // Gaussians of each tile, by tile, then depth: index in `splats`, row of sums, bit b: may touch 4x4 block b.
     Scratch<uint32_t> list_splats, list_rows;
     Scratch<uint16_t> list_blocks;
-    Scratch<float> transmittance, stop;   // per tile, in block order; stop: list position at which a pixel closed
-    Scratch<float> gradient_rows, information_rows16, information_rows8;
-    Scratch<double> pose_parts;
+    // Gaussians of each block, left by the forward pass: position in the tile's list, and which pixels it was blended in. A
+    // tile's items begin at item_start, block after block; a batch is sixteen items of a block.
+    Scratch<uint32_t> item_start, block_items;  // tiles + 1; tiles * BLOCKS, how many
+    Scratch<uint32_t> item_positions;
+    Scratch<uint16_t> item_pixels;
+    Scratch<float> batch_T;                  // transmittance of a block's pixels before the first item of every batch
+    Scratch<uint64_t> evaluated;             // per tile: vectors whose alpha was computed
+    Scratch<Splat> tile_splats;              // per thread: the splats of one tile's list
+    size_t longest_list = 0;
+    Scratch<float> rows;                     // sums: of one Gaussian in one tile each
+    Scratch<double> pose_parts, loss_parts;  // loss_parts: [tiles, LOSS_SUMS]
 };
 
 struct GradientArrays {
-    float *means, *quats_wxyz, *log_scales, *colors, *opacity_logits;
+    float *means, *quats_wxyz, *log_scales, *colors, *opacity_logits;  // or all null: only the pose
     float* fisher_diagonal;  // [n, 14] or null
     double* pose;            // [6] or null
 };
 
 struct FisherArrays {
-    double *geometry, *color, *opacity;  // [n, 45], [n, 3], [n], added to
-    uint32_t* observations;              // [n], added to
+    double *geometry, *color, *opacity;  // [n, 45], [n, 3], [n], added to, as the others
+    double *weight, *residual;           // [n]
+    double* diagonal;                    // [n, 14] or null
+    uint32_t* observations;              // [n]
+};
+
+// The loss of a view against the measured colour [h, w, 3] and depth [h, w], metres, 0 where there is none.
+struct Loss {
+    const float *color, *depth_m;
+    float color_huber, depth_weight, depth_huber_m, alpha_weight;
+    float gain, offset;  // of the exposure: the image is about gain * rendered + offset
+};
+constexpr int LOSS_SUMS = 5;  // color, depth, missing alpha, derivatives by ln gain and by offset
+struct LossValues {
+    double color, depth, missing_alpha, by_log_gain, by_offset;  // means over their pixels
 };
 
 enum class Status { ok, bad_gaussians, bad_first_image, bad_second_image, bad_third_image, too_many_intersections };
@@ -135,9 +154,11 @@ struct Kernels {
     Status (*forward)(Frame&, const GaussianArrays&, float* color, float* depth, float* alpha);
     Status (*backward)(Frame&, const GaussianArrays&, const float* d_color, const float* d_depth,
                        const float* d_alpha, const GradientArrays&);
-    Status (*fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth,
+    // residual may be null.
+    Status (*fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth, const float* residual,
                      const FisherArrays&);
     void (*contributions)(Frame&, float* weights, uint32_t* pixels);
+    Status (*fit)(Frame&, const GaussianArrays&, const Loss&, LossValues&, const GradientArrays&);
 };
 
 }  // namespace raster

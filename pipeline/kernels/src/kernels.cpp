@@ -1,25 +1,16 @@
 // All kernels of one instruction set. Compiled once per set, with KERNEL_ISA the namespace of the build.
-#include "parameters.h"
+#include "fitting.h"
 
 namespace KERNEL_ISA {
 
 static Status forward(Frame& frame, const GaussianArrays& gaussians, float* color, float* depth, float* alpha) {
-    if (!project_all(frame, gaussians)) return Status::bad_gaussians;
-    sort_by_depth(frame, gaussians.count);
-    const Status status = bin(frame);
+    const Status status = make_lists(frame, gaussians);
     if (status != Status::ok) return status;
     const int tiles = frame.tiles_x * frame.tiles_y;
-    frame.transmittance.need(static_cast<size_t>(tiles) * TILE_PIXELS);
-    frame.stop.need(static_cast<size_t>(tiles) * TILE_PIXELS);
 #pragma omp parallel for schedule(dynamic, 4) num_threads(frame.threads) if (frame.threads > 1)
     for (int tile = 0; tile < tiles; tile++) blend_tile(frame, tile, color, depth, alpha);
     return Status::ok;
 }
-
-template <Squares S>
-struct Constant {
-    static constexpr Squares value = S;
-};
 
 // Runs a kernel over all tiles; reports the complaint about the first image before the second, whatever ran first.
 template <class TileKernel>
@@ -37,31 +28,27 @@ static Status over_tiles(Frame& frame, TileKernel kernel) {
     return bad1 ? Status::bad_first_image : bad2 ? Status::bad_second_image : bad3 ? Status::bad_third_image : Status::ok;
 }
 
+template <Derivatives D>
 static Status backward(Frame& frame, const GaussianArrays& gaussians, const float* d_color, const float* d_depth,
                        const float* d_alpha, const GradientArrays& out) {
-    frame.gradient_rows.need(frame.intersection_count * GRADIENT_SUMS);
-    if (out.fisher_diagonal) {
-        frame.information_rows16.need(frame.intersection_count * 16);
-        if (d_depth) frame.information_rows8.need(frame.intersection_count * 8);
-    }
-    const auto run = [&](auto squares) {
-        return over_tiles(frame, [&](int tile) {
-            return gradient_tile<decltype(squares)::value>(frame, tile, d_color, d_depth, d_alpha);
-        });
-    };
-    const Status status = !out.fisher_diagonal ? run(Constant<NO_SQUARES>())
-                          : d_depth            ? run(Constant<COLOR_AND_DEPTH_SQUARES>())
-                                               : run(Constant<COLOR_SQUARES>());
-    if (status == Status::ok) gradients_of_parameters(frame, gaussians, d_depth != nullptr, out);
+    frame.rows.need(frame.intersection_count * ROW_OF<D>);
+    const Status status = over_tiles(frame, [&](int tile) { return gradient_tile<D>(frame, tile, d_color, d_depth, d_alpha); });
+    if (status == Status::ok) gradients_of_parameters<D>(frame, gaussians, out);
     return status;
+}
+static Status backward(Frame& frame, const GaussianArrays& gaussians, const float* d_color, const float* d_depth,
+                       const float* d_alpha, const GradientArrays& out) {
+    const auto of = !out.means             ? backward<Derivatives::POSE>
+                    : !out.fisher_diagonal ? backward<Derivatives::ALL>
+                                           : backward<Derivatives::ALL_AND_SQUARES>;
+    return of(frame, gaussians, d_color, d_depth, d_alpha, out);
 }
 
 static Status fisher(Frame& frame, const GaussianArrays& gaussians, const float* inv_var_color, const float* inv_var_depth,
-                     const FisherArrays& out) {
-    frame.information_rows16.need(frame.intersection_count * 16);
-    frame.information_rows8.need(frame.intersection_count * 8);
+                     const float* residual, const FisherArrays& out) {
+    frame.rows.need(frame.intersection_count * INFORMATION_ROW);
     const Status status =
-        over_tiles(frame, [&](int tile) { return information_tile(frame, tile, inv_var_color, inv_var_depth); });
+        over_tiles(frame, [&](int tile) { return information_tile(frame, tile, inv_var_color, inv_var_depth, residual); });
     if (status != Status::ok) return status;
     const int groups = static_cast<int>(group_count(frame));
 #pragma omp parallel for schedule(dynamic, 16) num_threads(frame.threads) if (frame.threads > 1)
@@ -70,22 +57,44 @@ static Status fisher(Frame& frame, const GaussianArrays& gaussians, const float*
 }
 
 static void contributions(Frame& frame, float* weights, uint32_t* pixels) {
-    frame.gradient_rows.need(frame.intersection_count * GRADIENT_SUMS);
+    frame.rows.need(frame.intersection_count * GRADIENT_ROW);
     over_tiles(frame, [&](int tile) {
         contribution_tile(frame, tile);
         return Status::ok;
     });
-    const float* rows = frame.gradient_rows.data();
+    const float* rows = frame.rows.data();
     for (size_t i = 0; i < frame.visible; i++) {
         float weight = 0.0f;
         uint32_t count = 0;
         for (uint32_t row = frame.first_row.data()[i]; row < frame.first_row.data()[i + 1]; row++) {
-            weight += rows[static_cast<size_t>(row) * GRADIENT_SUMS];
-            count += static_cast<uint32_t>(rows[static_cast<size_t>(row) * GRADIENT_SUMS + 1]);
+            weight += rows[static_cast<size_t>(row) * GRADIENT_ROW];
+            count += static_cast<uint32_t>(rows[static_cast<size_t>(row) * GRADIENT_ROW + 1]);
         }
         weights[frame.visible_ids.data()[i]] = weight;
         pixels[frame.visible_ids.data()[i]] = count;
     }
+}
+
+template <Derivatives D>
+static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& loss, LossValues& values, const GradientArrays& out) {
+    Status status = make_lists(frame, gaussians);
+    if (status != Status::ok) return status;
+    const int tiles = frame.tiles_x * frame.tiles_y;
+    frame.rows.need(frame.intersection_count * ROW_OF<D>);
+    const double* parts = frame.loss_parts.need(static_cast<size_t>(tiles) * LOSS_SUMS);
+    const LossScales scales(PixelCounts(frame.view, loss.depth_m));
+    status = over_tiles(frame, [&](int tile) { return fit_tile<D>(frame, tile, loss, scales); });
+    if (status != Status::ok) return status;
+    double total[LOSS_SUMS] = {};
+    for (int tile = 0; tile < tiles; tile++)
+        for (int k = 0; k < LOSS_SUMS; k++) total[k] += parts[static_cast<size_t>(tile) * LOSS_SUMS + k];
+    values = {total[0] * scales.per_color, total[1] * scales.per_depth, total[2] * scales.per_depth,
+              total[3] * scales.per_color * loss.gain, total[4] * scales.per_color};
+    gradients_of_parameters<D>(frame, gaussians, out);
+    return Status::ok;
+}
+static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& loss, LossValues& values, const GradientArrays& out) {
+    return (out.means ? fit<Derivatives::ALL> : fit<Derivatives::POSE>)(frame, gaussians, loss, values, out);
 }
 
 }  // namespace KERNEL_ISA
@@ -96,5 +105,5 @@ static void contributions(Frame& frame, float* weights, uint32_t* pixels) {
 namespace raster {
 extern const Kernels KERNEL_TABLE;
 const Kernels KERNEL_TABLE = {AS_TEXT(KERNEL_ISA), KERNEL_ISA::forward, KERNEL_ISA::backward, KERNEL_ISA::fisher,
-                              KERNEL_ISA::contributions};
+                              KERNEL_ISA::contributions, KERNEL_ISA::fit};
 }  // namespace raster

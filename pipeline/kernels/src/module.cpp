@@ -1,15 +1,18 @@
 // The Python module: picks the build for this processor and hands numpy arrays to it.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <algorithm>
 #include <atomic>
 #include <cstdlib>
 #include <mutex>
 #include <new>
 #include <stdexcept>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "frame.h"
@@ -102,7 +105,12 @@ template <class T>
 using Array = nb::ndarray<T, nb::numpy, nb::c_contig, nb::device::cpu>;
 using Floats = Array<float>;
 using Inputs = Array<const float>;
+using Bytes = Array<const uint8_t>;  // empty: not given
 
+template <class A>
+static auto data_or_null(const A& array) {
+    return array.size() ? array.data() : nullptr;
+}
 static GaussianArrays arrays_of(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors,
                                 const Inputs& logits) {
     return {means.shape(0), means.data(), quats.data(), log_scales.data(), colors.data(), logits.data()};
@@ -124,9 +132,83 @@ public:
     size_t intersections() const { return frame_.intersection_count; }
 
     int forward(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
-                const Inputs& pose, const Inputs& intrinsics, const Inputs& background, int width, int height, int threads,
+                const Inputs& pose, const Inputs& intrinsics, const Inputs& background, const Bytes& mask, int width, int height, int threads,
                 const Floats& color, const Floats& depth, const Floats& alpha) {
         const Use use(busy_);
+        look(pose, intrinsics, background, mask, width, height, threads);
+        const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
+        const nb::gil_scoped_release unlocked;
+        return static_cast<int>(kernels_->forward(frame_, gaussians, color.data(), depth.data(), alpha.data()));
+    }
+
+    // Forward, loss and backward; weights: of the loss, then gain and offset. values: as LossValues.
+    int fit(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
+            const Inputs& pose, const Inputs& intrinsics, const Inputs& background, const Bytes& mask, int width, int height, int threads,
+            const Inputs& color, const Inputs& depth_m, const Inputs& weights, const Array<double>& values, const Floats& g_means,
+            const Floats& g_quats, const Floats& g_log_scales, const Floats& g_colors, const Floats& g_logits,
+            const Array<double>& g_pose) {
+        const Use use(busy_);
+        look(pose, intrinsics, background, mask, width, height, threads);
+        const float* w = weights.data();
+        const Loss loss = {color.data(), depth_m.data(), w[0], w[1], w[2], w[3], w[4], w[5]};
+        const GradientArrays out = {data_or_null(g_means),  data_or_null(g_quats), data_or_null(g_log_scales), data_or_null(g_colors),
+                                    data_or_null(g_logits), nullptr,               data_or_null(g_pose)};
+        const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
+        const nb::gil_scoped_release unlocked;
+        LossValues found = {};
+        const Status status = kernels_->fit(frame_, gaussians, loss, found, out);
+        const double all[LOSS_SUMS] = {found.color, found.depth, found.missing_alpha, found.by_log_gain, found.by_offset};
+        std::copy(all, all + LOSS_SUMS, values.data());
+        return static_cast<int>(status);
+    }
+
+    int backward(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
+                 const Inputs& d_color, const Inputs& d_depth, const Inputs& d_alpha, const Floats& g_means, const Floats& g_quats,
+                 const Floats& g_log_scales, const Floats& g_colors, const Floats& g_logits, const Floats& fisher,
+                 const Array<double>& pose) {
+        const Use use(busy_);
+        const GradientArrays out = {data_or_null(g_means), data_or_null(g_quats), data_or_null(g_log_scales), data_or_null(g_colors),
+                                    data_or_null(g_logits), data_or_null(fisher), data_or_null(pose)};
+        const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
+        const nb::gil_scoped_release unlocked;
+        return static_cast<int>(
+            kernels_->backward(frame_, gaussians, d_color.data(), data_or_null(d_depth), data_or_null(d_alpha), out));
+    }
+
+    int fisher(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
+               const Inputs& inv_var_color, const Inputs& inv_var_depth, const Inputs& residual, const Array<double>& geometry,
+               const Array<double>& color, const Array<double>& opacity, const Array<double>& weight,
+               const Array<double>& residuals, const Array<double>& diagonal, const Array<uint32_t>& observations) {
+        const Use use(busy_);
+        const FisherArrays out = {geometry.data(),  color.data(),           opacity.data(),     weight.data(),
+                                  residuals.data(), data_or_null(diagonal), observations.data()};
+        const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
+        const nb::gil_scoped_release unlocked;
+        return static_cast<int>(
+            kernels_->fisher(frame_, gaussians, inv_var_color.data(), inv_var_depth.data(), data_or_null(residual), out));
+    }
+
+    void contributions(const Floats& weights, const Array<uint32_t>& pixels) {
+        const Use use(busy_);
+        const nb::gil_scoped_release unlocked;
+        kernels_->contributions(frame_, weights.data(), pixels.data());
+    }
+
+    // Pairs of a pixel and a Gaussian in the last view: whose alpha was computed, that were blended.
+    std::pair<uint64_t, uint64_t> pairs() const {
+        uint64_t evaluated = 0, blended = 0;
+        for (int tile = 0; tile < frame_.tiles_x * frame_.tiles_y; tile++) {
+            evaluated += frame_.evaluated.data()[tile] * 16;
+            uint32_t items = 0;
+            for (int b = 0; b < BLOCKS; b++) items += frame_.block_items.data()[static_cast<size_t>(tile) * BLOCKS + b];
+            const uint16_t* pixels = frame_.item_pixels.data() + frame_.item_start.data()[tile];
+            for (uint32_t i = 0; i < items; i++) blended += static_cast<uint64_t>(__builtin_popcount(pixels[i]));
+        }
+        return {evaluated, blended};
+    }
+
+private:
+    void look(const Inputs& pose, const Inputs& intrinsics, const Inputs& background, const Bytes& mask, int width, int height, int threads) {
         View& view = frame_.view;
         for (int i = 0; i < 3; i++) {
             for (int k = 0; k < 3; k++) view.R[3 * i + k] = pose.data()[4 * i + k];
@@ -136,42 +218,10 @@ public:
         view.fx = intrinsics.data()[0], view.fy = intrinsics.data()[1];
         view.cx = intrinsics.data()[2], view.cy = intrinsics.data()[3];
         view.width = width, view.height = height;
+        mask_.assign(mask.data(), mask.data() + mask.size());  // the backward passes need it too
+        view.mask = mask_.empty() ? nullptr : mask_.data();
         frame_.threads = threads;
-        const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
-        const nb::gil_scoped_release unlocked;
-        return static_cast<int>(kernels_->forward(frame_, gaussians, color.data(), depth.data(), alpha.data()));
     }
-
-    int backward(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
-                 const Inputs& d_color, const Inputs& d_depth, const Inputs& d_alpha, const Floats& g_means, const Floats& g_quats,
-                 const Floats& g_log_scales, const Floats& g_colors, const Floats& g_logits, const Floats& fisher,
-                 const Array<double>& pose) {
-        const Use use(busy_);
-        const GradientArrays out = {g_means.data(), g_quats.data(), g_log_scales.data(), g_colors.data(), g_logits.data(),
-                                    fisher.size() ? fisher.data() : nullptr, pose.size() ? pose.data() : nullptr};
-        const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
-        const nb::gil_scoped_release unlocked;
-        const float *depth = d_depth.size() ? d_depth.data() : nullptr, *alpha = d_alpha.size() ? d_alpha.data() : nullptr;
-        return static_cast<int>(kernels_->backward(frame_, gaussians, d_color.data(), depth, alpha, out));
-    }
-
-    int fisher(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
-               const Inputs& inv_var_color, const Inputs& inv_var_depth, const Array<double>& geometry,
-               const Array<double>& color, const Array<double>& opacity, const Array<uint32_t>& observations) {
-        const Use use(busy_);
-        const FisherArrays out = {geometry.data(), color.data(), opacity.data(), observations.data()};
-        const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
-        const nb::gil_scoped_release unlocked;
-        return static_cast<int>(kernels_->fisher(frame_, gaussians, inv_var_color.data(), inv_var_depth.data(), out));
-    }
-
-    void contributions(const Floats& weights, const Array<uint32_t>& pixels) {
-        const Use use(busy_);
-        const nb::gil_scoped_release unlocked;
-        kernels_->contributions(frame_, weights.data(), pixels.data());
-    }
-
-private:
     // A call while another runs would write into its scratch memory.
     class Use {
     public:
@@ -185,6 +235,7 @@ private:
     };
     const Kernels* kernels_ = nullptr;
     Frame frame_;
+    std::vector<uint8_t> mask_;
     std::atomic_flag busy_ = ATOMIC_FLAG_INIT;
 };
 
@@ -197,7 +248,9 @@ NB_MODULE(_raster, m) {
         .def_prop_ro("isa", &Raster::isa)
         .def_prop_ro("visible", &Raster::visible)
         .def_prop_ro("intersections", &Raster::intersections)
+        .def_prop_ro("pairs", &Raster::pairs)
         .def("forward", &Raster::forward)
+        .def("fit", &Raster::fit)
         .def("backward", &Raster::backward)
         .def("fisher", &Raster::fisher)
         .def("contributions", &Raster::contributions);

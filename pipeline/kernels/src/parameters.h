@@ -1,7 +1,7 @@
 // From rows of screen sums to the parameters of every Gaussian, sixteen Gaussians at a time.
 #pragma once
 
-#include "blending.h"
+#include "sweeps.h"
 
 namespace KERNEL_ISA {
 
@@ -23,30 +23,25 @@ struct Group : Members {
         : Members(frame, group), parameters(gather_parameters(gaussians, ids)),
           splat(project16(frame.view, parameters.mean, parameters.quat, parameters.log_scale)) {}
 
-    // Sums of the rows of each Gaussian, in order of the rows; sums[k] holds column k < USED of the sixteen.
-    template <int WIDTH, int USED>
-    void reduce(const Frame& frame, const float* rows, Vec* sums) const {
-        alignas(64) float columns[USED][LANES];
+    // Sums of the rows of each Gaussian, in order of the rows; sums[k] holds column k.
+    template <int ROW>
+    void reduce(const Frame& frame, Vec* sums) const {
         const uint32_t* first_row = frame.first_row.data() + first;
+        Vec totals[ROW];
         for (int lane = 0; lane < LANES; lane++) {
-            alignas(64) float total[LANES];
             const int member = lane < lanes ? lane : 0;
-            sum_rows<WIDTH>(rows, first_row[member], first_row[member + 1], total);
-            for (int k = 0; k < USED; k++) columns[k][lane] = total[k];
+            const float *row = frame.rows.data() + static_cast<size_t>(first_row[member]) * ROW;
+            const float* end = frame.rows.data() + static_cast<size_t>(first_row[member + 1]) * ROW;
+            Vec total[ROW / LANES];
+            for (Vec& part : total) part = Vec(0.0f);
+            for (; row < end; row += ROW)
+                for (int k = 0; k < ROW / LANES; k++) total[k] += load(row + k * LANES);
+            for (int k = 0; k < ROW / LANES; k++) totals[k * LANES + lane] = total[k];
         }
-        for (int k = 0; k < USED; k++) sums[k] = load(columns[k]);
-    }
-    template <int WIDTH>
-    static void sum_rows(const float* rows, uint32_t begin, uint32_t end, float* total) {
-        if (WIDTH == LANES) {
-            Vec sum(0.0f);
-            for (uint32_t row = begin; row < end; row++) sum += load(rows + static_cast<size_t>(row) * WIDTH);
-            store(total, sum);
-            return;
+        for (int k = 0; k < ROW; k += LANES) {
+            transpose16(totals + k);
+            for (int i = 0; i < LANES; i++) sums[k + i] = totals[k + i];
         }
-        for (int k = 0; k < WIDTH; k++) total[k] = 0.0f;
-        for (uint32_t row = begin; row < end; row++)
-            for (int k = 0; k < WIDTH; k++) total[k] += rows[static_cast<size_t>(row) * WIDTH + k];
     }
 };
 
@@ -127,8 +122,8 @@ inline Vec quadratic_form(const ScreenGram& gram, int row, int column, const Vec
 
 // ---------------------------------------------------------------- gradients
 
-// Diagonal of sum_p (d L_p / d theta)^2, order mean 3, quaternion 4, log-scale 3, colour 3, logit 1.
-inline void empirical_diagonal(const View& view, const Splat16& s, Vec transparency, const Vec* info, Vec* diagonal) {
+// Diagonal of the information in mean 3, quaternion 4, log-scale 3, colour 3, logit 1; of_color: that of the colours.
+inline void diagonal_information(const View& view, const Splat16& s, Vec transparency, const Vec* info, const Vec* of_color, Vec* diagonal) {
     const ScreenGram gram(info);
     const ScreenDerivatives derivatives(view, s);
     Vec by_quat[3][4], by_scale[3][3];
@@ -148,34 +143,24 @@ inline void empirical_diagonal(const View& view, const Splat16& s, Vec transpare
     for (int i = 0; i < 3; i++) {
         const Vec column[3] = {by_scale[0][i], by_scale[1][i], by_scale[2][i]};
         diagonal[7 + i] = quadratic_form<3, 3>(gram, 2, 2, column, column);
-        diagonal[10 + i] = info[INFO_R + i];
+        diagonal[10 + i] = of_color[i];
     }
     diagonal[13] = transparency * transparency * info[INFO_1];
 }
 
-inline void gradient_group(const Frame& frame, const GaussianArrays& gaussians, size_t index, bool has_depth,
-                           const GradientArrays& out, double* pose) {
+template <Derivatives D>
+inline void gradient_group(const Frame& frame, const GaussianArrays& gaussians, size_t index, const GradientArrays& out, double* pose) {
     const Group group(frame, gaussians, index);
     const Splat16& s = group.splat;
-    Vec sums[GRADIENT_SUMS];
-    group.reduce<GRADIENT_SUMS, SUM_Z + 1>(frame, frame.gradient_rows.data(), sums);
+    Vec sums[ROW_OF<D>];
+    group.reduce<ROW_OF<D>>(frame, sums);
 
-    Vec Q[6], Y[6], d_J[6], centre[3] = {Vec(0.0f), Vec(0.0f), Vec(0.0f)}, mean[3], quat[4], log_scale[3];
+    Vec Q[6], Y[6], d_J[6], centre[3] = {Vec(0.0f), Vec(0.0f), Vec(0.0f)};
     own_axes_cotangent(s, covariance_cotangent(s, sums[SUM_WXX], sums[SUM_WXY], sums[SUM_WYY]), Q, Y);
     jacobian_cotangent(s, Q, d_J);
     add_centre_from_jacobian(s, d_J, centre);
     add_centre_from_moments(s, sums[SUM_WX], sums[SUM_WY], centre);
     centre[2] += sums[SUM_Z];
-    to_map_frame(frame.view, centre, mean);
-    quaternion_cotangent(s, Y, quat);
-    log_scale_cotangent(s, Y, log_scale);
-    const Vec transparency = sigmoid(-group.parameters.logit), logit = sums[SUM_W] * transparency;
-    scatter<3>(mean, group, out.means);
-    scatter<4>(quat, group, out.quats_wxyz);
-    scatter<3>(log_scale, group, out.log_scales);
-    scatter<3>(sums + SUM_R, group, out.colors);
-    scatter<1>(&logit, group, out.opacity_logits);
-
     if (out.pose) {
         Vec by_pose[6];
         alignas(64) float lanes[LANES];
@@ -185,21 +170,31 @@ inline void gradient_group(const Frame& frame, const GaussianArrays& gaussians, 
             for (int lane = 0; lane < group.lanes; lane++) pose[k] += lanes[lane];
         }
     }
-    if (out.fisher_diagonal) {
-        Vec info[INFORMATION_SUMS], diagonal[14];
-        group.reduce<16, 16>(frame, frame.information_rows16.data(), info);
-        for (int k = 16; k < INFORMATION_SUMS; k++) info[k] = Vec(0.0f);
-        if (has_depth) group.reduce<8, INFO_ZZ + 1 - 16>(frame, frame.information_rows8.data(), info + 16);
-        empirical_diagonal(frame.view, s, transparency, info, diagonal);
-        scatter<14>(diagonal, group, out.fisher_diagonal);
+    if constexpr (D != Derivatives::POSE) {
+        Vec mean[3], quat[4], log_scale[3];
+        to_map_frame(frame.view, centre, mean);
+        quaternion_cotangent(s, Y, quat);
+        log_scale_cotangent(s, Y, log_scale);
+        const Vec transparency = sigmoid(-group.parameters.logit), logit = sums[SUM_W] * transparency;
+        scatter<3>(mean, group, out.means);
+        scatter<4>(quat, group, out.quats_wxyz);
+        scatter<3>(log_scale, group, out.log_scales);
+        scatter<3>(sums + SUM_R, group, out.colors);
+        scatter<1>(&logit, group, out.opacity_logits);
+        if constexpr (D == Derivatives::ALL_AND_SQUARES) {
+            const Vec* info = sums + GRADIENT_SUMS;
+            Vec diagonal[14];
+            diagonal_information(frame.view, s, transparency, info, info + INFO_R, diagonal);
+            scatter<14>(diagonal, group, out.fisher_diagonal);
+        }
     }
 }
 
 inline size_t group_count(const Frame& frame) { return (frame.visible + LANES - 1) / LANES; }
 
 // Gradients of all drawn Gaussians; the pose sums in 64 fixed chunks, in double, added in order.
-inline void gradients_of_parameters(Frame& frame, const GaussianArrays& gaussians, bool has_depth,
-                                    const GradientArrays& out) {
+template <Derivatives D>
+inline void gradients_of_parameters(Frame& frame, const GaussianArrays& gaussians, const GradientArrays& out) {
     const size_t groups = group_count(frame);
     double* parts = frame.pose_parts.need(POSE_CHUNKS * 6);
     std::memset(parts, 0, sizeof(double) * POSE_CHUNKS * 6);
@@ -207,7 +202,7 @@ inline void gradients_of_parameters(Frame& frame, const GaussianArrays& gaussian
     for (int chunk = 0; chunk < POSE_CHUNKS; chunk++) {
         double pose[6] = {};
         for (size_t g = groups * chunk / POSE_CHUNKS; g < groups * (chunk + 1) / POSE_CHUNKS; g++)
-            gradient_group(frame, gaussians, g, has_depth, out, pose);
+            gradient_group<D>(frame, gaussians, g, out, pose);
         std::memcpy(parts + 6 * chunk, pose, sizeof pose);
     }
     if (!out.pose) return;
@@ -268,15 +263,21 @@ inline void geometry_information(const View& view, const Splat16& s, const Vec* 
 
 inline void information_group(const Frame& frame, const GaussianArrays& gaussians, size_t index, const FisherArrays& out) {
     const Group group(frame, gaussians, index);
-    Vec info[INFORMATION_SUMS], upper[45];
-    group.reduce<16, 16>(frame, frame.information_rows16.data(), info);
-    group.reduce<8, INFO_ZZ + 1 - 16>(frame, frame.information_rows8.data(), info + 16);
+    Vec info[INFORMATION_ROW], upper[45];
+    group.reduce<INFORMATION_ROW>(frame, info);
     geometry_information(frame.view, group.splat, info, upper);
     const Vec transparency = sigmoid(-group.parameters.logit), opacity = transparency * transparency * info[INFO_1];
     const Vec color[3] = {info[INFO_R], info[INFO_R], info[INFO_R]};
     scatter_add<45>(upper, group, out.geometry);
     scatter_add<3>(color, group, out.color);
     scatter_add<1>(&opacity, group, out.opacity);
+    scatter_add<1>(info + INFO_WEIGHT, group, out.weight);
+    scatter_add<1>(info + INFO_RESIDUAL, group, out.residual);
+    if (out.diagonal) {
+        Vec diagonal[14];
+        diagonal_information(frame.view, group.splat, transparency, info, color, diagonal);
+        scatter_add<14>(diagonal, group, out.diagonal);
+    }
     const uint32_t observed = bits(Vec(0.0f) < info[INFO_R] + info[INFO_ZZ]);
     for (int lane = 0; lane < group.lanes; lane++) out.observations[group.ids[lane]] += observed >> lane & 1;
 }

@@ -7,14 +7,28 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <utility>
 
 #if !defined(KERNEL_PORTABLE)
 #include <immintrin.h>
 #endif
 
+#define ALWAYS_INLINE __attribute__((always_inline))
+#define NO_INLINE __attribute__((noinline))  // a loop of its own, with the registers to itself
+
 namespace KERNEL_ISA {
 
 constexpr int LANES = 16;
+
+// step(0), ..., step(N - 1), each with its number as a constant: arrays indexed by it stay in registers.
+template <class Step, int... K>
+ALWAYS_INLINE inline void unrolled(Step&& step, std::integer_sequence<int, K...>) {
+    (step(std::integral_constant<int, K>{}), ...);
+}
+template <int N, class Step>
+ALWAYS_INLINE inline void unrolled(Step&& step) {
+    unrolled(step, std::make_integer_sequence<int, N>{});
+}
 
 #if !defined(KERNEL_PORTABLE) && defined(__AVX512F__)
 
@@ -39,6 +53,7 @@ inline Vec fnma(Vec a, Vec b, Vec c) { return _mm512_fnmadd_ps(a.v, b.v, c.v); }
 inline Vec min(Vec a, Vec b) { return _mm512_min_ps(a.v, b.v); }                  // b where either is NaN
 inline Vec max(Vec a, Vec b) { return _mm512_max_ps(a.v, b.v); }
 inline Vec sqrt(Vec a) { return _mm512_sqrt_ps(a.v); }
+inline void pin(Vec& a) { asm("" : "+v"(a.v)); }  // computed here, not later: keeps independent chains side by side
 inline Mask operator>=(Vec a, Vec b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
 inline Mask operator<=(Vec a, Vec b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LE_OQ)}; }
 inline Mask operator<(Vec a, Vec b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_LT_OQ)}; }
@@ -46,6 +61,7 @@ inline Mask operator&(Mask a, Mask b) { return {(__mmask16)(a.bits & b.bits)}; }
 inline Vec select(Mask m, Vec a, Vec b) { return _mm512_mask_blend_ps(m.bits, b.v, a.v); }  // m ? a : b
 inline Vec select_or_zero(Mask m, Vec a) { return _mm512_maskz_mov_ps(m.bits, a.v); }
 inline uint32_t bits(Mask m) { return m.bits; }
+inline Mask mask_of_bits(uint32_t b) { return {(__mmask16)b}; }
 inline bool any(Mask m) { return m.bits != 0; }
 
 // 2^n x for an integer n held in the low mantissa bits of `shifted` (see exp2)
@@ -61,27 +77,33 @@ inline void split_exponent(Vec x, Vec& mantissa, Vec& exponent) {
         _mm512_or_si512(_mm512_and_si512(i, _mm512_set1_epi32(0x007fffff)), _mm512_set1_epi32(0x3f800000)));
 }
 
-// Each 128-bit part of the result holds that part's lane sums of a[0..3].
-inline __m512 sum_quads(const Vec* a) {
-    const __m512 s = _mm512_add_ps(_mm512_unpacklo_ps(a[0].v, a[1].v), _mm512_unpackhi_ps(a[0].v, a[1].v));
-    const __m512 t = _mm512_add_ps(_mm512_unpacklo_ps(a[2].v, a[3].v), _mm512_unpackhi_ps(a[2].v, a[3].v));
-    const __m512d x = _mm512_castps_pd(s), y = _mm512_castps_pd(t);
-    return _mm512_add_ps(_mm512_castpd_ps(_mm512_unpacklo_pd(x, y)), _mm512_castpd_ps(_mm512_unpackhi_pd(x, y)));
+// Four rows of four floats, `stride` floats apart.
+inline Vec load4x4(const float* p, size_t stride) {
+    const __m256 top = _mm256_set_m128(_mm_loadu_ps(p + stride), _mm_loadu_ps(p));
+    const __m256 bottom = _mm256_set_m128(_mm_loadu_ps(p + 3 * stride), _mm_loadu_ps(p + 2 * stride));
+    return _mm512_insertf32x8(_mm512_castps256_ps512(top), bottom, 1);
 }
-inline __m512 sum_parts(__m512 x, __m512 y) {
-    return _mm512_add_ps(_mm512_shuffle_f32x4(x, y, 0x88), _mm512_shuffle_f32x4(x, y, 0xdd));
+inline void store4x4(float* p, size_t stride, Vec a) {
+    _mm_storeu_ps(p, _mm512_castps512_ps128(a.v));
+    _mm_storeu_ps(p + stride, _mm512_extractf32x4_ps(a.v, 1));
+    _mm_storeu_ps(p + 2 * stride, _mm512_extractf32x4_ps(a.v, 2));
+    _mm_storeu_ps(p + 3 * stride, _mm512_extractf32x4_ps(a.v, 3));
 }
-// out[i] = sum of the lanes of a[i], i < 16; out 64-byte aligned
-inline void store_sums16(float* out, const Vec* a) {
-    const __m512 low = sum_parts(sum_quads(a), sum_quads(a + 4));
-    const __m512 high = sum_parts(sum_quads(a + 8), sum_quads(a + 12));
-    _mm512_store_ps(out, sum_parts(low, high));
+// Within every four lanes: the elements A, B, C, D.
+template <int A, int B, int C, int D>
+inline Vec permute4(Vec a) {
+    return _mm512_permute_ps(a.v, A | B << 2 | C << 4 | D << 6);
 }
-// out[i] = sum of the lanes of a[i], i < 8; out 32-byte aligned
-inline void store_sums8(float* out, const Vec* a) {
-    const __m512 low = sum_parts(sum_quads(a), sum_quads(a + 4));
-    _mm256_store_ps(out, _mm512_castps512_ps256(sum_parts(low, low)));
+// Within every four lanes: from a where bit of FROM_A, from b where bit of FROM_B, else from c.
+template <int FROM_A, int FROM_B>
+inline Vec merge4(Vec a, Vec b, Vec c) {
+    return _mm512_mask_blend_ps(FROM_A * 0x1111, _mm512_mask_blend_ps(FROM_B * 0x1111, c.v, b.v), a.v);
 }
+
+using Wide = Vec;  // lanes that stand for Gaussians
+constexpr int PARTS = 1;  // of a Vec
+inline Wide part(const Vec& a, int) { return a; }
+inline void set_part(Vec& a, int, Wide x) { a = x; }
 
 #elif !defined(KERNEL_PORTABLE) && defined(__AVX2__)
 
@@ -113,6 +135,7 @@ inline Vec fnma(Vec x, Vec y, Vec z) {
 inline Vec min(Vec x, Vec y) { return {_mm256_min_ps(x.a, y.a), _mm256_min_ps(x.b, y.b)}; }
 inline Vec max(Vec x, Vec y) { return {_mm256_max_ps(x.a, y.a), _mm256_max_ps(x.b, y.b)}; }
 inline Vec sqrt(Vec x) { return {_mm256_sqrt_ps(x.a), _mm256_sqrt_ps(x.b)}; }
+inline void pin(Vec& x) { asm("" : "+x"(x.a), "+x"(x.b)); }
 inline Mask operator>=(Vec x, Vec y) {
     return {_mm256_cmp_ps(x.a, y.a, _CMP_GE_OQ), _mm256_cmp_ps(x.b, y.b, _CMP_GE_OQ)};
 }
@@ -129,6 +152,12 @@ inline Vec select(Mask m, Vec x, Vec y) {
 inline Vec select_or_zero(Mask m, Vec x) { return {_mm256_and_ps(m.a, x.a), _mm256_and_ps(m.b, x.b)}; }
 inline uint32_t bits(Mask m) {
     return (uint32_t)_mm256_movemask_ps(m.a) | ((uint32_t)_mm256_movemask_ps(m.b) << 8);
+}
+inline Mask mask_of_bits(uint32_t b) {
+    const __m256i all = _mm256_set1_epi32(static_cast<int>(b));
+    const __m256i low = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128), high = _mm256_slli_epi32(low, 8);
+    return {_mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(all, low), low)),
+            _mm256_castsi256_ps(_mm256_cmpeq_epi32(_mm256_and_si256(all, high), high))};
 }
 inline bool any(Mask m) { return _mm256_movemask_ps(_mm256_or_ps(m.a, m.b)) != 0; }
 
@@ -150,27 +179,42 @@ inline void split_exponent(Vec x, Vec& mantissa, Vec& exponent) {
     split_exponent(x.b, mantissa.b, exponent.b);
 }
 
-// The tree of the AVX-512 build: lanes within 128 bits, then the parts 0+1 and 2+3, then both halves.
-inline __m256 sum_quads(__m256 a0, __m256 a1, __m256 a2, __m256 a3) {
-    const __m256 s = _mm256_add_ps(_mm256_unpacklo_ps(a0, a1), _mm256_unpackhi_ps(a0, a1));
-    const __m256 t = _mm256_add_ps(_mm256_unpacklo_ps(a2, a3), _mm256_unpackhi_ps(a2, a3));
-    const __m256d x = _mm256_castps_pd(s), y = _mm256_castps_pd(t);
-    return _mm256_add_ps(_mm256_castpd_ps(_mm256_unpacklo_pd(x, y)), _mm256_castpd_ps(_mm256_unpackhi_pd(x, y)));
+inline Vec load4x4(const float* p, size_t stride) {
+    return {_mm256_set_m128(_mm_loadu_ps(p + stride), _mm_loadu_ps(p)),
+            _mm256_set_m128(_mm_loadu_ps(p + 3 * stride), _mm_loadu_ps(p + 2 * stride))};
 }
-inline __m128 sum_halves(__m256 x) { return _mm_add_ps(_mm256_castps256_ps128(x), _mm256_extractf128_ps(x, 1)); }
-inline void store_sums4(float* out, const Vec* a) {
-    const __m256 low = sum_quads(a[0].a, a[1].a, a[2].a, a[3].a);
-    const __m256 high = sum_quads(a[0].b, a[1].b, a[2].b, a[3].b);
-    _mm_store_ps(out, _mm_add_ps(sum_halves(low), sum_halves(high)));
+inline void store4x4(float* p, size_t stride, Vec x) {
+    _mm_storeu_ps(p, _mm256_castps256_ps128(x.a));
+    _mm_storeu_ps(p + stride, _mm256_extractf128_ps(x.a, 1));
+    _mm_storeu_ps(p + 2 * stride, _mm256_castps256_ps128(x.b));
+    _mm_storeu_ps(p + 3 * stride, _mm256_extractf128_ps(x.b, 1));
 }
-inline void store_sums8(float* out, const Vec* a) {
-    store_sums4(out, a);
-    store_sums4(out + 4, a + 4);
+template <int A, int B, int C, int D>
+inline Vec permute4(Vec x) {
+    constexpr int order = A | B << 2 | C << 4 | D << 6;
+    return {_mm256_permute_ps(x.a, order), _mm256_permute_ps(x.b, order)};
 }
-inline void store_sums16(float* out, const Vec* a) {
-    store_sums8(out, a);
-    store_sums8(out + 8, a + 8);
+template <int FROM_A, int FROM_B>
+inline Vec merge4(Vec x, Vec y, Vec z) {
+    return {_mm256_blend_ps(_mm256_blend_ps(z.a, y.a, FROM_B * 0x11), x.a, FROM_A * 0x11),
+            _mm256_blend_ps(_mm256_blend_ps(z.b, y.b, FROM_B * 0x11), x.b, FROM_A * 0x11)};
 }
+
+// Lanes that stand for Gaussians: half as many, so that their sums stay in the sixteen registers.
+struct Wide {
+    __m256 v;
+    Wide() = default;
+    Wide(__m256 x) : v(x) {}
+    Wide(float s) : v(_mm256_set1_ps(s)) {}
+};
+constexpr int PARTS = 2;
+inline Wide part(const Vec& x, int k) { return k ? x.b : x.a; }
+inline void set_part(Vec& x, int k, Wide w) { (k ? x.b : x.a) = w.v; }
+inline Wide operator+(Wide a, Wide b) { return _mm256_add_ps(a.v, b.v); }
+inline Wide operator-(Wide a, Wide b) { return _mm256_sub_ps(a.v, b.v); }
+inline Wide operator*(Wide a, Wide b) { return _mm256_mul_ps(a.v, b.v); }
+inline Wide fma(Wide a, Wide b, Wide c) { return _mm256_fmadd_ps(a.v, b.v, c.v); }
+inline Wide& operator+=(Wide& a, Wide b) { return a = a + b; }
 
 #else  // portable: vectors of the compiler, which become SSE2, NEON or plain loops
 
@@ -215,6 +259,7 @@ inline Vec select(Mask m, Vec a, Vec b) { return as_float((as_int(a.v) & m.m) | 
 inline Vec select_or_zero(Mask m, Vec a) { return as_float(as_int(a.v) & m.m); }
 inline Vec min(Vec a, Vec b) { return select(a < b, a, b); }
 inline Vec max(Vec a, Vec b) { return select(b < a, a, b); }
+inline void pin(Vec&) {}
 inline Vec sqrt(Vec a) {
     Vec r;
     for (int i = 0; i < LANES; i++) r.v[i] = __builtin_sqrtf(a.v[i]);
@@ -223,6 +268,11 @@ inline Vec sqrt(Vec a) {
 inline uint32_t bits(Mask m) {
     uint32_t r = 0;
     for (int i = 0; i < LANES; i++) r |= (uint32_t)(m.m[i] & 1) << i;
+    return r;
+}
+inline Mask mask_of_bits(uint32_t b) {
+    Mask r;
+    for (int i = 0; i < LANES; i++) r.m[i] = -static_cast<int32_t>(b >> i & 1);
     return r;
 }
 inline bool any(Mask m) {
@@ -281,18 +331,31 @@ inline void split_exponent(Vec x, Vec& mantissa, Vec& exponent) {
     mantissa = as_float((i & 0x007fffff) | 0x3f800000);
 }
 
-// The tree of the AVX-512 build.
-inline float sum_lanes(Vec a) {
-    float part[4];
-    for (int p = 0; p < 4; p++) part[p] = (a.v[4 * p] + a.v[4 * p + 2]) + (a.v[4 * p + 1] + a.v[4 * p + 3]);
-    return (part[0] + part[1]) + (part[2] + part[3]);
+inline Vec load4x4(const float* p, size_t stride) {
+    Vec r;
+    for (int i = 0; i < LANES; i++) r.v[i] = p[i / 4 * stride + i % 4];
+    return r;
 }
-inline void store_sums8(float* out, const Vec* a) {
-    for (int i = 0; i < 8; i++) out[i] = sum_lanes(a[i]);
+inline void store4x4(float* p, size_t stride, Vec a) {
+    for (int i = 0; i < LANES; i++) p[i / 4 * stride + i % 4] = a.v[i];
 }
-inline void store_sums16(float* out, const Vec* a) {
-    for (int i = 0; i < 16; i++) out[i] = sum_lanes(a[i]);
+template <int A, int B, int C, int D>
+inline Vec permute4(Vec a) {
+    constexpr int from[4] = {A, B, C, D};
+    Vec r;
+    for (int i = 0; i < LANES; i++) r.v[i] = a.v[i / 4 * 4 + from[i % 4]];
+    return r;
 }
+template <int FROM_A, int FROM_B>
+inline Vec merge4(Vec a, Vec b, Vec c) {
+    Vec r;
+    for (int i = 0; i < LANES; i++) r.v[i] = FROM_A >> i % 4 & 1 ? a.v[i] : FROM_B >> i % 4 & 1 ? b.v[i] : c.v[i];
+    return r;
+}
+using Wide = Vec;
+constexpr int PARTS = 1;
+inline Wide part(const Vec& a, int) { return a; }
+inline void set_part(Vec& a, int, Wide x) { a = x; }
 
 #endif
 

@@ -62,6 +62,60 @@ inline void store_rows16(float* rows, const Vec* columns) {
     }
 }
 
+// Rows become columns.
+inline void transpose16(Vec* a) {
+    __m512 quads[4][4];  // [k][c]: part p holds column 4 p + c of rows 4 k..
+    for (int k = 0; k < 4; k++) transpose_quads(a[4 * k].v, a[4 * k + 1].v, a[4 * k + 2].v, a[4 * k + 3].v, quads[k]);
+    for (int c = 0; c < 4; c++) {
+        __m512 out[4];
+        transpose_parts(quads[0][c], quads[1][c], quads[2][c], quads[3][c], out);
+        for (int p = 0; p < 4; p++) a[4 * p + c] = out[p];
+    }
+}
+// columns[k] = element k of sixteen rows, k < 8; row(i): where row i begins, 32-byte aligned.
+template <class Row>
+inline void load_columns8(Row row, Vec* columns) {
+    __m512 pairs[8], low[4], high[4];  // pairs: of rows i and i + 4, i + 8 and i + 12
+    for (int i = 0; i < 8; i++) {
+        const int first = i / 4 * 8 + i % 4;
+        pairs[i] = _mm512_insertf32x8(_mm512_castps256_ps512(_mm256_load_ps(row(first))), _mm256_load_ps(row(first + 4)), 1);
+    }
+    transpose_quads(pairs[0], pairs[1], pairs[2], pairs[3], low);
+    transpose_quads(pairs[4], pairs[5], pairs[6], pairs[7], high);
+    for (int i = 0; i < 4; i++) {
+        columns[i] = _mm512_shuffle_f32x4(low[i], high[i], 0x88);
+        columns[4 + i] = _mm512_shuffle_f32x4(low[i], high[i], 0xdd);
+    }
+}
+
+// Appends the positions i < count at which words[i] has the bit, in order; returns how many. May write 15 beyond the
+// last, and reads 15 words beyond.
+inline uint32_t positions_with_bit(const uint16_t* words, uint32_t count, int bit, uint32_t* out) {
+    const __m256i test = _mm256_set1_epi16(static_cast<short>(1 << bit));
+    __m512i position = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    uint32_t found = 0;
+    for (uint32_t i = 0; i < count; i += 16) {
+        const uint32_t left = count - i, inside = left < 16 ? (1u << left) - 1 : 0xffffu;
+        const __m256i word = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(words + i));
+        const uint32_t hit = _mm256_test_epi16_mask(word, test) & inside;
+        _mm512_storeu_si512(out + found, _mm512_maskz_compress_epi32(static_cast<__mmask16>(hit), position));
+        found += static_cast<uint32_t>(__builtin_popcount(hit));
+        position = _mm512_add_epi32(position, _mm512_set1_epi32(16));
+    }
+    return found;
+}
+// The first `count` of sixteen numbers, then the first of them again; reads all sixteen.
+inline void load_positions(const uint32_t* numbers, int count, uint32_t* out) {
+    const __mmask16 real = static_cast<__mmask16>((1u << count) - 1);
+    const __m512i first = _mm512_set1_epi32(static_cast<int>(numbers[0]));
+    _mm512_store_si512(out, _mm512_mask_mov_epi32(first, real, _mm512_loadu_si512(numbers)));
+}
+// The first `count` of sixteen words, then zeros; reads all sixteen.
+inline void load_words(const uint16_t* words, int count, uint16_t* out) {
+    const __mmask16 real = static_cast<__mmask16>((1u << count) - 1);
+    _mm256_store_si256(reinterpret_cast<__m256i*>(out), _mm256_maskz_mov_epi16(real, _mm256_loadu_si256(reinterpret_cast<const __m256i*>(words))));
+}
+
 #elif !defined(KERNEL_PORTABLE) && defined(__AVX2__)
 
 inline __m256 load_parts(const float* low, const float* high) {
@@ -114,6 +168,63 @@ inline void store_rows16(float* rows, const Vec* columns) {
     }
 }
 
+// Rows and columns exchanged in a quarter of a 16x16 matrix.
+inline void transpose8(__m256* a) {
+    __m256 left[4], right[4];  // columns c and 4 + c of rows 0..3, of rows 4..7
+    transpose_quads(a[0], a[1], a[2], a[3], left);
+    transpose_quads(a[4], a[5], a[6], a[7], right);
+    for (int c = 0; c < 4; c++) {
+        a[c] = _mm256_permute2f128_ps(left[c], right[c], 0x20);
+        a[4 + c] = _mm256_permute2f128_ps(left[c], right[c], 0x31);
+    }
+}
+inline void transpose16(Vec* v) {
+    __m256 quarters[4][8];
+    for (int i = 0; i < 8; i++) {
+        quarters[0][i] = v[i].a, quarters[1][i] = v[i].b;
+        quarters[2][i] = v[8 + i].a, quarters[3][i] = v[8 + i].b;
+    }
+    for (auto& quarter : quarters) transpose8(quarter);
+    for (int i = 0; i < 8; i++) {
+        v[i] = {quarters[0][i], quarters[2][i]};
+        v[8 + i] = {quarters[1][i], quarters[3][i]};
+    }
+}
+template <class Row>
+inline void load_columns8(Row row, Vec* columns) {
+    __m256 low[8], high[8];
+    for (int i = 0; i < 8; i++) low[i] = _mm256_load_ps(row(i)), high[i] = _mm256_load_ps(row(8 + i));
+    transpose8(low);
+    transpose8(high);
+    for (int i = 0; i < 8; i++) columns[i] = {low[i], high[i]};
+}
+inline uint32_t positions_with_bit(const uint16_t* words, uint32_t count, int bit, uint32_t* out) {
+    uint32_t found = 0;
+    const __m256i test = _mm256_set1_epi16(static_cast<short>(1 << bit));
+    for (uint32_t i = 0; i < count; i += 16) {
+        const uint32_t left = count - i, inside = left < 16 ? (1u << left) - 1 : 0xffffu;
+        const __m256i word = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(words + i));
+        const __m256i equal = _mm256_cmpeq_epi16(_mm256_and_si256(word, test), test);
+        const __m128i bytes = _mm_packs_epi16(_mm256_castsi256_si128(equal), _mm256_extracti128_si256(equal, 1));
+        for (uint32_t hit = static_cast<uint32_t>(_mm_movemask_epi8(bytes)) & inside; hit; hit &= hit - 1)
+            out[found++] = i + static_cast<uint32_t>(__builtin_ctz(hit));
+    }
+    return found;
+}
+inline void load_positions(const uint32_t* numbers, int count, uint32_t* out) {
+    const __m256i first = _mm256_set1_epi32(static_cast<int>(numbers[0])), last = _mm256_set1_epi32(count);
+    for (int i = 0; i < 16; i += 8) {
+        const __m256i number = _mm256_add_epi32(_mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7), _mm256_set1_epi32(i));
+        const __m256i all = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(numbers + i));
+        _mm256_store_si256(reinterpret_cast<__m256i*>(out + i), _mm256_blendv_epi8(first, all, _mm256_cmpgt_epi32(last, number)));
+    }
+}
+inline void load_words(const uint16_t* words, int count, uint16_t* out) {
+    const __m256i number = _mm256_setr_epi16(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+    const __m256i real = _mm256_cmpgt_epi16(_mm256_set1_epi16(static_cast<short>(count)), number);
+    _mm256_store_si256(reinterpret_cast<__m256i*>(out), _mm256_and_si256(real, _mm256_loadu_si256(reinterpret_cast<const __m256i*>(words))));
+}
+
 #else
 
 template <int WIDTH>
@@ -123,6 +234,31 @@ inline void load_rows(const float* rows, Vec* columns) {
 }
 inline void load_rows3(const float* rows, Vec* columns) { load_rows<3>(rows, columns); }
 inline void load_rows4(const float* rows, Vec* columns) { load_rows<4>(rows, columns); }
+inline void transpose16(Vec* a) {
+    Vec t[16];
+    for (int i = 0; i < 16; i++)
+        for (int k = 0; k < 16; k++) t[i].v[k] = a[k].v[i];
+    for (int i = 0; i < 16; i++) a[i] = t[i];
+}
+template <class Row>
+inline void load_columns8(Row row, Vec* columns) {
+    for (int k = 0; k < 8; k++)
+        for (int i = 0; i < LANES; i++) columns[k].v[i] = row(i)[k];
+}
+inline uint32_t positions_with_bit(const uint16_t* words, uint32_t count, int bit, uint32_t* out) {
+    uint32_t found = 0;
+    for (uint32_t i = 0; i < count; i++) {
+        out[found] = i;
+        found += words[i] >> bit & 1;
+    }
+    return found;
+}
+inline void load_positions(const uint32_t* numbers, int count, uint32_t* out) {
+    for (int i = 0; i < 16; i++) out[i] = numbers[i < count ? i : 0];
+}
+inline void load_words(const uint16_t* words, int count, uint16_t* out) {
+    for (int i = 0; i < 16; i++) out[i] = i < count ? words[i] : 0;
+}
 inline void store_rows16(float* rows, const Vec* columns) {
     for (int lane = 0; lane < LANES; lane++)
         for (int k = 0; k < 16; k++) rows[16 * lane + k] = columns[k].v[lane];

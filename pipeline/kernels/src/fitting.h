@@ -1,0 +1,120 @@
+// Forward, loss and backward of one view in one pass over the tiles: what a block just blended is still near when its
+// derivatives are taken, and no image is written or read back.
+//
+// Per pixel, with h the Huber function of slope 1 in its tail: h(e^a colour + b - measured colour), and where a depth z was
+// measured h(depth - alpha z) and 1 - alpha; each term a mean over its pixels (splat.losses.rgbd_loss).
+#pragma once
+
+#include "parameters.h"
+
+namespace KERNEL_ISA {
+
+// slope = clip(r / delta, -1, 1), value = slope (r - delta slope / 2)
+struct Huber {
+    Vec slope, value;
+    Huber(Vec residual, float delta)
+        : slope(max(min(residual * Vec(1.0f / delta), Vec(1.0f)), Vec(-1.0f))), value(slope * fnma(Vec(0.5f * delta), slope, residual)) {}
+};
+
+// Pixels that count for the colour, and for the depth.
+struct PixelCounts {
+    size_t color = 0, depth = 0;
+    PixelCounts(const View& view, const float* depth_image) {
+        const size_t pixels = static_cast<size_t>(view.width) * view.height;
+        for (size_t i = 0; i < pixels; i++) {
+            const bool wanted = !view.mask || view.mask[i];
+            color += wanted;
+            depth += wanted && depth_image[i] > 0.0f;
+        }
+    }
+};
+
+struct LossScales {
+    float per_color, per_depth;  // 1 / number of terms
+    LossScales(const PixelCounts& counts)
+        : per_color(1.0f / static_cast<float>(counts.color ? 3 * counts.color : 1)),
+          per_depth(1.0f / static_cast<float>(counts.depth ? counts.depth : 1)) {}
+};
+
+// The measured images in one block.
+struct Measured {
+    alignas(64) float planes[4][LANES];  // red, green, blue, depth
+};
+
+// Sums of the loss's terms over a tile, in lanes.
+struct LossLanes {
+    Vec color{0.0f}, depth{0.0f}, missing{0.0f}, by_gain{0.0f}, by_offset{0.0f};
+    void store_sums(double* out) const {
+        const Vec* all[LOSS_SUMS] = {&color, &depth, &missing, &by_gain, &by_offset};
+        for (int k = 0; k < LOSS_SUMS; k++) {
+            alignas(64) float lanes[LANES];
+            store(lanes, *all[k]);
+            out[k] = 0.0;
+            for (float lane : lanes) out[k] += lane;
+        }
+    }
+};
+
+// Cotangents of a block's images, whose loss is added to `sums`.
+inline Cotangents loss_of_block(const OpenBlock& image, const Vec* rgb, const Measured& measured, Mask wanted, const Loss& loss,
+                                const LossScales& scales, LossLanes& sums) {
+    Cotangents v;
+    const Vec gain(loss.gain), zero(0.0f), one(1.0f);
+    for (int k = 0; k < 3; k++) {
+        const Huber h(fma(gain, rgb[k], Vec(loss.offset)) - load(measured.planes[k]), loss.color_huber);
+        const Vec slope = select_or_zero(wanted, h.slope);
+        sums.color += select_or_zero(wanted, h.value);
+        sums.by_gain = fma(slope, rgb[k], sums.by_gain);
+        sums.by_offset += slope;
+        store(v.planes[k], slope * Vec(loss.gain * scales.per_color));
+    }
+    const Vec z = load(measured.planes[3]), alpha = one - image.T;
+    const Mask has_depth = wanted & (zero < z);
+    const Huber h(fnma(alpha, z, image.D), loss.depth_huber_m);
+    const Vec by_depth = select_or_zero(has_depth, h.slope * Vec(loss.depth_weight * scales.per_depth));
+    sums.depth += select_or_zero(has_depth, h.value);
+    sums.missing += select_or_zero(has_depth, image.T);
+    store(v.planes[3], by_depth);
+    store(v.planes[4], fnma(by_depth, z, -select_or_zero(has_depth, Vec(loss.alpha_weight * scales.per_depth))));
+    return v;
+}
+
+template <Derivatives D>
+inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScales& scales) {
+    Sweep sweep = Sweep::begin<ROW_OF<D>>(frame, index);
+    const View& view = frame.view;
+    Measured measured[BLOCKS];
+    bool bad[2] = {};
+    for (int b = 0; b < BLOCKS; b++) {
+        const Block block(sweep.tile, b, view);
+        if (block.outside(view)) continue;
+        Vec rgb[3];
+        read_block_rgb(loss.color, block, view, rgb);
+        const Vec z = read_block(loss.depth_m, block, view);
+        bad[0] |= !(finite(rgb[0]) && finite(rgb[1]) && finite(rgb[2]));
+        bad[1] |= !finite(z);
+        for (int k = 0; k < 3; k++) store(measured[b].planes[k], rgb[k]);
+        store(measured[b].planes[3], z);
+    }
+    const Vec background[3] = {Vec(view.background[0]), Vec(view.background[1]), Vec(view.background[2])};
+    LossLanes sums;
+    uint64_t evaluated = 0;
+    for (int b = 0; b < BLOCKS; b++) {
+        const Block block(sweep.tile, b, view);
+        sweep.items.counts[b] = 0;
+        if (block.outside(view)) continue;
+        const Mask wanted = mask_of_bits(block.wanted(view));
+        TileItems next = sweep.items;
+        const OpenBlock image = blend_block(frame, sweep.tile, sweep.splats, b, block, wanted, next, evaluated);
+        const Vec rgb[3] = {fma(image.T, background[0], image.R), fma(image.T, background[1], image.G),
+                            fma(image.T, background[2], image.B)};
+        const Cotangents v = loss_of_block(image, rgb, measured[b], wanted, loss, scales, sums);
+        if (next.counts[b]) gradient_block<D>(sweep, block, next.counts[b], v);
+        sweep.items = next;
+    }
+    frame.evaluated.data()[index] = evaluated;
+    sums.store_sums(frame.loss_parts.data() + static_cast<size_t>(index) * LOSS_SUMS);
+    return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : Status::ok;
+}
+
+}  // namespace KERNEL_ISA

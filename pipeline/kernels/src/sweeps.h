@@ -1,0 +1,269 @@
+// The sweeps over a tile: rows of sums for the gradient, for information, for contributions.
+#pragma once
+
+#include "sums.h"
+
+namespace KERNEL_ISA {
+
+// Reads one word of every cache line, so that they are near when they are needed. Plain loads: there are machines on which
+// prefetch instructions do nothing.
+template <class T>
+inline void touch(const T* begin, size_t count) {
+    uint32_t sum = 0, word;
+    for (size_t i = 0; i < count; i += 64 / sizeof(T)) {
+        std::memcpy(&word, begin + i, sizeof word);
+        sum += word;
+    }
+    asm volatile("" : : "r"(sum));
+}
+// Fetches what the sweep over a tile will read, while the tile before is at work.
+inline void touch_items(const Frame& frame, int index) {
+    if (index >= frame.tiles_x * frame.tiles_y) return;
+    const TileItems items(frame, index);
+    size_t count = 0, batches = 0;
+    for (int b = 0; b < BLOCKS; b++) {
+        count += items.counts[b];
+        batches += (items.counts[b] + BATCH - 1) / BATCH;
+    }
+    touch(items.positions, count);
+    touch(items.pixels, count);
+    touch(items.batch_T, batches * LANES);
+}
+
+// A tile whose blocks are walked back to front; clears the rows of its list.
+struct Sweep {
+    const View& view;
+    const Tile tile;
+    const Splat* splats;
+    const uint32_t* list_rows;
+    float* rows;
+    TileItems items;
+
+    template <int ROW>
+    static Sweep begin(Frame& frame, int index) {
+        Sweep sweep(frame, Tile(frame, index));
+        for (uint32_t i = 0; i < sweep.tile.count; i++)
+            for (int first = 0; first < ROW; first += LANES)
+                store(sweep.rows + static_cast<size_t>(sweep.list_rows[i]) * ROW + first, Vec(0.0f));
+        return sweep;
+    }
+
+private:
+    Sweep(Frame& frame, const Tile& t)
+        : view(frame.view), tile(t), splats(gather_splats(frame, t)), list_rows(frame.list_rows.data() + t.first),
+          rows(frame.rows.data()), items(frame, t.index) {}
+};
+
+// Calls visit(batch, transmittance before it) for the batches of a block from the last to the first.
+template <class Visit>
+ALWAYS_INLINE inline void over_batches(const Sweep& sweep, uint32_t count, Visit visit) {
+    for (uint32_t first = (count - 1) / BATCH * BATCH;; first -= BATCH) {
+        visit(Batch(sweep.splats, sweep.items, first, count), load(sweep.items.batch_T + static_cast<size_t>(first) / BATCH * LANES));
+        if (first == 0) return;
+    }
+}
+
+// ---------------------------------------------------------------- gradient
+
+enum class Derivatives { POSE, ALL, ALL_AND_SQUARES };  // of the pose alone; of all parameters; and their squares per pixel
+
+template <Derivatives D>
+constexpr int ROW_OF = D == Derivatives::ALL_AND_SQUARES ? SQUARES_ROW : GRADIENT_ROW;
+
+// Cotangents of the images in one block; plane k of `planes`: red, green, blue, depth, alpha.
+struct Cotangents {
+    alignas(64) float planes[5][LANES];
+};
+
+// Squares of the gradient: the empirical information.
+inline void sum_squares(const Lanes& w_of, const Lanes& f_of, const Cotangents& v, const BatchShape& shape, const Block& block, int half,
+                        Vec* sums) {
+    sum_screen_moments([&](int p) ALWAYS_INLINE { return part(w_of[p], half) * part(w_of[p], half); }, shape, block, half, sums);
+    sum_depth_moments(
+        [&](int p, Wide& square) ALWAYS_INLINE {
+            const Wide by_z = part(f_of[p], half) * Wide(v.planes[3][p]);
+            square = by_z * by_z;
+            return by_z * part(w_of[p], half);
+        },
+        shape, block, half, sums);
+    Wide total[3] = {Wide(0.0f), Wide(0.0f), Wide(0.0f)};
+    for (int p = 0; p < LANES; p++)
+        for (int k = 0; k < 3; k++) {
+            const Wide by_color = part(f_of[p], half) * Wide(v.planes[k][p]);
+            total[k] = fma(by_color, by_color, total[k]);
+        }
+    set_parts(sums + INFO_R, half, total);
+}
+
+// Adds to the rows of a block's items.
+template <Derivatives D>
+NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uint32_t count, const Cotangents& v) {
+    constexpr int ROW = ROW_OF<D>;
+    const Vec r = load(v.planes[0]), g = load(v.planes[1]), b = load(v.planes[2]), z = load(v.planes[3]), a = load(v.planes[4]);
+    const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
+    const float* background = sweep.view.background;
+    Vec behind = fma(Vec(background[0]), r, fma(Vec(background[1]), g, Vec(background[2]) * b));
+    over_batches(sweep, count, [&](const Batch& batch, Vec T) ALWAYS_INLINE {
+        Lanes alpha, f, w;
+        Vec sums[ROW];
+        unused_sums<D == Derivatives::POSE ? SUM_R : D == Derivatives::ALL ? GRADIENT_SUMS : GRADIENT_SUMS + INFORMATION_SUMS, ROW>(sums);
+        replay(batch, pixel_x, pixel_y, T, alpha, f);
+        walk_back(batch, [&](int k, const Splat& s) ALWAYS_INLINE {
+            const Vec own = fma(Vec(s.r), r, fma(Vec(s.g), g, fma(Vec(s.b), b, fma(Vec(s.z), z, a))));
+            const Vec gain = gain_over(behind, own, alpha[k]);
+            w[k] = if_unclamped(alpha[k], f[k] * gain);
+        });
+        const BatchShape shape(batch);
+        transpose16(w);
+        for (int half = 0; half < PARTS; half++) sum_moments(w, shape, block, half, sums);
+        transpose16(f);
+        for (int half = 0; half < PARTS; half++) {
+            if constexpr (D == Derivatives::POSE)
+                sum_products<1>(f, v.planes + 3, half, sums + SUM_Z);  // colours wait for nobody
+            else
+                sum_products<4>(f, v.planes, half, sums + SUM_R);
+            if constexpr (D == Derivatives::ALL_AND_SQUARES) sum_squares(w, f, v, shape, block, half, sums + GRADIENT_SUMS);
+        }
+        add_to_rows<ROW>(batch, sums, sweep.rows, sweep.list_rows);
+    });
+}
+
+template <Derivatives D>
+inline Status gradient_tile(Frame& frame, int index, const float* d_color, const float* d_depth, const float* d_alpha) {
+    touch_items(frame, index + 1);
+    Sweep sweep = Sweep::begin<ROW_OF<D>>(frame, index);
+    const View& view = frame.view;
+    Cotangents cotangents[BLOCKS];
+    bool bad[3] = {};
+    for (int b = 0; b < BLOCKS; b++) {  // all at once: their cache misses then overlap
+        const Block block(sweep.tile, b, view);
+        if (block.outside(view)) continue;
+        Vec rgb[3];
+        read_block_rgb(d_color, block, view, rgb);
+        const Vec z = read_block_or_zero(d_depth, block, view), a = read_block_or_zero(d_alpha, block, view);
+        bad[0] |= !(finite(rgb[0]) && finite(rgb[1]) && finite(rgb[2]));
+        bad[1] |= !finite(z);
+        bad[2] |= !finite(a);
+        for (int k = 0; k < 3; k++) store(cotangents[b].planes[k], rgb[k]);
+        store(cotangents[b].planes[3], z);
+        store(cotangents[b].planes[4], a);
+    }
+    for (int b = 0; b < BLOCKS; b++) {
+        const uint32_t count = sweep.items.counts[b];
+        if (!count) continue;
+        gradient_block<D>(sweep, Block(sweep.tile, b, view), count, cotangents[b]);
+        sweep.items.skip(count);
+    }
+    return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
+}
+
+// ---------------------------------------------------------------- information
+
+// Precisions 1/sigma^2 of colour and depth in one block, the pixels that have one, and the residual.
+struct Precisions {
+    alignas(64) float color[LANES], depth[LANES], used[LANES], residual[LANES];
+};
+
+// Rows of J^T R^-1 J: each colour channel and depth has its own "behind", for their derivatives are squared one by one.
+NO_INLINE static void information_block(const Sweep& sweep, const Block& block, uint32_t count, const Precisions& v) {
+    const Vec of_color = load(v.color), of_depth = load(v.depth);
+    const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
+    const float* background = sweep.view.background;
+    Vec behind_r(background[0]), behind_g(background[1]), behind_b(background[2]), behind_z(0.0f);
+    over_batches(sweep, count, [&](const Batch& batch, Vec T) ALWAYS_INLINE {
+        Lanes alpha, f, w2, cross;
+        Vec sums[INFORMATION_ROW];
+        unused_sums<INFORMATION_SUMS, INFORMATION_ROW>(sums);
+        replay(batch, pixel_x, pixel_y, T, alpha, f);
+        walk_back(batch, [&](int k, const Splat& s) ALWAYS_INLINE {
+            const Vec gain_r = gain_over(behind_r, Vec(s.r), alpha[k]), gain_g = gain_over(behind_g, Vec(s.g), alpha[k]);
+            const Vec gain_b = gain_over(behind_b, Vec(s.b), alpha[k]), gain_z = gain_over(behind_z, Vec(s.z), alpha[k]);
+            const Vec color2 = fma(gain_r, gain_r, fma(gain_g, gain_g, gain_b * gain_b)), depth_gain = of_depth * gain_z;
+            const Vec moving2 = if_unclamped(alpha[k], f[k] * f[k]);
+            w2[k] = moving2 * fma(of_color, color2, depth_gain * gain_z);
+            cross[k] = moving2 * depth_gain;
+        });
+        const BatchShape shape(batch);
+        transpose16(w2);
+        for (int half = 0; half < PARTS; half++)
+            sum_screen_moments([&](int p) ALWAYS_INLINE { return part(w2[p], half); }, shape, block, half, sums);
+        transpose16(cross);
+        transpose16(f);
+        for (int half = 0; half < PARTS; half++) {
+            Wide total[3] = {Wide(0.0f), Wide(0.0f), Wide(0.0f)};
+            sum_depth_moments(
+                [&](int p, Wide& square) ALWAYS_INLINE {
+                    const Wide weight = part(f[p], half), weight2 = weight * weight;
+                    square = weight2 * Wide(v.depth[p]);
+                    total[0] = fma(weight2, Wide(v.color[p]), total[0]);
+                    total[1] = fma(weight, Wide(v.used[p]), total[1]);
+                    total[2] = fma(weight, Wide(v.residual[p]), total[2]);
+                    return part(cross[p], half);
+                },
+                shape, block, half, sums);
+            set_parts(sums + INFO_R, half, total);
+        }
+        add_to_rows<INFORMATION_ROW>(batch, sums, sweep.rows, sweep.list_rows);
+    });
+}
+
+inline Status information_tile(Frame& frame, int index, const float* inv_var_color, const float* inv_var_depth, const float* residual) {
+    touch_items(frame, index + 1);
+    Sweep sweep = Sweep::begin<INFORMATION_ROW>(frame, index);
+    const View& view = frame.view;
+    Precisions precisions[BLOCKS];
+    bool bad[3] = {};
+    for (int b = 0; b < BLOCKS; b++) {
+        const Block block(sweep.tile, b, view);
+        if (block.outside(view)) continue;
+        const Vec color = read_block(inv_var_color, block, view), depth = read_block(inv_var_depth, block, view);
+        const Vec r = read_block_or_zero(residual, block, view), zero(0.0f), used = select(zero < color + depth, Vec(1.0f), zero);
+        bad[0] |= !finite_not_negative(color);
+        bad[1] |= !finite_not_negative(depth);
+        bad[2] |= !finite_not_negative(r);
+        store(precisions[b].color, color);
+        store(precisions[b].depth, depth);
+        store(precisions[b].used, used);
+        store(precisions[b].residual, used * r);
+    }
+    for (int b = 0; b < BLOCKS; b++) {
+        const uint32_t count = sweep.items.counts[b];
+        if (!count) continue;
+        information_block(sweep, Block(sweep.tile, b, view), count, precisions[b]);
+        sweep.items.skip(count);
+    }
+    return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
+}
+
+// ---------------------------------------------------------------- contributions
+
+// Sum of weights and number of pixels.
+NO_INLINE static void contribution_block(const Sweep& sweep, const Block& block, uint32_t count) {
+    const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
+    over_batches(sweep, count, [&](const Batch& batch, Vec T) ALWAYS_INLINE {
+        Lanes alpha, f;
+        Vec sums[GRADIENT_ROW];
+        unused_sums<2, GRADIENT_ROW>(sums);
+        alignas(64) float pixels[BATCH];
+        for (int k = 0; k < BATCH; k++) pixels[k] = static_cast<float>(__builtin_popcount(batch.pixels[k]));
+        replay(batch, pixel_x, pixel_y, T, alpha, f);
+        transpose16(f);
+        sums[0] = f[0];
+        for (int p = 1; p < LANES; p++) sums[0] += f[p];
+        sums[1] = load(pixels);
+        add_to_rows<GRADIENT_ROW>(batch, sums, sweep.rows, sweep.list_rows);
+    });
+}
+
+inline void contribution_tile(Frame& frame, int index) {
+    touch_items(frame, index + 1);
+    Sweep sweep = Sweep::begin<GRADIENT_ROW>(frame, index);
+    for (int b = 0; b < BLOCKS; b++) {
+        const uint32_t count = sweep.items.counts[b];
+        if (!count) continue;
+        contribution_block(sweep, Block(sweep.tile, b, frame.view), count);
+        sweep.items.skip(count);
+    }
+}
+
+}  // namespace KERNEL_ISA
