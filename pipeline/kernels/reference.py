@@ -192,20 +192,27 @@ class ReferenceRasterizer:
         out[self._drawn] = (self._margins() > UNSURE_ALPHA) & ~mixed_up & ~at_clamp
         return out
 
+    def gradient_terms(
+        self, d_color: ArrayLike, d_depth: ArrayLike | None = None, d_alpha: ArrayLike | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What `backward` adds up to the gradients [n, 14] and the pose [6], with all signs taken away.
+
+        They are sums over pixels of sums over screen numbers. Where these cancel, rounding leaves an error in
+        proportion to this.
+        """
+        terms = self._terms(self._dot(d_color, d_depth, d_alpha)).sum((0, 1))
+        return terms[:, :14], terms[:, 14:].sum(axis=0)
+
     def empirical_terms(
         self, d_color: ArrayLike, d_depth: ArrayLike | None = None, d_alpha: ArrayLike | None = None
     ) -> NDArray[np.float64]:
-        """What `backward` adds up to its fisher_diagonal [n, 14], with all signs taken away.
-
-        The squared derivative by a parameter is the square of a sum over screen numbers; where that sum cancels,
-        rounding leaves an error in proportion to this.
-        """
-        return (self._terms(self._dot(d_color, d_depth, d_alpha)) ** 2).sum((0, 1))
+        """The same of `fisher_diagonal` [n, 14], whose squares are those of sums over screen numbers."""
+        return (self._terms(self._dot(d_color, d_depth, d_alpha))[..., :14] ** 2).sum((0, 1))
 
     def information_terms(self, inv_var_color: ArrayLike, inv_var_depth: ArrayLike) -> NDArray[np.float64]:
         """The same of the diagonal that `fisher` adds up."""
         precision = self._precision(inv_var_color, inv_var_depth)
-        return np.einsum("cm,cmni->ni", precision, self._terms(_color_and_depth) ** 2)
+        return np.einsum("cm,cmni->ni", precision, self._terms(_color_and_depth)[..., :14] ** 2)
 
     # ------------------------------------------------------------ drawing
 
@@ -300,7 +307,7 @@ class ReferenceRasterizer:
         return self._by_gaussian(np.einsum("cmks,ksp->cmkp", by_screen, by_inputs))
 
     def _terms(self, channels: _Channels) -> NDArray[np.float64]:
-        """The Jacobian [c, m, n, 14] with every product of the chain rule taken as positive.
+        """The Jacobian [c, m, n, 14 and pose 6] with every product of the chain rule taken as positive.
 
         Through screen numbers that know no long and short directions: M centre, M^-T C^-1 M^-1 (which is 1) and
         M^-T slope, with C^-1 = M^T M.
@@ -311,7 +318,7 @@ class ReferenceRasterizer:
         change[:, 0:2, 0:2], change[:, 7:9, 7:9] = M, back
         change[:, 2:6, 2:6] = np.einsum("kij,klm->kiljm", back, back).reshape(-1, 4, 4)
         by_screen = self._by_screen(channels, self._screen)
-        by_inputs = _by_inputs(self._screen, list(self._parameters.values()), self._order)
+        by_inputs = _by_inputs(self._screen, [*self._parameters.values(), self._xi], self._order)
         by_screen = np.abs(np.einsum("cmks,kst->cmkt", by_screen, np.linalg.inv(change)))
         return self._by_gaussian(np.einsum("cmks,ksp->cmkp", by_screen, np.abs(change @ by_inputs)))
 
