@@ -9,7 +9,7 @@
 
 namespace KERNEL_ISA {
 
-constexpr float ALPHA_MAX = 0.999f;
+constexpr float ALPHA_MAX = 0.999f, REST_MIN = 0.001f;  // of alpha, of 1 - alpha
 constexpr float TRANSMITTANCE_MIN = 1e-4f;  // a Gaussian that would take a pixel below this closes the pixel, unblended
 constexpr int ABREAST = 4;                  // Gaussians whose alpha is computed side by side
 
@@ -23,6 +23,14 @@ struct Whitened {
     }
     Vec log2_alpha(const Splat& s) const { return fnma(y, y, fnma(x, x, Vec(s.log2_opacity))); }
 };
+
+// From log2 alpha, clamped alpha and 1 - alpha; where it is not seen, 0 and 1.
+inline void alpha_and_rest(Vec& alpha, Mask seen, Vec& rest) {
+    Vec power;
+    exp2_and_rest(alpha, power, rest);
+    alpha = select_or_zero(seen, min(power, Vec(ALPHA_MAX)));
+    rest = select(seen, max(rest, Vec(REST_MIN)), Vec(1.0f));
+}
 
 // One block while it is blended.
 struct OpenBlock {
@@ -41,7 +49,7 @@ template <int N>
 ALWAYS_INLINE inline uint32_t blend_some(const Splat* splats, const uint32_t* candidates, const TileItems& items, uint32_t kept,
                                          OpenBlock& block) {
     uint32_t position[N];
-    Vec alpha[N];
+    Vec alpha[N], rest[N];  // rest: 1 - alpha
     Mask seen[N];
     unrolled<N>([&](auto k) ALWAYS_INLINE {
         position[k] = candidates[k];
@@ -50,14 +58,15 @@ ALWAYS_INLINE inline uint32_t blend_some(const Splat* splats, const uint32_t* ca
     });
     unrolled<N>([&](auto k) ALWAYS_INLINE {
         seen[k] = alpha[k] >= Vec(LOG2_ALPHA_MIN);
-        alpha[k] = select_or_zero(seen[k], min(exp2(alpha[k]), Vec(ALPHA_MAX)));
+        alpha_and_rest(alpha[k], seen[k], rest[k]);
         pin(alpha[k]);
+        pin(rest[k]);
     });
     block.left = max(block.left, Vec(1e-8f));  // far from denormal numbers
     unrolled<N>([&](auto k) ALWAYS_INLINE {
         const Splat& s = splats[position[k]];
         const Vec weight_if_open = alpha[k] * block.left;
-        block.left = fnma(alpha[k], block.left, block.left);
+        block.left = block.left * rest[k];
         const Mask blended = (block.left >= Vec(TRANSMITTANCE_MIN)) & seen[k];
         const Vec weight = select_or_zero(blended, weight_if_open);
         store(items.batch_T + (kept + TileItems::BATCH - 1) / TileItems::BATCH * LANES, block.T);  // what is there when a batch begins stays

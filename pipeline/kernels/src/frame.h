@@ -28,6 +28,7 @@ public:
         return data_;
     }
     __attribute__((always_inline)) T* data() const { return data_; }
+    __attribute__((always_inline)) size_t bytes() const { return capacity_ * sizeof(T); }
 
 private:
     __attribute__((always_inline)) void grow(size_t count, size_t kept) {
@@ -119,6 +120,16 @@ struct Frame {
     size_t longest_list = 0;
     Scratch<float> rows;                     // sums: of one Gaussian in one tile each
     Scratch<double> pose_parts, loss_parts;  // loss_parts: [tiles, LOSS_SUMS]
+
+    size_t bytes() const {  // held between calls
+        size_t total = 0;
+        const auto add = [&](const auto&... memory) { total += (memory.bytes() + ...); };
+        add(splats, depth_keys, depth_keys_swap, radix_counts, chunk_start, drawn, depth_order, visible_ids, first_row, row_ranges,
+            stretch_tile_counts, wanted_blocks, tile_start, list_splats, list_rows, list_blocks, item_start, block_items, item_positions,
+            item_pixels, batch_T, evaluated, tile_splats, rows, pose_parts, loss_parts);
+        for (const StretchRecords& stretch : stretches) add(stretch.tiles, stretch.splats, stretch.blocks);
+        return total;
+    }
 };
 
 struct GradientArrays {

@@ -130,6 +130,7 @@ public:
     std::string isa() const { return kernels_->name; }
     size_t visible() const { return frame_.visible; }
     size_t intersections() const { return frame_.intersection_count; }
+    size_t scratch_bytes() const { return frame_.bytes(); }
 
     int forward(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
                 const Inputs& pose, const Inputs& intrinsics, const Inputs& background, const Bytes& mask, int width, int height, int threads,
@@ -249,6 +250,7 @@ NB_MODULE(_raster, m) {
         .def_prop_ro("visible", &Raster::visible)
         .def_prop_ro("intersections", &Raster::intersections)
         .def_prop_ro("pairs", &Raster::pairs)
+        .def_prop_ro("scratch_bytes", &Raster::scratch_bytes)
         .def("forward", &Raster::forward)
         .def("fit", &Raster::fit)
         .def("backward", &Raster::backward)

@@ -97,11 +97,11 @@ struct ScreenDerivatives {
         to_map_frame(view, centre, by_mean[1]);
         for (int k = 0; k < 3; k++) {
             Vec Q[6], d_J[6];
-            const Symmetric2 c = covariance_cotangent(s, k == 0 ? one : zero, k == 1 ? one : zero, k == 2 ? one : zero);
+            const Symmetric2 c = whitened_cotangent(k == 0 ? one : zero, k == 1 ? one : zero, k == 2 ? one : zero);
             own_axes_cotangent(s, c, Q, Y[k]);
             jacobian_cotangent(s, Q, d_J);
             clear();
-            add_centre_from_jacobian(s, d_J, centre);
+            add_centre_from_jacobian(s, d_J, Y[k], centre);
             to_map_frame(view, centre, by_mean[2 + k]);
         }
         for (int i = 0; i < 3; i++) by_mean[5][i] = Vec(view.R[6 + i]);
@@ -156,9 +156,9 @@ inline void gradient_group(const Frame& frame, const GaussianArrays& gaussians, 
     group.reduce<ROW_OF<D>>(frame, sums);
 
     Vec Q[6], Y[6], d_J[6], centre[3] = {Vec(0.0f), Vec(0.0f), Vec(0.0f)};
-    own_axes_cotangent(s, covariance_cotangent(s, sums[SUM_WXX], sums[SUM_WXY], sums[SUM_WYY]), Q, Y);
+    own_axes_cotangent(s, whitened_cotangent(sums[SUM_WXX], sums[SUM_WXY], sums[SUM_WYY]), Q, Y);
     jacobian_cotangent(s, Q, d_J);
-    add_centre_from_jacobian(s, d_J, centre);
+    add_centre_from_jacobian(s, d_J, Y, centre);
     add_centre_from_moments(s, sums[SUM_WX], sums[SUM_WY], centre);
     centre[2] += sums[SUM_Z];
     if (out.pose) {

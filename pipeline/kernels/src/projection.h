@@ -32,6 +32,7 @@ struct Splat16 {
     Vec P[6];
     Vec cov_xx, cov_yy;
     Vec M11, M12, M22;               // M = [M11 M12; 0 M22], 1/px
+    Vec N[6];                        // M P: the axes as e sees them
     Vec u, v;
     Mask drawable;
 };
@@ -100,12 +101,21 @@ inline Splat16 project16(const View& view, const Vec* mean, const Vec* quat, con
     s.M11 = scale * sqrt(s.cov_yy / determinant);
     s.M12 = -(xy / s.cov_yy) * s.M11;
     s.M22 = scale / sqrt(s.cov_yy);
+    // N = M P. Its first row is M11 (P_xk - xy/yy P_yk), which cancels along a needle; by the minors it does not:
+    // P_xk yy - P_yk xy = sum_j U_yj (P_xk U_yj - P_yk U_xj) + blur P_xk
+    const Vec to_first = s.M11 / s.cov_yy;
+    for (int k = 0; k < 3; k++) {
+        const int i = (k + 1) % 3, j = (k + 2) % 3;
+        const Vec minor_i = s.P[k] * U[3 + i] - s.P[3 + k] * U[i], minor_j = s.P[k] * U[3 + j] - s.P[3 + k] * U[j];
+        s.N[k] = to_first * fma(U[3 + i], minor_i, fma(U[3 + j], minor_j, blur * s.P[k]));
+        s.N[3 + k] = s.M22 * s.P[3 + k];
+    }
     s.drawable = (s.z >= Vec(NEAR_M)) & (s.cov_xx <= Vec(LARGEST_PX2)) & (s.cov_yy <= Vec(LARGEST_PX2));
     return s;
 }
 
 inline Vec sigmoid(Vec logit) { return Vec(1.0f) / (Vec(1.0f) + exp(-logit)); }
-inline Vec log2_sigmoid(Vec logit) { return -log2(Vec(1.0f) + exp(-logit)); }
+inline Vec log2_sigmoid(Vec logit) { return -log2_1p(exp(-logit)); }
 
 // ---------------------------------------------------------------- screen to parameters
 
@@ -113,12 +123,11 @@ struct Symmetric2 {
     Vec xx, xy, yy;
 };
 
-// Cotangent of the screen covariance from the second moments sum w e e^T; w: cotangent of ln alpha. For
+// Second moments sum w e e^T in the unit of the cotangent of C, G = M^T W M; w: cotangent of ln alpha. For
 // ln alpha = -d^T C^-1 d / 2 it is C^-1 (sum w d d^T) C^-1 / 2, and C^-1 = 2 ln2 M^T M.
-inline Symmetric2 covariance_cotangent(const Splat16& s, Vec w_xx, Vec w_xy, Vec w_yy) {
+inline Symmetric2 whitened_cotangent(Vec w_xx, Vec w_xy, Vec w_yy) {
     const Vec factor(2.0f * LN_2 * LN_2);
-    const Vec top = fma(w_xx, s.M12, w_xy * s.M22), bottom = fma(w_xy, s.M12, w_yy * s.M22);
-    return {factor * (s.M11 * s.M11 * w_xx), factor * (s.M11 * top), factor * fma(s.M12, top, s.M22 * bottom)};
+    return {factor * w_xx, factor * w_xy, factor * w_yy};
 }
 
 // Adds what the first moments sum w e mean for the centre in the camera frame: d ln alpha / d centre = 2 ln2 M^T e.
@@ -130,13 +139,14 @@ inline void add_centre_from_moments(const Splat16& s, Vec w_x, Vec w_y, Vec* d_c
     d_centre[2] = fnma(x, s.slope_x, fnma(y, s.slope_y, d_centre[2]));
 }
 
-// Q = G P (2x3), and Y = P^T Q as (00, 11, 22, 01, 02, 12).
-inline void own_axes_cotangent(const Splat16& s, const Symmetric2& c, Vec* Q, Vec* Y) {
+// Q = W N (2x3), and Y = P^T G P = N^T Q as (00, 11, 22, 01, 02, 12). G itself is never formed: along a needle it would
+// cancel as the square of length over width.
+inline void own_axes_cotangent(const Splat16& s, const Symmetric2& w, Vec* Q, Vec* Y) {
     for (int k = 0; k < 3; k++) {
-        Q[k] = fma(c.xx, s.P[k], c.xy * s.P[3 + k]);
-        Q[3 + k] = fma(c.xy, s.P[k], c.yy * s.P[3 + k]);
+        Q[k] = fma(w.xx, s.N[k], w.xy * s.N[3 + k]);
+        Q[3 + k] = fma(w.xy, s.N[k], w.yy * s.N[3 + k]);
     }
-    auto product = [&](int i, int k) { return fma(s.P[i], Q[k], s.P[3 + i] * Q[3 + k]); };
+    auto product = [&](int i, int k) { return fma(s.N[i], Q[k], s.N[3 + i] * Q[3 + k]); };
     Y[0] = product(0, 0);
     Y[1] = product(1, 1);
     Y[2] = product(2, 2);
@@ -145,13 +155,13 @@ inline void own_axes_cotangent(const Splat16& s, const Symmetric2& c, Vec* Q, Ve
     Y[5] = product(1, 2);
 }
 
-// Cotangent of J, 2x3, from Q: P = J axes and covariance = P S^2 P^T.
+// Cotangent of J, 2x3, from Q: covariance = P S^2 P^T, P = J axes, G P = M^T Q.
 inline void jacobian_cotangent(const Splat16& s, const Vec* Q, Vec* d_J) {
     Vec d_P[6];
     for (int k = 0; k < 3; k++) {
         const Vec twice = s.scale[k] * s.scale[k] * Vec(2.0f);
-        d_P[k] = Q[k] * twice;
-        d_P[3 + k] = Q[3 + k] * twice;
+        d_P[k] = s.M11 * Q[k] * twice;
+        d_P[3 + k] = fma(s.M12, Q[k], s.M22 * Q[3 + k]) * twice;
     }
     for (int r = 0; r < 2; r++)
         for (int j = 0; j < 3; j++)
@@ -160,9 +170,11 @@ inline void jacobian_cotangent(const Splat16& s, const Vec* Q, Vec* d_J) {
 }
 
 // Adds what a cotangent of J means for the centre in the camera frame.
-inline void add_centre_from_jacobian(const Splat16& s, const Vec* d_J, Vec* d_centre) {
+// All of J goes as 1/z, and <d_J, J> = 2 tr(S^2 Y), which does not cancel.
+inline void add_centre_from_jacobian(const Splat16& s, const Vec* d_J, const Vec* Y, Vec* d_centre) {
     const Vec d_slope_x = -(s.J00 * d_J[2]) * s.inside_x, d_slope_y = -(s.J11 * d_J[5]) * s.inside_y;
-    const Vec d_inverse_z = fma(d_J[0], s.J00, fma(d_J[2], s.J02, fma(d_J[4], s.J11, d_J[5] * s.J12)));  // times z
+    Vec d_inverse_z(0.0f);  // times z
+    for (int k = 0; k < 3; k++) d_inverse_z = fma(Vec(2.0f) * s.scale[k] * s.scale[k], Y[k], d_inverse_z);
     d_centre[0] += d_slope_x * s.inverse_z;
     d_centre[1] += d_slope_y * s.inverse_z;
     d_centre[2] = fnma(s.inverse_z, fma(d_slope_x, s.slope_x, fma(d_slope_y, s.slope_y, d_inverse_z)), d_centre[2]);
@@ -183,10 +195,12 @@ inline void log_scale_cotangent(const Splat16& s, const Vec* Y, Vec* d_log_scale
 // Cotangent of the quaternion as given. A turn w about the Gaussian's own axes changes Sigma by Y_ik (s_k^2 - s_i^2),
 // and w = 2 vec(conj(q) dq).
 inline void quaternion_cotangent(const Splat16& s, const Vec* Y, Vec* d_quat) {
-    const Vec four(4.0f), v0 = s.scale[0] * s.scale[0], v1 = s.scale[1] * s.scale[1], v2 = s.scale[2] * s.scale[2];
-    const Vec x = four * Y[5] * (v1 - v2) * s.inverse_norm;
-    const Vec y = four * Y[4] * (v2 - v0) * s.inverse_norm;
-    const Vec z = four * Y[3] * (v0 - v1) * s.inverse_norm;
+    // s_i^2 - s_k^2 by the divided difference, which knows nearly equal scales apart
+    auto turn = [&](int i, int k) {
+        const Vec *l = s.log_scale, eight(8.0f);
+        return eight * ((l[i] - l[k]) * exp2x_divided_difference(l[i], l[k], s.scale[i], s.scale[k])) * s.inverse_norm;
+    };
+    const Vec x = Y[5] * turn(1, 2), y = Y[4] * turn(2, 0), z = Y[3] * turn(0, 1);
     const Vec *q = s.quat;
     d_quat[0] = -fma(q[1], x, fma(q[2], y, q[3] * z));
     d_quat[1] = fma(q[0], x, q[2] * z - q[3] * y);

@@ -50,19 +50,20 @@ using Lanes = Vec[BATCH];
 // alpha and weight of the items of a batch; T: transmittance before the first.
 ALWAYS_INLINE inline void replay(const Batch& batch, Vec pixel_x, Vec pixel_y, Vec T, Lanes& alphas, Lanes& weights) {
     for (int group = 0; group < batch.groups() * ABREAST; group += ABREAST) {
-        Vec alpha[ABREAST];
+        Vec alpha[ABREAST], rest[ABREAST];
         unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
             const Splat& s = batch.splat(group + k);
             alpha[k] = Whitened(s, pixel_x, pixel_y).log2_alpha(s);
         });
         unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
-            alpha[k] = select_or_zero(mask_of_bits(batch.pixels[group + k]), min(exp2(alpha[k]), Vec(ALPHA_MAX)));
+            alpha_and_rest(alpha[k], mask_of_bits(batch.pixels[group + k]), rest[k]);
             pin(alpha[k]);
+            pin(rest[k]);
         });
         unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
             alphas[group + k] = alpha[k];
             weights[group + k] = alpha[k] * T;
-            T = fnma(alpha[k], T, T);
+            T = T * rest[k];
         });
     }
 }

@@ -21,6 +21,20 @@ inline Vec exp2(Vec t) {
     return scale_by_power(p, shifted);
 }
 
+// 2^t and 1 - 2^t for -126 <= t <= 0, relative error 3e-7 of both: near t = 0 the difference would keep few digits.
+inline void exp2_and_rest(Vec t, Vec& power, Vec& rest) {
+    const Vec shifter(12582912.0f);
+    const Vec shifted = t + shifter;
+    const Vec f = t - (shifted - shifter);
+    Vec p = fma(Vec(1.3264727e-3f), f, Vec(9.671513e-3f));
+    p = fma(p, f, Vec(5.5507336e-2f));
+    p = fma(p, f, Vec(2.4022242e-1f));
+    p = fma(p, f, Vec(6.93147e-1f));
+    const Vec whole = scale_by_power(Vec(1.0f), shifted), part = p * f;
+    power = fma(whole, part, whole);
+    rest = fnma(whole, part, Vec(1.0f) - whole);
+}
+
 // e^x; x beyond +-83 counts as +-83.
 inline Vec exp(Vec x) { return exp2(min(max(x * Vec(LOG2_E), Vec(-120.0f)), Vec(120.0f))); }
 
@@ -37,6 +51,16 @@ inline Vec log2(Vec x) {
     p = fma(p, s2, Vec(1.0f / 3));
     p = fma(p, s2, Vec(1.0f));
     return fma(Vec(2.0f * LOG2_E) * s, p, e);
+}
+
+// log2(1 + x) for x >= 0, relative error 3e-7 also where x is small.
+inline Vec log2_1p(Vec x) {
+    const Vec s = x / (x + Vec(2.0f)), s2 = s * s;  // ln(1 + x) = 2 (s + s^3/3 + s^5/5 + ...)
+    Vec p = fma(s2, Vec(1.0f / 9), Vec(1.0f / 7));
+    p = fma(p, s2, Vec(1.0f / 5));
+    p = fma(p, s2, Vec(1.0f / 3));
+    p = fma(p, s2, Vec(1.0f));
+    return select(x < Vec(0.41421356f), Vec(2.0f * LOG2_E) * s * p, log2(Vec(1.0f) + x));
 }
 
 // Divided difference of exp(2 x) between log-scales a and b, (e^2a - e^2b) / (2a - 2b), with A = e^a, B = e^b.
