@@ -87,7 +87,9 @@ class Rasterizer:
         """
         height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth)
         color, depths, alpha = _empty(height, width, 3), _empty(height, width), _empty(height, width)
-        self._finish(gaussians, (height, width), self._raster.forward(*_arrays(gaussians), *view, color, depths, alpha))
+        self._finish(
+            gaussians, (height, width), self._raster.forward(*_arrays(gaussians), *view, color, depths, alpha)
+        )
         return Render(color, depths, alpha)
 
     def view_gradients(
@@ -121,7 +123,8 @@ class Rasterizer:
         if not isinstance(loss, LossWeights):
             raise ValueError(f"loss is {type(loss).__name__}, expected LossWeights")
         weights = np.array(
-            [loss.color_huber, loss.depth_weight, loss.depth_huber_m, loss.alpha_weight, gain, offset], np.float32
+            [loss.color_huber, loss.depth_weight, loss.depth_huber_m, loss.alpha_weight, gain, offset],
+            np.float32,
         )
         _check_wanted(pose, parameters, fisher=False)
         out = _outputs(gaussians, parameters)
@@ -152,6 +155,8 @@ class Rasterizer:
         behind = _checked_background(background)
         if depth not in DEPTH_KINDS:
             raise ValueError(f"depth is {depth!r}, expected one of {', '.join(DEPTH_KINDS)}")
+        if depth != "blended":
+            raise NotImplementedError("depth='ray_plane'")
         if len(gaussians) > MAX_GAUSSIANS:
             raise ValueError(f"gaussians are {len(gaussians)}, expected at most {MAX_GAUSSIANS}")
         wanted = _NO_MASK if mask is None else _checked_mask(mask, (height, width))
