@@ -18,7 +18,7 @@ from pipeline import streams
 from pipeline.frontend.mapping_config import MappingConfig
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import FisherSums, Rasterizer, Render
+from pipeline.kernels import FisherSums, LossWeights, Rasterizer, Render
 from pipeline.splat.gaussians import Gaussians
 from pipeline.splat.losses import Loss, halve, rgbd_loss
 from pipeline.splat.optimiser import BETA_1, BETA_2, Adam, LearningRates
@@ -80,6 +80,7 @@ class Mapper:
         self.config, self.seed = config, seed
         self.cameras = (camera, camera.halved())
         self.rasterizer = Rasterizer(threads=threads)
+        self._loss_weights = LossWeights(**config.loss.model_dump())
         self._gaussians = Gaussians.empty()
         self._adam = Adam()
         self._views: list[_View] = []
@@ -191,8 +192,16 @@ class Mapper:
 
     def _optimise(self, view: _View, level: int, rates: LearningRates) -> None:
         """One Adam step of all Gaussians in one view."""
-        loss = self._loss(view, level)
-        gradients = self.rasterizer.backward(loss.d_color, loss.d_depth, loss.d_alpha)
+        color, depth_m = view.images(level)
+        loss, gradients = self.rasterizer.view_gradients(
+            self._gaussians,
+            self.cameras[level],
+            se3.inverse(view.T_map_camera),
+            color,
+            depth_m,
+            self._loss_weights,
+            exposure=view.exposure,
+        )
         if self.config.exposure and view is not self._views[0]:
             view.step_exposure(loss.d_exposure, self.config.exposure_rate)
         stepped = self._adam.step(self._gaussians, gradients, rates)
