@@ -18,10 +18,10 @@ from pipeline import streams
 from pipeline.frontend.mapping_config import MappingConfig
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import FisherSums, LossWeights, Rasterizer, Render
+from pipeline.kernels import CompiledAdam, FisherSums, LossWeights, Rasterizer, Render
 from pipeline.splat.gaussians import Gaussians
 from pipeline.splat.losses import Loss, halve, rgbd_loss
-from pipeline.splat.optimiser import BETA_1, BETA_2, Adam, LearningRates
+from pipeline.splat.optimiser import BETA_1, BETA_2, LearningRates
 from pipeline.splat.seeding import seed_discs, unexplained
 
 Image = NDArray[np.float32]
@@ -82,7 +82,7 @@ class Mapper:
         self.rasterizer = Rasterizer(threads=threads)
         self._loss_weights = LossWeights(**config.loss.model_dump())
         self._gaussians = Gaussians.empty()
-        self._adam = Adam()
+        self._adam = CompiledAdam(threads=threads)
         self._views: list[_View] = []
         self._support: list[tuple[_View, NDArray[np.float64]]] = []  # with T_keyframe_camera
         self._next_id = 0

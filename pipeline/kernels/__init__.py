@@ -1,5 +1,6 @@
 """Drawing Gaussians, and the derivatives and information of what was drawn."""
 
+from pipeline.kernels.optimiser import CompiledAdam
 from pipeline.kernels.rasterizer import Rasterizer, available_isas
 from pipeline.kernels.types import (
     DepthKind,
@@ -12,6 +13,7 @@ from pipeline.kernels.types import (
 )
 
 __all__ = [
+    "CompiledAdam",
     "DepthKind",
     "FisherSums",
     "Gradients",

@@ -86,7 +86,7 @@ class Rasterizer:
         Raises ValueError, naming the argument, for what no camera or Gaussian can be.
         """
         height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth)
-        color, depths, alpha = _empty(height, width, 3), _empty(height, width), _empty(height, width)
+        color, depths, alpha = empty(height, width, 3), empty(height, width), empty(height, width)
         self._finish(
             gaussians, (height, width), self._raster.forward(*_arrays(gaussians), *view, color, depths, alpha)
         )
@@ -269,13 +269,13 @@ class Rasterizer:
         return self._gaussians, self._size
 
 
-def _empty(*shape: int) -> NDArray[np.float32]:
+def empty(*shape: int) -> NDArray[np.float32]:
     """An array in memory that earlier outputs gave back, holding anything."""
     return _raster.empty(int(np.prod(shape))).reshape(shape)
 
 
 def _zeros(*shape: int) -> NDArray[np.float32]:
-    array = _empty(*shape)
+    array = empty(*shape)
     array.fill(0.0)
     return array
 

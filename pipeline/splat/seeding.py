@@ -155,7 +155,7 @@ def quadtree(
 
 @dataclass(frozen=True)
 class _Grid:
-    """Statistics of the cells [rows, columns] of one size."""
+    """Statistics of the cells [rows, columns] of one size; 0 where a cell is not filled."""
 
     side: int
     filled: NDArray[np.bool_]  # at least half of its pixels are wanted
@@ -177,30 +177,36 @@ def _blocks(image: NDArray, side: int) -> NDArray:
 
 
 def _grid(color: Image, depth_m: Image, wanted: NDArray[np.bool_], side: int) -> _Grid:
-    mask, z = _blocks(wanted, side), _blocks(depth_m, side).astype(np.float64)
-    rgb = _blocks(color, side).astype(np.float64)
-    nearest = np.where(mask, z, np.inf).min(axis=2)
-    farthest = np.where(mask, z, -np.inf).max(axis=2)
-    front = mask & (z <= 1.05 * nearest[..., None])
-    weight = front / np.maximum(front.sum(axis=2), 1)[..., None]
+    masks = _blocks(wanted, side)
+    filled = masks.sum(axis=2) * 2 >= side * side
+    mask, z = masks[filled], _blocks(depth_m, side)[filled].astype(np.float64)
+    rgb = _blocks(color, side)[filled].astype(np.float64)
+    nearest = np.where(mask, z, np.inf).min(axis=1)
+    farthest = np.where(mask, z, -np.inf).max(axis=1)
+    front = mask & (z <= 1.05 * nearest[:, None])
+    weight = front / front.sum(axis=1)[:, None]
     inverse_z = np.where(front, 1.0 / np.where(front, z, 1.0), 0.0)
-    rows, columns = mask.shape[:2]
     offset = np.arange(side * side)
-    u = side * np.arange(columns)[None, :, None] + (offset % side)[None, None, :]
-    v = side * np.arange(rows)[:, None, None] + (offset // side)[None, None, :]
-    grey = rgb.mean(axis=3)
-    mean = (weight * grey).sum(axis=2)
-    detail = np.sqrt(np.maximum((weight * grey * grey).sum(axis=2) - mean * mean, 0.0))
-    with np.errstate(divide="ignore"):
-        z_mean = 1.0 / (weight * inverse_z).sum(axis=2)
+    row, column = np.nonzero(filled)
+    u = side * column[:, None] + offset % side
+    v = side * row[:, None] + offset // side
+    grey = (rgb[..., 0] + rgb[..., 1] + rgb[..., 2]) / 3
+    mean = (weight * grey).sum(axis=1)
+    detail = np.sqrt(np.maximum((weight * grey * grey).sum(axis=1) - mean * mean, 0.0))
+
+    def everywhere(values: NDArray) -> NDArray[np.float64]:
+        cells = np.zeros((*filled.shape, *values.shape[1:]))
+        cells[filled] = values
+        return cells
+
     return _Grid(
         side=side,
-        filled=mask.sum(axis=2) * 2 >= side * side,
-        detail=np.where(farthest > 1.05 * nearest, np.inf, detail),
-        u=(weight * u).sum(axis=2),
-        v=(weight * v).sum(axis=2),
-        z=z_mean,
-        color=(weight[..., None] * rgb).sum(axis=2),
+        filled=filled,
+        detail=everywhere(np.where(farthest > 1.05 * nearest, np.inf, detail)),
+        u=everywhere((weight * u).sum(axis=1)),
+        v=everywhere((weight * v).sum(axis=1)),
+        z=everywhere(1.0 / (weight * inverse_z).sum(axis=1)),
+        color=everywhere((weight[..., None] * rgb).sum(axis=1)),
     )
 
 

@@ -156,6 +156,27 @@ struct LossValues {
     double color, depth, missing_alpha, by_log_gain, by_offset;  // means over their pixels
 };
 
+// One step of Adam: all parameters of one kind, [count, width] each.
+struct AdamArray {
+    const float *values, *gradients;
+    float *first, *second;  // moments
+    float* out;             // the values after the step
+    float rate;
+    size_t width;           // 1, 3 or 4
+};
+struct AdamConstants {
+    float beta_1, rest_1, beta_2, rest_2, epsilon;  // rest = 1 - beta
+};
+struct AdamStep {
+    size_t count;
+    AdamArray arrays[5];
+    AdamConstants constants;
+    const float *d_colors, *d_opacity_logits;  // zero where the view did not touch a Gaussian
+    int32_t* steps;                            // [count], those taken so far, at most `longest`
+    const float* corrections;                  // [longest], of the bias after 1, 2, ... steps
+    int32_t longest;
+};
+
 enum class Status { ok, bad_gaussians, bad_first_image, bad_second_image, bad_third_image, too_many_intersections };
 
 // One build of the kernels for one instruction set.
@@ -170,6 +191,7 @@ struct Kernels {
                      const FisherArrays&);
     void (*contributions)(Frame&, float* weights, uint32_t* pixels);
     Status (*fit)(Frame&, const GaussianArrays&, const Loss&, LossValues&, const GradientArrays&);
+    void (*adam)(const AdamStep&, int threads);
 };
 
 }  // namespace raster

@@ -1,4 +1,5 @@
 // All kernels of one instruction set. Compiled once per set, with KERNEL_ISA the namespace of the build.
+#include "adam.h"
 #include "fitting.h"
 
 namespace KERNEL_ISA {
@@ -105,5 +106,5 @@ static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& los
 namespace raster {
 extern const Kernels KERNEL_TABLE;
 const Kernels KERNEL_TABLE = {AS_TEXT(KERNEL_ISA), KERNEL_ISA::forward, KERNEL_ISA::backward, KERNEL_ISA::fisher,
-                              KERNEL_ISA::contributions, KERNEL_ISA::fit};
+                              KERNEL_ISA::contributions, KERNEL_ISA::fit, KERNEL_ISA::adam};
 }  // namespace raster

@@ -8,6 +8,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cstdlib>
+#include <iterator>
 #include <mutex>
 #include <new>
 #include <stdexcept>
@@ -116,17 +117,35 @@ static GaussianArrays arrays_of(const Inputs& means, const Inputs& quats, const 
     return {means.shape(0), means.data(), quats.data(), log_scales.data(), colors.data(), logits.data()};
 }
 
+static const Kernels* kernels_named(const std::string& isa) {
+    for (const Kernels* kernels : usable_kernels())
+        if (isa == "auto" || isa == kernels->name) return kernels;
+    throw std::invalid_argument("isa: " + isa + " is not available on this processor");
+}
+
+// Shapes are checked by pipeline.kernels.optimiser, the only caller. The lists have an array for each kind of parameter.
+static void adam(const std::string& isa, const std::vector<Inputs>& values, const std::vector<Inputs>& gradients,
+                 const std::vector<Floats>& first, const std::vector<Floats>& second, const std::vector<Floats>& out, const Inputs& rates,
+                 const Inputs& constants, const Inputs& d_colors, const Inputs& d_logits, const Array<int32_t>& steps,
+                 const Inputs& corrections, int threads) {
+    AdamStep step;
+    step.count = steps.shape(0);
+    for (size_t k = 0; k < std::size(step.arrays); k++)
+        step.arrays[k] = {values[k].data(), gradients[k].data(), first[k].data(), second[k].data(), out[k].data(), rates.data()[k],
+                          values[k].ndim() > 1 ? values[k].shape(1) : 1};
+    const float* c = constants.data();
+    step.constants = {c[0], c[1], c[2], c[3], c[4]};
+    step.d_colors = d_colors.data(), step.d_opacity_logits = d_logits.data();
+    step.steps = steps.data(), step.corrections = corrections.data(), step.longest = static_cast<int32_t>(corrections.size());
+    const Kernels* kernels = kernels_named(isa);
+    const nb::gil_scoped_release unlocked;
+    kernels->adam(step, threads);
+}
+
 // Shapes and ranges are checked by pipeline.kernels.rasterizer, the only caller.
 class Raster {
 public:
-    explicit Raster(const std::string& isa) {
-        for (const Kernels* kernels : usable_kernels())
-            if (isa == "auto" || isa == kernels->name) {
-                kernels_ = kernels;
-                return;
-            }
-        throw std::invalid_argument("isa: " + isa + " is not available on this processor");
-    }
+    explicit Raster(const std::string& isa) : kernels_(kernels_named(isa)) {}
     std::string isa() const { return kernels_->name; }
     size_t visible() const { return frame_.visible; }
     size_t intersections() const { return frame_.intersection_count; }
@@ -234,7 +253,7 @@ private:
     private:
         std::atomic_flag& busy_;
     };
-    const Kernels* kernels_ = nullptr;
+    const Kernels* kernels_;
     Frame frame_;
     std::vector<uint8_t> mask_;
     std::atomic_flag busy_ = ATOMIC_FLAG_INIT;
@@ -256,6 +275,7 @@ NB_MODULE(_raster, m) {
         .def("backward", &Raster::backward)
         .def("fisher", &Raster::fisher)
         .def("contributions", &Raster::contributions);
+    m.def("adam", &raster::adam);
     m.def("empty", &raster::OutputPool::array);
     m.def("available_isas", [] {
         std::vector<std::string> names;

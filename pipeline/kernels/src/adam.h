@@ -1,0 +1,77 @@
+// One step of Adam (splat.optimiser.Adam, the same bits): every element goes its own way.
+#pragma once
+
+#include "frame.h"
+#include "simd.h"
+
+namespace KERNEL_ISA {
+
+using namespace raster;
+
+constexpr size_t ADAM_ROWS = 64;  // Gaussians at a time: their factors stay in the nearest cache
+
+// Counts the step of every Gaussian that the view touched; its bias correction, or 0 if it was not touched.
+inline bool count_steps(const AdamStep& step, size_t begin, size_t end, float* correction) {
+    bool any = false;
+    for (size_t row = begin; row < end; row++) {
+        const float* color = step.d_colors + 3 * row;
+        const bool touched = step.d_opacity_logits[row] != 0.0f || color[0] != 0.0f || color[1] != 0.0f || color[2] != 0.0f;
+        int32_t& count = step.steps[row];
+        if (touched && count < step.longest) count++;
+        correction[row - begin] = touched ? step.corrections[count - 1] : 0.0f;
+        any |= touched;
+    }
+    return any;
+}
+
+// Source: Kingma and Ba, ICLR 2015, algorithm 1. A function of its own, so that the compiler sees arrays that do not overlap
+// and makes vectors of the loop.
+NO_INLINE static void step_elements(size_t count, const AdamConstants& constants, float rate, const float* __restrict correction,
+                                    const float* __restrict value, const float* __restrict gradient, float* __restrict first,
+                                    float* __restrict second, float* __restrict out) {
+    const AdamConstants c = constants;
+    for (size_t i = 0; i < count; i++) {
+        const float g = gradient[i];
+        const float m = c.beta_1 * first[i] + c.rest_1 * g;
+        const float v = c.beta_2 * second[i] + c.rest_2 * (g * g);
+        const float change = m / (__builtin_sqrtf(v) + c.epsilon) * rate * correction[i];
+        const bool touched = correction[i] != 0.0f;
+        first[i] = touched ? m : first[i];
+        second[i] = touched ? v : second[i];
+        out[i] = touched ? value[i] - change : value[i];
+    }
+}
+
+template <size_t WIDTH>
+inline void step_array(const AdamArray& array, const AdamConstants& constants, size_t begin, size_t end, const float* correction) {
+    float of_element[ADAM_ROWS * WIDTH];
+    for (size_t row = 0; row < end - begin; row++)
+        for (size_t k = 0; k < WIDTH; k++) of_element[row * WIDTH + k] = correction[row];
+    const size_t start = begin * WIDTH;
+    step_elements((end - begin) * WIDTH, constants, array.rate, of_element, array.values + start, array.gradients + start,
+                  array.first + start, array.second + start, array.out + start);
+}
+
+static void adam(const AdamStep& step, int threads) {
+    const int groups = static_cast<int>((step.count + ADAM_ROWS - 1) / ADAM_ROWS);
+#pragma omp parallel for schedule(static) num_threads(threads) if (threads > 1)
+    for (int group = 0; group < groups; group++) {
+        const size_t begin = static_cast<size_t>(group) * ADAM_ROWS;
+        const size_t end = begin + ADAM_ROWS < step.count ? begin + ADAM_ROWS : step.count;
+        float correction[ADAM_ROWS];
+        const bool any = count_steps(step, begin, end, correction);
+        for (const AdamArray& array : step.arrays) {
+            if (!any)
+                __builtin_memcpy(array.out + begin * array.width, array.values + begin * array.width,
+                                 (end - begin) * array.width * sizeof(float));
+            else if (array.width == 1)
+                step_array<1>(array, step.constants, begin, end, correction);
+            else if (array.width == 3)
+                step_array<3>(array, step.constants, begin, end, correction);
+            else
+                step_array<4>(array, step.constants, begin, end, correction);
+        }
+    }
+}
+
+}  // namespace KERNEL_ISA
