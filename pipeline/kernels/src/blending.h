@@ -69,7 +69,6 @@ ALWAYS_INLINE inline uint32_t blend_some(const Splat* splats, const uint32_t* ca
         block.left = block.left * rest[k];
         const Mask blended = (block.left >= Vec(TRANSMITTANCE_MIN)) & seen[k];
         const Vec weight = select_or_zero(blended, weight_if_open);
-        store(items.batch_T + (kept + TileItems::BATCH - 1) / TileItems::BATCH * LANES, block.T);  // what is there when a batch begins stays
         block.T = select(blended, block.left, block.T);
         block.R = fma(weight, Vec(s.r), block.R);
         block.G = fma(weight, Vec(s.g), block.G);
@@ -101,6 +100,7 @@ inline OpenBlock blend_block(const Frame& frame, const Tile& tile, const Splat* 
     OpenBlock image(block, wanted);
     const uint32_t count = positions_with_bit(frame.list_blocks.data() + tile.first, tile.count, b, items.positions);
     items.counts[b] = blend_candidates(splats, items, count, image, evaluated);
+    store(items.T + b * LANES, image.T);
     items.skip(items.counts[b]);
     return image;
 }

@@ -109,7 +109,7 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
         const Vec rgb[3] = {fma(image.T, background[0], image.R), fma(image.T, background[1], image.G),
                             fma(image.T, background[2], image.B)};
         const Cotangents v = loss_of_block(image, rgb, measured[b], wanted, loss, scales, sums);
-        if (next.counts[b]) gradient_block<D>(sweep, block, next.counts[b], v);
+        if (next.counts[b]) gradient_block<D>(sweep, block, next.counts[b], v, image.T);
         sweep.items = next;
     }
     frame.evaluated.data()[index] = evaluated;

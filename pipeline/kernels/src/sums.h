@@ -1,8 +1,8 @@
 // Back to front: what the pixels of a block say about each of its Gaussians, summed.
 //
 // A block is walked from its last item to its first in batches of sixteen, in two steps.
-//   Replay: lanes are pixels. alpha as in front, the transmittance from that of the batch's beginning, and then, back to
-//   front, a few numbers per pixel and item.
+//   Replay: lanes are pixels. alpha as in front, the transmittance before each Gaussian from the one behind it, and a few
+//   numbers per pixel and item.
 //   Sums: lanes are Gaussians, after a transposition. The numbers times monomials of e = M (pixel - centre), added up over the
 //   sixteen pixels without a sum across lanes, and added to the Gaussian's row of this tile.
 #pragma once
@@ -11,7 +11,7 @@
 
 namespace KERNEL_ISA {
 
-constexpr int BATCH = TileItems::BATCH;
+constexpr int BATCH = 16;  // items
 
 // Sums of the gradient; w: cotangent of ln alpha, (X, Y) = e; R, G, B, Z: weight times cotangent.
 enum GradientSum { SUM_W, SUM_WX, SUM_WY, SUM_WXX, SUM_WXY, SUM_WYY, SUM_R, SUM_G, SUM_B, SUM_Z, GRADIENT_SUMS };
@@ -47,35 +47,29 @@ struct Batch {
 
 using Lanes = Vec[BATCH];
 
-// alpha and weight of the items of a batch; T: transmittance before the first.
-ALWAYS_INLINE inline void replay(const Batch& batch, Vec pixel_x, Vec pixel_y, Vec T, Lanes& alphas, Lanes& weights) {
-    for (int group = 0; group < batch.groups() * ABREAST; group += ABREAST) {
-        Vec alpha[ABREAST], rest[ABREAST];
+// Calls visit(k, splat, alpha, weight) for the items of a batch from the last to the first. T: transmittance behind them, then
+// before them; it is divided by the same 1 - alpha that it was multiplied by in front.
+template <class Visit>
+ALWAYS_INLINE inline void replay(const Batch& batch, Vec pixel_x, Vec pixel_y, Vec& T, Visit visit) {
+    for (int group = batch.groups(); group-- > 0;) {
+        Vec alpha[ABREAST], inverse[ABREAST];
         unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
-            const Splat& s = batch.splat(group + k);
+            const Splat& s = batch.splat(group * ABREAST + k);
             alpha[k] = Whitened(s, pixel_x, pixel_y).log2_alpha(s);
         });
         unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
-            alpha_and_rest(alpha[k], mask_of_bits(batch.pixels[group + k]), rest[k]);
+            Vec rest;
+            alpha_and_rest(alpha[k], mask_of_bits(batch.pixels[group * ABREAST + k]), rest);
+            inverse[k] = Vec(1.0f) / rest;
             pin(alpha[k]);
-            pin(rest[k]);
+            pin(inverse[k]);
         });
-        unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
-            alphas[group + k] = alpha[k];
-            weights[group + k] = alpha[k] * T;
-            T = T * rest[k];
+        unrolled<ABREAST>([&](auto back) ALWAYS_INLINE {
+            constexpr int k = ABREAST - 1 - back;
+            T = T * inverse[k];
+            visit(group * ABREAST + k, batch.splat(group * ABREAST + k), alpha[k], alpha[k] * T);
         });
     }
-}
-
-// Calls visit(k, splat) for the items of a batch from the last to the first.
-template <class Visit>
-ALWAYS_INLINE inline void walk_back(const Batch& batch, Visit visit) {
-    for (int group = batch.groups(); group-- > 0;)
-        unrolled<ABREAST>([&](auto back) ALWAYS_INLINE {
-            const int k = group * ABREAST + ABREAST - 1 - back;
-            visit(k, batch.splat(k));
-        });
 }
 
 // d channel / d ln alpha = weight (own value - what lies behind, composited); leaves in `behind` what lies behind the next.

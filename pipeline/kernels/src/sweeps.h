@@ -20,14 +20,10 @@ inline void touch(const T* begin, size_t count) {
 inline void touch_items(const Frame& frame, int index) {
     if (index >= frame.tiles_x * frame.tiles_y) return;
     const TileItems items(frame, index);
-    size_t count = 0, batches = 0;
-    for (int b = 0; b < BLOCKS; b++) {
-        count += items.counts[b];
-        batches += (items.counts[b] + BATCH - 1) / BATCH;
-    }
+    size_t count = 0;
+    for (int b = 0; b < BLOCKS; b++) count += items.counts[b];
     touch(items.positions, count);
     touch(items.pixels, count);
-    touch(items.batch_T, batches * LANES);
 }
 
 // A tile whose blocks are walked back to front; clears the rows of its list.
@@ -54,11 +50,11 @@ private:
           rows(frame.rows.data()), items(frame, t.index) {}
 };
 
-// Calls visit(batch, transmittance before it) for the batches of a block from the last to the first.
+// Calls visit(batch) for the batches of a block from the last to the first.
 template <class Visit>
 ALWAYS_INLINE inline void over_batches(const Sweep& sweep, uint32_t count, Visit visit) {
     for (uint32_t first = (count - 1) / BATCH * BATCH;; first -= BATCH) {
-        visit(Batch(sweep.splats, sweep.items, first, count), load(sweep.items.batch_T + static_cast<size_t>(first) / BATCH * LANES));
+        visit(Batch(sweep.splats, sweep.items, first, count));
         if (first == 0) return;
     }
 }
@@ -97,21 +93,21 @@ inline void sum_squares(const Lanes& w_of, const Lanes& f_of, const Cotangents& 
 
 // Adds to the rows of a block's items.
 template <Derivatives D>
-NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uint32_t count, const Cotangents& v) {
+NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uint32_t count, const Cotangents& v, Vec T) {
     constexpr int ROW = ROW_OF<D>;
     const Vec r = load(v.planes[0]), g = load(v.planes[1]), b = load(v.planes[2]), z = load(v.planes[3]), a = load(v.planes[4]);
     const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
     const float* background = sweep.view.background;
     Vec behind = fma(Vec(background[0]), r, fma(Vec(background[1]), g, Vec(background[2]) * b));
-    over_batches(sweep, count, [&](const Batch& batch, Vec T) ALWAYS_INLINE {
-        Lanes alpha, f, w;
+    over_batches(sweep, count, [&](const Batch& batch) ALWAYS_INLINE {
+        Lanes f, w;
         Vec sums[ROW];
         unused_sums<D == Derivatives::POSE ? SUM_R : D == Derivatives::ALL ? GRADIENT_SUMS : GRADIENT_SUMS + INFORMATION_SUMS, ROW>(sums);
-        replay(batch, pixel_x, pixel_y, T, alpha, f);
-        walk_back(batch, [&](int k, const Splat& s) ALWAYS_INLINE {
+        replay(batch, pixel_x, pixel_y, T, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
             const Vec own = fma(Vec(s.r), r, fma(Vec(s.g), g, fma(Vec(s.b), b, fma(Vec(s.z), z, a))));
-            const Vec gain = gain_over(behind, own, alpha[k]);
-            w[k] = if_unclamped(alpha[k], f[k] * gain);
+            const Vec gain = gain_over(behind, own, alpha);
+            w[k] = if_unclamped(alpha, weight * gain);
+            f[k] = weight;
         });
         const BatchShape shape(batch);
         transpose16(w);
@@ -151,7 +147,7 @@ inline Status gradient_tile(Frame& frame, int index, const float* d_color, const
     for (int b = 0; b < BLOCKS; b++) {
         const uint32_t count = sweep.items.counts[b];
         if (!count) continue;
-        gradient_block<D>(sweep, Block(sweep.tile, b, view), count, cotangents[b]);
+        gradient_block<D>(sweep, Block(sweep.tile, b, view), count, cotangents[b], load(sweep.items.T + b * LANES));
         sweep.items.skip(count);
     }
     return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
@@ -165,21 +161,21 @@ struct Precisions {
 };
 
 // Rows of J^T R^-1 J: each colour channel and depth has its own "behind", for their derivatives are squared one by one.
-NO_INLINE static void information_block(const Sweep& sweep, const Block& block, uint32_t count, const Precisions& v) {
+NO_INLINE static void information_block(const Sweep& sweep, const Block& block, uint32_t count, const Precisions& v, Vec T) {
     const Vec of_color = load(v.color), of_depth = load(v.depth);
     const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
     const float* background = sweep.view.background;
     Vec behind_r(background[0]), behind_g(background[1]), behind_b(background[2]), behind_z(0.0f);
-    over_batches(sweep, count, [&](const Batch& batch, Vec T) ALWAYS_INLINE {
-        Lanes alpha, f, w2, cross;
+    over_batches(sweep, count, [&](const Batch& batch) ALWAYS_INLINE {
+        Lanes f, w2, cross;
         Vec sums[INFORMATION_ROW];
         unused_sums<INFORMATION_SUMS, INFORMATION_ROW>(sums);
-        replay(batch, pixel_x, pixel_y, T, alpha, f);
-        walk_back(batch, [&](int k, const Splat& s) ALWAYS_INLINE {
-            const Vec gain_r = gain_over(behind_r, Vec(s.r), alpha[k]), gain_g = gain_over(behind_g, Vec(s.g), alpha[k]);
-            const Vec gain_b = gain_over(behind_b, Vec(s.b), alpha[k]), gain_z = gain_over(behind_z, Vec(s.z), alpha[k]);
+        replay(batch, pixel_x, pixel_y, T, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
+            const Vec gain_r = gain_over(behind_r, Vec(s.r), alpha), gain_g = gain_over(behind_g, Vec(s.g), alpha);
+            const Vec gain_b = gain_over(behind_b, Vec(s.b), alpha), gain_z = gain_over(behind_z, Vec(s.z), alpha);
             const Vec color2 = fma(gain_r, gain_r, fma(gain_g, gain_g, gain_b * gain_b)), depth_gain = of_depth * gain_z;
-            const Vec moving2 = if_unclamped(alpha[k], f[k] * f[k]);
+            const Vec moving2 = if_unclamped(alpha, weight * weight);
+            f[k] = weight;
             w2[k] = moving2 * fma(of_color, color2, depth_gain * gain_z);
             cross[k] = moving2 * depth_gain;
         });
@@ -229,7 +225,7 @@ inline Status information_tile(Frame& frame, int index, const float* inv_var_col
     for (int b = 0; b < BLOCKS; b++) {
         const uint32_t count = sweep.items.counts[b];
         if (!count) continue;
-        information_block(sweep, Block(sweep.tile, b, view), count, precisions[b]);
+        information_block(sweep, Block(sweep.tile, b, view), count, precisions[b], load(sweep.items.T + b * LANES));
         sweep.items.skip(count);
     }
     return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
@@ -238,15 +234,15 @@ inline Status information_tile(Frame& frame, int index, const float* inv_var_col
 // ---------------------------------------------------------------- contributions
 
 // Sum of weights and number of pixels.
-NO_INLINE static void contribution_block(const Sweep& sweep, const Block& block, uint32_t count) {
+NO_INLINE static void contribution_block(const Sweep& sweep, const Block& block, uint32_t count, Vec T) {
     const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
-    over_batches(sweep, count, [&](const Batch& batch, Vec T) ALWAYS_INLINE {
-        Lanes alpha, f;
+    over_batches(sweep, count, [&](const Batch& batch) ALWAYS_INLINE {
+        Lanes f;
         Vec sums[GRADIENT_ROW];
         unused_sums<2, GRADIENT_ROW>(sums);
         alignas(64) float pixels[BATCH];
         for (int k = 0; k < BATCH; k++) pixels[k] = static_cast<float>(__builtin_popcount(batch.pixels[k]));
-        replay(batch, pixel_x, pixel_y, T, alpha, f);
+        replay(batch, pixel_x, pixel_y, T, [&](int k, const Splat&, Vec, Vec weight) ALWAYS_INLINE { f[k] = weight; });
         transpose16(f);
         sums[0] = f[0];
         for (int p = 1; p < LANES; p++) sums[0] += f[p];
@@ -261,7 +257,7 @@ inline void contribution_tile(Frame& frame, int index) {
     for (int b = 0; b < BLOCKS; b++) {
         const uint32_t count = sweep.items.counts[b];
         if (!count) continue;
-        contribution_block(sweep, Block(sweep.tile, b, frame.view), count);
+        contribution_block(sweep, Block(sweep.tile, b, frame.view), count, load(sweep.items.T + b * LANES));
         sweep.items.skip(count);
     }
 }
