@@ -21,8 +21,8 @@ enum GradientSum { SUM_W, SUM_WX, SUM_WY, SUM_WXX, SUM_WXY, SUM_WYY, SUM_R, SUM_
 enum InformationSum {
     INFO_XX, INFO_XY, INFO_YY, INFO_XXX, INFO_XXY, INFO_XYY, INFO_YYY,
     INFO_XXXX, INFO_XXXY, INFO_XXYY, INFO_XYYY, INFO_YYYY, INFO_1,
-    INFO_ZX, INFO_ZY, INFO_ZXX, INFO_ZXY, INFO_ZYY, INFO_ZZ,
-    INFO_R, INFO_G, INFO_B, INFORMATION_SUMS,
+    INFO_ZX, INFO_ZY, INFO_ZXX, INFO_ZXY, INFO_ZYY,
+    INFO_R, INFO_G, INFO_B, INFO_ZZ, INFORMATION_SUMS,
     INFO_WEIGHT = INFO_G, INFO_RESIDUAL = INFO_B,
 };
 
@@ -135,14 +135,14 @@ inline void set_parts(Vec* sums, int half, const Wide (&values)[COUNT]) {
     for (int k = 0; k < COUNT; k++) set_part(sums[k], half, values[k]);
 }
 
-// sums[k] = sum of f times cotangent[k] over the pixels, k < COUNT.
-template <int COUNT>
-inline void sum_products(const Lanes& f_of, const float (*cotangents)[LANES], int half, Vec* sums) {
-    Wide total[COUNT];
-    for (Wide& t : total) t = Wide(0.0f);
-    for (int p = 0; p < LANES; p++)
-        for (int k = 0; k < COUNT; k++) total[k] = fma(part(f_of[p], half), Wide(cotangents[k][p]), total[k]);
-    set_parts(sums, half, total);
+// totals[k] = sum over the pixels p of value_of(p) times planes[k][p].
+template <int COUNT, class Value>
+inline void sum_products(Value value_of, const float (*planes)[LANES], Wide (&totals)[COUNT]) {
+    for (Wide& total : totals) total = Wide(0.0f);
+    for (int p = 0; p < LANES; p++) {
+        const Wide value = value_of(p);
+        for (int k = 0; k < COUNT; k++) totals[k] = fma(value, Wide(planes[k][p]), totals[k]);
+    }
 }
 
 // SUM_W .. SUM_WYY
@@ -208,21 +208,19 @@ inline void sum_screen_moments(W2 w2_of, const BatchShape& shape, const Block& b
     set_parts(sums, half, total);
 }
 
-// INFO_ZX .. INFO_ZZ. cross_of(p, square): product of depth's own derivative with that by ln alpha, and its square.
+// INFO_ZX .. INFO_ZYY. cross_of(p): product of depth's own derivative with that by ln alpha.
 template <class Cross>
 inline void sum_depth_moments(Cross cross_of, const BatchShape& shape, const Block& block, int half, Vec* sums) {
     const Wide zero(0.0f);
-    Wide X = zero, Y = zero, XX = zero, XY = zero, YY = zero, ZZ = zero;
+    Wide X = zero, Y = zero, XX = zero, XY = zero, YY = zero;
     Wide s0 = zero, s1 = zero, s2 = zero;
     over_rows(
         shape, half, block,
         [&](int p, Wide x) ALWAYS_INLINE {
-            Wide square;
-            const Wide cross = cross_of(p, square), cx = cross * x;
+            const Wide cross = cross_of(p), cx = cross * x;
             s0 += cross;
             s1 += cx;
             s2 = fma(cx, x, s2);
-            ZZ += square;
         },
         [&](Wide y) ALWAYS_INLINE {
             const Wide s0y = s0 * y;
@@ -233,7 +231,7 @@ inline void sum_depth_moments(Cross cross_of, const BatchShape& shape, const Blo
             YY = fma(s0y, y, YY);
             s0 = s1 = s2 = zero;
         });
-    set_parts(sums + INFO_ZX, half, {X, Y, XX, XY, YY, ZZ});
+    set_parts(sums + INFO_ZX, half, {X, Y, XX, XY, YY});
 }
 
 }  // namespace KERNEL_ISA

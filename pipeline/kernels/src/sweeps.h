@@ -71,24 +71,15 @@ struct Cotangents {
     alignas(64) float planes[5][LANES];
 };
 
-// Squares of the gradient: the empirical information.
-inline void sum_squares(const Lanes& w_of, const Lanes& f_of, const Cotangents& v, const BatchShape& shape, const Block& block, int half,
-                        Vec* sums) {
+// Squares of the gradient: the empirical information. squared: of the cotangents' planes.
+inline void sum_squares(const Lanes& w_of, const Lanes& f_of, const Cotangents& v, const float (*squared)[LANES], const BatchShape& shape,
+                        const Block& block, int half, Vec* sums) {
     sum_screen_moments([&](int p) ALWAYS_INLINE { return part(w_of[p], half) * part(w_of[p], half); }, shape, block, half, sums);
-    sum_depth_moments(
-        [&](int p, Wide& square) ALWAYS_INLINE {
-            const Wide by_z = part(f_of[p], half) * Wide(v.planes[3][p]);
-            square = by_z * by_z;
-            return by_z * part(w_of[p], half);
-        },
-        shape, block, half, sums);
-    Wide total[3] = {Wide(0.0f), Wide(0.0f), Wide(0.0f)};
-    for (int p = 0; p < LANES; p++)
-        for (int k = 0; k < 3; k++) {
-            const Wide by_color = part(f_of[p], half) * Wide(v.planes[k][p]);
-            total[k] = fma(by_color, by_color, total[k]);
-        }
-    set_parts(sums + INFO_R, half, total);
+    sum_depth_moments([&](int p) ALWAYS_INLINE { return part(f_of[p], half) * part(w_of[p], half) * Wide(v.planes[3][p]); }, shape, block,
+                      half, sums);
+    Wide totals[4];
+    sum_products([&](int p) ALWAYS_INLINE { return part(f_of[p], half) * part(f_of[p], half); }, squared, totals);
+    set_parts(sums + INFO_R, half, totals);
 }
 
 // Adds to the rows of a block's items.
@@ -98,6 +89,11 @@ NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uin
     const Vec r = load(v.planes[0]), g = load(v.planes[1]), b = load(v.planes[2]), z = load(v.planes[3]), a = load(v.planes[4]);
     const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
     const float* background = sweep.view.background;
+    alignas(64) float squared[4][LANES];
+    if constexpr (D == Derivatives::ALL_AND_SQUARES) {
+        const Vec all[4] = {r * r, g * g, b * b, z * z};
+        for (int k = 0; k < 4; k++) store(squared[k], all[k]);
+    }
     Vec behind = fma(Vec(background[0]), r, fma(Vec(background[1]), g, Vec(background[2]) * b));
     over_batches(sweep, count, [&](const Batch& batch) ALWAYS_INLINE {
         Lanes f, w;
@@ -114,11 +110,11 @@ NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uin
         for (int half = 0; half < PARTS; half++) sum_moments(w, shape, block, half, sums);
         transpose16(f);
         for (int half = 0; half < PARTS; half++) {
-            if constexpr (D == Derivatives::POSE)
-                sum_products<1>(f, v.planes + 3, half, sums + SUM_Z);  // colours wait for nobody
-            else
-                sum_products<4>(f, v.planes, half, sums + SUM_R);
-            if constexpr (D == Derivatives::ALL_AND_SQUARES) sum_squares(w, f, v, shape, block, half, sums + GRADIENT_SUMS);
+            constexpr int FIRST = D == Derivatives::POSE ? SUM_Z : SUM_R;  // the pose does not move colours
+            Wide totals[GRADIENT_SUMS - FIRST];
+            sum_products([&](int p) ALWAYS_INLINE { return part(f[p], half); }, v.planes + (FIRST - SUM_R), totals);
+            set_parts(sums + FIRST, half, totals);
+            if constexpr (D == Derivatives::ALL_AND_SQUARES) sum_squares(w, f, v, squared, shape, block, half, sums + GRADIENT_SUMS);
         }
         add_to_rows<ROW>(batch, sums, sweep.rows, sweep.list_rows);
     });
@@ -157,12 +153,12 @@ inline Status gradient_tile(Frame& frame, int index, const float* d_color, const
 
 // Precisions 1/sigma^2 of colour and depth in one block, the pixels that have one, and the residual.
 struct Precisions {
-    alignas(64) float color[LANES], depth[LANES], used[LANES], residual[LANES];
+    alignas(64) float planes[4][LANES];  // colour, depth, used, used times residual
 };
 
 // Rows of J^T R^-1 J: each colour channel and depth has its own "behind", for their derivatives are squared one by one.
 NO_INLINE static void information_block(const Sweep& sweep, const Block& block, uint32_t count, const Precisions& v, Vec T) {
-    const Vec of_color = load(v.color), of_depth = load(v.depth);
+    const Vec of_color = load(v.planes[0]), of_depth = load(v.planes[1]);
     const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
     const float* background = sweep.view.background;
     Vec behind_r(background[0]), behind_g(background[1]), behind_b(background[2]), behind_z(0.0f);
@@ -186,18 +182,14 @@ NO_INLINE static void information_block(const Sweep& sweep, const Block& block, 
         transpose16(cross);
         transpose16(f);
         for (int half = 0; half < PARTS; half++) {
-            Wide total[3] = {Wide(0.0f), Wide(0.0f), Wide(0.0f)};
-            sum_depth_moments(
-                [&](int p, Wide& square) ALWAYS_INLINE {
-                    const Wide weight = part(f[p], half), weight2 = weight * weight;
-                    square = weight2 * Wide(v.depth[p]);
-                    total[0] = fma(weight2, Wide(v.color[p]), total[0]);
-                    total[1] = fma(weight, Wide(v.used[p]), total[1]);
-                    total[2] = fma(weight, Wide(v.residual[p]), total[2]);
-                    return part(cross[p], half);
-                },
-                shape, block, half, sums);
-            set_parts(sums + INFO_R, half, total);
+            sum_depth_moments([&](int p) ALWAYS_INLINE { return part(cross[p], half); }, shape, block, half, sums);
+            Wide of_squares[2], of_weights[2];
+            sum_products([&](int p) ALWAYS_INLINE { return part(f[p], half) * part(f[p], half); }, v.planes, of_squares);
+            sum_products([&](int p) ALWAYS_INLINE { return part(f[p], half); }, v.planes + 2, of_weights);
+            set_part(sums[INFO_R], half, of_squares[0]);
+            set_part(sums[INFO_ZZ], half, of_squares[1]);
+            set_part(sums[INFO_WEIGHT], half, of_weights[0]);
+            set_part(sums[INFO_RESIDUAL], half, of_weights[1]);
         }
         add_to_rows<INFORMATION_ROW>(batch, sums, sweep.rows, sweep.list_rows);
     });
@@ -217,10 +209,8 @@ inline Status information_tile(Frame& frame, int index, const float* inv_var_col
         bad[0] |= !finite_not_negative(color);
         bad[1] |= !finite_not_negative(depth);
         bad[2] |= !finite_not_negative(r);
-        store(precisions[b].color, color);
-        store(precisions[b].depth, depth);
-        store(precisions[b].used, used);
-        store(precisions[b].residual, used * r);
+        const Vec planes[4] = {color, depth, used, used * r};
+        for (int k = 0; k < 4; k++) store(precisions[b].planes[k], planes[k]);
     }
     for (int b = 0; b < BLOCKS; b++) {
         const uint32_t count = sweep.items.counts[b];
