@@ -32,12 +32,13 @@ static_assert(GRADIENT_SUMS + INFORMATION_SUMS <= SQUARES_ROW, "");
 
 // Sixteen items of a block, or fewer: then the first stands for the missing, seen by no pixel.
 struct Batch {
+    uint32_t first;  // of the block's items
     alignas(64) uint32_t positions[BATCH];
     alignas(32) uint16_t pixels[BATCH];
     int count;
     const Splat* splats;  // of the tile's list
-    Batch(const Splat* tile_splats, const TileItems& items, uint32_t first, uint32_t block_count)
-        : count(block_count - first < BATCH ? static_cast<int>(block_count - first) : BATCH), splats(tile_splats) {
+    Batch(const Splat* tile_splats, const TileItems& items, uint32_t begin, uint32_t block_count)
+        : first(begin), count(block_count - first < BATCH ? static_cast<int>(block_count - first) : BATCH), splats(tile_splats) {
         load_positions(items.positions + first, count, positions);
         load_words(items.pixels + first, count, pixels);
     }
@@ -47,30 +48,47 @@ struct Batch {
 
 using Lanes = Vec[BATCH];
 
-// Calls visit(k, splat, alpha, weight) for the items of a batch from the last to the first. T: transmittance behind them, then
-// before them; it is divided by the same 1 - alpha that it was multiplied by in front.
-template <class Visit>
-ALWAYS_INLINE inline void replay(const Batch& batch, Vec pixel_x, Vec pixel_y, Vec& T, Visit visit) {
-    for (int group = batch.groups(); group-- > 0;) {
-        Vec alpha[ABREAST], inverse[ABREAST];
-        unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
-            const Splat& s = batch.splat(group * ABREAST + k);
-            alpha[k] = Whitened(s, pixel_x, pixel_y).log2_alpha(s);
-        });
-        unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
-            Vec rest;
-            alpha_and_rest(alpha[k], mask_of_bits(batch.pixels[group * ABREAST + k]), rest);
-            inverse[k] = Vec(1.0f) / rest;
-            pin(alpha[k]);
-            pin(inverse[k]);
-        });
-        unrolled<ABREAST>([&](auto back) ALWAYS_INLINE {
-            constexpr int k = ABREAST - 1 - back;
-            T = T * inverse[k];
-            visit(group * ABREAST + k, batch.splat(group * ABREAST + k), alpha[k], alpha[k] * T);
-        });
+// alpha and weight computed again. T: transmittance behind the items, then before them; it is divided by the same 1 - alpha
+// that it was multiplied by in front.
+struct Replay {
+    Vec pixel_x, pixel_y, T;
+    Replay(const Block& block, const float* end) : pixel_x(block.pixels_x()), pixel_y(block.pixels_y()), T(load(end)) {}
+
+    // Calls visit(k, splat, alpha, weight) for the items of a batch from the last to the first.
+    template <class Visit>
+    ALWAYS_INLINE void walk(const Batch& batch, Visit visit) {
+        for (int group = batch.groups(); group-- > 0;) {
+            Vec alpha[ABREAST], inverse[ABREAST];
+            unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
+                const Splat& s = batch.splat(group * ABREAST + k);
+                alpha[k] = Whitened(s, pixel_x, pixel_y).log2_alpha(s);
+            });
+            unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
+                Vec rest;
+                alpha_and_rest(alpha[k], mask_of_bits(batch.pixels[group * ABREAST + k]), rest);
+                inverse[k] = Vec(1.0f) / rest;
+                pin(alpha[k]);
+                pin(inverse[k]);
+            });
+            unrolled<ABREAST>([&](auto back) ALWAYS_INLINE {
+                constexpr int k = ABREAST - 1 - back;
+                T = T * inverse[k];
+                visit(group * ABREAST + k, batch.splat(group * ABREAST + k), alpha[k], alpha[k] * T);
+            });
+        }
     }
-}
+};
+// alpha and weight as the forward pass just left them.
+struct Recall {
+    Memory memory;
+    template <class Visit>
+    ALWAYS_INLINE void walk(const Batch& batch, Visit visit) {
+        for (int k = batch.count; k-- > 0;) {
+            const size_t at = static_cast<size_t>(batch.first + k) * LANES;
+            visit(k, batch.splat(k), load(memory.alphas + at), load(memory.weights + at));
+        }
+    }
+};
 
 // d channel / d ln alpha = weight (own value - what lies behind, composited); leaves in `behind` what lies behind the next.
 inline Vec gain_over(Vec& behind, Vec own, Vec alpha) {

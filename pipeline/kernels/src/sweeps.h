@@ -83,11 +83,10 @@ inline void sum_squares(const Lanes& w_of, const Lanes& f_of, const Cotangents& 
 }
 
 // Adds to the rows of a block's items.
-template <Derivatives D>
-NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uint32_t count, const Cotangents& v, Vec T) {
+template <Derivatives D, class Pass>
+NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uint32_t count, const Cotangents& v, Pass pass) {
     constexpr int ROW = ROW_OF<D>;
     const Vec r = load(v.planes[0]), g = load(v.planes[1]), b = load(v.planes[2]), z = load(v.planes[3]), a = load(v.planes[4]);
-    const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
     const float* background = sweep.view.background;
     alignas(64) float squared[4][LANES];
     if constexpr (D == Derivatives::ALL_AND_SQUARES) {
@@ -99,7 +98,7 @@ NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uin
         Lanes f, w;
         Vec sums[ROW];
         unused_sums<D == Derivatives::POSE ? SUM_R : D == Derivatives::ALL ? GRADIENT_SUMS : GRADIENT_SUMS + INFORMATION_SUMS, ROW>(sums);
-        replay(batch, pixel_x, pixel_y, T, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
+        pass.walk(batch, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
             const Vec own = fma(Vec(s.r), r, fma(Vec(s.g), g, fma(Vec(s.b), b, fma(Vec(s.z), z, a))));
             const Vec gain = gain_over(behind, own, alpha);
             w[k] = if_unclamped(alpha, weight * gain);
@@ -143,7 +142,8 @@ inline Status gradient_tile(Frame& frame, int index, const float* d_color, const
     for (int b = 0; b < BLOCKS; b++) {
         const uint32_t count = sweep.items.counts[b];
         if (!count) continue;
-        gradient_block<D>(sweep, Block(sweep.tile, b, view), count, cotangents[b], load(sweep.items.T + b * LANES));
+        const Block block(sweep.tile, b, view);
+        gradient_block<D>(sweep, block, count, cotangents[b], Replay(block, sweep.items.T + b * LANES));
         sweep.items.skip(count);
     }
     return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
@@ -157,16 +157,15 @@ struct Precisions {
 };
 
 // Rows of J^T R^-1 J: each colour channel and depth has its own "behind", for their derivatives are squared one by one.
-NO_INLINE static void information_block(const Sweep& sweep, const Block& block, uint32_t count, const Precisions& v, Vec T) {
+NO_INLINE static void information_block(const Sweep& sweep, const Block& block, uint32_t count, const Precisions& v, Replay pass) {
     const Vec of_color = load(v.planes[0]), of_depth = load(v.planes[1]);
-    const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
     const float* background = sweep.view.background;
     Vec behind_r(background[0]), behind_g(background[1]), behind_b(background[2]), behind_z(0.0f);
     over_batches(sweep, count, [&](const Batch& batch) ALWAYS_INLINE {
         Lanes f, w2, cross;
         Vec sums[INFORMATION_ROW];
         unused_sums<INFORMATION_SUMS, INFORMATION_ROW>(sums);
-        replay(batch, pixel_x, pixel_y, T, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
+        pass.walk(batch, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
             const Vec gain_r = gain_over(behind_r, Vec(s.r), alpha), gain_g = gain_over(behind_g, Vec(s.g), alpha);
             const Vec gain_b = gain_over(behind_b, Vec(s.b), alpha), gain_z = gain_over(behind_z, Vec(s.z), alpha);
             const Vec color2 = fma(gain_r, gain_r, fma(gain_g, gain_g, gain_b * gain_b)), depth_gain = of_depth * gain_z;
@@ -215,7 +214,8 @@ inline Status information_tile(Frame& frame, int index, const float* inv_var_col
     for (int b = 0; b < BLOCKS; b++) {
         const uint32_t count = sweep.items.counts[b];
         if (!count) continue;
-        information_block(sweep, Block(sweep.tile, b, view), count, precisions[b], load(sweep.items.T + b * LANES));
+        const Block block(sweep.tile, b, view);
+        information_block(sweep, block, count, precisions[b], Replay(block, sweep.items.T + b * LANES));
         sweep.items.skip(count);
     }
     return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
@@ -224,15 +224,14 @@ inline Status information_tile(Frame& frame, int index, const float* inv_var_col
 // ---------------------------------------------------------------- contributions
 
 // Sum of weights and number of pixels.
-NO_INLINE static void contribution_block(const Sweep& sweep, const Block& block, uint32_t count, Vec T) {
-    const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
+NO_INLINE static void contribution_block(const Sweep& sweep, uint32_t count, Replay pass) {
     over_batches(sweep, count, [&](const Batch& batch) ALWAYS_INLINE {
         Lanes f;
         Vec sums[GRADIENT_ROW];
         unused_sums<2, GRADIENT_ROW>(sums);
         alignas(64) float pixels[BATCH];
         for (int k = 0; k < BATCH; k++) pixels[k] = static_cast<float>(__builtin_popcount(batch.pixels[k]));
-        replay(batch, pixel_x, pixel_y, T, [&](int k, const Splat&, Vec, Vec weight) ALWAYS_INLINE { f[k] = weight; });
+        pass.walk(batch, [&](int k, const Splat&, Vec, Vec weight) ALWAYS_INLINE { f[k] = weight; });
         transpose16(f);
         sums[0] = f[0];
         for (int p = 1; p < LANES; p++) sums[0] += f[p];
@@ -247,7 +246,8 @@ inline void contribution_tile(Frame& frame, int index) {
     for (int b = 0; b < BLOCKS; b++) {
         const uint32_t count = sweep.items.counts[b];
         if (!count) continue;
-        contribution_block(sweep, Block(sweep.tile, b, frame.view), count, load(sweep.items.T + b * LANES));
+        const Block block(sweep.tile, b, frame.view);
+        contribution_block(sweep, count, Replay(block, sweep.items.T + b * LANES));
         sweep.items.skip(count);
     }
 }
