@@ -82,6 +82,7 @@ static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& los
     if (status != Status::ok) return status;
     const int tiles = frame.tiles_x * frame.tiles_y;
     frame.rows.need(frame.intersection_count * ROW_OF<D>);
+    frame.front.need((frame.longest_list + 1) * LANES * 2 * frame.threads);
     const double* parts = frame.loss_parts.need(static_cast<size_t>(tiles) * LOSS_SUMS);
     const LossScales scales(PixelCounts(frame.view, loss.depth_m));
     status = over_tiles(frame, [&](int tile) { return fit_tile<D>(frame, tile, loss, scales); });
