@@ -149,27 +149,27 @@ def estimate_noise(
     views: Sequence[View],
     config: InformationConfig,
     threads: int = 1,
-    stride_px: int = 4,
+    every: int = 4,
 ) -> Noise:
     """Noise from the residuals of the map's own renders: 1.4826 times the median absolute residual.
 
-    Only pixels that the map covers (alpha above 0.9) count, every `stride_px`-th in both directions. The residuals
-    hold the map's errors beside the sensor's, so that a poor map does not call itself certain. Depth residuals are
-    taken in units of the configured sigma(z); their spread is the factor on it. Without such pixels the colour is at
-    its floor and the factor is 1.
+    Only pixels that the map covers (alpha above 0.9) count, in every `every`-th block of 4x4 px in both
+    directions; such blocks are what the rasterizer can leave out. The residuals hold the map's errors beside the
+    sensor's, so that a poor map does not call itself certain. Depth residuals are taken in units of the configured
+    sigma(z); their spread is the factor on it. Without such pixels the colour is at its floor and the factor is 1.
     """
     rasterizer = Rasterizer(threads=threads)
     unit = Noise(1.0, 1.0, config.depth_sigma_base_m, config.depth_sigma_quadratic_per_m)
     colors, depths = [np.zeros(0)], [np.zeros(0)]
-    every = (slice(stride_px // 2, None, stride_px),) * 2
+    sample = _blocks_of_4x4(camera.height, camera.width, every)
     for view in views:
-        render = rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera))
-        alpha, z = render.alpha[every].astype(np.float64), view.depth_m[every].astype(np.float64)
+        render = rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera), mask=sample)
+        alpha, z = render.alpha[sample].astype(np.float64), view.depth_m[sample].astype(np.float64)
         covered = alpha > 0.9
-        difference = render.color[every].astype(np.float64) - view.color[every] / 255.0
+        difference = render.color[sample].astype(np.float64) - view.color[sample] / 255.0
         colors.append(np.abs(difference[covered]).ravel())
         both = covered & (z > 0)
-        residual = render.depth[every][both] / alpha[both] - z[both]
+        residual = render.depth[sample][both] / alpha[both] - z[both]
         depths.append(np.abs(residual) / unit.depth_sigma_m(z[both]))
     color, depth = np.concatenate(colors), np.concatenate(depths)
     color_sigma = MAD_TO_SIGMA * float(np.median(color)) if len(color) else 0.0
@@ -183,6 +183,12 @@ def estimate_noise(
         depth_base_m=config.depth_sigma_base_m,
         depth_quadratic_per_m=config.depth_sigma_quadratic_per_m,
     )
+
+
+def _blocks_of_4x4(height: int, width: int, every: int) -> NDArray[np.bool_]:
+    """Pixels [height, width] of every `every`-th block in both directions."""
+    rows, columns = (np.arange(side) // 4 % every == every // 2 for side in (height, width))
+    return rows[:, None] & columns[None, :]
 
 
 def sum_information(
@@ -203,8 +209,8 @@ def sum_information(
     inverse_color = np.full((camera.height, camera.width), noise.color_sigma**-2, np.float32)
     # newest first, so that `per_gaussian` can stop at the latest that saw a Gaussian
     for view in reversed(chosen):
-        measured = view.depth_m > 0
-        inverse_depth = np.where(measured, noise.depth_sigma_m(view.depth_m) ** -2.0, 0.0).astype(np.float32)
+        inverse_variance = 1.0 / np.square(noise.depth_sigma_m(view.depth_m))
+        inverse_depth = np.where(view.depth_m > 0, inverse_variance, 0.0).astype(np.float32)
         rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera))
         if config.window == "per_gaussian":
             one = FisherSums(len(gaussians))

@@ -65,12 +65,14 @@ def views_of(gaussians: Gaussians, color_noise: float = 0.0, depth_factor: float
 
 def test_noise_is_found_in_the_residuals() -> None:
     gaussians = wall()
-    noisy = estimate_noise(
-        gaussians, CAMERA, views_of(gaussians, 0.05, 2.0), InformationConfig(), stride_px=1
-    )
+    views = views_of(gaussians, 0.05, 2.0)
+    noisy = estimate_noise(gaussians, CAMERA, views, InformationConfig(), every=1)
     assert noisy.color_sigma == pytest.approx(0.05, rel=0.05)
     assert noisy.depth_factor == pytest.approx(2.0, rel=0.05)
     assert noisy.depth_formula() == f"{noisy.depth_factor:.6g} * (0.0012 + 0.0019 * (z - 0.4)^2)"
+    sampled = estimate_noise(gaussians, CAMERA, views, InformationConfig())
+    assert sampled.color_sigma == pytest.approx(noisy.color_sigma, rel=0.15)  # 384 pixels
+    assert sampled.depth_factor == pytest.approx(noisy.depth_factor, rel=0.15)
     clean = estimate_noise(gaussians, CAMERA, views_of(gaussians), InformationConfig())
     assert clean.color_sigma == InformationConfig().color_sigma_floor
     assert clean.depth_factor == InformationConfig().depth_factor_min
@@ -86,7 +88,7 @@ def test_a_few_wrong_pixels_do_not_change_the_noise() -> None:
         view.color[:6] = 255
         view.depth_m[:6] = 9.0
     config = InformationConfig()
-    a, b = (estimate_noise(gaussians, CAMERA, v, config, stride_px=1) for v in (views, spoiled))
+    a, b = (estimate_noise(gaussians, CAMERA, v, config, every=1) for v in (views, spoiled))
     assert b.color_sigma == pytest.approx(a.color_sigma, rel=0.35)
     assert b.depth_factor == pytest.approx(a.depth_factor, rel=0.35)
 
