@@ -51,4 +51,6 @@ def _check_gradient(name: str, gradient: object, shape: tuple[int, ...]) -> None
         found = gradient.dtype if isinstance(gradient, np.ndarray) else type(gradient).__name__
         raise ValueError(f"gradients.{name} is {found}, expected an array of float32")
     if gradient.shape != shape:
-        raise ValueError(f"gradients.{name} has shape {gradient.shape}, expected {shape}, that of gaussians.{name}")
+        raise ValueError(
+            f"gradients.{name} has shape {gradient.shape}, expected {shape}, that of gaussians.{name}"
+        )

@@ -1,10 +1,12 @@
 """Adam: the textbook's steps, per Gaussian."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
-from pipeline.kernels import Gradients
+from pipeline.kernels import CompiledAdam, Gradients, available_isas
 from pipeline.splat.gaussians import Gaussians
 from pipeline.splat.optimiser import BETA_1, BETA_2, Adam, LearningRates
 
@@ -27,9 +29,10 @@ def gradients(n: int, seed: int) -> Gradients:
     )
 
 
-def test_steps_are_the_textbooks() -> None:
+@pytest.mark.parametrize("adam_of", [Adam, CompiledAdam])
+def test_steps_are_the_textbooks(adam_of: type[Adam]) -> None:
     rates = LearningRates(means=0.01, quats_wxyz=0.02, log_scales=0.03, colors=0.04, opacity_logits=0.05)
-    gaussians, adam = some(4), Adam(4)
+    gaussians, adam = some(4), adam_of(4)
     expected = {name: getattr(gaussians, name).astype(np.float64) for name in NAMES}
     m = {name: np.zeros_like(value) for name, value in expected.items()}
     v = {name: np.zeros_like(value) for name, value in expected.items()}
@@ -45,23 +48,25 @@ def test_steps_are_the_textbooks() -> None:
         np.testing.assert_allclose(getattr(gaussians, name), expected[name], atol=2e-6)
 
 
-def test_what_a_view_does_not_touch_stays() -> None:
-    gaussians, adam = some(5), Adam(5)
+@pytest.mark.parametrize("adam_of", [Adam, CompiledAdam])
+def test_what_a_view_does_not_touch_stays(adam_of: type[Adam]) -> None:
+    gaussians, adam = some(5), adam_of(5)
     full = gradients(5, 1)
     seen = np.array([True, False, True, False, True])
     g = Gradients(
         *(np.where(seen.reshape(-1, *[1] * (x.ndim - 1)), x, 0) for x in (getattr(full, n) for n in NAMES))
     )
     after = adam.step(adam.step(gaussians, full, LearningRates()), g, LearningRates())
-    once = Adam(5).step(gaussians, full, LearningRates())
+    once = adam_of(5).step(gaussians, full, LearningRates())
     for name in NAMES:
         np.testing.assert_array_equal(getattr(after, name)[~seen], getattr(once, name)[~seen])
         assert (getattr(after, name)[seen] != getattr(once, name)[seen]).any()
 
 
-def test_a_gaussian_does_not_depend_on_its_neighbours() -> None:
+@pytest.mark.parametrize("adam_of", [Adam, CompiledAdam])
+def test_a_gaussian_does_not_depend_on_its_neighbours(adam_of: type[Adam]) -> None:
     gaussians, order = some(6), np.array([4, 0, 5, 2])
-    all_of_them, some_of_them = Adam(6), Adam(6)
+    all_of_them, some_of_them = adam_of(6), adam_of(6)
     some_of_them.select(order)
     whole, part = gaussians, gaussians.select(order)
     for t in range(3):
@@ -72,16 +77,59 @@ def test_a_gaussian_does_not_depend_on_its_neighbours() -> None:
         np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[order])
 
 
-def test_a_new_gaussian_starts_afresh() -> None:
-    gaussians, adam = some(3), Adam(2)
+@pytest.mark.parametrize("adam_of", [Adam, CompiledAdam])
+def test_a_new_gaussian_starts_afresh(adam_of: type[Adam]) -> None:
+    gaussians, adam = some(3), adam_of(2)
     first = gaussians.select(slice(2))
     for t in range(4):
         first = adam.step(first, gradients(2, t), LearningRates())
     adam.extend(1)
     g = gradients(3, 9)
     together = adam.step(Gaussians.concatenate([first, gaussians.select([2])]), g, LearningRates())
-    alone = Adam(1).step(
+    alone = adam_of(1).step(
         gaussians.select([2]), Gradients(*(getattr(g, n)[2:] for n in NAMES)), LearningRates()
     )
     np.testing.assert_array_equal(together.means[2], alone.means[0])
     assert len(adam) == 3
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("isa", available_isas())
+def test_the_compiled_steps_are_the_same_bits(isa: str, threads: int) -> None:
+    n = 1000  # not whole groups of 64; a third of them without anything touched
+    gaussians, r = some(n), np.random.default_rng(7)
+    plain, compiled = Adam(n), CompiledAdam(n, isa, threads)
+    expected = found = gaussians
+    for t in range(30):
+        scale = 10.0 ** r.integers(-30, 3)  # squares down to subnormal numbers and zero
+        seen = np.repeat(r.random(16) < 0.7, 64)[:n] & (r.random(n) < 0.8)
+        g = Gradients(
+            *(
+                np.where(seen.reshape(-1, *[1] * (x.ndim - 1)), x * np.float32(scale), 0).astype(np.float32)
+                for x in (getattr(gradients(n, t), name) for name in NAMES)
+            )
+        )
+        expected = plain.step(expected, g, LearningRates())
+        found = compiled.step(found, g, LearningRates())
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+def test_steps_are_counted_to_the_end_only() -> None:
+    gaussians = some(2)
+    plain, compiled = Adam(2), CompiledAdam(2)
+    expected = found = gaussians
+    for t in range(1030):
+        expected = plain.step(expected, gradients(2, t), LearningRates())
+        found = compiled.step(found, gradients(2, t), LearningRates())
+    np.testing.assert_array_equal(found.means, expected.means)
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    gaussians, g, adam = some(3), gradients(3, 0), CompiledAdam(3)
+    with pytest.raises(ValueError, match="gaussians are 2, expected 3"):
+        adam.step(gaussians.select(slice(2)), g, LearningRates())
+    with pytest.raises(ValueError, match=r"gradients\.means has shape \(2, 3\), expected \(3, 3\)"):
+        adam.step(gaussians, replace(g, means=g.means[:2]), LearningRates())
+    with pytest.raises(ValueError, match=r"gradients\.colors is float64, expected an array of float32"):
+        adam.step(gaussians, replace(g, colors=g.colors.astype(np.float64)), LearningRates())
