@@ -21,6 +21,8 @@ Image = NDArray[np.float32]
 THICKNESS_FLOOR_M = 1e-3
 """Thickness below which no splat is told from a plane: log-scales stop here, and carry no information there."""
 
+_CELLS_AT_A_TIME = 256  # windows of as many stay in the cache
+
 
 class SeedingConfig(Config):
     """Where Gaussians are put and what they look like at first."""
@@ -166,47 +168,49 @@ class _Grid:
     color: NDArray[np.float64]
 
 
-def _blocks(image: NDArray, side: int) -> NDArray:
-    """Cells of an image [H, W, ...] as [rows, columns, side * side, ...], zero-padded at the right and bottom."""
+def _cells(image: NDArray, side: int) -> NDArray:
+    """Cells of an image [H, W, ...], row by row, as [side * side, cells, ...]; zero-padded at the right and bottom."""
     h, w = image.shape[:2]
-    pad = [(0, -h % side), (0, -w % side), *[(0, 0)] * (image.ndim - 2)]
-    image = np.pad(image, pad)
-    rows, columns = image.shape[0] // side, image.shape[1] // side
-    blocks = image.reshape(rows, side, columns, side, *image.shape[2:]).swapaxes(1, 2)
-    return blocks.reshape(rows, columns, side * side, *image.shape[2:])
+    image = np.pad(image, [(0, -h % side), (0, -w % side), *[(0, 0)] * (image.ndim - 2)])
+    rows, columns, tail = image.shape[0] // side, image.shape[1] // side, image.shape[2:]
+    pixels_first = np.moveaxis(image.reshape(rows, side, columns, side, *tail), (1, 3), (0, 1))
+    return pixels_first.reshape(side * side, rows * columns, *tail)
 
 
 def _grid(color: Image, depth_m: Image, wanted: NDArray[np.bool_], side: int) -> _Grid:
-    masks = _blocks(wanted, side)
-    filled = masks.sum(axis=2) * 2 >= side * side
-    mask, z = masks[filled], _blocks(depth_m, side)[filled].astype(np.float64)
-    rgb = _blocks(color, side)[filled].astype(np.float64)
-    nearest = np.where(mask, z, np.inf).min(axis=1)
-    farthest = np.where(mask, z, -np.inf).max(axis=1)
-    front = mask & (z <= 1.05 * nearest[:, None])
-    weight = front / front.sum(axis=1)[:, None]
+    """Only filled cells are measured: the others are split whatever they hold."""
+    rows, columns = -(-depth_m.shape[0] // side), -(-depth_m.shape[1] // side)
+    mask = _cells(wanted, side)
+    filled = mask.sum(axis=0) * 2 >= side * side
+    cells = np.flatnonzero(filled)
+    mask = mask[:, cells]
+    z = _cells(depth_m, side)[:, cells].astype(np.float64)
+    rgb = _cells(color, side)[:, cells].astype(np.float64)
+    nearest = np.where(mask, z, np.inf).min(axis=0)
+    farthest = np.where(mask, z, -np.inf).max(axis=0)
+    front = mask & (z <= 1.05 * nearest)
+    weight = front / front.sum(axis=0)
     inverse_z = np.where(front, 1.0 / np.where(front, z, 1.0), 0.0)
-    offset = np.arange(side * side)
-    row, column = np.nonzero(filled)
-    u = side * column[:, None] + offset % side
-    v = side * row[:, None] + offset // side
+    pixel = np.arange(side * side)[:, None]
+    u = side * (cells % columns) + pixel % side
+    v = side * (cells // columns) + pixel // side
     grey = (rgb[..., 0] + rgb[..., 1] + rgb[..., 2]) / 3
-    mean = (weight * grey).sum(axis=1)
-    detail = np.sqrt(np.maximum((weight * grey * grey).sum(axis=1) - mean * mean, 0.0))
+    mean = (weight * grey).sum(axis=0)
+    detail = np.sqrt(np.maximum((weight * grey * grey).sum(axis=0) - mean * mean, 0.0))
 
     def everywhere(values: NDArray) -> NDArray[np.float64]:
-        cells = np.zeros((*filled.shape, *values.shape[1:]))
-        cells[filled] = values
-        return cells
+        image = np.zeros((rows * columns, *values.shape[1:]))
+        image[cells] = values
+        return image.reshape(rows, columns, *values.shape[1:])
 
     return _Grid(
         side=side,
-        filled=filled,
+        filled=filled.reshape(rows, columns),
         detail=everywhere(np.where(farthest > 1.05 * nearest, np.inf, detail)),
-        u=everywhere((weight * u).sum(axis=1)),
-        v=everywhere((weight * v).sum(axis=1)),
-        z=everywhere(1.0 / (weight * inverse_z).sum(axis=1)),
-        color=everywhere((weight[..., None] * rgb).sum(axis=1)),
+        u=everywhere((weight * u).sum(axis=0)),
+        v=everywhere((weight * v).sum(axis=0)),
+        z=everywhere(1.0 / (weight * inverse_z).sum(axis=0)),
+        color=everywhere((weight[..., None] * rgb).sum(axis=0)),
     )
 
 
@@ -236,38 +240,48 @@ def surface_normals(
     pixels of a (2 radius + 1)^2 window within 5 % of the cell's inverse depth. Where it is not determined the
     normal is the viewing ray.
     """
-    h, w = depth_m.shape
-    side = 2 * radius_px + 1
-    du, dv = np.arange(side * side) % side - radius_px, np.arange(side * side) // side - radius_px
-    u = np.rint(cells.uv[:, 0]).astype(np.int64)[:, None] + du
-    v = np.rint(cells.uv[:, 1]).astype(np.int64)[:, None] + dv
-    inside = (u >= 0) & (u < w) & (v >= 0) & (v < h)
-    z = np.where(inside, depth_m[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)], 0).astype(np.float64)
-    q = 1.0 / np.where(z > 0, z, np.inf)
-    q_cell = 1.0 / cells.depth_m
-    weight = ((z > 0) & (np.abs(q / q_cell[:, None] - 1) < 0.05)).astype(np.float64)
-    x, y = du.astype(np.float64), dv.astype(np.float64)
-    s = weight.sum(axis=1)
-    safe = np.maximum(s, 1.0)
-    mx, my, mq = ((weight * value).sum(axis=1) / safe for value in (x, y, q))
-    cxx = (weight * x * x).sum(axis=1) / safe - mx * mx
-    cyy = (weight * y * y).sum(axis=1) / safe - my * my
-    cxy = (weight * x * y).sum(axis=1) / safe - mx * my
-    cxq = (weight * x * q).sum(axis=1) / safe - mx * mq
-    cyq = (weight * y * q).sum(axis=1) / safe - my * mq
-    det = cxx * cyy - cxy * cxy
-    determined = (s >= 6) & (det > 0.25)
-    det = np.where(determined, det, 1.0)
-    slope_u = np.where(determined, (cyy * cxq - cxy * cyq) / det, 0.0)
-    slope_v = np.where(determined, (cxx * cyq - cxy * cxq) / det, 0.0)
-    level = q_cell - slope_u * (cells.uv[:, 0] - camera.cx) - slope_v * (cells.uv[:, 1] - camera.cy)
-    normal = np.stack([slope_u * camera.fx, slope_v * camera.fy, level], axis=1)
-    ray = np.stack(
-        [(cells.uv[:, 0] - camera.cx) / camera.fx, (cells.uv[:, 1] - camera.cy) / camera.fy, np.ones_like(s)],
-        axis=1,
-    )
+    n = len(cells.uv)
+    slope, determined = np.zeros((n, 2)), np.zeros(n, bool)
+    for start in range(0, n, _CELLS_AT_A_TIME):
+        part = slice(start, start + _CELLS_AT_A_TIME)
+        slope[part], determined[part] = _inverse_depth_slope(
+            depth_m, cells.uv[part], 1.0 / cells.depth_m[part], radius_px
+        )
+    offset = cells.uv - np.array([camera.cx, camera.cy])
+    level = 1.0 / cells.depth_m - slope[:, 0] * offset[:, 0] - slope[:, 1] * offset[:, 1]
+    normal = np.column_stack([slope * np.array([camera.fx, camera.fy]), level])
+    ray = np.column_stack([offset / np.array([camera.fx, camera.fy]), np.ones(n)])
     normal = np.where(determined[:, None], normal, ray)
     return -normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def _inverse_depth_slope(
+    depth_m: Image, uv: NDArray[np.float64], q_cell: NDArray[np.float64], radius_px: int
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Slope [n, 2] of inverse depth along u and v around pixels uv, by least squares, and whether it is determined."""
+    h, w = depth_m.shape
+    side = 2 * radius_px + 1
+    x, y = (np.arange(side * side)[:, None] // step % side - radius_px for step in (1, side))
+    u, v = (np.rint(column).astype(np.int64) for column in uv.T)
+    u, v = u + x, v + y
+    inside = (u >= 0) & (u < w) & (v >= 0) & (v < h)
+    z = depth_m[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)].astype(np.float64)
+    measured = inside & (z > 0)
+    q = 1.0 / np.where(measured, z, np.inf)
+    weight = (measured & (np.abs(q / q_cell - 1) < 0.05)).astype(np.float64)
+    wx, wy = weight * x, weight * y
+    s = weight.sum(axis=0)
+    safe = np.maximum(s, 1.0)
+    mx, my, mq = (value.sum(axis=0) / safe for value in (wx, wy, weight * q))
+    cxx = (wx * x).sum(axis=0) / safe - mx * mx
+    cyy = (wy * y).sum(axis=0) / safe - my * my
+    cxy = (wx * y).sum(axis=0) / safe - mx * my
+    cxq = (wx * q).sum(axis=0) / safe - mx * mq
+    cyq = (wy * q).sum(axis=0) / safe - my * mq
+    det = cxx * cyy - cxy * cxy
+    determined = (s >= 6) & (det > 0.25)
+    slope = np.stack([cyy * cxq - cxy * cyq, cxx * cyq - cxy * cxq], axis=1)
+    return slope / np.where(determined, det, 1.0)[:, None] * determined[:, None], determined
 
 
 def _disc_axes(normals: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
