@@ -26,6 +26,7 @@ from schemas import topics
 MAD_TO_SIGMA = 1.4826
 FLOOR_TOLERANCE = 1e-3  # of a log-scale; float32 logs of metres are good to 1e-6
 _UPPER = np.triu_indices(9)
+_ROWS_AT_A_TIME = 1024  # 9x9 matrices of as many stay in the cache
 
 
 @dataclass(frozen=True)
@@ -233,20 +234,27 @@ def without_thickness(
     information given the floor, and v itself has none. The tilt of a disc (e e_t^T + e_t e^T) keeps its information.
     """
     at_floor = gaussians.log_scales <= np.float32(np.log(floor_m) + FLOOR_TOLERANCE)
-    if not at_floor.any():
-        return geometry
-    full = np.zeros((len(gaussians), 9, 9))
-    full[:, _UPPER[0], _UPPER[1]] = geometry
-    full[:, _UPPER[1], _UPPER[0]] = geometry
-    axes = so3.from_quat_wxyz(gaussians.quats_wxyz)
+    result = geometry.copy()
+    rows = np.flatnonzero(at_floor.any(axis=1))
+    for start in range(0, len(rows), _ROWS_AT_A_TIME):
+        part = rows[start : start + _ROWS_AT_A_TIME]
+        result[part] = _projected(geometry[part], so3.from_quat_wxyz(gaussians.quats_wxyz[part]), at_floor[part])
+    return result
+
+
+def _projected(
+    geometry: NDArray[np.float64], axes: NDArray[np.float64], at_floor: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """P F P of information [n, 45] for every axis k (columns of [n, 3, 3]) where at_floor[:, k]."""
+    F = np.zeros((len(geometry), 9, 9))
+    F[:, _UPPER[0], _UPPER[1]] = geometry
+    F[:, _UPPER[1], _UPPER[0]] = geometry
     for k in range(3):
-        rows = np.flatnonzero(at_floor[:, k])
-        e = axes[rows, :, k]
-        v = np.zeros((len(rows), 9))
-        v[:, 3:] = spd.sym_to_vec(e[:, :, None] * e[:, None, :])
-        F = full[rows]
+        e = axes[:, :, k]
+        v = np.zeros((len(e), 9))
+        v[:, 3:] = spd.sym_to_vec(e[:, :, None] * e[:, None, :]) * at_floor[:, k, None]
         Fv = (F * v[:, None, :]).sum(axis=2)
-        vFv = (Fv * v).sum(axis=1)
-        outer = Fv[:, :, None] * v[:, None, :]
-        full[rows] = F - outer - outer.swapaxes(1, 2) + vFv[:, None, None] * (v[:, :, None] * v[:, None, :])
-    return full[:, _UPPER[0], _UPPER[1]]
+        half = Fv - 0.5 * (Fv * v).sum(axis=1)[:, None] * v
+        outer = half[:, :, None] * v[:, None, :]
+        F -= outer + outer.swapaxes(1, 2)
+    return F[:, _UPPER[0], _UPPER[1]]
