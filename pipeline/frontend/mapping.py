@@ -25,6 +25,7 @@ from pipeline.splat.optimiser import BETA_1, BETA_2, LearningRates
 from pipeline.splat.seeding import seed_discs, unexplained
 
 Image = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class _View:
     """A keyframe as the mapper keeps it: colours as bytes, depth in metres."""
 
     index: int
-    color: NDArray[np.uint8]
+    color: Bytes
     depth_m: Image
     half_color: Image
     half_depth_m: Image
@@ -54,7 +55,7 @@ class _View:
 
     def images(self, level: int) -> tuple[Image, Image]:
         if level == 0:
-            return self.color.astype(np.float32) * np.float32(1 / 255), self.depth_m
+            return _from_bytes(self.color), self.depth_m
         return self.half_color, self.half_depth_m
 
     def step_exposure(self, gradient: tuple[float, float], rate: float) -> None:
@@ -98,13 +99,13 @@ class Mapper:
         return {view.index: view.exposure for view in self._views}
 
     def add_keyframe(
-        self, keyframe_index: int, color: Image, depth_m: Image, T_map_camera: NDArray[np.float64]
+        self, keyframe_index: int, color: Bytes, depth_m: Image, T_map_camera: NDArray[np.float64]
     ) -> MappingStats:
         """Seed what the map does not explain of a new keyframe and optimise the window around it.
 
         Args:
             keyframe_index: 0, 1, 2, ... in order of arrival.
-            color: RGB 0..1 [H, W, 3] (kept as bytes). depth_m: metres [H, W], 0 where there is none.
+            color: RGB [H, W, 3]. depth_m: metres [H, W], 0 where there is none. Both are kept, not copied.
             T_map_camera: pose of the camera in the map frame.
         """
         if keyframe_index != len(self._views):
@@ -143,7 +144,7 @@ class Mapper:
         self._gaussians = self._gaussians.moved(old, new)
 
     def add_view(
-        self, keyframe_index: int, color: Image, depth_m: Image, T_keyframe_camera: NDArray[np.float64]
+        self, keyframe_index: int, color: Bytes, depth_m: Image, T_keyframe_camera: NDArray[np.float64]
     ) -> None:
         """Let a tracked frame that is no keyframe take part in `finish`; it moves with its keyframe.
 
@@ -315,11 +316,14 @@ def overlap(
 
     A pixel counts if its point projects into the other image and lies within 10 % of the depth measured there.
     """
-    z = depth_m[stride_px // 2 :: stride_px, stride_px // 2 :: stride_px].astype(np.float64)
-    rays = camera.rays()[stride_px // 2 :: stride_px, stride_px // 2 :: stride_px]
-    points = (rays * z[..., None])[z > 0]
-    if len(points) == 0:
+    first = stride_px // 2
+    z = depth_m[first::stride_px, first::stride_px].astype(np.float64)
+    row, column = np.nonzero(z > 0)
+    if len(row) == 0:
         return 0.0
+    z = z[row, column]
+    u, v = first + stride_px * column, first + stride_px * row
+    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
     seen = se3.transform(se3.inverse(T_map_other) @ T_map_camera, points)
     seen = seen[seen[:, 2] > 0.05]
     uv = np.rint(camera.project(seen)).astype(np.int64)
@@ -329,17 +333,23 @@ def overlap(
     return float(np.count_nonzero(agree)) / len(points)
 
 
-def _view(index: int, color: Image, depth_m: Image, T_map_camera: NDArray[np.float64]) -> _View:
-    kept = np.rint(np.clip(color, 0, 1) * 255).astype(np.uint8)
+def _view(index: int, color: Bytes, depth_m: Image, T_map_camera: NDArray[np.float64]) -> _View:
+    if color.dtype != np.uint8:
+        raise ValueError(f"color is an array of {color.dtype}, expected uint8")
     depth_m = np.asarray(depth_m, dtype=np.float32)
     return _View(
         index=index,
-        color=kept,
+        color=color,
         depth_m=depth_m,
-        half_color=halve(kept.astype(np.float32) * np.float32(1 / 255)),
+        half_color=halve(_from_bytes(color)),
         half_depth_m=_halve_depth(depth_m),
         T_map_camera=np.array(T_map_camera, dtype=np.float64),
     )
+
+
+def _from_bytes(color: Bytes) -> Image:
+    """Colours 0..1."""
+    return color * np.float32(1 / 255)
 
 
 def _first_exposure(render: Render, color: Image) -> tuple[float, float]:

@@ -165,13 +165,11 @@ def _map(
     updates = []
     for keyframe in steps:
         frame = log.frame(keyframe.frame_index)
-        image = frame.color.astype(np.float32) * np.float32(1 / 255)
-        stats = mapper.add_keyframe(keyframe.keyframe_index, image, frame.depth, keyframe.T_map_camera)
+        stats = mapper.add_keyframe(keyframe.keyframe_index, frame.color, frame.depth, keyframe.T_map_camera)
         updates.append(update(keyframe, stats))
     for supporting in _support(frames, keyframes, config):
         frame = log.frame(supporting.frame_index)
-        image = frame.color.astype(np.float32) * np.float32(1 / 255)
-        mapper.add_view(supporting.keyframe_index, image, frame.depth, supporting.T_keyframe_camera)
+        mapper.add_view(supporting.keyframe_index, frame.color, frame.depth, supporting.T_keyframe_camera)
     updates.append(update(keyframes[-1], mapper.finish()))
     return updates, mapper.gaussians
 

@@ -33,7 +33,7 @@ def shot(T_map_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     z = hits.min(axis=0)
     points = origin + rays * z[..., None]
     phase = points @ np.array([[3.0, 1.0, 0.0], [0.0, 2.0, 3.0], [2.0, 0.0, 2.0]])
-    return (0.5 + 0.3 * np.sin(phase)).astype(np.float32), z.astype(np.float32)
+    return np.rint(255 * (0.5 + 0.3 * np.sin(phase))).astype(np.uint8), z.astype(np.float32)
 
 
 def build(
@@ -53,7 +53,7 @@ def drawn(mapper: Mapper, T_map_camera: np.ndarray) -> tuple[float, float, float
     """PSNR, depth error and completeness of a view."""
     color, depth = shot(T_map_camera)
     render = Rasterizer().forward(mapper.gaussians, CAMERA, se3.inverse(T_map_camera))
-    return psnr(render.color, color), *depth_error(render, depth)
+    return psnr(render.color, color / 255), *depth_error(render, depth)
 
 
 def test_views_that_were_never_mapped_are_drawn_well() -> None:
@@ -188,7 +188,8 @@ def test_exposure_is_found() -> None:
     mapper = Mapper(CAMERA, config, seed=0)
     for k in range(3):
         color, depth = shot(POSES[k])
-        mapper.add_keyframe(k, color * (0.8 if k == 1 else 1.0), depth, POSES[k])
+        dimmed = np.rint(color * (0.8 if k == 1 else 1.0)).astype(np.uint8)
+        mapper.add_keyframe(k, dimmed, depth, POSES[k])
     mapper.finish()
     assert mapper.exposures[0] == (0.0, 0.0)
     gains = [np.exp(a) * 0.5 + b for a, b in mapper.exposures.values()]  # at mid grey
