@@ -162,9 +162,11 @@ def estimate_noise(
     rasterizer = Rasterizer(threads=threads)
     unit = Noise(1.0, 1.0, config.depth_sigma_base_m, config.depth_sigma_quadratic_per_m)
     colors, depths = [np.zeros(0)], [np.zeros(0)]
-    sample = _blocks_of_4x4(camera.height, camera.width, every)
+    sample = np.ix_(_in_blocks(camera.height, every), _in_blocks(camera.width, every))
+    mask = np.zeros((camera.height, camera.width), bool)
+    mask[sample] = True
     for view in views:
-        render = rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera), mask=sample)
+        render = rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera), mask=mask)
         alpha, z = render.alpha[sample].astype(np.float64), view.depth_m[sample].astype(np.float64)
         covered = alpha > 0.9
         difference = render.color[sample].astype(np.float64) - view.color[sample] / 255.0
@@ -186,10 +188,10 @@ def estimate_noise(
     )
 
 
-def _blocks_of_4x4(height: int, width: int, every: int) -> NDArray[np.bool_]:
-    """Pixels [height, width] of every `every`-th block in both directions."""
-    rows, columns = (np.arange(side) // 4 % every == every // 2 for side in (height, width))
-    return rows[:, None] & columns[None, :]
+def _in_blocks(side_px: int, every: int) -> NDArray[np.int64]:
+    """Pixels along a side of the image that lie in every `every`-th block of four."""
+    pixels = np.arange(side_px)
+    return pixels[pixels // 4 % every == every // 2]
 
 
 def sum_information(
