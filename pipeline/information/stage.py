@@ -240,7 +240,9 @@ def without_thickness(
     rows = np.flatnonzero(at_floor.any(axis=1))
     for start in range(0, len(rows), _ROWS_AT_A_TIME):
         part = rows[start : start + _ROWS_AT_A_TIME]
-        result[part] = _projected(geometry[part], so3.from_quat_wxyz(gaussians.quats_wxyz[part]), at_floor[part])
+        result[part] = _projected(
+            geometry[part], so3.from_quat_wxyz(gaussians.quats_wxyz[part]), at_floor[part]
+        )
     return result
 
 
