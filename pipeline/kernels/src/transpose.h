@@ -248,14 +248,16 @@ inline void transpose_quads(float32x4_t a, float32x4_t b, float32x4_t c, float32
     out[2] = vreinterpretq_f32_f64(vtrn2q_f64(ab_even, cd_even));
     out[3] = vreinterpretq_f32_f64(vtrn2q_f64(ab_odd, cd_odd));
 }
-inline void store_rows16(float* rows, const Vec* columns) {
-    for (int k = 0; k < 16; k += 4)
+template <int WIDTH>
+inline void store_rows(float* rows, const Vec* columns) {
+    for (int k = 0; k < WIDTH; k += 4)
         for (int p = 0; p < 4; p++) {
             float32x4_t out[4];
             transpose_quads(columns[k].q[p], columns[k + 1].q[p], columns[k + 2].q[p], columns[k + 3].q[p], out);
-            for (int r = 0; r < 4; r++) vst1q_f32(rows + 16 * (4 * p + r) + k, out[r]);
+            for (int r = 0; r < 4; r++) vst1q_f32(rows + WIDTH * (4 * p + r) + k, out[r]);
         }
 }
+inline void store_rows16(float* rows, const Vec* columns) { store_rows<16>(rows, columns); }
 inline void transpose16(Vec* a) {
     Vec out[16];
     for (int k = 0; k < 4; k++)
