@@ -4,7 +4,7 @@
 // Tile images are kept in block order: index 16 block + lane.
 #pragma once
 
-#include "visibility.h"
+#include "lists.h"
 
 namespace KERNEL_ISA {
 

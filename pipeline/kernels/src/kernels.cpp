@@ -5,7 +5,6 @@ namespace KERNEL_ISA {
 
 static Status forward(Frame& frame, const GaussianArrays& gaussians, float* color, float* depth, float* alpha) {
     if (!project_all(frame, gaussians)) return Status::bad_gaussians;
-    sort_by_depth(frame, gaussians.count);
     const Status status = bin(frame);
     if (status != Status::ok) return status;
     const int tiles = frame.tiles_x * frame.tiles_y;
