@@ -82,11 +82,13 @@ struct alignas(32) Footprint {
     uint32_t tile_columns, tile_rows;  // the tiles that it may touch, a TileRange each
 };
 
-// A Gaussian in one band of tiles.
-struct BandMember {
-    uint32_t id;      // index in the caller's arrays
-    uint32_t count;   // of its tiles in the band
-    uint32_t offset;  // of its first record; later what leads from a record to its row of sums
+// The records of a Gaussian in one band.
+struct RecordRange {
+    uint32_t count, first;
+};
+// What a record still lacks to enter a list: index in the caller's arrays, and what leads from the record to its row.
+struct ListEntry {
+    uint32_t id, to_row;
 };
 struct RowsAndVisible {
     uint32_t rows = 0, visible = 0;
@@ -95,11 +97,15 @@ struct RowsAndVisible {
 struct Band {
     int first, last;                    // rows of tiles, both included
     size_t member_count = 0, record_count = 0;
-    Scratch<BandMember> members;        // Gaussians whose box meets the band, in the order of the arrays
-    Scratch<Footprint> footprints;      // of the members
+    Scratch<uint32_t> ids;              // of the members, Gaussians whose box meets the band, ascending
+    Scratch<Footprint> own_footprints;
+    const Footprint* footprints;        // of the members: own, or all where there is only one band
     Scratch<uint32_t> chunk_first;      // first member out of every projection chunk
     Scratch<uint64_t> keys, keys_swap;  // depth above, member below
     Scratch<uint32_t> order;            // members by depth
+    Scratch<RecordRange> ranges;        // per member
+    Scratch<uint32_t> rows_above;       // per member, how many rows it has in the bands above
+    Scratch<ListEntry> entries;         // per member
     Scratch<uint32_t> record_tiles, record_members;  // records: one Gaussian in one tile each, by depth
     Scratch<uint16_t> record_blocks;
     Scratch<uint32_t> tile_places;      // per tile of the band: number of records, then where they go
@@ -123,7 +129,7 @@ struct Frame {
 
     Scratch<Splat> splats;                   // by index in the caller's arrays; holds anything where not visible
     Scratch<Footprint> footprints;           // the same
-    Scratch<uint64_t> depth_keys;            // depth above, index below: the drawn ones at the front of each chunk
+    Scratch<uint64_t> depth_keys;            // depth above, index below; the drawn ones at the front of each chunk
     size_t chunks = 0;                       // of Gaussians that are projected together
     Scratch<uint32_t> chunk_drawn;           // per chunk, how many of them are drawn
     Scratch<RowsAndVisible> chunk_rows;      // per chunk, what lies before it
@@ -131,7 +137,7 @@ struct Frame {
     Scratch<uint16_t> wanted_blocks;         // per tile: bit b: block b has a pixel of the image that is to be drawn
     Band bands[MOST_BANDS];
     int band_count = 0;
-    Scratch<uint8_t> band_of_row;            // of tiles
+    Scratch<uint32_t> rows_of_id;            // by index in the caller's arrays: number of rows, then the first
     uint64_t records_found = 0;              // by all bands; too many end the search
     Scratch<uint32_t> visible_ids;           // index of those that touch a tile, ascending
     Scratch<uint32_t> first_row;             // per visible Gaussian, visible + 1: its rows of sums are contiguous

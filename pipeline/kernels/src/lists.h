@@ -12,56 +12,83 @@ namespace KERNEL_ISA {
 
 // ---------------------------------------------------------------- bands
 
-constexpr uint32_t KEYS_PER_SAMPLE = 8;
+constexpr size_t BAND_SAMPLES = 2048;
+
+inline size_t drawn_count(const Frame& frame) {
+    size_t drawn = 0;
+    for (size_t chunk = 0; chunk < frame.chunks; chunk++) drawn += frame.chunk_drawn.data()[chunk];
+    return drawn;
+}
 
 // Cuts the image so that each band has about the same number of Gaussian and tile pairs, by a sample of the footprints.
 inline void choose_bands(Frame& frame) {
     const int rows = frame.tiles_y, wanted_bands = smaller(smaller(frame.threads, MOST_BANDS), rows);
     frame.band_count = wanted_bands;
-    uint8_t* band_of_row = frame.band_of_row.need(rows);
     uint64_t* weights = frame.row_weights.need(rows);
     for (int row = 0; row < rows; row++) weights[row] = 1;
-    if (wanted_bands > 1)
-        for (size_t chunk = 0; chunk < frame.chunks; chunk++)
-            for (uint32_t k = 0; k < frame.chunk_drawn.data()[chunk]; k += KEYS_PER_SAMPLE) {
-                const Footprint& f = frame.footprints.data()[static_cast<uint32_t>(frame.depth_keys.data()[chunk * CHUNK + k])];
-                const TileRange x(f.tile_columns), y(f.tile_rows);
-                for (int row = y.first; row <= y.last; row++) weights[row] += x.last - x.first + 2;
-            }
+    const uint32_t step = static_cast<uint32_t>(1 + drawn_count(frame) / BAND_SAMPLES);
+    for (size_t chunk = 0; chunk < frame.chunks && wanted_bands > 1; chunk++)
+        for (uint32_t k = 0; k < frame.chunk_drawn.data()[chunk]; k += step) {
+            const Footprint& f = frame.footprints.data()[static_cast<uint32_t>(frame.depth_keys.data()[chunk * CHUNK + k])];
+            const TileRange x(f.tile_columns), y(f.tile_rows);
+            weights[y.first] += 4;  // a Gaussian costs as much as four of its tiles
+            for (int row = y.first; row <= y.last; row++) weights[row] += x.last - x.first + 2;
+        }
     uint64_t total = 0, before = 0;
     for (int row = 0; row < rows; row++) total += weights[row];
-    for (int b = 0; b < wanted_bands; b++) frame.bands[b].first = rows, frame.bands[b].last = -1;
+    for (int b = 0; b < wanted_bands; b++) frame.bands[b].first = rows, frame.bands[b].last = rows - 1;  // empty
     for (int row = 0; row < rows; row++) {
         const int b = static_cast<int>((before + weights[row] / 2) * wanted_bands / total);
-        band_of_row[row] = static_cast<uint8_t>(b);
-        frame.bands[b].first = smaller(frame.bands[b].first, row);
+        if (frame.bands[b].first == rows) frame.bands[b].first = row;
         frame.bands[b].last = row;
         before += weights[row];
     }
 }
 
-// Copies what the band needs of the Gaussians whose box meets it.
+// Members of the only band: all drawn Gaussians, under their own index.
+inline void pick_all(const Frame& frame, Band& band) {
+    const size_t count = drawn_count(frame);
+    uint32_t* next_id = band.ids.need(count);
+    uint64_t* next_key = band.keys.need(count);
+    for (size_t chunk = 0; chunk < frame.chunks; chunk++) {
+        const uint64_t* keys = frame.depth_keys.data() + chunk * CHUNK;
+        for (uint32_t k = 0; k < frame.chunk_drawn.data()[chunk]; k++) {
+            *next_id++ = static_cast<uint32_t>(keys[k]);
+            *next_key++ = keys[k];
+        }
+    }
+    band.member_count = count;
+    band.footprints = frame.footprints.data();
+    band.ranges.need(frame.chunks * CHUNK);
+    band.entries.need(frame.chunks * CHUNK);
+}
+
+// Members of one of several bands: the drawn Gaussians whose box meets it, numbered anew, with footprints of their own, so
+// that the thread has what it needs close by.
 inline void pick_members(const Frame& frame, Band& band) {
-    size_t drawn = 0, count = 0;
-    for (size_t chunk = 0; chunk < frame.chunks; chunk++) drawn += frame.chunk_drawn.data()[chunk];
-    BandMember* members = band.members.need(drawn + 1);
-    Footprint* footprints = band.footprints.need(drawn + 1);
-    uint64_t* keys = band.keys.need(drawn + 1);
-    uint32_t* chunk_first = band.chunk_first.need(frame.chunks);
-    const Footprint* all = frame.footprints.data();
+    const size_t most = drawn_count(frame) + 1;
+    uint32_t *ids = band.ids.need(most), *chunk_first = band.chunk_first.need(frame.chunks + 1);
+    Footprint* footprints = band.own_footprints.need(most);
+    uint64_t* member_keys = band.keys.need(most);
+    size_t count = 0;
     for (size_t chunk = 0; chunk < frame.chunks; chunk++) {
         const uint64_t *key = frame.depth_keys.data() + chunk * CHUNK, *end = key + frame.chunk_drawn.data()[chunk];
         chunk_first[chunk] = static_cast<uint32_t>(count);
         for (; key < end; key++) {
             const uint32_t id = static_cast<uint32_t>(*key);
-            const TileRange rows(all[id].tile_rows);
-            footprints[count] = all[id];
-            members[count].id = id;
-            keys[count] = (*key & 0xffffffff00000000u) | count;
-            count += rows.first <= band.last && rows.last >= band.first;
+            const TileRange rows(frame.footprints.data()[id].tile_rows);
+            ids[count] = id;
+            footprints[count] = frame.footprints.data()[id];
+            member_keys[count] = (*key & 0xffffffff00000000u) | count;
+            count += (rows.first <= band.last) & (rows.last >= band.first);
         }
     }
+    chunk_first[frame.chunks] = static_cast<uint32_t>(count);
     band.member_count = count;
+    band.footprints = footprints;
+    band.ranges.need(count);
+    band.rows_above.need(count);
+    band.entries.need(count);
 }
 
 // Radix sort by depth, 3 passes of 11 bits; stable, so equal depths keep the order of the arrays.
@@ -122,6 +149,7 @@ struct Window {
     uint16_t tile_x, tile_y;
     bool wide, opens;  // opens: first window of its member
 };
+constexpr size_t GAUSSIANS_AHEAD = 96, RECORDS_AHEAD = 64;  // to prefetch: what memory takes to answer
 constexpr int WINDOWS_IN_STEP = 4;
 constexpr int WINDOWS = 64 * WINDOWS_IN_STEP;
 
@@ -164,12 +192,12 @@ inline void touched_blocks(const Footprint* footprints, const Window* windows, W
 
 // Appends what the windows find to the records of the band. `opened`: the first record of the member at hand.
 inline void test_windows(Frame& frame, Band& band, const Window* windows, int count, size_t& opened_last) {
-    const size_t before = band.record_count, most = before + 8 * count;
+    const size_t before = band.record_count, most = before + 8 * count + RECORDS_AHEAD;
     uint32_t* tiles = band.record_tiles.need_keeping(most, before);
     uint32_t* member_of = band.record_members.need_keeping(most, before);
     uint16_t* blocks = band.record_blocks.need_keeping(most, before);
-    const Footprint* footprints = band.footprints.data();
-    BandMember* members = band.members.data();
+    const Footprint* footprints = band.footprints;
+    RecordRange* ranges = band.ranges.data();
     const uint32_t stride = static_cast<uint32_t>(wanted_stride(frame)), tiles_x = frame.tiles_x;
     const uint16_t *wanted = frame.wanted_blocks.data(), *nothing = wanted + static_cast<size_t>(frame.tiles_y) * stride;
     size_t total = before, opened = opened_last;
@@ -184,8 +212,7 @@ inline void test_windows(Frame& frame, Band& band, const Window* windows, int co
             opened = w.opens ? total : opened;
             for (int k = 0; k < 8; k++) member_of[total + k] = w.member;
             total += store_nonzero(found, (w.tile_y - band.first) * tiles_x + w.tile_x, w.wide ? 4 : tiles_x, blocks + total, tiles + total);
-            members[w.member].count = static_cast<uint32_t>(total - opened);
-            members[w.member].offset = static_cast<uint32_t>(opened);
+            ranges[w.member] = {static_cast<uint32_t>(total - opened), static_cast<uint32_t>(opened)};
         }
     }
     uint32_t* counts = band.tile_places.data();
@@ -197,9 +224,9 @@ inline void test_windows(Frame& frame, Band& band, const Window* windows, int co
 // Records of the band by depth, and the number of each tile. Ends early when all bands together have found too many.
 inline void find_records(Frame& frame, Band& band) {
     const size_t tiles = static_cast<size_t>(band.last - band.first + 1) * frame.tiles_x, count = band.member_count;
-    std::memset(band.tile_places.need(tiles), 0, tiles * sizeof(uint32_t));
-    const Footprint* footprints = band.footprints.data();
-    BandMember* members = band.members.data();
+    std::memset(band.tile_places.need(tiles + 1), 0, tiles * sizeof(uint32_t));
+    const Footprint* footprints = band.footprints;
+    RecordRange* ranges = band.ranges.data();
     const uint32_t* order = band.order.data();
     Window windows[WINDOWS + WINDOWS_IN_STEP] = {};
     int waiting = 0;
@@ -213,7 +240,9 @@ inline void find_records(Frame& frame, Band& band) {
     };
     const int first_row = band.first, last_row = band.last;
     for (size_t i = 0; i < count && !too_many; i++) {
-        __builtin_prefetch(&footprints[order[i + 24 < count ? i + 24 : i]]);
+        const uint32_t ahead = order[i + GAUSSIANS_AHEAD < count ? i + GAUSSIANS_AHEAD : i];
+        __builtin_prefetch(&footprints[ahead]);
+        __builtin_prefetch(&ranges[ahead], 1);
         const uint32_t member = order[i];
         const TileRange columns(footprints[member].tile_columns), rows(footprints[member].tile_rows);
         const int top = larger(rows.first, first_row), bottom = smaller(rows.last, last_row);
@@ -223,7 +252,7 @@ inline void find_records(Frame& frame, Band& band) {
             windows[waiting + 1] = {member, static_cast<uint16_t>(columns.first), static_cast<uint16_t>(top + 2), false, false};
             waiting += 1 + (height > 2);
         } else {
-            members[member].count = 0;  // should it lie between two pixels
+            ranges[member] = {0, 0};  // should it lie between two pixels
             const bool wide = width > 4;
             bool opens = true;
             for (int y = top; y <= bottom; y += wide ? 1 : 2)
@@ -236,69 +265,57 @@ inline void find_records(Frame& frame, Band& band) {
         if (waiting >= WINDOWS) test(waiting), waiting = 0;
     }
     test(waiting);
+    std::memset(band.record_members.data() + band.record_count, 0, RECORDS_AHEAD * sizeof(uint32_t));  // for the prefetch
 }
 
 // ---------------------------------------------------------------- lists
 
-// Walks the drawn Gaussians of a chunk; visit(id, number of its tiles, first and last band that it is a member of, next):
-// next[b] is its place among the members of band b.
-template <class Visit>
-inline void for_each_drawn(const Frame& frame, size_t chunk, Visit visit) {
-    const uint64_t* keys = frame.depth_keys.data() + chunk * CHUNK;
-    const uint32_t drawn = frame.chunk_drawn.data()[chunk];
-    uint32_t next[MOST_BANDS];
-    for (int b = 0; b < frame.band_count; b++) next[b] = frame.bands[b].chunk_first.data()[chunk];
-    for (uint32_t k = 0; k < drawn; k++) {
-        const uint32_t id = static_cast<uint32_t>(keys[k]);
-        int first = 0, last = 0;
-        if (frame.band_count > 1) {
-            const TileRange rows(frame.footprints.data()[id].tile_rows);
-            first = frame.band_of_row.data()[rows.first], last = frame.band_of_row.data()[rows.last];
+// Adds up the tiles of the Gaussians of a chunk over all bands; returns what the chunk holds.
+inline RowsAndVisible count_rows(Frame& frame, size_t chunk) {
+    uint32_t* rows = frame.rows_of_id.data() + chunk * CHUNK;
+    std::memset(rows, 0, CHUNK * sizeof(uint32_t));
+    for (int b = 0; b < frame.band_count; b++) {
+        const Band& band = frame.bands[b];
+        for (uint32_t j = band.chunk_first.data()[chunk]; j < band.chunk_first.data()[chunk + 1]; j++) {
+            uint32_t& count = rows[band.ids.data()[j] % CHUNK];
+            band.rows_above.data()[j] = count;
+            count += band.ranges.data()[j].count;
         }
-        uint32_t count = 0;
-        for (int b = first; b <= last; b++) count += frame.bands[b].members.data()[next[b]].count;
-        visit(id, count, first, last, next);
-        for (int b = first; b <= last; b++) next[b]++;
     }
-}
-
-inline RowsAndVisible count_rows(const Frame& frame, size_t chunk) {
     RowsAndVisible sum;
-    for_each_drawn(frame, chunk, [&](uint32_t, uint32_t count, int, int, const uint32_t*) {
-        sum.rows += count;
-        sum.visible += count > 0;
-    });
+    for (size_t i = 0; i < CHUNK; i++) sum.rows += rows[i], sum.visible += rows[i] > 0;
     return sum;
 }
 
-// Gives rows to the Gaussians of a chunk, from `start` on; returns where the next chunk starts.
-inline RowsAndVisible assign_rows(Frame& frame, size_t chunk, RowsAndVisible start) {
-    uint32_t *ids = frame.visible_ids.data(), *first_row = frame.first_row.data();
-    for_each_drawn(frame, chunk, [&](uint32_t id, uint32_t count, int first, int last, const uint32_t* next) {
-        ids[start.visible] = id;
-        first_row[start.visible] = start.rows;
-        start.visible += count > 0;
-        for (int b = first; b <= last; b++) {
-            BandMember& member = frame.bands[b].members.data()[next[b]];
-            member.offset = start.rows - member.offset;
-            start.rows += member.count;
-        }
-    });
-    return start;
+// Gives rows to the Gaussians of a chunk, from `start` on.
+inline void assign_rows(Frame& frame, size_t chunk, RowsAndVisible start) {
+    uint32_t *rows = frame.rows_of_id.data() + chunk * CHUNK, ids[CHUNK + 1], first_row[CHUNK + 1], visible = 0;
+    for (size_t i = 0; i < CHUNK; i++) {
+        const uint32_t count = rows[i];
+        ids[visible] = static_cast<uint32_t>(chunk * CHUNK + i);
+        first_row[visible] = rows[i] = start.rows;
+        visible += count > 0;
+        start.rows += count;
+    }
+    std::memcpy(frame.visible_ids.data() + start.visible, ids, visible * sizeof(uint32_t));
+    std::memcpy(frame.first_row.data() + start.visible, first_row, visible * sizeof(uint32_t));
 }
 
 // The same for all Gaussians, if there is only one band.
 inline RowsAndVisible assign_rows(Frame& frame, Band& band) {
-    uint32_t *ids = frame.visible_ids.data(), *first_row = frame.first_row.data();
-    BandMember* members = band.members.data();
+    const size_t count = band.member_count;
+    uint32_t *visible_ids = frame.visible_ids.data(), *first_row = frame.first_row.data();
+    const uint32_t* ids = band.ids.data();
+    const RecordRange* ranges = band.ranges.data();
+    ListEntry* entries = band.entries.data();
     RowsAndVisible start;
-    for (size_t i = 0; i < band.member_count; i++) {
-        BandMember& member = members[i];
-        ids[start.visible] = member.id;
+    for (size_t i = 0; i < count; i++) {
+        const uint32_t id = ids[i];
+        visible_ids[start.visible] = id;
         first_row[start.visible] = start.rows;
-        start.visible += member.count > 0;
-        member.offset = start.rows - member.offset;
-        start.rows += member.count;
+        entries[id] = {id, start.rows - ranges[id].first};
+        start.visible += ranges[id].count > 0;
+        start.rows += ranges[id].count;
     }
     return start;
 }
@@ -306,15 +323,14 @@ inline RowsAndVisible assign_rows(Frame& frame, Band& band) {
 // Rows of sums for every Gaussian that touches a tile: contiguous, and in the order of the arrays, so that what follows
 // is a streaming pass in a fixed order.
 inline void assign_all_rows(Frame& frame) {
-    RowsAndVisible* starts = frame.chunk_rows.need(frame.chunks + 1);
-    size_t drawn = 0;
-    for (size_t chunk = 0; chunk < frame.chunks; chunk++) drawn += frame.chunk_drawn.data()[chunk];
-    frame.visible_ids.need(drawn + 1);
-    frame.first_row.need(drawn + 1);
-    RowsAndVisible end;
+    const size_t most = drawn_count(frame) + 1;
+    frame.visible_ids.need(most);
+    frame.first_row.need(most);
+    RowsAndVisible end, *starts = frame.chunk_rows.need(frame.chunks);
     if (frame.band_count == 1)
         end = assign_rows(frame, frame.bands[0]);
     else {
+        frame.rows_of_id.need(frame.chunks * CHUNK);
 #pragma omp parallel for schedule(static) num_threads(frame.threads)
         for (size_t chunk = 0; chunk < frame.chunks; chunk++) starts[chunk] = count_rows(frame, chunk);
         for (size_t chunk = 0; chunk < frame.chunks; chunk++) {
@@ -323,15 +339,25 @@ inline void assign_all_rows(Frame& frame) {
             end = {end.rows + sum.rows, end.visible + sum.visible};
         }
 #pragma omp parallel for schedule(static) num_threads(frame.threads)
-        for (size_t chunk = 0; chunk < frame.chunks; chunk++) assign_rows(frame, chunk, starts[chunk]);
+        for (size_t chunk = 0; chunk < frame.chunks; chunk++)
+            if (frame.chunk_drawn.data()[chunk]) assign_rows(frame, chunk, starts[chunk]);
     }
     frame.first_row.data()[end.visible] = end.rows;
     frame.visible = end.visible;
 }
 
+// What the records of a band lack, once the rows are known.
+inline void complete_entries(const Frame& frame, Band& band) {
+    const size_t count = band.member_count;
+    const uint32_t *ids = band.ids.data(), *above = band.rows_above.data(), *row_of_id = frame.rows_of_id.data();
+    const RecordRange* ranges = band.ranges.data();
+    ListEntry* entries = band.entries.data();
+    for (size_t i = 0; i < count; i++) entries[i] = {ids[i], row_of_id[ids[i]] + above[i] - ranges[i].first};
+}
+
 // The lists of the tiles of a band, which begin at `start`.
 inline void write_lists(Frame& frame, Band& band, uint32_t start) {
-    const size_t tiles = static_cast<size_t>(band.last - band.first + 1) * frame.tiles_x;
+    const size_t tiles = static_cast<size_t>(band.last - band.first + 1) * frame.tiles_x, records = band.record_count;
     uint32_t *tile_start = frame.tile_start.data() + static_cast<size_t>(band.first) * frame.tiles_x, *place = band.tile_places.data();
     for (size_t tile = 0; tile < tiles; tile++) {
         tile_start[tile] = start;
@@ -340,14 +366,15 @@ inline void write_lists(Frame& frame, Band& band, uint32_t start) {
     }
     uint32_t *splats = frame.list_splats.data(), *rows = frame.list_rows.data();
     uint16_t* blocks = frame.list_blocks.data();
-    const BandMember* members = band.members.data();
+    const ListEntry* entries = band.entries.data();
     const uint32_t *record_tiles = band.record_tiles.data(), *record_members = band.record_members.data();
     const uint16_t* record_blocks = band.record_blocks.data();
-    for (size_t r = 0; r < band.record_count; r++) {
-        const BandMember& member = members[record_members[r]];
+    for (size_t r = 0; r < records; r++) {
+        __builtin_prefetch(&entries[record_members[r + RECORDS_AHEAD]]);
+        const ListEntry entry = entries[record_members[r]];
         const uint32_t p = place[record_tiles[r]]++;
-        splats[p] = member.id;
-        rows[p] = static_cast<uint32_t>(r) + member.offset;
+        splats[p] = entry.id;
+        rows[p] = static_cast<uint32_t>(r) + entry.to_row;
         blocks[p] = record_blocks[r];
     }
 }
@@ -367,7 +394,7 @@ inline Status bin(Frame& frame) {
         Band& band = frame.bands[b];
         try {
             find_wanted_blocks(frame, band);
-            pick_members(frame, band);
+            frame.band_count == 1 ? pick_all(frame, band) : pick_members(frame, band);
             sort_members(band);
             find_records(frame, band);
         } catch (...) {  // an exception must not leave a parallel loop
@@ -388,7 +415,10 @@ inline Status bin(Frame& frame) {
     frame.list_rows.need(total + LIST_SPARE);
     frame.list_blocks.need(total + LIST_SPARE);
 #pragma omp parallel for schedule(static, 1) num_threads(frame.threads) if (frame.threads > 1)
-    for (int b = 0; b < frame.band_count; b++) write_lists(frame, frame.bands[b], band_start[b]);
+    for (int b = 0; b < frame.band_count; b++) {
+        if (frame.band_count > 1) complete_entries(frame, frame.bands[b]);
+        write_lists(frame, frame.bands[b], band_start[b]);
+    }
     for (size_t p = total; p < total + LIST_SPARE; p++)
         frame.list_splats.data()[p] = frame.list_rows.data()[p] = frame.list_blocks.data()[p] = 0;
     frame.intersection_count = total;

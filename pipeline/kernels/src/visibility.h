@@ -114,6 +114,8 @@ struct TileRange {
     }
 };
 
+constexpr size_t CHUNK = 32 * LANES;  // Gaussians that are projected together
+
 // Writes the splats and footprints from `first` on, and the keys of those that are drawn; returns how many are.
 __attribute__((flatten)) inline uint32_t project_group(Frame& frame, const Neighbours16& g, size_t first, uint32_t lanes,
                                                        uint64_t* keys) {
@@ -131,8 +133,9 @@ __attribute__((flatten)) inline uint32_t project_group(Frame& frame, const Neigh
                            zero, zero, zero, zero, zero, zero};
     store_rows16(reinterpret_cast<float*>(frame.splats.data() + first), splat);
     // C is (M^T M)^-1 up to a factor: its correlation is -M12 / |(M12, M22)|, and nothing cancels in sqrt(1 - c^2)
-    const Vec length = sqrt(fma(s.M12, s.M12, s.M22 * s.M22)), skew = -s.M12 / length, blocks_x = Vec(0.25f) * extent_x;
-    const Vec footprint[8] = {Vec(0.25f) * s.u, s.v, one / extent_y, skew, blocks_x * skew, blocks_x * (s.M22 / length),
+    const Vec per_length = one / sqrt(fma(s.M12, s.M12, s.M22 * s.M22)), blocks_x = Vec(0.25f) * extent_x;
+    const Vec skew = -s.M12 * per_length, upright = s.M22 * per_length;
+    const Vec footprint[8] = {Vec(0.25f) * s.u, s.v, one / extent_y, skew, blocks_x * skew, blocks_x * upright,
                               TileRange::pack(s.u - extent_x + one, s.u + extent_x, view.width),  // + 1: up, if only by part
                               TileRange::pack(s.v - extent_y + one, s.v + extent_y, view.height)};
     store_rows8(reinterpret_cast<float*>(frame.footprints.data() + first), footprint);
@@ -148,7 +151,6 @@ __attribute__((flatten)) inline uint32_t project_group(Frame& frame, const Neigh
     return count;
 }
 
-constexpr size_t CHUNK = 32 * LANES;  // Gaussians that are projected together
 inline size_t chunk_count(size_t gaussians) { return (gaussians + CHUNK - 1) / CHUNK; }
 
 // Projects one chunk; false if a parameter is not usable.
