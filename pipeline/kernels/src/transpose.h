@@ -268,6 +268,7 @@ inline void store_rows(float* rows, const Vec* columns) {
             for (int r = 0; r < 4; r++) vst1q_f32(rows + WIDTH * (4 * p + r) + k, out[r]);
         }
 }
+inline void store_rows8(float* rows, const Vec* columns) { store_rows<8>(rows, columns); }
 inline void store_rows16(float* rows, const Vec* columns) { store_rows<16>(rows, columns); }
 inline void transpose16(Vec* a) {
     Vec out[16];
