@@ -36,6 +36,8 @@ _NOTHING = np.zeros(0, dtype=np.float32)  # an optional array that is not given
 _NO_DOUBLES = np.zeros(0)
 _NO_MASK = np.zeros(0, dtype=np.uint8)
 
+_NO_PRECISION = "a NaN, an infinity or a negative number"
+
 _OK, _BAD_GAUSSIANS, _BAD_FIRST, _BAD_SECOND, _BAD_THIRD, _TOO_MANY = range(6)  # enum Status of frame.h
 
 
@@ -155,12 +157,11 @@ class Rasterizer:
         behind = _checked_background(background)
         if depth not in DEPTH_KINDS:
             raise ValueError(f"depth is {depth!r}, expected one of {', '.join(DEPTH_KINDS)}")
-        if depth != "blended":
-            raise NotImplementedError("depth='ray_plane'")
         if len(gaussians) > MAX_GAUSSIANS:
             raise ValueError(f"gaussians are {len(gaussians)}, expected at most {MAX_GAUSSIANS}")
         wanted = _NO_MASK if mask is None else _checked_mask(mask, (height, width))
-        return height, width, (pose, intrinsics, behind, wanted, width, height, self.threads)
+        ray_plane = depth == "ray_plane"
+        return height, width, (pose, intrinsics, behind, wanted, ray_plane, width, height, self.threads)
 
     def _finish(self, gaussians: Gaussians, size: tuple[int, int], status: int) -> None:
         """Remember what was drawn, or refuse what could not be."""
@@ -244,8 +245,21 @@ class Rasterizer:
             sums.observations,
         )
         _refuse_bad_image(
-            status, ("inv_var_color", "inv_var_depth", "residual"), "a NaN, an infinity or a negative number"
+            status, ("inv_var_color", "inv_var_depth", "residual"), _NO_PRECISION
         )
+
+    def full_fisher(self, inv_var_color: Image, inv_var_depth: Image) -> NDArray[np.float64]:
+        """J^T R^-1 J [n, 14, 14] of the last view with all its cross terms; for validation, not for speed.
+
+        Columns: mean 3, quaternion 4, log-scale 3, colour 3, logit 1. The images as in `fisher`.
+        """
+        gaussians, size = self._last_forward()
+        color = _checked_image("inv_var_color", inv_var_color, size)
+        depth = _checked_image("inv_var_depth", inv_var_depth, size)
+        information = np.zeros((len(gaussians), FISHER_DIAGONAL_COLUMNS, FISHER_DIAGONAL_COLUMNS))
+        status = self._raster.full_fisher(*_arrays(gaussians), color, depth, information)
+        _refuse_bad_image(status, ("inv_var_color", "inv_var_depth"), _NO_PRECISION)
+        return information
 
     def contributions(self) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
         """What each Gaussian gave to the last view: sum of its blending weights [n] and number of its pixels [n]."""

@@ -43,6 +43,9 @@ private:
     size_t capacity_ = 0;
 };
 
+// Depth of a Gaussian at a pixel: that of its centre, or its mean along the ray of the pixel.
+enum class DepthKind { blended, ray_plane };
+
 // Pinhole camera at its pose; pixel centres are the integers. R, t: T_camera_map, R row by row.
 struct View {
     float R[9], t[3];
@@ -50,6 +53,7 @@ struct View {
     int width, height;
     float background[3];
     const uint8_t* mask = nullptr;  // [height, width], 0: not drawn; or null: all drawn
+    DepthKind depth = DepthKind::blended;
 };
 
 // n Gaussians, arrays of the caller, row-major.
@@ -67,7 +71,7 @@ struct alignas(64) Splat {
     float r, g, b, z;          // colour, depth in metres
     float extent_x, extent_y;  // half size of the box in which alpha >= 1/255, px
     float skew, upright;       // correlation c of x and y on the screen, sqrt(1 - c^2)
-    float unused[2];
+    float slope_x, slope_y;    // of the depth along e, metres; set only for ray_plane
 };
 
 // Where the rows of sums of one Gaussian lie while the lists are made.
@@ -169,6 +173,8 @@ struct Kernels {
     Status (*fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth, const float* residual,
                      const FisherArrays&);
     void (*contributions)(Frame&, float* weights, uint32_t* pixels);
+    // information: [n, 14, 14]
+    Status (*full_fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth, double* information);
     Status (*fit)(Frame&, const GaussianArrays&, const Loss&, LossValues&, const GradientArrays&);
 };
 

@@ -67,8 +67,12 @@ ALWAYS_INLINE inline void over_batches(const Sweep& sweep, uint32_t count, Visit
 
 enum class Derivatives { POSE, ALL, ALL_AND_SQUARES };  // of the pose alone; of all parameters; and their squares per pixel
 
-template <Derivatives D>
-constexpr int ROW_OF = D == Derivatives::ALL_AND_SQUARES ? SQUARES_ROW : GRADIENT_ROW;
+template <Derivatives D, DepthKind KIND>
+constexpr int ROW_OF = D == Derivatives::ALL_AND_SQUARES ? SQUARES_ROW<KIND> : GRADIENT_ROW;
+template <Derivatives D, DepthKind KIND>
+constexpr int SUMS_OF = D == Derivatives::ALL_AND_SQUARES ? GRADIENT_SUMS<KIND> + INFORMATION_SUMS<KIND> : GRADIENT_SUMS<KIND>;
+static_assert(SUMS_OF<Derivatives::ALL_AND_SQUARES, DepthKind::blended> <= SQUARES_ROW<DepthKind::blended>, "");
+static_assert(SUMS_OF<Derivatives::ALL_AND_SQUARES, DepthKind::ray_plane> <= SQUARES_ROW<DepthKind::ray_plane>, "");
 
 // Cotangents of the images in one block; plane k of `planes`: red, green, blue, depth, alpha.
 struct Cotangents {
@@ -76,16 +80,21 @@ struct Cotangents {
 };
 
 // Squares of the gradient: the empirical information.
+template <DepthKind KIND>
 inline void sum_squares(const Lanes& w_of, const Lanes& f_of, const Cotangents& v, const BatchShape& shape, const Block& block, int half,
                         Vec* sums) {
     sum_screen_moments([&](int p) ALWAYS_INLINE { return part(w_of[p], half) * part(w_of[p], half); }, shape, block, half, sums);
-    sum_depth_moments(
-        [&](int p, Wide& square) ALWAYS_INLINE {
-            const Wide by_z = part(f_of[p], half) * Wide(v.planes[3][p]);
-            square = by_z * by_z;
-            return by_z * part(w_of[p], half);
-        },
-        shape, block, half, sums);
+    const auto by_z = [&](int p) ALWAYS_INLINE { return part(f_of[p], half) * Wide(v.planes[3][p]); };
+    if constexpr (KIND == DepthKind::ray_plane)
+        sum_ray_depth_moments([&](int p) ALWAYS_INLINE { return by_z(p) * part(w_of[p], half); },
+                              [&](int p) ALWAYS_INLINE { return by_z(p) * by_z(p); }, shape, block, half, sums);
+    else
+        sum_depth_moments(
+            [&](int p, Wide& square) ALWAYS_INLINE {
+                square = by_z(p) * by_z(p);
+                return by_z(p) * part(w_of[p], half);
+            },
+            shape, block, half, sums);
     Wide total[3] = {Wide(0.0f), Wide(0.0f), Wide(0.0f)};
     for (int p = 0; p < LANES; p++)
         for (int k = 0; k < 3; k++) {
@@ -96,9 +105,9 @@ inline void sum_squares(const Lanes& w_of, const Lanes& f_of, const Cotangents& 
 }
 
 // Adds to the rows of a block's items.
-template <Derivatives D>
+template <Derivatives D, DepthKind KIND>
 NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uint32_t count, const Cotangents& v) {
-    constexpr int ROW = ROW_OF<D>;
+    constexpr int ROW = ROW_OF<D, KIND>;
     const Vec r = load(v.planes[0]), g = load(v.planes[1]), b = load(v.planes[2]), z = load(v.planes[3]), a = load(v.planes[4]);
     const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
     const float* background = sweep.view.background;
@@ -106,10 +115,11 @@ NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uin
     over_batches(sweep, count, [&](const Batch& batch, Vec T) ALWAYS_INLINE {
         Lanes alpha, f, w;
         Vec sums[ROW];
-        unused_sums<D == Derivatives::POSE ? SUM_R : D == Derivatives::ALL ? GRADIENT_SUMS : GRADIENT_SUMS + INFORMATION_SUMS, ROW>(sums);
+        unused_sums<D == Derivatives::POSE ? SUM_R : SUMS_OF<D, KIND>, ROW>(sums);
         replay(batch, pixel_x, pixel_y, T, alpha, f);
         walk_back(batch, [&](int k, const Splat& s) ALWAYS_INLINE {
-            const Vec own = fma(Vec(s.r), r, fma(Vec(s.g), g, fma(Vec(s.b), b, fma(Vec(s.z), z, a))));
+            const Vec depth = depth_at<KIND>(s, Whitened(s, pixel_x, pixel_y));
+            const Vec own = fma(Vec(s.r), r, fma(Vec(s.g), g, fma(Vec(s.b), b, fma(depth, z, a))));
             const Vec gain = gain_over(behind, own, alpha[k]);
             w[k] = if_unclamped(alpha[k], f[k] * gain);
         });
@@ -122,16 +132,22 @@ NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uin
                 sum_products<1>(f, v.planes + 3, half, sums + SUM_Z);  // colours wait for nobody
             else
                 sum_products<4>(f, v.planes, half, sums + SUM_R);
-            if constexpr (D == Derivatives::ALL_AND_SQUARES) sum_squares(w, f, v, shape, block, half, sums + GRADIENT_SUMS);
+            if constexpr (KIND == DepthKind::ray_plane) {
+                Wide total[monomials(1)];
+                sum_monomials<1>([&](int p) ALWAYS_INLINE { return part(f[p], half) * Wide(v.planes[3][p]); }, shape, block, half, total);
+                set_part(sums[SUM_ZX], half, total[1]);
+                set_part(sums[SUM_ZY], half, total[2]);
+            }
+            if constexpr (D == Derivatives::ALL_AND_SQUARES) sum_squares<KIND>(w, f, v, shape, block, half, sums + GRADIENT_SUMS<KIND>);
         }
         add_to_rows<ROW>(batch, sums, sweep.rows, sweep.list_rows);
     });
 }
 
-template <Derivatives D>
+template <Derivatives D, DepthKind KIND>
 inline Status gradient_tile(Frame& frame, int index, const float* d_color, const float* d_depth, const float* d_alpha) {
     touch_items(frame, index + 1);
-    Sweep sweep = Sweep::begin<ROW_OF<D>>(frame, index);
+    Sweep sweep = Sweep::begin<ROW_OF<D, KIND>>(frame, index);
     const View& view = frame.view;
     Cotangents cotangents[BLOCKS];
     bool bad[3] = {};
@@ -151,7 +167,7 @@ inline Status gradient_tile(Frame& frame, int index, const float* d_color, const
     for (int b = 0; b < BLOCKS; b++) {
         const uint32_t count = sweep.items.counts[b];
         if (!count) continue;
-        gradient_block<D>(sweep, Block(sweep.tile, b, view), count, cotangents[b]);
+        gradient_block<D, KIND>(sweep, Block(sweep.tile, b, view), count, cotangents[b]);
         sweep.items.skip(count);
     }
     return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
@@ -165,6 +181,7 @@ struct Precisions {
 };
 
 // Rows of J^T R^-1 J: each colour channel and depth has its own "behind", for their derivatives are squared one by one.
+template <DepthKind KIND>
 NO_INLINE static void information_block(const Sweep& sweep, const Block& block, uint32_t count, const Precisions& v) {
     const Vec of_color = load(v.color), of_depth = load(v.depth);
     const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
@@ -173,11 +190,12 @@ NO_INLINE static void information_block(const Sweep& sweep, const Block& block, 
     over_batches(sweep, count, [&](const Batch& batch, Vec T) ALWAYS_INLINE {
         Lanes alpha, f, w2, cross;
         Vec sums[INFORMATION_ROW];
-        unused_sums<INFORMATION_SUMS, INFORMATION_ROW>(sums);
+        unused_sums<INFORMATION_SUMS<KIND>, INFORMATION_ROW>(sums);
         replay(batch, pixel_x, pixel_y, T, alpha, f);
         walk_back(batch, [&](int k, const Splat& s) ALWAYS_INLINE {
             const Vec gain_r = gain_over(behind_r, Vec(s.r), alpha[k]), gain_g = gain_over(behind_g, Vec(s.g), alpha[k]);
-            const Vec gain_b = gain_over(behind_b, Vec(s.b), alpha[k]), gain_z = gain_over(behind_z, Vec(s.z), alpha[k]);
+            const Vec depth = depth_at<KIND>(s, Whitened(s, pixel_x, pixel_y));
+            const Vec gain_b = gain_over(behind_b, Vec(s.b), alpha[k]), gain_z = gain_over(behind_z, depth, alpha[k]);
             const Vec color2 = fma(gain_r, gain_r, fma(gain_g, gain_g, gain_b * gain_b)), depth_gain = of_depth * gain_z;
             const Vec moving2 = if_unclamped(alpha[k], f[k] * f[k]);
             w2[k] = moving2 * fma(of_color, color2, depth_gain * gain_z);
@@ -191,25 +209,35 @@ NO_INLINE static void information_block(const Sweep& sweep, const Block& block, 
         transpose16(f);
         for (int half = 0; half < PARTS; half++) {
             Wide total[3] = {Wide(0.0f), Wide(0.0f), Wide(0.0f)};
-            sum_depth_moments(
-                [&](int p, Wide& square) ALWAYS_INLINE {
-                    const Wide weight = part(f[p], half), weight2 = weight * weight;
-                    square = weight2 * Wide(v.depth[p]);
-                    total[0] = fma(weight2, Wide(v.color[p]), total[0]);
-                    total[1] = fma(weight, Wide(v.used[p]), total[1]);
-                    total[2] = fma(weight, Wide(v.residual[p]), total[2]);
-                    return part(cross[p], half);
-                },
-                shape, block, half, sums);
+            const auto square_of = [&](int p) ALWAYS_INLINE {
+                const Wide weight = part(f[p], half), weight2 = weight * weight;
+                total[0] = fma(weight2, Wide(v.color[p]), total[0]);
+                total[1] = fma(weight, Wide(v.used[p]), total[1]);
+                total[2] = fma(weight, Wide(v.residual[p]), total[2]);
+                return weight2 * Wide(v.depth[p]);
+            };
+            const auto cross_of = [&](int p) ALWAYS_INLINE { return part(cross[p], half); };
+            if constexpr (KIND == DepthKind::ray_plane)
+                sum_ray_depth_moments(cross_of, square_of, shape, block, half, sums);
+            else
+                sum_depth_moments(
+                    [&](int p, Wide& square) ALWAYS_INLINE {
+                        square = square_of(p);
+                        return cross_of(p);
+                    },
+                    shape, block, half, sums);
             set_parts(sums + INFO_R, half, total);
         }
         add_to_rows<INFORMATION_ROW>(batch, sums, sweep.rows, sweep.list_rows);
     });
 }
 
-inline Status information_tile(Frame& frame, int index, const float* inv_var_color, const float* inv_var_depth, const float* residual) {
+// Calls of_block(sweep, block, count of its items, precisions) for the blocks of a tile that have items.
+template <int ROW, class OfBlock>
+inline Status over_precisions(Frame& frame, int index, const float* inv_var_color, const float* inv_var_depth, const float* residual,
+                              OfBlock of_block) {
     touch_items(frame, index + 1);
-    Sweep sweep = Sweep::begin<INFORMATION_ROW>(frame, index);
+    Sweep sweep = Sweep::begin<ROW>(frame, index);
     const View& view = frame.view;
     Precisions precisions[BLOCKS];
     bool bad[3] = {};
@@ -229,10 +257,14 @@ inline Status information_tile(Frame& frame, int index, const float* inv_var_col
     for (int b = 0; b < BLOCKS; b++) {
         const uint32_t count = sweep.items.counts[b];
         if (!count) continue;
-        information_block(sweep, Block(sweep.tile, b, view), count, precisions[b]);
+        of_block(sweep, Block(sweep.tile, b, view), count, precisions[b]);
         sweep.items.skip(count);
     }
     return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
+}
+template <DepthKind KIND>
+inline Status information_tile(Frame& frame, int index, const float* inv_var_color, const float* inv_var_depth, const float* residual) {
+    return over_precisions<INFORMATION_ROW>(frame, index, inv_var_color, inv_var_depth, residual, information_block<KIND>);
 }
 
 // ---------------------------------------------------------------- contributions
