@@ -92,7 +92,7 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
         read_block_rgb(loss.color, block, view, rgb);
         const Vec z = read_block(loss.depth_m, block, view);
         bad[0] |= !(finite(rgb[0]) && finite(rgb[1]) && finite(rgb[2]));
-        bad[1] |= !finite(z);
+        bad[1] |= !finite_not_negative(z);
         for (int k = 0; k < 3; k++) store(measured[b].planes[k], rgb[k]);
         store(measured[b].planes[3], z);
     }
