@@ -53,10 +53,22 @@ struct OpenBlock {
     bool open() const { return any(left >= Vec(TRANSMITTANCE_MIN)); }
 };
 
+// alpha and weight of a block's items, for a sweep that follows at once.
+struct Memory {
+    float *alphas, *weights;
+    void keep(uint32_t item, Vec alpha, Vec weight) const {
+        store(alphas + static_cast<size_t>(item) * LANES, alpha);
+        store(weights + static_cast<size_t>(item) * LANES, weight);
+    }
+};
+struct NoMemory {
+    void keep(uint32_t, Vec, Vec) const {}
+};
+
 // Blends the next N candidates; keeps those that were blended.
-template <DepthKind KIND, int N>
+template <DepthKind KIND, int N, class Kept>
 ALWAYS_INLINE inline uint32_t blend_some(const Splat* splats, const uint32_t* candidates, const TileItems& items, uint32_t kept,
-                                         OpenBlock& block) {
+                                         const Kept& memory, OpenBlock& block) {
     uint32_t position[N];
     Vec alpha[N], rest[N], depth[N];  // rest: 1 - alpha
     Mask seen[N];
@@ -80,12 +92,12 @@ ALWAYS_INLINE inline uint32_t blend_some(const Splat* splats, const uint32_t* ca
         block.left = block.left * rest[k];
         const Mask blended = (block.left >= Vec(TRANSMITTANCE_MIN)) & seen[k];
         const Vec weight = select_or_zero(blended, weight_if_open);
-        store(items.batch_T + (kept + TileItems::BATCH - 1) / TileItems::BATCH * LANES, block.T);  // what is there when a batch begins stays
         block.T = select(blended, block.left, block.T);
         block.R = fma(weight, Vec(s.r), block.R);
         block.G = fma(weight, Vec(s.g), block.G);
         block.B = fma(weight, Vec(s.b), block.B);
         block.D = fma(weight, KIND == DepthKind::ray_plane ? depth[k] : Vec(s.z), block.D);  // z is not kept in a register
+        memory.keep(kept, select_or_zero(blended, alpha[k]), weight);
         const uint32_t pixels = bits(blended);
         items.positions[kept] = position[k];
         items.pixels[kept] = static_cast<uint16_t>(pixels);
@@ -96,24 +108,27 @@ ALWAYS_INLINE inline uint32_t blend_some(const Splat* splats, const uint32_t* ca
 
 // Blends the candidates of one block, which stand at the beginning of `items`; keeps those that were blended, in place.
 // Returns how many, and in `evaluated` how many it looked at.
-template <DepthKind KIND>
-NO_INLINE static uint32_t blend_candidates(const Splat* splats, const TileItems items, uint32_t count, OpenBlock& result, uint64_t& evaluated) {
+template <DepthKind KIND, class Kept>
+NO_INLINE static uint32_t blend_candidates(const Splat* splats, const TileItems items, uint32_t count, const Kept memory, OpenBlock& result,
+                                           uint64_t& evaluated) {
     OpenBlock block = result;
     uint32_t kept = 0, i = 0;
-    for (; i + ABREAST <= count && block.open(); i += ABREAST) kept = blend_some<KIND, ABREAST>(splats, items.positions + i, items, kept, block);
-    for (; i < count && block.open(); i++) kept = blend_some<KIND, 1>(splats, items.positions + i, items, kept, block);
+    for (; i + ABREAST <= count && block.open(); i += ABREAST)
+        kept = blend_some<KIND, ABREAST>(splats, items.positions + i, items, kept, memory, block);
+    for (; i < count && block.open(); i++) kept = blend_some<KIND, 1>(splats, items.positions + i, items, kept, memory, block);
     evaluated += i;
     result = block;
     return kept;
 }
 
 // Blends block b of a tile and steps over its items.
-template <DepthKind KIND>
+template <DepthKind KIND, class Kept>
 inline OpenBlock blend_block(const Frame& frame, const Tile& tile, const Splat* splats, int b, const Block& block, Mask wanted,
-                             TileItems& items, uint64_t& evaluated) {
+                             const Kept& memory, TileItems& items, uint64_t& evaluated) {
     OpenBlock image(block, wanted);
     const uint32_t count = positions_with_bit(frame.list_blocks.data() + tile.first, tile.count, b, items.positions);
-    items.counts[b] = blend_candidates<KIND>(splats, items, count, image, evaluated);
+    items.counts[b] = blend_candidates<KIND>(splats, items, count, memory, image, evaluated);
+    store(items.T + b * LANES, image.T);
     items.skip(items.counts[b]);
     return image;
 }
@@ -131,7 +146,7 @@ inline void blend_tile(Frame& frame, int index, float* color, float* depth, floa
         items.counts[b] = 0;
         if (block.outside(view)) continue;
         const Mask wanted = mask_of_bits(block.wanted(view));
-        const OpenBlock image = blend_block<KIND>(frame, tile, splats, b, block, wanted, items, evaluated);
+        const OpenBlock image = blend_block<KIND>(frame, tile, splats, b, block, wanted, NoMemory(), items, evaluated);
         const Vec rgb[3] = {select_or_zero(wanted, fma(image.T, background[0], image.R)),
                             select_or_zero(wanted, fma(image.T, background[1], image.G)),
                             select_or_zero(wanted, fma(image.T, background[2], image.B))};

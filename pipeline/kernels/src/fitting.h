@@ -97,6 +97,9 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
         store(measured[b].planes[3], z);
     }
     const Vec background[3] = {Vec(view.background[0]), Vec(view.background[1]), Vec(view.background[2])};
+    const size_t kept = (frame.longest_list + 1) * LANES;  // one more is written before it is known that it was not blended
+    float* front = frame.front.data() + this_thread() * 2 * kept;
+    const Memory memory = {front, front + kept};
     LossLanes sums;
     uint64_t evaluated = 0;
     for (int b = 0; b < BLOCKS; b++) {
@@ -105,11 +108,11 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
         if (block.outside(view)) continue;
         const Mask wanted = mask_of_bits(block.wanted(view));
         TileItems next = sweep.items;
-        const OpenBlock image = blend_block<KIND>(frame, sweep.tile, sweep.splats, b, block, wanted, next, evaluated);
+        const OpenBlock image = blend_block<KIND>(frame, sweep.tile, sweep.splats, b, block, wanted, memory, next, evaluated);
         const Vec rgb[3] = {fma(image.T, background[0], image.R), fma(image.T, background[1], image.G),
                             fma(image.T, background[2], image.B)};
         const Cotangents v = loss_of_block(image, rgb, measured[b], wanted, loss, scales, sums);
-        if (next.counts[b]) gradient_block<D, KIND>(sweep, block, next.counts[b], v);
+        if (next.counts[b]) gradient_block<D, KIND>(sweep, block, next.counts[b], v, Recall{memory});
         sweep.items = next;
     }
     frame.evaluated.data()[index] = evaluated;

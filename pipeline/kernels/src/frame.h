@@ -114,14 +114,15 @@ struct Frame {
     Scratch<uint32_t> list_splats, list_rows;
     Scratch<uint16_t> list_blocks;
     // Gaussians of each block, left by the forward pass: position in the tile's list, and which pixels it was blended in. A
-    // tile's items begin at item_start, block after block; a batch is sixteen items of a block.
+    // tile's items begin at item_start, block after block.
     Scratch<uint32_t> item_start, block_items;  // tiles + 1; tiles * BLOCKS, how many
     Scratch<uint32_t> item_positions;
     Scratch<uint16_t> item_pixels;
-    Scratch<float> batch_T;                  // transmittance of a block's pixels before the first item of every batch
+    Scratch<float> transmittance;            // behind the last item; per tile, block after block
     Scratch<uint64_t> evaluated;             // per tile: vectors whose alpha was computed
     Scratch<Splat> tile_splats;              // per thread: the splats of one tile's list
     size_t longest_list = 0;
+    Scratch<float> front;                    // per thread: alpha and weight of one block's items
     Scratch<float> rows;                     // sums: of one Gaussian in one tile each
     Scratch<double> pose_parts, loss_parts;  // loss_parts: [tiles, LOSS_SUMS]
 
@@ -130,7 +131,7 @@ struct Frame {
         const auto add = [&](const auto&... memory) { total += (memory.bytes() + ...); };
         add(splats, depth_keys, depth_keys_swap, radix_counts, chunk_start, drawn, depth_order, visible_ids, first_row, row_ranges,
             stretch_tile_counts, wanted_blocks, tile_start, list_splats, list_rows, list_blocks, item_start, block_items, item_positions,
-            item_pixels, batch_T, evaluated, tile_splats, rows, pose_parts, loss_parts);
+            item_pixels, transmittance, evaluated, tile_splats, front, rows, pose_parts, loss_parts);
         for (const StretchRecords& stretch : stretches) add(stretch.tiles, stretch.splats, stretch.blocks);
         return total;
     }

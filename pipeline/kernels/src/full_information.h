@@ -13,39 +13,40 @@ constexpr int FULL_ROW = 64;
 static_assert(INFORMATION_SUMS<DepthKind::ray_plane> <= INFORMATION_ROW && FULL_SUMS <= FULL_ROW, "");
 
 template <DepthKind KIND>
-NO_INLINE static void full_block(const Sweep& sweep, const Block& block, uint32_t count, const Precisions& v) {
-    const Vec of_color = load(v.color), of_depth = load(v.depth);
+NO_INLINE static void full_block(const Sweep& sweep, const Block& block, uint32_t count, const Precisions& v, Replay pass) {
+    const Vec of_color = load(v.planes[0]), of_depth = load(v.planes[1]);
     const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
     Vec behind[4] = {Vec(sweep.view.background[0]), Vec(sweep.view.background[1]), Vec(sweep.view.background[2]), Vec(0.0f)};
-    over_batches(sweep, count, [&](const Batch& batch, Vec T) ALWAYS_INLINE {
+    over_batches(sweep, count, [&](const Batch& batch) ALWAYS_INLINE {
         // squares of the weight and of the derivative by ln alpha, and their products, each with its precision
-        Lanes alpha, f, own_color, own_depth, w2, cross[4];
+        Lanes own_color, own_depth, w2, cross[4];
         Vec sums[FULL_ROW];
         for (Vec& sum : sums) sum = Vec(0.0f);
-        replay(batch, pixel_x, pixel_y, T, alpha, f);
-        walk_back(batch, [&](int k, const Splat& s) ALWAYS_INLINE {
+        pass.walk(batch, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
             const Vec own[4] = {Vec(s.r), Vec(s.g), Vec(s.b), depth_at<KIND>(s, Whitened(s, pixel_x, pixel_y))};
-            const Vec f2 = f[k] * f[k], moving2 = if_unclamped(alpha[k], f2);
+            const Vec weight2 = weight * weight, moving2 = if_unclamped(alpha, weight2);
             w2[k] = Vec(0.0f);
             for (int channel = 0; channel < 4; channel++) {
-                const Vec gain = gain_over(behind[channel], own[channel], alpha[k]);
+                const Vec gain = gain_over(behind[channel], own[channel], alpha);
                 cross[channel][k] = moving2 * gain * (channel < 3 ? of_color : of_depth);
                 w2[k] = fma(cross[channel][k], gain, w2[k]);
             }
-            own_color[k] = f2 * of_color;
-            own_depth[k] = f2 * of_depth;
+            own_color[k] = weight2 * of_color;
+            own_depth[k] = weight2 * of_depth;
         });
         for (Vec* lanes : {own_color, own_depth, w2, cross[0], cross[1], cross[2], cross[3]}) transpose16(lanes);
         const BatchShape shape(batch);
         for (int half = 0; half < PARTS; half++) {
             const auto numbers = [half](const Lanes& lanes) { return [&lanes, half](int p) { return part(lanes[p], half); }; };
-            const int places[monomials(4)] = {INFO_1,   FULL_X,   FULL_Y,    INFO_XX,   INFO_XY,   INFO_YY,   INFO_XXX, INFO_XXY,
-                                              INFO_XYY, INFO_YYY, INFO_XXXX, INFO_XXXY, INFO_XXYY, INFO_XYYY, INFO_YYYY};
-            Wide color[monomials(0)], of_w2[monomials(4)], of_channel[monomials(2)];
+            constexpr int OF_W2[] = {INFO_1,   FULL_X,   FULL_Y,    INFO_XX,   INFO_XY,   INFO_YY,   INFO_XXX, INFO_XXY,
+                                     INFO_XYY, INFO_YYY, INFO_XXXX, INFO_XXXY, INFO_XXYY, INFO_XYYY, INFO_YYYY};
+            Wide color[1], depth[1], of_w2[monomials(4)], of_channel[monomials(2)];
             sum_monomials<0>(numbers(own_color), shape, block, half, color);
-            set_parts(sums + INFO_R, half, color);
+            sum_monomials<0>(numbers(own_depth), shape, block, half, depth);
             sum_monomials<4>(numbers(w2), shape, block, half, of_w2);
-            set_parts(sums, half, of_w2, places);
+            set_part(sums[INFO_R], half, color[0]);
+            set_part(sums[INFO_ZZ], half, depth[0]);
+            for (int k = 0; k < monomials(4); k++) set_part(sums[OF_W2[k]], half, of_w2[k]);
             sum_ray_depth_moments(numbers(cross[3]), numbers(own_depth), shape, block, half, sums);
             for (int channel = 0; channel < 3; channel++) {
                 sum_monomials<2>(numbers(cross[channel]), shape, block, half, of_channel);

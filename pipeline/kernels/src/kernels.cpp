@@ -119,6 +119,7 @@ static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& los
     Status status = prepare(frame, gaussians);
     if (status != Status::ok) return status;
     const int tiles = frame.tiles_x * frame.tiles_y;
+    frame.front.need((frame.longest_list + 1) * LANES * 2 * frame.threads);
     const double* parts = frame.loss_parts.need(static_cast<size_t>(tiles) * LOSS_SUMS);
     const LossScales scales(PixelCounts(frame.view, loss.depth_m));
     status = by_depth_kind(frame, [&](auto kind) {

@@ -1,8 +1,8 @@
 // Back to front: what the pixels of a block say about each of its Gaussians, summed.
 //
 // A block is walked from its last item to its first in batches of sixteen, in two steps.
-//   Replay: lanes are pixels. alpha as in front, the transmittance from that of the batch's beginning, and then, back to
-//   front, a few numbers per pixel and item.
+//   Replay: lanes are pixels. alpha as in front, the transmittance before each Gaussian from the one behind it, and a few
+//   numbers per pixel and item.
 //   Sums: lanes are Gaussians, after a transposition. The numbers times monomials of e = M (pixel - centre), added up over the
 //   sixteen pixels without a sum across lanes, and added to the Gaussian's row of this tile.
 #pragma once
@@ -11,7 +11,7 @@
 
 namespace KERNEL_ISA {
 
-constexpr int BATCH = TileItems::BATCH;
+constexpr int BATCH = 16;  // items
 
 // Sums of the gradient; w: cotangent of ln alpha, (X, Y) = e; R, G, B, Z: weight times cotangent, the last two times e for
 // ray_plane only.
@@ -23,8 +23,8 @@ enum GradientSum { SUM_W, SUM_WX, SUM_WY, SUM_WXX, SUM_WXY, SUM_WYY, SUM_R, SUM_
 enum InformationSum {
     INFO_XX, INFO_XY, INFO_YY, INFO_XXX, INFO_XXY, INFO_XYY, INFO_YYY,
     INFO_XXXX, INFO_XXXY, INFO_XXYY, INFO_XYYY, INFO_YYYY, INFO_1,
-    INFO_ZX, INFO_ZY, INFO_ZXX, INFO_ZXY, INFO_ZYY, INFO_ZZ,
-    INFO_R, INFO_G, INFO_B,
+    INFO_ZX, INFO_ZY, INFO_ZXX, INFO_ZXY, INFO_ZYY,
+    INFO_R, INFO_G, INFO_B, INFO_ZZ,
     INFO_Z1, INFO_ZXXX, INFO_ZXXY, INFO_ZXYY, INFO_ZYYY, INFO_ZZX, INFO_ZZY, INFO_ZZXX, INFO_ZZXY, INFO_ZZYY,  // ray_plane only
     INFO_WEIGHT = INFO_G, INFO_RESIDUAL = INFO_B,
 };
@@ -32,7 +32,7 @@ enum InformationSum {
 template <DepthKind KIND>
 constexpr int GRADIENT_SUMS = KIND == DepthKind::ray_plane ? SUM_ZY + 1 : SUM_Z + 1;
 template <DepthKind KIND>
-constexpr int INFORMATION_SUMS = KIND == DepthKind::ray_plane ? INFO_ZZYY + 1 : INFO_B + 1;
+constexpr int INFORMATION_SUMS = KIND == DepthKind::ray_plane ? INFO_ZZYY + 1 : INFO_ZZ + 1;
 
 constexpr int GRADIENT_ROW = 16, INFORMATION_ROW = 32;  // floats; whole cache lines
 template <DepthKind KIND>
@@ -40,12 +40,13 @@ constexpr int SQUARES_ROW = KIND == DepthKind::ray_plane ? 48 : 32;  // gradient
 
 // Sixteen items of a block, or fewer: then the first stands for the missing, seen by no pixel.
 struct Batch {
+    uint32_t first;  // of the block's items
     alignas(64) uint32_t positions[BATCH];
     alignas(32) uint16_t pixels[BATCH];
     int count;
     const Splat* splats;  // of the tile's list
-    Batch(const Splat* tile_splats, const TileItems& items, uint32_t first, uint32_t block_count)
-        : count(block_count - first < BATCH ? static_cast<int>(block_count - first) : BATCH), splats(tile_splats) {
+    Batch(const Splat* tile_splats, const TileItems& items, uint32_t begin, uint32_t block_count)
+        : first(begin), count(block_count - first < BATCH ? static_cast<int>(block_count - first) : BATCH), splats(tile_splats) {
         load_positions(items.positions + first, count, positions);
         load_words(items.pixels + first, count, pixels);
     }
@@ -55,36 +56,47 @@ struct Batch {
 
 using Lanes = Vec[BATCH];
 
-// alpha and weight of the items of a batch; T: transmittance before the first.
-ALWAYS_INLINE inline void replay(const Batch& batch, Vec pixel_x, Vec pixel_y, Vec T, Lanes& alphas, Lanes& weights) {
-    for (int group = 0; group < batch.groups() * ABREAST; group += ABREAST) {
-        Vec alpha[ABREAST], rest[ABREAST];
-        unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
-            const Splat& s = batch.splat(group + k);
-            alpha[k] = Whitened(s, pixel_x, pixel_y).log2_alpha(s);
-        });
-        unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
-            alpha_and_rest(alpha[k], mask_of_bits(batch.pixels[group + k]), rest[k]);
-            pin(alpha[k]);
-            pin(rest[k]);
-        });
-        unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
-            alphas[group + k] = alpha[k];
-            weights[group + k] = alpha[k] * T;
-            T = T * rest[k];
-        });
-    }
-}
+// alpha and weight computed again. T: transmittance behind the items, then before them; it is divided by the same 1 - alpha
+// that it was multiplied by in front.
+struct Replay {
+    Vec pixel_x, pixel_y, T;
+    Replay(const Block& block, const float* end) : pixel_x(block.pixels_x()), pixel_y(block.pixels_y()), T(load(end)) {}
 
-// Calls visit(k, splat) for the items of a batch from the last to the first.
-template <class Visit>
-ALWAYS_INLINE inline void walk_back(const Batch& batch, Visit visit) {
-    for (int group = batch.groups(); group-- > 0;)
-        unrolled<ABREAST>([&](auto back) ALWAYS_INLINE {
-            const int k = group * ABREAST + ABREAST - 1 - back;
-            visit(k, batch.splat(k));
-        });
-}
+    // Calls visit(k, splat, alpha, weight) for the items of a batch from the last to the first.
+    template <class Visit>
+    ALWAYS_INLINE void walk(const Batch& batch, Visit visit) {
+        for (int group = batch.groups(); group-- > 0;) {
+            Vec alpha[ABREAST], inverse[ABREAST];
+            unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
+                const Splat& s = batch.splat(group * ABREAST + k);
+                alpha[k] = Whitened(s, pixel_x, pixel_y).log2_alpha(s);
+            });
+            unrolled<ABREAST>([&](auto k) ALWAYS_INLINE {
+                Vec rest;
+                alpha_and_rest(alpha[k], mask_of_bits(batch.pixels[group * ABREAST + k]), rest);
+                inverse[k] = Vec(1.0f) / rest;
+                pin(alpha[k]);
+                pin(inverse[k]);
+            });
+            unrolled<ABREAST>([&](auto back) ALWAYS_INLINE {
+                constexpr int k = ABREAST - 1 - back;
+                T = T * inverse[k];
+                visit(group * ABREAST + k, batch.splat(group * ABREAST + k), alpha[k], alpha[k] * T);
+            });
+        }
+    }
+};
+// alpha and weight as the forward pass just left them.
+struct Recall {
+    Memory memory;
+    template <class Visit>
+    ALWAYS_INLINE void walk(const Batch& batch, Visit visit) {
+        for (int k = batch.count; k-- > 0;) {
+            const size_t at = static_cast<size_t>(batch.first + k) * LANES;
+            visit(k, batch.splat(k), load(memory.alphas + at), load(memory.weights + at));
+        }
+    }
+};
 
 // d channel / d ln alpha = weight (own value - what lies behind, composited); leaves in `behind` what lies behind the next.
 inline Vec gain_over(Vec& behind, Vec own, Vec alpha) {
@@ -148,20 +160,47 @@ template <int COUNT>
 inline void set_parts(Vec* sums, int half, const Wide (&values)[COUNT]) {
     for (int k = 0; k < COUNT; k++) set_part(sums[k], half, values[k]);
 }
-// The same, value k to sums[slots[k]].
-template <int COUNT, class Slot>
-inline void set_parts(Vec* sums, int half, const Wide (&values)[COUNT], const Slot (&slots)[COUNT]) {
-    for (int k = 0; k < COUNT; k++) set_part(sums[slots[k]], half, values[k]);
+
+constexpr int monomials(int degree) { return (degree + 1) * (degree + 2) / 2; }
+
+// totals = sums of w x^i y^j over the pixels, i + j <= DEGREE, by degree, then by j: 1, x, y, xx, xy, yy, xxx ...
+template <int DEGREE, class W>
+inline void sum_monomials(W w_of, const BatchShape& shape, const Block& block, int half, Wide (&totals)[monomials(DEGREE)]) {
+    Wide of_row[DEGREE + 1];  // of w x^i
+    for (Wide& total : totals) total = Wide(0.0f);
+    for (Wide& total : of_row) total = Wide(0.0f);
+    over_rows(
+        shape, half, block,
+        [&](int p, Wide x) ALWAYS_INLINE {
+            Wide wx = w_of(p);
+            of_row[0] += wx;
+            unrolled<DEGREE>([&](auto i) ALWAYS_INLINE {
+                of_row[i + 1] = fma(wx, x, of_row[i + 1]);
+                wx = wx * x;
+            });
+        },
+        [&](Wide y) ALWAYS_INLINE {
+            unrolled<DEGREE + 1>([&](auto i) ALWAYS_INLINE {
+                Wide wxy = of_row[i];
+                totals[monomials(i - 1)] += wxy;
+                unrolled<DEGREE - i>([&](auto j) ALWAYS_INLINE {
+                    constexpr int place = monomials(i + j) + j + 1;
+                    totals[place] = fma(wxy, y, totals[place]);
+                    wxy = wxy * y;
+                });
+                of_row[i] = Wide(0.0f);
+            });
+        });
 }
 
-// sums[k] = sum of f times cotangent[k] over the pixels, k < COUNT.
-template <int COUNT>
-inline void sum_products(const Lanes& f_of, const float (*cotangents)[LANES], int half, Vec* sums) {
-    Wide total[COUNT];
-    for (Wide& t : total) t = Wide(0.0f);
-    for (int p = 0; p < LANES; p++)
-        for (int k = 0; k < COUNT; k++) total[k] = fma(part(f_of[p], half), Wide(cotangents[k][p]), total[k]);
-    set_parts(sums, half, total);
+// totals[k] = sum over the pixels p of value_of(p) times planes[k][p].
+template <int COUNT, class Value>
+inline void sum_products(Value value_of, const float (*planes)[LANES], Wide (&totals)[COUNT]) {
+    for (Wide& total : totals) total = Wide(0.0f);
+    for (int p = 0; p < LANES; p++) {
+        const Wide value = value_of(p);
+        for (int k = 0; k < COUNT; k++) totals[k] = fma(value, Wide(planes[k][p]), totals[k]);
+    }
 }
 
 // SUM_W .. SUM_WYY
@@ -227,52 +266,19 @@ inline void sum_screen_moments(W2 w2_of, const BatchShape& shape, const Block& b
     set_parts(sums, half, total);
 }
 
-constexpr int monomials(int degree) { return (degree + 1) * (degree + 2) / 2; }
-
-// total = sums of w x^i y^j for i + j <= DEGREE, by degree, then by j: 1, x, y, xx, xy, yy, xxx ...
-template <int DEGREE, class W>
-inline void sum_monomials(W w_of, const BatchShape& shape, const Block& block, int half, Wide (&total)[monomials(DEGREE)]) {
-    Wide of_row[DEGREE + 1];  // of w x^i
-    for (Wide& t : total) t = Wide(0.0f);
-    for (Wide& t : of_row) t = Wide(0.0f);
-    over_rows(
-        shape, half, block,
-        [&](int p, Wide x) ALWAYS_INLINE {
-            Wide wx = w_of(p);
-            of_row[0] += wx;
-            unrolled<DEGREE>([&](auto i) ALWAYS_INLINE {
-                of_row[i + 1] = fma(wx, x, of_row[i + 1]);
-                wx = wx * x;
-            });
-        },
-        [&](Wide y) ALWAYS_INLINE {
-            unrolled<DEGREE + 1>([&](auto i) ALWAYS_INLINE {
-                Wide wxy = of_row[i];
-                total[monomials(i - 1)] += wxy;
-                unrolled<DEGREE - i>([&](auto j) ALWAYS_INLINE {
-                    total[monomials(i + j) + j + 1] = fma(wxy, y, total[monomials(i + j) + j + 1]);
-                    wxy = wxy * y;
-                });
-                of_row[i] = Wide(0.0f);
-            });
-        });
-}
-
-// INFO_ZX .. INFO_ZZ. cross_of(p, square): product of depth's own derivative with that by ln alpha, and its square.
+// INFO_ZX .. INFO_ZYY. cross_of(p): product of depth's own derivative with that by ln alpha.
 template <class Cross>
 inline void sum_depth_moments(Cross cross_of, const BatchShape& shape, const Block& block, int half, Vec* sums) {
     const Wide zero(0.0f);
-    Wide X = zero, Y = zero, XX = zero, XY = zero, YY = zero, ZZ = zero;
+    Wide X = zero, Y = zero, XX = zero, XY = zero, YY = zero;
     Wide s0 = zero, s1 = zero, s2 = zero;
     over_rows(
         shape, half, block,
         [&](int p, Wide x) ALWAYS_INLINE {
-            Wide square;
-            const Wide cross = cross_of(p, square), cx = cross * x;
+            const Wide cross = cross_of(p), cx = cross * x;
             s0 += cross;
             s1 += cx;
             s2 = fma(cx, x, s2);
-            ZZ += square;
         },
         [&](Wide y) ALWAYS_INLINE {
             const Wide s0y = s0 * y;
@@ -283,17 +289,20 @@ inline void sum_depth_moments(Cross cross_of, const BatchShape& shape, const Blo
             YY = fma(s0y, y, YY);
             s0 = s1 = s2 = zero;
         });
-    set_parts(sums + INFO_ZX, half, {X, Y, XX, XY, YY, ZZ});
+    set_parts(sums + INFO_ZX, half, {X, Y, XX, XY, YY});
 }
 
-// The same for ray_plane, whose own derivative of depth goes as 1, x and y. cross_of(p), square_of(p): as above at e = 0.
+// The same for ray_plane, whose own derivative of depth goes as 1, x and y, and what the square of that needs beside INFO_ZZ.
+// cross_of(p), square_of(p): of the part that goes as 1.
 template <class Cross, class Square>
 inline void sum_ray_depth_moments(Cross cross_of, Square square_of, const BatchShape& shape, const Block& block, int half, Vec* sums) {
+    constexpr int OF_CROSS[] = {INFO_Z1, INFO_ZX, INFO_ZY, INFO_ZXX, INFO_ZXY, INFO_ZYY, INFO_ZXXX, INFO_ZXXY, INFO_ZXYY, INFO_ZYYY};
+    constexpr int OF_SQUARE[] = {INFO_ZZX, INFO_ZZY, INFO_ZZXX, INFO_ZZXY, INFO_ZZYY};
     Wide cross[monomials(3)], square[monomials(2)];
     sum_monomials<3>(cross_of, shape, block, half, cross);
     sum_monomials<2>(square_of, shape, block, half, square);
-    set_parts(sums, half, cross, {INFO_Z1, INFO_ZX, INFO_ZY, INFO_ZXX, INFO_ZXY, INFO_ZYY, INFO_ZXXX, INFO_ZXXY, INFO_ZXYY, INFO_ZYYY});
-    set_parts(sums, half, square, {INFO_ZZ, INFO_ZZX, INFO_ZZY, INFO_ZZXX, INFO_ZZXY, INFO_ZZYY});
+    for (int k = 0; k < monomials(3); k++) set_part(sums[OF_CROSS[k]], half, cross[k]);
+    for (int k = 1; k < monomials(2); k++) set_part(sums[OF_SQUARE[k - 1]], half, square[k]);
 }
 
 }  // namespace KERNEL_ISA

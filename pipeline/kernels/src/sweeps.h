@@ -20,14 +20,10 @@ inline void touch(const T* begin, size_t count) {
 inline void touch_items(const Frame& frame, int index) {
     if (index >= frame.tiles_x * frame.tiles_y) return;
     const TileItems items(frame, index);
-    size_t count = 0, batches = 0;
-    for (int b = 0; b < BLOCKS; b++) {
-        count += items.counts[b];
-        batches += (items.counts[b] + BATCH - 1) / BATCH;
-    }
+    size_t count = 0;
+    for (int b = 0; b < BLOCKS; b++) count += items.counts[b];
     touch(items.positions, count);
     touch(items.pixels, count);
-    touch(items.batch_T, batches * LANES);
 }
 
 // A tile whose blocks are walked back to front; clears the rows of its list.
@@ -54,11 +50,11 @@ private:
           rows(frame.rows.data()), items(frame, t.index) {}
 };
 
-// Calls visit(batch, transmittance before it) for the batches of a block from the last to the first.
+// Calls visit(batch) for the batches of a block from the last to the first.
 template <class Visit>
 ALWAYS_INLINE inline void over_batches(const Sweep& sweep, uint32_t count, Visit visit) {
     for (uint32_t first = (count - 1) / BATCH * BATCH;; first -= BATCH) {
-        visit(Batch(sweep.splats, sweep.items, first, count), load(sweep.items.batch_T + static_cast<size_t>(first) / BATCH * LANES));
+        visit(Batch(sweep.splats, sweep.items, first, count));
         if (first == 0) return;
     }
 }
@@ -79,66 +75,65 @@ struct Cotangents {
     alignas(64) float planes[5][LANES];
 };
 
-// Squares of the gradient: the empirical information.
+// Squares of the gradient: the empirical information. squared: of the cotangents' planes.
 template <DepthKind KIND>
-inline void sum_squares(const Lanes& w_of, const Lanes& f_of, const Cotangents& v, const BatchShape& shape, const Block& block, int half,
-                        Vec* sums) {
+inline void sum_squares(const Lanes& w_of, const Lanes& f_of, const Cotangents& v, const float (*squared)[LANES], const BatchShape& shape,
+                        const Block& block, int half, Vec* sums) {
     sum_screen_moments([&](int p) ALWAYS_INLINE { return part(w_of[p], half) * part(w_of[p], half); }, shape, block, half, sums);
-    const auto by_z = [&](int p) ALWAYS_INLINE { return part(f_of[p], half) * Wide(v.planes[3][p]); };
-    if constexpr (KIND == DepthKind::ray_plane)
-        sum_ray_depth_moments([&](int p) ALWAYS_INLINE { return by_z(p) * part(w_of[p], half); },
-                              [&](int p) ALWAYS_INLINE { return by_z(p) * by_z(p); }, shape, block, half, sums);
-    else
-        sum_depth_moments(
-            [&](int p, Wide& square) ALWAYS_INLINE {
-                square = by_z(p) * by_z(p);
-                return by_z(p) * part(w_of[p], half);
-            },
-            shape, block, half, sums);
-    Wide total[3] = {Wide(0.0f), Wide(0.0f), Wide(0.0f)};
-    for (int p = 0; p < LANES; p++)
-        for (int k = 0; k < 3; k++) {
-            const Wide by_color = part(f_of[p], half) * Wide(v.planes[k][p]);
-            total[k] = fma(by_color, by_color, total[k]);
-        }
-    set_parts(sums + INFO_R, half, total);
+    const auto cross_of = [&](int p) ALWAYS_INLINE { return part(f_of[p], half) * part(w_of[p], half) * Wide(v.planes[3][p]); };
+    const auto weight2_of = [&](int p) ALWAYS_INLINE { return part(f_of[p], half) * part(f_of[p], half); };
+    if constexpr (KIND == DepthKind::ray_plane) {
+        const auto square_of = [&](int p) ALWAYS_INLINE { return weight2_of(p) * Wide(squared[3][p]); };
+        sum_ray_depth_moments(cross_of, square_of, shape, block, half, sums);
+    } else {
+        sum_depth_moments(cross_of, shape, block, half, sums);
+    }
+    Wide totals[4];
+    sum_products(weight2_of, squared, totals);
+    set_parts(sums + INFO_R, half, totals);
 }
 
 // Adds to the rows of a block's items.
-template <Derivatives D, DepthKind KIND>
-NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uint32_t count, const Cotangents& v) {
+template <Derivatives D, DepthKind KIND, class Pass>
+NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uint32_t count, const Cotangents& v, Pass pass) {
     constexpr int ROW = ROW_OF<D, KIND>;
     const Vec r = load(v.planes[0]), g = load(v.planes[1]), b = load(v.planes[2]), z = load(v.planes[3]), a = load(v.planes[4]);
     const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
     const float* background = sweep.view.background;
+    alignas(64) float squared[4][LANES];
+    if constexpr (D == Derivatives::ALL_AND_SQUARES) {
+        const Vec all[4] = {r * r, g * g, b * b, z * z};
+        for (int k = 0; k < 4; k++) store(squared[k], all[k]);
+    }
     Vec behind = fma(Vec(background[0]), r, fma(Vec(background[1]), g, Vec(background[2]) * b));
-    over_batches(sweep, count, [&](const Batch& batch, Vec T) ALWAYS_INLINE {
-        Lanes alpha, f, w;
+    over_batches(sweep, count, [&](const Batch& batch) ALWAYS_INLINE {
+        Lanes f, w;
         Vec sums[ROW];
         unused_sums<D == Derivatives::POSE ? SUM_R : SUMS_OF<D, KIND>, ROW>(sums);
-        replay(batch, pixel_x, pixel_y, T, alpha, f);
-        walk_back(batch, [&](int k, const Splat& s) ALWAYS_INLINE {
+        pass.walk(batch, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
             const Vec depth = depth_at<KIND>(s, Whitened(s, pixel_x, pixel_y));
             const Vec own = fma(Vec(s.r), r, fma(Vec(s.g), g, fma(Vec(s.b), b, fma(depth, z, a))));
-            const Vec gain = gain_over(behind, own, alpha[k]);
-            w[k] = if_unclamped(alpha[k], f[k] * gain);
+            const Vec gain = gain_over(behind, own, alpha);
+            w[k] = if_unclamped(alpha, weight * gain);
+            f[k] = weight;
         });
         const BatchShape shape(batch);
         transpose16(w);
         for (int half = 0; half < PARTS; half++) sum_moments(w, shape, block, half, sums);
         transpose16(f);
         for (int half = 0; half < PARTS; half++) {
-            if constexpr (D == Derivatives::POSE)
-                sum_products<1>(f, v.planes + 3, half, sums + SUM_Z);  // colours wait for nobody
-            else
-                sum_products<4>(f, v.planes, half, sums + SUM_R);
+            constexpr int FIRST = D == Derivatives::POSE ? SUM_Z : SUM_R;  // the pose does not move colours
+            Wide totals[SUM_Z + 1 - FIRST];
+            sum_products([&](int p) ALWAYS_INLINE { return part(f[p], half); }, v.planes + (FIRST - SUM_R), totals);
+            set_parts(sums + FIRST, half, totals);
             if constexpr (KIND == DepthKind::ray_plane) {
-                Wide total[monomials(1)];
-                sum_monomials<1>([&](int p) ALWAYS_INLINE { return part(f[p], half) * Wide(v.planes[3][p]); }, shape, block, half, total);
-                set_part(sums[SUM_ZX], half, total[1]);
-                set_part(sums[SUM_ZY], half, total[2]);
+                Wide of_depth[monomials(1)];
+                sum_monomials<1>([&](int p) ALWAYS_INLINE { return part(f[p], half) * Wide(v.planes[3][p]); }, shape, block, half, of_depth);
+                set_part(sums[SUM_ZX], half, of_depth[1]);
+                set_part(sums[SUM_ZY], half, of_depth[2]);
             }
-            if constexpr (D == Derivatives::ALL_AND_SQUARES) sum_squares<KIND>(w, f, v, shape, block, half, sums + GRADIENT_SUMS<KIND>);
+            if constexpr (D == Derivatives::ALL_AND_SQUARES)
+                sum_squares<KIND>(w, f, v, squared, shape, block, half, sums + GRADIENT_SUMS<KIND>);
         }
         add_to_rows<ROW>(batch, sums, sweep.rows, sweep.list_rows);
     });
@@ -167,7 +162,8 @@ inline Status gradient_tile(Frame& frame, int index, const float* d_color, const
     for (int b = 0; b < BLOCKS; b++) {
         const uint32_t count = sweep.items.counts[b];
         if (!count) continue;
-        gradient_block<D, KIND>(sweep, Block(sweep.tile, b, view), count, cotangents[b]);
+        const Block block(sweep.tile, b, view);
+        gradient_block<D, KIND>(sweep, block, count, cotangents[b], Replay(block, sweep.items.T + b * LANES));
         sweep.items.skip(count);
     }
     return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
@@ -177,27 +173,27 @@ inline Status gradient_tile(Frame& frame, int index, const float* d_color, const
 
 // Precisions 1/sigma^2 of colour and depth in one block, the pixels that have one, and the residual.
 struct Precisions {
-    alignas(64) float color[LANES], depth[LANES], used[LANES], residual[LANES];
+    alignas(64) float planes[4][LANES];  // colour, depth, used, used times residual
 };
 
 // Rows of J^T R^-1 J: each colour channel and depth has its own "behind", for their derivatives are squared one by one.
 template <DepthKind KIND>
-NO_INLINE static void information_block(const Sweep& sweep, const Block& block, uint32_t count, const Precisions& v) {
-    const Vec of_color = load(v.color), of_depth = load(v.depth);
+NO_INLINE static void information_block(const Sweep& sweep, const Block& block, uint32_t count, const Precisions& v, Replay pass) {
+    const Vec of_color = load(v.planes[0]), of_depth = load(v.planes[1]);
     const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
     const float* background = sweep.view.background;
     Vec behind_r(background[0]), behind_g(background[1]), behind_b(background[2]), behind_z(0.0f);
-    over_batches(sweep, count, [&](const Batch& batch, Vec T) ALWAYS_INLINE {
-        Lanes alpha, f, w2, cross;
+    over_batches(sweep, count, [&](const Batch& batch) ALWAYS_INLINE {
+        Lanes f, w2, cross;
         Vec sums[INFORMATION_ROW];
         unused_sums<INFORMATION_SUMS<KIND>, INFORMATION_ROW>(sums);
-        replay(batch, pixel_x, pixel_y, T, alpha, f);
-        walk_back(batch, [&](int k, const Splat& s) ALWAYS_INLINE {
-            const Vec gain_r = gain_over(behind_r, Vec(s.r), alpha[k]), gain_g = gain_over(behind_g, Vec(s.g), alpha[k]);
+        pass.walk(batch, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
+            const Vec gain_r = gain_over(behind_r, Vec(s.r), alpha), gain_g = gain_over(behind_g, Vec(s.g), alpha);
             const Vec depth = depth_at<KIND>(s, Whitened(s, pixel_x, pixel_y));
-            const Vec gain_b = gain_over(behind_b, Vec(s.b), alpha[k]), gain_z = gain_over(behind_z, depth, alpha[k]);
+            const Vec gain_b = gain_over(behind_b, Vec(s.b), alpha), gain_z = gain_over(behind_z, depth, alpha);
             const Vec color2 = fma(gain_r, gain_r, fma(gain_g, gain_g, gain_b * gain_b)), depth_gain = of_depth * gain_z;
-            const Vec moving2 = if_unclamped(alpha[k], f[k] * f[k]);
+            const Vec moving2 = if_unclamped(alpha, weight * weight);
+            f[k] = weight;
             w2[k] = moving2 * fma(of_color, color2, depth_gain * gain_z);
             cross[k] = moving2 * depth_gain;
         });
@@ -208,31 +204,27 @@ NO_INLINE static void information_block(const Sweep& sweep, const Block& block, 
         transpose16(cross);
         transpose16(f);
         for (int half = 0; half < PARTS; half++) {
-            Wide total[3] = {Wide(0.0f), Wide(0.0f), Wide(0.0f)};
-            const auto square_of = [&](int p) ALWAYS_INLINE {
-                const Wide weight = part(f[p], half), weight2 = weight * weight;
-                total[0] = fma(weight2, Wide(v.color[p]), total[0]);
-                total[1] = fma(weight, Wide(v.used[p]), total[1]);
-                total[2] = fma(weight, Wide(v.residual[p]), total[2]);
-                return weight2 * Wide(v.depth[p]);
-            };
             const auto cross_of = [&](int p) ALWAYS_INLINE { return part(cross[p], half); };
-            if constexpr (KIND == DepthKind::ray_plane)
+            const auto weight2_of = [&](int p) ALWAYS_INLINE { return part(f[p], half) * part(f[p], half); };
+            if constexpr (KIND == DepthKind::ray_plane) {
+                const auto square_of = [&](int p) ALWAYS_INLINE { return weight2_of(p) * Wide(v.planes[1][p]); };
                 sum_ray_depth_moments(cross_of, square_of, shape, block, half, sums);
-            else
-                sum_depth_moments(
-                    [&](int p, Wide& square) ALWAYS_INLINE {
-                        square = square_of(p);
-                        return cross_of(p);
-                    },
-                    shape, block, half, sums);
-            set_parts(sums + INFO_R, half, total);
+            } else {
+                sum_depth_moments(cross_of, shape, block, half, sums);
+            }
+            Wide of_squares[2], of_weights[2];
+            sum_products(weight2_of, v.planes, of_squares);
+            sum_products([&](int p) ALWAYS_INLINE { return part(f[p], half); }, v.planes + 2, of_weights);
+            set_part(sums[INFO_R], half, of_squares[0]);
+            set_part(sums[INFO_ZZ], half, of_squares[1]);
+            set_part(sums[INFO_WEIGHT], half, of_weights[0]);
+            set_part(sums[INFO_RESIDUAL], half, of_weights[1]);
         }
         add_to_rows<INFORMATION_ROW>(batch, sums, sweep.rows, sweep.list_rows);
     });
 }
 
-// Calls of_block(sweep, block, count of its items, precisions) for the blocks of a tile that have items.
+// Calls of_block(sweep, block, count of its items, precisions, replay) for the blocks of a tile that have items.
 template <int ROW, class OfBlock>
 inline Status over_precisions(Frame& frame, int index, const float* inv_var_color, const float* inv_var_depth, const float* residual,
                               OfBlock of_block) {
@@ -249,15 +241,14 @@ inline Status over_precisions(Frame& frame, int index, const float* inv_var_colo
         bad[0] |= !finite_not_negative(color);
         bad[1] |= !finite_not_negative(depth);
         bad[2] |= !finite_not_negative(r);
-        store(precisions[b].color, color);
-        store(precisions[b].depth, depth);
-        store(precisions[b].used, used);
-        store(precisions[b].residual, used * r);
+        const Vec planes[4] = {color, depth, used, used * r};
+        for (int k = 0; k < 4; k++) store(precisions[b].planes[k], planes[k]);
     }
     for (int b = 0; b < BLOCKS; b++) {
         const uint32_t count = sweep.items.counts[b];
         if (!count) continue;
-        of_block(sweep, Block(sweep.tile, b, view), count, precisions[b]);
+        const Block block(sweep.tile, b, view);
+        of_block(sweep, block, count, precisions[b], Replay(block, sweep.items.T + b * LANES));
         sweep.items.skip(count);
     }
     return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
@@ -270,15 +261,14 @@ inline Status information_tile(Frame& frame, int index, const float* inv_var_col
 // ---------------------------------------------------------------- contributions
 
 // Sum of weights and number of pixels.
-NO_INLINE static void contribution_block(const Sweep& sweep, const Block& block, uint32_t count) {
-    const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
-    over_batches(sweep, count, [&](const Batch& batch, Vec T) ALWAYS_INLINE {
-        Lanes alpha, f;
+NO_INLINE static void contribution_block(const Sweep& sweep, uint32_t count, Replay pass) {
+    over_batches(sweep, count, [&](const Batch& batch) ALWAYS_INLINE {
+        Lanes f;
         Vec sums[GRADIENT_ROW];
         unused_sums<2, GRADIENT_ROW>(sums);
         alignas(64) float pixels[BATCH];
         for (int k = 0; k < BATCH; k++) pixels[k] = static_cast<float>(__builtin_popcount(batch.pixels[k]));
-        replay(batch, pixel_x, pixel_y, T, alpha, f);
+        pass.walk(batch, [&](int k, const Splat&, Vec, Vec weight) ALWAYS_INLINE { f[k] = weight; });
         transpose16(f);
         sums[0] = f[0];
         for (int p = 1; p < LANES; p++) sums[0] += f[p];
@@ -293,7 +283,8 @@ inline void contribution_tile(Frame& frame, int index) {
     for (int b = 0; b < BLOCKS; b++) {
         const uint32_t count = sweep.items.counts[b];
         if (!count) continue;
-        contribution_block(sweep, Block(sweep.tile, b, frame.view), count);
+        const Block block(sweep.tile, b, frame.view);
+        contribution_block(sweep, count, Replay(block, sweep.items.T + b * LANES));
         sweep.items.skip(count);
     }
 }

@@ -117,24 +117,18 @@ inline const Splat* gather_splats(Frame& frame, const Tile& tile) {
 struct TileItems {
     uint32_t* positions;
     uint16_t* pixels;
-    float* batch_T;
+    float* T;          // transmittance at the end, block after block
     uint32_t* counts;  // of the blocks
     TileItems(const Frame& frame, int tile)
         : positions(frame.item_positions.data() + frame.item_start.data()[tile]),
           pixels(frame.item_pixels.data() + frame.item_start.data()[tile]),
-          batch_T(frame.batch_T.data() + first_batch(frame, tile) * LANES),
+          T(frame.transmittance.data() + static_cast<size_t>(tile) * BLOCKS * LANES),
           counts(frame.block_items.data() + static_cast<size_t>(tile) * BLOCKS) {}
     // Steps over a block.
     void skip(uint32_t count) {
         positions += count;
         pixels += count;
-        batch_T += (count + BATCH - 1) / BATCH * LANES;
     }
-    // A bound: every block may begin a batch that it does not fill, and a slot behind its last is written too.
-    static size_t first_batch(const Frame& frame, int tile) {
-        return frame.item_start.data()[tile] / BATCH + static_cast<size_t>(tile) * 2 * BLOCKS;
-    }
-    static constexpr int BATCH = 16;
 };
 
 // Room for the items of all tiles: as many as candidates.
@@ -160,7 +154,7 @@ inline void prepare_items(Frame& frame) {
     start[tiles] = items;
     frame.item_positions.need(items);
     frame.item_pixels.need(items);
-    frame.batch_T.need(TileItems::first_batch(frame, tiles) * LANES);
+    frame.transmittance.need(static_cast<size_t>(tiles) * BLOCKS * LANES);
     frame.block_items.need(static_cast<size_t>(tiles) * BLOCKS);
     frame.evaluated.need(tiles);
     frame.tile_splats.need(frame.longest_list * frame.threads);
