@@ -61,6 +61,14 @@ inline void store_rows16(float* rows, const Vec* columns) {
         for (int p = 0; p < 4; p++) _mm512_store_ps(rows + 16 * (4 * p + r), out[p]);
     }
 }
+inline void store_rows8(float* rows, const Vec* columns) {
+    __m512 quads[2][4], out[4];
+    for (int k = 0; k < 2; k++) transpose_quads(columns[4 * k].v, columns[4 * k + 1].v, columns[4 * k + 2].v, columns[4 * k + 3].v, quads[k]);
+    for (int r = 0; r < 4; r += 2) {
+        transpose_parts(quads[0][r], quads[1][r], quads[0][r + 1], quads[1][r + 1], out);
+        for (int p = 0; p < 4; p++) _mm512_store_ps(rows + 8 * (4 * p + r), out[p]);
+    }
+}
 
 // Rows become columns.
 inline void transpose16(Vec* a) {
@@ -149,23 +157,26 @@ inline void load_rows4(const float* rows, Vec* columns) {
                     load_parts(rows + 44, rows + 60), high);
     for (int k = 0; k < 4; k++) columns[k] = Vec(low[k], high[k]);
 }
-// Columns k..k+7 of eight rows.
-inline void store_rows8(float* rows, const __m256* columns) {
+// Eight columns of eight rows, which lie `stride` floats apart.
+inline void store_8x8(float* rows, int stride, const __m256* columns) {
     __m256 left[4], right[4];  // of rows r and 4 + r
     transpose_quads(columns[0], columns[1], columns[2], columns[3], left);
     transpose_quads(columns[4], columns[5], columns[6], columns[7], right);
     for (int r = 0; r < 4; r++) {
-        _mm256_store_ps(rows + 16 * r, _mm256_permute2f128_ps(left[r], right[r], 0x20));
-        _mm256_store_ps(rows + 16 * (r + 4), _mm256_permute2f128_ps(left[r], right[r], 0x31));
+        _mm256_store_ps(rows + stride * r, _mm256_permute2f128_ps(left[r], right[r], 0x20));
+        _mm256_store_ps(rows + stride * (r + 4), _mm256_permute2f128_ps(left[r], right[r], 0x31));
     }
 }
+inline void store_columns8(float* rows, int stride, const Vec* columns) {
+    __m256 low[8], high[8];
+    for (int k = 0; k < 8; k++) low[k] = columns[k].a, high[k] = columns[k].b;
+    store_8x8(rows, stride, low);
+    store_8x8(rows + 8 * stride, stride, high);
+}
+inline void store_rows8(float* rows, const Vec* columns) { store_columns8(rows, 8, columns); }
 inline void store_rows16(float* rows, const Vec* columns) {
-    for (int k = 0; k < 16; k += 8) {
-        __m256 low[8], high[8];
-        for (int i = 0; i < 8; i++) low[i] = columns[k + i].a, high[i] = columns[k + i].b;
-        store_rows8(rows + k, low);
-        store_rows8(rows + 16 * 8 + k, high);
-    }
+    store_columns8(rows, 16, columns);
+    store_columns8(rows + 8, 16, columns + 8);
 }
 
 // Rows and columns exchanged in a quarter of a 16x16 matrix.
@@ -333,10 +344,13 @@ inline void load_positions(const uint32_t* numbers, int count, uint32_t* out) {
 inline void load_words(const uint16_t* words, int count, uint16_t* out) {
     for (int i = 0; i < 16; i++) out[i] = i < count ? words[i] : 0;
 }
-inline void store_rows16(float* rows, const Vec* columns) {
+template <int WIDTH>
+inline void store_rows(float* rows, const Vec* columns) {
     for (int lane = 0; lane < LANES; lane++)
-        for (int k = 0; k < 16; k++) rows[16 * lane + k] = columns[k].v[lane];
+        for (int k = 0; k < WIDTH; k++) rows[WIDTH * lane + k] = columns[k].v[lane];
 }
+inline void store_rows8(float* rows, const Vec* columns) { store_rows<8>(rows, columns); }
+inline void store_rows16(float* rows, const Vec* columns) { store_rows<16>(rows, columns); }
 
 #endif
 
@@ -375,7 +389,8 @@ inline Words8 transpose_nibbles(Words8 x) {
 inline Words8 masked(Words8 x, const uint16_t* low, const uint16_t* high) {
     return _mm_and_si128(x, _mm_unpacklo_epi64(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(low)), _mm_loadl_epi64(reinterpret_cast<const __m128i*>(high))));
 }
-// Stores the words that are not zero, and tile + 0, 1, 2, 3, next_row + 0, 1, 2, 3 for those; returns how many. Writes all eight.
+// Stores the words that are not zero, and of tile + 0, 1, 2, 3 and those + stride the ones of these words; returns how many.
+// Writes all eight.
 #if defined(__AVX512F__)
 inline uint32_t store_nonzero(Words8 x, uint32_t tile, uint32_t stride, uint16_t* words, uint32_t* tiles) {
     const __mmask8 some = _mm_test_epi16_mask(x, x);
