@@ -48,6 +48,9 @@ private:
     size_t capacity_ = 0;
 };
 
+// Depth of a Gaussian at a pixel: that of its centre, or its mean along the ray of the pixel.
+enum class DepthKind { blended, ray_plane };
+
 // Pinhole camera at its pose; pixel centres are the integers. R, t: T_camera_map, R row by row.
 struct View {
     float R[9], t[3];
@@ -55,6 +58,7 @@ struct View {
     int width, height;
     float background[3];
     const uint8_t* mask = nullptr;  // [height, width], 0: not drawn; or null: all drawn
+    DepthKind depth = DepthKind::blended;
 };
 
 // n Gaussians, arrays of the caller, row-major.
@@ -70,7 +74,8 @@ struct alignas(64) Splat {
     float M11, M12, M22;       // 1/px
     float log2_opacity;
     float r, g, b, z;          // colour, depth in metres
-    float spare[6];
+    float slope_x, slope_y;    // of the depth along e, metres; set only for ray_plane
+    float spare[4];
 };
 
 // What the ellipse alpha >= 1/255 of a Gaussian covers. With t = dy / Y, Y its half height, and c the correlation of x and
@@ -207,6 +212,8 @@ struct Kernels {
     Status (*fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth, const float* residual,
                      const FisherArrays&);
     void (*contributions)(Frame&, float* weights, uint32_t* pixels);
+    // information: [n, 14, 14]
+    Status (*full_fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth, double* information);
     Status (*fit)(Frame&, const GaussianArrays&, const Loss&, LossValues&, const GradientArrays&);
 };
 

@@ -160,7 +160,7 @@ inline void prepare_items(Frame& frame) {
     frame.tile_splats.need(frame.longest_list * frame.threads);
 }
 
-// Everything before the pixels.
+// Which Gaussians lie where.
 inline Status make_lists(Frame& frame, const GaussianArrays& gaussians) {
     if (!project_all(frame, gaussians)) return Status::bad_gaussians;
     const Status status = bin(frame);
