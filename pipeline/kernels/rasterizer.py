@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import reprlib
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -36,11 +38,14 @@ _NOTHING = np.zeros(0, dtype=np.float32)  # an optional array that is not given
 _NO_DOUBLES = np.zeros(0)
 _NO_MASK = np.zeros(0, dtype=np.uint8)
 
+_NOT_FINITE = "a NaN or an infinity"
+_NEGATIVE = "a NaN, an infinity or a negative number"
+
 _OK, _BAD_GAUSSIANS, _BAD_FIRST, _BAD_SECOND, _BAD_THIRD, _TOO_MANY = range(6)  # enum Status of frame.h
 
 
 def available_isas() -> list[str]:
-    """Builds that this processor can run, fastest first: "avx512", "avx2", "portable"."""
+    """Builds that this processor can run, fastest first: "avx512", "avx2", "neon", "portable"."""
     return list(_raster.available_isas())
 
 
@@ -53,10 +58,10 @@ class Rasterizer:
     """
 
     def __init__(self, isa: str = "auto", threads: int = 1) -> None:
-        if isa != "auto" and isa not in available_isas():
+        if not isinstance(isa, str) or isa not in ("auto", *available_isas()):
             raise ValueError(f"isa is {isa!r}, available here: auto, {', '.join(available_isas())}")
-        if not 1 <= threads <= MAX_THREADS:
-            raise ValueError(f"threads is {threads}, expected 1 to {MAX_THREADS}")
+        if not isinstance(threads, (int, np.integer)) or not 1 <= threads <= MAX_THREADS:
+            raise ValueError(f"threads is {threads!r}, expected a whole number from 1 to {MAX_THREADS}")
         self.threads = int(threads)
         self._raster = _raster.Raster(isa)
         self._gaussians: Gaussians | None = None
@@ -64,7 +69,7 @@ class Rasterizer:
 
     @property
     def isa(self) -> str:
-        """The instruction set in use: "avx512", "avx2" or "portable"."""
+        """The instruction set in use: "avx512", "avx2", "neon" or "portable"."""
         return self._raster.isa
 
     def forward(
@@ -120,8 +125,7 @@ class Rasterizer:
             _checked_image("depth_m", depth_m, (height, width), "the camera"),
         )
         gain, offset = _checked_exposure(exposure)
-        if not isinstance(loss, LossWeights):
-            raise ValueError(f"loss is {type(loss).__name__}, expected LossWeights")
+        _check_type("loss", loss, LossWeights)
         weights = np.array(
             [loss.color_huber, loss.depth_weight, loss.depth_huber_m, loss.alpha_weight, gain, offset],
             np.float32,
@@ -131,13 +135,13 @@ class Rasterizer:
         by_pose, values = np.zeros(6 if pose else 0), np.zeros(5)
         status = self._raster.fit(*_arrays(gaussians), *view, *measured, weights, values, *out, by_pose)
         self._gaussians = None
-        _refuse_bad_image(status, ("color", "depth_m"), "a NaN or an infinity")
+        _refuse_bad_image(status, {"color": _NOT_FINITE, "depth_m": _NEGATIVE})
         self._finish(gaussians, (height, width), status)
         of_color, of_depth, missing, by_gain, by_offset = (float(value) for value in values)
         value = of_color + loss.depth_weight * of_depth + loss.alpha_weight * missing
         return (
             ViewLoss(value, of_color, of_depth, (by_gain, by_offset)),
-            Gradients(*(out if parameters else [None] * 5), by_pose if pose else None),
+            _gradients(out if parameters else None, by_pose if pose else None),
         )
 
     def _view(
@@ -150,17 +154,17 @@ class Rasterizer:
         depth: DepthKind,
     ) -> tuple[int, int, tuple[Any, ...]]:
         """Height, width, and what the kernels take of a view, checked."""
+        _check_type("gaussians", gaussians, Gaussians)
         height, width, intrinsics = _checked_camera(camera)
         pose = _checked_pose("T_camera_map", T_camera_map)
         behind = _checked_background(background)
-        if depth not in DEPTH_KINDS:
+        if not isinstance(depth, str) or depth not in DEPTH_KINDS:
             raise ValueError(f"depth is {depth!r}, expected one of {', '.join(DEPTH_KINDS)}")
-        if depth != "blended":
-            raise NotImplementedError("depth='ray_plane'")
         if len(gaussians) > MAX_GAUSSIANS:
             raise ValueError(f"gaussians are {len(gaussians)}, expected at most {MAX_GAUSSIANS}")
         wanted = _NO_MASK if mask is None else _checked_mask(mask, (height, width))
-        return height, width, (pose, intrinsics, behind, wanted, width, height, self.threads)
+        ray_plane = depth == "ray_plane"
+        return height, width, (pose, intrinsics, behind, wanted, ray_plane, width, height, self.threads)
 
     def _finish(self, gaussians: Gaussians, size: tuple[int, int], status: int) -> None:
         """Remember what was drawn, or refuse what could not be."""
@@ -200,9 +204,9 @@ class Rasterizer:
         by_pose = np.zeros(6 if pose else 0)
         diagonal = _zeros(n, FISHER_DIAGONAL_COLUMNS) if fisher else _NOTHING
         status = self._raster.backward(*_arrays(gaussians), *images, *out, diagonal, by_pose)
-        _refuse_bad_image(status, ("d_color", "d_depth", "d_alpha"), "a NaN or an infinity")
-        return Gradients(
-            *(out if parameters else [None] * 5), by_pose if pose else None, diagonal if fisher else None
+        _refuse_bad_image(status, dict.fromkeys(("d_color", "d_depth", "d_alpha"), _NOT_FINITE))
+        return _gradients(
+            out if parameters else None, by_pose if pose else None, diagonal if fisher else None
         )
 
     def fisher(
@@ -218,6 +222,7 @@ class Rasterizer:
         n = len(gaussians)
         color = _checked_image("inv_var_color", inv_var_color, size)
         depth = _checked_image("inv_var_depth", inv_var_depth, size)
+        _check_type("sums", sums, FisherSums)
         expected = {
             "geometry": ((n, GEOMETRY_COLUMNS), np.float64),
             "color": ((n, 3), np.float64),
@@ -243,9 +248,20 @@ class Rasterizer:
             _NO_DOUBLES if sums.diagonal is None else sums.diagonal,
             sums.observations,
         )
-        _refuse_bad_image(
-            status, ("inv_var_color", "inv_var_depth", "residual"), "a NaN, an infinity or a negative number"
-        )
+        _refuse_bad_image(status, dict.fromkeys(("inv_var_color", "inv_var_depth", "residual"), _NEGATIVE))
+
+    def full_fisher(self, inv_var_color: Image, inv_var_depth: Image) -> NDArray[np.float64]:
+        """J^T R^-1 J [n, 14, 14] of the last view with all its cross terms; for validation, not for speed.
+
+        Columns: mean 3, quaternion 4, log-scale 3, colour 3, logit 1. The images as in `fisher`.
+        """
+        gaussians, size = self._last_forward()
+        color = _checked_image("inv_var_color", inv_var_color, size)
+        depth = _checked_image("inv_var_depth", inv_var_depth, size)
+        information = np.zeros((len(gaussians), FISHER_DIAGONAL_COLUMNS, FISHER_DIAGONAL_COLUMNS))
+        status = self._raster.full_fisher(*_arrays(gaussians), color, depth, information)
+        _refuse_bad_image(status, dict.fromkeys(("inv_var_color", "inv_var_depth"), _NEGATIVE))
+        return information
 
     def contributions(self) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
         """What each Gaussian gave to the last view: sum of its blending weights [n] and number of its pixels [n]."""
@@ -284,6 +300,16 @@ def _outputs(gaussians: Gaussians, parameters: bool) -> list[NDArray[np.float32]
     return [_zeros(*array.shape) if parameters else _NOTHING for array in _arrays(gaussians)]
 
 
+def _gradients(
+    of_parameters: list[NDArray[np.float32]] | None,
+    pose: NDArray[np.float64] | None,
+    fisher_diagonal: NDArray[np.float32] | None = None,
+) -> Gradients:
+    nothing: list[None] = [None] * 5
+    means, quats_wxyz, log_scales, colors, opacity_logits = of_parameters or nothing
+    return Gradients(means, quats_wxyz, log_scales, colors, opacity_logits, pose, fisher_diagonal)
+
+
 def _check_wanted(pose: bool, parameters: bool, fisher: bool) -> None:
     if not parameters and (fisher or not pose):
         raise ValueError("parameters is False, expected pose=True and fisher=False with it")
@@ -299,27 +325,49 @@ def _arrays(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:
     )
 
 
+def _check_type(name: str, value: object, expected: type) -> None:
+    if not isinstance(value, expected):
+        raise ValueError(f"{name} is {type(value).__name__}, expected {expected.__name__}")
+
+
 def _checked_camera(camera: PinholeCamera) -> tuple[int, int, NDArray[np.float32]]:
+    _check_type("camera", camera, PinholeCamera)
     for name in ("width", "height"):
         side = getattr(camera, name)
-        if int(side) != side or not 1 <= side <= MAX_SIDE_PX:
-            raise ValueError(f"camera.{name} is {side}, expected 1 to {MAX_SIDE_PX} pixels")
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float64)
-    for name, value in zip(("fx", "fy", "cx", "cy"), intrinsics, strict=True):
-        if not abs(value) < 1e9 or (name in ("fx", "fy") and value < 1e-3):
+        if not isinstance(side, Real) or not 1 <= float(side) <= MAX_SIDE_PX or float(side) % 1:
             raise ValueError(
-                f"camera.{name} is {value}, expected a finite number of pixels, positive for a focal length"
+                f"camera.{name} is {side!r}, expected a whole number of 1 to {MAX_SIDE_PX} pixels"
             )
-    return int(camera.height), int(camera.width), intrinsics.astype(np.float32)
+    names = ("fx", "fy", "cx", "cy")
+    for name in names:
+        value, smallest = getattr(camera, name), 1e-3 if name in ("fx", "fy") else -1e9
+        if not isinstance(value, Real) or not smallest <= float(value) < 1e9:
+            raise ValueError(
+                f"camera.{name} is {value!r}, expected a finite number of pixels, positive for a focal length"
+            )
+    intrinsics = np.array([getattr(camera, name) for name in names], dtype=np.float32)
+    return int(camera.height), int(camera.width), intrinsics
+
+
+def _real_numbers(name: str, value: ArrayLike, expected: str) -> NDArray[np.float64]:
+    """`value` as an array; refuses what is text, complex, ragged or no array at all."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError):  # ragged, or a tensor that cannot be read
+        array = np.asarray(None)
+    if array.dtype.kind not in "iuf":
+        found = f"an array of {array.dtype}" if isinstance(value, np.ndarray) else reprlib.repr(value)
+        raise ValueError(f"{name} is {found}, expected {expected}")
+    return array.astype(np.float64)
 
 
 def _checked_pose(name: str, T: ArrayLike) -> NDArray[np.float32]:
-    pose = np.asarray(T, dtype=np.float64)
+    pose = _real_numbers(name, T, "an array of numbers")
     if pose.shape != (4, 4):
         raise ValueError(f"{name} has shape {pose.shape}, expected (4, 4)")
     R = pose[:3, :3]
-    if not np.isfinite(pose).all():
-        raise ValueError(f"{name} holds a NaN or an infinity")
+    if not (np.abs(pose) < 1e30).all():
+        raise ValueError(f"{name} holds a NaN, an infinity or a number beyond 1e30")
     if (
         np.abs(R.T @ R - np.eye(3)).max() > ROTATION_TOLERANCE
         or np.linalg.det(R) < 0
@@ -330,10 +378,11 @@ def _checked_pose(name: str, T: ArrayLike) -> NDArray[np.float32]:
 
 
 def _checked_background(background: ArrayLike) -> NDArray[np.float32]:
-    color = np.asarray(background, dtype=np.float32)
-    if color.shape != (3,) or not np.isfinite(color).all():
-        raise ValueError(f"background is {background!r}, expected three finite numbers")
-    return np.ascontiguousarray(color)
+    expected = "three numbers within +-1e9"
+    color = _real_numbers("background", background, expected)
+    if color.shape != (3,) or not (np.abs(color) <= 1e9).all():
+        raise ValueError(f"background is {reprlib.repr(background)}, expected {expected}")
+    return color.astype(np.float32)
 
 
 def _checked_mask(mask: object, shape: tuple[int, int]) -> NDArray[np.uint8]:
@@ -347,9 +396,10 @@ def _checked_mask(mask: object, shape: tuple[int, int]) -> NDArray[np.uint8]:
 
 def _checked_exposure(exposure: tuple[float, float]) -> tuple[float, float]:
     """Gain and offset of an exposure (a, b)."""
-    pair = np.asarray(exposure, dtype=np.float64)
-    if pair.shape != (2,) or not np.isfinite(pair).all() or abs(pair[0]) > 80:
-        raise ValueError(f"exposure is {exposure!r}, expected two finite numbers, the first within +-80")
+    expected = "two numbers within +-80 and +-1e9"
+    pair = _real_numbers("exposure", exposure, expected)
+    if pair.shape != (2,) or not (np.abs(pair) <= (80.0, 1e9)).all():
+        raise ValueError(f"exposure is {reprlib.repr(exposure)}, expected {expected}")
     return math.exp(pair[0]), float(pair[1])
 
 
@@ -374,10 +424,11 @@ def _checked_image(
     return np.ascontiguousarray(image)
 
 
-def _refuse_bad_image(status: int, names: tuple[str, ...], what: str) -> None:
-    for code, name in zip((_BAD_FIRST, _BAD_SECOND, _BAD_THIRD), names, strict=False):
+def _refuse_bad_image(status: int, faults: dict[str, str]) -> None:
+    """faults: what a bad image holds, by its name, in the order of the kernel's arguments."""
+    for code, (name, fault) in zip((_BAD_FIRST, _BAD_SECOND, _BAD_THIRD), faults.items(), strict=False):
         if status == code:
-            raise ValueError(f"{name} holds {what}")
+            raise ValueError(f"{name} holds {fault}")
 
 
 def _complaint_about(gaussians: Gaussians) -> str:

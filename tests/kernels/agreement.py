@@ -26,8 +26,9 @@ from typing import Any
 import numpy as np
 
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import FisherSums, Rasterizer
+from pipeline.kernels import DepthKind, FisherSums, Gradients, LossWeights, Rasterizer
 from pipeline.kernels.reference import ReferenceRasterizer
+from pipeline.splat.losses import rgbd_loss
 from tests.kernels.scenes import Scene
 
 PARAMETERS = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
@@ -44,6 +45,8 @@ INFORMATION_BAR = 1e-4
 SLACK = 8.0
 HALF_ULP = 2.0**-24
 DRAWS = 10
+LOSS = LossWeights(color_huber=0.1, depth_weight=0.5, depth_huber_m=0.02, alpha_weight=0.02)
+EXPOSURE = (0.1, -0.05)
 ROUNDING = 2 * 2.0**-23
 
 Outputs = dict[str, tuple[np.ndarray, float, float]]
@@ -77,41 +80,97 @@ def moved(scene: Scene, seed: int) -> tuple[Float64Gaussians, PinholeCamera, np.
 
 
 def outputs(
-    rasterizer: Any, scene: Scene, where: np.ndarray, inputs: tuple[Any, ...] | None = None
+    rasterizer: Any,
+    scene: Scene,
+    where: np.ndarray,
+    depth: DepthKind = "blended",
+    inputs: tuple[Any, ...] | None = None,
 ) -> Outputs:
-    """Everything about one view, as far as it depends on the pixels `where`; `inputs` instead of the scene's own."""
-    gaussians, camera, T = inputs or (scene.gaussians, scene.camera, scene.T_camera_map)
-    render = rasterizer.forward(gaussians, camera, T, scene.background)
-    out: Outputs = {name: (image[where], IMAGE_BAR, 0.0) for name, image in vars(render).items()}
-    cotangents = scene.image(1, 3) * where[..., None], scene.image(2) * where, scene.image(3) * where
-    gradients = rasterizer.backward(*cotangents, pose=True, fisher=True)
-    of_gradients, of_pose, of_squares = (
-        np.zeros((len(gaussians), 14)),
-        np.zeros(6),
-        np.zeros((len(gaussians), 14)),
-    )
-    if isinstance(rasterizer, ReferenceRasterizer):
-        of_gradients, of_pose = rasterizer.gradient_terms(*cotangents)
-        of_squares = rasterizer.empirical_terms(*cotangents)
-    for name, columns in zip(PARAMETERS, FAMILIES.values(), strict=True):
-        out[f"by {name}"] = (getattr(gradients, name), GRADIENT_BAR, rounding_of(of_gradients[:, columns]))
-    out["by pose"] = (gradients.pose, GRADIENT_BAR, rounding_of(of_pose))
-    out.update(diagonal_outputs("empirical", gradients.fisher_diagonal, of_squares))
+    """Everything about one view of the pixels `where`; `inputs` instead of the scene's own."""
+    view = inputs or (scene.gaussians, scene.camera, scene.T_camera_map)
+    options: dict[str, Any] = {"depth": depth, "mask": None if where.all() else where}
+    render = rasterizer.forward(*view, scene.background, **options)
+    out: Outputs = {name: (image, IMAGE_BAR, 0.0) for name, image in vars(render).items()}
+    weights, pixels = rasterizer.contributions()
+    out["weights"], out["pixels"] = (weights, IMAGE_BAR, 0.0), (pixels.astype(np.float64), 0.0, 0.0)
 
-    sums = FisherSums(len(gaussians))
-    rasterizer.fisher(scene.image(4, low=0.0) * where, scene.image(5, low=0.0) * where, sums)
-    blocks = sums.geometry_matrices()
-    for name, rows, columns in (
-        ("mm", slice(0, 3), slice(0, 3)),
-        ("ms", slice(0, 3), slice(3, 9)),
-        ("ss", slice(3, 9), slice(3, 9)),
-    ):
+    cotangents = scene.image(1, 3), scene.image(2), scene.image(3)
+    gradients = rasterizer.backward(*cotangents, pose=True, fisher=True)
+    out.update(gradient_outputs("by", rasterizer, gradients, cotangents))
+    squares = np.zeros((len(weights), 14))
+    if isinstance(rasterizer, ReferenceRasterizer):
+        squares = rasterizer.empirical_terms(*cotangents)
+    out.update(diagonal_outputs("empirical", gradients.fisher_diagonal, squares))
+    out.update(information_outputs(rasterizer, scene, len(weights)))
+    out.update(loss_outputs(rasterizer, scene, view, options))
+    return out
+
+
+def gradient_outputs(
+    name: str, rasterizer: Any, gradients: Gradients, cotangents: tuple[Any, ...]
+) -> Outputs:
+    """The arrays of `gradients`, and their floors if the rasterizer is the reference."""
+    n = len(gradients.opacity_logits)
+    terms, of_pose = np.zeros((n, 14)), np.zeros(6)
+    if isinstance(rasterizer, ReferenceRasterizer):
+        terms, of_pose = rasterizer.gradient_terms(*cotangents)
+    out: Outputs = {f"{name} pose": (gradients.pose, GRADIENT_BAR, rounding_of(of_pose))}
+    for parameter, columns in zip(PARAMETERS, FAMILIES.values(), strict=True):
+        floor = rounding_of(terms[:, columns])
+        out[f"{name} {parameter}"] = (getattr(gradients, parameter), GRADIENT_BAR, floor)
+    return out
+
+
+def information_outputs(rasterizer: Any, scene: Scene, n: int) -> Outputs:
+    """The `gauss_newton` information of the last view, in blocks and one Gaussian at a time."""
+    precisions, sums = (scene.image(4, low=0.0), scene.image(5, low=0.0)), FisherSums(n, diagonal=True)
+    rasterizer.fisher(*precisions, sums, residual=scene.image(6, low=0.0))
+    blocks, mean, log = sums.geometry_matrices(), slice(0, 3), slice(3, 9)
+    out: Outputs = {}
+    for name, rows, columns in (("mm", mean, mean), ("ms", mean, log), ("ss", log, log)):
         out[f"block {name}"] = (blocks[:, rows, columns], INFORMATION_BAR, 0.0)
     for i, block in enumerate(blocks):  # one at a time too: a weak Gaussian must not hide behind a strong one
         out[f"block of {i}"] = (block, INFORMATION_BAR, 0.0)
     out["information of colour"] = (sums.color, INFORMATION_BAR, 0.0)
     out["information of opacity"] = (sums.opacity, INFORMATION_BAR, 0.0)
     out["observations"] = (sums.observations.astype(np.float64), 0.0, 0.0)
+    out["weight"], out["residual"] = (sums.weight, IMAGE_BAR, 0.0), (sums.residual, IMAGE_BAR, 0.0)
+
+    terms = np.zeros((n, 14))
+    if isinstance(rasterizer, ReferenceRasterizer):
+        terms = rasterizer.information_terms(*precisions)
+    assert sums.diagonal is not None
+    out.update(diagonal_outputs("gauss_newton", sums.diagonal, terms))
+    full = rasterizer.full_fisher(*precisions)
+    for a, rows in FAMILIES.items():
+        for (
+            b,
+            columns,
+        ) in FAMILIES.items():  # |F_ij| <= sqrt(F_ii F_jj): the terms of what lies off the diagonal
+            floor = np.sqrt(rounding_of(terms[:, rows]) * rounding_of(terms[:, columns]))
+            out[f"full {a} {b}"] = (full[:, rows, columns], INFORMATION_BAR, float(floor))
+    return out
+
+
+def loss_outputs(rasterizer: Any, scene: Scene, view: tuple[Any, ...], options: dict[str, Any]) -> Outputs:
+    """The loss of the view against made images, and its derivatives."""
+    rng, shape = np.random.default_rng(7), (scene.camera.height, scene.camera.width)
+    color, depth_m = (
+        rng.random((*shape, 3)).astype(np.float32),
+        rng.uniform(0.5, 4.0, shape).astype(np.float32),
+    )
+    depth_m[rng.random(shape) < 0.2] = 0.0
+    loss, gradients = rasterizer.view_gradients(
+        *view, color, depth_m, LOSS, exposure=EXPOSURE, background=scene.background, pose=True, **options
+    )
+    cotangents: tuple[Any, ...] = ()
+    if isinstance(rasterizer, ReferenceRasterizer):
+        render = rasterizer.forward(*view, scene.background, **options)
+        wanted = rgbd_loss(render, color, depth_m, LOSS, EXPOSURE, options["mask"])
+        cotangents = wanted.d_color, wanted.d_depth, wanted.d_alpha
+    out: Outputs = {"loss": (np.array([loss.value, loss.color, loss.depth]), IMAGE_BAR, 0.0)}
+    out["loss by exposure"] = (np.array(loss.d_exposure), GRADIENT_BAR, ROUNDING)  # means of slopes up to 1
+    out.update(gradient_outputs("loss by", rasterizer, gradients, cotangents))
     return out
 
 
@@ -139,12 +198,12 @@ class Error:
     passes: bool
 
 
-def compare(scene: Scene, isa: str = "auto") -> Iterator[Error]:
+def compare(scene: Scene, isa: str = "auto", depth: DepthKind = "blended") -> Iterator[Error]:
     """The error of every output; inputs are moved only if one is beyond its bar."""
     reference = ReferenceRasterizer()
     reference.forward(scene.gaussians, scene.camera, scene.T_camera_map, scene.background)
     where = reference.decided()
-    wanted, found = outputs(reference, scene, where), outputs(Rasterizer(isa), scene, where)
+    wanted, found = (outputs(rasterizer, scene, where, depth) for rasterizer in (reference, Rasterizer(isa)))
     errors = {name: float(np.linalg.norm(found[name][0] - exact)) for name, (exact, _, _) in wanted.items()}
     limits = {
         name: max(bar * float(np.linalg.norm(exact)), floor) for name, (exact, bar, floor) in wanted.items()
@@ -152,7 +211,7 @@ def compare(scene: Scene, isa: str = "auto") -> Iterator[Error]:
     changes = dict.fromkeys(wanted, 0.0)
     if any(errors[name] > limits[name] for name in wanted):
         for seed in range(DRAWS):
-            other = outputs(reference, scene, where, moved(scene, seed))
+            other = outputs(reference, scene, where, depth, moved(scene, seed))
             for name, (exact, _, _) in wanted.items():
                 changes[name] = max(changes[name], float(np.linalg.norm(other[name][0] - exact)))
     for name, error in errors.items():

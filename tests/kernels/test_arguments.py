@@ -1,5 +1,7 @@
 """What no camera and no Gaussian can be is refused by name; what is merely extreme is drawn."""
 
+import reprlib
+
 import numpy as np
 import pytest
 
@@ -48,7 +50,17 @@ def test_gaussians_without_orientation_or_size():
         ("fy", -5.0),
         ("fx", np.nan),
         ("cx", np.inf),
+        ("width", np.nan),
+        ("width", np.inf),
+        ("height", None),
+        ("height", "10"),
+        ("width", [20]),
+        ("fx", "a"),
+        ("fy", None),
+        ("cx", 1j),
+        ("cy", [4.5]),
     ],
+    ids=str,
 )
 def test_cameras_that_cannot_be(name, value):
     values = {**vars(CAMERA), name: value}
@@ -63,14 +75,27 @@ def test_cameras_that_cannot_be(name, value):
         (np.full((4, 4), np.nan), "NaN"),
         (np.diag([1.0, 1.0, -1.0, 1.0]), "rigid"),
         (2 * np.eye(4), "rigid"),
+        (1e39 * np.eye(4), "infinity"),
+        ("map", "numbers"),
+        (None, "numbers"),
+        ([["a"] * 4] * 4, "numbers"),
+        ([[1, 0, 0, 0], [0, 1, 0]], "numbers"),
+        (np.eye(4, dtype=complex), "complex"),
+        (np.eye(4, dtype=object), "numbers"),
+        (np.eye(4) > 0, "bool"),
     ],
+    ids=reprlib.repr,
 )
 def test_poses_that_cannot_be(T, complaint):
     with pytest.raises(ValueError, match=f"T_camera_map .*{complaint}"):
         Rasterizer().forward(Gaussians.empty(), CAMERA, T)
 
 
-@pytest.mark.parametrize("background", [(0, 0), (0, 0, np.nan)])
+@pytest.mark.parametrize(
+    "background",
+    [(0, 0), (0, 0, np.nan), (0, 0, 1e39), "abc", 0.5, None, (0, 0, 1j), ((0, 0), 0, 0)],
+    ids=str,
+)
 def test_backgrounds_that_cannot_be(background):
     with pytest.raises(ValueError, match="background"):
         Rasterizer().forward(Gaussians.empty(), CAMERA, np.eye(4), background)
@@ -108,11 +133,27 @@ def test_sums_of_another_map():
 
 
 def test_settings_that_cannot_be():
-    with pytest.raises(ValueError, match="isa"):
-        Rasterizer("mmx")
-    with pytest.raises(ValueError, match="threads"):
-        Rasterizer(threads=0)
+    for isa in ("mmx", "", None, 2, ["avx2"]):
+        with pytest.raises(ValueError, match="isa is"):
+            Rasterizer(isa)
+    for threads in (0, -1, 10**9, 1.5, np.nan, "2", None, [2]):
+        with pytest.raises(ValueError, match="threads is"):
+            Rasterizer(threads=threads)
     assert Rasterizer().isa == available_isas()[0]
+    assert Rasterizer(threads=np.int64(2)).threads == 2
+
+
+@pytest.mark.parametrize(
+    "value", [None, "room", 3, np.zeros((5, 3), np.float32)], ids=["none", "text", "number", "array"]
+)
+def test_arguments_of_another_type(value):
+    ones = np.ones((10, 20), np.float32)
+    with pytest.raises(ValueError, match=r"gaussians is .* expected Gaussians"):
+        Rasterizer().forward(value, CAMERA, np.eye(4))
+    with pytest.raises(ValueError, match=r"camera is .* expected PinholeCamera"):
+        Rasterizer().forward(random_gaussians(5, 0), value, np.eye(4))
+    with pytest.raises(ValueError, match=r"sums is .* expected FisherSums"):
+        drawn().fisher(ones, ones, value)
 
 
 def test_nothing_to_differentiate_before_the_first_view():

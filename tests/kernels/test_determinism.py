@@ -8,30 +8,40 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import FisherSums, Rasterizer, available_isas
+from pipeline.kernels import FisherSums, LossWeights, Rasterizer, available_isas
 from tests.kernels.scenes import make_scene, random_gaussians
 
 CAMERA = PinholeCamera(203, 117, 90.0, 92.0, 101.2, 57.1)
+LOSS = LossWeights(color_huber=0.1, depth_weight=0.5, depth_huber_m=0.02, alpha_weight=0.02)
 CALLS = [(isa, threads) for isa in available_isas() for threads in (1, 2, 3, 5)]
 
 
 def digest(rasterizer: Rasterizer) -> str:
-    """SHA-256 over every output of one view of 3000 Gaussians."""
+    """SHA-256 over every output of views of 3000 Gaussians."""
     gaussians = random_gaussians(3000, seed=1)
     rng, shape = np.random.default_rng(2), (CAMERA.height, CAMERA.width)
     d_color, d_depth, d_alpha = (rng.normal(size=s).astype(np.float32) for s in ((*shape, 3), shape, shape))
     of_color, of_depth = (rng.uniform(0, 1e3, shape).astype(np.float32) for _ in range(2))
-    sums = FisherSums(len(gaussians))
-    render = rasterizer.forward(gaussians, CAMERA, np.eye(4), (0.1, 0.2, 0.3))
-    gradients = rasterizer.backward(d_color, d_depth, d_alpha, pose=True, fisher=True)
-    rasterizer.fisher(of_color, of_depth, sums)
-    arrays = [
-        *vars(render).values(),
-        *vars(gradients).values(),
-        *sums.arrays().values(),
-        *rasterizer.contributions(),
-    ]
-    assert len(arrays) == 18
+    color, depth_m = rng.random((*shape, 3)).astype(np.float32), rng.uniform(0, 4, shape).astype(np.float32)
+    view = gaussians, CAMERA, np.eye(4)
+    arrays: list[np.ndarray] = []
+    for depth, mask in (("blended", None), ("ray_plane", rng.random(shape) < 0.8)):
+        sums = FisherSums(len(gaussians), diagonal=True)
+        render = rasterizer.forward(*view, (0.1, 0.2, 0.3), depth=depth, mask=mask)
+        gradients = rasterizer.backward(d_color, d_depth, d_alpha, pose=True, fisher=True)
+        by_pose = rasterizer.backward(d_color, d_depth, d_alpha, pose=True, parameters=False)
+        rasterizer.fisher(of_color, of_depth, sums, residual=of_depth)
+        arrays += [*vars(render).values(), *vars(gradients).values(), *sums.arrays().values(), by_pose.pose]
+        arrays += [rasterizer.full_fisher(of_color, of_depth), *rasterizer.contributions()]
+        loss, gradients = rasterizer.view_gradients(
+            *view, color, depth_m, LOSS, exposure=(0.1, -0.05), mask=mask, depth=depth, pose=True
+        )
+        statistics = rasterizer.statistics()
+        arrays += [a for a in vars(gradients).values() if a is not None]
+        arrays += [np.array([loss.value, loss.color, loss.depth, *loss.d_exposure])]
+        arrays += [np.array([statistics.visible, statistics.intersections])]
+        arrays += [np.array([statistics.evaluated_pairs, statistics.blended_pairs])]
+    assert len(arrays) == 2 * 30
     return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
 
 

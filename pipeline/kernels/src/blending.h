@@ -24,6 +24,15 @@ struct Whitened {
     Vec log2_alpha(const Splat& s) const { return fnma(y, y, fnma(x, x, Vec(s.log2_opacity))); }
 };
 
+// Depth of a Gaussian at the pixels whose e is given.
+template <DepthKind KIND>
+inline Vec depth_at(const Splat& s, const Whitened& e) {
+    if constexpr (KIND == DepthKind::ray_plane)
+        return fma(Vec(s.slope_x), e.x, fma(Vec(s.slope_y), e.y, Vec(s.z)));
+    else
+        return Vec(s.z);
+}
+
 // From log2 alpha, clamped alpha and 1 - alpha; where it is not seen, 0 and 1.
 inline void alpha_and_rest(Vec& alpha, Mask seen, Vec& rest) {
     Vec power;
@@ -57,16 +66,18 @@ struct NoMemory {
 };
 
 // Blends the next N candidates; keeps those that were blended.
-template <int N, class Kept>
+template <DepthKind KIND, int N, class Kept>
 ALWAYS_INLINE inline uint32_t blend_some(const Splat* splats, const uint32_t* candidates, const TileItems& items, uint32_t kept,
                                          const Kept& memory, OpenBlock& block) {
     uint32_t position[N];
-    Vec alpha[N], rest[N];  // rest: 1 - alpha
+    Vec alpha[N], rest[N], depth[N];  // rest: 1 - alpha
     Mask seen[N];
     unrolled<N>([&](auto k) ALWAYS_INLINE {
         position[k] = candidates[k];
         const Splat& s = splats[position[k]];
-        alpha[k] = Whitened(s, block.pixel_x, block.pixel_y).log2_alpha(s);
+        const Whitened e(s, block.pixel_x, block.pixel_y);
+        alpha[k] = e.log2_alpha(s);
+        depth[k] = depth_at<KIND>(s, e);
     });
     unrolled<N>([&](auto k) ALWAYS_INLINE {
         seen[k] = alpha[k] >= Vec(LOG2_ALPHA_MIN);
@@ -85,7 +96,7 @@ ALWAYS_INLINE inline uint32_t blend_some(const Splat* splats, const uint32_t* ca
         block.R = fma(weight, Vec(s.r), block.R);
         block.G = fma(weight, Vec(s.g), block.G);
         block.B = fma(weight, Vec(s.b), block.B);
-        block.D = fma(weight, Vec(s.z), block.D);
+        block.D = fma(weight, KIND == DepthKind::ray_plane ? depth[k] : Vec(s.z), block.D);  // z is not kept in a register
         memory.keep(kept, select_or_zero(blended, alpha[k]), weight);
         const uint32_t pixels = bits(blended);
         items.positions[kept] = position[k];
@@ -97,31 +108,32 @@ ALWAYS_INLINE inline uint32_t blend_some(const Splat* splats, const uint32_t* ca
 
 // Blends the candidates of one block, which stand at the beginning of `items`; keeps those that were blended, in place.
 // Returns how many, and in `evaluated` how many it looked at.
-template <class Kept>
+template <DepthKind KIND, class Kept>
 NO_INLINE static uint32_t blend_candidates(const Splat* splats, const TileItems items, uint32_t count, const Kept memory, OpenBlock& result,
                                            uint64_t& evaluated) {
     OpenBlock block = result;
     uint32_t kept = 0, i = 0;
     for (; i + ABREAST <= count && block.open(); i += ABREAST)
-        kept = blend_some<ABREAST>(splats, items.positions + i, items, kept, memory, block);
-    for (; i < count && block.open(); i++) kept = blend_some<1>(splats, items.positions + i, items, kept, memory, block);
+        kept = blend_some<KIND, ABREAST>(splats, items.positions + i, items, kept, memory, block);
+    for (; i < count && block.open(); i++) kept = blend_some<KIND, 1>(splats, items.positions + i, items, kept, memory, block);
     evaluated += i;
     result = block;
     return kept;
 }
 
 // Blends block b of a tile and steps over its items.
-template <class Kept>
+template <DepthKind KIND, class Kept>
 inline OpenBlock blend_block(const Frame& frame, const Tile& tile, const Splat* splats, int b, const Block& block, Mask wanted,
                              const Kept& memory, TileItems& items, uint64_t& evaluated) {
     OpenBlock image(block, wanted);
     const uint32_t count = positions_with_bit(frame.list_blocks.data() + tile.first, tile.count, b, items.positions);
-    items.counts[b] = blend_candidates(splats, items, count, memory, image, evaluated);
+    items.counts[b] = blend_candidates<KIND>(splats, items, count, memory, image, evaluated);
     store(items.T + b * LANES, image.T);
     items.skip(items.counts[b]);
     return image;
 }
 
+template <DepthKind KIND>
 inline void blend_tile(Frame& frame, int index, float* color, float* depth, float* alpha) {
     const Tile tile(frame, index);
     const View& view = frame.view;
@@ -134,7 +146,7 @@ inline void blend_tile(Frame& frame, int index, float* color, float* depth, floa
         items.counts[b] = 0;
         if (block.outside(view)) continue;
         const Mask wanted = mask_of_bits(block.wanted(view));
-        const OpenBlock image = blend_block(frame, tile, splats, b, block, wanted, NoMemory(), items, evaluated);
+        const OpenBlock image = blend_block<KIND>(frame, tile, splats, b, block, wanted, NoMemory(), items, evaluated);
         const Vec rgb[3] = {select_or_zero(wanted, fma(image.T, background[0], image.R)),
                             select_or_zero(wanted, fma(image.T, background[1], image.G)),
                             select_or_zero(wanted, fma(image.T, background[2], image.B))};

@@ -79,9 +79,9 @@ inline Cotangents loss_of_block(const OpenBlock& image, const Vec* rgb, const Me
     return v;
 }
 
-template <Derivatives D>
+template <Derivatives D, DepthKind KIND>
 inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScales& scales) {
-    Sweep sweep = Sweep::begin<ROW_OF<D>>(frame, index);
+    Sweep sweep = Sweep::begin<ROW_OF<D, KIND>>(frame, index);
     const View& view = frame.view;
     Measured measured[BLOCKS];
     bool bad[2] = {};
@@ -92,7 +92,7 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
         read_block_rgb(loss.color, block, view, rgb);
         const Vec z = read_block(loss.depth_m, block, view);
         bad[0] |= !(finite(rgb[0]) && finite(rgb[1]) && finite(rgb[2]));
-        bad[1] |= !finite(z);
+        bad[1] |= !finite_not_negative(z);
         for (int k = 0; k < 3; k++) store(measured[b].planes[k], rgb[k]);
         store(measured[b].planes[3], z);
     }
@@ -108,11 +108,11 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
         if (block.outside(view)) continue;
         const Mask wanted = mask_of_bits(block.wanted(view));
         TileItems next = sweep.items;
-        const OpenBlock image = blend_block(frame, sweep.tile, sweep.splats, b, block, wanted, memory, next, evaluated);
+        const OpenBlock image = blend_block<KIND>(frame, sweep.tile, sweep.splats, b, block, wanted, memory, next, evaluated);
         const Vec rgb[3] = {fma(image.T, background[0], image.R), fma(image.T, background[1], image.G),
                             fma(image.T, background[2], image.B)};
         const Cotangents v = loss_of_block(image, rgb, measured[b], wanted, loss, scales, sums);
-        if (next.counts[b]) gradient_block<D>(sweep, block, next.counts[b], v, Recall{memory});
+        if (next.counts[b]) gradient_block<D, KIND>(sweep, block, next.counts[b], v, Recall{memory});
         sweep.items = next;
     }
     frame.evaluated.data()[index] = evaluated;

@@ -1,16 +1,34 @@
 // All kernels of one instruction set. Compiled once per set, with KERNEL_ISA the namespace of the build.
 #include "adam.h"
 #include "fitting.h"
+#include "full_information.h"
 
 namespace KERNEL_ISA {
 
-static Status forward(Frame& frame, const GaussianArrays& gaussians, float* color, float* depth, float* alpha) {
+// Calls call(kind) with the view's kind of depth as a constant.
+template <class Call>
+static Status by_depth_kind(const Frame& frame, Call call) {
+    if (frame.view.depth == DepthKind::ray_plane) return call(std::integral_constant<DepthKind, DepthKind::ray_plane>{});
+    return call(std::integral_constant<DepthKind, DepthKind::blended>{});
+}
+
+// Everything before the pixels.
+static Status prepare(Frame& frame, const GaussianArrays& gaussians) {
     const Status status = make_lists(frame, gaussians);
+    if (status == Status::ok && frame.view.depth == DepthKind::ray_plane) set_depth_slopes(frame, gaussians);
+    return status;
+}
+
+static Status forward(Frame& frame, const GaussianArrays& gaussians, float* color, float* depth, float* alpha) {
+    const Status status = prepare(frame, gaussians);
     if (status != Status::ok) return status;
-    const int tiles = frame.tiles_x * frame.tiles_y;
+    return by_depth_kind(frame, [&](auto kind) {
+        constexpr DepthKind KIND = kind;
+        const int tiles = frame.tiles_x * frame.tiles_y;
 #pragma omp parallel for schedule(dynamic, 4) num_threads(frame.threads) if (frame.threads > 1)
-    for (int tile = 0; tile < tiles; tile++) blend_tile(frame, tile, color, depth, alpha);
-    return Status::ok;
+        for (int tile = 0; tile < tiles; tile++) blend_tile<KIND>(frame, tile, color, depth, alpha);
+        return Status::ok;
+    });
 }
 
 // Runs a kernel over all tiles; reports the complaint about the first image before the second, whatever ran first.
@@ -32,10 +50,13 @@ static Status over_tiles(Frame& frame, TileKernel kernel) {
 template <Derivatives D>
 static Status backward(Frame& frame, const GaussianArrays& gaussians, const float* d_color, const float* d_depth,
                        const float* d_alpha, const GradientArrays& out) {
-    frame.rows.need(frame.intersection_count * ROW_OF<D>);
-    const Status status = over_tiles(frame, [&](int tile) { return gradient_tile<D>(frame, tile, d_color, d_depth, d_alpha); });
-    if (status == Status::ok) gradients_of_parameters<D>(frame, gaussians, out);
-    return status;
+    return by_depth_kind(frame, [&](auto kind) {
+        constexpr DepthKind KIND = kind;
+        frame.rows.need(frame.intersection_count * ROW_OF<D, KIND>);
+        const Status status = over_tiles(frame, [&](int tile) { return gradient_tile<D, KIND>(frame, tile, d_color, d_depth, d_alpha); });
+        if (status == Status::ok) gradients_of_parameters<D, KIND>(frame, gaussians, out);
+        return status;
+    });
 }
 static Status backward(Frame& frame, const GaussianArrays& gaussians, const float* d_color, const float* d_depth,
                        const float* d_alpha, const GradientArrays& out) {
@@ -47,14 +68,32 @@ static Status backward(Frame& frame, const GaussianArrays& gaussians, const floa
 
 static Status fisher(Frame& frame, const GaussianArrays& gaussians, const float* inv_var_color, const float* inv_var_depth,
                      const float* residual, const FisherArrays& out) {
-    frame.rows.need(frame.intersection_count * INFORMATION_ROW);
-    const Status status =
-        over_tiles(frame, [&](int tile) { return information_tile(frame, tile, inv_var_color, inv_var_depth, residual); });
-    if (status != Status::ok) return status;
-    const int groups = static_cast<int>(group_count(frame));
+    return by_depth_kind(frame, [&](auto kind) {
+        constexpr DepthKind KIND = kind;
+        frame.rows.need(frame.intersection_count * INFORMATION_ROW);
+        const Status status =
+            over_tiles(frame, [&](int tile) { return information_tile<KIND>(frame, tile, inv_var_color, inv_var_depth, residual); });
+        if (status != Status::ok) return status;
+        const int groups = static_cast<int>(group_count(frame));
 #pragma omp parallel for schedule(dynamic, 16) num_threads(frame.threads) if (frame.threads > 1)
-    for (int group = 0; group < groups; group++) information_group(frame, gaussians, group, out);
-    return status;
+        for (int group = 0; group < groups; group++) information_group<KIND>(frame, gaussians, group, out);
+        return status;
+    });
+}
+
+// All cross terms, for validation: both kinds of depth take the same sums.
+static Status full_fisher(Frame& frame, const GaussianArrays& gaussians, const float* inv_var_color, const float* inv_var_depth,
+                          double* information) {
+    return by_depth_kind(frame, [&](auto kind) {
+        constexpr DepthKind KIND = kind;
+        frame.rows.need(frame.intersection_count * FULL_ROW);
+        const Status status = over_tiles(frame, [&](int tile) { return full_tile<KIND>(frame, tile, inv_var_color, inv_var_depth); });
+        if (status != Status::ok) return status;
+        const int groups = static_cast<int>(group_count(frame));
+#pragma omp parallel for schedule(dynamic, 4) num_threads(frame.threads) if (frame.threads > 1)
+        for (int group = 0; group < groups; group++) full_group<KIND>(frame, gaussians, group, information);
+        return status;
+    });
 }
 
 static void contributions(Frame& frame, float* weights, uint32_t* pixels) {
@@ -78,21 +117,25 @@ static void contributions(Frame& frame, float* weights, uint32_t* pixels) {
 
 template <Derivatives D>
 static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& loss, LossValues& values, const GradientArrays& out) {
-    Status status = make_lists(frame, gaussians);
+    Status status = prepare(frame, gaussians);
     if (status != Status::ok) return status;
     const int tiles = frame.tiles_x * frame.tiles_y;
-    frame.rows.need(frame.intersection_count * ROW_OF<D>);
     frame.front.need((frame.longest_list + 1) * LANES * 2 * frame.threads);
     const double* parts = frame.loss_parts.need(static_cast<size_t>(tiles) * LOSS_SUMS);
     const LossScales scales(PixelCounts(frame.view, loss.depth_m));
-    status = over_tiles(frame, [&](int tile) { return fit_tile<D>(frame, tile, loss, scales); });
+    status = by_depth_kind(frame, [&](auto kind) {
+        constexpr DepthKind KIND = kind;
+        frame.rows.need(frame.intersection_count * ROW_OF<D, KIND>);
+        const Status of_tiles = over_tiles(frame, [&](int tile) { return fit_tile<D, KIND>(frame, tile, loss, scales); });
+        if (of_tiles == Status::ok) gradients_of_parameters<D, KIND>(frame, gaussians, out);
+        return of_tiles;
+    });
     if (status != Status::ok) return status;
     double total[LOSS_SUMS] = {};
     for (int tile = 0; tile < tiles; tile++)
         for (int k = 0; k < LOSS_SUMS; k++) total[k] += parts[static_cast<size_t>(tile) * LOSS_SUMS + k];
     values = {total[0] * scales.per_color, total[1] * scales.per_depth, total[2] * scales.per_depth,
               total[3] * scales.per_color * loss.gain, total[4] * scales.per_color};
-    gradients_of_parameters<D>(frame, gaussians, out);
     return Status::ok;
 }
 static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& loss, LossValues& values, const GradientArrays& out) {
@@ -107,5 +150,5 @@ static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& los
 namespace raster {
 extern const Kernels KERNEL_TABLE;
 const Kernels KERNEL_TABLE = {AS_TEXT(KERNEL_ISA), KERNEL_ISA::forward, KERNEL_ISA::backward, KERNEL_ISA::fisher,
-                              KERNEL_ISA::contributions, KERNEL_ISA::fit, KERNEL_ISA::adam};
+                              KERNEL_ISA::contributions, KERNEL_ISA::full_fisher, KERNEL_ISA::fit, KERNEL_ISA::adam};
 }  // namespace raster

@@ -28,6 +28,9 @@ extern const Kernels kernels_avx512;
 #if defined(HAVE_AVX2)
 extern const Kernels kernels_avx2;
 #endif
+#if defined(HAVE_NEON)
+extern const Kernels kernels_neon;
+#endif
 extern const Kernels kernels_portable;
 
 void* allocate_aligned(size_t bytes) {
@@ -98,6 +101,9 @@ static std::vector<const Kernels*> usable_kernels() {
     if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2"))
         usable.push_back(&kernels_avx2);
 #endif
+#if defined(HAVE_NEON)
+    usable.push_back(&kernels_neon);  // part of every 64-bit ARM processor
+#endif
     usable.push_back(&kernels_portable);
     return usable;
 }
@@ -152,10 +158,10 @@ public:
     size_t scratch_bytes() const { return frame_.bytes(); }
 
     int forward(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
-                const Inputs& pose, const Inputs& intrinsics, const Inputs& background, const Bytes& mask, int width, int height, int threads,
-                const Floats& color, const Floats& depth, const Floats& alpha) {
+                const Inputs& pose, const Inputs& intrinsics, const Inputs& background, const Bytes& mask, bool ray_plane, int width,
+                int height, int threads, const Floats& color, const Floats& depth, const Floats& alpha) {
         const Use use(busy_);
-        look(pose, intrinsics, background, mask, width, height, threads);
+        look(pose, intrinsics, background, mask, ray_plane, width, height, threads);
         const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
         const nb::gil_scoped_release unlocked;
         return static_cast<int>(kernels_->forward(frame_, gaussians, color.data(), depth.data(), alpha.data()));
@@ -163,12 +169,12 @@ public:
 
     // Forward, loss and backward; weights: of the loss, then gain and offset. values: as LossValues.
     int fit(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
-            const Inputs& pose, const Inputs& intrinsics, const Inputs& background, const Bytes& mask, int width, int height, int threads,
-            const Inputs& color, const Inputs& depth_m, const Inputs& weights, const Array<double>& values, const Floats& g_means,
+            const Inputs& pose, const Inputs& intrinsics, const Inputs& background, const Bytes& mask, bool ray_plane, int width,
+            int height, int threads, const Inputs& color, const Inputs& depth_m, const Inputs& weights, const Array<double>& values, const Floats& g_means,
             const Floats& g_quats, const Floats& g_log_scales, const Floats& g_colors, const Floats& g_logits,
             const Array<double>& g_pose) {
         const Use use(busy_);
-        look(pose, intrinsics, background, mask, width, height, threads);
+        look(pose, intrinsics, background, mask, ray_plane, width, height, threads);
         const float* w = weights.data();
         const Loss loss = {color.data(), depth_m.data(), w[0], w[1], w[2], w[3], w[4], w[5]};
         const GradientArrays out = {data_or_null(g_means),  data_or_null(g_quats), data_or_null(g_log_scales), data_or_null(g_colors),
@@ -208,6 +214,15 @@ public:
             kernels_->fisher(frame_, gaussians, inv_var_color.data(), inv_var_depth.data(), data_or_null(residual), out));
     }
 
+    int full_fisher(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
+                    const Inputs& inv_var_color, const Inputs& inv_var_depth, const Array<double>& information) {
+        const Use use(busy_);
+        const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
+        const nb::gil_scoped_release unlocked;
+        return static_cast<int>(
+            kernels_->full_fisher(frame_, gaussians, inv_var_color.data(), inv_var_depth.data(), information.data()));
+    }
+
     void contributions(const Floats& weights, const Array<uint32_t>& pixels) {
         const Use use(busy_);
         const nb::gil_scoped_release unlocked;
@@ -228,7 +243,8 @@ public:
     }
 
 private:
-    void look(const Inputs& pose, const Inputs& intrinsics, const Inputs& background, const Bytes& mask, int width, int height, int threads) {
+    void look(const Inputs& pose, const Inputs& intrinsics, const Inputs& background, const Bytes& mask, bool ray_plane, int width,
+              int height, int threads) {
         View& view = frame_.view;
         for (int i = 0; i < 3; i++) {
             for (int k = 0; k < 3; k++) view.R[3 * i + k] = pose.data()[4 * i + k];
@@ -240,6 +256,7 @@ private:
         view.width = width, view.height = height;
         mask_.assign(mask.data(), mask.data() + mask.size());  // the backward passes need it too
         view.mask = mask_.empty() ? nullptr : mask_.data();
+        view.depth = ray_plane ? DepthKind::ray_plane : DepthKind::blended;
         frame_.threads = threads;
     }
     // A call while another runs would write into its scratch memory.
@@ -274,6 +291,7 @@ NB_MODULE(_raster, m) {
         .def("fit", &Raster::fit)
         .def("backward", &Raster::backward)
         .def("fisher", &Raster::fisher)
+        .def("full_fisher", &Raster::full_fisher)
         .def("contributions", &Raster::contributions);
     m.def("adam", &raster::adam);
     m.def("empty", &raster::OutputPool::array);

@@ -62,29 +62,42 @@ inline void scatter_add(const Vec* values, const Group& group, double* array) {
         for (int k = 0; k < WIDTH; k++) array[static_cast<size_t>(group.ids[lane]) * WIDTH + k] += columns[k][lane];
 }
 
-// Gram matrix of one pixel sum: entry (k, l) is the sum of w2 m_k m_l over the monomials m = (x, y, x^2, x y, y^2) of e,
-// row and column 5 the direct derivative of depth.
+// What the derivative of a pixel by the geometry of a Gaussian is made of: by ln alpha it goes as x, y, x^2, x y, y^2 (e = (x, y)),
+// and depth's own as 1, for ray_plane also as x and y. The mean moves all of them, the shape those from SHAPE_FIRST on but the last.
+template <DepthKind KIND>
+constexpr int SCREEN_TERMS = KIND == DepthKind::ray_plane ? 8 : 6;
+constexpr int SHAPE_FIRST = 2;
+template <DepthKind KIND>
+constexpr int SHAPE_TERMS = SCREEN_TERMS<KIND> - SHAPE_FIRST - 1;
+
+// Gram matrix of these terms, summed over the pixels.
+template <DepthKind KIND>
 struct ScreenGram {
-    Vec g[6][6];
+    static constexpr int TERMS = SCREEN_TERMS<KIND>;
+    Vec g[TERMS][TERMS];
     explicit ScreenGram(const Vec* s) {
-        const InformationSum upper[6][6] = {
-            {INFO_XX, INFO_XY, INFO_XXX, INFO_XXY, INFO_XYY, INFO_ZX},
-            {INFO_XY, INFO_YY, INFO_XXY, INFO_XYY, INFO_YYY, INFO_ZY},
-            {INFO_XXX, INFO_XXY, INFO_XXXX, INFO_XXXY, INFO_XXYY, INFO_ZXX},
-            {INFO_XXY, INFO_XYY, INFO_XXXY, INFO_XXYY, INFO_XYYY, INFO_ZXY},
-            {INFO_XYY, INFO_YYY, INFO_XXYY, INFO_XYYY, INFO_YYYY, INFO_ZYY},
-            {INFO_ZX, INFO_ZY, INFO_ZXX, INFO_ZXY, INFO_ZYY, INFO_ZZ},
+        const InformationSum all[8][8] = {
+            {INFO_XX, INFO_XY, INFO_XXX, INFO_XXY, INFO_XYY, INFO_ZXX, INFO_ZXY, INFO_ZX},
+            {INFO_XY, INFO_YY, INFO_XXY, INFO_XYY, INFO_YYY, INFO_ZXY, INFO_ZYY, INFO_ZY},
+            {INFO_XXX, INFO_XXY, INFO_XXXX, INFO_XXXY, INFO_XXYY, INFO_ZXXX, INFO_ZXXY, INFO_ZXX},
+            {INFO_XXY, INFO_XYY, INFO_XXXY, INFO_XXYY, INFO_XYYY, INFO_ZXXY, INFO_ZXYY, INFO_ZXY},
+            {INFO_XYY, INFO_YYY, INFO_XXYY, INFO_XYYY, INFO_YYYY, INFO_ZXYY, INFO_ZYYY, INFO_ZYY},
+            {INFO_ZXX, INFO_ZXY, INFO_ZXXX, INFO_ZXXY, INFO_ZXYY, INFO_ZZXX, INFO_ZZXY, INFO_ZZX},
+            {INFO_ZXY, INFO_ZYY, INFO_ZXXY, INFO_ZXYY, INFO_ZYYY, INFO_ZZXY, INFO_ZZYY, INFO_ZZY},
+            {INFO_ZX, INFO_ZY, INFO_ZXX, INFO_ZXY, INFO_ZYY, INFO_ZZX, INFO_ZZY, INFO_ZZ},
         };
-        for (int k = 0; k < 6; k++)
-            for (int l = 0; l < 6; l++) g[k][l] = s[upper[k][l]];
+        const auto place = [](int term) { return term < TERMS - 1 ? term : 7; };  // the last is depth's own 1
+        for (int k = 0; k < TERMS; k++)
+            for (int l = 0; l < TERMS; l++) g[k][l] = s[all[place(k)][place(l)]];
     }
 };
 
-// Derivatives of the per-pixel coefficients of (x, y, x^2, x y, y^2, depth) by the centre in the map frame, and
-// the cotangents Y of Sigma in own axes that belong to the three quadratic ones.
+// Derivatives of the coefficients of the terms by the centre in the map frame, and the cotangents Y of Sigma in own axes that
+// belong to those of the shape.
+template <DepthKind KIND>
 struct ScreenDerivatives {
-    Vec by_mean[6][3];
-    Vec Y[3][6];
+    Vec by_mean[SCREEN_TERMS<KIND>][3];
+    Vec Y[SHAPE_TERMS<KIND>][6];
     ScreenDerivatives(const View& view, const Splat16& s) {
         const Vec zero(0.0f), one(1.0f);
         Vec centre[3];
@@ -101,16 +114,32 @@ struct ScreenDerivatives {
             own_axes_cotangent(s, c, Q, Y[k]);
             jacobian_cotangent(s, Q, d_J);
             clear();
-            add_centre_from_jacobian(s, d_J, Y[k], centre);
+            add_centre_from_jacobian(s, d_J, jacobian_along_itself(s, Y[k]), centre);
             to_map_frame(view, centre, by_mean[2 + k]);
         }
-        for (int i = 0; i < 3; i++) by_mean[5][i] = Vec(view.R[6 + i]);
+        clear();
+        if constexpr (KIND == DepthKind::ray_plane) {
+            const RayDepth depth(s);
+            for (int k = 0; k < 3; k++) {  // x, y, 1
+                Vec own[6], d_J[6], along_J(0.0f), turn[2];
+                for (int i = 0; i < 6; i++) own[i] = d_J[i] = zero;
+                clear();
+                depth.add_cotangents(s, k == 2 ? one : zero, k == 0 ? one : zero, k == 1 ? one : zero, own, d_J, along_J, centre, turn);
+                add_centre_from_jacobian(s, d_J, along_J, centre);
+                if (k < 2) {
+                    to_map_frame(view, centre, by_mean[5 + k]);
+                    for (int i = 0; i < 6; i++) Y[3 + k][i] = own[i];
+                }
+            }
+        }
+        centre[2] += one;
+        to_map_frame(view, centre, by_mean[SCREEN_TERMS<KIND> - 1]);
     }
 };
 
 // sum_kl a_k G[first + k][other + l] b_l over ROWS x COLUMNS.
-template <int ROWS, int COLUMNS>
-inline Vec quadratic_form(const ScreenGram& gram, int row, int column, const Vec* a, const Vec* b) {
+template <int ROWS, int COLUMNS, class Gram>
+inline Vec quadratic_form(const Gram& gram, int row, int column, const Vec* a, const Vec* b) {
     Vec total(0.0f);
     for (int k = 0; k < ROWS; k++) {
         Vec inner(0.0f);
@@ -120,51 +149,79 @@ inline Vec quadratic_form(const ScreenGram& gram, int row, int column, const Vec
     return total;
 }
 
+inline size_t group_count(const Frame& frame) { return (frame.visible + LANES - 1) / LANES; }
+
+// Completes the splats of the visible Gaussians for ray_plane.
+inline void set_depth_slopes(Frame& frame, const GaussianArrays& gaussians) {
+    const int groups = static_cast<int>(group_count(frame));
+#pragma omp parallel for schedule(static) num_threads(frame.threads) if (frame.threads > 1)
+    for (int g = 0; g < groups; g++) {
+        const Group group(frame, gaussians, g);
+        Vec slopes[2];
+        alignas(64) float lanes[2][LANES];
+        depth_slopes(group.splat, slopes);
+        for (int k = 0; k < 2; k++) store(lanes[k], slopes[k]);
+        for (int lane = 0; lane < group.lanes; lane++) {
+            Splat& splat = frame.splats.data()[group.ids[lane]];
+            splat.slope_x = lanes[0][lane];
+            splat.slope_y = lanes[1][lane];
+        }
+    }
+}
+
 // ---------------------------------------------------------------- gradients
 
 // Diagonal of the information in mean 3, quaternion 4, log-scale 3, colour 3, logit 1; of_color: that of the colours.
+template <DepthKind KIND>
 inline void diagonal_information(const View& view, const Splat16& s, Vec transparency, const Vec* info, const Vec* of_color, Vec* diagonal) {
-    const ScreenGram gram(info);
-    const ScreenDerivatives derivatives(view, s);
-    Vec by_quat[3][4], by_scale[3][3];
-    for (int k = 0; k < 3; k++) {
+    constexpr int TERMS = SCREEN_TERMS<KIND>, SHAPE = SHAPE_TERMS<KIND>;
+    const ScreenGram<KIND> gram(info);
+    const ScreenDerivatives<KIND> derivatives(view, s);
+    Vec by_quat[SHAPE][4], by_scale[SHAPE][3];
+    for (int k = 0; k < SHAPE; k++) {
         quaternion_cotangent(s, derivatives.Y[k], by_quat[k]);
         log_scale_cotangent(s, derivatives.Y[k], by_scale[k]);
     }
     for (int i = 0; i < 3; i++) {
-        Vec column[6];
-        for (int k = 0; k < 6; k++) column[k] = derivatives.by_mean[k][i];
-        diagonal[i] = quadratic_form<6, 6>(gram, 0, 0, column, column);
+        Vec column[TERMS];
+        for (int k = 0; k < TERMS; k++) column[k] = derivatives.by_mean[k][i];
+        diagonal[i] = quadratic_form<TERMS, TERMS>(gram, 0, 0, column, column);
     }
     for (int i = 0; i < 4; i++) {
-        const Vec column[3] = {by_quat[0][i], by_quat[1][i], by_quat[2][i]};
-        diagonal[3 + i] = quadratic_form<3, 3>(gram, 2, 2, column, column);
+        Vec column[SHAPE];
+        for (int k = 0; k < SHAPE; k++) column[k] = by_quat[k][i];
+        diagonal[3 + i] = quadratic_form<SHAPE, SHAPE>(gram, SHAPE_FIRST, SHAPE_FIRST, column, column);
     }
     for (int i = 0; i < 3; i++) {
-        const Vec column[3] = {by_scale[0][i], by_scale[1][i], by_scale[2][i]};
-        diagonal[7 + i] = quadratic_form<3, 3>(gram, 2, 2, column, column);
+        Vec column[SHAPE];
+        for (int k = 0; k < SHAPE; k++) column[k] = by_scale[k][i];
+        diagonal[7 + i] = quadratic_form<SHAPE, SHAPE>(gram, SHAPE_FIRST, SHAPE_FIRST, column, column);
         diagonal[10 + i] = of_color[i];
     }
     diagonal[13] = transparency * transparency * info[INFO_1];
 }
 
-template <Derivatives D>
+template <Derivatives D, DepthKind KIND>
 inline void gradient_group(const Frame& frame, const GaussianArrays& gaussians, size_t index, const GradientArrays& out, double* pose) {
     const Group group(frame, gaussians, index);
     const Splat16& s = group.splat;
-    Vec sums[ROW_OF<D>];
-    group.reduce<ROW_OF<D>>(frame, sums);
+    Vec sums[ROW_OF<D, KIND>];
+    group.reduce<ROW_OF<D, KIND>>(frame, sums);
 
-    Vec Q[6], Y[6], d_J[6], centre[3] = {Vec(0.0f), Vec(0.0f), Vec(0.0f)};
+    Vec Q[6], Y[6], d_J[6], centre[3] = {Vec(0.0f), Vec(0.0f), Vec(0.0f)}, turn[2];
     own_axes_cotangent(s, whitened_cotangent(sums[SUM_WXX], sums[SUM_WXY], sums[SUM_WYY]), Q, Y);
     jacobian_cotangent(s, Q, d_J);
-    add_centre_from_jacobian(s, d_J, Y, centre);
+    Vec along_J = jacobian_along_itself(s, Y);
+    if constexpr (KIND == DepthKind::ray_plane)
+        RayDepth(s).add_cotangents(s, sums[SUM_Z], sums[SUM_ZX], sums[SUM_ZY], Y, d_J, along_J, centre, turn);
+    add_centre_from_jacobian(s, d_J, along_J, centre);
     add_centre_from_moments(s, sums[SUM_WX], sums[SUM_WY], centre);
     centre[2] += sums[SUM_Z];
     if (out.pose) {
         Vec by_pose[6];
         alignas(64) float lanes[LANES];
         pose_cotangent(s, centre, d_J, by_pose);
+        if constexpr (KIND == DepthKind::ray_plane) add_turn_of_depth(turn, by_pose);
         for (int k = 0; k < 6; k++) {
             store(lanes, by_pose[k]);
             for (int lane = 0; lane < group.lanes; lane++) pose[k] += lanes[lane];
@@ -182,18 +239,16 @@ inline void gradient_group(const Frame& frame, const GaussianArrays& gaussians, 
         scatter<3>(sums + SUM_R, group, out.colors);
         scatter<1>(&logit, group, out.opacity_logits);
         if constexpr (D == Derivatives::ALL_AND_SQUARES) {
-            const Vec* info = sums + GRADIENT_SUMS;
+            const Vec* info = sums + GRADIENT_SUMS<KIND>;
             Vec diagonal[14];
-            diagonal_information(frame.view, s, transparency, info, info + INFO_R, diagonal);
+            diagonal_information<KIND>(frame.view, s, transparency, info, info + INFO_R, diagonal);
             scatter<14>(diagonal, group, out.fisher_diagonal);
         }
     }
 }
 
-inline size_t group_count(const Frame& frame) { return (frame.visible + LANES - 1) / LANES; }
-
 // Gradients of all drawn Gaussians; the pose sums in 64 fixed chunks, in double, added in order.
-template <Derivatives D>
+template <Derivatives D, DepthKind KIND>
 inline void gradients_of_parameters(Frame& frame, const GaussianArrays& gaussians, const GradientArrays& out) {
     const size_t groups = group_count(frame);
     double* parts = frame.pose_parts.need(POSE_CHUNKS * 6);
@@ -202,7 +257,7 @@ inline void gradients_of_parameters(Frame& frame, const GaussianArrays& gaussian
     for (int chunk = 0; chunk < POSE_CHUNKS; chunk++) {
         double pose[6] = {};
         for (size_t g = groups * chunk / POSE_CHUNKS; g < groups * (chunk + 1) / POSE_CHUNKS; g++)
-            gradient_group<D>(frame, gaussians, g, out, pose);
+            gradient_group<D, KIND>(frame, gaussians, g, out, pose);
         std::memcpy(parts + 6 * chunk, pose, sizeof pose);
     }
     if (!out.pose) return;
@@ -240,32 +295,35 @@ inline void log_covariance_cotangent(const Splat16& s, const Vec* Y, const Vec* 
 }
 
 // Upper triangle, row by row, of the 9x9 information in (mean, vec log Sigma), map frame.
+template <DepthKind KIND>
 inline void geometry_information(const View& view, const Splat16& s, const Vec* info, Vec* upper) {
-    const ScreenGram gram(info);
-    const ScreenDerivatives derivatives(view, s);
+    constexpr int TERMS = SCREEN_TERMS<KIND>, SHAPE = SHAPE_TERMS<KIND>;
+    const ScreenGram<KIND> gram(info);
+    const ScreenDerivatives<KIND> derivatives(view, s);
     auto difference = [&](int i, int k) {
         return exp2x_divided_difference(s.log_scale[i], s.log_scale[k], s.scale[i], s.scale[k]);
     };
     const Vec differences[3] = {difference(0, 1), difference(0, 2), difference(1, 2)};
-    Vec by_log[3][6], mean[3][6], log[6][3];
-    for (int k = 0; k < 3; k++) log_covariance_cotangent(s, derivatives.Y[k], differences, by_log[k]);
+    Vec by_log[SHAPE][6], mean[3][TERMS], log[6][SHAPE];
+    for (int k = 0; k < SHAPE; k++) log_covariance_cotangent(s, derivatives.Y[k], differences, by_log[k]);
     for (int i = 0; i < 3; i++)
-        for (int k = 0; k < 6; k++) mean[i][k] = derivatives.by_mean[k][i];
+        for (int k = 0; k < TERMS; k++) mean[i][k] = derivatives.by_mean[k][i];
     for (int i = 0; i < 6; i++)
-        for (int k = 0; k < 3; k++) log[i][k] = by_log[k][i];
+        for (int k = 0; k < SHAPE; k++) log[i][k] = by_log[k][i];
     for (int i = 0; i < 3; i++) {
-        for (int j = i; j < 3; j++) *upper++ = quadratic_form<6, 6>(gram, 0, 0, mean[i], mean[j]);
-        for (int j = 0; j < 6; j++) *upper++ = quadratic_form<6, 3>(gram, 0, 2, mean[i], log[j]);
+        for (int j = i; j < 3; j++) *upper++ = quadratic_form<TERMS, TERMS>(gram, 0, 0, mean[i], mean[j]);
+        for (int j = 0; j < 6; j++) *upper++ = quadratic_form<TERMS, SHAPE>(gram, 0, SHAPE_FIRST, mean[i], log[j]);
     }
     for (int i = 0; i < 6; i++)
-        for (int j = i; j < 6; j++) *upper++ = quadratic_form<3, 3>(gram, 2, 2, log[i], log[j]);
+        for (int j = i; j < 6; j++) *upper++ = quadratic_form<SHAPE, SHAPE>(gram, SHAPE_FIRST, SHAPE_FIRST, log[i], log[j]);
 }
 
+template <DepthKind KIND>
 inline void information_group(const Frame& frame, const GaussianArrays& gaussians, size_t index, const FisherArrays& out) {
     const Group group(frame, gaussians, index);
     Vec info[INFORMATION_ROW], upper[45];
     group.reduce<INFORMATION_ROW>(frame, info);
-    geometry_information(frame.view, group.splat, info, upper);
+    geometry_information<KIND>(frame.view, group.splat, info, upper);
     const Vec transparency = sigmoid(-group.parameters.logit), opacity = transparency * transparency * info[INFO_1];
     const Vec color[3] = {info[INFO_R], info[INFO_R], info[INFO_R]};
     scatter_add<45>(upper, group, out.geometry);
@@ -275,7 +333,7 @@ inline void information_group(const Frame& frame, const GaussianArrays& gaussian
     scatter_add<1>(info + INFO_RESIDUAL, group, out.residual);
     if (out.diagonal) {
         Vec diagonal[14];
-        diagonal_information(frame.view, group.splat, transparency, info, color, diagonal);
+        diagonal_information<KIND>(frame.view, group.splat, transparency, info, color, diagonal);
         scatter_add<14>(diagonal, group, out.diagonal);
     }
     const uint32_t observed = bits(Vec(0.0f) < info[INFO_R] + info[INFO_ZZ]);

@@ -5,6 +5,8 @@
 // The pixel loops work in e = M d, d = pixel - centre, with M^T M = C^-1 log2(e)/2, so that alpha = opacity 2^-|e|^2.
 // No 3x3 covariance is ever formed; the way back needs only the symmetric Y = P^T G P, G the cotangent of C: it is the
 // cotangent of Sigma in the Gaussian's own axes.
+//
+// Depth along the ray of a pixel: z + k^T C^-1 d with k = P S^2 a the covariance of screen position and depth, a = axes^T e_z.
 #pragma once
 
 #include "frame.h"
@@ -50,20 +52,31 @@ inline void rotation_of_quaternion(const Vec* q, Vec* R) {
     R[8] = one - two * (x * x + y * y);
 }
 
+// Sixteen centres: in the camera frame, as slopes x/z, y/z, on the screen.
+struct CameraPoint16 {
+    Vec x, y, z, inverse_z, slope_x, slope_y, u, v;
+    CameraPoint16(const View& view, const Vec* mean) {
+        const float *W = view.R, *t = view.t;
+        x = fma(Vec(W[0]), mean[0], fma(Vec(W[1]), mean[1], fma(Vec(W[2]), mean[2], Vec(t[0]))));
+        y = fma(Vec(W[3]), mean[0], fma(Vec(W[4]), mean[1], fma(Vec(W[5]), mean[2], Vec(t[1]))));
+        z = fma(Vec(W[6]), mean[0], fma(Vec(W[7]), mean[1], fma(Vec(W[8]), mean[2], Vec(t[2]))));
+        inverse_z = Vec(1.0f) / max(z, Vec(NEAR_M));
+        slope_x = x * inverse_z;
+        slope_y = y * inverse_z;
+        u = fma(Vec(view.fx), slope_x, Vec(view.cx));
+        v = fma(Vec(view.fy), slope_y, Vec(view.cy));
+    }
+};
+inline float slope_limit(int pixels, float focal) { return FIELD_MARGIN * 0.5f * pixels / focal; }
+
 inline Splat16 project16(const View& view, const Vec* mean, const Vec* quat, const Vec* log_scale) {
     Splat16 s;
-    const float *W = view.R, *t = view.t;
-    s.x = fma(Vec(W[0]), mean[0], fma(Vec(W[1]), mean[1], fma(Vec(W[2]), mean[2], Vec(t[0]))));
-    s.y = fma(Vec(W[3]), mean[0], fma(Vec(W[4]), mean[1], fma(Vec(W[5]), mean[2], Vec(t[1]))));
-    s.z = fma(Vec(W[6]), mean[0], fma(Vec(W[7]), mean[1], fma(Vec(W[8]), mean[2], Vec(t[2]))));
-    s.inverse_z = Vec(1.0f) / max(s.z, Vec(NEAR_M));
-    s.slope_x = s.x * s.inverse_z;
-    s.slope_y = s.y * s.inverse_z;
-    s.u = fma(Vec(view.fx), s.slope_x, Vec(view.cx));
-    s.v = fma(Vec(view.fy), s.slope_y, Vec(view.cy));
+    const float* W = view.R;
+    const CameraPoint16 c(view, mean);
+    s.x = c.x, s.y = c.y, s.z = c.z, s.inverse_z = c.inverse_z;
+    s.slope_x = c.slope_x, s.slope_y = c.slope_y, s.u = c.u, s.v = c.v;
 
-    const Vec limit_x(FIELD_MARGIN * 0.5f * view.width / view.fx);
-    const Vec limit_y(FIELD_MARGIN * 0.5f * view.height / view.fy);
+    const Vec limit_x(slope_limit(view.width, view.fx)), limit_y(slope_limit(view.height, view.fy));
     const Vec clamped_x = min(max(s.slope_x, -limit_x), limit_x);
     const Vec clamped_y = min(max(s.slope_y, -limit_y), limit_y);
     s.inside_x = select_or_zero((s.slope_x >= -limit_x) & (s.slope_x <= limit_x), Vec(1.0f));
@@ -169,16 +182,104 @@ inline void jacobian_cotangent(const Splat16& s, const Vec* Q, Vec* d_J) {
                                  fma(d_P[3 * r + 1], s.axes[3 * j + 1], d_P[3 * r + 2] * s.axes[3 * j + 2]));
 }
 
-// Adds what a cotangent of J means for the centre in the camera frame.
-// All of J goes as 1/z, and <d_J, J> = 2 tr(S^2 Y), which does not cancel.
-inline void add_centre_from_jacobian(const Splat16& s, const Vec* d_J, const Vec* Y, Vec* d_centre) {
+// <d_J, J> = 2 tr(S^2 Y), which does not cancel.
+inline Vec jacobian_along_itself(const Splat16& s, const Vec* Y) {
+    Vec along_J(0.0f);
+    for (int k = 0; k < 3; k++) along_J = fma(Vec(2.0f) * s.scale[k] * s.scale[k], Y[k], along_J);
+    return along_J;
+}
+
+// Adds what a cotangent of J means for the centre in the camera frame. All of J goes as 1/z; along_J: <d_J, J>.
+inline void add_centre_from_jacobian(const Splat16& s, const Vec* d_J, Vec along_J, Vec* d_centre) {
     const Vec d_slope_x = -(s.J00 * d_J[2]) * s.inside_x, d_slope_y = -(s.J11 * d_J[5]) * s.inside_y;
-    Vec d_inverse_z(0.0f);  // times z
-    for (int k = 0; k < 3; k++) d_inverse_z = fma(Vec(2.0f) * s.scale[k] * s.scale[k], Y[k], d_inverse_z);
     d_centre[0] += d_slope_x * s.inverse_z;
     d_centre[1] += d_slope_y * s.inverse_z;
-    d_centre[2] = fnma(s.inverse_z, fma(d_slope_x, s.slope_x, fma(d_slope_y, s.slope_y, d_inverse_z)), d_centre[2]);
+    d_centre[2] = fnma(s.inverse_z, fma(d_slope_x, s.slope_x, fma(d_slope_y, s.slope_y, along_J)), d_centre[2]);
 }
+
+// The depth along the ray is z + g . e with g = 2 ln2 M k = 2 ln2 N S^2 a.
+inline void depth_slopes(const Splat16& s, Vec* g) {
+    g[0] = g[1] = Vec(0.0f);
+    for (int k = 0; k < 3; k++) {
+        const Vec factor = s.scale[k] * s.axes[6 + k] * Vec(2.0f * LN_2);
+        g[0] = fma(s.N[k] * s.scale[k], factor, g[0]);
+        g[1] = fma(s.N[3 + k] * s.scale[k], factor, g[1]);
+    }
+}
+
+// What the depth along the ray adds on the way back. With q = C^-1 d and m = C^-1 k
+//   d(k^T C^-1 d) = q . dk - m^T dC q - m . d(centre),
+// and as k and C hold the same Sigma, cotangents come in pairs, with y = P^T q = 2 ln2 N^T e and r = a - P^T m:
+//   of Sigma in own axes   (y r^T + r y^T) / 2
+//   of J                   q (axes S^2 r)^T - m (axes S^2 y)^T, with <d_J, J> = 2 b q . m - g . e, b the blur
+//   of a turn of the camera, in which e_z turns: e_z x axes S^2 y, beside that of J
+// q = 2 ln2 M^T e, m = M^T g.
+struct RayDepth {
+    Vec g[2], r[3];
+
+    explicit RayDepth(const Splat16& s) {
+        depth_slopes(s, g);
+        find_r(s);
+    }
+
+    // Adds the cotangents of sum f v z(pixel) except that of z itself, from Z = sum f v and (X, Y) = sum f v e.
+    void add_cotangents(const Splat16& s, Vec sum, Vec sum_x, Vec sum_y, Vec* Y, Vec* d_J, Vec& along_J, Vec* d_centre, Vec* turn) const {
+        const Vec two_ln2(2.0f * LN_2), half(0.5f);
+        const Vec q[2] = {two_ln2 * (s.M11 * sum_x), two_ln2 * fma(s.M12, sum_x, s.M22 * sum_y)};
+        const Vec m[2] = {s.M11 * g[0], fma(s.M12, g[0], s.M22 * g[1])};
+        Vec y[3], S2r[3], S2y[3];
+        for (int k = 0; k < 3; k++) {
+            const Vec scale2 = s.scale[k] * s.scale[k];
+            y[k] = two_ln2 * fma(s.N[k], sum_x, s.N[3 + k] * sum_y);
+            S2r[k] = scale2 * r[k];
+            S2y[k] = scale2 * y[k];
+            Y[k] = fma(y[k], r[k], Y[k]);
+        }
+        Y[3] = fma(half, fma(y[0], r[1], y[1] * r[0]), Y[3]);
+        Y[4] = fma(half, fma(y[0], r[2], y[2] * r[0]), Y[4]);
+        Y[5] = fma(half, fma(y[1], r[2], y[2] * r[1]), Y[5]);
+        for (int j = 0; j < 3; j++) {
+            const Vec of_r = in_camera(s, S2r, j), of_y = in_camera(s, S2y, j);
+            d_J[j] += fnma(m[0], of_y, q[0] * of_r);
+            d_J[3 + j] += fnma(m[1], of_y, q[1] * of_r);
+        }
+        along_J += fnma(g[0], sum_x, fnma(g[1], sum_y, Vec(2.0f * BLUR_PX2) * fma(q[0], m[0], q[1] * m[1])));
+        const Vec by_u = -(sum * m[0]) * s.J00, by_v = -(sum * m[1]) * s.J11;
+        d_centre[0] += by_u;
+        d_centre[1] += by_v;
+        d_centre[2] = fnma(by_u, s.slope_x, fnma(by_v, s.slope_y, d_centre[2]));
+        turn[0] = -in_camera(s, S2y, 1);
+        turn[1] = in_camera(s, S2y, 0);
+    }
+
+private:
+    static Vec in_camera(const Splat16& s, const Vec* own, int row) {
+        const Vec* axes = s.axes + 3 * row;
+        return fma(axes[0], own[0], fma(axes[1], own[1], axes[2] * own[2]));
+    }
+
+    // r is a small difference if the Gaussian is flat or long. With U = P S and b the blur
+    //   S r = (1 - U^T C^-1 U) S a = (1 + U^T U / b)^-1 S a = (b^2 + b sum_u (|u|^2 - u u^T) + n n^T) S a / det C,
+    // u the two rows of U and n their cross product; n . S a = det(J, e_z) s0 s1 s2, and division by S leaves cross products
+    // of J_x, J_y and e_z in own axes.
+    void find_r(const Splat16& s) {
+        const Vec blur(BLUR_PX2), area = s.J00 * s.J11, to_unit = Vec(2.0f * LN_2) * (s.M11 * s.M22);  // 1 / sqrt(det C)
+        Vec a_Px[3], a_Py[3];  // a x P_x, a x P_y
+        for (int k = 0; k < 3; k++) {
+            a_Px[k] = s.J00 * s.axes[3 + k];
+            a_Py[k] = -(s.J11 * s.axes[k]);
+        }
+        for (int k = 0; k < 3; k++) {
+            const int i = (k + 1) % 3, j = (k + 2) % 3;
+            const Vec of_i = s.scale[i] * s.scale[i] * fma(s.P[i], a_Px[j], s.P[3 + i] * a_Py[j]);
+            const Vec of_j = s.scale[j] * s.scale[j] * fma(s.P[j], a_Px[i], s.P[3 + j] * a_Py[i]);
+            const Vec blurred = blur * fma(blur, s.axes[6 + k], of_i - of_j);
+            const Vec normal = fma(area, s.axes[6 + k], fnma(s.J02 * s.J11, s.axes[k], -(s.J00 * s.J12 * s.axes[3 + k])));  // P_x x P_y
+            const Vec face = to_unit * (s.scale[i] * s.scale[j]);
+            r[k] = fma(face * normal, face * area, to_unit * blurred * to_unit);
+        }
+    }
+};
 
 // W^T d: a cotangent of the centre from the camera frame to the map frame.
 inline void to_map_frame(const View& view, const Vec* d_centre, Vec* d_mean) {
@@ -218,6 +319,11 @@ inline void pose_cotangent(const Splat16& s, const Vec* d_centre, const Vec* d_J
     d_pose[3] = (s.z * g[1] - s.y * g[2]) + (n12 - n21);
     d_pose[4] = (s.x * g[2] - s.z * g[0]) + (n20 - n02);
     d_pose[5] = (s.y * g[0] - s.x * g[1]) + (n01 - n10);
+}
+// Adds the turn of e_z, which only the depth along the ray sees.
+inline void add_turn_of_depth(const Vec* turn, Vec* d_pose) {
+    d_pose[3] += turn[0];
+    d_pose[4] += turn[1];
 }
 
 }  // namespace KERNEL_ISA

@@ -13,22 +13,30 @@ namespace KERNEL_ISA {
 
 constexpr int BATCH = 16;  // items
 
-// Sums of the gradient; w: cotangent of ln alpha, (X, Y) = e; R, G, B, Z: weight times cotangent.
-enum GradientSum { SUM_W, SUM_WX, SUM_WY, SUM_WXX, SUM_WXY, SUM_WYY, SUM_R, SUM_G, SUM_B, SUM_Z, GRADIENT_SUMS };
+// Sums of the gradient; w: cotangent of ln alpha, (X, Y) = e; R, G, B, Z: weight times cotangent, the last two times e for
+// ray_plane only.
+enum GradientSum { SUM_W, SUM_WX, SUM_WY, SUM_WXX, SUM_WXY, SUM_WYY, SUM_R, SUM_G, SUM_B, SUM_Z, SUM_ZX, SUM_ZY };
 
-// Sums of information. w2: square of the derivative by ln alpha, over channels; Z: with depth's own. The empirical
-// information squares the three colours one by one; to J^T R^-1 J they are all the same, and its other two count by-products.
+// Sums of information. w2: square of the derivative by ln alpha, over channels; Z: its product with depth's own; ZZ: the
+// square of that. The empirical information squares the three colours one by one; to J^T R^-1 J they are all the same, and its
+// other two count by-products.
 enum InformationSum {
     INFO_XX, INFO_XY, INFO_YY, INFO_XXX, INFO_XXY, INFO_XYY, INFO_YYY,
     INFO_XXXX, INFO_XXXY, INFO_XXYY, INFO_XYYY, INFO_YYYY, INFO_1,
     INFO_ZX, INFO_ZY, INFO_ZXX, INFO_ZXY, INFO_ZYY,
-    INFO_R, INFO_G, INFO_B, INFO_ZZ, INFORMATION_SUMS,
+    INFO_R, INFO_G, INFO_B, INFO_ZZ,
+    INFO_Z1, INFO_ZXXX, INFO_ZXXY, INFO_ZXYY, INFO_ZYYY, INFO_ZZX, INFO_ZZY, INFO_ZZXX, INFO_ZZXY, INFO_ZZYY,  // ray_plane only
     INFO_WEIGHT = INFO_G, INFO_RESIDUAL = INFO_B,
 };
 
+template <DepthKind KIND>
+constexpr int GRADIENT_SUMS = KIND == DepthKind::ray_plane ? SUM_ZY + 1 : SUM_Z + 1;
+template <DepthKind KIND>
+constexpr int INFORMATION_SUMS = KIND == DepthKind::ray_plane ? INFO_ZZYY + 1 : INFO_ZZ + 1;
+
 constexpr int GRADIENT_ROW = 16, INFORMATION_ROW = 32;  // floats; whole cache lines
-constexpr int SQUARES_ROW = 32;                         // gradient, then information
-static_assert(GRADIENT_SUMS + INFORMATION_SUMS <= SQUARES_ROW, "");
+template <DepthKind KIND>
+constexpr int SQUARES_ROW = KIND == DepthKind::ray_plane ? 48 : 32;  // gradient, then information
 
 // Sixteen items of a block, or fewer: then the first stands for the missing, seen by no pixel.
 struct Batch {
@@ -153,6 +161,38 @@ inline void set_parts(Vec* sums, int half, const Wide (&values)[COUNT]) {
     for (int k = 0; k < COUNT; k++) set_part(sums[k], half, values[k]);
 }
 
+constexpr int monomials(int degree) { return (degree + 1) * (degree + 2) / 2; }
+
+// totals = sums of w x^i y^j over the pixels, i + j <= DEGREE, by degree, then by j: 1, x, y, xx, xy, yy, xxx ...
+template <int DEGREE, class W>
+inline void sum_monomials(W w_of, const BatchShape& shape, const Block& block, int half, Wide (&totals)[monomials(DEGREE)]) {
+    Wide of_row[DEGREE + 1];  // of w x^i
+    for (Wide& total : totals) total = Wide(0.0f);
+    for (Wide& total : of_row) total = Wide(0.0f);
+    over_rows(
+        shape, half, block,
+        [&](int p, Wide x) ALWAYS_INLINE {
+            Wide wx = w_of(p);
+            of_row[0] += wx;
+            unrolled<DEGREE>([&](auto i) ALWAYS_INLINE {
+                of_row[i + 1] = fma(wx, x, of_row[i + 1]);
+                wx = wx * x;
+            });
+        },
+        [&](Wide y) ALWAYS_INLINE {
+            unrolled<DEGREE + 1>([&](auto i) ALWAYS_INLINE {
+                Wide wxy = of_row[i];
+                totals[monomials(i - 1)] += wxy;
+                unrolled<DEGREE - i>([&](auto j) ALWAYS_INLINE {
+                    constexpr int place = monomials(i + j) + j + 1;
+                    totals[place] = fma(wxy, y, totals[place]);
+                    wxy = wxy * y;
+                });
+                of_row[i] = Wide(0.0f);
+            });
+        });
+}
+
 // totals[k] = sum over the pixels p of value_of(p) times planes[k][p].
 template <int COUNT, class Value>
 inline void sum_products(Value value_of, const float (*planes)[LANES], Wide (&totals)[COUNT]) {
@@ -250,6 +290,19 @@ inline void sum_depth_moments(Cross cross_of, const BatchShape& shape, const Blo
             s0 = s1 = s2 = zero;
         });
     set_parts(sums + INFO_ZX, half, {X, Y, XX, XY, YY});
+}
+
+// The same for ray_plane, whose own derivative of depth goes as 1, x and y, and what the square of that needs beside INFO_ZZ.
+// cross_of(p), square_of(p): of the part that goes as 1.
+template <class Cross, class Square>
+inline void sum_ray_depth_moments(Cross cross_of, Square square_of, const BatchShape& shape, const Block& block, int half, Vec* sums) {
+    constexpr int OF_CROSS[] = {INFO_Z1, INFO_ZX, INFO_ZY, INFO_ZXX, INFO_ZXY, INFO_ZYY, INFO_ZXXX, INFO_ZXXY, INFO_ZXYY, INFO_ZYYY};
+    constexpr int OF_SQUARE[] = {INFO_ZZX, INFO_ZZY, INFO_ZZXX, INFO_ZZXY, INFO_ZZYY};
+    Wide cross[monomials(3)], square[monomials(2)];
+    sum_monomials<3>(cross_of, shape, block, half, cross);
+    sum_monomials<2>(square_of, shape, block, half, square);
+    for (int k = 0; k < monomials(3); k++) set_part(sums[OF_CROSS[k]], half, cross[k]);
+    for (int k = 1; k < monomials(2); k++) set_part(sums[OF_SQUARE[k - 1]], half, square[k]);
 }
 
 }  // namespace KERNEL_ISA

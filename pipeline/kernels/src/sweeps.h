@@ -63,8 +63,12 @@ ALWAYS_INLINE inline void over_batches(const Sweep& sweep, uint32_t count, Visit
 
 enum class Derivatives { POSE, ALL, ALL_AND_SQUARES };  // of the pose alone; of all parameters; and their squares per pixel
 
-template <Derivatives D>
-constexpr int ROW_OF = D == Derivatives::ALL_AND_SQUARES ? SQUARES_ROW : GRADIENT_ROW;
+template <Derivatives D, DepthKind KIND>
+constexpr int ROW_OF = D == Derivatives::ALL_AND_SQUARES ? SQUARES_ROW<KIND> : GRADIENT_ROW;
+template <Derivatives D, DepthKind KIND>
+constexpr int SUMS_OF = D == Derivatives::ALL_AND_SQUARES ? GRADIENT_SUMS<KIND> + INFORMATION_SUMS<KIND> : GRADIENT_SUMS<KIND>;
+static_assert(SUMS_OF<Derivatives::ALL_AND_SQUARES, DepthKind::blended> <= SQUARES_ROW<DepthKind::blended>, "");
+static_assert(SUMS_OF<Derivatives::ALL_AND_SQUARES, DepthKind::ray_plane> <= SQUARES_ROW<DepthKind::ray_plane>, "");
 
 // Cotangents of the images in one block; plane k of `planes`: red, green, blue, depth, alpha.
 struct Cotangents {
@@ -72,21 +76,29 @@ struct Cotangents {
 };
 
 // Squares of the gradient: the empirical information. squared: of the cotangents' planes.
+template <DepthKind KIND>
 inline void sum_squares(const Lanes& w_of, const Lanes& f_of, const Cotangents& v, const float (*squared)[LANES], const BatchShape& shape,
                         const Block& block, int half, Vec* sums) {
     sum_screen_moments([&](int p) ALWAYS_INLINE { return part(w_of[p], half) * part(w_of[p], half); }, shape, block, half, sums);
-    sum_depth_moments([&](int p) ALWAYS_INLINE { return part(f_of[p], half) * part(w_of[p], half) * Wide(v.planes[3][p]); }, shape, block,
-                      half, sums);
+    const auto cross_of = [&](int p) ALWAYS_INLINE { return part(f_of[p], half) * part(w_of[p], half) * Wide(v.planes[3][p]); };
+    const auto weight2_of = [&](int p) ALWAYS_INLINE { return part(f_of[p], half) * part(f_of[p], half); };
+    if constexpr (KIND == DepthKind::ray_plane) {
+        const auto square_of = [&](int p) ALWAYS_INLINE { return weight2_of(p) * Wide(squared[3][p]); };
+        sum_ray_depth_moments(cross_of, square_of, shape, block, half, sums);
+    } else {
+        sum_depth_moments(cross_of, shape, block, half, sums);
+    }
     Wide totals[4];
-    sum_products([&](int p) ALWAYS_INLINE { return part(f_of[p], half) * part(f_of[p], half); }, squared, totals);
+    sum_products(weight2_of, squared, totals);
     set_parts(sums + INFO_R, half, totals);
 }
 
 // Adds to the rows of a block's items.
-template <Derivatives D, class Pass>
+template <Derivatives D, DepthKind KIND, class Pass>
 NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uint32_t count, const Cotangents& v, Pass pass) {
-    constexpr int ROW = ROW_OF<D>;
+    constexpr int ROW = ROW_OF<D, KIND>;
     const Vec r = load(v.planes[0]), g = load(v.planes[1]), b = load(v.planes[2]), z = load(v.planes[3]), a = load(v.planes[4]);
+    const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
     const float* background = sweep.view.background;
     alignas(64) float squared[4][LANES];
     if constexpr (D == Derivatives::ALL_AND_SQUARES) {
@@ -97,9 +109,10 @@ NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uin
     over_batches(sweep, count, [&](const Batch& batch) ALWAYS_INLINE {
         Lanes f, w;
         Vec sums[ROW];
-        unused_sums<D == Derivatives::POSE ? SUM_R : D == Derivatives::ALL ? GRADIENT_SUMS : GRADIENT_SUMS + INFORMATION_SUMS, ROW>(sums);
+        unused_sums<D == Derivatives::POSE ? SUM_R : SUMS_OF<D, KIND>, ROW>(sums);
         pass.walk(batch, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
-            const Vec own = fma(Vec(s.r), r, fma(Vec(s.g), g, fma(Vec(s.b), b, fma(Vec(s.z), z, a))));
+            const Vec depth = depth_at<KIND>(s, Whitened(s, pixel_x, pixel_y));
+            const Vec own = fma(Vec(s.r), r, fma(Vec(s.g), g, fma(Vec(s.b), b, fma(depth, z, a))));
             const Vec gain = gain_over(behind, own, alpha);
             w[k] = if_unclamped(alpha, weight * gain);
             f[k] = weight;
@@ -110,19 +123,26 @@ NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uin
         transpose16(f);
         for (int half = 0; half < PARTS; half++) {
             constexpr int FIRST = D == Derivatives::POSE ? SUM_Z : SUM_R;  // the pose does not move colours
-            Wide totals[GRADIENT_SUMS - FIRST];
+            Wide totals[SUM_Z + 1 - FIRST];
             sum_products([&](int p) ALWAYS_INLINE { return part(f[p], half); }, v.planes + (FIRST - SUM_R), totals);
             set_parts(sums + FIRST, half, totals);
-            if constexpr (D == Derivatives::ALL_AND_SQUARES) sum_squares(w, f, v, squared, shape, block, half, sums + GRADIENT_SUMS);
+            if constexpr (KIND == DepthKind::ray_plane) {
+                Wide of_depth[monomials(1)];
+                sum_monomials<1>([&](int p) ALWAYS_INLINE { return part(f[p], half) * Wide(v.planes[3][p]); }, shape, block, half, of_depth);
+                set_part(sums[SUM_ZX], half, of_depth[1]);
+                set_part(sums[SUM_ZY], half, of_depth[2]);
+            }
+            if constexpr (D == Derivatives::ALL_AND_SQUARES)
+                sum_squares<KIND>(w, f, v, squared, shape, block, half, sums + GRADIENT_SUMS<KIND>);
         }
         add_to_rows<ROW>(batch, sums, sweep.rows, sweep.list_rows);
     });
 }
 
-template <Derivatives D>
+template <Derivatives D, DepthKind KIND>
 inline Status gradient_tile(Frame& frame, int index, const float* d_color, const float* d_depth, const float* d_alpha) {
     touch_items(frame, index + 1);
-    Sweep sweep = Sweep::begin<ROW_OF<D>>(frame, index);
+    Sweep sweep = Sweep::begin<ROW_OF<D, KIND>>(frame, index);
     const View& view = frame.view;
     Cotangents cotangents[BLOCKS];
     bool bad[3] = {};
@@ -143,7 +163,7 @@ inline Status gradient_tile(Frame& frame, int index, const float* d_color, const
         const uint32_t count = sweep.items.counts[b];
         if (!count) continue;
         const Block block(sweep.tile, b, view);
-        gradient_block<D>(sweep, block, count, cotangents[b], Replay(block, sweep.items.T + b * LANES));
+        gradient_block<D, KIND>(sweep, block, count, cotangents[b], Replay(block, sweep.items.T + b * LANES));
         sweep.items.skip(count);
     }
     return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
@@ -157,17 +177,20 @@ struct Precisions {
 };
 
 // Rows of J^T R^-1 J: each colour channel and depth has its own "behind", for their derivatives are squared one by one.
+template <DepthKind KIND>
 NO_INLINE static void information_block(const Sweep& sweep, const Block& block, uint32_t count, const Precisions& v, Replay pass) {
     const Vec of_color = load(v.planes[0]), of_depth = load(v.planes[1]);
+    const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
     const float* background = sweep.view.background;
     Vec behind_r(background[0]), behind_g(background[1]), behind_b(background[2]), behind_z(0.0f);
     over_batches(sweep, count, [&](const Batch& batch) ALWAYS_INLINE {
         Lanes f, w2, cross;
         Vec sums[INFORMATION_ROW];
-        unused_sums<INFORMATION_SUMS, INFORMATION_ROW>(sums);
+        unused_sums<INFORMATION_SUMS<KIND>, INFORMATION_ROW>(sums);
         pass.walk(batch, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
             const Vec gain_r = gain_over(behind_r, Vec(s.r), alpha), gain_g = gain_over(behind_g, Vec(s.g), alpha);
-            const Vec gain_b = gain_over(behind_b, Vec(s.b), alpha), gain_z = gain_over(behind_z, Vec(s.z), alpha);
+            const Vec depth = depth_at<KIND>(s, Whitened(s, pixel_x, pixel_y));
+            const Vec gain_b = gain_over(behind_b, Vec(s.b), alpha), gain_z = gain_over(behind_z, depth, alpha);
             const Vec color2 = fma(gain_r, gain_r, fma(gain_g, gain_g, gain_b * gain_b)), depth_gain = of_depth * gain_z;
             const Vec moving2 = if_unclamped(alpha, weight * weight);
             f[k] = weight;
@@ -181,9 +204,16 @@ NO_INLINE static void information_block(const Sweep& sweep, const Block& block, 
         transpose16(cross);
         transpose16(f);
         for (int half = 0; half < PARTS; half++) {
-            sum_depth_moments([&](int p) ALWAYS_INLINE { return part(cross[p], half); }, shape, block, half, sums);
+            const auto cross_of = [&](int p) ALWAYS_INLINE { return part(cross[p], half); };
+            const auto weight2_of = [&](int p) ALWAYS_INLINE { return part(f[p], half) * part(f[p], half); };
+            if constexpr (KIND == DepthKind::ray_plane) {
+                const auto square_of = [&](int p) ALWAYS_INLINE { return weight2_of(p) * Wide(v.planes[1][p]); };
+                sum_ray_depth_moments(cross_of, square_of, shape, block, half, sums);
+            } else {
+                sum_depth_moments(cross_of, shape, block, half, sums);
+            }
             Wide of_squares[2], of_weights[2];
-            sum_products([&](int p) ALWAYS_INLINE { return part(f[p], half) * part(f[p], half); }, v.planes, of_squares);
+            sum_products(weight2_of, v.planes, of_squares);
             sum_products([&](int p) ALWAYS_INLINE { return part(f[p], half); }, v.planes + 2, of_weights);
             set_part(sums[INFO_R], half, of_squares[0]);
             set_part(sums[INFO_ZZ], half, of_squares[1]);
@@ -194,9 +224,12 @@ NO_INLINE static void information_block(const Sweep& sweep, const Block& block, 
     });
 }
 
-inline Status information_tile(Frame& frame, int index, const float* inv_var_color, const float* inv_var_depth, const float* residual) {
+// Calls of_block(sweep, block, count of its items, precisions, replay) for the blocks of a tile that have items.
+template <int ROW, class OfBlock>
+inline Status over_precisions(Frame& frame, int index, const float* inv_var_color, const float* inv_var_depth, const float* residual,
+                              OfBlock of_block) {
     touch_items(frame, index + 1);
-    Sweep sweep = Sweep::begin<INFORMATION_ROW>(frame, index);
+    Sweep sweep = Sweep::begin<ROW>(frame, index);
     const View& view = frame.view;
     Precisions precisions[BLOCKS];
     bool bad[3] = {};
@@ -215,10 +248,14 @@ inline Status information_tile(Frame& frame, int index, const float* inv_var_col
         const uint32_t count = sweep.items.counts[b];
         if (!count) continue;
         const Block block(sweep.tile, b, view);
-        information_block(sweep, block, count, precisions[b], Replay(block, sweep.items.T + b * LANES));
+        of_block(sweep, block, count, precisions[b], Replay(block, sweep.items.T + b * LANES));
         sweep.items.skip(count);
     }
     return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
+}
+template <DepthKind KIND>
+inline Status information_tile(Frame& frame, int index, const float* inv_var_color, const float* inv_var_depth, const float* residual) {
+    return over_precisions<INFORMATION_ROW>(frame, index, inv_var_color, inv_var_depth, residual, information_block<KIND>);
 }
 
 // ---------------------------------------------------------------- contributions

@@ -1,0 +1,108 @@
+"""The compiled kernels keep their bars in scenes that hypothesis makes up; see `agreement` for what a bar is.
+
+Every Gaussian of a scene has one of several shapes, places and opacities; hypothesis looks for the combination that
+fails and shrinks it to the fewest Gaussians. The draws are the same in every run.
+"""
+
+import hashlib
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.kernels import DepthKind, Rasterizer, available_isas
+from pipeline.kernels.types import DEPTH_KINDS
+from tests.kernels.agreement import compare, outputs
+from tests.kernels.drawn_scenes import (
+    OPACITIES,
+    PLACES,
+    SHAPES,
+    cameras,
+    crowded_scene,
+    crowded_scenes,
+    made_scene,
+    mixed_scenes,
+)
+from tests.kernels.scenes import Scene
+
+
+def examples(count: int) -> settings:
+    return settings(
+        max_examples=count, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+    )
+
+
+def assert_agreement(scene: Scene, depth: DepthKind = "blended") -> None:
+    failed = [
+        f"{error.name}: {error.relative:.1e}" for error in compare(scene, depth=depth) if not error.passes
+    ]
+    assert not failed, failed
+
+
+depths = st.sampled_from(DEPTH_KINDS)
+
+
+@examples(120)
+@given(scene=mixed_scenes(), depth=depths)
+def test_mixed_scenes(scene, depth):
+    assert_agreement(scene, depth)
+
+
+@examples(6)
+@given(scene=crowded_scenes(most=1500), depth=depths)
+def test_thousands_on_one_pixel(scene, depth):
+    assert_agreement(scene, depth)
+
+
+@pytest.mark.slow
+@examples(3000)
+@given(scene=mixed_scenes(), depth=depths)
+def test_many_mixed_scenes(scene, depth):
+    assert_agreement(scene, depth)
+
+
+@pytest.mark.slow
+@examples(100)
+@given(scene=crowded_scenes(most=5000), depth=depths)
+def test_many_thousands_on_one_pixel(scene, depth):
+    assert_agreement(scene, depth)
+
+
+@pytest.mark.parametrize(("shape", "place", "opacity"), list(itertools.product(SHAPES, PLACES, OPACITIES)))
+def test_every_kind_alone(shape, place, opacity):
+    """One Gaussian: nothing else can hide what is wrong with it."""
+    rng = np.random.default_rng(5)
+    for seed, depth in enumerate(DEPTH_KINDS):
+        fx, fy, cx, cy = rng.uniform([20, 20, 0, 0], [60, 60, 30, 22]).astype(np.float32).tolist()
+        scene = made_scene(seed, [(shape, place, opacity)], PinholeCamera(30, 22, fx, fy, cx, cy))
+        assert_agreement(scene, depth)
+
+
+def digest(isa: str, scene: Scene, depth: DepthKind) -> str:
+    everywhere = np.ones((scene.camera.height, scene.camera.width), dtype=bool)
+    arrays = [array for array, _, _ in outputs(Rasterizer(isa), scene, everywhere, depth).values()]
+    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
+
+
+@examples(40)
+@given(scene=st.one_of(mixed_scenes(), crowded_scenes(most=400)), depth=depths)
+def test_every_build_gives_the_same_bits(scene, depth):
+    assert len({digest(isa, scene, depth) for isa in available_isas()}) == 1
+
+
+@examples(20)
+@given(camera=cameras(), n=st.integers(0, 2))
+def test_scenes_of_next_to_nothing(camera, n):
+    assert_agreement(made_scene(n, [("plain", "plain", "plain")] * n, camera))
+
+
+def test_a_crowd_is_a_crowd():
+    """In the crowded scenes hundreds of Gaussians count in one pixel."""
+    scene = crowded_scene(1, 3000, PinholeCamera(5, 5, 20.0, 20.0, 2.0, 2.0))
+    rasterizer = Rasterizer()
+    rasterizer.forward(scene.gaussians, scene.camera, scene.T_camera_map)
+    _, pixels = rasterizer.contributions()
+    assert (pixels > 0).sum() > 300
