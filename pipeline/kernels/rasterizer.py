@@ -45,7 +45,7 @@ _OK, _BAD_GAUSSIANS, _BAD_FIRST, _BAD_SECOND, _BAD_THIRD, _TOO_MANY = range(6)  
 
 
 def available_isas() -> list[str]:
-    """Builds that this processor can run, fastest first: "avx512", "avx2", "portable"."""
+    """Builds that this processor can run, fastest first: "avx512", "avx2", "neon", "portable"."""
     return list(_raster.available_isas())
 
 
@@ -69,7 +69,7 @@ class Rasterizer:
 
     @property
     def isa(self) -> str:
-        """The instruction set in use: "avx512", "avx2" or "portable"."""
+        """The instruction set in use: "avx512", "avx2", "neon" or "portable"."""
         return self._raster.isa
 
     def forward(

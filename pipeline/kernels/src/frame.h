@@ -29,6 +29,11 @@ public:
     }
     __attribute__((always_inline)) T* data() const { return data_; }
     __attribute__((always_inline)) size_t bytes() const { return capacity_ * sizeof(T); }
+    __attribute__((always_inline)) void release() {
+        release_aligned(data_);
+        data_ = nullptr;
+        capacity_ = 0;
+    }
 
 private:
     __attribute__((always_inline)) void grow(size_t count, size_t kept) {
@@ -69,46 +74,77 @@ struct alignas(64) Splat {
     float M11, M12, M22;       // 1/px
     float log2_opacity;
     float r, g, b, z;          // colour, depth in metres
-    float extent_x, extent_y;  // half size of the box in which alpha >= 1/255, px
-    float skew, upright;       // correlation c of x and y on the screen, sqrt(1 - c^2)
     float slope_x, slope_y;    // of the depth along e, metres; set only for ray_plane
+    float spare[4];
 };
 
-// Where the rows of sums of one Gaussian lie while the lists are made.
-struct RowRange {
-    uint32_t offset, count;
+// What the ellipse alpha >= 1/255 of a Gaussian covers. With t = dy / Y, Y its half height, and c the correlation of x and
+// y on the screen, its sides are at dx = X (c t +- sqrt(1 - c^2) sqrt(1 - t^2)).
+struct alignas(32) Footprint {
+    float blocks_u, v;                 // centre: in blocks of 4 px, in px
+    float per_pixel;                   // 1 / Y
+    float skew;                        // c
+    float wide_skew, wide_upright;     // X c and X sqrt(1 - c^2), in blocks
+    uint32_t tile_columns, tile_rows;  // the tiles that it may touch, a TileRange each
 };
-// Intersections of one stretch of the depth order, as they are found.
-struct StretchRecords {
-    Scratch<uint32_t> tiles, splats;
-    Scratch<uint16_t> blocks;
-    size_t count = 0, opened = 0;
+
+// The records of a Gaussian in one band.
+struct RecordRange {
+    uint32_t count, first;
+};
+// What a record still lacks to enter a list: index in the caller's arrays, and what leads from the record to its row.
+struct ListEntry {
+    uint32_t id, to_row;
+};
+struct RowsAndVisible {
+    uint32_t rows = 0, visible = 0;
+};
+// Some rows of tiles: what one thread lists. The lists do not depend on how the image is cut.
+struct Band {
+    int first, last;                    // rows of tiles, both included
+    size_t member_count = 0, record_count = 0;
+    Scratch<uint32_t> ids;              // of the members, Gaussians whose box meets the band, ascending
+    Scratch<Footprint> own_footprints;
+    const Footprint* footprints;        // of the members: own, or all where there is only one band
+    Scratch<uint32_t> chunk_first;      // first member out of every projection chunk
+    Scratch<uint64_t> keys, keys_swap;  // depth above, member below
+    Scratch<uint32_t> order;            // members by depth
+    Scratch<RecordRange> ranges;        // per member
+    Scratch<uint32_t> rows_above;       // per member, how many rows it has in the bands above
+    Scratch<ListEntry> entries;         // per member
+    Scratch<uint32_t> record_tiles, record_members;  // records: one Gaussian in one tile each, by depth
+    Scratch<uint16_t> record_blocks;
+    Scratch<uint32_t> tile_places;      // per tile of the band: number of records, then where they go
 };
 
 constexpr int TILE = 16;                   // pixels; a tile is 16 blocks of 4x4, a block is one vector
 constexpr int BLOCKS = 16;                 // of a tile
 constexpr int LIST_SPARE = 16;             // zeros behind the lists of tiles: readers load whole vectors
-constexpr int MOST_STRETCHES = 64;         // of the depth order, for as many threads; the lists do not depend on it
+constexpr int MOST_BANDS = 64;
+constexpr uint64_t MOST_INTERSECTIONS = 1u << 27;  // 1.3 GB of records, as much of lists, 8.6 GB of gradient rows
 constexpr int POSE_CHUNKS = 64;
 
 // Everything between the calls of one rasterizer.
 struct Frame {
     View view;
     int threads = 1;
-    size_t drawn_count = 0, visible = 0, intersection_count = 0;
+    size_t visible = 0, intersection_count = 0;
     int tiles_x = 0, tiles_y = 0;
 
     Scratch<Splat> splats;                   // by index in the caller's arrays; holds anything where not visible
-    Scratch<uint64_t> depth_keys, depth_keys_swap;  // depth above, index below
-    Scratch<uint32_t> radix_counts;
-    Scratch<uint32_t> chunk_start;           // of the drawn Gaussians of every projection chunk
-    Scratch<uint32_t> drawn, depth_order;    // indices of the drawn Gaussians, ascending and by depth
-    Scratch<uint32_t> visible_ids;           // indices of those that touch a tile, ascending
-    Scratch<uint32_t> first_row;             // per visible Gaussian, visible + 1: its rows are contiguous
-    Scratch<RowRange> row_ranges;            // by index in the caller's arrays
-    StretchRecords stretches[MOST_STRETCHES];
-    Scratch<uint32_t> stretch_tile_counts;
+    Scratch<Footprint> footprints;           // the same
+    Scratch<uint64_t> depth_keys;            // depth above, index below; the drawn ones at the front of each chunk
+    size_t chunks = 0;                       // of Gaussians that are projected together
+    Scratch<uint32_t> chunk_drawn;           // per chunk, how many of them are drawn
+    Scratch<RowsAndVisible> chunk_rows;      // per chunk, what lies before it
+    Scratch<uint64_t> row_weights;           // per row of tiles, about how much there is to list
     Scratch<uint16_t> wanted_blocks;         // per tile: bit b: block b has a pixel of the image that is to be drawn
+    Band bands[MOST_BANDS];
+    int band_count = 0;
+    Scratch<uint32_t> rows_of_id;            // by index in the caller's arrays: number of rows, then the first
+    uint64_t records_found = 0;              // by all bands; too many end the search
+    Scratch<uint32_t> visible_ids;           // index of those that touch a tile, ascending
+    Scratch<uint32_t> first_row;             // per visible Gaussian, visible + 1: its rows of sums are contiguous
     Scratch<uint32_t> tile_start;            // tiles + 1
     // Gaussians of each tile, by tile, then depth: index in `splats`, row of sums, bit b: may touch 4x4 block b.
     Scratch<uint32_t> list_splats, list_rows;
@@ -129,10 +165,12 @@ struct Frame {
     size_t bytes() const {  // held between calls
         size_t total = 0;
         const auto add = [&](const auto&... memory) { total += (memory.bytes() + ...); };
-        add(splats, depth_keys, depth_keys_swap, radix_counts, chunk_start, drawn, depth_order, visible_ids, first_row, row_ranges,
-            stretch_tile_counts, wanted_blocks, tile_start, list_splats, list_rows, list_blocks, item_start, block_items, item_positions,
-            item_pixels, transmittance, evaluated, tile_splats, front, rows, pose_parts, loss_parts);
-        for (const StretchRecords& stretch : stretches) add(stretch.tiles, stretch.splats, stretch.blocks);
+        add(splats, footprints, depth_keys, chunk_drawn, chunk_rows, row_weights, wanted_blocks, rows_of_id, visible_ids, first_row, tile_start,
+            list_splats, list_rows, list_blocks, item_start, block_items, item_positions, item_pixels, transmittance, evaluated, tile_splats,
+            front, rows, pose_parts, loss_parts);
+        for (const Band& band : bands)
+            add(band.ids, band.own_footprints, band.chunk_first, band.keys, band.keys_swap, band.order, band.ranges, band.rows_above,
+                band.entries, band.record_tiles, band.record_members, band.record_blocks, band.tile_places);
         return total;
     }
 };

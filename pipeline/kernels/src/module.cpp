@@ -27,6 +27,9 @@ extern const Kernels kernels_avx512;
 #if defined(HAVE_AVX2)
 extern const Kernels kernels_avx2;
 #endif
+#if defined(HAVE_NEON)
+extern const Kernels kernels_neon;
+#endif
 extern const Kernels kernels_portable;
 
 void* allocate_aligned(size_t bytes) {
@@ -96,6 +99,9 @@ static std::vector<const Kernels*> usable_kernels() {
 #if defined(HAVE_AVX2)
     if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2"))
         usable.push_back(&kernels_avx2);
+#endif
+#if defined(HAVE_NEON)
+    usable.push_back(&kernels_neon);  // part of every 64-bit ARM processor
 #endif
     usable.push_back(&kernels_portable);
     return usable;

@@ -52,20 +52,31 @@ inline void rotation_of_quaternion(const Vec* q, Vec* R) {
     R[8] = one - two * (x * x + y * y);
 }
 
+// Sixteen centres: in the camera frame, as slopes x/z, y/z, on the screen.
+struct CameraPoint16 {
+    Vec x, y, z, inverse_z, slope_x, slope_y, u, v;
+    CameraPoint16(const View& view, const Vec* mean) {
+        const float *W = view.R, *t = view.t;
+        x = fma(Vec(W[0]), mean[0], fma(Vec(W[1]), mean[1], fma(Vec(W[2]), mean[2], Vec(t[0]))));
+        y = fma(Vec(W[3]), mean[0], fma(Vec(W[4]), mean[1], fma(Vec(W[5]), mean[2], Vec(t[1]))));
+        z = fma(Vec(W[6]), mean[0], fma(Vec(W[7]), mean[1], fma(Vec(W[8]), mean[2], Vec(t[2]))));
+        inverse_z = Vec(1.0f) / max(z, Vec(NEAR_M));
+        slope_x = x * inverse_z;
+        slope_y = y * inverse_z;
+        u = fma(Vec(view.fx), slope_x, Vec(view.cx));
+        v = fma(Vec(view.fy), slope_y, Vec(view.cy));
+    }
+};
+inline float slope_limit(int pixels, float focal) { return FIELD_MARGIN * 0.5f * pixels / focal; }
+
 inline Splat16 project16(const View& view, const Vec* mean, const Vec* quat, const Vec* log_scale) {
     Splat16 s;
-    const float *W = view.R, *t = view.t;
-    s.x = fma(Vec(W[0]), mean[0], fma(Vec(W[1]), mean[1], fma(Vec(W[2]), mean[2], Vec(t[0]))));
-    s.y = fma(Vec(W[3]), mean[0], fma(Vec(W[4]), mean[1], fma(Vec(W[5]), mean[2], Vec(t[1]))));
-    s.z = fma(Vec(W[6]), mean[0], fma(Vec(W[7]), mean[1], fma(Vec(W[8]), mean[2], Vec(t[2]))));
-    s.inverse_z = Vec(1.0f) / max(s.z, Vec(NEAR_M));
-    s.slope_x = s.x * s.inverse_z;
-    s.slope_y = s.y * s.inverse_z;
-    s.u = fma(Vec(view.fx), s.slope_x, Vec(view.cx));
-    s.v = fma(Vec(view.fy), s.slope_y, Vec(view.cy));
+    const float* W = view.R;
+    const CameraPoint16 c(view, mean);
+    s.x = c.x, s.y = c.y, s.z = c.z, s.inverse_z = c.inverse_z;
+    s.slope_x = c.slope_x, s.slope_y = c.slope_y, s.u = c.u, s.v = c.v;
 
-    const Vec limit_x(FIELD_MARGIN * 0.5f * view.width / view.fx);
-    const Vec limit_y(FIELD_MARGIN * 0.5f * view.height / view.fy);
+    const Vec limit_x(slope_limit(view.width, view.fx)), limit_y(slope_limit(view.height, view.fy));
     const Vec clamped_x = min(max(s.slope_x, -limit_x), limit_x);
     const Vec clamped_y = min(max(s.slope_y, -limit_y), limit_y);
     s.inside_x = select_or_zero((s.slope_x >= -limit_x) & (s.slope_x <= limit_x), Vec(1.0f));

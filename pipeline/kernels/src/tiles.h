@@ -1,7 +1,7 @@
 // Tiles of 16x16 pixels and their sixteen blocks of 4x4: one block is one vector, its lanes row by row.
 #pragma once
 
-#include "visibility.h"
+#include "lists.h"
 
 #if defined(_OPENMP)
 #include <omp.h>
@@ -163,7 +163,6 @@ inline void prepare_items(Frame& frame) {
 // Which Gaussians lie where.
 inline Status make_lists(Frame& frame, const GaussianArrays& gaussians) {
     if (!project_all(frame, gaussians)) return Status::bad_gaussians;
-    sort_by_depth(frame, gaussians.count);
     const Status status = bin(frame);
     if (status == Status::ok) prepare_items(frame);
     return status;

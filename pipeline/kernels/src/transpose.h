@@ -61,6 +61,14 @@ inline void store_rows16(float* rows, const Vec* columns) {
         for (int p = 0; p < 4; p++) _mm512_store_ps(rows + 16 * (4 * p + r), out[p]);
     }
 }
+inline void store_rows8(float* rows, const Vec* columns) {
+    __m512 quads[2][4], out[4];
+    for (int k = 0; k < 2; k++) transpose_quads(columns[4 * k].v, columns[4 * k + 1].v, columns[4 * k + 2].v, columns[4 * k + 3].v, quads[k]);
+    for (int r = 0; r < 4; r += 2) {
+        transpose_parts(quads[0][r], quads[1][r], quads[0][r + 1], quads[1][r + 1], out);
+        for (int p = 0; p < 4; p++) _mm512_store_ps(rows + 8 * (4 * p + r), out[p]);
+    }
+}
 
 // Rows become columns.
 inline void transpose16(Vec* a) {
@@ -149,23 +157,26 @@ inline void load_rows4(const float* rows, Vec* columns) {
                     load_parts(rows + 44, rows + 60), high);
     for (int k = 0; k < 4; k++) columns[k] = Vec(low[k], high[k]);
 }
-// Columns k..k+7 of eight rows.
-inline void store_rows8(float* rows, const __m256* columns) {
+// Eight columns of eight rows, which lie `stride` floats apart.
+inline void store_8x8(float* rows, int stride, const __m256* columns) {
     __m256 left[4], right[4];  // of rows r and 4 + r
     transpose_quads(columns[0], columns[1], columns[2], columns[3], left);
     transpose_quads(columns[4], columns[5], columns[6], columns[7], right);
     for (int r = 0; r < 4; r++) {
-        _mm256_store_ps(rows + 16 * r, _mm256_permute2f128_ps(left[r], right[r], 0x20));
-        _mm256_store_ps(rows + 16 * (r + 4), _mm256_permute2f128_ps(left[r], right[r], 0x31));
+        _mm256_store_ps(rows + stride * r, _mm256_permute2f128_ps(left[r], right[r], 0x20));
+        _mm256_store_ps(rows + stride * (r + 4), _mm256_permute2f128_ps(left[r], right[r], 0x31));
     }
 }
+inline void store_columns8(float* rows, int stride, const Vec* columns) {
+    __m256 low[8], high[8];
+    for (int k = 0; k < 8; k++) low[k] = columns[k].a, high[k] = columns[k].b;
+    store_8x8(rows, stride, low);
+    store_8x8(rows + 8 * stride, stride, high);
+}
+inline void store_rows8(float* rows, const Vec* columns) { store_columns8(rows, 8, columns); }
 inline void store_rows16(float* rows, const Vec* columns) {
-    for (int k = 0; k < 16; k += 8) {
-        __m256 low[8], high[8];
-        for (int i = 0; i < 8; i++) low[i] = columns[k + i].a, high[i] = columns[k + i].b;
-        store_rows8(rows + k, low);
-        store_rows8(rows + 16 * 8 + k, high);
-    }
+    store_columns8(rows, 16, columns);
+    store_columns8(rows + 8, 16, columns + 8);
 }
 
 // Rows and columns exchanged in a quarter of a 16x16 matrix.
@@ -225,6 +236,83 @@ inline void load_words(const uint16_t* words, int count, uint16_t* out) {
     _mm256_store_si256(reinterpret_cast<__m256i*>(out), _mm256_and_si256(real, _mm256_loadu_si256(reinterpret_cast<const __m256i*>(words))));
 }
 
+#elif !defined(KERNEL_PORTABLE) && defined(__aarch64__)
+
+inline void load_rows3(const float* rows, Vec* columns) {
+    for (int p = 0; p < 4; p++) {
+        const float32x4x3_t part = vld3q_f32(rows + 12 * p);
+        for (int k = 0; k < 3; k++) columns[k].q[p] = part.val[k];
+    }
+}
+inline void load_rows4(const float* rows, Vec* columns) {
+    for (int p = 0; p < 4; p++) {
+        const float32x4x4_t part = vld4q_f32(rows + 16 * p);
+        for (int k = 0; k < 4; k++) columns[k].q[p] = part.val[k];
+    }
+}
+// 4x4 transpose
+inline void transpose_quads(float32x4_t a, float32x4_t b, float32x4_t c, float32x4_t d, float32x4_t* out) {
+    const float64x2_t ab_even = vreinterpretq_f64_f32(vtrn1q_f32(a, b)), ab_odd = vreinterpretq_f64_f32(vtrn2q_f32(a, b));
+    const float64x2_t cd_even = vreinterpretq_f64_f32(vtrn1q_f32(c, d)), cd_odd = vreinterpretq_f64_f32(vtrn2q_f32(c, d));
+    out[0] = vreinterpretq_f32_f64(vtrn1q_f64(ab_even, cd_even));
+    out[1] = vreinterpretq_f32_f64(vtrn1q_f64(ab_odd, cd_odd));
+    out[2] = vreinterpretq_f32_f64(vtrn2q_f64(ab_even, cd_even));
+    out[3] = vreinterpretq_f32_f64(vtrn2q_f64(ab_odd, cd_odd));
+}
+template <int WIDTH>
+inline void store_rows(float* rows, const Vec* columns) {
+    for (int k = 0; k < WIDTH; k += 4)
+        for (int p = 0; p < 4; p++) {
+            float32x4_t out[4];
+            transpose_quads(columns[k].q[p], columns[k + 1].q[p], columns[k + 2].q[p], columns[k + 3].q[p], out);
+            for (int r = 0; r < 4; r++) vst1q_f32(rows + WIDTH * (4 * p + r) + k, out[r]);
+        }
+}
+inline void store_rows8(float* rows, const Vec* columns) { store_rows<8>(rows, columns); }
+inline void store_rows16(float* rows, const Vec* columns) { store_rows<16>(rows, columns); }
+inline void transpose16(Vec* a) {
+    Vec out[16];
+    for (int k = 0; k < 4; k++)
+        for (int p = 0; p < 4; p++) {
+            float32x4_t quad[4];
+            transpose_quads(a[4 * k].q[p], a[4 * k + 1].q[p], a[4 * k + 2].q[p], a[4 * k + 3].q[p], quad);
+            for (int r = 0; r < 4; r++) out[4 * p + r].q[k] = quad[r];
+        }
+    for (int i = 0; i < 16; i++) a[i] = out[i];
+}
+template <class Row>
+inline void load_columns8(Row row, Vec* columns) {
+    for (int k = 0; k < 8; k += 4)
+        for (int p = 0; p < 4; p++) {
+            float32x4_t out[4];
+            transpose_quads(vld1q_f32(row(4 * p) + k), vld1q_f32(row(4 * p + 1) + k), vld1q_f32(row(4 * p + 2) + k),
+                            vld1q_f32(row(4 * p + 3) + k), out);
+            for (int c = 0; c < 4; c++) columns[k + c].q[p] = out[c];
+        }
+}
+inline uint32_t positions_with_bit(const uint16_t* words, uint32_t count, int bit, uint32_t* out) {
+    uint32_t found = 0;
+    const uint16x8_t test = vdupq_n_u16(static_cast<uint16_t>(1 << bit));
+    for (uint32_t i = 0; i < count; i += 16) {
+        const uint32_t left = count - i, inside = left < 16 ? (1u << left) - 1 : 0xffffu;
+        const uint8x16_t bytes = low_halves(vtstq_u16(vld1q_u16(words + i), test), vtstq_u16(vld1q_u16(words + i + 8), test));
+        for (uint32_t hit = bits(bytes) & inside; hit; hit &= hit - 1) out[found++] = i + static_cast<uint32_t>(__builtin_ctz(hit));
+    }
+    return found;
+}
+inline void load_positions(const uint32_t* numbers, int count, uint32_t* out) {
+    const uint32x4_t first = vdupq_n_u32(numbers[0]), last = vdupq_n_u32(static_cast<uint32_t>(count)), lanes = {0, 1, 2, 3};
+    for (uint32_t i = 0; i < 16; i += 4) {
+        const uint32x4_t real = vcltq_u32(vaddq_u32(lanes, vdupq_n_u32(i)), last);
+        vst1q_u32(out + i, vbslq_u32(real, vld1q_u32(numbers + i), first));
+    }
+}
+inline void load_words(const uint16_t* words, int count, uint16_t* out) {
+    const uint16x8_t last = vdupq_n_u16(static_cast<uint16_t>(count)), low = {0, 1, 2, 3, 4, 5, 6, 7}, high = vaddq_u16(low, vdupq_n_u16(8));
+    vst1q_u16(out, vandq_u16(vcltq_u16(low, last), vld1q_u16(words)));
+    vst1q_u16(out + 8, vandq_u16(vcltq_u16(high, last), vld1q_u16(words + 8)));
+}
+
 #else
 
 template <int WIDTH>
@@ -259,10 +347,13 @@ inline void load_positions(const uint32_t* numbers, int count, uint32_t* out) {
 inline void load_words(const uint16_t* words, int count, uint16_t* out) {
     for (int i = 0; i < 16; i++) out[i] = i < count ? words[i] : 0;
 }
-inline void store_rows16(float* rows, const Vec* columns) {
+template <int WIDTH>
+inline void store_rows(float* rows, const Vec* columns) {
     for (int lane = 0; lane < LANES; lane++)
-        for (int k = 0; k < 16; k++) rows[16 * lane + k] = columns[k].v[lane];
+        for (int k = 0; k < WIDTH; k++) rows[WIDTH * lane + k] = columns[k].v[lane];
 }
+inline void store_rows8(float* rows, const Vec* columns) { store_rows<8>(rows, columns); }
+inline void store_rows16(float* rows, const Vec* columns) { store_rows<16>(rows, columns); }
 
 #endif
 
@@ -274,7 +365,7 @@ inline Vec load_unaligned(const float* p) {
 
 // Eight counts of bits, right, and eight, left, to eight words of 16 bits: the bits left[i] .. right[i] - 1 of word i.
 // Then, for each half of the words, the transpose of a 4x4 matrix of four-bit numbers.
-#if !defined(KERNEL_PORTABLE)
+#if !defined(KERNEL_PORTABLE) && defined(__AVX2__)
 typedef __m128i Words8;
 
 #if defined(__AVX512F__)
@@ -301,7 +392,8 @@ inline Words8 transpose_nibbles(Words8 x) {
 inline Words8 masked(Words8 x, const uint16_t* low, const uint16_t* high) {
     return _mm_and_si128(x, _mm_unpacklo_epi64(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(low)), _mm_loadl_epi64(reinterpret_cast<const __m128i*>(high))));
 }
-// Stores the words that are not zero, and tile + 0, 1, 2, 3, next_row + 0, 1, 2, 3 for those; returns how many. Writes all eight.
+// Stores the words that are not zero, and of tile + 0, 1, 2, 3 and those + stride the ones of these words; returns how many.
+// Writes all eight.
 #if defined(__AVX512F__)
 inline uint32_t store_nonzero(Words8 x, uint32_t tile, uint32_t stride, uint16_t* words, uint32_t* tiles) {
     const __mmask8 some = _mm_test_epi16_mask(x, x);
@@ -333,6 +425,47 @@ inline uint32_t store_nonzero(Words8 x, uint32_t tile, uint32_t stride, uint16_t
     return __builtin_popcount(some);
 }
 #endif
+
+#elif !defined(KERNEL_PORTABLE) && defined(__aarch64__)
+typedef uint16x8_t Words8;
+
+inline Words8 bits_between(Vec counts) {
+    const auto from = [&](int k) {  // the bits from `count` on; none from 16
+        const int16x8_t count = vuzp1q_s16(vreinterpretq_s16_s32(vcvtq_s32_f32(counts.q[k])), vreinterpretq_s16_s32(vcvtq_s32_f32(counts.q[k + 1])));
+        return vshlq_u16(vdupq_n_u16(0xffff), count);
+    };
+    return vbicq_u16(from(2), from(0));
+}
+inline Words8 transpose_nibbles(Words8 words) {
+    uint64x2_t x = vreinterpretq_u64_u16(words);
+    uint64x2_t t = vandq_u64(veorq_u64(x, vshrq_n_u64(x, 12)), vdupq_n_u64(0x0000f0f00000f0f0));
+    x = veorq_u64(x, veorq_u64(t, vshlq_n_u64(t, 12)));
+    t = vandq_u64(veorq_u64(x, vshrq_n_u64(x, 24)), vdupq_n_u64(0x00000000ff00ff00));
+    return vreinterpretq_u16_u64(veorq_u64(x, veorq_u64(t, vshlq_n_u64(t, 24))));
+}
+inline Words8 masked(Words8 x, const uint16_t* low, const uint16_t* high) {
+    return vandq_u16(x, vcombine_u16(vld1_u16(low), vld1_u16(high)));
+}
+struct Compress8 {  // for every set of bits, their numbers
+    alignas(64) uint8_t lanes[256][8];
+    constexpr Compress8() : lanes() {
+        for (int set = 0; set < 256; set++)
+            for (int bit = 0, n = 0; bit < 8; bit++)
+                if (set >> bit & 1) lanes[set][n++] = static_cast<uint8_t>(bit);
+    }
+};
+alignas(64) static constexpr Compress8 COMPRESS8;
+inline uint32_t store_nonzero(Words8 x, uint32_t tile, uint32_t stride, uint16_t* words, uint32_t* tiles) {
+    const uint16x8_t weights = {1, 2, 4, 8, 16, 32, 64, 128};
+    const uint32_t some = vaddvq_u16(vandq_u16(vtstq_u16(x, x), weights));
+    const uint16x8_t lane = vmovl_u8(vld1_u8(COMPRESS8.lanes[some]));
+    const uint16x8_t bytes = vmlaq_n_u16(vdupq_n_u16(0x0100), lane, 0x0202);  // 2 lane, 2 lane + 1
+    vst1q_u16(words, vreinterpretq_u16_u8(vqtbl1q_u8(vreinterpretq_u8_u16(x), vreinterpretq_u8_u16(bytes))));
+    const auto tile_of = [&](uint32x4_t k) { return vmlaq_n_u32(vaddq_u32(k, vdupq_n_u32(tile)), vshrq_n_u32(k, 2), stride - 4); };
+    vst1q_u32(tiles, tile_of(vmovl_u16(vget_low_u16(lane))));
+    vst1q_u32(tiles + 4, tile_of(vmovl_high_u16(lane)));
+    return static_cast<uint32_t>(__builtin_popcount(some));
+}
 
 #else
 struct Words8 {
