@@ -219,8 +219,8 @@ def sum_information(
             one = FisherSums(len(gaussians))
             rasterizer.fisher(inverse_color, inverse_depth, one)
             wanting = total.observations < config.window_length
-            for name in ("geometry", "color", "opacity", "observations"):
-                getattr(total, name)[wanting] += getattr(one, name)[wanting]
+            for name, array in total.arrays().items():
+                array[wanting] += one.arrays()[name][wanting]
         else:
             rasterizer.fisher(inverse_color, inverse_depth, total)
     return total

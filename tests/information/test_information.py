@@ -106,7 +106,10 @@ def test_windows() -> None:
     assert rolling.observations.max() == 2
     np.testing.assert_array_equal(latest.observations, np.minimum(everything.observations, 2))
     seen_by_both = rolling.observations == 2
-    np.testing.assert_allclose(latest.geometry[seen_by_both], rolling.geometry[seen_by_both], rtol=1e-12)
+    for name, array in latest.arrays().items():
+        wanted = rolling.arrays()[name][seen_by_both]
+        np.testing.assert_allclose(array[seen_by_both], wanted, rtol=1e-12, err_msg=name)
+    assert latest.weight[seen_by_both].any()
     assert (everything.opacity >= latest.opacity).all()
     early = (rolling.observations == 0) & (everything.observations > 0)
     assert early.any()  # seen at the beginning only: forgotten by `rolling`, kept by `per_gaussian`
