@@ -78,8 +78,8 @@ struct alignas(64) Splat {
     float spare[4];
 };
 
-// What the ellipse alpha >= 1/255 of a Gaussian covers. With t = dy / Y, Y its half height, and c the correlation of x and
-// y on the screen, its sides are at dx = X (c t +- sqrt(1 - c^2) sqrt(1 - t^2)).
+// What the ellipse alpha >= 1/255 of a Gaussian covers. With X, Y half its width and height, t = dy / Y, and c the
+// correlation of x and y on the screen, its sides are at dx = X (c t +- sqrt(1 - c^2) sqrt(1 - t^2)).
 struct alignas(32) Footprint {
     float blocks_u, v;                 // centre: in blocks of 4 px, in px
     float per_pixel;                   // 1 / Y
