@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch.autograd.function import once_differentiable
 from pipeline.geometry import se3, so3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels.rasterizer import Rasterizer
+from pipeline.kernels.types import DepthKind
 from pipeline.splat.gaussians import Gaussians
 
 _TAILS = {"means": (3,), "quats_wxyz": (4,), "log_scales": (3,), "colors": (3,), "opacity_logits": ()}
@@ -29,6 +31,7 @@ def rasterize(
     camera: PinholeCamera,
     T_camera_map: ArrayLike,
     background: ArrayLike = (0.0, 0.0, 0.0),
+    depth: DepthKind = "blended",
     xi: torch.Tensor | None = None,
     rasterizer: Rasterizer | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -40,7 +43,7 @@ def rasterize(
 
     Args:
         means, quats_wxyz, log_scales, colors, opacity_logits: float32 CPU tensors [n, 3], [n, 4], [n, 3], [n, 3], [n].
-        camera, T_camera_map, background: as in `Rasterizer.forward`.
+        camera, T_camera_map, background, depth: as in `Rasterizer.forward`.
         xi: float32 or float64 [6], moves the camera to T_map_camera exp(xi) (translation m, rotation rad).
         rasterizer: what draws; by default one of one thread, kept for each thread that calls.
     Raises:
@@ -61,8 +64,10 @@ def rasterize(
             _of_thread.rasterizer = Rasterizer()
         rasterizer = _of_thread.rasterizer
     contiguous = [tensor.contiguous() for tensor in parameters.values()]
-    color, depth, alpha = _Rasterize.apply(rasterizer, camera, T_camera_map, background, xi, *contiguous)
-    return color, depth, alpha
+    color, depths, alpha = _Rasterize.apply(
+        rasterizer, camera, T_camera_map, background, depth, xi, *contiguous
+    )
+    return color, depths, alpha
 
 
 class _Rasterize(torch.autograd.Function):
@@ -75,6 +80,7 @@ class _Rasterize(torch.autograd.Function):
         camera: PinholeCamera,
         T_camera_map: ArrayLike,
         background: ArrayLike,
+        depth: DepthKind,
         xi: torch.Tensor | None,
         *parameters: torch.Tensor,
     ) -> tuple[torch.Tensor, ...]:
@@ -84,10 +90,12 @@ class _Rasterize(torch.autograd.Function):
         arrays = dict(zip(_TAILS, map(_array, parameters), strict=True))
         n = len(parameters[0])
         ctx.gaussians = Gaussians(ids=np.arange(n), anchors=np.zeros(n, dtype=np.int32), **arrays)
-        ctx.rasterizer, ctx.view = rasterizer, (camera, pose, background)
+        ctx.rasterizer = rasterizer
+        ctx.draw = partial(rasterizer.forward, ctx.gaussians, camera, pose, background, depth=depth)
         ctx.save_for_backward(xi, *parameters)  # torch then refuses a backward after a change in place
         ctx.set_materialize_grads(False)
-        render = rasterizer.forward(ctx.gaussians, *ctx.view)
+        render = ctx.draw()
+        ctx.color_shape = render.color.shape
         return tuple(torch.from_numpy(image) for image in (render.color, render.depth, render.alpha))
 
     @staticmethod
@@ -96,17 +104,18 @@ class _Rasterize(torch.autograd.Function):
         xi, *_ = ctx.saved_tensors
         d_color, d_depth, d_alpha = (None if c is None else _array(c.contiguous()) for c in cotangents)
         if d_color is None:
-            camera = ctx.view[0]
-            d_color = np.zeros((camera.height, camera.width, 3), dtype=np.float32)
-        by_pose = ctx.needs_input_grad[4]
+            d_color = np.zeros(ctx.color_shape, dtype=np.float32)
+        by_pose, parameters = ctx.needs_input_grad[5], any(ctx.needs_input_grad[6:])
         if ctx.rasterizer._gaussians is not ctx.gaussians:  # every context has its own
-            ctx.rasterizer.forward(ctx.gaussians, *ctx.view)
-        gradients = ctx.rasterizer.backward(d_color, d_depth, d_alpha, pose=by_pose)
+            ctx.draw()
+        gradients = ctx.rasterizer.backward(d_color, d_depth, d_alpha, pose=by_pose, parameters=parameters)
         by_xi = None
         if by_pose:
             by_xi = torch.from_numpy(_right_jacobian(_array(xi)).T @ gradients.pose).to(xi.dtype)
-        of_parameters = (torch.from_numpy(getattr(gradients, name)) for name in _TAILS)
-        return None, None, None, None, by_xi, *of_parameters
+        of_parameters = [
+            torch.from_numpy(getattr(gradients, name)) if parameters else None for name in _TAILS
+        ]
+        return None, None, None, None, None, by_xi, *of_parameters
 
 
 def _array(tensor: torch.Tensor) -> NDArray[Any]:

@@ -1,4 +1,6 @@
-"""Table of the errors of the compiled kernels against the float64 reference: python -m tests.kernels.accuracy
+"""Table of the errors of the compiled kernels against the float64 reference.
+
+    python -m tests.kernels.accuracy [number of made scenes] [ray_plane]
 
 Relative L2 over the fixed scenes of `scenes` and over made scenes of `drawn_scenes`, the same in every run. "Within
 the bar" is the plain bar; what is beyond it must be so because of its conditioning or be counted in the last column,
@@ -14,6 +16,7 @@ from collections import defaultdict
 import numpy as np
 
 from pipeline.geometry.camera import PinholeCamera
+from pipeline.kernels import DepthKind
 from tests.kernels.agreement import Error, compare
 from tests.kernels.drawn_scenes import OPACITIES, PLACES, SHAPES, made_scene
 from tests.kernels.scenes import KINDS, Scene, make_scene
@@ -42,12 +45,13 @@ def main() -> None:
     fixed: dict[str, list[Error]] = defaultdict(list)
     made: dict[str, list[Error]] = defaultdict(list)
     count = int(sys.argv[1]) if len(sys.argv) > 1 else MADE
+    depth: DepthKind = "ray_plane" if "ray_plane" in sys.argv else "blended"
     for scenes, errors in (
         ((make_scene(kind) for kind in KINDS), fixed),
         ((mixed_scene(seed) for seed in range(count)), made),
     ):
         for scene in scenes:
-            for error in compare(scene):
+            for error in compare(scene, depth=depth):
                 group = group_of(error.name)
                 if group is not None:
                     errors[group].append(error)

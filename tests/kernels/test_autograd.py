@@ -35,19 +35,18 @@ def assert_close(found, wanted, tolerance):
 
 
 @pytest.mark.parametrize("kind", ["plain", "opaque", "wide"])
-@pytest.mark.parametrize("xi_type", [torch.float32, torch.float64])
-def test_gradients_are_those_of_the_reference(kind, xi_type):
+@pytest.mark.parametrize(("xi_type", "depth"), [(torch.float32, "blended"), (torch.float64, "ray_plane")])
+def test_gradients_are_those_of_the_reference(kind, xi_type, depth):
     scene = make_scene(kind)
     parameters, xi = tensors_of(scene), torch.tensor(TWIST, dtype=xi_type, requires_grad=True)
-    images = draw(scene, parameters, xi=xi)
+    images = draw(scene, parameters, depth=depth, xi=xi)
     value, cotangents = weighted(scene, images)
     value.backward()
 
     def reference_at(twist):
         reference = ReferenceRasterizer()
-        render = reference.forward(
-            scene.gaussians, scene.camera, se3.exp(-twist) @ scene.T_camera_map, scene.background
-        )
+        pose = se3.exp(-twist) @ scene.T_camera_map
+        render = reference.forward(scene.gaussians, scene.camera, pose, scene.background, depth=depth)
         assert reference.gate_margin() > 1e-5  # rounding does not decide what is drawn
         return reference, render
 

@@ -14,6 +14,7 @@ from tests.kernels.scenes import make_scene, random_gaussians
 CAMERA = PinholeCamera(203, 117, 90.0, 92.0, 101.2, 57.1)
 LOSS = LossWeights(color_huber=0.1, depth_weight=0.5, depth_huber_m=0.02, alpha_weight=0.02)
 CALLS = [(isa, threads) for isa in available_isas() for threads in (1, 2, 3, 5)]
+QUICK = [call for call in CALLS if call[0] != "portable" or call[1] in (1, 3)]  # it imitates fma, at length
 
 
 def digest(rasterizer: Rasterizer) -> str:
@@ -50,7 +51,7 @@ def one_digest() -> str:
     return digest(Rasterizer(*CALLS[0]))
 
 
-@pytest.mark.parametrize(("isa", "threads"), CALLS)
+@pytest.mark.parametrize(("isa", "threads"), QUICK)
 def test_one_digest_for_threads_and_instruction_sets(isa, threads):
     assert digest(Rasterizer(isa, threads)) == one_digest()
 
@@ -62,7 +63,7 @@ def digest_of(call: tuple[str, int]) -> str:
 def test_one_digest_for_processes():
     """Fresh processes, each with addresses and hash seeds of its own."""
     with multiprocessing.get_context("spawn").Pool(2) as pool:
-        assert set(pool.map(digest_of, CALLS * 2, chunksize=len(CALLS))) == {one_digest()}
+        assert set(pool.map(digest_of, QUICK * 2, chunksize=len(QUICK))) == {one_digest()}
 
 
 def be_busy() -> None:

@@ -26,7 +26,7 @@ from tests.kernels.drawn_scenes import (
     made_scene,
     mixed_scenes,
 )
-from tests.kernels.scenes import Scene
+from tests.kernels.scenes import KINDS, Scene, make_scene
 
 
 def examples(count: int) -> settings:
@@ -79,6 +79,12 @@ def test_every_kind_alone(shape, place, opacity):
         fx, fy, cx, cy = rng.uniform([20, 20, 0, 0], [60, 60, 30, 22]).astype(np.float32).tolist()
         scene = made_scene(seed, [(shape, place, opacity)], PinholeCamera(30, 22, fx, fy, cx, cy))
         assert_agreement(scene, depth)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("depth", DEPTH_KINDS)
+def test_fixed_scenes(kind, depth):
+    assert_agreement(make_scene(kind), depth)
 
 
 def digest(isa: str, scene: Scene, depth: DepthKind) -> str:
