@@ -34,8 +34,8 @@ extern const Kernels kernels_neon;
 extern const Kernels kernels_portable;
 
 void* allocate_aligned(size_t bytes) {
-    void* memory = std::aligned_alloc(64, (bytes + 63) / 64 * 64);
-    if (!memory) throw std::bad_alloc();
+    void* memory = nullptr;
+    if (posix_memalign(&memory, 64, bytes ? bytes : 1)) throw std::bad_alloc();
     return memory;
 }
 void release_aligned(void* memory) { std::free(memory); }
@@ -70,6 +70,7 @@ public:
     static nb::ndarray<nb::numpy, float, nb::ndim<1>> array(size_t count) {
         size_t capacity = 1024;
         while (capacity < count) capacity *= 2;
+        if (!SLACK) capacity = count;
         auto* loan = new Loan{instance().take(capacity), capacity};
         const nb::capsule owner(loan, [](void* p) noexcept {
             auto* loan = static_cast<Loan*>(p);
