@@ -243,6 +243,8 @@ struct Kernels {
     Status (*full_fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth, double* information);
     Status (*fit)(Frame&, const GaussianArrays&, const Loss&, LossValues&, const GradientArrays&);
     void (*adam)(const AdamStep&, int threads);
+    double (*fma_rate)(int threads, double seconds);                              // of the machine, GFLOP/s
+    void (*bandwidth)(int threads, double seconds, double* read, double* copied);  // GB/s
 };
 
 }  // namespace raster

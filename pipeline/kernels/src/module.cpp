@@ -130,6 +130,21 @@ static const Kernels* kernels_named(const std::string& isa) {
     throw std::invalid_argument("isa: " + isa + " is not available on this processor");
 }
 
+// Peaks of the machine, over `seconds`: GFLOP/s of multiply-adds; GB/s of reading and of copying.
+static double fma_rate(const std::string& isa, int threads, double seconds) {
+    const Kernels* kernels = kernels_named(isa);
+    const nb::gil_scoped_release unlocked;
+    return kernels->fma_rate(threads, seconds);
+}
+static nb::tuple bandwidth(int threads, double seconds) {
+    double read = 0.0, copied = 0.0;
+    {
+        const nb::gil_scoped_release unlocked;
+        usable_kernels().front()->bandwidth(threads, seconds, &read, &copied);
+    }
+    return nb::make_tuple(read, copied);
+}
+
 // Shapes are checked by pipeline.kernels.optimiser, the only caller. The lists have an array for each kind of parameter.
 static void adam(const std::string& isa, const std::vector<Inputs>& values, const std::vector<Inputs>& gradients,
                  const std::vector<Floats>& first, const std::vector<Floats>& second, const std::vector<Floats>& out, const Inputs& rates,
@@ -296,6 +311,8 @@ NB_MODULE(_raster, m) {
         .def("contributions", &Raster::contributions);
     m.def("adam", &raster::adam);
     m.def("empty", &raster::OutputPool::array);
+    m.def("fma_rate", &raster::fma_rate);
+    m.def("bandwidth", &raster::bandwidth);
     m.def("available_isas", [] {
         std::vector<std::string> names;
         for (const raster::Kernels* kernels : raster::usable_kernels()) names.push_back(kernels->name);
