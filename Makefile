@@ -6,9 +6,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
 SOURCES := pyproject.toml CMakeLists.txt $(wildcard pipeline/kernels/src/*)
+SANITIZED := build/sanitize/.built
 DEMO := outputs/demo
 
-.PHONY: help setup demo test bench lint format check-full clean
+.PHONY: help setup demo test bench lint format sanitize check-full clean
 .DEFAULT_GOAL := help
 
 help:
@@ -16,7 +17,7 @@ help:
 	@echo "make test        set up, then run the tests"
 	@echo "make lint        ruff and mypy"
 	@echo "make bench       speed of the kernels, side by side with plain torch"
-	@echo "make check-full  the slow checks as well (minutes)"
+	@echo "make check-full  the slow checks as well, and the kernels under sanitizers (minutes)"
 
 setup: $(STAMP)
 
@@ -37,8 +38,21 @@ demo: setup
 test: setup
 	$(BIN)/python -m pytest -m "not slow"
 
-check-full: setup
+check-full: setup sanitize
 	$(BIN)/python -m pytest
+
+# The tests of the kernels with every access to memory and every operation checked. CPython itself leaks on purpose.
+sanitize: setup $(SANITIZED)
+	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
+	LD_PRELOAD="$$(c++ -print-file-name=libasan.so) $$(c++ -print-file-name=libstdc++.so)" \
+	DUAGC_RASTER=$$(echo $(dir $(SANITIZED))pipeline/kernels/_raster*.so) \
+	$(BIN)/python -m pytest --capture=sys -p tests.kernels.other_build -m "not slow" tests/kernels
+
+$(SANITIZED): $(SOURCES)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --upgrade --target $(dir $@) \
+	  --config-settings=build-dir=$(dir $@)cmake --config-settings=cmake.define.DUAGC_SANITIZE=ON \
+	  --config-settings=install.strip=false .
+	touch $@
 
 bench: setup
 	$(BIN)/duagc bench raster

@@ -3,7 +3,7 @@
 import json
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -326,9 +326,69 @@ def config_check(config: Annotated[Path, typer.Argument(show_default=False)]) ->
 
 
 @bench_app.command("raster")
-def bench_raster(as_json: Json = False) -> None:
-    """Time the rasterizer beside plain torch."""
-    from pipeline.kernels import bench
+def bench_raster(
+    sizes: Annotated[str, typer.Option(help="Image sizes.")] = "320x240,640x480,1200x680",
+    gaussians: Annotated[
+        str, typer.Option(help="Numbers of Gaussians; k and M are understood.")
+    ] = "60k,300k",
+    threads: Annotated[str, typer.Option(help="Numbers of threads.")] = "1,2",
+    isa: Annotated[
+        str | None,
+        typer.Option(
+            help="Instruction sets; by default all, the portable one in one round only.", show_default=False
+        ),
+    ] = None,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds that are timed.")] = 7,
+    full: Annotated[
+        bool, typer.Option("--full", help="Also 1M Gaussians, and 15 rounds: some minutes.")
+    ] = False,
+    no_torch: Annotated[bool, typer.Option("--no-torch", help="Without the plain torch rasterizer.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Time the rasterizer, beside the machine's own peak and a plain torch rasterizer.
 
-    result: Any = bench.run()
-    print(json.dumps(result, indent=2) if as_json else bench.format_table(result))
+    Lists are separated by commas. Takes about two minutes on an idle machine; a busy one gives other times.
+    """
+    from pipeline.kernels import available_isas, bench
+
+    isas = available_isas() if isa is None else isa.split(",")
+    for name in isas:
+        if name not in available_isas():
+            raise typer.BadParameter(
+                f"{name!r} is not one of {', '.join(available_isas())}", param_hint="--isa"
+            )
+    plan = bench.Plan(
+        sizes=tuple(_sizes(sizes)),
+        gaussians=tuple(_counts("--gaussians", "60k,300k,1M" if full else gaussians)),
+        threads=tuple(_counts("--threads", threads)),
+        rounds=max(rounds, 15) if full else rounds,
+        torch_too=not no_torch,
+        isas=tuple(isas),
+        portable_everywhere=isa is not None,
+    )
+    result = bench.run(plan)
+    print(json.dumps(result, indent=2) if as_json else bench.format_tables(result))
+
+
+def _counts(option: str, text: str) -> list[int]:
+    """Positive numbers out of text like 60k,1M."""
+    counts = []
+    for word in text.split(","):
+        digits, unit = (word[:-1], word[-1]) if word[-1:] in ("k", "M") else (word, "")
+        if not digits.isdecimal() or int(digits) == 0:
+            raise typer.BadParameter(
+                f"{word!r} is not a positive number, such as 2, 60k or 1M", param_hint=option
+            )
+        counts.append(int(digits) * {"": 1, "k": 1000, "M": 1_000_000}[unit])
+    return counts
+
+
+def _sizes(text: str) -> list[tuple[int, int]]:
+    """Widths and heights out of text like 320x240,640x480."""
+    sizes = []
+    for word in text.split(","):
+        width, cross, height = word.partition("x")
+        if not (cross and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+            raise typer.BadParameter(f"{word!r} is not an image size, such as 640x480", param_hint="--sizes")
+        sizes.append((int(width), int(height)))
+    return sizes

@@ -1,91 +1,350 @@
-"""Speed of the rasterizer on a synthetic room, beside a plain torch tile rasterizer in the same run.
+"""Speed of the rasterizer on a synthetic room, beside a plain torch tile rasterizer and the machine's own peak.
 
-Rounds of all candidates alternate, so that other load on the machine hits them alike. Time with one thread is the
-thread's own CPU time (that of the process would count idle helpers that still spin), with more threads wall time; the
-median over the rounds is reported.
+Everything is measured in one run. Rounds of all candidates alternate, so that other load on the machine hits them
+alike. One thread: the thread's own CPU time (that of the process would count idle helpers that still spin), the median
+over the rounds. More threads: wall time, the lower quartile.
+
+The fraction of the peak is counted by hand, not measured: what a pair of pixel and Gaussian needs (`FLOPS`), times the
+drawn pairs, over the time of the whole call, over the rate of multiply-adds of the same instruction set on as many
+threads. Projection, sorting, lists and the chain to the parameters take time but are not counted, nor are lanes of a
+vector in which nothing is drawn. The fraction of the bandwidth is counted alike: arrays and scratch memory of a pass,
+each written or read once, over the rate of a copy; what stays in a cache counts too.
 """
 
 from __future__ import annotations
 
+import os
+import platform
 import statistics
 import time
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import repeat
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.geometry import so3
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import reference
+from pipeline.kernels import _raster, reference
 from pipeline.kernels.rasterizer import Rasterizer, available_isas
-from pipeline.kernels.types import FisherSums
+from pipeline.kernels.types import FisherSums, Gradients, LossWeights, Statistics
+from pipeline.progress import track
 from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.losses import LossConfig, rgbd_loss
 
-SIZES_PX = ((320, 240), (640, 480), (1200, 680))
+Size = tuple[int, int]
+
+SIZES_PX: tuple[Size, ...] = ((320, 240), (640, 480), (1200, 680))
+GAUSSIANS = (60_000, 300_000, 1_000_000)
 THREADS = (1, 2)
-GAUSSIANS = 60_000
+ROUNDS = 7
 ROOM_M = np.array([6.0, 3.0, 5.0])  # x, y down, z
 SPACING_PER_SCALE, FLATNESS = 0.62, 0.13
 TORCH_TILE_PX = 16
 TORCH_ROUNDS = 3
+TORCH_LARGEST = 640 * 480 * 60_000  # pixels times Gaussians: seconds and gigabytes beyond
+PEAK_S = 0.1  # per instruction set, number of threads and scene; the best counts
+
+# Floating-point operations per pair, counted in the source; a multiply-add counts as two, min, compare as one. What the
+# four pixels of a row of a block share counts a quarter.
+LOG2_ALPHA = 10  # pixel - centre 2, e = M d 4, log2 opacity - |e|^2 4
+ALPHA = 17  # 2^t and 1 - 2^t 15: three to split off the exponent, five multiply-adds, two for the rest; two clamps
+REPLAY = LOG2_ALPHA + ALPHA + 2  # weight, transmittance
+E_AGAIN = 3  # e for the sums
+OWN = 8 + 3 + 2  # cotangent of the own value, of what lies behind; w, zero where alpha is clamped
+MOMENTS = E_AGAIN + 5 + 9 / 4  # six, of w
+SCREEN_MOMENTS = E_AGAIN + 9 + 23 / 4  # thirteen, of w^2
+DEPTH_MOMENTS = E_AGAIN + 6 + 8 / 4  # six
+FLOPS = {
+    "forward": ALPHA + 3 + 4 * 2,  # weight, transmittance, closed?; three colours and depth
+    "backward": REPLAY + OWN + MOMENTS + 4 * 2,
+    "backward_fisher": REPLAY + OWN + MOMENTS + 4 * 2 + (1 + SCREEN_MOMENTS) + (3 + DEPTH_MOMENTS) + 3 * 3,
+    "gauss_newton": REPLAY + 4 * 3 + 13 + SCREEN_MOMENTS + (2 + DEPTH_MOMENTS) + 3 * 2,
+    "contributions": REPLAY + 1,
+}
+FLOPS["view_gradients"] = FLOPS["forward"] + FLOPS["backward"]  # the loss is of pixels, not of pairs
+EVALUATED_FLOPS = (
+    LOG2_ALPHA + 1
+)  # of the pairs that a forward looks at, drawn or not: is alpha at least 1/255?
+TITLES = {
+    "forward": "forward",
+    "backward": "backward",
+    "backward_fisher": "backward + empirical",
+    "gauss_newton": "gauss_newton",
+    "contributions": "contributions",
+    "forward_loss_backward": "forward, loss, backward",
+    "view_gradients": "view_gradients",
+}
 
 
-def run(
-    sizes: tuple[tuple[int, int], ...] = SIZES_PX,
-    threads: tuple[int, ...] = THREADS,
-    gaussians: int = GAUSSIANS,
-    rounds: int = 7,
-    with_torch: bool = True,
-) -> dict[str, Any]:
-    """Milliseconds of forward, backward (with pose), and Fisher information, per size, instruction set and threads.
+@dataclass(frozen=True)
+class Plan:
+    """What to measure: every scene with every instruction set on every number of threads.
 
-    The portable build is slow on x86, where it must imitate fused multiply-add: one round, one thread.
+    portable_everywhere: else the portable build, slow on x86 where it must imitate fused multiply-add, runs one round
+    of the smallest scene on one thread.
     """
-    room = make_room(gaussians)
-    rows: list[dict[str, Any]] = []
-    for width, height in sizes:
-        camera = PinholeCamera(width, height, width / 2, width / 2, width / 2 - 0.5, height / 2 - 0.5)
-        candidates = {
-            (isa, n): _steps(Rasterizer(isa, n), room, camera)
-            for isa in available_isas()
-            for n in threads
-            if isa != "portable" or n == min(threads)
+
+    sizes: tuple[Size, ...] = SIZES_PX
+    gaussians: tuple[int, ...] = GAUSSIANS[:1]
+    threads: tuple[int, ...] = THREADS
+    isas: tuple[str, ...] = tuple(available_isas())
+    rounds: int = ROUNDS
+    torch_too: bool = True
+    portable_everywhere: bool = False
+
+    def scenes(self) -> list[tuple[Size, int]]:
+        """Image sizes and numbers of Gaussians, small ones first."""
+        return [(size, n) for n in sorted(self.gaussians) for size in sorted(self.sizes)]
+
+    def candidates(self, scene: tuple[Size, int]) -> list[tuple[str, int]]:
+        """Instruction sets and numbers of threads that run in this scene."""
+        every = [(isa, n) for isa in self.isas for n in self.threads]
+        smallest = scene == self.scenes()[0]
+        return [c for c in every if not self._spares(c[0]) or (smallest and c[1] == min(self.threads))]
+
+    def rounds_of(self, isa: str) -> int:
+        """Rounds that are timed; one before them warms up."""
+        return 1 if self._spares(isa) else self.rounds
+
+    def _spares(self, isa: str) -> bool:
+        return isa == "portable" and len(self.isas) > 1 and not self.portable_everywhere
+
+    def torch_rounds(self, scene: tuple[Size, int]) -> int:
+        """Rounds of plain torch in this scene."""
+        (width, height), n = scene
+        return min(TORCH_ROUNDS, self.rounds) if self.torch_too and width * height * n <= TORCH_LARGEST else 0
+
+
+def run(plan: Plan) -> dict[str, Any]:
+    """Times, work and peaks as {"machine": {...}, "rows": [...]}, ready for JSON; a row per scene and candidate."""
+    peaks = Peaks(plan.isas, plan.threads)
+    measured: list[Scene] = []
+    rounds = _rounds(plan, peaks, measured)
+    total = sum(_ticks(plan, scene) * (plan.rounds + 1) for scene in plan.scenes())
+    for _ in track(rounds, "timing the rasterizer", total=total):
+        pass
+    rows = [row for scene in measured for row in scene.rows(peaks)]
+    return {"machine": peaks.as_dict(), "rows": rows}
+
+
+def _ticks(plan: Plan, scene: tuple[Size, int]) -> int:
+    """Roughly how long a round of a scene takes, in steps of the progress bar."""
+    (width, height), n = scene
+    pixels = width * height
+    torch_share = plan.torch_rounds(scene) / (plan.rounds + 1)
+    return round(1 + pixels / 25_000 + n / 10_000 + torch_share * (30 + pixels / 1000))
+
+
+def _rounds(plan: Plan, peaks: Peaks, measured: list[Scene]) -> Iterator[None]:
+    """Measure scene by scene, round by round; yields as often as a round's share of the whole."""
+    for scene in plan.scenes():
+        measured.append(Scene(plan, *scene))
+        for _ in measured[-1].rounds(peaks):
+            yield from repeat(None, _ticks(plan, scene))
+
+
+class Peaks:
+    """The best rates that the machine has shown so far."""
+
+    def __init__(self, isas: Iterable[str], threads: Iterable[int]) -> None:
+        self.load_average = os.getloadavg()[0]  # of the last minute: others that want the same cores
+        self.fma_gflops = {isa: dict.fromkeys(threads, 0.0) for isa in isas}
+        self.read_gb_per_s = dict.fromkeys(threads, 0.0)
+        self.copy_gb_per_s = dict.fromkeys(threads, 0.0)
+
+    def measure(self) -> None:
+        """Try again to reach higher rates."""
+        for isa, rates in self.fma_gflops.items():
+            for n in rates:
+                rates[n] = max(rates[n], _raster.fma_rate(isa, n, PEAK_S))
+        for n in self.read_gb_per_s:
+            read, copied = _raster.bandwidth(n, 2 * PEAK_S)
+            self.read_gb_per_s[n] = max(self.read_gb_per_s[n], read)
+            self.copy_gb_per_s[n] = max(self.copy_gb_per_s[n], copied)
+
+    def as_dict(self) -> dict[str, Any]:
+        """What ran all this, and the peaks; keys of the inner dictionaries are numbers of threads."""
+        return {
+            "cpu": cpu_name(),
+            "cores": len(os.sched_getaffinity(0)),
+            "isas": list(self.fma_gflops),
+            **vars(self),
         }
-        times: dict[tuple[str, int], dict[str, list[float]]] = {c: {} for c in candidates}
-        for k in range(rounds + 1):  # the first warms up
-            for (isa, n), steps in candidates.items():
-                if isa == "portable" and k != 1:
-                    continue
-                for name, step in steps.items():
-                    milliseconds, _ = _timed(step, wall=n > 1)
-                    if k > 0:
-                        times[isa, n].setdefault(name, []).append(milliseconds)
-        for (isa, n), by_step in times.items():
-            medians = {name: statistics.median(values) for name, values in by_step.items()}
-            rows.append({"width": width, "height": height, "implementation": isa, "threads": n, **medians})
-    if with_torch:
-        rows.append(_torch_row(room, *sizes[0], rows))
-    return {"gaussians": gaussians, "unit": "ms", "rows": rows}
 
 
-def format_table(result: dict[str, Any]) -> str:
-    """The result of `run` as a table of text."""
-    lines = [
-        f"{result['gaussians']} Gaussians; ms; one thread: CPU time, more: wall time",
-        f"{'size':>10} {'implementation':>15} {'threads':>7} {'forward':>9} {'backward':>9} {'fisher':>9}",
-    ]
-    for row in result["rows"]:
-        size = f"{row['width']}x{row['height']}"
-        cells = "".join(f" {row[name]:9.1f}" if name in row else f" {'-':>9}" for name in STEPS)
-        lines.append(f"{size:>10} {row['implementation']:>15} {row['threads']:>7}{cells}")
-        if "slower_than_fastest" in row:
-            ratios = ", ".join(f"{name} x{value:.0f}" for name, value in row["slower_than_fastest"].items())
-            lines.append(f"  plain torch against the fastest build, one thread each: {ratios}")
-    return "\n".join(lines)
+def cpu_name() -> str:
+    """As the system calls it."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
 
 
-STEPS = ("forward", "backward", "fisher")
+def draws(name: str) -> bool:
+    """Whether a pass draws the view itself, rather than refer to what was drawn."""
+    return name in ("forward", "view_gradients")
+
+
+class Scene:
+    """One image size and number of Gaussians, its candidates and their times."""
+
+    def __init__(self, plan: Plan, size: Size, gaussians: int) -> None:
+        self.plan, self.size, self.gaussians = plan, size, gaussians
+        candidates = plan.candidates((size, gaussians))
+        self.times_ms: dict[tuple[str, int], dict[str, list[float]]] = {c: {} for c in candidates}
+        self.torch_times_ms: dict[int, dict[str, list[float]]] = {n: {} for n in plan.threads}
+        self.scratch_bytes: dict[tuple[str, int], int] = {}
+
+    def rounds(self, peaks: Peaks) -> Iterator[None]:
+        """Time everything once per round, after one that only warms up; yields after each."""
+        view = View(self.size, self.gaussians)
+        self.work = Work(self.plan.isas[0], view)
+        rasterizers = {candidate: Rasterizer(*candidate) for candidate in self.times_ms}
+        peaks.measure()
+        for k in range(self.plan.rounds + 1):
+            for candidate, rasterizer in rasterizers.items():
+                if k <= self.plan.rounds_of(candidate[0]):
+                    self._round(k, candidate, view.passes(rasterizer))
+            if 0 < k <= self.plan.torch_rounds((self.size, self.gaussians)):
+                for threads, times in self.torch_times_ms.items():
+                    for name, milliseconds in _time_torch(view, threads).items():
+                        times.setdefault(name, []).append(milliseconds)
+            yield
+        self.scratch_bytes = {
+            c: rasterizer.statistics().scratch_bytes for c, rasterizer in rasterizers.items()
+        }
+
+    def _round(self, k: int, candidate: tuple[str, int], passes: dict[str, Callable[[], object]]) -> None:
+        for name, step in passes.items():
+            milliseconds, _ = _timed(step, wall=candidate[1] > 1)
+            if k > 0:
+                self.times_ms[candidate].setdefault(name, []).append(milliseconds)
+
+    def rows(self, peaks: Peaks) -> list[dict[str, Any]]:
+        """A row per candidate."""
+        return [self._row(isa, threads, peaks) for isa, threads in self.times_ms]
+
+    def _row(self, isa: str, threads: int, peaks: Peaks) -> dict[str, Any]:
+        ms = {name: _typical(values, threads) for name, values in self.times_ms[isa, threads].items()}
+        torch_ms = {name: _typical(values, threads) for name, values in self.torch_times_ms[threads].items()}
+        seen, flops, moved = self.work.seen, self.work.flops(), self.work.moved_bytes
+        fma, copy = peaks.fma_gflops[isa][threads], peaks.copy_gb_per_s[threads]
+        row: dict[str, Any] = {
+            "width": self.size[0],
+            "height": self.size[1],
+            "gaussians": self.gaussians,
+            "threads": threads,
+            "isa": isa,
+            **{f"{name}_ms": value for name, value in ms.items()},
+            "torch_forward_ms": torch_ms.get("forward"),
+            "torch_backward_ms": torch_ms.get("backward"),
+            "visible": seen.visible,
+            "intersections": seen.intersections,
+            "evaluated_pairs": seen.evaluated_pairs,
+            "contributing_pairs": seen.blended_pairs,
+            "scratch_mb": 1e-6 * self.scratch_bytes[isa, threads],
+        }
+        for name in FLOPS:
+            row[f"{name}_pairs_per_s"] = seen.blended_pairs / (1e-3 * ms[name])
+            row[f"{name}_fraction_of_peak"] = flops[name] / (1e6 * ms[name]) / fma
+            row[f"{name}_fraction_of_bandwidth"] = moved[name] / (1e6 * ms[name]) / copy
+        return row
+
+
+class View:
+    """The room in one camera, with what the passes over it take."""
+
+    def __init__(self, size: Size, gaussians: int) -> None:
+        width, height = size
+        self.room, self.T_camera_map = make_room(gaussians), view_of_room()
+        self.camera = PinholeCamera(width, height, width / 2, width / 2, width / 2 - 0.5, height / 2 - 0.5)
+        shape, rng = (height, width), np.random.default_rng(1)
+        self.d_color = np.sign(rng.normal(size=(*shape, 3))).astype(np.float32)
+        self.d_depth = np.sign(rng.normal(size=shape)).astype(np.float32)
+        self.precision, self.sums = np.ones(shape, dtype=np.float32), FisherSums(gaussians)
+        render = Rasterizer().forward(self.room, self.camera, self.T_camera_map)
+        noise = rng.normal(0, 0.05, (*shape, 4)).astype(np.float32)
+        self.color = (render.color + noise[..., :3]).clip(0, 1)
+        self.depth_m = np.where(render.alpha > 0.5, render.depth / render.alpha.clip(0.5) + noise[..., 3], 0)
+        self.weights = LossConfig()
+
+    def passes(self, rasterizer: Rasterizer) -> dict[str, Callable[[], object]]:
+        """The calls to time, in this order: each but the first refers to the view that is drawn last."""
+        d, view = (self.d_color, self.d_depth), (self.room, self.camera, self.T_camera_map)
+        weights = LossWeights(**self.weights.model_dump())
+
+        def forward_loss_backward() -> Gradients:
+            loss = rgbd_loss(rasterizer.forward(*view), self.color, self.depth_m, self.weights)
+            return rasterizer.backward(loss.d_color, loss.d_depth, loss.d_alpha, pose=True)
+
+        return {
+            "forward": lambda: rasterizer.forward(*view),
+            "backward": lambda: rasterizer.backward(*d, pose=True),
+            "backward_fisher": lambda: rasterizer.backward(*d, pose=True, fisher=True),
+            "gauss_newton": lambda: rasterizer.fisher(self.precision, self.precision, self.sums),
+            "contributions": rasterizer.contributions,
+            "forward_loss_backward": forward_loss_backward,
+            "view_gradients": lambda: rasterizer.view_gradients(
+                *view, self.color, self.depth_m, weights, pose=True
+            ),
+        }
+
+    def array_bytes(self, name: str, visible: int) -> int:
+        """Arrays of the caller that a pass reads or writes once; the sums of the Gaussians in sight both."""
+        n, pixels, floats = len(self.room), self.camera.width * self.camera.height, 4
+        a_sum = 8 * (45 + 3 + 1 + 1 + 1) + 4
+        return {
+            "forward": floats * (14 * n + 5 * pixels),
+            "backward": floats * (28 * n + 4 * pixels),
+            "backward_fisher": floats * (42 * n + 4 * pixels),
+            "gauss_newton": floats * (14 * n + 2 * pixels) + 2 * a_sum * visible,
+            "contributions": floats * 2 * n,
+            "view_gradients": floats * (28 * n + 4 * pixels),
+        }[name]
+
+
+class Work:
+    """What the passes over one view have to do, counted; the same on every instruction set and number of threads."""
+
+    def __init__(self, isa: str, view: View) -> None:
+        self.moved_bytes: dict[str, float] = {}
+        for name in FLOPS:
+            rasterizer = Rasterizer(isa)  # a new one, whose memory tells what the pass needs
+            passes = view.passes(rasterizer)
+            passes["forward"]()
+            self.seen: Statistics = rasterizer.statistics()
+            passes[name]()
+            drawn = self.seen.scratch_bytes
+            added = rasterizer.statistics().scratch_bytes - drawn
+            # what a pass adds is written once and read once, what the forward left is read once more
+            scratch = 2 * (drawn + added) if draws(name) else drawn + 2 * added
+            self.moved_bytes[name] = scratch + view.array_bytes(name, self.seen.visible)
+
+    def flops(self) -> dict[str, float]:
+        """Of each pass, by `FLOPS`."""
+        counts = {name: flops * self.seen.blended_pairs for name, flops in FLOPS.items()}
+        for name in filter(draws, FLOPS):
+            counts[name] += EVALUATED_FLOPS * self.seen.evaluated_pairs
+        return counts
+
+
+def _timed(step: Callable[[], Any], wall: bool) -> tuple[float, Any]:
+    """Milliseconds of a step, and what it returned."""
+    clock = time.perf_counter if wall else time.thread_time
+    start = clock()
+    result = step()
+    return 1e3 * (clock() - start), result
+
+
+def _typical(milliseconds: list[float], threads: int) -> float:
+    """Median of CPU times, lower quartile of wall times: other load makes those longer, never shorter."""
+    return float(np.percentile(milliseconds, 25)) if threads > 1 else statistics.median(milliseconds)
+
+
+# ---------------------------------------------------------------- the room
 
 
 def make_room(n: int, seed: int = 0) -> Gaussians:
@@ -123,57 +382,120 @@ def view_of_room() -> np.ndarray:
     return T
 
 
-def _timed(step: Callable[[], Any], wall: bool) -> tuple[float, Any]:
-    """Milliseconds of a step, and what it returned."""
-    clock = time.perf_counter if wall else time.thread_time
-    start = clock()
-    result = step()
-    return 1e3 * (clock() - start), result
+# ---------------------------------------------------------------- tables
+
+WHO = ["size", "Gaussians", "threads", "isa"]
 
 
-def _steps(rasterizer: Rasterizer, room: Gaussians, camera: PinholeCamera) -> dict[str, Callable[[], object]]:
-    shape, rng, T = (camera.height, camera.width), np.random.default_rng(1), view_of_room()
-    d_color = np.sign(rng.normal(size=(*shape, 3))).astype(np.float32)
-    d_depth = np.sign(rng.normal(size=shape)).astype(np.float32)
-    precision, sums = np.ones(shape, dtype=np.float32), FisherSums(len(room))
-    return {
-        "forward": lambda: rasterizer.forward(room, camera, T),
-        "backward": lambda: rasterizer.backward(d_color, d_depth, pose=True),
-        "fisher": lambda: rasterizer.fisher(precision, precision, sums),
-    }
+def format_tables(result: dict[str, Any]) -> str:
+    """The result of `run` as Markdown."""
+    rows: list[dict[str, Any]] = result["rows"]
+    first_of_scene = {(row["width"], row["height"], row["gaussians"]): row for row in reversed(rows)}
+    counted = [TITLES[name] for name in FLOPS]
+    with_torch = [row for row in rows if row["torch_forward_ms"] is not None]
+    parts = [
+        _machine_lines(result["machine"]),
+        "Milliseconds; one thread: CPU time, median; more: wall time, lower quartile.",
+        _table([*WHO, *TITLES.values()], [[*_who(row), *_cells(row, "{}_ms", 1)] for row in rows]),
+        "Work of one view; pairs of pixel and Gaussian whose alpha is evaluated, and that are drawn.",
+        _table(
+            ["size", "Gaussians", "visible", "tile entries", "evaluated, M", "drawn, M", "scratch, MB"],
+            [
+                [
+                    *_who(row)[:2],
+                    str(row["visible"]),
+                    str(row["intersections"]),
+                    f"{1e-6 * row['evaluated_pairs']:.1f}",
+                    f"{1e-6 * row['contributing_pairs']:.1f}",
+                    f"{row['scratch_mb']:.0f}",
+                ]
+                for row in reversed(first_of_scene.values())
+            ],
+        ),
+        "Drawn pairs per second, in 10^9.",
+        _table([*WHO, *counted], [[*_who(row), *_cells(row, "{}_pairs_per_s", 2, 1e-9)] for row in rows]),
+        "Percent of the peak rate of multiply-adds / of the bandwidth; flops and bytes are counted by hand.",
+        _table(
+            [*WHO, *counted],
+            [
+                [
+                    *_who(row),
+                    *(
+                        f"{a} / {b}"
+                        for a, b in zip(
+                            _cells(row, "{}_fraction_of_peak", 0, 100),
+                            _cells(row, "{}_fraction_of_bandwidth", 0, 100),
+                            strict=True,
+                        )
+                    ),
+                ]
+                for row in rows
+            ],
+        ),
+    ]
+    if with_torch:
+        parts += [
+            "Plain torch, milliseconds, and how many times as long it takes.",
+            _table(
+                [*WHO, "torch forward", "torch backward", "forward, times", "backward, times"],
+                [
+                    [
+                        *_who(row),
+                        f"{row['torch_forward_ms']:.0f}",
+                        f"{row['torch_backward_ms']:.0f}",
+                        f"{row['torch_forward_ms'] / row['forward_ms']:.0f}",
+                        f"{row['torch_backward_ms'] / row['backward_ms']:.0f}",
+                    ]
+                    for row in with_torch
+                ],
+            ),
+        ]
+    return "\n\n".join(parts)
+
+
+def _machine_lines(machine: dict[str, Any]) -> str:
+    lines = [f"{machine['cpu']}, {machine['cores']} cores, load average {machine['load_average']:.1f} before"]
+    for isa, rates in machine["fma_gflops"].items():
+        lines.append(
+            f"{isa}: " + ", ".join(f"{rate:.0f} GFLOP/s with {n}" for n, rate in rates.items()) + " threads"
+        )
+    for n, read in machine["read_gb_per_s"].items():
+        lines.append(
+            f"memory, {n} threads: read {read:.0f} GB/s, copy {machine['copy_gb_per_s'][n]:.0f} GB/s"
+        )
+    return "\n".join(f"- {line}" for line in lines)
+
+
+def _who(row: dict[str, Any]) -> list[str]:
+    return [f"{row['width']}x{row['height']}", str(row["gaussians"]), str(row["threads"]), row["isa"]]
+
+
+def _cells(row: dict[str, Any], key: str, digits: int, factor: float = 1.0) -> list[str]:
+    return [f"{factor * row[key.format(name)]:.{digits}f}" for name in TITLES if key.format(name) in row]
+
+
+def _table(titles: list[str], rows: list[list[str]]) -> str:
+    widths = [max(len(line[i]) for line in (titles, *rows)) for i in range(len(titles))]
+    lines = [titles, ["-" * (width - 1) + ":" for width in widths], *rows]
+    return "\n".join(
+        "| " + " | ".join(c.rjust(w) for c, w in zip(line, widths, strict=True)) + " |" for line in lines
+    )
 
 
 # ---------------------------------------------------------------- plain torch, for comparison
 
 
-def _torch_row(room: Gaussians, width: int, height: int, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def _time_torch(view: View, threads: int) -> dict[str, float]:
+    """Milliseconds of one forward and one backward."""
     import torch
 
-    camera = PinholeCamera(width, height, width / 2, width / 2, width / 2 - 0.5, height / 2 - 0.5)
     threads_before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    parameters = _torch_parameters(room)
-    times: dict[str, list[float]] = {"forward": [], "backward": []}
-    for _ in range(TORCH_ROUNDS):
-        forward = partial(torch_tiles, parameters, camera, view_of_room())
-        milliseconds, image = _timed(forward, wall=False)
-        times["forward"].append(milliseconds)
-        times["backward"].append(_timed(image.sum().backward, wall=False)[0])
-        del image
+    torch.set_num_threads(threads)
+    parameters, wall = _torch_parameters(view.room), threads > 1
+    forward_ms, image = _timed(lambda: torch_tiles(parameters, view.camera, view.T_camera_map), wall)
+    backward_ms, _ = _timed(image.sum().backward, wall)
     torch.set_num_threads(threads_before)
-    row: dict[str, Any] = {
-        "width": width,
-        "height": height,
-        "implementation": "plain torch",
-        "threads": 1,
-        **{name: statistics.median(values) for name, values in times.items()},
-    }
-    same = [r for r in rows if (r["width"], r["height"], r["threads"]) == (width, height, 1)]
-    if same:
-        row["slower_than_fastest"] = {
-            name: row[name] / min(r[name] for r in same) for name in ("forward", "backward")
-        }
-    return row
+    return {"forward": forward_ms, "backward": backward_ms}
 
 
 def _torch_parameters(room: Gaussians) -> dict[str, Any]:

@@ -11,6 +11,12 @@ namespace raster {
 void* allocate_aligned(size_t bytes);
 void release_aligned(void* memory);
 
+#if defined(__SANITIZE_ADDRESS__)  // no spare memory in which an access too far would go unseen
+constexpr bool SLACK = false;
+#else
+constexpr bool SLACK = true;
+#endif
+
 // Growable memory, 64-byte aligned, kept between calls; growing does not keep the content unless asked to.
 template <class T>
 class Scratch {
@@ -20,11 +26,11 @@ public:
     ~Scratch() { release_aligned(data_); }
 
     __attribute__((always_inline)) T* need(size_t count) {
-        if (count > capacity_) grow(count, 0);
+        if (count > capacity_) grow(count, SLACK ? count / 4 + 64 : 0, 0);
         return data_;
     }
     __attribute__((always_inline)) T* need_keeping(size_t count, size_t kept) {
-        if (count > capacity_) grow(count, kept);
+        if (count > capacity_) grow(count, count / 4 + 64, kept);
         return data_;
     }
     __attribute__((always_inline)) T* data() const { return data_; }
@@ -36,8 +42,8 @@ public:
     }
 
 private:
-    __attribute__((always_inline)) void grow(size_t count, size_t kept) {
-        const size_t capacity = count + count / 4 + 64;
+    __attribute__((always_inline)) void grow(size_t count, size_t spare, size_t kept) {
+        const size_t capacity = count + spare;
         T* memory = static_cast<T*>(allocate_aligned(capacity * sizeof(T)));
         if (kept) __builtin_memcpy(memory, data_, kept * sizeof(T));
         release_aligned(data_);
@@ -78,8 +84,8 @@ struct alignas(64) Splat {
     float spare[4];
 };
 
-// What the ellipse alpha >= 1/255 of a Gaussian covers. With t = dy / Y, Y its half height, and c the correlation of x and
-// y on the screen, its sides are at dx = X (c t +- sqrt(1 - c^2) sqrt(1 - t^2)).
+// What the ellipse alpha >= 1/255 of a Gaussian covers. With X, Y half its width and height, t = dy / Y, and c the
+// correlation of x and y on the screen, its sides are at dx = X (c t +- sqrt(1 - c^2) sqrt(1 - t^2)).
 struct alignas(32) Footprint {
     float blocks_u, v;                 // centre: in blocks of 4 px, in px
     float per_pixel;                   // 1 / Y
@@ -237,6 +243,8 @@ struct Kernels {
     Status (*full_fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth, double* information);
     Status (*fit)(Frame&, const GaussianArrays&, const Loss&, LossValues&, const GradientArrays&);
     void (*adam)(const AdamStep&, int threads);
+    double (*fma_rate)(int threads, double seconds);                              // of the machine, GFLOP/s
+    void (*bandwidth)(int threads, double seconds, double* read, double* copied);  // GB/s
 };
 
 }  // namespace raster

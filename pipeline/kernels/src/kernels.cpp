@@ -2,6 +2,7 @@
 #include "adam.h"
 #include "fitting.h"
 #include "full_information.h"
+#include "machine_peak.h"
 
 namespace KERNEL_ISA {
 
@@ -150,5 +151,6 @@ static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& los
 namespace raster {
 extern const Kernels KERNEL_TABLE;
 const Kernels KERNEL_TABLE = {AS_TEXT(KERNEL_ISA), KERNEL_ISA::forward, KERNEL_ISA::backward, KERNEL_ISA::fisher,
-                              KERNEL_ISA::contributions, KERNEL_ISA::full_fisher, KERNEL_ISA::fit, KERNEL_ISA::adam};
+                              KERNEL_ISA::contributions, KERNEL_ISA::full_fisher, KERNEL_ISA::fit, KERNEL_ISA::adam,
+                              KERNEL_ISA::fma_rate, KERNEL_ISA::bandwidth};
 }  // namespace raster

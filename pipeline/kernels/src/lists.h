@@ -1,9 +1,9 @@
 // Which Gaussian touches which 4x4 block of which tile, in order of depth.
 //
-// The image is cut into bands of tile rows, one for each thread. A thread picks the Gaussians that may touch its band, sorts
-// them by depth, tests them against the tiles and counts; once all have counted, each knows where its lists begin and
-// writes them. A list depends on nothing but its tile, so the cuts do not show, and no two threads write to the same
-// memory: a cache line that goes back and forth between two processors costs more than everything done with it.
+// The image is cut into bands of tile rows, one for each thread. A thread picks the Gaussians that may touch its band,
+// sorts them by depth, tests them against the tiles and counts; once all have counted, each knows where its lists begin
+// and writes them. A list depends on nothing but its tile, so the cuts do not show; and threads hardly ever write to the
+// same cache line, which would cost more than all that is done with it.
 #pragma once
 
 #include "visibility.h"
@@ -13,6 +13,7 @@ namespace KERNEL_ISA {
 // ---------------------------------------------------------------- bands
 
 constexpr size_t BAND_SAMPLES = 2048;
+constexpr int MEMBER_WEIGHT = 4;  // what a Gaussian costs a band, in tiles that it touches
 
 inline size_t drawn_count(const Frame& frame) {
     size_t drawn = 0;
@@ -20,27 +21,40 @@ inline size_t drawn_count(const Frame& frame) {
     return drawn;
 }
 
-// Cuts the image so that each band has about the same number of Gaussian and tile pairs, by a sample of the footprints.
-inline void choose_bands(Frame& frame) {
-    const int rows = frame.tiles_y, wanted_bands = smaller(smaller(frame.threads, MOST_BANDS), rows);
-    frame.band_count = wanted_bands;
-    uint64_t* weights = frame.row_weights.need(rows);
-    for (int row = 0; row < rows; row++) weights[row] = 1;
+inline size_t tile_count(const Frame& frame, const Band& band) {
+    return static_cast<size_t>(band.last - band.first + 1) * frame.tiles_x;
+}
+
+// What there is to list in each row of tiles, about, from a sample of the footprints.
+inline void weigh_rows(const Frame& frame, uint64_t* weights) {
+    for (int row = 0; row < frame.tiles_y; row++) weights[row] = 1;
     const uint32_t step = static_cast<uint32_t>(1 + drawn_count(frame) / BAND_SAMPLES);
-    for (size_t chunk = 0; chunk < frame.chunks && wanted_bands > 1; chunk++)
+    for (size_t chunk = 0; chunk < frame.chunks; chunk++)
         for (uint32_t k = 0; k < frame.chunk_drawn.data()[chunk]; k += step) {
-            const Footprint& f = frame.footprints.data()[static_cast<uint32_t>(frame.depth_keys.data()[chunk * CHUNK + k])];
+            const uint32_t id = static_cast<uint32_t>(frame.depth_keys.data()[chunk * CHUNK + k]);
+            const Footprint& f = frame.footprints.data()[id];
             const TileRange x(f.tile_columns), y(f.tile_rows);
-            weights[y.first] += 4;  // a Gaussian costs as much as four of its tiles
+            weights[y.first] += MEMBER_WEIGHT;
             for (int row = y.first; row <= y.last; row++) weights[row] += x.last - x.first + 2;
         }
-    uint64_t total = 0, before = 0;
+}
+
+// Cuts the image so that each band has about the same to list.
+inline void choose_bands(Frame& frame) {
+    const int rows = frame.tiles_y, count = smaller(smaller(frame.threads, MOST_BANDS), rows);
+    uint64_t *weights = frame.row_weights.need(rows), total = 0, before = 0;
+    frame.band_count = count;
+    if (count == 1) {
+        frame.bands[0].first = 0, frame.bands[0].last = rows - 1;
+        return;
+    }
+    weigh_rows(frame, weights);
     for (int row = 0; row < rows; row++) total += weights[row];
-    for (int b = 0; b < wanted_bands; b++) frame.bands[b].first = rows, frame.bands[b].last = rows - 1;  // empty
+    for (int b = 0; b < count; b++) frame.bands[b].first = rows, frame.bands[b].last = rows - 1;  // no row
     for (int row = 0; row < rows; row++) {
-        const int b = static_cast<int>((before + weights[row] / 2) * wanted_bands / total);
-        if (frame.bands[b].first == rows) frame.bands[b].first = row;
-        frame.bands[b].last = row;
+        Band& band = frame.bands[(before + weights[row] / 2) * count / total];
+        if (band.first == rows) band.first = row;
+        band.last = row;
         before += weights[row];
     }
 }
@@ -63,8 +77,8 @@ inline void pick_all(const Frame& frame, Band& band) {
     band.entries.need(frame.chunks * CHUNK);
 }
 
-// Members of one of several bands: the drawn Gaussians whose box meets it, numbered anew, with footprints of their own, so
-// that the thread has what it needs close by.
+// Members of one of several bands: the drawn Gaussians whose box meets it, numbered anew, with footprints of their own,
+// so that the thread has what it needs close by.
 inline void pick_members(const Frame& frame, Band& band) {
     const size_t most = drawn_count(frame) + 1;
     uint32_t *ids = band.ids.need(most), *chunk_first = band.chunk_first.need(frame.chunks + 1);
@@ -118,13 +132,22 @@ inline void sort_members(Band& band) {
 
 // The blocks of one tile that have a pixel which lies in the image and is wanted by the mask.
 inline uint32_t wanted_blocks(const View& view, int tile_x, int tile_y) {
-    const int x0 = tile_x * TILE, y0 = tile_y * TILE, x1 = smaller(x0 + TILE, view.width), y1 = smaller(y0 + TILE, view.height);
+    const int x0 = tile_x * TILE, y0 = tile_y * TILE;
+    const int x1 = smaller(x0 + TILE, view.width), y1 = smaller(y0 + TILE, view.height);
     const bool whole = x1 - x0 == TILE && y1 - y0 == TILE;
     if (whole && !view.mask) return 0xffff;
     uint32_t blocks = 0;
     for (int y = y0; y < y1; y++) {
+        const int row_of_blocks = (y - y0) / 4 * 4;
         const uint8_t* row = view.mask + static_cast<size_t>(y) * view.width;
-        for (int x = x0; x < x1; x++) blocks |= static_cast<uint32_t>(!view.mask || row[x]) << ((y - y0) / 4 * 4 + (x - x0) / 4);
+        if (whole) {
+            uint32_t quads[4];  // of pixels
+            std::memcpy(quads, row + x0, sizeof quads);
+            for (int b = 0; b < 4; b++) blocks |= static_cast<uint32_t>(quads[b] != 0) << (row_of_blocks + b);
+        } else {
+            for (int x = x0; x < x1; x++)
+                blocks |= static_cast<uint32_t>(!view.mask || row[x]) << (row_of_blocks + (x - x0) / 4);
+        }
     }
     return blocks;
 }
@@ -168,8 +191,8 @@ struct WindowLanes {  // eight rows of sixteen blocks: their right sides, then t
 };
 alignas(64) static constexpr WindowLanes WINDOW_LANES[2] = {false, true};
 
-// The blocks of four windows that their ellipses touch, a word for each tile. Step by step for all four, since the steps of
-// one wait for each other.
+// The blocks of four windows that their ellipses touch, a word for each tile. Step by step for all four, since the steps
+// of one wait for each other.
 inline void touched_blocks(const Footprint* footprints, const Window* windows, Words8* touched) {
     constexpr int N = WINDOWS_IN_STEP;
     const Vec side = load(WINDOW_LANES[0].side), zero(0.0f), one(1.0f), all(16.0f);
@@ -184,7 +207,8 @@ inline void touched_blocks(const Footprint* footprints, const Window* windows, W
     for (int i = 0; i < N; i++) bottom[i] = top[i] + Vec(3.0f * f[i]->per_pixel);
     for (int i = 0; i < N; i++) t[i] = min(max(side * Vec(f[i]->skew), top[i]), bottom[i]);
     for (int i = 0; i < N; i++) width[i] = sqrt(fnma(t[i], t[i], one));  // not a number above and below the ellipse
-    for (int i = 0; i < N; i++) x[i] = fma(Vec(f[i]->wide_skew), t[i], load(lanes[i]->blocks) + Vec(f[i]->blocks_u - windows[i].tile_x * 4));
+    for (int i = 0; i < N; i++) x[i] = load(lanes[i]->blocks) + Vec(f[i]->blocks_u - windows[i].tile_x * 4);
+    for (int i = 0; i < N; i++) x[i] = fma(Vec(f[i]->wide_skew), t[i], x[i]);
     for (int i = 0; i < N; i++) x[i] = fma(Vec(f[i]->wide_upright), side * width[i], x[i]);
     for (int i = 0; i < N; i++) touched[i] = bits_between(min(max(x[i], zero), all));  // max(nan, 0) is 0
     for (int i = 0; i < N; i++) touched[i] = transpose_nibbles(touched[i]);
@@ -198,20 +222,23 @@ inline void test_windows(Frame& frame, Band& band, const Window* windows, int co
     uint16_t* blocks = band.record_blocks.need_keeping(most, before);
     const Footprint* footprints = band.footprints;
     RecordRange* ranges = band.ranges.data();
-    const uint32_t stride = static_cast<uint32_t>(wanted_stride(frame)), tiles_x = frame.tiles_x;
-    const uint16_t *wanted = frame.wanted_blocks.data(), *nothing = wanted + static_cast<size_t>(frame.tiles_y) * stride;
+    const size_t stride = wanted_stride(frame);
+    const uint16_t *wanted = frame.wanted_blocks.data(), *nothing = wanted + frame.tiles_y * stride;
+    const uint32_t tiles_x = frame.tiles_x, first_row = band.first;
+    const int last_row = band.last;
     size_t total = before, opened = opened_last;
     for (int first = 0; first < count; first += WINDOWS_IN_STEP) {
         Words8 touched[WINDOWS_IN_STEP];
         touched_blocks(footprints, windows + first, touched);
         for (int i = 0; i < WINDOWS_IN_STEP && first + i < count; i++) {
             const Window w = windows[first + i];
-            const uint16_t* first4 = wanted + static_cast<size_t>(w.tile_y) * stride + w.tile_x;
-            const uint16_t* below = w.tile_y < band.last ? first4 + stride : nothing;
-            const Words8 found = masked(touched[i], first4, w.wide ? first4 + 4 : below);
+            const uint16_t* wanted_first = wanted + w.tile_y * stride + w.tile_x;
+            const uint16_t* wanted_below = w.tile_y < last_row ? wanted_first + stride : nothing;
+            const Words8 found = masked(touched[i], wanted_first, w.wide ? wanted_first + 4 : wanted_below);
+            const uint32_t tile = (w.tile_y - first_row) * tiles_x + w.tile_x, to_second_four = w.wide ? 4 : tiles_x;
             opened = w.opens ? total : opened;
             for (int k = 0; k < 8; k++) member_of[total + k] = w.member;
-            total += store_nonzero(found, (w.tile_y - band.first) * tiles_x + w.tile_x, w.wide ? 4 : tiles_x, blocks + total, tiles + total);
+            total += store_nonzero(found, tile, to_second_four, blocks + total, tiles + total);
             ranges[w.member] = {static_cast<uint32_t>(total - opened), static_cast<uint32_t>(opened)};
         }
     }
@@ -223,7 +250,7 @@ inline void test_windows(Frame& frame, Band& band, const Window* windows, int co
 
 // Records of the band by depth, and the number of each tile. Ends early when all bands together have found too many.
 inline void find_records(Frame& frame, Band& band) {
-    const size_t tiles = static_cast<size_t>(band.last - band.first + 1) * frame.tiles_x, count = band.member_count;
+    const size_t tiles = tile_count(frame, band), count = band.member_count;
     std::memset(band.tile_places.need(tiles + 1), 0, tiles * sizeof(uint32_t));
     const Footprint* footprints = band.footprints;
     RecordRange* ranges = band.ranges.data();
@@ -236,7 +263,8 @@ inline void find_records(Frame& frame, Band& band) {
     const auto test = [&](int number) {
         const size_t before = band.record_count;
         test_windows(frame, band, windows, number, opened);
-        too_many = __atomic_add_fetch(&frame.records_found, band.record_count - before, __ATOMIC_RELAXED) > MOST_INTERSECTIONS;
+        const uint64_t found = band.record_count - before;
+        too_many = __atomic_add_fetch(&frame.records_found, found, __ATOMIC_RELAXED) > MOST_INTERSECTIONS;
     };
     const int first_row = band.first, last_row = band.last;
     for (size_t i = 0; i < count && !too_many; i++) {
@@ -248,8 +276,9 @@ inline void find_records(Frame& frame, Band& band) {
         const int top = larger(rows.first, first_row), bottom = smaller(rows.last, last_row);
         const int height = bottom - top + 1, width = columns.last - columns.first + 1;
         if (0 < height && height <= 4 && 0 < width && width <= 4) {  // nearly all: one window or two
-            windows[waiting] = {member, static_cast<uint16_t>(columns.first), static_cast<uint16_t>(top), false, true};
-            windows[waiting + 1] = {member, static_cast<uint16_t>(columns.first), static_cast<uint16_t>(top + 2), false, false};
+            const uint16_t x = static_cast<uint16_t>(columns.first), y = static_cast<uint16_t>(top);
+            windows[waiting] = {member, x, y, false, true};
+            windows[waiting + 1] = {member, x, static_cast<uint16_t>(y + 2), false, false};
             waiting += 1 + (height > 2);
         } else {
             ranges[member] = {0, 0};  // should it lie between two pixels
@@ -265,7 +294,7 @@ inline void find_records(Frame& frame, Band& band) {
         if (waiting >= WINDOWS) test(waiting), waiting = 0;
     }
     test(waiting);
-    std::memset(band.record_members.data() + band.record_count, 0, RECORDS_AHEAD * sizeof(uint32_t));  // for the prefetch
+    std::memset(band.record_members.data() + band.record_count, 0, RECORDS_AHEAD * sizeof(uint32_t));  // to prefetch
 }
 
 // ---------------------------------------------------------------- lists
@@ -357,8 +386,9 @@ inline void complete_entries(const Frame& frame, Band& band) {
 
 // The lists of the tiles of a band, which begin at `start`.
 inline void write_lists(Frame& frame, Band& band, uint32_t start) {
-    const size_t tiles = static_cast<size_t>(band.last - band.first + 1) * frame.tiles_x, records = band.record_count;
-    uint32_t *tile_start = frame.tile_start.data() + static_cast<size_t>(band.first) * frame.tiles_x, *place = band.tile_places.data();
+    const size_t tiles = tile_count(frame, band), records = band.record_count;
+    uint32_t* tile_start = frame.tile_start.data() + static_cast<size_t>(band.first) * frame.tiles_x;
+    uint32_t* place = band.tile_places.data();
     for (size_t tile = 0; tile < tiles; tile++) {
         tile_start[tile] = start;
         start += place[tile];
@@ -389,7 +419,8 @@ inline Status bin(Frame& frame) {
     frame.records_found = 0;
     choose_bands(frame);
     int out_of_memory = 0;
-#pragma omp parallel for schedule(static, 1) num_threads(frame.threads) reduction(+ : out_of_memory) if (frame.threads > 1)
+#pragma omp parallel for schedule(static, 1) num_threads(frame.threads) reduction(+ : out_of_memory) \
+    if (frame.threads > 1)
     for (int b = 0; b < frame.band_count; b++) {
         Band& band = frame.bands[b];
         try {
@@ -403,13 +434,17 @@ inline Status bin(Frame& frame) {
     }
     const size_t total = frame.records_found;
     if (out_of_memory || total > MOST_INTERSECTIONS) {
-        for (Band& band : frame.bands) band.record_tiles.release(), band.record_members.release(), band.record_blocks.release();
+        for (Band& band : frame.bands) {
+            band.record_tiles.release();
+            band.record_members.release();
+            band.record_blocks.release();
+        }
         return Status::too_many_intersections;
     }
     assign_all_rows(frame);
 
-    uint32_t band_start[MOST_BANDS + 1] = {};
-    for (int b = 0; b < frame.band_count; b++) band_start[b + 1] = band_start[b] + static_cast<uint32_t>(frame.bands[b].record_count);
+    size_t band_start[MOST_BANDS + 1] = {};
+    for (int b = 0; b < frame.band_count; b++) band_start[b + 1] = band_start[b] + frame.bands[b].record_count;
     frame.tile_start.need(tiles + 1)[tiles] = static_cast<uint32_t>(total);
     frame.list_splats.need(total + LIST_SPARE);
     frame.list_rows.need(total + LIST_SPARE);
@@ -417,7 +452,7 @@ inline Status bin(Frame& frame) {
 #pragma omp parallel for schedule(static, 1) num_threads(frame.threads) if (frame.threads > 1)
     for (int b = 0; b < frame.band_count; b++) {
         if (frame.band_count > 1) complete_entries(frame, frame.bands[b]);
-        write_lists(frame, frame.bands[b], band_start[b]);
+        write_lists(frame, frame.bands[b], static_cast<uint32_t>(band_start[b]));
     }
     for (size_t p = total; p < total + LIST_SPARE; p++)
         frame.list_splats.data()[p] = frame.list_rows.data()[p] = frame.list_blocks.data()[p] = 0;

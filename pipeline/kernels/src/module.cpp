@@ -34,8 +34,8 @@ extern const Kernels kernels_neon;
 extern const Kernels kernels_portable;
 
 void* allocate_aligned(size_t bytes) {
-    void* memory = std::aligned_alloc(64, (bytes + 63) / 64 * 64);
-    if (!memory) throw std::bad_alloc();
+    void* memory = nullptr;
+    if (posix_memalign(&memory, 64, bytes ? bytes : 1)) throw std::bad_alloc();
     return memory;
 }
 void release_aligned(void* memory) { std::free(memory); }
@@ -70,6 +70,7 @@ public:
     static nb::ndarray<nb::numpy, float, nb::ndim<1>> array(size_t count) {
         size_t capacity = 1024;
         while (capacity < count) capacity *= 2;
+        if (!SLACK) capacity = count;
         auto* loan = new Loan{instance().take(capacity), capacity};
         const nb::capsule owner(loan, [](void* p) noexcept {
             auto* loan = static_cast<Loan*>(p);
@@ -127,6 +128,21 @@ static const Kernels* kernels_named(const std::string& isa) {
     for (const Kernels* kernels : usable_kernels())
         if (isa == "auto" || isa == kernels->name) return kernels;
     throw std::invalid_argument("isa: " + isa + " is not available on this processor");
+}
+
+// Peaks of the machine, over `seconds`: GFLOP/s of multiply-adds; GB/s of reading and of copying.
+static double fma_rate(const std::string& isa, int threads, double seconds) {
+    const Kernels* kernels = kernels_named(isa);
+    const nb::gil_scoped_release unlocked;
+    return kernels->fma_rate(threads, seconds);
+}
+static nb::tuple bandwidth(int threads, double seconds) {
+    double read = 0.0, copied = 0.0;
+    {
+        const nb::gil_scoped_release unlocked;
+        usable_kernels().front()->bandwidth(threads, seconds, &read, &copied);
+    }
+    return nb::make_tuple(read, copied);
 }
 
 // Shapes are checked by pipeline.kernels.optimiser, the only caller. The lists have an array for each kind of parameter.
@@ -295,6 +311,8 @@ NB_MODULE(_raster, m) {
         .def("contributions", &Raster::contributions);
     m.def("adam", &raster::adam);
     m.def("empty", &raster::OutputPool::array);
+    m.def("fma_rate", &raster::fma_rate);
+    m.def("bandwidth", &raster::bandwidth);
     m.def("available_isas", [] {
         std::vector<std::string> names;
         for (const raster::Kernels* kernels : raster::usable_kernels()) names.push_back(kernels->name);

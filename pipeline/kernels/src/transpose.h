@@ -7,19 +7,19 @@ namespace KERNEL_ISA {
 
 #if !defined(KERNEL_PORTABLE) && defined(__AVX512F__)
 
-template <int WIDTH>
-struct ColumnIndices {  // where column k of sixteen rows of WIDTH floats lies, in their first two vectors and in the third
-    alignas(64) int32_t first[WIDTH][LANES], then[WIDTH][LANES];
-    constexpr ColumnIndices() : first(), then() {
-        for (int k = 0; k < WIDTH; k++)
+// Where column k of sixteen rows of three floats lies: in the first two vectors, and then with the third.
+struct ColumnsOf3 {
+    alignas(64) int32_t first[3][LANES], then[3][LANES];
+    constexpr ColumnsOf3() : first(), then() {
+        for (int k = 0; k < 3; k++)
             for (int lane = 0; lane < LANES; lane++) {
-                const int place = WIDTH * lane + k;
+                const int place = 3 * lane + k;
                 first[k][lane] = place % (2 * LANES);
                 then[k][lane] = place < 2 * LANES ? lane : LANES + place % LANES;
             }
     }
 };
-alignas(64) static constexpr ColumnIndices<3> COLUMNS_OF_3;
+alignas(64) static constexpr ColumnsOf3 COLUMNS_OF_3;
 
 inline __m512i load_indices(const int32_t* p) { return _mm512_load_si512(p); }
 
@@ -29,10 +29,11 @@ inline void load_rows3(const float* rows, Vec* columns) {
         columns[k] = _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, load_indices(COLUMNS_OF_3.first[k]), b),
                                             load_indices(COLUMNS_OF_3.then[k]), c);
 }
-// 4x4 transposes of floats within 128 bits, then of the 128-bit parts
+// 4x4 transposes of floats within 128 bits, and of the 128-bit parts
+inline __m512d low_pairs(__m512 a, __m512 b) { return _mm512_castps_pd(_mm512_unpacklo_ps(a, b)); }
+inline __m512d high_pairs(__m512 a, __m512 b) { return _mm512_castps_pd(_mm512_unpackhi_ps(a, b)); }
 inline void transpose_quads(__m512 a, __m512 b, __m512 c, __m512 d, __m512* out) {
-    const __m512d ab_low = _mm512_castps_pd(_mm512_unpacklo_ps(a, b)), ab_high = _mm512_castps_pd(_mm512_unpackhi_ps(a, b));
-    const __m512d cd_low = _mm512_castps_pd(_mm512_unpacklo_ps(c, d)), cd_high = _mm512_castps_pd(_mm512_unpackhi_ps(c, d));
+    const __m512d ab_low = low_pairs(a, b), ab_high = high_pairs(a, b), cd_low = low_pairs(c, d), cd_high = high_pairs(c, d);
     out[0] = _mm512_castpd_ps(_mm512_unpacklo_pd(ab_low, cd_low));
     out[1] = _mm512_castpd_ps(_mm512_unpackhi_pd(ab_low, cd_low));
     out[2] = _mm512_castpd_ps(_mm512_unpacklo_pd(ab_high, cd_high));
@@ -48,13 +49,18 @@ inline void transpose_parts(__m512 a, __m512 b, __m512 c, __m512 d, __m512* out)
 }
 inline void load_rows4(const float* rows, Vec* columns) {
     __m512 parts[4], out[4];
-    transpose_parts(_mm512_loadu_ps(rows), _mm512_loadu_ps(rows + 16), _mm512_loadu_ps(rows + 32), _mm512_loadu_ps(rows + 48), parts);
+    transpose_parts(_mm512_loadu_ps(rows), _mm512_loadu_ps(rows + 16), _mm512_loadu_ps(rows + 32),
+                    _mm512_loadu_ps(rows + 48), parts);
     transpose_quads(parts[0], parts[1], parts[2], parts[3], out);
     for (int k = 0; k < 4; k++) columns[k] = out[k];
 }
+// Part p of quads[r] becomes columns 0 to 3 of row 4 p + r.
+inline void transpose_quads(const Vec* columns, __m512* quads) {
+    transpose_quads(columns[0].v, columns[1].v, columns[2].v, columns[3].v, quads);
+}
 inline void store_rows16(float* rows, const Vec* columns) {
-    __m512 quads[4][4];  // [k][r]: part p holds columns 4k.. of row 4p + r
-    for (int k = 0; k < 4; k++) transpose_quads(columns[4 * k].v, columns[4 * k + 1].v, columns[4 * k + 2].v, columns[4 * k + 3].v, quads[k]);
+    __m512 quads[4][4];
+    for (int k = 0; k < 4; k++) transpose_quads(columns + 4 * k, quads[k]);
     for (int r = 0; r < 4; r++) {
         __m512 out[4];
         transpose_parts(quads[0][r], quads[1][r], quads[2][r], quads[3][r], out);
@@ -63,7 +69,7 @@ inline void store_rows16(float* rows, const Vec* columns) {
 }
 inline void store_rows8(float* rows, const Vec* columns) {
     __m512 quads[2][4], out[4];
-    for (int k = 0; k < 2; k++) transpose_quads(columns[4 * k].v, columns[4 * k + 1].v, columns[4 * k + 2].v, columns[4 * k + 3].v, quads[k]);
+    for (int k = 0; k < 2; k++) transpose_quads(columns + 4 * k, quads[k]);
     for (int r = 0; r < 4; r += 2) {
         transpose_parts(quads[0][r], quads[1][r], quads[0][r + 1], quads[1][r + 1], out);
         for (int p = 0; p < 4; p++) _mm512_store_ps(rows + 8 * (4 * p + r), out[p]);
@@ -141,9 +147,10 @@ inline void load_rows3(const float* rows, Vec* columns) {
     load_rows3(rows + 24, columns[0].b, columns[1].b, columns[2].b);
 }
 // 4x4 transposes within 128 bits
+inline __m256d low_pairs(__m256 a, __m256 b) { return _mm256_castps_pd(_mm256_unpacklo_ps(a, b)); }
+inline __m256d high_pairs(__m256 a, __m256 b) { return _mm256_castps_pd(_mm256_unpackhi_ps(a, b)); }
 inline void transpose_quads(__m256 a, __m256 b, __m256 c, __m256 d, __m256* out) {
-    const __m256d ab_low = _mm256_castps_pd(_mm256_unpacklo_ps(a, b)), ab_high = _mm256_castps_pd(_mm256_unpackhi_ps(a, b));
-    const __m256d cd_low = _mm256_castps_pd(_mm256_unpacklo_ps(c, d)), cd_high = _mm256_castps_pd(_mm256_unpackhi_ps(c, d));
+    const __m256d ab_low = low_pairs(a, b), ab_high = high_pairs(a, b), cd_low = low_pairs(c, d), cd_high = high_pairs(c, d);
     out[0] = _mm256_castpd_ps(_mm256_unpacklo_pd(ab_low, cd_low));
     out[1] = _mm256_castpd_ps(_mm256_unpackhi_pd(ab_low, cd_low));
     out[2] = _mm256_castpd_ps(_mm256_unpacklo_pd(ab_high, cd_high));
@@ -363,15 +370,21 @@ inline Vec load_unaligned(const float* p) {
     return r;
 }
 
-// Eight counts of bits, right, and eight, left, to eight words of 16 bits: the bits left[i] .. right[i] - 1 of word i.
-// Then, for each half of the words, the transpose of a 4x4 matrix of four-bit numbers.
+// ---------------------------------------------------------------- eight words of 16 bits
+//
+// bits_between      word i has the bits counts[8 + i] to counts[i] - 1; counts are 0 to 16, fractions are cut off
+// transpose_nibbles  for each half of the words, the transpose of a 4x4 matrix of four-bit numbers
+// masked            the first four words and those of `low`, the others and those of `high`
+// store_nonzero     the words that are not zero, and which of tile + 0, 1, 2, 3, tile + step + 0, 1, 2, 3 they belong to;
+//                   returns how many; what lies behind them, up to eight, holds anything
 #if !defined(KERNEL_PORTABLE) && defined(__AVX2__)
 typedef __m128i Words8;
 
 #if defined(__AVX512F__)
 inline Words8 bits_between(Vec counts) {
     const __m512i one = _mm512_set1_epi32(1);
-    const __m256i below = _mm512_cvtepi32_epi16(_mm512_sub_epi32(_mm512_sllv_epi32(one, _mm512_cvttps_epi32(counts.v)), one));
+    const __m512i power = _mm512_sllv_epi32(one, _mm512_cvttps_epi32(counts.v));
+    const __m256i below = _mm512_cvtepi32_epi16(_mm512_sub_epi32(power, one));
     return _mm_andnot_si128(_mm256_extracti128_si256(below, 1), _mm256_castsi256_si128(below));
 }
 #else
@@ -390,15 +403,15 @@ inline Words8 transpose_nibbles(Words8 x) {
     return _mm_xor_si128(x, _mm_xor_si128(t, _mm_slli_epi64(t, 24)));
 }
 inline Words8 masked(Words8 x, const uint16_t* low, const uint16_t* high) {
-    return _mm_and_si128(x, _mm_unpacklo_epi64(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(low)), _mm_loadl_epi64(reinterpret_cast<const __m128i*>(high))));
+    const __m128i first = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(low));
+    const __m128i second = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(high));
+    return _mm_and_si128(x, _mm_unpacklo_epi64(first, second));
 }
-// Stores the words that are not zero, and of tile + 0, 1, 2, 3 and those + stride the ones of these words; returns how many.
-// Writes all eight.
 #if defined(__AVX512F__)
-inline uint32_t store_nonzero(Words8 x, uint32_t tile, uint32_t stride, uint16_t* words, uint32_t* tiles) {
+inline uint32_t store_nonzero(Words8 x, uint32_t tile, uint32_t step, uint16_t* words, uint32_t* tiles) {
     const __mmask8 some = _mm_test_epi16_mask(x, x);
-    const __m256i of_row = _mm256_add_epi32(_mm256_setr_epi32(0, 1, 2, 3, 0, 1, 2, 3), _mm256_set1_epi32(tile));
-    const __m256i all = _mm256_mask_add_epi32(of_row, 0xf0, of_row, _mm256_set1_epi32(stride));
+    const __m256i in_four = _mm256_add_epi32(_mm256_setr_epi32(0, 1, 2, 3, 0, 1, 2, 3), _mm256_set1_epi32(tile));
+    const __m256i all = _mm256_mask_add_epi32(in_four, 0xf0, in_four, _mm256_set1_epi32(step));
     _mm256_storeu_si256(reinterpret_cast<__m256i*>(tiles), _mm256_maskz_compress_epi32(some, all));
     const __m256i wide = _mm256_maskz_compress_epi32(some, _mm256_cvtepu16_epi32(x));
     _mm_storeu_si128(reinterpret_cast<__m128i*>(words), _mm256_cvtepi32_epi16(wide));
@@ -414,14 +427,17 @@ struct Compress8 {  // for every set of bits, their numbers
     }
 };
 alignas(64) static constexpr Compress8 COMPRESS8;
-inline uint32_t store_nonzero(Words8 x, uint32_t tile, uint32_t stride, uint16_t* words, uint32_t* tiles) {
+inline uint32_t store_nonzero(Words8 x, uint32_t tile, uint32_t step, uint16_t* words, uint32_t* tiles) {
     const __m256i wide = _mm256_cvtepu16_epi32(x);
-    const uint32_t some = 0xff & ~_mm256_movemask_ps(_mm256_castsi256_ps(_mm256_cmpeq_epi32(wide, _mm256_setzero_si256())));
+    const __m256i none = _mm256_cmpeq_epi32(wide, _mm256_setzero_si256());
+    const uint32_t some = 0xff & ~_mm256_movemask_ps(_mm256_castsi256_ps(none));
     const __m256i lanes = _mm256_load_si256(reinterpret_cast<const __m256i*>(COMPRESS8.lanes[some]));
-    const __m256i all = _mm256_add_epi32(_mm256_set1_epi32(tile), _mm256_setr_epi32(0, 1, 2, 3, stride, stride + 1, stride + 2, stride + 3));
+    const __m256i places = _mm256_setr_epi32(0, 1, 2, 3, step, step + 1, step + 2, step + 3);
+    const __m256i all = _mm256_add_epi32(_mm256_set1_epi32(tile), places);
     _mm256_storeu_si256(reinterpret_cast<__m256i*>(tiles), _mm256_permutevar8x32_epi32(all, lanes));
     const __m256i kept = _mm256_permutevar8x32_epi32(wide, lanes);
-    _mm_storeu_si128(reinterpret_cast<__m128i*>(words), _mm_packus_epi32(_mm256_castsi256_si128(kept), _mm256_extracti128_si256(kept, 1)));
+    const __m128i narrow = _mm_packus_epi32(_mm256_castsi256_si128(kept), _mm256_extracti128_si256(kept, 1));
+    _mm_storeu_si128(reinterpret_cast<__m128i*>(words), narrow);
     return __builtin_popcount(some);
 }
 #endif
@@ -473,8 +489,8 @@ struct Words8 {
 };
 inline Words8 bits_between(Vec counts) {
     uint16_t words[8];
-    for (int i = 0; i < 8; i++)
-        words[i] = static_cast<uint16_t>(((1u << static_cast<int>(counts.v[i])) - 1) & ~((1u << static_cast<int>(counts.v[8 + i])) - 1));
+    const auto below = [&](int i) { return (1u << static_cast<int>(counts.v[i])) - 1; };
+    for (int i = 0; i < 8; i++) words[i] = static_cast<uint16_t>(below(i) & ~below(8 + i));
     Words8 r;
     std::memcpy(&r, words, sizeof r);
     return r;
@@ -494,11 +510,11 @@ inline Words8 masked(Words8 r, const uint16_t* low, const uint16_t* high) {
     std::memcpy(&b, high, sizeof b);
     return {{r.half[0] & a, r.half[1] & b}};
 }
-inline uint32_t store_nonzero(Words8 x, uint32_t tile, uint32_t stride, uint16_t* words, uint32_t* tiles) {
+inline uint32_t store_nonzero(Words8 x, uint32_t tile, uint32_t step, uint16_t* words, uint32_t* tiles) {
     uint32_t n = 0;
     for (int i = 0; i < 8; i++) {
         const uint16_t word = static_cast<uint16_t>(x.half[i / 4] >> i % 4 * 16);
-        words[n] = word, tiles[n] = tile + i % 4 + (i / 4 ? stride : 0);
+        words[n] = word, tiles[n] = tile + i % 4 + (i / 4 ? step : 0);
         n += word != 0;
     }
     return n;

@@ -21,8 +21,6 @@ struct BlockOffsets {
 };
 alignas(64) static constexpr BlockOffsets PIXEL_OF_BLOCK(1);  // lane -> pixel within its 4x4 block
 
-// ---------------------------------------------------------------- projection
-
 // Column k of the rows `ids` of a row-major array, for all k < WIDTH.
 template <int WIDTH>
 inline void gather(const float* array, const uint32_t* ids, Vec* out) {
@@ -87,41 +85,62 @@ inline Mask on_screen(const View& view, Vec u, Vec v, Vec extent_x, Vec extent_y
            (v - extent_y <= Vec(view.height - 1.0f));
 }
 
+// At least e^x, at most 2.2 times that: without the mantissa.
+inline Vec exp_bound(Vec x) {
+    const Vec t = min(max(x * Vec(LOG2_E), Vec(-120.0f)), Vec(120.0f));
+    return scale_by_power(Vec(1.5f), t + Vec(12582912.0f));
+}
+
 // False where a bound from centre and largest scale alone keeps a Gaussian off the screen: most of a map lies elsewhere.
-// |row of J| = f/z sqrt(1 + slope^2), so a variance is at most (s f/z)^2 (1 + limit^2) + blur, and alpha >= 1/255 reaches no
-// further than sqrt(2 ln 255) = 3.33 standard deviations.
+// |row of J| = f/z sqrt(1 + slope^2), so a variance is at most (s f/z)^2 (1 + limit^2) + blur, and alpha >= 1/255 reaches
+// no further than sqrt(2 ln 255) = 3.33 standard deviations.
 inline Mask may_be_seen(const View& view, const Parameters16& p) {
     const CameraPoint16 c(view, p.mean);
-    const Vec largest = exp(max(p.log_scale[0], max(p.log_scale[1], p.log_scale[2]))) * c.inverse_z;
+    const Vec largest = exp_bound(max(p.log_scale[0], max(p.log_scale[1], p.log_scale[2]))) * c.inverse_z;
     const auto bound = [&](float focal, float limit) {
         return fma(largest, Vec(3.34f * focal * __builtin_sqrtf(1.0f + limit * limit)), Vec(3.34f * 0.548f));
     };
-    return (c.z >= Vec(NEAR_M)) & on_screen(view, c.u, c.v, bound(view.fx, slope_limit(view.width, view.fx)),
-                                            bound(view.fy, slope_limit(view.height, view.fy)));
+    const Vec extent_x = bound(view.fx, slope_limit(view.width, view.fx));
+    const Vec extent_y = bound(view.fy, slope_limit(view.height, view.fy));
+    return (c.z >= Vec(NEAR_M)) & on_screen(view, c.u, c.v, extent_x, extent_y);
 }
 
 constexpr float ALPHA_SLACK = 1e-4f;  // of log2 alpha; more than the rounding of the loops over pixels
 
-// First and last tile on one axis as one number, in the low bits of a float.
+// First and last tile on one axis as one number below 2^22, in the low bits of a float.
 struct TileRange {
     int first, last;
     explicit TileRange(uint32_t bits) : first(bits & 2047), last(bits >> 11 & 2047) {}
     static Vec pack(Vec first_pixel, Vec last_pixel, int pixels) {
-        const Vec zero(0.0f), edge(pixels - 1.0f), half(0.5f), per_tile(1.0f / TILE);
-        const Vec shifter(12582912.0f), integer(8388608.0f);  // adding one rounds to an integer, see exp2; floats from the other on are
-        const auto tile = [&](Vec pixel) { return (fma(min(max(pixel, zero), edge), per_tile, -half) + shifter) - shifter; };
-        return fma(tile(last_pixel), Vec(2048.0f), tile(first_pixel)) + integer;
+        const Vec zero(0.0f), edge(pixels - 1.0f), half(0.5f), per_tile(1.0f / TILE), shifter(12582912.0f);  // see exp2
+        const auto tile = [&](Vec pixel) {
+            return (fma(min(max(pixel, zero), edge), per_tile, -half) + shifter) - shifter;
+        };
+        return fma(tile(last_pixel), Vec(2048.0f), tile(first_pixel)) + Vec(8388608.0f);  // 2^23
     }
 };
 
-constexpr size_t CHUNK = 32 * LANES;  // Gaussians that are projected together
+// What the ellipse covers, see Footprint. C is (M^T M)^-1 up to a factor, so its correlation is -M12 / |(M12, M22)|, and
+// nothing cancels in sqrt(1 - c^2).
+inline void footprint_columns(const View& view, const Splat16& s, Vec extent_x, Vec extent_y, Vec* columns) {
+    const Vec one(1.0f), quarter(0.25f), per_length = one / sqrt(fma(s.M12, s.M12, s.M22 * s.M22));
+    const Vec skew = -s.M12 * per_length, upright = s.M22 * per_length;
+    const Vec rounding = (max(s.u, -s.u) + max(s.v, -s.v)) * Vec(1.0f / (1 << 22));  // of centres far from the screen
+    columns[0] = quarter * s.u;
+    columns[1] = s.v;
+    columns[2] = one / extent_y;
+    columns[3] = skew;
+    columns[4] = quarter * (extent_x * skew);
+    columns[5] = quarter * fma(extent_x, upright, rounding);
+    columns[6] = TileRange::pack(s.u - extent_x + one, s.u + extent_x, view.width);  // + 1: up, if only by part of a pixel
+    columns[7] = TileRange::pack(s.v - extent_y + one, s.v + extent_y, view.height);
+}
 
 // Writes the splats and footprints from `first` on, and the keys of those that are drawn; returns how many are.
-__attribute__((flatten)) inline uint32_t project_group(Frame& frame, const Neighbours16& g, size_t first, uint32_t lanes,
-                                                       uint64_t* keys) {
+inline uint32_t project_group(Frame& frame, const Neighbours16& g, size_t first, uint32_t lanes, uint64_t* keys) {
     const View& view = frame.view;
     const Splat16 s = project16(view, g.p.mean, g.p.quat, g.p.log_scale);
-    const Vec log2_opacity = log2_sigmoid(g.p.logit), zero(0.0f), one(1.0f);
+    const Vec log2_opacity = log2_sigmoid(g.p.logit), zero(0.0f);
     // alpha >= 1/255 is an ellipse in a box of half size sqrt(2 ln(255 opacity) cov_ii)
     const Vec reach = max(log2_opacity - Vec(LOG2_ALPHA_MIN - ALPHA_SLACK), zero) * Vec(2.0f * LN_2);
     const Vec extent_x = sqrt(reach * s.cov_xx), extent_y = sqrt(reach * s.cov_yy);
@@ -132,13 +151,10 @@ __attribute__((flatten)) inline uint32_t project_group(Frame& frame, const Neigh
     const Vec splat[16] = {s.u, s.v, s.M11, s.M12, s.M22, log2_opacity, g.color[0], g.color[1], g.color[2], s.z,
                            zero, zero, zero, zero, zero, zero};
     store_rows16(reinterpret_cast<float*>(frame.splats.data() + first), splat);
-    // C is (M^T M)^-1 up to a factor: its correlation is -M12 / |(M12, M22)|, and nothing cancels in sqrt(1 - c^2)
-    const Vec per_length = one / sqrt(fma(s.M12, s.M12, s.M22 * s.M22)), blocks_x = Vec(0.25f) * extent_x;
-    const Vec skew = -s.M12 * per_length, upright = s.M22 * per_length;
-    const Vec footprint[8] = {Vec(0.25f) * s.u, s.v, one / extent_y, skew, blocks_x * skew, blocks_x * upright,
-                              TileRange::pack(s.u - extent_x + one, s.u + extent_x, view.width),  // + 1: up, if only by part
-                              TileRange::pack(s.v - extent_y + one, s.v + extent_y, view.height)};
+    Vec footprint[8];
+    footprint_columns(view, s, extent_x, extent_y, footprint);
     store_rows8(reinterpret_cast<float*>(frame.footprints.data() + first), footprint);
+
     alignas(64) float depth[LANES];
     store(depth, s.z);
     uint32_t count = 0;
@@ -151,19 +167,19 @@ __attribute__((flatten)) inline uint32_t project_group(Frame& frame, const Neigh
     return count;
 }
 
-inline size_t chunk_count(size_t gaussians) { return (gaussians + CHUNK - 1) / CHUNK; }
+constexpr size_t CHUNK = 32 * LANES;  // Gaussians that are projected together
 
-// Projects one chunk; false if a parameter is not usable.
-inline bool project_chunk(Frame& frame, const GaussianArrays& gaussians, size_t chunk) {
+// Projects one chunk; false if a parameter is not usable. Flat, because most of a Splat16 serves only the way back.
+__attribute__((flatten)) inline bool project_chunk(Frame& frame, const GaussianArrays& gaussians, size_t chunk) {
     const size_t begin = chunk * CHUNK, end = begin + CHUNK < gaussians.count ? begin + CHUNK : gaussians.count;
     uint64_t* keys = frame.depth_keys.data() + begin;
     uint32_t drawn = 0;
     bool all_usable = true;
     for (size_t first = begin; first < end; first += LANES) {
         const Neighbours16 g(gaussians, first);
+        const uint32_t lanes = end - first < LANES ? (1u << (end - first)) - 1 : 0xffffu;
         all_usable &= usable(g);
-        if (!any(may_be_seen(frame.view, g.p))) continue;
-        drawn += project_group(frame, g, first, end - first < LANES ? (1u << (end - first)) - 1 : 0xffffu, keys + drawn);
+        if (any(may_be_seen(frame.view, g.p))) drawn += project_group(frame, g, first, lanes, keys + drawn);
     }
     frame.chunk_drawn.data()[chunk] = drawn;
     return all_usable;
@@ -171,7 +187,7 @@ inline bool project_chunk(Frame& frame, const GaussianArrays& gaussians, size_t 
 
 // Projects all Gaussians; false if a parameter is not usable.
 inline bool project_all(Frame& frame, const GaussianArrays& gaussians) {
-    const size_t chunks = chunk_count(gaussians.count);
+    const size_t chunks = (gaussians.count + CHUNK - 1) / CHUNK;
     frame.chunks = chunks;
     frame.splats.need(chunks * CHUNK);
     frame.footprints.need(chunks * CHUNK);
