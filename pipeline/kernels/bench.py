@@ -51,20 +51,23 @@ PEAK_S = 0.1  # per instruction set, number of threads and scene; the best count
 # four pixels of a row of a block share counts a quarter.
 LOG2_ALPHA = 10  # pixel - centre 2, e = M d 4, log2 opacity - |e|^2 4
 ALPHA = 17  # 2^t and 1 - 2^t 15: three to split off the exponent, five multiply-adds, two for the rest; two clamps
-REPLAY = LOG2_ALPHA + ALPHA + 2  # weight, transmittance
+REPLAY = LOG2_ALPHA + ALPHA + 3  # transmittance before, from that behind by a division; weight
 E_AGAIN = 3  # e for the sums
 OWN = 8 + 3 + 2  # cotangent of the own value, of what lies behind; w, zero where alpha is clamped
 MOMENTS = E_AGAIN + 5 + 9 / 4  # six, of w
 SCREEN_MOMENTS = E_AGAIN + 9 + 23 / 4  # thirteen, of w^2
-DEPTH_MOMENTS = E_AGAIN + 6 + 8 / 4  # six
+DEPTH_MOMENTS = E_AGAIN + 5 + 8 / 4  # five
+SWEEP = OWN + MOMENTS + 4 * 2  # weight times the four cotangents
 FLOPS = {
     "forward": ALPHA + 3 + 4 * 2,  # weight, transmittance, closed?; three colours and depth
-    "backward": REPLAY + OWN + MOMENTS + 4 * 2,
-    "backward_fisher": REPLAY + OWN + MOMENTS + 4 * 2 + (1 + SCREEN_MOMENTS) + (3 + DEPTH_MOMENTS) + 3 * 3,
-    "gauss_newton": REPLAY + 4 * 3 + 13 + SCREEN_MOMENTS + (2 + DEPTH_MOMENTS) + 3 * 2,
+    "backward": REPLAY + SWEEP,
+    "backward_fisher": REPLAY + SWEEP + (1 + SCREEN_MOMENTS) + (2 + DEPTH_MOMENTS) + (1 + 4 * 2),
+    "gauss_newton": REPLAY + 4 * 3 + 13 + SCREEN_MOMENTS + DEPTH_MOMENTS + (1 + 2 * 2) + 2 * 2,
     "contributions": REPLAY + 1,
 }
-FLOPS["view_gradients"] = FLOPS["forward"] + FLOPS["backward"]  # the loss is of pixels, not of pairs
+FLOPS["view_gradients"] = (
+    FLOPS["forward"] + SWEEP
+)  # alpha and weight are there; the loss is of pixels, not of pairs
 EVALUATED_FLOPS = (
     LOG2_ALPHA + 1
 )  # of the pairs that a forward looks at, drawn or not: is alpha at least 1/255?

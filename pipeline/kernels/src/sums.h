@@ -109,11 +109,6 @@ inline Vec if_unclamped(Vec alpha, Vec value) { return select_or_zero(alpha < Ve
 
 // ---------------------------------------------------------------- lanes are Gaussians
 
-inline void transpose(const Lanes& rows, Lanes& columns) {
-    for (int k = 0; k < BATCH; k++) columns[k] = rows[k];
-    transpose16(columns);
-}
-
 template <int USED, int ROW>
 ALWAYS_INLINE inline void unused_sums(Vec* sums) {
     unrolled<ROW - USED>([&](auto k) ALWAYS_INLINE {
