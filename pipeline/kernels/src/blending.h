@@ -24,13 +24,15 @@ struct Whitened {
     Vec log2_alpha(const Splat& s) const { return fnma(y, y, fnma(x, x, Vec(s.log2_opacity))); }
 };
 
-// Depth of a Gaussian at the pixels whose e is given.
+// Depth of a Gaussian at the pixels.
 template <DepthKind KIND>
-inline Vec depth_at(const Splat& s, const Whitened& e) {
-    if constexpr (KIND == DepthKind::ray_plane)
+ALWAYS_INLINE inline Vec depth_at(const Splat& s, Vec pixel_x, Vec pixel_y) {
+    if constexpr (KIND == DepthKind::ray_plane) {
+        const Whitened e(s, pixel_x, pixel_y);
         return fma(Vec(s.slope_x), e.x, fma(Vec(s.slope_y), e.y, Vec(s.z)));
-    else
+    } else {
         return Vec(s.z);
+    }
 }
 
 // From log2 alpha, clamped alpha and 1 - alpha; where it is not seen, 0 and 1.
@@ -75,9 +77,8 @@ ALWAYS_INLINE inline uint32_t blend_some(const Splat* splats, const uint32_t* ca
     unrolled<N>([&](auto k) ALWAYS_INLINE {
         position[k] = candidates[k];
         const Splat& s = splats[position[k]];
-        const Whitened e(s, block.pixel_x, block.pixel_y);
-        alpha[k] = e.log2_alpha(s);
-        depth[k] = depth_at<KIND>(s, e);
+        alpha[k] = Whitened(s, block.pixel_x, block.pixel_y).log2_alpha(s);
+        if constexpr (KIND == DepthKind::ray_plane) depth[k] = depth_at<KIND>(s, block.pixel_x, block.pixel_y);
     });
     unrolled<N>([&](auto k) ALWAYS_INLINE {
         seen[k] = alpha[k] >= Vec(LOG2_ALPHA_MIN);

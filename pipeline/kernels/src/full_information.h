@@ -23,7 +23,7 @@ NO_INLINE static void full_block(const Sweep& sweep, const Block& block, uint32_
         Vec sums[FULL_ROW];
         for (Vec& sum : sums) sum = Vec(0.0f);
         pass.walk(batch, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
-            const Vec own[4] = {Vec(s.r), Vec(s.g), Vec(s.b), depth_at<KIND>(s, Whitened(s, pixel_x, pixel_y))};
+            const Vec own[4] = {Vec(s.r), Vec(s.g), Vec(s.b), depth_at<KIND>(s, pixel_x, pixel_y)};
             const Vec weight2 = weight * weight, moving2 = if_unclamped(alpha, weight2);
             w2[k] = Vec(0.0f);
             for (int channel = 0; channel < 4; channel++) {

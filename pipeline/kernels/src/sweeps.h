@@ -111,7 +111,7 @@ NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uin
         Vec sums[ROW];
         unused_sums<D == Derivatives::POSE ? SUM_R : SUMS_OF<D, KIND>, ROW>(sums);
         pass.walk(batch, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
-            const Vec depth = depth_at<KIND>(s, Whitened(s, pixel_x, pixel_y));
+            const Vec depth = depth_at<KIND>(s, pixel_x, pixel_y);
             const Vec own = fma(Vec(s.r), r, fma(Vec(s.g), g, fma(Vec(s.b), b, fma(depth, z, a))));
             const Vec gain = gain_over(behind, own, alpha);
             w[k] = if_unclamped(alpha, weight * gain);
@@ -189,7 +189,7 @@ NO_INLINE static void information_block(const Sweep& sweep, const Block& block, 
         unused_sums<INFORMATION_SUMS<KIND>, INFORMATION_ROW>(sums);
         pass.walk(batch, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
             const Vec gain_r = gain_over(behind_r, Vec(s.r), alpha), gain_g = gain_over(behind_g, Vec(s.g), alpha);
-            const Vec depth = depth_at<KIND>(s, Whitened(s, pixel_x, pixel_y));
+            const Vec depth = depth_at<KIND>(s, pixel_x, pixel_y);
             const Vec gain_b = gain_over(behind_b, Vec(s.b), alpha), gain_z = gain_over(behind_z, depth, alpha);
             const Vec color2 = fma(gain_r, gain_r, fma(gain_g, gain_g, gain_b * gain_b)), depth_gain = of_depth * gain_z;
             const Vec moving2 = if_unclamped(alpha, weight * weight);

@@ -196,7 +196,7 @@ inline void transpose8(__m256* a) {
         a[4 + c] = _mm256_permute2f128_ps(left[c], right[c], 0x31);
     }
 }
-inline void transpose16(Vec* v) {
+NO_INLINE static void transpose16(Vec* v) {  // it takes all sixteen registers
     __m256 quarters[4][8];
     for (int i = 0; i < 8; i++) {
         quarters[0][i] = v[i].a, quarters[1][i] = v[i].b;
