@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.poses import PosePacket, SharedKeyframes
+from pipeline.consensus.links import PosePacket, SharedKeyframes
 from pipeline.exchange.compact import COMPACT, decode, encode
 from pipeline.exchange.packets import (
     EVIDENCE_BYTES,

@@ -140,12 +140,16 @@ def talk(agents: dict[str, PoseAgent], rounds: int, loss: float = 0.0, seed: int
     return rounds
 
 
+def in_root_frame(agents: dict[str, PoseAgent]) -> dict[str, Array]:
+    """Keyframes by robot in the map frame of the lowest name, whose first keyframe stays where its own map has it."""
+    root = agents[min(agents)]
+    T = root.T_map_keyframe[0] @ se3.inverse(root.T_world_keyframe[0])
+    return {robot: T @ agents[robot].T_world_keyframe for robot in sorted(agents)}
+
+
 def team_poses(agents: dict[str, PoseAgent]) -> Array:
     """All keyframes one after the other, in order of name, in the root's map frame."""
-    root = agents[min(agents)]
-    for agent in agents.values():
-        agent.apply_gauge(root.gauge_correction())
-    return np.concatenate([agents[r].T_world_keyframe for r in sorted(agents)])
+    return np.concatenate(list(in_root_frame(agents).values()))
 
 
 def from_first(poses: Array) -> Array:
