@@ -50,6 +50,7 @@ class Kind(IntEnum):
     PAIRS = 10  # matched Gaussians of two robots
     EVIDENCE = 11  # Gaussians of one robot with their information, compact
     EVIDENCE_EXACT = 12  # the same in float32
+    POSE_GRAPH = 13  # `duagc posegraph` only: frames and eliminated graphs; its first byte says which
 
 
 FIRE_AND_FORGET = frozenset({Kind.ACK, Kind.STATE})
