@@ -10,7 +10,7 @@ as fronts: the step is that of the centralised solver, up to rounding.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,11 +30,12 @@ _ANCHOR = 1e6  # of the largest diagonal entry, on the root's first keyframe; on
 class Block:
     """Quadratic form that is left of a subtree: 1/2 d' H d + g' d over its shared variables, H [6 b, 6 b], g [6 b].
 
+    H is None if it is that of the last block: nothing below was linearised anew.
     cost: the subtree's |r|^2 at the linearisation point. largest_step: largest component of its last step (m, rad).
     reweighted: some weight below has changed since the last block. unsure: some weight below is not final.
     """
 
-    H: Array
+    H: Array | None
     g: Array
     cost: float
     largest_step: float
@@ -55,73 +56,69 @@ class Front:
         shared: Sequence[Variable],
     ) -> None:
         """own: variables of the robot's own factors, copies included. children: by child, its shared variables."""
-        eliminated = [*own, *(v for child in sorted(children) for v in children[child])]
-        eliminated = [v for v in dict.fromkeys(eliminated) if v not in set(shared)]
-        order = [*eliminated, *shared]
-        at = {v: k for k, v in enumerate(order)}
-        self.variables, self.shared, self.eliminated = order, list(shared), len(eliminated)
+        everything = [*own, *(v for child in sorted(children) for v in children[child])]
+        up = set(shared)
+        eliminated = [v for v in dict.fromkeys(everything) if v not in up]
+        at = {v: k for k, v in enumerate([*eliminated, *shared])}
+        self.shared, self.eliminated, self.size = list(shared), len(eliminated), len(at)
         self.own_slots = np.array([at[v] for v in own], dtype=np.int64)
         self.child_slots = {child: np.array([at[v] for v in children[child]], np.int64) for child in children}
-        self._back: tuple[object, Array, Array] | None = None
+        self._solve: Callable[[Array], Array] | None = None
+        self._coupling = self._rest = np.zeros((0, 0))
 
-    def reduce(
-        self,
-        factors: Factors,
-        weights: Array,
-        T: Array,
-        children: Mapping[int, Block],
-        damping: float,
-        anchor: int | None = None,
-    ) -> tuple[Array, Array]:
-        """Linearise own factors at poses T [own, 4, 4], add the children's blocks, eliminate.
-
-        Args:
-            damping: Levenberg-Marquardt, relative to the diagonal. anchor: own variable that is held, at the root.
-        Returns:
-            H [6 s, 6 s] and g [6 s] over the shared variables.
-        """
-        g_own, jacobians = pose_factors.gradient(factors, weights, T)
-        undamped = pose_factors.curvature_matrix(factors, jacobians, np.zeros_like(g_own))
-        scale = undamped.diagonal().reshape(-1, 6)
-        diagonal = damping * scale + _FLOOR * scale.max(initial=1.0)
-        if anchor is not None:
-            diagonal[anchor] += _ANCHOR * scale.max()
-        H_own = (undamped + sparse.diags(diagonal.ravel())).tocoo()
-        lanes = np.arange(6)
-        own = (6 * self.own_slots[:, None] + lanes).ravel()
-        g = np.zeros(6 * len(self.variables))
-        g[own] = g_own.ravel()
-        rows, columns, values = [own[H_own.row]], [own[H_own.col]], [H_own.data]
+    def factorise(self, H_own: sparse.csc_matrix, children: Mapping[int, Array]) -> Array:
+        """Add the children's blocks [6 b, 6 b] to the own one, eliminate; returns H [6 s, 6 s] over the shared ones."""
+        own = H_own.tocoo()
+        slots = _lanes(self.own_slots)
+        rows, columns, values = [slots[own.row]], [slots[own.col]], [own.data]
         for child in sorted(children):
-            slots = (6 * self.child_slots[child][:, None] + lanes).ravel()
-            block = children[child]
-            filled = np.nonzero(block.H)
+            slots, filled = _lanes(self.child_slots[child]), np.nonzero(children[child])
             rows.append(slots[filled[0]])
             columns.append(slots[filled[1]])
-            values.append(block.H[filled])
-            g[slots] += block.g
-        size = 6 * len(self.variables)
+            values.append(children[child][filled])
         index = (np.concatenate(rows), np.concatenate(columns))
-        H = sparse.coo_matrix((np.concatenate(values), index), shape=(size, size)).tocsc()
+        shape = (6 * self.size, 6 * self.size)
+        H = sparse.coo_matrix((np.concatenate(values), index), shape=shape).tocsc()
         e = 6 * self.eliminated
-        H_es = np.ascontiguousarray(H[:e, e:].toarray())
-        H_ss, g_s = H[e:, e:].toarray(), g[e:].copy()
-        if e == 0:
-            self._back = (None, np.zeros((0, len(g_s))), np.zeros(0))
-            return H_ss, g_s
-        solve = pose_factors.factorised(H[:e, :e].tocsc())
-        X = solve(H_es) if H_es.shape[1] else H_es
-        y = solve(g[:e])
-        self._back = (solve, X, y)
-        S = H_ss - H_es.T @ X
-        return 0.5 * (S + S.T), g_s - H_es.T @ y
+        across, kept = H[:e, e:].toarray(), H[e:, e:].toarray()
+        self._solve = pose_factors.factorised(H[:e, :e].tocsc()) if e else None
+        self._coupling = self._solve(across) if self._solve is not None and across.size else across
+        S = kept - across.T @ self._coupling
+        return 0.5 * (S + S.T)
+
+    def eliminate(self, g_own: Array, children: Mapping[int, Array]) -> Array:
+        """The gradient [6 s] over the shared variables, from those of own variables [v, 6] and of children [6 b]."""
+        g = np.zeros(6 * self.size)
+        g[_lanes(self.own_slots)] = g_own.ravel()
+        for child in sorted(children):
+            g[_lanes(self.child_slots[child])] += children[child]
+        e = 6 * self.eliminated
+        self._rest = self._solve(g[:e]) if self._solve is not None else g[:0]
+        return g[e:] - self._coupling.T @ g[:e]
 
     def resolve(self, shared_step: Array) -> Array:
         """Steps [v, 6] of all variables from those of the shared ones [s, 6]."""
-        assert self._back is not None
-        _, X, y = self._back
-        eliminated = -y - X @ shared_step.ravel()
+        eliminated = -self._rest - self._coupling @ shared_step.ravel()
         return np.concatenate([eliminated, shared_step.ravel()]).reshape(-1, 6)
+
+
+def _lanes(slots: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows of the tangents of some variables."""
+    return (6 * slots[:, None] + np.arange(6)).ravel()
+
+
+def damped(factors: Factors, jacobians: tuple[Array, Array], n: int, damping: float, anchor: int | None) -> sparse.csc_matrix:
+    """Gauss-Newton matrix of a robot's own factors over its n variables, damped relative to its diagonal.
+
+    Args:
+        anchor: own variable that is held, at the root: it only fixes the gauge.
+    """
+    H = pose_factors.curvature_matrix(factors, jacobians, np.zeros((n, 6)))
+    scale = H.diagonal().reshape(-1, 6)
+    diagonal = damping * scale + _FLOOR * scale.max(initial=1.0)
+    if anchor is not None:
+        diagonal[anchor] += _ANCHOR * scale.max()
+    return (H + sparse.diags(diagonal.ravel())).tocsc()
 
 
 def shared_variables(everybody: Mapping[Variable, int], subtree: int) -> list[Variable]:

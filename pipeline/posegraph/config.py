@@ -33,6 +33,8 @@ class PoseGraphConfig(Config):
     """Shared by all solvers: robust weights, tolerance, and what only edge-ADMM uses."""
     elimination_tolerance: float = Field(default=1e-7, gt=0.0)
     """The exact steps end when nothing moves more than this (m, rad)."""
+    elimination_wire: Literal["float32", "float64"] = "float64"
+    """Precision of the matrices on the wire; float32 halves the bytes, and slows ill-conditioned graphs."""
     paper_penalty: float = Field(default=1.0, gt=0.0)
     """rho of the printed iteration, as a multiple of the closures' information."""
 

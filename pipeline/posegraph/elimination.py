@@ -1,7 +1,8 @@
 """Exact elimination on the wire: blocks go up the best supported tree of robots, steps come down.
 
 One exchange is a block up and a step down every link of the tree: a Gauss-Newton step of the whole team, damped after
-Levenberg and Marquardt where it would not lower the cost. The root, the lowest name, only adds and decides on the
+Levenberg and Marquardt where it would not lower the cost. A matrix is sent again only where rotations below moved (or
+weights or damping changed); gradients always. The root, the lowest name, only adds and decides on the
 damping; it sees a quadratic form over shared keyframes, nobody's graph.
 """
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.consensus import factors as pose_factors
 from pipeline.consensus.closures import closure_factors, holder, spanning_tree
-from pipeline.consensus.elimination import Block, Front, Variable, shared_variables
+from pipeline.consensus.elimination import Block, Front, Variable, damped, shared_variables
 from pipeline.consensus.factors import Factors, retract
 from pipeline.consensus.graphs import RobotGraph
 from pipeline.consensus.robust import RobustWeights
@@ -25,6 +26,8 @@ from pipeline.posegraph.config import PoseGraphConfig
 from pipeline.posegraph.wire import Code, Step
 
 Array = NDArray[np.float64]
+_SLOW = 0.5  # share of the step before from which the matrices are too old
+_ROUNDING = 1e-10  # relative rise of the cost that is no rise
 
 
 class EliminationAgent(GraphAgent):
@@ -52,7 +55,9 @@ class EliminationAgent(GraphAgent):
             self._subtree |= (at == self.own) << robot
         self._fronts: dict[int, dict[Variable, int]] = {}
         self._blocks: dict[int, Block] = {}
-        self._damping = self._largest_step = 0.0
+        self._damping = self._damped = self._largest_step = self._moved_rad = 0.0
+        self._matrices: dict[int, Array] = {}  # by child: the last one that came
+        self._step_before = np.inf
         self._cost: float | None = None  # at the root: of the last accepted poses
         self._sent = -1  # exchange whose block went up
         self._variables_of_own()
@@ -137,14 +142,12 @@ class EliminationAgent(GraphAgent):
             return
         self._sent = self.exchange
         reweighted = self._weigh()
-        weights = self._weights()
-        H, g = self._front.reduce(
-            self._factors, weights, self._x, self._blocks, self._damping, 0 if self._parent is None else None
-        )
-        blocks = self._blocks.values()
+        weights, blocks = self._weights(), self._blocks.values()
+        g, jacobians = pose_factors.gradient(self._factors, weights, self._x)
+        H = self._relinearised(jacobians, reweighted)
         block = Block(
             H,
-            g,
+            self._front.eliminate(g, {child: b.g for child, b in self._blocks.items()}),
             pose_factors.cost(self._factors, self._x, weights) + sum(b.cost for b in blocks),
             max([self._largest_step, *(b.largest_step for b in blocks)]),
             reweighted or any(b.reweighted for b in blocks),
@@ -153,18 +156,38 @@ class EliminationAgent(GraphAgent):
         if self._parent is None:
             self._decide_step(block)
         else:
-            self.send([self.neighbours[self._parent]], wire.write_block(self.exchange, block))
+            payload = wire.write_block(self.exchange, block, self.config.elimination_wire)
+            self.send([self.neighbours[self._parent]], payload)
+
+    def _relinearised(self, jacobians: tuple[Array, Array], reweighted: bool) -> Array | None:
+        """The eliminated matrix, or None if the last one still holds: here, and everywhere below."""
+        for child, block in self._blocks.items():
+            if block.H is not None:
+                self._matrices[child] = block.H
+            elif child not in self._matrices:
+                raise MalformedError("a block without its first matrix")
+        below = any(block.H is not None for block in self._blocks.values())
+        moved = self._moved_rad > self.config.consensus.relinearise_rad
+        if not (below or moved or reweighted or self._damping != self._damped or self.exchange == 0):
+            return None
+        if moved or reweighted or self._damping != self._damped or self.exchange == 0:
+            anchor = 0 if self._parent is None else None
+            self._H_own = damped(self._factors, jacobians, len(self._x), self._damping, anchor)
+            self._moved_rad, self._damped = 0.0, self._damping
+        return self._front.factorise(self._H_own, self._matrices)
 
     def _decide_step(self, block: Block) -> None:
         """At the root: was the last step good, and what comes next."""
         small = block.largest_step < self.config.elimination_tolerance and self.exchange > 0
-        accepted = block.reweighted or self._cost is None or block.cost <= self._cost
+        accepted = block.reweighted or self._cost is None or block.cost <= self._cost * (1 + _ROUNDING)
         damping = max(1e-6, 10 * self._damping) if not accepted else self._damping / 10
         if accepted:
             self._cost = block.cost
             damping = damping if damping > 1e-8 else 0.0
+        fresh = not accepted or block.largest_step > _SLOW * self._step_before
+        self._step_before = block.largest_step if self.exchange else np.inf
         finished = small and not block.unsure
-        self._descend(Step(self.exchange, accepted, finished, damping, np.zeros((0, 6))))
+        self._descend(Step(self.exchange, accepted, finished, fresh, damping, np.zeros((0, 6))))
 
     def _descend(self, step: Step) -> None:
         """Move, and hand the children their part of the step."""
@@ -175,12 +198,15 @@ class EliminationAgent(GraphAgent):
             own = delta[self._front.own_slots]
             self._before, self._x = self._x, retract(self._x, own)
             self._largest_step = float(np.abs(own).max())
+            self._moved_rad += float(np.abs(own[:, 3:]).max())
         else:
             delta, self._x = np.zeros((0, 6)), self._before
         for child in self._children:
             part = delta[self._front.child_slots[child]] if step.accepted else delta
-            answer = Step(step.exchange, step.accepted, step.finished, step.damping, part)
+            answer = Step(step.exchange, step.accepted, step.finished, step.fresh, step.damping, part)
             self.send([self.neighbours[child]], wire.write_step(answer))
+        if step.fresh:
+            self._moved_rad = np.inf
         self._damping, self.finished = step.damping, step.finished
         self._blocks = {}
         self.exchange += 1

@@ -156,8 +156,8 @@ def _read_motions(reader: Reader, n: int) -> Array:
 _FRONT = struct.Struct("<BI")
 _BLOCK = struct.Struct("<BIIddB")
 _STEP = struct.Struct("<BIBdI")
-_REWEIGHTED, _UNSURE = 1, 2
-_ACCEPTED, _FINISHED = 1, 2
+_REWEIGHTED, _UNSURE, _DOUBLE, _NEW = 1, 2, 4, 8
+_ACCEPTED, _FINISHED, _FRESH = 1, 2, 4
 _UPPER = np.triu_indices(6)
 
 
@@ -166,12 +166,13 @@ class Step:
     """The root's answer to the blocks of one exchange.
 
     accepted: the last step lowered the cost; else everybody goes back to where it was before. finished: this is the
-    last message. damping: for the next blocks. delta: [s, 6], steps of the variables shared with the parent.
+    last message. fresh: everybody linearises anew. damping: for the next blocks. delta: [s, 6], steps of the variables shared with the parent.
     """
 
     exchange: int
     accepted: bool
     finished: bool
+    fresh: bool
     damping: float
     delta: Array
 
@@ -205,24 +206,28 @@ def read_front(data: bytes, team: int) -> dict[Variable, int]:
     return dict(zip(names, masks, strict=True))
 
 
-def write_block(exchange: int, block: Block) -> bytes:
-    """Bytes of BLOCK: upper triangle, of the 6x6 parts beside the diagonal only those that are not zero; float64.
+def write_block(exchange: int, block: Block, precision: str) -> bytes:
+    """Bytes of BLOCK. Of H the upper triangle, and of its 6x6 parts beside the diagonal those that are not zero.
 
-    In float32 the rounding of strong directions drowns the weak ones of a long chain.
+    precision: float32 or float64, of H; the gradient, which decides where the iteration ends, is always float64.
     """
     n = len(block.g) // 6
+    flags = _REWEIGHTED * block.reweighted + _UNSURE * block.unsure + _DOUBLE * (precision == "float64")
+    flags += _NEW * (block.H is not None)
+    head = _BLOCK.pack(Code.BLOCK, exchange, n, block.cost, block.largest_step, flags)
+    if block.H is None:
+        return head + array_bytes(block.g, "float64")
     parts = block.H.reshape(n, 6, n, 6).transpose(0, 2, 1, 3)
     beside = parts[np.triu_indices(n, 1)].reshape(-1, 36)
     filled = beside.any(axis=1)
     diagonal = parts[np.arange(n), np.arange(n)][:, _UPPER[0], _UPPER[1]]
-    flags = _REWEIGHTED * block.reweighted + _UNSURE * block.unsure
     return b"".join(
         [
-            _BLOCK.pack(Code.BLOCK, exchange, n, block.cost, block.largest_step, flags),
+            head,
             array_bytes(block.g, "float64"),
-            array_bytes(diagonal, "float64"),
+            array_bytes(diagonal, precision),
             np.packbits(filled, bitorder="little").tobytes(),
-            array_bytes(beside[filled], "float64"),
+            array_bytes(beside[filled], precision),
         ]
     )
 
@@ -231,25 +236,31 @@ def read_block(data: bytes, variables: int) -> tuple[int, Block]:
     """Number of the exchange and the block, over so many variables."""
     reader = Reader(data, "block")
     _, exchange, n, cost, largest_step, flags = reader.fields(_BLOCK)
-    if n != variables or not (cost >= 0 and largest_step >= 0) or flags > _REWEIGHTED + _UNSURE:
+    if n != variables or not (cost >= 0 and largest_step >= 0) or flags >= 2 * _NEW:
         raise MalformedError(f"block: over {n} variables, expected {variables}; or impossible numbers")
-    g, diagonal = reader.array("float64", (6 * n,)), reader.array("float64", (n, 21))
+    g = reader.array("float64", (6 * n,))
+    H = _read_matrix(reader, n, "float64" if flags & _DOUBLE else "float32") if flags & _NEW else None
+    reader.done()
+    return exchange, Block(H, g, cost, largest_step, bool(flags & _REWEIGHTED), bool(flags & _UNSURE))
+
+
+def _read_matrix(reader: Reader, n: int, precision: str) -> Array:
+    """A symmetric matrix [6 n, 6 n] of 6x6 parts."""
+    diagonal = reader.array(precision, (n, 21))
     off = n * (n - 1) // 2
     filled = np.unpackbits(reader.array("uint8", (-(-off // 8),)), count=off, bitorder="little").astype(bool)
-    beside = reader.array("float64", (int(filled.sum()), 6, 6))
-    reader.done()
+    beside = reader.array(precision, (int(filled.sum()), 6, 6))
     parts = np.zeros((n, n, 6, 6))
     rows, columns = (index[filled] for index in np.triu_indices(n, 1))
     parts[rows, columns], parts[columns, rows] = beside, beside.transpose(0, 2, 1)
     own = np.arange(n)[:, None]
     parts[own, own, _UPPER[0], _UPPER[1]] = parts[own, own, _UPPER[1], _UPPER[0]] = diagonal
-    H = parts.transpose(0, 2, 1, 3).reshape(6 * n, 6 * n)
-    return exchange, Block(H, g, cost, largest_step, bool(flags & _REWEIGHTED), bool(flags & _UNSURE))
+    return np.ascontiguousarray(parts.transpose(0, 2, 1, 3)).reshape(6 * n, 6 * n)
 
 
 def write_step(step: Step) -> bytes:
     """Bytes of STEP: 48 per shared variable."""
-    flags = _ACCEPTED * step.accepted + _FINISHED * step.finished
+    flags = _ACCEPTED * step.accepted + _FINISHED * step.finished + _FRESH * step.fresh
     head = _STEP.pack(Code.STEP, step.exchange, flags, step.damping, len(step.delta))
     return head + array_bytes(step.delta, "float64")
 
@@ -261,9 +272,9 @@ def read_step(data: bytes, variables: int) -> Step:
     delta = reader.array("float64", (n, 6))
     reader.done()
     accepted = bool(flags & _ACCEPTED)
-    if flags > _ACCEPTED + _FINISHED or n != accepted * variables or not damping >= 0:
+    if flags >= 2 * _FRESH or n != accepted * variables or not damping >= 0:
         raise MalformedError(f"step: over {n} variables, expected {variables}; or impossible numbers")
-    return Step(exchange, accepted, bool(flags & _FINISHED), damping, delta)
+    return Step(exchange, accepted, bool(flags & _FINISHED), bool(flags & _FRESH), damping, delta)
 
 
 assert MAX_TEAM <= 64  # masks of robots are 64 bits
