@@ -9,10 +9,11 @@ from pipeline.consensus.closures import holder
 from pipeline.consensus.links import SharedKeyframes, link_metric
 from pipeline.consensus.poses import PoseAgent
 from pipeline.exchange.packets import MAX_PAYLOAD_BYTES
-from pipeline.exchange.wire import poses_per_packet, read_poses, write_poses
+from pipeline.posegraph import wire
 from pipeline.posegraph.agent import GraphAgent, Neighbour
 
 Array = NDArray[np.float64]
+_STARTED = b"\0"  # told until all neighbours have said the same: poses sent before would be wasted
 
 
 class AdmmAgent(GraphAgent):
@@ -21,6 +22,7 @@ class AdmmAgent(GraphAgent):
     poses: PoseAgent
 
     def start(self) -> None:
+        self._started: set[int] = set()  # neighbours that were heard after their own start
         c = self.config.consensus
         self.poses = PoseAgent(
             self.graph.name,
@@ -43,17 +45,29 @@ class AdmmAgent(GraphAgent):
                 self.poses.add_link(n.name, shared=SharedKeyframes(n.own_keyframes, metric))
 
     def advance(self) -> None:
-        self.poses.step()
+        if self._everybody_started():
+            self.poses.step()
+            if self.first_round is None:
+                self.first_round = self.round
 
     def states(self, neighbour: Neighbour) -> list[bytes]:
+        if not self._everybody_started():
+            return [_STARTED]
         packet = self.poses.outgoing(neighbour.name)
-        per = poses_per_packet(MAX_PAYLOAD_BYTES, packet.translations.dtype == np.float64)
-        parts = range(0, len(packet.keyframes), per)
-        return [write_poses(packet.part(slice(first, first + per))) for first in parts]
+        n = len(packet.keyframes)
+        parts = -(-n // wire.poses_per_packet(MAX_PAYLOAD_BYTES, packet.translations.dtype == np.float64))
+        cuts = [n * k // parts for k in range(parts + 1)]
+        return [wire.write_poses(packet, a, b - a, self.own < neighbour.index) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
 
     def take_state(self, neighbour: Neighbour, payload: bytes) -> None:
-        shared = self.poses.links[neighbour.name].keyframes
-        self.poses.receive(neighbour.name, read_poses(payload, shared))
+        self._started.add(neighbour.index)
+        if payload != _STARTED:
+            shared = self.poses.links[neighbour.name].keyframes
+            poses = wire.read_poses(payload, shared, neighbour.index < self.own)
+            self.poses.receive(neighbour.name, poses)
+
+    def _everybody_started(self) -> bool:
+        return self._started == set(self.neighbours)
 
     @property
     def T_world_keyframe(self) -> Array:  # noqa: N802 (a transform)

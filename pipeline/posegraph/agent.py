@@ -38,6 +38,14 @@ _TRANSPORT = TransportConfig(contact_lost_after_rounds=_NEVER, silent_after_roun
 _UNLIMITED = 1 << 40  # bytes per round and link: what a solver sends is counted, not held back
 
 
+class EagerTransport(Transport):
+    """Sends again the sooner, the more is lost: waiting for an acknowledgement that will not come is no use."""
+
+    def _retransmit_after(self) -> int:
+        heard = self._packets_heard / (self._highest_sequence + 1)
+        return max(1, round(super()._retransmit_after() * heard))
+
+
 @dataclass
 class Neighbour:
     """What a robot knows about one neighbour. closures: of the pair, from this robot's side."""
@@ -74,7 +82,7 @@ class GraphAgent:
             self.team.index(peer): Neighbour(
                 peer,
                 self.team.index(peer),
-                Transport(self.own, self.team.index(peer), peer, _TRANSPORT, self._new_id),
+                EagerTransport(self.own, self.team.index(peer), peer, _TRANSPORT, self._new_id),
                 closures,
             )
             for peer, closures in sorted(graph.closures.items())
@@ -82,7 +90,7 @@ class GraphAgent:
         self.T_world_map: dict[int, Array] = {}  # of every robot of the component, once known
         self.round = -1
         self.refused: list[str] = []
-        self.started_round: int | None = None
+        self.first_round: int | None = None  # of its solver
         self._messages = 0
         self._rosters: dict[int, Roster] = {}
         self._frames: dict[tuple[int, int], PairFrame] = {}
@@ -216,7 +224,6 @@ class GraphAgent:
         if any(pair not in self._frames for pair in pairs):
             return
         self.T_world_map = self._chain(members, [self._frames[pair] for pair in pairs])
-        self.started_round = self.round
         self._check_plausible()
         self.start()
 

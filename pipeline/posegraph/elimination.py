@@ -141,6 +141,8 @@ class EliminationAgent(GraphAgent):
         if self._sent == self.exchange:
             return
         self._sent = self.exchange
+        if self.first_round is None:
+            self.first_round = self.round
         reweighted = self._weigh()
         weights, blocks = self._weights(), self._blocks.values()
         g, jacobians = pose_factors.gradient(self._factors, weights, self._x)
