@@ -83,6 +83,7 @@ class Link:
     sent: int = 0
     received: float = 0.0  # packets since the last change of penalties, parts counted by their share
     received_total: float = 0.0
+    adapting_from: float = 0.0  # received_total when the robust weights became final after their schedule
     newest: NDArray[np.int64] = field(init=False)  # [s] sequence last used
     newest_header: int = 0
     change: Array = field(init=False)  # [s] last change by an arrival (m, rad)

@@ -329,7 +329,8 @@ class PoseAgent:
         if own is None or link.peer_curvature is None:
             return
         c = self.config
-        limit = 1.0 + 2.0 / max(1.0, link.received_total / c.penalty_decay)
+        received = link.received_total - link.adapting_from
+        limit = 1.0 + 2.0 / max(1.0, received / c.penalty_decay)
         penalties = np.sqrt(own * link.peer_curvature)
         penalties = np.clip(penalties, link.penalties / limit, link.penalties * limit)
         penalties = np.clip(penalties, c.penalty_min, c.penalty_max).astype(np.float32).astype(np.float64)
@@ -351,7 +352,7 @@ class PoseAgent:
             return pose_factors.squared_residuals(link.factors, self._x)
 
         if link.robust.advance(link.received_total, self._steady(link), squared):
-            self._collect_weights()
+            self._reweighted()
             if link.robust.done:
                 link.reference, link.received = None, 0.0
 
@@ -364,7 +365,15 @@ class PoseAgent:
 
         received = min(link.received_total for link in links)
         if self.loop_weights.advance(received, all(self._steady(link) for link in links), squared):
-            self._collect_weights()
+            self._reweighted()
+
+    def _reweighted(self) -> None:
+        """Some weights changed; when the last are final, penalties begin to adapt as if the links were new."""
+        self._collect_weights()
+        groups = [self.loop_weights, *(link.robust for link in self.links.values())]
+        if self.robust_done and any(group.graduated for group in groups):
+            for link in self.links.values():
+                link.adapting_from = link.received_total
 
     def _steady(self, link: Link) -> bool:
         """Whether a link has left its start behind."""

@@ -63,6 +63,11 @@ class RobustWeights:
         self._step += 1
         return True
 
+    @property
+    def graduated(self) -> bool:
+        """Whether the schedule ran, and was not skipped because nothing was in doubt."""
+        return self._step > 0
+
     def _finish(self, weights: Array) -> bool:
         self.weights, self.done = weights, True
         return True

@@ -75,8 +75,10 @@ class AdmmAgent(GraphAgent):
 
     @property
     def settled(self) -> bool:
-        return bool(self.T_world_map) and self.poses.agreed
+        return bool(self.T_world_map) and (not self.neighbours or self.poses.agreed)
 
     def kept(self) -> tuple[Array, dict[str, Array]]:
+        if not self.neighbours:
+            return self.keep_loops.astype(np.float64), {}
         held = {peer: link.robust.weights for peer, link in self.poses.links.items() if link.holds}
         return self.poses.loop_weights.weights, held

@@ -28,7 +28,7 @@ class PoseGraphConfig(Config):
     max_rounds: int = Field(default=3000, ge=1)
     """A round is one burst of every robot to every neighbour; the run ends here whatever has been agreed."""
     consensus: PoseConsensusConfig = PoseConsensusConfig(
-        odometry_floor_m=0, odometry_floor_rad=0, closures=_AS_GIVEN, robust=False
+        odometry_floor_m=0, odometry_floor_rad=0, closures=_AS_GIVEN, robust=False, penalty_start=0.3
     )
     """Shared by all solvers: robust weights, tolerance, and what only edge-ADMM uses."""
     elimination_tolerance: float = Field(default=1e-7, gt=0.0)

@@ -14,9 +14,14 @@ from pipeline.posegraph.admm import AdmmAgent
 from pipeline.posegraph.agent import GraphAgent
 from pipeline.posegraph.config import PoseGraphConfig
 from pipeline.posegraph.elimination import EliminationAgent
+from pipeline.posegraph.paper import PaperAgent
 from pipeline.progress import track
 
-SOLVERS: dict[str, type[GraphAgent]] = {"admm": AdmmAgent, "elimination": EliminationAgent}
+SOLVERS: dict[str, type[GraphAgent]] = {
+    "admm": AdmmAgent,
+    "elimination": EliminationAgent,
+    "paper": PaperAgent,
+}
 
 
 @dataclass
