@@ -216,7 +216,8 @@ def posegraph(
         typer.Option(help="gnc: closures and loops may be false, odometry is trusted."),
     ] = "none",
     only_reference: Annotated[
-        bool, typer.Option("--only-reference", help="Leave out what the reference beside the graph calls false.")
+        bool,
+        typer.Option("--only-reference", help="Leave out what the reference beside the graph calls false."),
     ] = False,
     max_rounds: Annotated[int, typer.Option(min=1, help="Give up after so many rounds.")] = 3000,
     seed: Annotated[int, typer.Option(help="Of the losses; nothing else is random.")] = 0,

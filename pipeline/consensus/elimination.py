@@ -107,7 +107,9 @@ def _lanes(slots: NDArray[np.int64]) -> NDArray[np.int64]:
     return (6 * slots[:, None] + np.arange(6)).ravel()
 
 
-def damped(factors: Factors, jacobians: tuple[Array, Array], n: int, damping: float, anchor: int | None) -> sparse.csc_matrix:
+def damped(
+    factors: Factors, jacobians: tuple[Array, Array], n: int, damping: float, anchor: int | None
+) -> sparse.csc_matrix:
     """Gauss-Newton matrix of a robot's own factors over its n variables, damped relative to its diagonal.
 
     Args:

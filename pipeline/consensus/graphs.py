@@ -23,7 +23,11 @@ from pipeline.geometry import se3
 
 Array = NDArray[np.float64]
 SYMBOL_BITS = 56  # a gtsam symbol is a character in the highest byte and an index below it
-_IGNORED_TAGS = {"VERTEX_SE3:QUAT", "FIX", "PARAMS_SE3OFFSET"}  # start values and gauge: agents find their own
+_IGNORED_TAGS = {
+    "VERTEX_SE3:QUAT",
+    "FIX",
+    "PARAMS_SE3OFFSET",
+}  # start values and gauge: agents find their own
 _REFERENCES = ("reference_inliers.csv", "gt_info.xml")
 
 Key = tuple[str, int]  # robot (or "" before a graph is cut), index
@@ -116,7 +120,9 @@ def read_team(path: Path, robots: int | None = None, *, only_reference: bool = F
     if names == [""]:
         edges = _cut(edges, 4 if robots is None else robots, path)
     elif robots is not None and robots != len(names):
-        raise DuagError(f"{path}: --robots {robots}, but the graph is that of {len(names)} robots: {', '.join(names)}")
+        raise DuagError(
+            f"{path}: --robots {robots}, but the graph is that of {len(names)} robots: {', '.join(names)}"
+        )
     edges, reference = _with_reference(edges, path)
     if only_reference:
         if edges.inlier is None:
@@ -143,7 +149,9 @@ def _read(path: Path) -> tuple[Edges, tuple[str, ...]]:
     plain = [all(key[0] == "" for key in (*g.i, *g.j)) for g in graphs]
     team = [g for g, is_plain in zip(graphs, plain, strict=True) if not is_plain]
     if not team:
-        raise DuagError(f"{path}: {len(files)} graphs with plain keys; a team's graphs need gtsam symbols as keys")
+        raise DuagError(
+            f"{path}: {len(files)} graphs with plain keys; a team's graphs need gtsam symbols as keys"
+        )
     return _merge(team), tuple(f.name for f, is_plain in zip(files, plain, strict=True) if is_plain)
 
 
@@ -198,15 +206,31 @@ def _isotropic(upper: Array, path: Path) -> tuple[Array, Array]:
     for block in (full[:, :3, :3], full[:, 3:, 3:]):
         bad = np.linalg.eigvalsh(block)[:, 0] <= 0
         if bad.any():
-            raise DuagError(f"{path}: the information of edge {int(np.argmax(bad)) + 1} is not positive definite")
+            raise DuagError(
+                f"{path}: the information of edge {int(np.argmax(bad)) + 1} is not positive definite"
+            )
     tau = 3 / np.trace(np.linalg.inv(full[:, :3, :3]), axis1=1, axis2=2)
     kappa = 3 / (2 * np.trace(np.linalg.inv(full[:, 3:, 3:]), axis1=1, axis2=2))
     return kappa, tau
 
 
 def read_kimera(path: Path) -> Edges:
-    """Edges of one robot's `measurements.csv` of Kimera-Multi; its columns `weight` and `is_known_inlier` are ignored."""
-    needed = ["robot_src", "pose_src", "robot_dst", "pose_dst", "qx", "qy", "qz", "qw", "tx", "ty", "tz", "kappa", "tau"]
+    """Edges of one robot's `measurements.csv` of Kimera-Multi; `weight` and `is_known_inlier` are ignored."""
+    needed = [
+        "robot_src",
+        "pose_src",
+        "robot_dst",
+        "pose_dst",
+        "qx",
+        "qy",
+        "qz",
+        "qw",
+        "tx",
+        "ty",
+        "tz",
+        "kappa",
+        "tau",
+    ]
     reader = csv.DictReader(_text(path).splitlines())
     missing = [name for name in needed if name not in (reader.fieldnames or [])]
     if missing:
@@ -282,7 +306,9 @@ def _with_reference(edges: Edges, path: Path) -> tuple[Edges, str | None]:
         for line in _text(file).splitlines()[1:]:
             words = line.split(",")
             if len(words) != 5 or not all(word.strip().isdigit() for word in words):
-                raise DuagError(f"{file}: expected robot_src,pose_src,robot_dst,pose_dst,inlier, found {line!r}")
+                raise DuagError(
+                    f"{file}: expected robot_src,pose_src,robot_dst,pose_dst,inlier, found {line!r}"
+                )
             a, i, b, j, flag = (int(word) for word in words)
             if flag:
                 true.add(((f"robot{a}", i), (f"robot{b}", j)))
@@ -290,7 +316,9 @@ def _with_reference(edges: Edges, path: Path) -> tuple[Edges, str | None]:
     else:  # numbers of edges of the only graph, counted from 1 in the order of the file; the rest is odometry
         false = [int(n) for n in re.findall(r"<outlier_lc_indices>\s*(\d+)\s*<", _text(file))]
         if not false or max(false) > len(inlier) or min(false) < 1:
-            raise DuagError(f"{file}: expected <outlier_lc_indices> from 1 to the {len(inlier)} edges of the graph")
+            raise DuagError(
+                f"{file}: expected <outlier_lc_indices> from 1 to the {len(inlier)} edges of the graph"
+            )
         inlier[:] = True
         inlier[np.array(false) - 1] = False
     return Edges(edges.i, edges.j, edges.T_i_j, edges.kappa, edges.tau, inlier), file.name

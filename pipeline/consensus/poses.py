@@ -438,7 +438,9 @@ class PoseAgent:
             "step": self.step_change,
             "penalties": {peer: tuple(link.penalties.tolist()) for peer, link in self.links.items()},
             "versions": {peer: link.version for peer, link in self.links.items()},
-            "weights": {peer: link.robust.weights.tolist() for peer, link in self.links.items() if link.holds},
+            "weights": {
+                peer: link.robust.weights.tolist() for peer, link in self.links.items() if link.holds
+            },
             "factorisations": self.factorisations,
         }
 

@@ -54,7 +54,7 @@ class RobustWeights:
         squared = squared_residuals()
         if self._step < 0:
             self._step = 0
-            if np.all(squared <= c2):  # nothing is in doubt: every truncated weight is one
+            if c.robust_skip and np.all(squared <= c2):  # nothing is in doubt: every truncated weight is one
                 return self._finish(np.ones(len(squared)))
         self._next = received + c.robust_packets
         if self._step == len(self._schedule):

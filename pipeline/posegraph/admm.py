@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -57,7 +59,7 @@ class AdmmAgent(GraphAgent):
         n = len(packet.keyframes)
         parts = -(-n // wire.poses_per_packet(MAX_PAYLOAD_BYTES, packet.translations.dtype == np.float64))
         cuts = [n * k // parts for k in range(parts + 1)]
-        return [wire.write_poses(packet, a, b - a, self.own < neighbour.index) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+        return [wire.write_poses(packet, a, b - a, self.own < neighbour.index) for a, b in pairwise(cuts)]
 
     def take_state(self, neighbour: Neighbour, payload: bytes) -> None:
         self._started.add(neighbour.index)

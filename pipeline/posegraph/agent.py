@@ -112,7 +112,11 @@ class GraphAgent:
             self._set_up()
         if self.T_world_map:
             self.advance()
-        return [out for n in self.neighbours.values() for out in n.transport.burst(self.round, self._states(n), _UNLIMITED)]
+        return [
+            out
+            for n in self.neighbours.values()
+            for out in n.transport.burst(self.round, self._states(n), _UNLIMITED)
+        ]
 
     @property
     def T_world_keyframe(self) -> Array:  # noqa: N802 (a transform)
@@ -210,7 +214,10 @@ class GraphAgent:
         self.drift = drift(self.graph.odometry, self.graph.keyframes, self.config.consensus.closures)
         for n in everyone:
             named = n.own_keyframes
-            self.send([n], wire.write_keyframes(NamedKeyframes(named, self.T_map_keyframe[named], self.drift[named])))
+            self.send(
+                [n],
+                wire.write_keyframes(NamedKeyframes(named, self.T_map_keyframe[named], self.drift[named])),
+            )
 
     def _set_up(self) -> None:
         """Decide on pairs of which this is the lower end; start once all is known."""
@@ -241,7 +248,9 @@ class GraphAgent:
 
     def _chain(self, members: list[int], frames: list[PairFrame]) -> dict[int, Array]:
         names = [self.team[m] for m in members]
-        pairs = {(self.team[f.lower], self.team[f.higher]): (f.T_lower_higher, float(f.support)) for f in frames}
+        pairs = {
+            (self.team[f.lower], self.team[f.higher]): (f.T_lower_higher, float(f.support)) for f in frames
+        }
         chained = chain_frames(pairs, names)
         return {m: chained[self.team[m]] for m in members}
 

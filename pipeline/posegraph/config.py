@@ -28,7 +28,13 @@ class PoseGraphConfig(Config):
     max_rounds: int = Field(default=3000, ge=1)
     """A round is one burst of every robot to every neighbour; the run ends here whatever has been agreed."""
     consensus: PoseConsensusConfig = PoseConsensusConfig(
-        odometry_floor_m=0, odometry_floor_rad=0, closures=_AS_GIVEN, robust=False, penalty_start=0.3
+        odometry_floor_m=0,
+        odometry_floor_rad=0,
+        closures=_AS_GIVEN,
+        robust=False,
+        penalty_start=0.3,
+        robust_passes=((1e-5, 52),),
+        robust_skip=False,
     )
     """Shared by all solvers: robust weights, tolerance, and what only edge-ADMM uses."""
     elimination_tolerance: float = Field(default=1e-7, gt=0.0)
@@ -39,7 +45,9 @@ class PoseGraphConfig(Config):
     """rho of the printed iteration, as a multiple of the closures' information."""
 
 
-def settings(solver: Solver = "admm", robust: Robust = "none", loss: float = 0.0, seed: int = 0, max_rounds: int = 3000) -> PoseGraphConfig:
+def settings(
+    solver: Solver = "admm", robust: Robust = "none", loss: float = 0.0, seed: int = 0, max_rounds: int = 3000
+) -> PoseGraphConfig:
     """Settings of the command line."""
     default = PoseGraphConfig()
     consensus = default.consensus.model_copy(update={"robust": robust == "gnc"})

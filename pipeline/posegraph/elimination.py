@@ -36,7 +36,9 @@ class EliminationAgent(GraphAgent):
     def __init__(self, graph: RobotGraph, team: Sequence[str], config: PoseGraphConfig) -> None:
         super().__init__(graph, team, config)
         self.exchange, self.finished, self._laid_out = 0, False, False
-        self._arrived: list[tuple[Neighbour, bytes]] = []  # to be used in `advance`: some come before the start
+        self._arrived: list[
+            tuple[Neighbour, bytes]
+        ] = []  # to be used in `advance`: some come before the start
 
     def start(self) -> None:
         names = [self.team[m] for m in self.T_world_map]
@@ -66,7 +68,7 @@ class EliminationAgent(GraphAgent):
         """Own keyframes, then copies by neighbour, and factors over them: as in edge-ADMM."""
         self._variables: list[Variable] = [(self.own, k) for k in range(self.graph.keyframes)]
         poses = [self.T_world_map[self.own] @ self.T_map_keyframe]
-        masks = {k: 1 << self.own for k in range(self.graph.keyframes)}
+        masks = dict.fromkeys(range(self.graph.keyframes), 1 << self.own)
         parts, c = [self.own_factors()], self.config.consensus
         self._held: dict[str, tuple[Factors, RobustWeights]] = {}
         for n in self.neighbours.values():
@@ -74,7 +76,8 @@ class EliminationAgent(GraphAgent):
                 for k in n.own_keyframes.tolist():
                     masks[k] |= 1 << n.index
                 continue
-            assert n.told is not None and n.keep is not None
+            assert n.told is not None
+            assert n.keep is not None
             slots = len(self._variables) + np.searchsorted(
                 n.told.keyframes, [k.peer_keyframe for k in n.closures]
             )
@@ -87,13 +90,13 @@ class EliminationAgent(GraphAgent):
         self._factors = Factors.concatenate(parts)
         self._loop_weights = RobustWeights(self.keep_loops.astype(np.float64), c)
         everybody = {(self.own, k): mask for k, mask in masks.items() if mask != 1 << self.own}
-        copies = {v: 0 for v in self._variables[self.graph.keyframes :]}
+        copies = dict.fromkeys(self._variables[self.graph.keyframes :], 0)
         self._everybody: dict[Variable, int] = {**copies, **everybody}
 
     # --- messages
 
     def take_message(self, neighbour: Neighbour, code: int, payload: bytes) -> None:
-        
+
         if code not in (Code.FRONT, Code.BLOCK, Code.STEP):
             raise MalformedError(f"unknown message {code}")
         self._arrived.append((neighbour, payload))

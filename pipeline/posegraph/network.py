@@ -41,7 +41,9 @@ class Traffic:
 Watch = Callable[[int, dict[str, GraphAgent], Traffic], None]
 
 
-def meet(team: TeamGraph, config: PoseGraphConfig, watch: Watch) -> tuple[dict[str, GraphAgent], Traffic, int]:
+def meet(
+    team: TeamGraph, config: PoseGraphConfig, watch: Watch
+) -> tuple[dict[str, GraphAgent], Traffic, int]:
     """Let the team solve its graph.
 
     Args:

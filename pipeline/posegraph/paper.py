@@ -9,6 +9,8 @@ if they were exact, so that noisy cycles have no fixed point and the limit, if a
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,7 +41,9 @@ class PaperAgent(GraphAgent):
             assert n.told is not None
             slots = self._slots[n.index] = count + np.arange(len(n.told.keyframes))
             copies = slots[np.searchsorted(n.told.keyframes, [k.peer_keyframe for k in n.closures])]
-            parts.append(closure_factors(n.closures, [k.own_keyframe for k in n.closures], copies, c.closures))
+            parts.append(
+                closure_factors(n.closures, [k.own_keyframe for k in n.closures], copies, c.closures)
+            )
             poses.append(self.T_world_map[n.index] @ n.told.T_map_keyframe)
             count += len(slots)
         self._x = np.concatenate(poses)
@@ -92,7 +96,7 @@ class PaperAgent(GraphAgent):
         packet = PosePacket(self._sent, 0, named, quats, t, nothing, None, self.settled)
         parts = -(-len(named) // wire.poses_per_packet(MAX_PAYLOAD_BYTES, double=False))
         cuts = [len(named) * k // parts for k in range(parts + 1)]
-        return [wire.write_poses(packet, a, b - a, decides=False) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+        return [wire.write_poses(packet, a, b - a, decides=False) for a, b in pairwise(cuts)]
 
     def take_state(self, neighbour: Neighbour, payload: bytes) -> None:
         packet = wire.read_poses(payload, neighbour.peer_keyframes, from_decider=False)
@@ -116,9 +120,13 @@ class PaperAgent(GraphAgent):
             return False
         if not self.neighbours:
             return True
-        raw = np.linalg.solve(self._between.whitening, pose_factors.residuals(self._between, self._x)[..., None])
+        raw = np.linalg.solve(
+            self._between.whitening, pose_factors.residuals(self._between, self._x)[..., None]
+        )
         return float(np.abs(raw).max()) < _RESIDUAL and self._step < self.config.consensus.tolerance
 
     def kept(self) -> tuple[Array, dict[str, Array]]:
         """The printed iteration has no robust weights: everything counts."""
-        return np.ones(len(self.graph.loops)), {n.name: np.ones(len(n.closures)) for n in self.neighbours.values()}
+        return np.ones(len(self.graph.loops)), {
+            n.name: np.ones(len(n.closures)) for n in self.neighbours.values()
+        }

@@ -122,7 +122,9 @@ def _truncated(component: _Component, T: Array, kept: NDArray[np.bool_], c2: flo
 # --- what is seen of the agents
 
 
-def _watch(components: list[_Component], k: int, agents: dict[str, GraphAgent], traffic: Traffic, c2: float | None) -> None:
+def _watch(
+    components: list[_Component], k: int, agents: dict[str, GraphAgent], traffic: Traffic, c2: float | None
+) -> None:
     """After round k: costs of all components that are past their set-up."""
     for component in components:
         members = [agents[name] for name in component.robots]
@@ -134,7 +136,9 @@ def _watch(components: list[_Component], k: int, agents: dict[str, GraphAgent], 
         component.trace.append((k, component.cost(T, c2), sent))
 
 
-def _result(component: _Component, agents: dict[str, GraphAgent], config: PoseGraphConfig, c2: float | None) -> dict[str, Any]:
+def _result(
+    component: _Component, agents: dict[str, GraphAgent], config: PoseGraphConfig, c2: float | None
+) -> dict[str, Any]:
     """What one component reached."""
     members = [agents[name] for name in component.robots]
     T = np.concatenate([agent.T_world_keyframe for agent in members])
@@ -184,7 +188,9 @@ def _kept(component: _Component, agents: dict[str, GraphAgent]) -> NDArray[np.bo
     return np.concatenate([*loops, *(held[pair] for pair in sorted(held))]) >= COUNTS
 
 
-def _against_reference(component: _Component, kept: NDArray[np.bool_], T: Array, c2: float | None) -> dict[str, Any]:
+def _against_reference(
+    component: _Component, kept: NDArray[np.bool_], T: Array, c2: float | None
+) -> dict[str, Any]:
     """Precision and recall of loops and closures together, and of closures between robots alone."""
     assert component.true is not None
     true = component.true
@@ -272,7 +278,9 @@ def _summary(
         "packets": traffic.packets,
         "packets_lost": traffic.lost,
         "rounds_to": {gap: last("rounds_to", gap) if together else 0 for gap in GAPS},
-        "bytes_to": {gap: last("bytes_to", gap) if len(together) == 1 else _sum(together, gap) for gap in GAPS},
+        "bytes_to": {
+            gap: last("bytes_to", gap) if len(together) == 1 else _sum(together, gap) for gap in GAPS
+        },
         "bytes_raw_alternative": total("bytes_raw_alternative"),
         "converged": all(agent.settled for agent in agents.values()),
         "packets_refused": sum(len(agent.refused) for agent in agents.values()),

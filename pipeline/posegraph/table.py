@@ -29,7 +29,7 @@ def format_result(result: dict[str, Any]) -> str:
         f"{state}",
     ]
     if r["ignored_files"]:
-        lines.append(f"not read: {', '.join(r['ignored_files'])}, which have plain keys")
+        lines.append(f"not read: {', '.join(r['ignored_files'])} (plain keys, no robot named)")
     return "\n".join(lines)
 
 
@@ -41,13 +41,17 @@ def _component(c: dict[str, Any]) -> list[str]:
         + (f"  in {c['exchanges']} exchanges" if c["exchanges"] is not None else ""),
     ]
     for gap, rounds in c["rounds_to"].items():
-        reached = "not reached" if rounds is None else f"{rounds} rounds, {_bytes(c['bytes_to'][gap])} with set-up"
+        reached = (
+            "not reached" if rounds is None else f"{rounds} rounds, {_bytes(c['bytes_to'][gap])} with set-up"
+        )
         lines.append(f"{'to a gap of ' + gap:<28}{reached}")
     if c["inlier_cost"] != c["cost"]:
         lines.append(f"{'cost of what was kept':<28}{c['inlier_cost']:.8g}  ({c['kept']} loops and closures)")
     if c["reference"] is not None:
         ref = c["reference"]
-        lines.append(f"{'against the reference':<28}{_share(ref)}; between robots {_share(ref['between_robots'])}")
+        lines.append(
+            f"{'against the reference':<28}{_share(ref)}; between robots {_share(ref['between_robots'])}"
+        )
         if "cost_of_reference" in ref:
             lines.append(f"{'cost of the reference':<28}{ref['cost_of_reference']:.8g}")
     return [*lines, ""]

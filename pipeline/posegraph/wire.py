@@ -156,7 +156,9 @@ def _read_motions(reader: Reader, n: int) -> Array:
 
 _POSES = struct.Struct("<IIBHH2f")
 _CONVERGED, _CURVATURE, _PENALTIES, _POSE_DOUBLE = 1, 2, 4, 8
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # components that are sent beside the largest
+_OTHERS = np.array(
+    [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]
+)  # components that are sent beside the largest
 
 
 def write_poses(packet: PosePacket, first: int, count: int, decides: bool) -> bytes:
@@ -201,7 +203,7 @@ def read_poses(data: bytes, shared: NDArray[np.int32], from_decider: bool) -> Po
     if flags >= 2 * _POSE_DOUBLE or bool(flags & _PENALTIES) != from_decider or first + n > len(shared):
         raise MalformedError("poses: unknown flags, not from this end, or of keyframes that are not shared")
     brings = flags & (_PENALTIES | _CURVATURE)
-    if brings and not (np.isfinite(numbers).all() and 1e-12 < min(numbers) and max(numbers) < 1e9):
+    if brings and not (np.isfinite(numbers).all() and min(numbers) > 1e-12 and max(numbers) < 1e9):
         raise MalformedError("poses: penalties and curvature must be positive")
     precision = "float64" if flags & _POSE_DOUBLE else "float32"
     bits = np.unpackbits(reader.array("uint8", (-(-n // 4),)), count=2 * n, bitorder="little").reshape(n, 2)
@@ -238,7 +240,8 @@ class Step:
     """The root's answer to the blocks of one exchange.
 
     accepted: the last step lowered the cost; else everybody goes back to where it was before. finished: this is the
-    last message. fresh: everybody linearises anew. damping: for the next blocks. delta: [s, 6], steps of the variables shared with the parent.
+    last message. fresh: everybody linearises anew. damping: for the next blocks. delta: [s, 6], steps of the variables
+    shared with the parent.
     """
 
     exchange: int
