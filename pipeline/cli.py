@@ -219,7 +219,7 @@ def posegraph(
         bool,
         typer.Option("--only-reference", help="Leave out what the reference beside the graph calls false."),
     ] = False,
-    max_rounds: Annotated[int, typer.Option(min=1, help="Give up after so many rounds.")] = 3000,
+    max_rounds: Annotated[int, typer.Option(min=1, help="Give up after so many rounds.")] = 5000,
     seed: Annotated[int, typer.Option(help="Of the losses; nothing else is random.")] = 0,
     as_json: Json = False,
 ) -> None:

@@ -80,7 +80,7 @@ class AdmmAgent(GraphAgent):
         return bool(self.T_world_map) and (not self.neighbours or self.poses.agreed)
 
     def kept(self) -> tuple[Array, dict[str, Array]]:
-        if not self.neighbours:
-            return self.keep_loops.astype(np.float64), {}
+        if not self.T_world_map or not self.neighbours:
+            return super().kept()
         held = {peer: link.robust.weights for peer, link in self.poses.links.items() if link.holds}
         return self.poses.loop_weights.weights, held

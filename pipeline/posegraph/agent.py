@@ -148,8 +148,9 @@ class GraphAgent:
         raise MalformedError(f"unknown message {code}")
 
     def kept(self) -> tuple[Array, dict[str, Array]]:
-        """Robust weights of own loops, and of the closures that this robot holds, by neighbour."""
-        raise NotImplementedError
+        """Robust weights of own loops, and of the closures that this robot holds, by neighbour; before the start of the
+        solver none of these."""
+        return self.keep_loops.astype(np.float64), {}
 
     # --- packets
 

@@ -25,7 +25,7 @@ class PoseGraphConfig(Config):
     """Chance that a packet is lost, independent of every other packet."""
     seed: int = 0
     """Of the losses; nothing else is random."""
-    max_rounds: int = Field(default=3000, ge=1)
+    max_rounds: int = Field(default=5000, ge=1)
     """A round is one burst of every robot to every neighbour; the run ends here whatever has been agreed."""
     consensus: PoseConsensusConfig = PoseConsensusConfig(
         odometry_floor_m=0,
@@ -46,7 +46,7 @@ class PoseGraphConfig(Config):
 
 
 def settings(
-    solver: Solver = "admm", robust: Robust = "none", loss: float = 0.0, seed: int = 0, max_rounds: int = 3000
+    solver: Solver = "admm", robust: Robust = "none", loss: float = 0.0, seed: int = 0, max_rounds: int = 5000
 ) -> PoseGraphConfig:
     """Settings of the command line."""
     default = PoseGraphConfig()

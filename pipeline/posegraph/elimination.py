@@ -249,5 +249,7 @@ class EliminationAgent(GraphAgent):
         return self.finished
 
     def kept(self) -> tuple[Array, dict[str, Array]]:
+        if not self.T_world_map:
+            return super().kept()
         held = {peer: robust.weights for peer, (_, robust) in self._held.items()}
         return self._loop_weights.weights, held

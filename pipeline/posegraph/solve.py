@@ -179,8 +179,13 @@ def _result(
 
 
 def _kept(component: _Component, agents: dict[str, GraphAgent]) -> NDArray[np.bool_]:
-    """Which doubtful factors count, in the order of the team's graph."""
-    loops, held = [], {}
+    """Which doubtful factors count, in the order of the team's graph; closures that nobody holds yet do not."""
+    members = [agents[name] for name in component.robots]
+    pairs = [
+        (agent.graph.name, n.name, len(n.closures)) for agent in members for n in agent.neighbours.values()
+    ]
+    held = {(a, b): np.zeros(count) for a, b, count in pairs if a < b}
+    loops = []
     for name in component.robots:
         weights, by_peer = agents[name].kept()
         loops.append(weights)

@@ -12,12 +12,11 @@ from pipeline.geometry import se3
 from tests.consensus.worlds import (
     EXACT,
     TeamWorld,
-    cut,
+    benchmark,
     from_first,
     in_root_frame,
     make_team,
     random_poses,
-    read_g2o,
     talk,
     team_cost,
     team_poses,
@@ -244,7 +243,7 @@ def test_records_name_every_neighbour():
 
 def test_benchmark_graph_cut_into_four_robots():
     """smallGrid3D: 35 rounds to a gap of 1e-6 is the limit that was measured for this algorithm."""
-    world = cut(read_g2o("smallGrid3D.g2o"), 4)
+    world = benchmark("smallGrid3D.g2o", 4)
     agents = world.agents(PLAIN)
     factors, _ = world.optimum(agents)
     talk(agents, 35)
