@@ -105,7 +105,13 @@ def simulate(
     out: Out,
     robots: Annotated[int, typer.Option(min=1, max=8, help="Number of robots.")] = 2,
     frames: Annotated[int, typer.Option(min=2, help="Frames per robot.")] = 160,
-    scene: Annotated[str, typer.Option(help="Name of a procedural scene.")] = "room",
+    scene: Annotated[
+        str, typer.Option(help="room, or a folder of textured meshes (GLB, glTF, OBJ, PLY).")
+    ] = "room",
+    up: Annotated[
+        str,
+        typer.Option(help="Axis that is up in the meshes: y, z, or auto (y for GLB, glTF, OBJ; z for PLY)."),
+    ] = "auto",
     width: Annotated[int, typer.Option(min=32, help="Pixels.")] = 480,
     height: Annotated[int, typer.Option(min=32, help="Pixels.")] = 360,
     overlap: Annotated[
@@ -116,9 +122,11 @@ def simulate(
     workers: Workers = 2,
     force: Force = False,
 ) -> None:
-    """Render a recording of a robot team in a procedural room, with exact ground truth.
+    """Render a recording of a robot team, in a procedural room or among textured meshes, with exact ground truth.
 
-    Example: `duagc simulate --robots 3 --noise kinect --out recordings/room`
+    Examples:
+    `duagc simulate --robots 3 --noise kinect --out recordings/room`,
+    `duagc simulate --scene scans/house --width 640 --height 480 --frames 300 --out recordings/house`
     """
     from converters.simulate import simulate as simulate_recording
 
@@ -127,6 +135,7 @@ def simulate(
         robots=robots,
         frames=frames,
         scene=scene,
+        up=up,
         size=(width, height),
         overlap=overlap,
         noise=noise,
