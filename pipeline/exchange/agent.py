@@ -177,12 +177,23 @@ class Agent:
         return [n for n in self.neighbours.values() if n.joined]
 
     def _watch(self) -> None:
-        """Give up neighbours that were silent for too long; do not wait for them any more."""
+        """Give up neighbours that were silent for too long; do not wait for them any more.
+
+        A link that died while the poses were sought would leave its two ends with different last words of each other
+        for ever, so the rest of the team begins again without it. If nobody is left, or a neighbour has agreed
+        already, what there is stays.
+        """
+        died = 0
         for neighbour in self._living():
             heard = neighbour.transport.last_heard
             silent = self.round - (0 if heard is None else heard)
             if silent > self.config.transport.silent_after_rounds and not self.done:
+                died |= pair_bit(self.own, neighbour.index) if neighbour.joined else 0
                 neighbour.gone = True
+        others = self._joined()
+        settled = self.agreed or any(n.state is not None and n.state.agreed for n in others)
+        if died and others and not settled:
+            self._part(self.parted | died)
 
     # --- incoming
 

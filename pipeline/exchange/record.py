@@ -68,7 +68,8 @@ class ExchangeRecorder:
             length=len(packet.payload),
             header=out.packet[:HEADER_BYTES],
             delivered=fate.delivered,
-            deliver_ns=fate.deliver_ns or 0,
+            deliver_ns=fate.deliver_ns[0] if fate.delivered else 0,
+            copies_deliver_ns=fate.deliver_ns[1:],
             dropped=fate.reason,
         )
         pack_stamp(message, send_ns)
@@ -77,7 +78,7 @@ class ExchangeRecorder:
         totals[0] += 1
         totals[1] += not fate.delivered
         totals[2] += len(out.packet)
-        totals[3] += len(out.packet) * fate.delivered
+        totals[3] += len(out.packet) * len(fate.deliver_ns)
 
     def _message(self, sender: str, out: Outgoing, send_ns: int) -> None:
         key = (sender, out.message.id)
@@ -148,7 +149,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class RecordedPacket:
-    """One packet of a recorded session, rebuilt."""
+    """One packet of a recorded session, rebuilt; deliver_ns: of every copy that arrived."""
 
     sender: str
     receiver: str
@@ -156,7 +157,7 @@ class RecordedPacket:
     round: int
     kind_name: str
     send_ns: int
-    deliver_ns: int | None
+    deliver_ns: tuple[int, ...]
     dropped: str
     data: bytes
 
@@ -193,7 +194,7 @@ def read_session(exchange_path: Path) -> Recorded:
                     m.round,
                     kind_name,
                     record.log_time_ns,
-                    m.deliver_ns if m.delivered else None,
+                    (m.deliver_ns, *m.copies_deliver_ns) if m.delivered else (),
                     m.dropped,
                     data,
                 )

@@ -29,6 +29,7 @@ from pipeline.exchange.packets import (
 
 _ACK_HEAD = struct.Struct("<IIH")  # message id, first chunk, number of chunks told; then one bit per chunk
 MAX_REPEATS = 32
+SEQUENCE_BLOCK = 1024
 ACK_CHUNKS = 8 * (MAX_PAYLOAD_BYTES - _ACK_HEAD.size)
 
 
@@ -103,6 +104,7 @@ class Transport:
         self._received: dict[int, tuple[Kind, int]] = {}  # complete messages: kind, total bytes
         self._to_acknowledge: dict[int, _News] = {}
         self._packets_heard = self._highest_sequence = 0
+        self._heard: dict[int, int] = {}  # sequence numbers, a mask for each block of SEQUENCE_BLOCK
         self._delay_rounds: int | None = None  # least seen between sending and arrival
 
     # --- outgoing
@@ -242,6 +244,8 @@ class Transport:
         Raises:
             MalformedError: it contradicts what came before, or asks for too much; it is then ignored.
         """
+        if not self._is_new(packet.sequence):
+            return None  # a copy that the network made, or somebody repeats what was heard
         self.last_heard = round_index
         self._packets_heard += 1
         delay = max(0, round_index - packet.round)
@@ -253,6 +257,13 @@ class Transport:
         if packet.kind is Kind.STATE:
             return Arrival(packet.kind, packet.message, packet.payload, complete=True)
         return self._take_chunk(packet, round_index)
+
+    def _is_new(self, sequence: int) -> bool:
+        """Whether a sequence number is heard for the first time; remembers it, however far it jumps."""
+        block, bit = sequence // SEQUENCE_BLOCK, 1 << sequence % SEQUENCE_BLOCK
+        heard = self._heard.get(block, 0)
+        self._heard[block] = heard | bit
+        return not heard & bit
 
     def _take_chunk(self, packet: Packet, round_index: int) -> Arrival | None:
         known = self._received.get(packet.message)
