@@ -561,6 +561,31 @@ def unpack_depth(m: Any, where: str) -> NDArray[np.uint16]:
     return unpack_array(m.data, "uint16", (m.height, m.step // 2), where)[:, : m.width]
 
 
+def pack_mask(stamp_ns: int, robot: str, usable: NDArray[np.bool_]) -> Any:
+    """foxglove.RawImage, 8UC1, of the pixels that may be used, bool [H, W]: 255 = yes, 0 = no."""
+    if usable.dtype != np.bool_ or usable.ndim != 2:
+        raise ValueError(f"mask is {usable.dtype} {usable.shape}, expected bool [H, W]")
+    height, width = usable.shape
+    data = np.where(usable, np.uint8(255), np.uint8(0)).tobytes()
+    fields = {"width": width, "height": height, "encoding": "8UC1", "step": width, "data": data}
+    return _foxglove("RawImage", stamp_ns, camera_frame(robot), **fields)
+
+
+def unpack_mask(m: Any, where: str) -> NDArray[np.bool_]:
+    """bool [H, W], True = usable, of a foxglove.RawImage; `where` begins the line of an error."""
+    if m.encoding != "8UC1":
+        raise DuagError(f"{where} is {m.encoding or 'without encoding'}, expected 8UC1")
+    if m.step < m.width or m.height * m.width == 0:
+        raise DuagError(
+            f"{where} has rows of {m.step} bytes for {m.width}x{m.height} pixels, expected one per pixel"
+        )
+    values = unpack_array(m.data, "uint8", (m.height, m.step), where)[:, : m.width]
+    odd = values[(values != 0) & (values != 255)]
+    if len(odd):
+        raise DuagError(f"{where} has the value {odd[0]}, expected 0 (ignore) and 255 (usable) only")
+    return values == 255
+
+
 def pack_calibration(stamp_ns: int, robot: str, camera: PinholeCamera) -> Any:
     """foxglove.CameraCalibration of an undistorted camera."""
     K = camera.matrix()

@@ -200,7 +200,7 @@ def load(source: AgentInput) -> RobotData:
     def images(keyframe: int) -> Images:
         with open_rgbd(source.log) as log:
             frame = log.frame(keyframes[keyframe].frame_index)
-        return frame.color, frame.depth
+        return frame.color, frame.usable_depth
 
     return RobotData(
         robot,

@@ -43,6 +43,13 @@ DEPTH = Topic(
     Scope.SENSOR,
     "16UC1 depth along z, registered to colour, 0 = none; channel metadata depth_scale = metres per unit",
 )
+MASK = Topic(
+    "/<robot>/camera/mask",
+    "foxglove.RawImage",
+    "converters",
+    Scope.SENSOR,
+    "8UC1, pixels of the colour image that may be used: 255 = yes, 0 = no, for example a moving object",
+)
 CALIBRATION = Topic(
     "/<robot>/camera/calibration",
     "foxglove.CameraCalibration",
@@ -134,6 +141,7 @@ CLOSURE_DECISION = Topic(
 TOPICS: tuple[Topic, ...] = (
     COLOR,
     DEPTH,
+    MASK,
     CALIBRATION,
     GROUNDTRUTH_POSE,
     GROUNDTRUTH_DEPTH,

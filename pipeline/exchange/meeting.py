@@ -25,11 +25,12 @@ from pipeline.consensus.poses import PoseAgent, SharedKeyframes
 from pipeline.exchange import places, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.packets import Kind, MalformedError
-from pipeline.exchange.places import Candidate, Features
+from pipeline.exchange.places import Candidate
 from pipeline.exchange.verification import Verdict, Verified, verify
 from pipeline.exchange.wire import KeyframeSample, PlaceBook, Verdicts
 from pipeline.geometry import se3
 from pipeline.registration import Reference, RgbdPyramid
+from pipeline.registration.features import Features, extract
 from pipeline.robot import RobotData, factors_of
 
 Array = NDArray[np.float64]
@@ -52,9 +53,7 @@ class OwnPlaces:
         if self._features is None:
             most = self.config.places.features_per_keyframe
             camera = self.data.camera
-            self._features = [
-                places.extract(*self.data.images(k), camera, most) for k in range(self.data.keyframes)
-            ]
+            self._features = [extract(*self.data.images(k), camera, most) for k in range(self.data.keyframes)]
         return self._features
 
     def pyramid(self, keyframe: int) -> RgbdPyramid:

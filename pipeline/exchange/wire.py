@@ -25,8 +25,8 @@ from pipeline.exchange.packets import (
     chunk_bytes,
     records_per_chunk,
 )
-from pipeline.exchange.places import DIMENSIONS, Descriptors, Features
 from pipeline.registration import Reference, ReferenceLevel
+from pipeline.registration.features import DIMENSIONS, Descriptors, Features
 
 Array = NDArray[np.float64]
 

@@ -41,7 +41,10 @@ class MappingStats:
 
 @dataclass
 class _View:
-    """A keyframe as the mapper keeps it: colours as bytes, depth in metres."""
+    """A keyframe as the mapper keeps it: colours as bytes, depth in metres, 0 also where a mask forbids the pixel.
+
+    mask, half_mask: pixels that may be used; None = all.
+    """
 
     index: int
     color: Bytes
@@ -49,6 +52,8 @@ class _View:
     half_color: Image
     half_depth_m: Image
     T_map_camera: NDArray[np.float64]
+    mask: NDArray[np.bool_] | None = None
+    half_mask: NDArray[np.bool_] | None = None
     exposure: tuple[float, float] = (0.0, 0.0)
     exposure_moments: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 2)))
     exposure_steps: int = 0
@@ -57,6 +62,10 @@ class _View:
         if level == 0:
             return _from_bytes(self.color), self.depth_m
         return self.half_color, self.half_depth_m
+
+    def usable(self, level: int) -> NDArray[np.bool_] | None:
+        """The mask of a level; None = all pixels."""
+        return self.mask if level == 0 else self.half_mask
 
     def step_exposure(self, gradient: tuple[float, float], rate: float) -> None:
         """One Adam step of (a, b)."""
@@ -99,7 +108,13 @@ class Mapper:
         return {view.index: view.exposure for view in self._views}
 
     def add_keyframe(
-        self, keyframe_index: int, color: Bytes, depth_m: Image, T_map_camera: NDArray[np.float64]
+        self,
+        keyframe_index: int,
+        color: Bytes,
+        depth_m: Image,
+        T_map_camera: NDArray[np.float64],
+        *,
+        mask: NDArray[np.bool_] | None = None,
     ) -> MappingStats:
         """Seed what the map does not explain of a new keyframe and optimise the window around it.
 
@@ -107,10 +122,11 @@ class Mapper:
             keyframe_index: 0, 1, 2, ... in order of arrival.
             color: RGB [H, W, 3]. depth_m: metres [H, W], 0 where there is none. Both are kept, not copied.
             T_map_camera: pose of the camera in the map frame.
+            mask: bool [H, W], False where a pixel neither seeds nor counts in a loss; None = all count.
         """
         if keyframe_index != len(self._views):
             raise ValueError(f"keyframe {keyframe_index} added after {len(self._views)} keyframes")
-        view = _view(keyframe_index, color, depth_m, T_map_camera)
+        view = _view(keyframe_index, color, depth_m, T_map_camera, mask)
         self._views.append(view)
         inserted, pruned = self._seed(
             view, self.config.first_share if keyframe_index == 0 else self.config.keyframe_share
@@ -144,14 +160,20 @@ class Mapper:
         self._gaussians = self._gaussians.moved(old, new)
 
     def add_view(
-        self, keyframe_index: int, color: Bytes, depth_m: Image, T_keyframe_camera: NDArray[np.float64]
+        self,
+        keyframe_index: int,
+        color: Bytes,
+        depth_m: Image,
+        T_keyframe_camera: NDArray[np.float64],
+        *,
+        mask: NDArray[np.bool_] | None = None,
     ) -> None:
         """Let a tracked frame that is no keyframe take part in `finish`; it moves with its keyframe.
 
         It seeds no Gaussians. Never give a frame that is held out for evaluation.
         """
         T_map_camera = self._views[keyframe_index].T_map_camera @ T_keyframe_camera
-        self._support.append((_view(keyframe_index, color, depth_m, T_map_camera), T_keyframe_camera))
+        self._support.append((_view(keyframe_index, color, depth_m, T_map_camera, mask), T_keyframe_camera))
 
     def finish(self) -> MappingStats:
         """Refine geometry and colour over all views: `final_iterations` steps for each keyframe, at full size.
@@ -183,7 +205,7 @@ class Mapper:
     def _render(self, view: _View, level: int) -> tuple[Render, Loss]:
         color, depth_m = view.images(level)
         render = self.rasterizer.forward(self._gaussians, self.cameras[level], se3.inverse(view.T_map_camera))
-        return render, rgbd_loss(render, color, depth_m, self.config.loss, view.exposure)
+        return render, rgbd_loss(render, color, depth_m, self.config.loss, view.exposure, view.usable(level))
 
     def _loss(self, view: _View, level: int) -> Loss:
         return self._render(view, level)[1]
@@ -202,6 +224,7 @@ class Mapper:
             depth_m,
             self._loss_weights,
             exposure=view.exposure,
+            mask=view.usable(level),
         )
         if self.config.exposure and view is not self._views[0]:
             view.step_exposure(loss.d_exposure, self.config.exposure_rate)
@@ -222,11 +245,15 @@ class Mapper:
         if len(self._gaussians):
             render = self.rasterizer.forward(self._gaussians, self.cameras[0], se3.inverse(view.T_map_camera))
             if config.exposure:
-                view.exposure = _first_exposure(render, color)
+                view.exposure = _first_exposure(render, color, view.mask)
             color = (color - np.float32(view.exposure[1])) * np.float32(np.exp(-view.exposure[0]))
+            if (
+                view.mask is not None
+            ):  # errors are smoothed: a masked pixel must not speak through its neighbours
+                color = np.where(view.mask[..., None], color, render.color)
             wanted = unexplained(render, color, depth_m, config.seeding)
         else:
-            wanted = depth_m > 0
+            wanted = depth_m > 0  # zero where the mask forbids a pixel
         new = seed_discs(
             color,
             depth_m,
@@ -258,7 +285,8 @@ class Mapper:
             (camera.height, camera.width), self.config.contribution_color_sigma**-2, np.float32
         )
         for view in self._views:
-            self.rasterizer.forward(self._gaussians, camera, se3.inverse(view.T_map_camera))
+            T_camera_map = se3.inverse(view.T_map_camera)
+            self.rasterizer.forward(self._gaussians, camera, T_camera_map, mask=view.half_mask)
             inverse_depth = (view.half_depth_m > 0) * np.float32(self.config.contribution_depth_sigma_m**-2)
             self.rasterizer.fisher(inverse_color, inverse_depth, sums)
         transparency = 1.0 / (1.0 + np.exp(self._gaussians.opacity_logits.astype(np.float64)))
@@ -333,10 +361,18 @@ def overlap(
     return float(np.count_nonzero(agree)) / len(points)
 
 
-def _view(index: int, color: Bytes, depth_m: Image, T_map_camera: NDArray[np.float64]) -> _View:
+def _view(
+    index: int,
+    color: Bytes,
+    depth_m: Image,
+    T_map_camera: NDArray[np.float64],
+    mask: NDArray[np.bool_] | None = None,
+) -> _View:
     if color.dtype != np.uint8:
         raise ValueError(f"color is an array of {color.dtype}, expected uint8")
     depth_m = np.asarray(depth_m, dtype=np.float32)
+    if mask is not None:
+        depth_m = np.where(mask, depth_m, np.float32(0))
     return _View(
         index=index,
         color=color,
@@ -344,6 +380,8 @@ def _view(index: int, color: Bytes, depth_m: Image, T_map_camera: NDArray[np.flo
         half_color=halve(_from_bytes(color)),
         half_depth_m=_halve_depth(depth_m),
         T_map_camera=np.array(T_map_camera, dtype=np.float64),
+        mask=mask,
+        half_mask=None if mask is None else _halve_mask(mask),
     )
 
 
@@ -352,9 +390,13 @@ def _from_bytes(color: Bytes) -> Image:
     return color * np.float32(1 / 255)
 
 
-def _first_exposure(render: Render, color: Image) -> tuple[float, float]:
+def _first_exposure(
+    render: Render, color: Image, mask: NDArray[np.bool_] | None = None
+) -> tuple[float, float]:
     """Log gain from the medians over the pixels that the map covers; the offset starts at zero."""
     covered = render.alpha > 0.9
+    if mask is not None:
+        covered &= mask
     if np.count_nonzero(covered) < 1000:
         return 0.0, 0.0
     ratio = np.median(color[covered]) / max(float(np.median(render.color[covered])), 0.02)
@@ -367,3 +409,9 @@ def _halve_depth(depth_m: Image) -> Image:
     quarters = np.stack([depth_m[i:h:2, j:w:2] for i in (0, 1) for j in (0, 1)])
     nearest, farthest = quarters.min(axis=0), quarters.max(axis=0)
     return np.where((nearest > 0) & (farthest <= 1.02 * nearest), halve(depth_m), np.float32(0))
+
+
+def _halve_mask(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Blocks of 2x2 pixels that may all be used; a last odd row or column is cut."""
+    h, w = mask.shape[0] // 2 * 2, mask.shape[1] // 2 * 2
+    return mask[0:h:2, :w:2] & mask[0:h:2, 1:w:2] & mask[1:h:2, :w:2] & mask[1:h:2, 1:w:2]

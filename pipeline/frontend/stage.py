@@ -82,7 +82,7 @@ def _track(log: RgbdLog, config: FrontendConfig, progress: bool) -> tuple[Tracke
     tracked = []
     for frame in source:
         image = frame.color.astype(np.float32) * np.float32(1 / 255)
-        tracked.append(tracker.track(frame.index, frame.stamp_ns, image, frame.depth))
+        tracked.append(tracker.track(frame.index, frame.stamp_ns, image, frame.depth, mask=frame.mask))
     return tracker, tracked
 
 
@@ -165,11 +165,19 @@ def _map(
     updates = []
     for keyframe in steps:
         frame = log.frame(keyframe.frame_index)
-        stats = mapper.add_keyframe(keyframe.keyframe_index, frame.color, frame.depth, keyframe.T_map_camera)
+        stats = mapper.add_keyframe(
+            keyframe.keyframe_index, frame.color, frame.depth, keyframe.T_map_camera, mask=frame.mask
+        )
         updates.append(update(keyframe, stats))
     for supporting in _support(frames, keyframes, config):
         frame = log.frame(supporting.frame_index)
-        mapper.add_view(supporting.keyframe_index, frame.color, frame.depth, supporting.T_keyframe_camera)
+        mapper.add_view(
+            supporting.keyframe_index,
+            frame.color,
+            frame.depth,
+            supporting.T_keyframe_camera,
+            mask=frame.mask,
+        )
     updates.append(update(keyframes[-1], mapper.finish()))
     return updates, mapper.gaussians
 

@@ -31,11 +31,15 @@ _ROWS_AT_A_TIME = 1024  # 9x9 matrices of as many stay in the cache
 
 @dataclass(frozen=True)
 class View:
-    """One keyframe: colour uint8 [H, W, 3] RGB, depth float32 [H, W] m, pose of the camera in the map."""
+    """One keyframe: colour uint8 [H, W, 3] RGB, depth float32 [H, W] m, pose of the camera in the map.
+
+    mask: bool [H, W], pixels that may be used; None = all.
+    """
 
     color: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
     T_map_camera: NDArray[np.float64]
+    mask: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,7 @@ def run_information(
         views = []
         for keyframe in keyframes:
             frame = log.frame(keyframe.frame_index)
-            views.append(View(frame.color, frame.depth, keyframe.T_map_camera))
+            views.append(View(frame.color, frame.depth, keyframe.T_map_camera, frame.mask))
         camera = log.camera
     noise = estimate_noise(final.gaussians, camera, views, config, threads)
     sums = sum_information(final.gaussians, camera, views, noise, config, threads)
@@ -166,7 +170,8 @@ def estimate_noise(
     mask = np.zeros((camera.height, camera.width), bool)
     mask[sample] = True
     for view in views:
-        render = rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera), mask=mask)
+        usable = mask if view.mask is None else mask & view.mask  # alpha is 0 elsewhere: not covered
+        render = rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera), mask=usable)
         alpha, z = render.alpha[sample].astype(np.float64), view.depth_m[sample].astype(np.float64)
         covered = alpha > 0.9
         difference = render.color[sample].astype(np.float64) - view.color[sample] / 255.0
@@ -204,7 +209,8 @@ def sum_information(
 ) -> FisherSums:
     """One sweep over the views at the current Gaussians; the newest view is the last.
 
-    Where the map or the depth image has a hole the depth brings nothing; a Gaussian that no view saw keeps zero.
+    Where the map or the depth image has a hole the depth brings nothing, where a view's mask forbids a pixel neither
+    does colour; a Gaussian that no view saw keeps zero.
     """
     rasterizer = Rasterizer(threads=threads)
     total = FisherSums(len(gaussians))
@@ -214,7 +220,7 @@ def sum_information(
     for view in reversed(chosen):
         inverse_variance = 1.0 / np.square(noise.depth_sigma_m(view.depth_m))
         inverse_depth = np.where(view.depth_m > 0, inverse_variance, 0.0).astype(np.float32)
-        rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera))
+        rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera), mask=view.mask)
         if config.window == "per_gaussian":
             one = FisherSums(len(gaussians))
             rasterizer.fisher(inverse_color, inverse_depth, one)

@@ -13,9 +13,9 @@ from pipeline.consensus.evidence import pack_symmetric, unpack_symmetric
 from pipeline.consensus.poses import PosePacket, SharedKeyframes
 from pipeline.exchange import wire
 from pipeline.exchange.packets import EVIDENCE_KINDS, Kind, MalformedError, chunk_bytes
-from pipeline.exchange.places import Features
 from pipeline.geometry import se3, so3
 from pipeline.registration import Reference, ReferenceLevel
+from pipeline.registration.features import Features
 
 RNG = np.random.default_rng(5)
 TEAM = 4

@@ -213,3 +213,29 @@ def test_keyframes_come_in_order(index: int) -> None:
     arguments: Any = (index, color, depth, POSES[0])
     with pytest.raises(ValueError, match="after 0 keyframes"):
         mapper.add_keyframe(*arguments)
+
+
+def test_masked_pixels_neither_seed_nor_count() -> None:
+    """A red card in front of the wall is not in the map where it is masked, and its colours change no bit."""
+    masks = [np.ones((CAMERA.height, CAMERA.width), bool) for _ in range(2)]
+    masks[0][10:30, 20:44] = False
+    masks[1][10:30, 24:48] = False
+
+    def mapped(card: int) -> Mapper:
+        mapper = Mapper(CAMERA, QUICK, seed=5)
+        for k, mask in enumerate(masks):
+            color, depth = shot(POSES[k])
+            color, depth = color.copy(), depth.copy()
+            color[~mask], depth[~mask] = (card, 0, 0), 0.5
+            mapper.add_keyframe(k, color, depth, POSES[k], mask=mask)
+        mapper.add_view(1, color, depth, np.eye(4), mask=mask)
+        mapper.finish()
+        return mapper
+
+    red, black = mapped(255), mapped(0)
+    assert same(red.gaussians, black.gaussians)
+    assert red.gaussians.means[:, 2].min() > 0.9  # nothing at half a metre
+    psnr_db, l1_m, completeness = drawn(red, POSES[1])
+    assert psnr_db > 20
+    assert l1_m < 0.05
+    assert completeness > 0.9
