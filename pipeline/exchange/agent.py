@@ -44,6 +44,7 @@ from pipeline.exchange.evidence import (
 from pipeline.exchange.knowledge import Knowledge
 from pipeline.exchange.meeting import HigherEnd, LowerEnd, Meeting, OwnPlaces, Send
 from pipeline.exchange.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError, Packet, parse
+from pipeline.exchange.signatures import Identity
 from pipeline.exchange.transport import Arrival, Message, Outgoing, Transport
 from pipeline.exchange.verification import Verdict
 from pipeline.exchange.wire import Anchors, Frame, PairList, State, pair_bit
@@ -108,6 +109,9 @@ class Agent:
         self.data, self.config, self.seed = data, config, seed
         self.team = sorted(team)
         self.own = self.team.index(data.robot)
+        self.identity = None
+        if config.transport.signatures == "ed25519":
+            self.identity = Identity.simulated(seed, self.team, data.robot)
         self.places = OwnPlaces(data, config)
         self._messages = 0
         self.neighbours = {self.team.index(name): self._neighbour(name) for name in sorted(neighbours)}
@@ -133,9 +137,10 @@ class Agent:
         index = self.team.index(name)
         end = LowerEnd if self.data.robot < name else HigherEnd
         meeting = end(self.data.robot, name, self.places, self.config, self.seed)
-        return Neighbour(
-            index, name, Transport(self.own, index, name, self.config.transport, self._new_id), meeting
+        transport = Transport(
+            self.own, index, name, self.config.transport, self._new_id, identity=self.identity
         )
+        return Neighbour(index, name, transport, meeting)
 
     # --- one round
 
@@ -200,7 +205,7 @@ class Agent:
     def _take(self, data: bytes) -> None:
         """Parse and handle one packet; what cannot be used is counted with its reason and has no other effect."""
         try:
-            packet = parse(data)
+            packet = parse(data) if self.identity is None else self.identity.open(data)
             neighbour = self._addressed(packet)
             arrival = neighbour.transport.receive(packet, self.round)
             if arrival is not None:

@@ -88,6 +88,8 @@ class LinkConfig(Config):
 class TransportConfig(Config):
     """Selective acknowledgement and retransmission, in rounds."""
 
+    signatures: Literal["none", "ed25519"] = "none"
+    """Sign every packet (64 bytes behind its 1200) and refuse what its sender did not sign."""
     retransmit_after_rounds: int = Field(default=4, ge=1)
     """An unacknowledged packet of a reliable message is sent again after so many rounds."""
     contact_lost_after_rounds: int = Field(default=64, ge=1)

@@ -122,6 +122,11 @@ def serialise(packet: Packet) -> bytes:
     return fields + _CRC.pack(zlib.crc32(packet.payload, zlib.crc32(fields))) + packet.payload
 
 
+def payload_bytes(data: bytes) -> int:
+    """Length of the payload that a header announces; a signature may follow the payload."""
+    return int(_FIELDS.unpack_from(data)[-1])
+
+
 def parse(data: bytes) -> Packet:
     """Read one packet.
 

@@ -26,6 +26,7 @@ from pipeline.exchange.packets import (
     chunk_count,
     serialise,
 )
+from pipeline.exchange.signatures import SIGNATURE_BYTES, Identity
 
 _ACK_HEAD = struct.Struct("<IIH")  # message id, first chunk, number of chunks told; then one bit per chunk
 MAX_REPEATS = 32
@@ -92,11 +93,22 @@ class Transport:
     """One end of the link to one neighbour."""
 
     def __init__(
-        self, own: int, peer: int, peer_name: str, config: TransportConfig, new_id: Callable[[], int]
+        self,
+        own: int,
+        peer: int,
+        peer_name: str,
+        config: TransportConfig,
+        new_id: Callable[[], int],
+        identity: Identity | None = None,
     ) -> None:
-        """own, peer: indices in the sorted team. new_id: gives message ids that are unique for this sender."""
+        """own, peer: indices in the sorted team. new_id: gives message ids that are unique for this sender.
+
+        identity: signs the packets; without, they are not signed.
+        """
         self.own, self.peer, self.peer_name, self.config = own, peer, peer_name, config
         self.new_id = new_id
+        self._seal = serialise if identity is None else identity.seal
+        self._overhead_bytes = HEADER_BYTES + (0 if identity is None else SIGNATURE_BYTES)
         self.sequence = 0
         self.last_heard: int | None = None
         self._open: dict[int, _Open] = {}
@@ -151,13 +163,13 @@ class Transport:
         """
         out: list[Outgoing] = []
         for message in [*self._acknowledgements(round_index), *states]:
-            budget_bytes -= HEADER_BYTES + len(message.payload)
+            budget_bytes -= self._overhead_bytes + len(message.payload)
             if budget_bytes < 0:
                 return out
             out.append(self._packet(message, 0, round_index))
         if self.in_contact(round_index):
             for entry, chunk in self._due(round_index):
-                size = HEADER_BYTES + min(
+                size = self._overhead_bytes + min(
                     chunk_bytes(entry.message.kind),
                     len(entry.message.payload) - chunk * chunk_bytes(entry.message.kind),
                 )
@@ -191,7 +203,7 @@ class Transport:
             message.payload[chunk * step : (chunk + 1) * step],
         )
         self.sequence += 1
-        return Outgoing(self.peer_name, serialise(packet), message)
+        return Outgoing(self.peer_name, self._seal(packet), message)
 
     def _acknowledgements(self, round_index: int) -> list[Message]:
         """ACK messages for every chunk that arrived lately, with what arrived around it."""

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.consensus.evidence import unpack_symmetric
 from pipeline.consensus.poses import PosePacket, SharedKeyframes
 from pipeline.exchange.compact import COMPACT, decode, encode
 from pipeline.exchange.packets import (
@@ -32,6 +33,8 @@ Array = NDArray[np.float64]
 
 MAX_KEYFRAMES = 100_000
 MAX_COORDINATE = 1e6  # m, or units of theta; beyond it positions lose their meaning
+MAX_INFORMATION = 1e15  # of a coordinate, 1/m^2: 30 nm
+INDEFINITE_TOLERANCE = 1e-4  # of the largest eigenvalue: rounding of float32
 MAX_LOG_COVARIANCE = 60.0  # beyond it exponentials overflow in float32
 ROTATION_TOLERANCE = 1e-6  # of R R' = 1 in a pose that a neighbour sent
 
@@ -630,6 +633,8 @@ def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any]
             raise MalformedError("evidence: not a finite number")
     records = from_body(kind, body)
     check_evidence(records)
+    if kind is Kind.EVIDENCE_EXACT:  # the factors of the compact kind cannot say anything impossible
+        check_information(records["information"].astype(np.float64))
     return owner, body, records
 
 
@@ -644,3 +649,19 @@ def check_evidence(records: NDArray[Any]) -> None:
         raise MalformedError("evidence: a negative keyframe")
     if len(np.unique(records["id"])) != len(records):
         raise MalformedError("evidence: a Gaussian twice")
+
+
+def check_information(information: Array) -> None:
+    """Refuse information [n, 31] that no measurement can give: indefinite, or beyond all sensors.
+
+    Raises:
+        MalformedError: with the reason.
+    """
+    if np.abs(information).max(initial=0.0) > MAX_INFORMATION:
+        raise MalformedError(f"evidence: information beyond {MAX_INFORMATION:g}")
+    if information[:, 27:].min(initial=0.0) < 0:
+        raise MalformedError("evidence: negative information")
+    for part, size in ((slice(0, 6), 3), (slice(6, 27), 6)):
+        values = np.linalg.eigvalsh(unpack_symmetric(information[:, part], size))
+        if (values[:, 0] < -INDEFINITE_TOLERANCE * np.maximum(values[:, -1], 1e-6)).any():
+            raise MalformedError("evidence: indefinite information")

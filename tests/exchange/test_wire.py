@@ -51,7 +51,10 @@ def sample() -> wire.KeyframeSample:
 def records(n: int) -> np.ndarray:
     out = np.zeros(n, wire.RECORD)
     out["id"], out["anchor"] = RNG.permutation(n) + 5, RNG.integers(0, 4, n)
-    out["theta"], out["information"] = RNG.normal(size=(n, 13)), RNG.uniform(0, 1, (n, 31))
+    out["theta"] = RNG.normal(size=(n, 13))
+    L3, L6 = (np.tril(RNG.normal(size=(n, size, size))) for size in (3, 6))
+    blocks = [pack_symmetric(L @ L.swapaxes(1, 2)) for L in (L3, L6)]
+    out["information"] = np.concatenate([*blocks, RNG.uniform(0, 1, (n, 4))], axis=1)
     return out
 
 
@@ -190,6 +193,19 @@ def test_evidence_comes_back_and_every_chunk_is_useful_alone(kind: Kind, n: int)
 def test_exact_evidence_is_exact() -> None:
     sent = records(30)
     assert np.array_equal(as_sent(Kind.EVIDENCE_EXACT, sent), sent)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "reason"),
+    [(0, -5.0, "indefinite"), (1, 1e4, "indefinite"), (26, -1e3, "indefinite"), (30, -1e-3, "negative"),
+     (28, 1e16, "beyond"), (2, np.nan, "finite"), (6, np.inf, "finite")],
+)  # fmt: skip
+def test_impossible_information_is_refused(field: int, value: float, reason: str) -> None:
+    sent = records(20)
+    sent["information"][7, field] = value
+    data = wire.write_evidence(Kind.EVIDENCE_EXACT, 1, 1, sent)
+    with pytest.raises(MalformedError, match=reason):
+        wire.read_evidence(Kind.EVIDENCE_EXACT, data, TEAM)
 
 
 def evidence_with_information(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
