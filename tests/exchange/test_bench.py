@@ -39,8 +39,8 @@ def test_evidence_is_there_after_as_many_hops_as_the_team_is_wide(rows: dict) ->
 def test_the_command_prints_one_document_and_refuses_unknown_words() -> None:
     command = [
         sys.executable,
-        "-m",
-        "pipeline.cli",
+        "-c",
+        "from pipeline.cli import main; main()",
         "bench",
         "consensus",
         "--robots",
