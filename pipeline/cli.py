@@ -416,8 +416,8 @@ def bench_consensus(
     contrast: Annotated[str, typer.Option(help="Largest over smallest information.")] = "47,1e4",
     unknown: Annotated[str, typer.Option(help="Shares of tracks that a robot knows nothing of.")] = "0,0.2",
     mode: Annotated[
-        str, typer.Option(help="evidence, evidence_float32, admm, paper.")
-    ] = "evidence,evidence_float32,admm,paper",
+        str, typer.Option(help="evidence (compact), evidence_float32, evidence_float64, admm, paper.")
+    ] = "evidence,evidence_float64,admm,paper",
     tracks: Annotated[int, typer.Option(min=1, help="Matched Gaussians.")] = 200,
     max_rounds: Annotated[int, typer.Option(min=1, help="A session ends here.")] = 3000,
     seed: Annotated[int, typer.Option(help="Seed of evidence and links.")] = 0,

@@ -36,6 +36,7 @@ PURPOSE = {  # of a message, by its kind
     "ANCHORS": "set-up",
     "EVIDENCE": "Gaussians",
     "EVIDENCE_EXACT": "Gaussians",
+    "EVIDENCE_DOUBLE": "Gaussians",
     "STATE": "poses",
     "ACK": "acknowledgements",
 }

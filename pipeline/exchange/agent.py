@@ -53,6 +53,11 @@ from pipeline.robot import AgentResult, ClosureRecord, RobotData
 
 Array = NDArray[np.float64]
 EVERYWHERE = 255  # a hop count that has reached the whole component, for good
+EVIDENCE_WIRES = {
+    "compact": Kind.EVIDENCE,
+    "float32": Kind.EVIDENCE_EXACT,
+    "float64": Kind.EVIDENCE_DOUBLE,
+}
 MEETING_KINDS = frozenset({Kind.DESCRIPTORS, Kind.REQUEST, Kind.SAMPLE, Kind.CLOSURES})
 
 
@@ -117,7 +122,7 @@ class Agent:
         self.neighbours = {self.team.index(name): self._neighbour(name) for name in sorted(neighbours)}
         self.round = -1
         self.refused: Counter[str] = Counter()
-        self.evidence_kind = Kind.EVIDENCE if config.evidence_wire == "compact" else Kind.EVIDENCE_EXACT
+        self.evidence_kind = EVIDENCE_WIRES[config.evidence_wire]
         self.knowledge = Knowledge(self.own, len(self.team), self.evidence_kind)
         self.frame = Frame(self.own, wire.WHOLE, 0, np.eye(4))
         self.members = 1 << self.own
@@ -486,7 +491,7 @@ class Agent:
     def _own_body(self) -> NDArray[Any]:
         """Own evidence as it is sent, best first."""
         if self._body is None:
-            records = own_records(self.data)
+            records = own_records(self.data, self.evidence_kind)
             self._body = wire.to_body(self.evidence_kind, records[best_first(records)])
         return self._body
 

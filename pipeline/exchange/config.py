@@ -149,8 +149,8 @@ class ExchangeConfig(Config):
     """The session ends here, whatever has been agreed."""
     coverage: Literal["all", "overlap"] = "all"
     """Send every Gaussian to everybody, or only those in space that the receiver's keyframes saw."""
-    evidence_wire: Literal["compact", "float32"] = "compact"
-    """100 bytes per Gaussian, rounded far below its uncertainty, or 188 bytes."""
+    evidence_wire: Literal["compact", "float32", "float64"] = "compact"
+    """100 bytes per Gaussian, rounded far below its uncertainty, or 188, or 364 bytes and not rounded at all."""
     overlap_voxel_m: float = Field(default=0.25, gt=0.0)
     """Edge of the voxels that say which space a robot saw (coverage = overlap)."""
     link: LinkConfig = LinkConfig()
