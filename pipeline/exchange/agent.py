@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from pipeline.consensus.closures import Closure, plausible
 from pipeline.consensus.poses import COUNTS, PoseAgent
-from pipeline.exchange import wire
+from pipeline.exchange import injection, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.evidence import (
     best_first,
@@ -304,7 +304,11 @@ class Agent:
             )
         )
         payloads = [state]
-        if self.poses is not None and neighbour.name in self.poses.links and not self._all_agreed():
+        missing = injection.poses_are_missing(
+            self.config.injection, self.seed, self.data.robot, neighbour.name, self.round
+        )
+        speaks = self.poses is not None and neighbour.name in self.poses.links and not missing
+        if self.poses is not None and speaks and not self._all_agreed():
             packet = self.poses.outgoing(neighbour.name)
             double = packet.translations.dtype == np.float64
             per = wire.poses_per_packet(MAX_PAYLOAD_BYTES - len(state), double)
@@ -550,6 +554,9 @@ class Agent:
                     k.sound_records(other),
                     k.anchors[other].T_common_keyframe,
                     self.config.matching,
+                )
+                ids = injection.false_matches(
+                    ids, self.config.injection, self.seed, self.data.robot, self.team[other]
                 )
                 pairs = PairList(self.own, other, 1, ids)
                 k.pairs[self.own, other] = pairs
