@@ -47,12 +47,14 @@ class FusedMap:
     """A robot's fused map in the world frame: its own Gaussians first, in their order, then those taken over.
 
     gaussians: ids of own ones are kept; those taken over count on from the largest own id. Anchors are keyframes of
-    the source robot. information: float64 [n, 31] as in `consensus.evidence`, world frame, the sum over members.
+    the source robot. theta: float64 [n, 13], the same before rounding to float32. information: float64 [n, 31] as in
+    `consensus.evidence`, world frame, the sum over members.
     robots: names. source: int32 [n], index into robots: whose Gaussian it was. source_ids: int64 [n], its id there.
     members: int32 [n], robots whose evidence is in it. matched: own Gaussians fused with others. added: taken over.
     """
 
     gaussians: Gaussians
+    theta: Array
     information: Array
     robots: tuple[str, ...]
     source: NDArray[np.int32]
@@ -286,6 +288,7 @@ def fuse(
     order = np.concatenate([own_rows, added])
     return FusedMap(
         gaussians=Gaussians.concatenate([kept, taken]),
+        theta=rows.theta[order] + move[order],
         information=sums[order],
         robots=names,
         source=owner[order].astype(np.int32),

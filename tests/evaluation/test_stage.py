@@ -46,7 +46,7 @@ SCHEMA = {
     },
     "consensus": {
         "solver": str, "converged": bool, "rounds_to_tolerance": int, "gap_to_oracle_sigma": NUMBER,
-        "gap_to_oracle_m": NUMBER, "gap_to_oracle_rad": NUMBER,
+        "gap_to_oracle_sigma_p99": NUMBER, "gap_to_oracle_m": NUMBER, "gap_to_oracle_rad": NUMBER,
     },
     "protocol": dict.fromkeys(
         ("alignment", "ate", "team_ate", "rpe", "initial_relative_poses", "held_out", "peers", "training", "poses",
