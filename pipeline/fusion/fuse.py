@@ -35,7 +35,7 @@ from pipeline.consensus.matching import Pairs, held_thickness, tracks
 from pipeline.fusion.config import FusionConfig
 from pipeline.geometry import se3, spd
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.gaussians import DepthKind, Gaussians
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -225,6 +225,7 @@ def fuse(
     camera: PinholeCamera,
     config: FusionConfig,
     matching: MatchingConfig,
+    depth: DepthKind = "blended",
 ) -> FusedMap:
     """Fuse what a robot knows into one map in the world frame.
 
@@ -238,6 +239,7 @@ def fuse(
         depth_images: (own keyframe index, depth [H, W] in metres, 0 invalid), read once; for `coverage = all`.
         camera: of these depth images.
         matching: as the pairs were found; for splitting tracks that hold two Gaussians of one robot.
+        depth: of a Gaussian at a pixel, as the own map was made.
     """
     own = evidence[robot]
     if not np.array_equal(np.sort(own.ids), np.sort(gaussians.ids)):
@@ -275,7 +277,7 @@ def fuse(
     moved = gaussians if same_frame else gaussians.moved(T_map_keyframe, T_world_keyframe[robot])
     added = np.zeros(0, np.int64)
     if config.coverage == "all" and len(foreign):
-        surfaces = _surfaces(moved, T_world_keyframe[robot], depth_images, camera, config)
+        surfaces = _surfaces(moved, T_world_keyframe[robot], depth_images, camera, config, depth)
         added = _to_add(foreign, rows, sums, T_world_keyframe[robot], surfaces, camera, config)
 
     kept = _applied(moved, move[own_rows], rows.theta[own_rows, LOG_COVARIANCE])
@@ -364,6 +366,7 @@ def _surfaces(
     depth_images: Iterable[tuple[int, NDArray[np.float32]]],
     camera: PinholeCamera,
     config: FusionConfig,
+    depth: DepthKind,
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """What own keyframes know of surfaces: measured depth, rendered where it is missing, the farthest close by."""
     from scipy.ndimage import maximum_filter
@@ -371,10 +374,11 @@ def _surfaces(
     from pipeline.kernels import Rasterizer
 
     rasterizer = Rasterizer()
-    for keyframe, depth in depth_images:
-        render = rasterizer.forward(own_world, camera, se3.inverse(T_world_keyframe[keyframe]))
-        stands_in = (depth <= 0) & (render.alpha > config.explained_opacity)
-        filled = np.where(stands_in, render.depth / np.maximum(render.alpha, np.float32(1e-3)), depth)
+    for keyframe, measured in depth_images:
+        T_camera_world = se3.inverse(T_world_keyframe[keyframe])
+        render = rasterizer.forward(own_world, camera, T_camera_world, depth=depth)
+        stands_in = (measured <= 0) & (render.alpha > config.explained_opacity)
+        filled = np.where(stands_in, render.depth / np.maximum(render.alpha, np.float32(1e-3)), measured)
         yield keyframe, maximum_filter(filled, 2 * config.explained_px + 1)
 
 
