@@ -328,7 +328,14 @@ def convert(
     dataset: Annotated[str | None, typer.Argument(help="Name of the dataset; see --list.")] = None,
     source: Annotated[Path | None, typer.Argument(metavar="SRC", help="Where its files are.")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write; must not exist.")] = None,
-    robots: Annotated[int, typer.Option(min=1, help="Cut one sequence into this many robots.")] = 1,
+    robots: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Cut one sequence into this many robots; else one, or as many as the dataset has.",
+            show_default=False,
+        ),
+    ] = None,
     options: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Option of the converter; repeatable."),
