@@ -133,6 +133,7 @@ class RobotWriter:
         depth: NDArray[np.uint16],
         T_world_camera: NDArray[np.float64] | None = None,
         exact_depth: NDArray[np.uint16] | None = None,
+        mask: NDArray[np.bool_] | None = None,
     ) -> None:
         """Append one frame.
 
@@ -142,8 +143,11 @@ class RobotWriter:
             depth: uint16 [H, W] in units of depth_scale along z, registered to colour, 0 = none.
             T_world_camera: true pose [4, 4] of the colour camera in the world that all robots share, where known.
             exact_depth: like depth, without noise, where that differs and is known.
+            mask: bool [H, W], False where a pixel must not be used (a moving object); None = all may.
         """
         self._check_size(depth)
+        if mask is not None:
+            self._check_size(mask)
         if color_format not in ("jpeg", "png"):
             raise ValueError(f"colour format {color_format!r}, expected 'jpeg' or 'png'")
         if self._stamps and stamp_ns <= self._stamps[-1]:
@@ -157,6 +161,8 @@ class RobotWriter:
             topics.COLOR.of(name), messages.pack_color(stamp_ns, name, color, color_format), stamp_ns
         )
         self._log.write(topics.DEPTH.of(name), messages.pack_depth(stamp_ns, name, depth), stamp_ns)
+        if mask is not None:
+            self._log.write(topics.MASK.of(name), messages.pack_mask(stamp_ns, name, mask), stamp_ns)
         if T_world_camera is not None:
             pose = messages.pack_pose_in_frame(stamp_ns, messages.WORLD_FRAME, T_world_camera)
             self._truth_log().write(topics.GROUNDTRUTH_POSE.of(name), pose, stamp_ns)
@@ -171,9 +177,9 @@ class RobotWriter:
                 self._has_exact_depth = True
             truth.write(topic, messages.pack_depth(stamp_ns, name, exact_depth), stamp_ns)
 
-    def _check_size(self, depth: NDArray[np.uint16]) -> None:
-        if depth.shape != (self.camera.height, self.camera.width):
-            raise ValueError(f"depth is {depth.shape}, expected {(self.camera.height, self.camera.width)}")
+    def _check_size(self, image: NDArray[np.uint16] | NDArray[np.bool_]) -> None:
+        if image.shape != (self.camera.height, self.camera.width):
+            raise ValueError(f"an image is {image.shape}, expected {(self.camera.height, self.camera.width)}")
 
     def _truth_log(self) -> LogWriter:
         """The ground-truth log, opened when there is something to say."""

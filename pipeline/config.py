@@ -79,6 +79,13 @@ def dump(config: Config) -> str:
     return tomlkit.dumps(document)
 
 
+def _plain(value: Any) -> Any:
+    """What TOML can hold: tuples become lists, models in them tables without what is not set."""
+    if isinstance(value, Config):
+        return value.model_dump(mode="json", exclude_none=True)
+    return [_plain(element) for element in value] if isinstance(value, tuple) else value
+
+
 def _fill(table: Any, config: Config) -> None:
     import tomlkit
 
@@ -94,7 +101,7 @@ def _fill(table: Any, config: Config) -> None:
         if value is None:  # TOML has no null; leaving a setting out means its default, which is None
             table.add(tomlkit.comment(f"{name} is not set"))
             continue
-        table.add(name, tomlkit.item(list(value) if isinstance(value, tuple) else value))
+        table.add(name, tomlkit.item(_plain(value)))
     for name, section in sections:
         inner = tomlkit.table()
         if type(section).__doc__:

@@ -18,7 +18,7 @@ import schemas
 from pipeline.errors import DuagError
 from pipeline.geometry import se3, so3
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.gaussians import DEPTH_KINDS, DepthKind, Gaussians
 
 Array = NDArray[np.float64]
 NANOSECONDS = 1_000_000_000
@@ -419,7 +419,10 @@ class GaussianInformation:
 
 @dataclass(frozen=True, eq=False)
 class GaussianMap:
-    """A complete map in the frame `frame_id`, with the information of its Gaussians where it is known."""
+    """A complete map in the frame `frame_id`, with the information of its Gaussians where it is known.
+
+    depth: which depth of a Gaussian at a pixel the map was made with (DepthKind).
+    """
 
     schema: ClassVar[str] = "duagc.v1.GaussianMap"
 
@@ -428,6 +431,7 @@ class GaussianMap:
     frame_id: str
     gaussians: Gaussians
     information: GaussianInformation | None = None
+    depth: DepthKind = "blended"
 
     def pack(self) -> Any:
         """duagc.v1.GaussianMap."""
@@ -437,6 +441,7 @@ class GaussianMap:
             robot=self.robot,
             gaussians=pack_gaussians(self.gaussians),
             information=None if self.information is None else self.information.pack(),
+            depth=self.depth,
         )
         pack_stamp(message, self.stamp_ns)
         return message
@@ -450,7 +455,16 @@ class GaussianMap:
             frame_id=m.frame_id,
             gaussians=unpack_gaussians(m.gaussians),
             information=GaussianInformation.unpack(m.information) if m.HasField("information") else None,
+            depth=_depth_kind(m.depth),
         )
+
+
+def _depth_kind(name: str) -> DepthKind:
+    """The kind of depth of a map; maps written before it was recorded are blended."""
+    for kind in DEPTH_KINDS:
+        if kind == (name or "blended"):
+            return kind
+    raise DuagError(f"GaussianMap.depth is {name!r}, expected one of {', '.join(DEPTH_KINDS)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -559,6 +573,31 @@ def unpack_depth(m: Any, where: str) -> NDArray[np.uint16]:
             f"{where} has rows of {m.step} bytes for {m.width}x{m.height} pixels, expected two per pixel"
         )
     return unpack_array(m.data, "uint16", (m.height, m.step // 2), where)[:, : m.width]
+
+
+def pack_mask(stamp_ns: int, robot: str, usable: NDArray[np.bool_]) -> Any:
+    """foxglove.RawImage, 8UC1, of the pixels that may be used, bool [H, W]: 255 = yes, 0 = no."""
+    if usable.dtype != np.bool_ or usable.ndim != 2:
+        raise ValueError(f"mask is {usable.dtype} {usable.shape}, expected bool [H, W]")
+    height, width = usable.shape
+    data = np.where(usable, np.uint8(255), np.uint8(0)).tobytes()
+    fields = {"width": width, "height": height, "encoding": "8UC1", "step": width, "data": data}
+    return _foxglove("RawImage", stamp_ns, camera_frame(robot), **fields)
+
+
+def unpack_mask(m: Any, where: str) -> NDArray[np.bool_]:
+    """bool [H, W], True = usable, of a foxglove.RawImage; `where` begins the line of an error."""
+    if m.encoding != "8UC1":
+        raise DuagError(f"{where} is {m.encoding or 'without encoding'}, expected 8UC1")
+    if m.step < m.width or m.height * m.width == 0:
+        raise DuagError(
+            f"{where} has rows of {m.step} bytes for {m.width}x{m.height} pixels, expected one per pixel"
+        )
+    values = unpack_array(m.data, "uint8", (m.height, m.step), where)[:, : m.width]
+    odd = values[(values != 0) & (values != 255)]
+    if len(odd):
+        raise DuagError(f"{where} has the value {odd[0]}, expected 0 (ignore) and 255 (usable) only")
+    return values == 255
 
 
 def pack_calibration(stamp_ns: int, robot: str, camera: PinholeCamera) -> Any:

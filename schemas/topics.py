@@ -43,6 +43,13 @@ DEPTH = Topic(
     Scope.SENSOR,
     "16UC1 depth along z, registered to colour, 0 = none; channel metadata depth_scale = metres per unit",
 )
+MASK = Topic(
+    "/<robot>/camera/mask",
+    "foxglove.RawImage",
+    "converters",
+    Scope.SENSOR,
+    "8UC1, pixels of the colour image that may be used: 255 = yes, 0 = no, for example a moving object",
+)
 CALIBRATION = Topic(
     "/<robot>/camera/calibration",
     "foxglove.CameraCalibration",
@@ -77,6 +84,13 @@ MAP_UPDATE = Topic(
     "/<robot>/map_update", "duagc.v1.MapUpdate", "frontend", Scope.ROBOT, "what one keyframe did to the map"
 )
 MAP = Topic("/<robot>/map", "duagc.v1.GaussianMap", "frontend", Scope.ROBOT, "the robot's own map")
+UNREFINED_MAP = Topic(
+    "/<robot>/map/unrefined",
+    "duagc.v1.GaussianMap",
+    "frontend",
+    Scope.ROBOT,
+    "the robot's own map before its final refinement, for comparison",
+)
 INFORMATION = Topic(
     "/<robot>/information",
     "duagc.v1.GaussianInformation",
@@ -134,6 +148,7 @@ CLOSURE_DECISION = Topic(
 TOPICS: tuple[Topic, ...] = (
     COLOR,
     DEPTH,
+    MASK,
     CALIBRATION,
     GROUNDTRUTH_POSE,
     GROUNDTRUTH_DEPTH,
@@ -142,6 +157,7 @@ TOPICS: tuple[Topic, ...] = (
     KEYFRAME_FACTOR,
     MAP_UPDATE,
     MAP,
+    UNREFINED_MAP,
     INFORMATION,
     FUSED_MAP,
     CORRECTED_KEYFRAMES,

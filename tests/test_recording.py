@@ -63,6 +63,7 @@ def write_camera(
     scale: str | None = "0.001",
     color: Callable[[int], bytes] = lambda index: png(image(index)),
     depth: Callable[[int], np.ndarray] = depth,
+    masks: dict[int, Any] | None = None,
 ) -> Path:
     with LogWriter(path, "alpha") as log:
         log.channel(
@@ -79,6 +80,8 @@ def write_camera(
                 log.write(topics.COLOR.of("alpha"), m.pack_color(stamp, "alpha", color(index), "png"), stamp)
             if index not in skip_depth:
                 log.write(topics.DEPTH.of("alpha"), m.pack_depth(stamp, "alpha", depth(index)), stamp)
+            if masks is not None and index in masks:
+                log.write(topics.MASK.of("alpha"), masks[index], stamp)
     return path
 
 
@@ -361,6 +364,69 @@ def test_frames_come_back_in_any_order(tmp_path: Path) -> None:
             assert frame.depth.dtype == np.float32
         with pytest.raises(IndexError):
             log.frame(9)
+
+
+def usable(index: int) -> np.ndarray:
+    return np.random.default_rng(2000 + index).random((CAMERA.height, CAMERA.width)) < 0.6
+
+
+def test_masks_come_with_their_images(tmp_path: Path) -> None:
+    """Some frames have one; a masked pixel keeps its depth, but not its usable depth."""
+    masks = {k: m.pack_mask(k * FRAME_NS, "alpha", usable(k)) for k in (1, 4, 5)}
+    with open_rgbd(write_camera(tmp_path / "alpha.mcap", frames=7, masks=masks)) as log:
+        for frame in [*log.frames(), log.frame(4)]:
+            if frame.index in masks:
+                assert frame.mask is not None
+                assert np.array_equal(frame.mask, usable(frame.index))
+                assert np.array_equal(frame.usable_depth, frame.depth * usable(frame.index))
+            else:
+                assert frame.mask is None
+                assert frame.usable_depth is frame.depth
+
+
+def test_masks_can_be_recorded(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "rec") as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
+        for k in range(3):
+            robot.add_frame(k * FRAME_NS, png(image(k)), "png", depth(k), mask=usable(k) if k else None)
+        with pytest.raises(ValueError, match="an image is"):
+            robot.add_frame(3 * FRAME_NS, png(image(3)), "png", depth(3), mask=usable(3).T)
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
+        assert [frame.mask is None for frame in log.frames()] == [True, False, False]
+
+
+def odd_mask(**fields: Any) -> Any:
+    message = m.pack_mask(0, "alpha", usable(0))
+    for name, value in fields.items():
+        setattr(message, name, value)
+    return message
+
+
+@pytest.mark.parametrize(
+    ("mask", "words"),
+    [
+        (odd_mask(encoding="mono8"), "at 0 ns is mono8, expected 8UC1"),
+        (odd_mask(step=15), "has rows of 15 bytes for 16x12 pixels"),
+        (odd_mask(data=b"x"), "has 1 bytes, expected 192"),
+        (
+            odd_mask(data=bytes([255] * 191 + [7])),
+            "has the value 7, expected 0 (ignore) and 255 (usable) only",
+        ),
+        (odd_mask(width=8, height=24, step=8), "is 8x24, expected 16x12"),
+    ],
+)
+def test_unsound_masks_are_one_line(tmp_path: Path, mask: Any, words: str) -> None:
+    path = write_camera(tmp_path / "alpha.mcap", masks={0: mask})
+    with pytest.raises(DuagError) as caught:
+        list(open_rgbd(path).frames())
+    assert str(caught.value).startswith(f"{path}: /alpha/camera/mask")
+    assert words in str(caught.value)
+
+
+def test_a_mask_of_no_image_is_an_error(tmp_path: Path) -> None:
+    skipped = {"skip_color": (2,), "skip_depth": (2,)}
+    masks = {2: m.pack_mask(2 * FRAME_NS, "alpha", usable(2))}
+    with pytest.raises(DuagError, match="has a mask at 66666666 ns, expected one in /alpha/camera/color"):
+        open_rgbd(write_camera(tmp_path / "alpha.mcap", masks=masks, **skipped))
 
 
 def test_frames_stream(tmp_path: Path) -> None:

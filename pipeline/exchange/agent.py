@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from pipeline.consensus.closures import Closure, plausible
 from pipeline.consensus.poses import PoseAgent
 from pipeline.consensus.robust import COUNTS
-from pipeline.exchange import wire
+from pipeline.exchange import injection, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.evidence import (
     best_first,
@@ -45,6 +45,7 @@ from pipeline.exchange.evidence import (
 from pipeline.exchange.knowledge import Knowledge
 from pipeline.exchange.meeting import HigherEnd, LowerEnd, Meeting, OwnPlaces, Send
 from pipeline.exchange.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError, Packet, parse
+from pipeline.exchange.signatures import Identity
 from pipeline.exchange.transport import Arrival, Message, Outgoing, Transport
 from pipeline.exchange.verification import Verdict
 from pipeline.exchange.wire import Anchors, Frame, PairList, State, pair_bit
@@ -53,6 +54,11 @@ from pipeline.robot import AgentResult, ClosureRecord, RobotData
 
 Array = NDArray[np.float64]
 EVERYWHERE = 255  # a hop count that has reached the whole component, for good
+EVIDENCE_WIRES = {
+    "compact": Kind.EVIDENCE,
+    "float32": Kind.EVIDENCE_EXACT,
+    "float64": Kind.EVIDENCE_DOUBLE,
+}
 MEETING_KINDS = frozenset({Kind.DESCRIPTORS, Kind.REQUEST, Kind.SAMPLE, Kind.CLOSURES})
 
 
@@ -109,12 +115,15 @@ class Agent:
         self.data, self.config, self.seed = data, config, seed
         self.team = sorted(team)
         self.own = self.team.index(data.robot)
+        self.identity = None
+        if config.transport.signatures == "ed25519":
+            self.identity = Identity.simulated(seed, self.team, data.robot)
         self.places = OwnPlaces(data, config)
         self._messages = 0
         self.neighbours = {self.team.index(name): self._neighbour(name) for name in sorted(neighbours)}
         self.round = -1
         self.refused: Counter[str] = Counter()
-        self.evidence_kind = Kind.EVIDENCE if config.evidence_wire == "compact" else Kind.EVIDENCE_EXACT
+        self.evidence_kind = EVIDENCE_WIRES[config.evidence_wire]
         self.knowledge = Knowledge(self.own, len(self.team), self.evidence_kind)
         self.frame = Frame(self.own, wire.WHOLE, 0, np.eye(4))
         self.members = 1 << self.own
@@ -134,9 +143,10 @@ class Agent:
         index = self.team.index(name)
         end = LowerEnd if self.data.robot < name else HigherEnd
         meeting = end(self.data.robot, name, self.places, self.config, self.seed)
-        return Neighbour(
-            index, name, Transport(self.own, index, name, self.config.transport, self._new_id), meeting
+        transport = Transport(
+            self.own, index, name, self.config.transport, self._new_id, identity=self.identity
         )
+        return Neighbour(index, name, transport, meeting)
 
     # --- one round
 
@@ -178,19 +188,30 @@ class Agent:
         return [n for n in self.neighbours.values() if n.joined]
 
     def _watch(self) -> None:
-        """Give up neighbours that were silent for too long; do not wait for them any more."""
+        """Give up neighbours that were silent for too long; do not wait for them any more.
+
+        A link that died while the poses were sought would leave its two ends with different last words of each other
+        for ever, so the rest of the team begins again without it. If nobody is left, or a neighbour has agreed
+        already, what there is stays.
+        """
+        died = 0
         for neighbour in self._living():
             heard = neighbour.transport.last_heard
             silent = self.round - (0 if heard is None else heard)
             if silent > self.config.transport.silent_after_rounds and not self.done:
+                died |= pair_bit(self.own, neighbour.index) if neighbour.joined else 0
                 neighbour.gone = True
+        others = self._joined()
+        settled = self.agreed or any(n.state is not None and n.state.agreed for n in others)
+        if died and others and not settled:
+            self._part(self.parted | died)
 
     # --- incoming
 
     def _take(self, data: bytes) -> None:
         """Parse and handle one packet; what cannot be used is counted with its reason and has no other effect."""
         try:
-            packet = parse(data)
+            packet = parse(data) if self.identity is None else self.identity.open(data)
             neighbour = self._addressed(packet)
             arrival = neighbour.transport.receive(packet, self.round)
             if arrival is not None:
@@ -284,7 +305,11 @@ class Agent:
             )
         )
         payloads = [state]
-        if self.poses is not None and neighbour.name in self.poses.links and not self._all_agreed():
+        missing = injection.poses_are_missing(
+            self.config.injection, self.seed, self.data.robot, neighbour.name, self.round
+        )
+        speaks = self.poses is not None and neighbour.name in self.poses.links and not missing
+        if self.poses is not None and speaks and not self._all_agreed():
             packet = self.poses.outgoing(neighbour.name)
             double = packet.translations.dtype == np.float64
             per = wire.poses_per_packet(MAX_PAYLOAD_BYTES - len(state), double)
@@ -471,7 +496,7 @@ class Agent:
     def _own_body(self) -> NDArray[Any]:
         """Own evidence as it is sent, best first."""
         if self._body is None:
-            records = own_records(self.data)
+            records = own_records(self.data, self.evidence_kind)
             self._body = wire.to_body(self.evidence_kind, records[best_first(records)])
         return self._body
 
@@ -530,6 +555,9 @@ class Agent:
                     k.sound_records(other),
                     k.anchors[other].T_common_keyframe,
                     self.config.matching,
+                )
+                ids = injection.false_matches(
+                    ids, self.config.injection, self.seed, self.data.robot, self.team[other]
                 )
                 pairs = PairList(self.own, other, 1, ids)
                 k.pairs[self.own, other] = pairs

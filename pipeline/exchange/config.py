@@ -2,11 +2,35 @@
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from pipeline.config import Config
 from pipeline.consensus.config import MatchingConfig, PoseConsensusConfig
 from pipeline.registration import RegistrationConfig
+
+
+class LinkWindow(Config):
+    """A stretch of time in which one robot hears another."""
+
+    sender: str
+    receiver: str
+    both_ways: bool = True
+    """The receiver is heard by the sender as well."""
+    from_ns: int = Field(default=0, ge=0)
+    """Time since the beginning of the session."""
+    until_ns: int | None = Field(default=None, ge=0)
+    """The link dies here; not set: never."""
+    loss_probability: float | None = Field(default=None, ge=0.0, le=1.0)
+    """Instead of that of all links."""
+
+
+class Waypoint(Config):
+    """Where the radio of a robot is at one time of the session; in between it moves straight."""
+
+    robot: str
+    time_ns: int = Field(default=0, ge=0)
+    position_m: tuple[float, float, float]
+    """In one frame for all robots: a part of the scenario, known to the link model and to no robot."""
 
 
 class LinkConfig(Config):
@@ -14,19 +38,58 @@ class LinkConfig(Config):
 
     enabled: bool = True
     """False: nobody talks to anybody, whatever the topology."""
-    topology: Literal["full", "ring", "chain", "star", "none"] = "full"
-    """Who can talk to whom, over the robots in alphabetical order; the centre of the star is the first."""
+    topology: Literal["full", "ring", "chain", "star", "none", "range", "listed"] = "full"
+    """Who can talk to whom: laid over the robots in alphabetical order (the centre of the star is the first), by
+    distance (`range`, needs range_m and waypoints), or as `windows` say (`listed`)."""
+    windows: tuple[LinkWindow, ...] = ()
+    """Links of topology `listed`, each with the time in which it exists."""
+    range_m: float = Field(default=0.0, ge=0.0)
+    """Robots farther apart do not hear each other (topology `range`)."""
+    waypoints: tuple[Waypoint, ...] = ()
+    """Where the robots' radios are (topology `range`); every robot needs one."""
     loss_probability: float = Field(default=0.0, ge=0.0, le=1.0)
     """Chance that a packet is lost, independent of every other packet."""
+    burst_gap_ns: int = Field(default=1_000_000_000, ge=1)
+    """Mean time between two bursts of loss (Gilbert-Elliott: the good state)."""
+    burst_length_ns: int = Field(default=0, ge=0)
+    """Mean length of a burst (the bad state); 0: there are none."""
+    burst_loss_probability: float = Field(default=1.0, ge=0.0, le=1.0)
+    """Chance that a packet sent during a burst is lost."""
     latency_ns: int = Field(default=20_000_000, ge=0)
-    """Time from sending to delivery."""
+    """Least time from sending to delivery."""
+    jitter_ns: int = Field(default=0, ge=0)
+    """Further delay, drawn evenly from 0 to this; packets that overtake each other are reordered."""
+    duplicate_probability: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Chance that a delivered packet arrives a second time, with a delay of its own."""
+    bandwidth_bytes_per_s: int = Field(default=0, ge=0)
+    """A packet occupies its directed link for its size over this; 0: for no time."""
+    queue_ns: int = Field(default=1_000_000_000, ge=0)
+    """A packet that would wait longer than this for the link is dropped by its sender's radio."""
     budget_bytes: int = Field(default=250_000, ge=2_400)
     """Most that one robot sends to one neighbour in one round, headers included."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "LinkConfig":
+        if self.topology == "listed" and not self.windows:
+            raise ValueError("exchange.link.windows is empty, expected the links of topology 'listed'")
+        if self.topology == "range" and (self.range_m <= 0 or not self.waypoints):
+            raise ValueError("exchange.link: topology 'range' expects range_m above 0 and waypoints")
+        for window in self.windows:
+            if window.sender == window.receiver:
+                raise ValueError(f"exchange.link.windows: {window.sender} is linked to itself")
+            if window.until_ns is not None and window.until_ns <= window.from_ns:
+                raise ValueError(
+                    f"exchange.link.windows: {window.sender} to {window.receiver} ends at {window.until_ns} ns, "
+                    f"expected later than {window.from_ns} ns"
+                )
+        return self
 
 
 class TransportConfig(Config):
     """Selective acknowledgement and retransmission, in rounds."""
 
+    signatures: Literal["none", "ed25519"] = "none"
+    """Sign every packet (64 bytes behind its 1200) and refuse what its sender did not sign."""
     retransmit_after_rounds: int = Field(default=4, ge=1)
     """An unacknowledged packet of a reliable message is sent again after so many rounds."""
     contact_lost_after_rounds: int = Field(default=64, ge=1)
@@ -77,6 +140,19 @@ class VerificationConfig(Config):
     """Largest rotation by which the registration may change what RANSAC found."""
 
 
+class InjectionConfig(Config):
+    """Faults made on purpose; all off unless asked for."""
+
+    false_closures: float = Field(default=0.0, ge=0.0, lt=1.0)
+    """Share of false ones among all closures of a pair of robots that found any."""
+    false_closure_m: float = Field(default=3.0, gt=0.0)
+    """Largest coordinate of the translation of a false closure; its rotation is any."""
+    false_matches: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Share of the matched Gaussians of a pair of robots whose partners are exchanged."""
+    pose_dropouts: float = Field(default=0.0, ge=0.0, lt=1.0)
+    """Chance that a robot says nothing of its poses to a neighbour in a round."""
+
+
 class ExchangeConfig(Config):
     """One session of the team."""
 
@@ -86,8 +162,8 @@ class ExchangeConfig(Config):
     """The session ends here, whatever has been agreed."""
     coverage: Literal["all", "overlap"] = "all"
     """Send every Gaussian to everybody, or only those in space that the receiver's keyframes saw."""
-    evidence_wire: Literal["compact", "float32"] = "compact"
-    """100 bytes per Gaussian, rounded far below its uncertainty, or 188 bytes."""
+    evidence_wire: Literal["compact", "float32", "float64"] = "compact"
+    """100 bytes per Gaussian, rounded far below its uncertainty, or 188, or 364 bytes and not rounded at all."""
     overlap_voxel_m: float = Field(default=0.25, gt=0.0)
     """Edge of the voxels that say which space a robot saw (coverage = overlap)."""
     link: LinkConfig = LinkConfig()
@@ -96,3 +172,4 @@ class ExchangeConfig(Config):
     verification: VerificationConfig = VerificationConfig()
     consensus: PoseConsensusConfig = PoseConsensusConfig()
     matching: MatchingConfig = MatchingConfig()
+    injection: InjectionConfig = InjectionConfig()

@@ -23,14 +23,15 @@ from pipeline import streams
 from pipeline.consensus.closures import Closure, consistent, drift
 from pipeline.consensus.links import SharedKeyframes
 from pipeline.consensus.poses import PoseAgent
-from pipeline.exchange import places, wire
+from pipeline.exchange import injection, places, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.packets import Kind, MalformedError
-from pipeline.exchange.places import Candidate, Features
+from pipeline.exchange.places import Candidate
 from pipeline.exchange.verification import Verdict, Verified, verify
 from pipeline.exchange.wire import KeyframeSample, PlaceBook, Verdicts
 from pipeline.geometry import se3
 from pipeline.registration import Reference, RgbdPyramid
+from pipeline.registration.features import Features, extract
 from pipeline.robot import RobotData, factors_of
 
 Array = NDArray[np.float64]
@@ -53,9 +54,7 @@ class OwnPlaces:
         if self._features is None:
             most = self.config.places.features_per_keyframe
             camera = self.data.camera
-            self._features = [
-                places.extract(*self.data.images(k), camera, most) for k in range(self.data.keyframes)
-            ]
+            self._features = [extract(*self.data.images(k), camera, most) for k in range(self.data.keyframes)]
         return self._features
 
     def pyramid(self, keyframe: int) -> RgbdPyramid:
@@ -210,9 +209,21 @@ class LowerEnd(Meeting):
             )
             self.tried.append(Tried(candidate, result))
 
+    def _inject(self) -> None:
+        """Add the false closures that the configuration asks for."""
+        assert self.book is not None
+        found = [t.result.closure for t in self.tried if t.result.closure is not None]
+        ends = self.places.data.keyframes, len(self.book.descriptors)
+        for c in injection.false_closures(
+            found, *ends, self.config.injection, self.seed, self.own, self.peer
+        ):
+            result = Verified(Verdict.KEPT, 0, 0, injection.DETAIL, c)
+            self.tried.append(Tried(Candidate(c.own_keyframe, c.peer_keyframe, 0), result))
+
     def _decide(self, send: Send) -> None:
         """Pairwise consistency, the relative frame, and the message that says so."""
         assert self.book is not None
+        self._inject()
         self.tried.sort(key=lambda t: (t.candidate.peer_keyframe, t.candidate.own_keyframe))
         closures = [t.result.closure for t in self.tried if t.result.closure is not None]
         agreement = consistent(
@@ -228,6 +239,8 @@ class LowerEnd(Meeting):
             if t.result.closure is not None:
                 keep, reason = next(verdicts)
                 if not keep:
+                    if t.result.detail == injection.DETAIL:
+                        reason = f"{reason}; {injection.DETAIL}"
                     result = replace(t.result, verdict=Verdict.INCONSISTENT, detail=reason)
                     self.tried[at] = Tried(t.candidate, result)
         T = agreement.T_ownmap_peermap

@@ -12,7 +12,7 @@ import schemas
 from pipeline.errors import DuagError
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.links import Fate
-from pipeline.exchange.packets import EVIDENCE_KINDS, HEADER_BYTES, Kind, MalformedError, parse
+from pipeline.exchange.packets import EVIDENCE_KINDS, HEADER_BYTES, Kind, MalformedError, parse, payload_bytes
 from pipeline.exchange.transport import Outgoing
 from pipeline.messages import map_frame, pack_pose, pack_stamp
 from pipeline.recording import LogWriter, read_log
@@ -56,7 +56,9 @@ class ExchangeRecorder:
     ) -> None:
         """Record one packet, and its message if this is the first packet of it."""
         self._message(sender, out, send_ns)
-        packet = parse(out.packet)
+        length = payload_bytes(out.packet)
+        end = HEADER_BYTES + length
+        packet = parse(out.packet[:end])
         message = schemas.new(
             "PeerPacket",
             robot=sender,
@@ -65,10 +67,12 @@ class ExchangeRecorder:
             round=round_index,
             message=out.message.id,
             offset=packet.offset,
-            length=len(packet.payload),
+            length=length,
             header=out.packet[:HEADER_BYTES],
+            signature=out.packet[end:],
             delivered=fate.delivered,
-            deliver_ns=fate.deliver_ns or 0,
+            deliver_ns=fate.deliver_ns[0] if fate.delivered else 0,
+            copies_deliver_ns=fate.deliver_ns[1:],
             dropped=fate.reason,
         )
         pack_stamp(message, send_ns)
@@ -77,7 +81,7 @@ class ExchangeRecorder:
         totals[0] += 1
         totals[1] += not fate.delivered
         totals[2] += len(out.packet)
-        totals[3] += len(out.packet) * fate.delivered
+        totals[3] += len(out.packet) * len(fate.deliver_ns)
 
     def _message(self, sender: str, out: Outgoing, send_ns: int) -> None:
         key = (sender, out.message.id)
@@ -148,7 +152,7 @@ class Recorded:
 
 @dataclass(frozen=True)
 class RecordedPacket:
-    """One packet of a recorded session, rebuilt."""
+    """One packet of a recorded session, rebuilt; deliver_ns: of every copy that arrived."""
 
     sender: str
     receiver: str
@@ -156,7 +160,7 @@ class RecordedPacket:
     round: int
     kind_name: str
     send_ns: int
-    deliver_ns: int | None
+    deliver_ns: tuple[int, ...]
     dropped: str
     data: bytes
 
@@ -193,9 +197,9 @@ def read_session(exchange_path: Path) -> Recorded:
                     m.round,
                     kind_name,
                     record.log_time_ns,
-                    m.deliver_ns if m.delivered else None,
+                    (m.deliver_ns, *m.copies_deliver_ns) if m.delivered else (),
                     m.dropped,
-                    data,
+                    data + m.signature,
                 )
             )
         elif record.schema == topics.EXCHANGE_SUMMARY.schema:

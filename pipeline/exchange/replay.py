@@ -53,8 +53,8 @@ def replay_agent_of(
     for p in session.packets:
         if p.sender == data.robot:
             recorded.update(p.data)
-        if p.receiver == data.robot and p.deliver_ns is not None:
-            waiting.append((p.deliver_ns, p.sender, p.sequence, p.data))
+        if p.receiver == data.robot:
+            waiting.extend((at_ns, p.sender, p.sequence, p.data) for at_ns in p.deliver_ns)
     neighbours = links.neighbours(config.link, session.team)[data.robot]
     agent = Agent(data, session.team, neighbours, config, seed)
     for round_index in range(session.rounds):

@@ -75,10 +75,11 @@ def run_session_of(
             for sender, burst in sent:
                 for out in burst:
                     sequence = int.from_bytes(out.packet[8:12], "little")
-                    fate = model.fate(sender, out.receiver, sequence, now_ns)
+                    fate = model.fate(sender, out.receiver, sequence, now_ns, len(out.packet))
                     packets.packet(sender, out, sequence, round_index, now_ns, fate)
-                    if fate.deliver_ns is not None:
-                        waiting[out.receiver].append((fate.deliver_ns, sender, sequence, out.packet))
+                    waiting[out.receiver].extend(
+                        (at_ns, sender, sequence, out.packet) for at_ns in fate.deliver_ns
+                    )
             if all(agent.done for agent in agents.values()):
                 break
         results = {robot: agent.result() for robot, agent in agents.items()}

@@ -26,9 +26,11 @@ from pipeline.exchange.packets import (
     chunk_count,
     serialise,
 )
+from pipeline.exchange.signatures import SIGNATURE_BYTES, Identity
 
 _ACK_HEAD = struct.Struct("<IIH")  # message id, first chunk, number of chunks told; then one bit per chunk
 MAX_REPEATS = 32
+SEQUENCE_BLOCK = 1024
 ACK_CHUNKS = 8 * (MAX_PAYLOAD_BYTES - _ACK_HEAD.size)
 
 
@@ -91,11 +93,22 @@ class Transport:
     """One end of the link to one neighbour."""
 
     def __init__(
-        self, own: int, peer: int, peer_name: str, config: TransportConfig, new_id: Callable[[], int]
+        self,
+        own: int,
+        peer: int,
+        peer_name: str,
+        config: TransportConfig,
+        new_id: Callable[[], int],
+        identity: Identity | None = None,
     ) -> None:
-        """own, peer: indices in the sorted team. new_id: gives message ids that are unique for this sender."""
+        """own, peer: indices in the sorted team. new_id: gives message ids that are unique for this sender.
+
+        identity: signs the packets; without, they are not signed.
+        """
         self.own, self.peer, self.peer_name, self.config = own, peer, peer_name, config
         self.new_id = new_id
+        self._seal = serialise if identity is None else identity.seal
+        self._overhead_bytes = HEADER_BYTES + (0 if identity is None else SIGNATURE_BYTES)
         self.sequence = 0
         self.last_heard: int | None = None
         self._open: dict[int, _Open] = {}
@@ -103,6 +116,7 @@ class Transport:
         self._received: dict[int, tuple[Kind, int]] = {}  # complete messages: kind, total bytes
         self._to_acknowledge: dict[int, _News] = {}
         self._packets_heard = self._highest_sequence = 0
+        self._heard: dict[int, int] = {}  # sequence numbers, a mask for each block of SEQUENCE_BLOCK
         self._delay_rounds: int | None = None  # least seen between sending and arrival
 
     # --- outgoing
@@ -149,13 +163,13 @@ class Transport:
         """
         out: list[Outgoing] = []
         for message in [*self._acknowledgements(round_index), *states]:
-            budget_bytes -= HEADER_BYTES + len(message.payload)
+            budget_bytes -= self._overhead_bytes + len(message.payload)
             if budget_bytes < 0:
                 return out
             out.append(self._packet(message, 0, round_index))
         if self.in_contact(round_index):
             for entry, chunk in self._due(round_index):
-                size = HEADER_BYTES + min(
+                size = self._overhead_bytes + min(
                     chunk_bytes(entry.message.kind),
                     len(entry.message.payload) - chunk * chunk_bytes(entry.message.kind),
                 )
@@ -189,7 +203,7 @@ class Transport:
             message.payload[chunk * step : (chunk + 1) * step],
         )
         self.sequence += 1
-        return Outgoing(self.peer_name, serialise(packet), message)
+        return Outgoing(self.peer_name, self._seal(packet), message)
 
     def _acknowledgements(self, round_index: int) -> list[Message]:
         """ACK messages for every chunk that arrived lately, with what arrived around it."""
@@ -242,6 +256,8 @@ class Transport:
         Raises:
             MalformedError: it contradicts what came before, or asks for too much; it is then ignored.
         """
+        if not self._is_new(packet.sequence):
+            return None  # a copy that the network made, or somebody repeats what was heard
         self.last_heard = round_index
         self._packets_heard += 1
         delay = max(0, round_index - packet.round)
@@ -253,6 +269,13 @@ class Transport:
         if packet.kind is Kind.STATE:
             return Arrival(packet.kind, packet.message, packet.payload, complete=True)
         return self._take_chunk(packet, round_index)
+
+    def _is_new(self, sequence: int) -> bool:
+        """Whether a sequence number is heard for the first time; remembers it, however far it jumps."""
+        block, bit = sequence // SEQUENCE_BLOCK, 1 << sequence % SEQUENCE_BLOCK
+        heard = self._heard.get(block, 0)
+        self._heard[block] = heard | bit
+        return not heard & bit
 
     def _take_chunk(self, packet: Packet, round_index: int) -> Arrival | None:
         known = self._received.get(packet.message)

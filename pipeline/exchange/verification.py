@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from pipeline.consensus.closures import Closure
 from pipeline.exchange.config import VerificationConfig
-from pipeline.exchange.places import Features, matches
-from pipeline.geometry import se3, so3
+from pipeline.geometry import se3
 from pipeline.registration import Reference, RgbdPyramid, register
+from pipeline.registration.features import Features, matches, ransac
 
 Array = NDArray[np.float64]
-REFINEMENT_ROUNDS = 3  # of fitting to the inliers and finding them again
 
 
 class Verdict(Enum):
@@ -42,52 +41,6 @@ class Verified:
     inliers: int
     detail: str = ""
     closure: Closure | None = None
-
-
-def fit(points_a: Array, points_b: Array) -> Array:
-    """T_a_b [..., 4, 4] that minimises sum |a - T_a_b b|^2 over paired points [..., n, 3] (Kabsch, batched)."""
-    mean_a, mean_b = points_a.mean(axis=-2, keepdims=True), points_b.mean(axis=-2, keepdims=True)
-    R = so3.project(np.swapaxes(points_a - mean_a, -1, -2) @ (points_b - mean_b))
-    return se3.from_rotation_translation(R, mean_a[..., 0, :] - (R @ mean_b[..., 0, :, None])[..., 0])
-
-
-def ransac(
-    points_a: Array, points_b: Array, inlier_m: float, hypotheses: int, rng: np.random.Generator
-) -> tuple[Array, NDArray[np.bool_]]:
-    """The motion that most matched points agree on.
-
-    Args:
-        points_a, points_b: paired points [n, 3], n >= 3, camera frames, metres.
-        inlier_m: largest distance at one metre of depth; it grows with depth as the noise of a depth camera does.
-        hypotheses: three-point samples drawn.
-    Returns:
-        T_a_b [4, 4], fitted to its inliers, and the inliers [n].
-    """
-    n = len(points_a)
-    # three different indices per row, without rejection: the second and third skip those before them
-    i = rng.integers(0, n, hypotheses)
-    j = rng.integers(0, n - 1, hypotheses)
-    k = rng.integers(0, n - 2, hypotheses)
-    j += j >= i
-    low, high = np.minimum(i, j), np.maximum(i, j)
-    k += k >= low
-    k += k >= high
-    triples = np.stack([i, j, k], axis=1)
-    limit_m = inlier_m * np.maximum(1.0, np.maximum(points_a[:, 2], points_b[:, 2]))
-
-    def agreeing(T: Array) -> NDArray[np.bool_]:
-        return np.linalg.norm(points_a - se3.transform(T, points_b), axis=-1) < limit_m
-
-    T = fit(points_a[triples], points_b[triples])
-    counts = agreeing(T).sum(axis=1)
-    best = T[int(np.argmax(counts))]
-    inliers = agreeing(best)
-    for _ in range(REFINEMENT_ROUNDS):
-        if inliers.sum() < 3:
-            break
-        best = fit(points_a[inliers], points_b[inliers])
-        inliers = agreeing(best)
-    return best, inliers
 
 
 def verify(

@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.consensus.evidence import unpack_symmetric
 from pipeline.consensus.links import PosePacket, SharedKeyframes
 from pipeline.exchange.compact import COMPACT, decode, encode
 from pipeline.exchange.packets import (
     EVIDENCE_BYTES,
+    EVIDENCE_DOUBLE_BYTES,
     EVIDENCE_EXACT_BYTES,
     EVIDENCE_HEAD_BYTES,
     EVIDENCE_KINDS,
@@ -25,13 +27,15 @@ from pipeline.exchange.packets import (
     chunk_bytes,
     records_per_chunk,
 )
-from pipeline.exchange.places import DIMENSIONS, Descriptors, Features
 from pipeline.registration import Reference, ReferenceLevel
+from pipeline.registration.features import DIMENSIONS, Descriptors, Features
 
 Array = NDArray[np.float64]
 
 MAX_KEYFRAMES = 100_000
 MAX_COORDINATE = 1e6  # m, or units of theta; beyond it positions lose their meaning
+MAX_INFORMATION = 1e15  # of a coordinate, 1/m^2: 30 nm
+INDEFINITE_TOLERANCE = 1e-4  # of the largest eigenvalue: rounding of float32
 MAX_LOG_COVARIANCE = 60.0  # beyond it exponentials overflow in float32
 ROTATION_TOLERANCE = 1e-6  # of R R' = 1 in a pose that a neighbour sent
 
@@ -570,10 +574,17 @@ def read_pairs(data: bytes, team: int) -> PairList:
 # --- evidence
 
 RECORD = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f4", 13), ("information", "<f4", 31)])
+RECORD_DOUBLE = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f8", 13), ("information", "<f8", 31)])
 _EVIDENCE = struct.Struct("<HHI")  # owner, version, records of the whole message
 assert RECORD.itemsize == EVIDENCE_EXACT_BYTES
+assert RECORD_DOUBLE.itemsize == EVIDENCE_DOUBLE_BYTES
 assert COMPACT.itemsize == EVIDENCE_BYTES
 assert _EVIDENCE.size == EVIDENCE_HEAD_BYTES
+
+
+def record_dtype(kind: Kind) -> np.dtype[Any]:
+    """Records as they are made and read for this kind of evidence."""
+    return RECORD_DOUBLE if kind is Kind.EVIDENCE_DOUBLE else RECORD
 
 
 def to_body(kind: Kind, records: NDArray[Any]) -> NDArray[Any]:
@@ -587,7 +598,7 @@ def from_body(kind: Kind, body: NDArray[Any]) -> NDArray[Any]:
 
 
 def write_evidence(kind: Kind, owner: int, version: int, body: NDArray[Any]) -> bytes:
-    """Bytes of EVIDENCE or EVIDENCE_EXACT: chunks of whole records, each with its own head, as they are cut."""
+    """Bytes of evidence of any kind: chunks of whole records, each with its own head, as they are cut."""
     n, per, size = len(body), records_per_chunk(kind), body.itemsize
     head = _EVIDENCE.pack(owner, version, n)
     chunks = max(1, -(-n // per))
@@ -624,12 +635,14 @@ def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any]
     if odd or n > announced:
         raise MalformedError(f"evidence: {len(data)} bytes are no {announced} records")
     flat = np.ascontiguousarray(rows[:, EVIDENCE_HEAD_BYTES:]).reshape(-1)
-    body: NDArray[Any] = flat.view(COMPACT if kind is Kind.EVIDENCE else RECORD)[:n].copy()
+    body: NDArray[Any] = flat.view(COMPACT if kind is Kind.EVIDENCE else record_dtype(kind))[:n].copy()
     for name in body.dtype.names or ():
         if body[name].dtype.kind == "f" and not np.isfinite(body[name]).all():
             raise MalformedError("evidence: not a finite number")
     records = from_body(kind, body)
     check_evidence(records)
+    if kind is not Kind.EVIDENCE:  # the factors of the compact kind cannot say anything impossible
+        check_information(records["information"].astype(np.float64))
     return owner, body, records
 
 
@@ -644,3 +657,19 @@ def check_evidence(records: NDArray[Any]) -> None:
         raise MalformedError("evidence: a negative keyframe")
     if len(np.unique(records["id"])) != len(records):
         raise MalformedError("evidence: a Gaussian twice")
+
+
+def check_information(information: Array) -> None:
+    """Refuse information [n, 31] that no measurement can give: indefinite, or beyond all sensors.
+
+    Raises:
+        MalformedError: with the reason.
+    """
+    if np.abs(information).max(initial=0.0) > MAX_INFORMATION:
+        raise MalformedError(f"evidence: information beyond {MAX_INFORMATION:g}")
+    if information[:, 27:].min(initial=0.0) < 0:
+        raise MalformedError("evidence: negative information")
+    for part, size in ((slice(0, 6), 3), (slice(6, 27), 6)):
+        values = np.linalg.eigvalsh(unpack_symmetric(information[:, part], size))
+        if (values[:, 0] < -INDEFINITE_TOLERANCE * np.maximum(values[:, -1], 1e-6)).any():
+            raise MalformedError("evidence: indefinite information")

@@ -77,12 +77,23 @@ class Tracker:
         self._motion = np.eye(4)  # T_camera_next of the two frames before, identity after a loss
         self._lost = False
 
-    def track(self, frame_index: int, stamp_ns: int, image: Image, depth_m: Image) -> TrackedFrame:
+    def track(
+        self,
+        frame_index: int,
+        stamp_ns: int,
+        image: Image,
+        depth_m: Image,
+        *,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> TrackedFrame:
         """Track one frame; the first becomes keyframe 0 and the origin of the map.
 
         Args:
             image: colour [h, w, 3] or grey [h, w], 0..1. depth_m: [h, w], metres, 0 = unknown.
+            mask: bool [h, w], False where a pixel must not be used; its depth counts as unknown. None = all may.
         """
+        if mask is not None:
+            depth_m = np.where(mask, depth_m, 0)
         pyramid = RgbdPyramid.build(image, depth_m, self.camera, levels=len(self.config.tracking.strides))
         if not self.keyframes:
             self._add_keyframe(frame_index, stamp_ns, pyramid, -1, np.eye(4), None)

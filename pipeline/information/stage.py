@@ -20,7 +20,7 @@ from pipeline.information.config import InformationConfig
 from pipeline.kernels import FisherSums, Rasterizer
 from pipeline.messages import GaussianInformation, GaussianMap, Keyframe, Odometry
 from pipeline.recording import LogWriter, open_rgbd, read_log
-from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.gaussians import DepthKind, Gaussians
 from schemas import topics
 
 MAD_TO_SIGMA = 1.4826
@@ -31,11 +31,15 @@ _ROWS_AT_A_TIME = 1024  # 9x9 matrices of as many stay in the cache
 
 @dataclass(frozen=True)
 class View:
-    """One keyframe: colour uint8 [H, W, 3] RGB, depth float32 [H, W] m, pose of the camera in the map."""
+    """One keyframe: colour uint8 [H, W, 3] RGB, depth float32 [H, W] m, pose of the camera in the map.
+
+    mask: bool [H, W], pixels that may be used; None = all.
+    """
 
     color: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
     T_map_camera: NDArray[np.float64]
+    mask: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -83,10 +87,10 @@ def run_information(
         views = []
         for keyframe in keyframes:
             frame = log.frame(keyframe.frame_index)
-            views.append(View(frame.color, frame.depth, keyframe.T_map_camera))
+            views.append(View(frame.color, frame.depth, keyframe.T_map_camera, frame.mask))
         camera = log.camera
-    noise = estimate_noise(final.gaussians, camera, views, config, threads)
-    sums = sum_information(final.gaussians, camera, views, noise, config, threads)
+    noise = estimate_noise(final.gaussians, camera, views, config, threads, depth=final.depth)
+    sums = sum_information(final.gaussians, camera, views, noise, config, threads, depth=final.depth)
     result = GaussianInformation(
         stamp_ns=final.stamp_ns,
         robot=final.robot,
@@ -151,6 +155,7 @@ def estimate_noise(
     config: InformationConfig,
     threads: int = 1,
     every: int = 4,
+    depth: DepthKind = "blended",
 ) -> Noise:
     """Noise from the residuals of the map's own renders: 1.4826 times the median absolute residual.
 
@@ -166,7 +171,10 @@ def estimate_noise(
     mask = np.zeros((camera.height, camera.width), bool)
     mask[sample] = True
     for view in views:
-        render = rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera), mask=mask)
+        usable = mask if view.mask is None else mask & view.mask  # alpha is 0 elsewhere: not covered
+        render = rasterizer.forward(
+            gaussians, camera, se3.inverse(view.T_map_camera), mask=usable, depth=depth
+        )
         alpha, z = render.alpha[sample].astype(np.float64), view.depth_m[sample].astype(np.float64)
         covered = alpha > 0.9
         difference = render.color[sample].astype(np.float64) - view.color[sample] / 255.0
@@ -174,11 +182,11 @@ def estimate_noise(
         both = covered & (z > 0)
         residual = render.depth[sample][both] / alpha[both] - z[both]
         depths.append(np.abs(residual) / unit.depth_sigma_m(z[both]))
-    color, depth = np.concatenate(colors), np.concatenate(depths)
+    color, units = np.concatenate(colors), np.concatenate(depths)
     color_sigma = MAD_TO_SIGMA * float(np.median(color)) if len(color) else 0.0
     factor = 1.0
-    if config.depth_factor_from_residuals and len(depth):
-        factor = MAD_TO_SIGMA * float(np.median(depth))
+    if config.depth_factor_from_residuals and len(units):
+        factor = MAD_TO_SIGMA * float(np.median(units))
         factor = float(np.clip(factor, config.depth_factor_min, config.depth_factor_max))
     return Noise(
         color_sigma=max(color_sigma, config.color_sigma_floor),
@@ -201,10 +209,12 @@ def sum_information(
     noise: Noise,
     config: InformationConfig,
     threads: int = 1,
+    depth: DepthKind = "blended",
 ) -> FisherSums:
     """One sweep over the views at the current Gaussians; the newest view is the last.
 
-    Where the map or the depth image has a hole the depth brings nothing; a Gaussian that no view saw keeps zero.
+    Where the map or the depth image has a hole the depth brings nothing, where a view's mask forbids a pixel neither
+    does colour; a Gaussian that no view saw keeps zero.
     """
     rasterizer = Rasterizer(threads=threads)
     total = FisherSums(len(gaussians))
@@ -214,7 +224,7 @@ def sum_information(
     for view in reversed(chosen):
         inverse_variance = 1.0 / np.square(noise.depth_sigma_m(view.depth_m))
         inverse_depth = np.where(view.depth_m > 0, inverse_variance, 0.0).astype(np.float32)
-        rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera))
+        rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera), mask=view.mask, depth=depth)
         if config.window == "per_gaussian":
             one = FisherSums(len(gaussians))
             rasterizer.fisher(inverse_color, inverse_depth, one)

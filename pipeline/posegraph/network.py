@@ -22,6 +22,7 @@ SOLVERS: dict[str, type[GraphAgent]] = {
     "elimination": EliminationAgent,
     "paper": PaperAgent,
 }
+_ROUND_NS = 100_000_000  # a packet that is not lost is there one round later
 
 
 @dataclass
@@ -70,7 +71,7 @@ def meet(
                 traffic.sent[sender] += len(out.packet)
                 traffic.packets += 1
                 sequence = int.from_bytes(out.packet[8:12], "little")
-                if model.fate(sender, out.receiver, sequence, 0).delivered:
+                if model.fate(sender, out.receiver, sequence, rounds * _ROUND_NS, len(out.packet)).delivered:
                     waiting[out.receiver].append(out.packet)
                 else:
                     traffic.lost += 1

@@ -102,6 +102,7 @@ def _crc_of(stream: IO[bytes], start: int, stop: int) -> int:
 
 
 _verified: set[tuple[str, int, int, int]] = set()
+_publish_times: dict[tuple[str, int, int, int, str], dict[int, tuple[int, int, int]]] = {}
 
 
 def verify(path: Path) -> None:
@@ -241,6 +242,24 @@ class LogFile:
                 index = MessageIndex.read(ReadDataStream(self._stream))
                 out += [(time, chunk.chunk_start_offset, offset) for time, offset in index.records]
         return sorted(out)
+
+    def entries_by_time(self, topic: str) -> dict[int, tuple[int, int, int]]:
+        """The entry of every message of a topic by its publish time; of equal times the first.
+
+        Only the messages themselves know their publish time, so all their chunks are unpacked; a process does it
+        once per file and topic.
+        """
+        status = self.path.stat()
+        key = (str(self.path.resolve()), status.st_size, status.st_mtime_ns, status.st_ino, topic)
+        if key not in _publish_times:
+            entries = self.entries(topic)
+            times = [self._publish_time(entry) for entry in entries]
+            _publish_times[key] = dict(zip(reversed(times), reversed(entries), strict=True))
+        return _publish_times[key]
+
+    def _publish_time(self, entry: tuple[int, int, int]) -> int:
+        with parsing(self.path):
+            return int(_MESSAGE.unpack_from(self._chunk(entry[1]), entry[2])[-1])
 
     def record_at(self, topic: str, entry: tuple[int, int, int]) -> Record:
         """The message at an entry of `entries(topic)`; the last few chunks are kept unpacked."""

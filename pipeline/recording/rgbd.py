@@ -23,17 +23,24 @@ class RgbdFrame:
     """One colour image with its depth.
 
     index: position in the log. stamp_ns: when both were taken. color: uint8 [H, W, 3], RGB.
-    depth: float32 [H, W], metres along z, 0 where nothing was measured.
+    depth: float32 [H, W], metres along z, 0 where nothing was measured. mask: bool [H, W], True = usable, False = a
+    moving object or otherwise to be ignored; None = all usable.
     """
 
     index: int
     stamp_ns: int
     color: NDArray[np.uint8]
     depth: NDArray[np.float32]
+    mask: NDArray[np.bool_] | None = None
+
+    @property
+    def usable_depth(self) -> NDArray[np.float32]:
+        """The depth, 0 also where the mask forbids the pixel."""
+        return self.depth if self.mask is None else np.where(self.mask, self.depth, np.float32(0))
 
 
 class RgbdLog:
-    """Registered colour and depth of one robot; frames are paired by equal publish time.
+    """Registered colour and depth of one robot; frames are paired by equal publish time, masks too where there are any.
 
     `robot`, `camera`, `depth_scale` (metres per unit). Reads what is asked for and keeps no more than a few frames.
     """
@@ -64,6 +71,8 @@ class RgbdLog:
             raise DuagError(self._unpaired())
         self.camera = self._read_camera()
         self.depth_scale = self._read_depth_scale()
+        self._mask_topic = topic_table.MASK.of(self.robot)
+        self._mask_at = self._read_mask_times()
 
     def _unpaired(self) -> str:
         """The line that names the first image without a partner."""
@@ -117,6 +126,22 @@ class RgbdLog:
             raise DuagError(f"{where} is {text!r}, expected metres per unit, for example '0.001'")
         return scale
 
+    def _read_mask_times(self) -> dict[int, tuple[int, int, int]]:
+        """The entry of every mask by its publish time.
+
+        Raises:
+            DuagError: a mask is of no colour image.
+        """
+        at = self._log.entries_by_time(self._mask_topic)
+        if at:
+            stray = sorted(at.keys() - self._log.entries_by_time(self._color_topic).keys())
+            if stray:
+                raise DuagError(
+                    f"{self.path}: {self._mask_topic} has a mask at {stray[0]} ns, "
+                    f"expected one in {self._color_topic} at the same time"
+                )
+        return at
+
     def __len__(self) -> int:
         return len(self._color)
 
@@ -146,7 +171,10 @@ class RgbdLog:
                 f"{self.path}: {depth.topic} number {index} is of {depth.publish_time_ns} ns, "
                 f"expected {color.publish_time_ns} ns as in {color.topic}"
             )
-        return RgbdFrame(index, color.publish_time_ns, self._decode_color(color), self._decode_depth(depth))
+        stamp = color.publish_time_ns
+        return RgbdFrame(
+            index, stamp, self._decode_color(color), self._decode_depth(depth), self._mask_of(stamp)
+        )
 
     def _decode_color(self, record: Record) -> NDArray[np.uint8]:
         import cv2
@@ -165,6 +193,15 @@ class RgbdLog:
         )
         self._check_size(record, raw.shape[1], raw.shape[0])
         return raw.astype(np.float32) * np.float32(self.depth_scale)
+
+    def _mask_of(self, stamp_ns: int) -> NDArray[np.bool_] | None:
+        entry = self._mask_at.get(stamp_ns)
+        if entry is None:
+            return None
+        record = self._log.record_at(self._mask_topic, entry)
+        mask = messages.unpack_mask(record.proto(), f"{self.path}: {record.topic} at {stamp_ns} ns")
+        self._check_size(record, mask.shape[1], mask.shape[0])
+        return mask
 
     def _check_size(self, record: Record, width: int, height: int) -> None:
         if (width, height) != (self.camera.width, self.camera.height):

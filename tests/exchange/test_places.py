@@ -9,8 +9,9 @@ from pipeline import streams
 from pipeline.exchange import places, wire
 from pipeline.exchange.config import ExchangeConfig, VerificationConfig
 from pipeline.exchange.meeting import OwnPlaces
-from pipeline.exchange.verification import Verdict, inverse_information, ransac, verify
+from pipeline.exchange.verification import Verdict, inverse_information, verify
 from pipeline.geometry import se3
+from pipeline.registration import features
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,7 @@ def test_matching_bytes_is_exact() -> None:
     rng = np.random.default_rng(0)
     a, b = (rng.integers(0, 256, (50, 128)).astype(np.uint8) for _ in range(2))
     exact = ((a[:, None].astype(np.int64) - b.astype(np.int64)) ** 2).sum(axis=-1)
-    assert np.array_equal(places._squared_distances(a, b), exact)
+    assert np.array_equal(features._squared_distances(a, b), exact)
 
 
 def test_a_descriptor_matches_itself_only() -> None:
@@ -34,7 +35,7 @@ def test_a_descriptor_matches_itself_only() -> None:
     a = rng.integers(0, 256, (40, 128)).astype(np.uint8)
     noisy = np.clip(a[:20].astype(int) + rng.integers(-3, 4, (20, 128)), 0, 255).astype(np.uint8)
     theirs = np.concatenate([noisy, rng.integers(0, 256, (20, 128)).astype(np.uint8)])
-    assert np.array_equal(places.matches(a, theirs, 0.8), np.stack([np.arange(20)] * 2, axis=1))
+    assert np.array_equal(features.matches(a, theirs, 0.8), np.stack([np.arange(20)] * 2, axis=1))
 
 
 def test_ransac_finds_the_motion_among_false_matches() -> None:
@@ -43,7 +44,7 @@ def test_ransac_finds_the_motion_among_false_matches() -> None:
     points_b = rng.uniform([-1, -1, 1], [1, 1, 3], (60, 3))
     points_a = se3.transform(T, points_b) + rng.normal(0, 0.003, (60, 3))
     points_a[:35] = rng.uniform([-1, -1, 1], [1, 1, 3], (35, 3))
-    found, inliers = ransac(points_a, points_b, 0.03, 500, streams.generator(0, "test"))
+    found, inliers = features.ransac(points_a, points_b, 0.03, 500, streams.generator(0, "test"))
     assert inliers[35:].all()
     assert inliers[:35].sum() <= 2
     assert max(float(d) for d in se3.distance(found, T)) < 0.01

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 
 from pipeline.consensus.config import PoseConsensusConfig
 from pipeline.exchange.agent import Agent
-from pipeline.exchange.config import ExchangeConfig, LinkConfig, TransportConfig
+from pipeline.exchange.config import ExchangeConfig, InjectionConfig, LinkConfig, TransportConfig
 from pipeline.exchange.packets import Kind, Packet, chunk_bytes, parse, serialise
 from pipeline.exchange.record import read_session
 from pipeline.exchange.replay import replay_agent_of
@@ -128,10 +129,10 @@ def test_the_log_accounts_for_every_byte(lossy_chain: Any) -> None:
     session = read_session(folder / "exchange.mcap")
     summary = next(iter(read_log(folder / "exchange.mcap", ["/exchange/summary"]))).message()
     assert summary.bytes_sent == sum(len(p.data) for p in session.packets)
-    assert summary.bytes_delivered == sum(len(p.data) for p in session.packets if p.deliver_ns is not None)
-    assert summary.packets_dropped == sum(p.deliver_ns is None for p in session.packets)
+    assert summary.bytes_delivered == sum(len(p.data) * len(p.deliver_ns) for p in session.packets)
+    assert summary.packets_dropped == sum(not p.deliver_ns for p in session.packets)
     assert 0.2 < summary.packets_dropped / summary.packets_sent < 0.4
-    assert all(bool(p.dropped) == (p.deliver_ns is None) for p in session.packets)
+    assert all(bool(p.dropped) == (not p.deliver_ns) for p in session.packets)
     for sender in NAMES:
         for receiver in NAMES:
             sequences = [p.sequence for p in session.packets if (p.sender, p.receiver) == (sender, receiver)]
@@ -178,6 +179,116 @@ def test_total_loss_is_no_communication(team: Any, tmp_path: Path) -> None:
             assert result.pairs == {}
         assert same(dataclasses.replace(lost[name], rounds=0), dataclasses.replace(none[name], rounds=0))
         assert lost[name].rounds == 22
+
+
+TROUBLE = {
+    "bursts": {"burst_gap_ns": 600_000_000, "burst_length_ns": 300_000_000},
+    "jitter": {"jitter_ns": 450_000_000},
+    "duplicates": {"duplicate_probability": 0.5, "jitter_ns": 150_000_000},
+    "bandwidth": {"bandwidth_bytes_per_s": 150_000, "queue_ns": 150_000_000},
+    "everything": {
+        "loss_probability": 0.2,
+        "burst_gap_ns": 800_000_000,
+        "burst_length_ns": 200_000_000,
+        "jitter_ns": 300_000_000,
+        "duplicate_probability": 0.2,
+        "bandwidth_bytes_per_s": 600_000,
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(team: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, AgentResult]:
+    return meet(team, 2, tmp_path_factory.mktemp("undisturbed"))
+
+
+@pytest.mark.parametrize("name", TROUBLE)
+def test_a_troubled_link_costs_rounds_and_nothing_else(
+    team: Any, undisturbed: dict[str, AgentResult], tmp_path: Path, name: str
+) -> None:
+    link = LinkConfig(**TROUBLE[name])  # type: ignore[arg-type]
+    results = meet(team, 2, tmp_path, link=link)
+    for robot, result in results.items():
+        assert result.converged
+        moved_m, _ = se3.distance(result.T_world_keyframe, undisturbed[robot].T_world_keyframe)
+        assert moved_m.max() < 1e-4  # both stop when they move by less than that, on different ways
+        assert set(result.evidence) == set(NAMES[:2]) - {robot}
+        again, sent = replay_agent_of(
+            team[robot][0], ExchangeConfig(link=link), seed=0, exchange_path=tmp_path / "exchange.mcap"
+        )
+        assert sent.equal
+        assert same(again, result)
+    assert results["alpha"].rounds > undisturbed["alpha"].rounds or name == "duplicates"
+
+
+def test_a_copy_made_by_the_network_changes_nothing(
+    team: Any, undisturbed: dict[str, AgentResult], tmp_path: Path
+) -> None:
+    results = meet(team, 2, tmp_path, link=LinkConfig(duplicate_probability=1.0))
+    assert all(same(results[robot], undisturbed[robot]) for robot in undisturbed)
+    summary = next(iter(read_log(tmp_path / "exchange.mcap", ["/exchange/summary"]))).message()
+    assert summary.bytes_delivered == 2 * summary.bytes_sent
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_injected_false_closures_are_found_out(
+    team: Any, undisturbed: dict[str, AgentResult], tmp_path: Path, seed: int
+) -> None:
+    faults = InjectionConfig(false_closures=0.3)
+    results = meet(team, 2, tmp_path, seed=seed, injection=faults)
+    closures = results["alpha"].closures
+    false = [c for c in closures if "injected" in c.detail]
+    true = [c for c in closures if c.T_own_peer is not None and "injected" not in c.detail]
+    assert len(false) == round(3 / 7 * len(true)) > 1
+    assert all(c.weight == 0.0 for c in false)  # they took part and lost
+    assert sum(c.weight is not None and c.weight > 0.5 for c in true) >= 0.9 * len(true)
+    for name, result in results.items():
+        assert result.converged
+        moved_m, _ = se3.distance(result.T_world_keyframe, undisturbed[name].T_world_keyframe)
+        assert moved_m.max() < 2e-3
+
+
+def test_missing_poses_cost_rounds_and_false_matches_are_as_many_as_asked_for(
+    team: Any, undisturbed: dict[str, AgentResult], tmp_path: Path
+) -> None:
+    faults = InjectionConfig(pose_dropouts=0.5, false_matches=0.4)
+    results = meet(team, 2, tmp_path, injection=faults)
+    for name, result in results.items():
+        assert result.converged
+        assert result.rounds > undisturbed[name].rounds
+        moved_m, _ = se3.distance(result.T_world_keyframe, undisturbed[name].T_world_keyframe)
+        assert moved_m.max() < 1e-4
+    true, mixed = (r["alpha"].pairs["alpha", "bravo"] for r in (undisturbed, results))
+    assert len(true) == len(mixed)
+    assert 0.2 < np.mean(np.any(true != mixed, axis=1)) < 0.6
+    assert np.array_equal(np.sort(true[:, 1]), np.sort(mixed[:, 1]))
+
+
+def test_a_link_that_dies_leaves_the_way_around(team: Any, tmp_path: Path) -> None:
+    """Alpha and charlie lose sight of each other while the poses move; bravo hears both."""
+    windows = (
+        {"sender": "alpha", "receiver": "bravo"},
+        {"sender": "bravo", "receiver": "charlie"},
+        {"sender": "alpha", "receiver": "charlie", "until_ns": 2_000_000_000},
+    )
+    link = LinkConfig(topology="listed", windows=windows)  # type: ignore[arg-type]
+    transport = TransportConfig(contact_lost_after_rounds=16, silent_after_rounds=40)
+    results = meet(team, 3, tmp_path, link=link, transport=transport)
+    reasons = {p.dropped for p in read_session(tmp_path / "exchange.mcap").packets}
+    assert reasons == {"", "no link at this time"}
+    for name, result in results.items():
+        assert result.component == NAMES
+        assert error_m(result, team) < 0.02
+        assert set(result.evidence) == set(NAMES) - {name}
+
+
+def test_a_link_in_one_direction_is_no_link(team: Any, tmp_path: Path) -> None:
+    windows = ({"sender": "alpha", "receiver": "bravo", "both_ways": False},)
+    link = LinkConfig(topology="listed", windows=windows)  # type: ignore[arg-type]
+    results = meet(team, 2, tmp_path, link=link, transport=TransportConfig(silent_after_rounds=20))
+    for name, result in results.items():
+        assert result.component == (name,)
+        assert np.array_equal(result.T_world_keyframe, team[name][0].T_map_keyframe)
 
 
 def test_robots_that_saw_different_places_stay_apart(make_robot: Any, tmp_path: Path) -> None:
@@ -247,19 +358,22 @@ def test_an_end_by_rounds_leaves_the_own_map_usable(team: Any, tmp_path: Path) -
 def test_hostile_packets_change_nothing(team: Any) -> None:
     """An agent fed with rubbish, forgeries and contradictions behaves as one that heard nothing useful."""
     rng = np.random.default_rng(0)
-    rubbish: list[bytes] = [rng.bytes(int(n)) for n in rng.integers(0, 1300, 50)]
+    rubbish: list[bytes | Packet] = [rng.bytes(int(n)) for n in rng.integers(0, 1300, 50)]
     for kind in Kind:
         for size in (0, 7, 40, 1100):
             payload = rng.bytes(size)
             for sender in (1, 2):
-                rubbish.append(serialise(Packet(kind, sender, 0, 0, 0, int(kind), 0, size, payload)))
-        step = chunk_bytes(kind)
-        rubbish.append(
-            serialise(Packet(kind, 1, 0, 0, 0, 77, 0, 1 << 31, bytes(step))) if kind > Kind.STATE else b""
-        )
+                rubbish.append(Packet(kind, sender, 0, 0, 0, int(kind), 0, size, payload))
+        if kind > Kind.STATE:
+            rubbish.append(Packet(kind, 1, 0, 0, 0, 77, 0, 1 << 31, bytes(chunk_bytes(kind))))
     agent = Agent(team["alpha"][0], ["alpha", "bravo", "charlie"], ["bravo"], ExchangeConfig(), seed=0)
+    sequences = itertools.count()
     for round_index in range(4):
-        for out in agent.tick(round_index, round_index, rubbish):
+        packets = [
+            serialise(dataclasses.replace(r, sequence=next(sequences))) if isinstance(r, Packet) else r
+            for r in rubbish
+        ]
+        for out in agent.tick(round_index, round_index, packets):
             assert parse(out.packet).sender == 0
     assert sum(agent.refused.values()) > 200
     assert not agent.neighbours[1].decided

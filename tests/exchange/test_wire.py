@@ -13,9 +13,9 @@ from pipeline.consensus.evidence import pack_symmetric, unpack_symmetric
 from pipeline.consensus.links import PosePacket, SharedKeyframes
 from pipeline.exchange import wire
 from pipeline.exchange.packets import EVIDENCE_KINDS, Kind, MalformedError, chunk_bytes
-from pipeline.exchange.places import Features
 from pipeline.geometry import se3, so3
 from pipeline.registration import Reference, ReferenceLevel
+from pipeline.registration.features import Features
 
 RNG = np.random.default_rng(5)
 TEAM = 4
@@ -32,6 +32,15 @@ def pose_packet(dtype: str) -> PosePacket:
     keyframes = np.array([1, 4, 9], np.int32)
     penalties = np.array([0.1, 0.2], np.float32)
     return PosePacket(7, 2, keyframes, quats, translations, penalties, np.array([3, 4], np.float32), True)
+
+
+def records_of(kind: Kind, n: int) -> np.ndarray:
+    """Records in the precision of a kind."""
+    out = np.zeros(n, wire.record_dtype(kind))
+    single = records(n)
+    for name in out.dtype.names or ():
+        out[name] = single[name]
+    return out
 
 
 def as_sent(kind: Kind, sent: np.ndarray) -> np.ndarray:
@@ -51,7 +60,10 @@ def sample() -> wire.KeyframeSample:
 def records(n: int) -> np.ndarray:
     out = np.zeros(n, wire.RECORD)
     out["id"], out["anchor"] = RNG.permutation(n) + 5, RNG.integers(0, 4, n)
-    out["theta"], out["information"] = RNG.normal(size=(n, 13)), RNG.uniform(0, 1, (n, 31))
+    out["theta"] = RNG.normal(size=(n, 13))
+    L3, L6 = (np.tril(RNG.normal(size=(n, size, size))) for size in (3, 6))
+    blocks = [pack_symmetric(L @ L.swapaxes(1, 2)) for L in (L3, L6)]
+    out["information"] = np.concatenate([*blocks, RNG.uniform(0, 1, (n, 4))], axis=1)
     return out
 
 
@@ -176,7 +188,7 @@ def test_a_sample_comes_back_within_its_quantisation() -> None:
 @given(n=st.integers(0, 40))
 @settings(max_examples=20, deadline=None)
 def test_evidence_comes_back_and_every_chunk_is_useful_alone(kind: Kind, n: int) -> None:
-    sent = records(n)
+    sent = records_of(kind, n)
     data = wire.write_evidence(kind, 1, 1, wire.to_body(kind, sent))
     owner, body, back = wire.read_evidence(kind, data, TEAM)
     assert owner == 1
@@ -188,8 +200,22 @@ def test_evidence_comes_back_and_every_chunk_is_useful_alone(kind: Kind, n: int)
 
 
 def test_exact_evidence_is_exact() -> None:
-    sent = records(30)
-    assert np.array_equal(as_sent(Kind.EVIDENCE_EXACT, sent), sent)
+    for kind in (Kind.EVIDENCE_EXACT, Kind.EVIDENCE_DOUBLE):
+        sent = records_of(kind, 30)
+        assert np.array_equal(as_sent(kind, sent), sent)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "reason"),
+    [(0, -5.0, "indefinite"), (1, 1e4, "indefinite"), (26, -1e3, "indefinite"), (30, -1e-3, "negative"),
+     (28, 1e16, "beyond"), (2, np.nan, "finite"), (6, np.inf, "finite")],
+)  # fmt: skip
+def test_impossible_information_is_refused(field: int, value: float, reason: str) -> None:
+    sent = records(20)
+    sent["information"][7, field] = value
+    data = wire.write_evidence(Kind.EVIDENCE_EXACT, 1, 1, sent)
+    with pytest.raises(MalformedError, match=reason):
+        wire.read_evidence(Kind.EVIDENCE_EXACT, data, TEAM)
 
 
 def evidence_with_information(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

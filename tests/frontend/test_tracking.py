@@ -100,6 +100,25 @@ def test_failed_images_are_lost_and_the_camera_is_found_again(spoil) -> None:
     assert ate_rmse_m(truth[seen], positions(tracker, frames)[seen]) < 1e-3
 
 
+def test_a_moving_object_behind_a_mask_leaves_the_poses_alone() -> None:
+    """A box that follows the camera fills two fifths of the view: seen, it drags the pose along; masked, not."""
+    usable = np.ones((CAMERA.height, CAMERA.width), bool)
+    usable[:, 40:100] = False
+    gray, depth = render(walk(0))
+    errors = {}
+    for masked in (False, True):
+        tracker, frames = Tracker(CAMERA, CONFIG), []
+        for k in range(10):
+            image, depth_m = render(walk(k))
+            image, depth_m = np.where(usable, image, gray), np.where(usable, depth_m, np.minimum(depth, 0.8))
+            frames.append(tracker.track(k, 100 * k, image, depth_m, mask=usable if masked else None))
+        truth = np.array([walk(k)[:3, 3] for k in range(10)])
+        errors[masked] = ate_rmse_m(truth, positions(tracker, frames))
+        assert not masked or all(f.status is Status.OK for f in frames)
+    assert errors[True] < 2e-3
+    assert errors[False] > 10 * errors[True]
+
+
 def test_too_large_a_motion_is_not_called_tracked() -> None:
     tracker = Tracker(CAMERA, CONFIG)
     tracker.track(0, 0, *render(walk(0)))

@@ -144,6 +144,27 @@ def test_holes_in_the_depth_bring_no_depth_information() -> None:
     assert np.median(along_z[with_depth.observations > 0]) > 100.0
 
 
+def test_masked_pixels_bring_nothing() -> None:
+    """What they show does not matter, neither for the noise nor for the sums, and they only ever take away."""
+    gaussians, whole = wall(), views_of(wall(), 0.05, 2.0)
+    mask = np.ones((CAMERA.height, CAMERA.width), bool)
+    mask[:, 10:30] = False
+    masked, spoiled = [], []
+    for view in whole:
+        color, depth = view.color.copy(), view.depth_m.copy()
+        color[~mask], depth[~mask] = 255, 9.0
+        masked.append(View(view.color, view.depth_m, view.T_map_camera, mask))
+        spoiled.append(View(color, depth, view.T_map_camera, mask))
+    config = InformationConfig()
+    noise = estimate_noise(gaussians, CAMERA, masked, config)
+    assert noise == estimate_noise(gaussians, CAMERA, spoiled, config)
+    sums = [sum_information(gaussians, CAMERA, views, noise, config) for views in (masked, spoiled, whole)]
+    for name, array in sums[0].arrays().items():
+        np.testing.assert_array_equal(array, sums[1].arrays()[name])
+    assert np.all(sums[0].color <= sums[2].color * (1 + 1e-6))
+    assert sums[0].color.sum() < 0.9 * sums[2].color.sum()
+
+
 def test_thickness_at_the_floor_has_no_information_and_the_rest_is_untouched() -> None:
     r = np.random.default_rng(0)
     n = 50

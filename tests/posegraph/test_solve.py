@@ -70,7 +70,7 @@ def test_two_runs_send_the_same_packets(helix_file):
     for _ in range(2):
         packets = []
         team = read_team(helix_file, 3)
-        agents, traffic, rounds = record(team, settings("admm", loss=0.3, seed=4), packets)
+        _, traffic, rounds = record(team, settings("admm", loss=0.3, seed=4), packets)
         runs.append((packets, traffic.bytes, rounds))
     assert runs[0] == runs[1]
 
@@ -79,9 +79,9 @@ def record(team, config, packets):
     """`meet`, keeping every packet that was sent."""
     carried = network.LinkModel.fate
 
-    def fate(self, sender, receiver, sequence, send_ns):
-        packets.append((sender, receiver, sequence))
-        return carried(self, sender, receiver, sequence, send_ns)
+    def fate(self, sender, receiver, sequence, send_ns, size):
+        packets.append((sender, receiver, sequence, size))
+        return carried(self, sender, receiver, sequence, send_ns, size)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(network.LinkModel, "fate", fate)

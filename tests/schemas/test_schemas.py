@@ -20,7 +20,7 @@ ELEMENT_TYPES = (
     "_float32",
     "_float64",
 )
-OPAQUE_BYTES = ("payload", "header")
+OPAQUE_BYTES = ("payload", "header", "signature")
 
 
 def own_messages() -> list[Any]:

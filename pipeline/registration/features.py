@@ -1,0 +1,147 @@
+"""Features of a view with known depth, their matches between two views, and the motion that matches agree on.
+
+Descriptors are RootSIFT (Arandjelovic and Zisserman 2012), the square root of the L1-normalised SIFT, quantised to
+one byte. Products of bytes summed over 128 dimensions stay below 2^24, so float32 matrix products of them are exact
+and do not depend on the order of the sum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry import se3, so3
+from pipeline.geometry.camera import PinholeCamera
+
+Array = NDArray[np.float64]
+Descriptors = NDArray[np.uint8]
+DIMENSIONS = 128
+REFINEMENT_ROUNDS = 3  # of fitting to the inliers and finding them again
+SCALE = 512.0  # RootSIFT entries are at most 1 and mostly below 0.5; larger ones saturate at one byte
+
+
+@dataclass(frozen=True)
+class Features:
+    """Keypoints of one keyframe with known depth, strongest response first.
+
+    descriptors: uint8 [n, 128]. points: float32 [n, 3], metres, camera frame.
+    """
+
+    descriptors: Descriptors
+    points: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def extract(
+    color: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera, most: int
+) -> Features:
+    """The strongest SIFT features of a frame that have a depth.
+
+    Args:
+        color: uint8 RGB [h, w, 3]. depth_m: float32 [h, w], 0 = unknown. most: number of features kept.
+    """
+    import cv2
+
+    gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
+    keypoints, sift = cv2.SIFT.create(nfeatures=2 * most).detectAndCompute(gray, None)
+    if not keypoints:
+        return Features(np.zeros((0, DIMENSIONS), np.uint8), np.zeros((0, 3), np.float32))
+    u, v = np.array([k.pt for k in keypoints], dtype=np.float64).T
+    response = np.array([k.response for k in keypoints])
+    column = np.clip(np.rint(u).astype(np.int64), 0, camera.width - 1)
+    row = np.clip(np.rint(v).astype(np.int64), 0, camera.height - 1)
+    z = depth_m[row, column].astype(np.float64)
+    angle = np.array([k.angle for k in keypoints])
+    order = np.lexsort((angle, u, v, -response))
+    order = order[z[order] > 0][:most]
+    z = z[order]
+    points = np.stack(
+        [(u[order] - camera.cx) / camera.fx * z, (v[order] - camera.cy) / camera.fy * z, z], axis=-1
+    )
+    return Features(root_sift(sift[order]), points.astype(np.float32))
+
+
+def root_sift(sift: NDArray[np.float32]) -> Descriptors:
+    """RootSIFT of SIFT descriptors [n, 128], one byte per entry."""
+    values = np.asarray(sift, dtype=np.float64)
+    total = np.maximum(values.sum(axis=-1, keepdims=True), 1e-12)
+    return np.minimum(np.rint(SCALE * np.sqrt(values / total)), 255).astype(np.uint8)
+
+
+def matches(ours: Descriptors, theirs: Descriptors, ratio: float) -> NDArray[np.int64]:
+    """Mutual nearest neighbours that pass the ratio test among ours.
+
+    Args:
+        ours: uint8 [n, 128], at least two. theirs: uint8 [m, 128].
+        ratio: nearest distance over second-nearest, below which a match counts.
+    Returns:
+        Pairs (index in ours, index in theirs), int64 [k, 2], by index in theirs.
+    """
+    if len(ours) < 2 or not len(theirs):
+        return np.zeros((0, 2), dtype=np.int64)
+    return _matches(_squared_distances(ours, theirs), ratio)
+
+
+def _squared_distances(ours: Descriptors, theirs: Descriptors) -> NDArray[np.float32]:
+    """[n, m], exact integers."""
+    a, b = ours.astype(np.float32), theirs.astype(np.float32)
+    return (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * (a @ b.T)
+
+
+def _matches(squared: NDArray[np.float32], ratio: float) -> NDArray[np.int64]:
+    columns = np.arange(squared.shape[1])
+    best = squared.argmin(axis=0)
+    second = np.partition(squared, 1, axis=0)[1]
+    mutual = squared.argmin(axis=1)[best] == columns
+    good = mutual & (squared[best, columns] < np.float32(ratio) ** 2 * second)
+    return np.stack([best[good], columns[good]], axis=1)
+
+
+def fit(points_a: Array, points_b: Array) -> Array:
+    """T_a_b [..., 4, 4] that minimises sum |a - T_a_b b|^2 over paired points [..., n, 3] (Kabsch, batched)."""
+    mean_a, mean_b = points_a.mean(axis=-2, keepdims=True), points_b.mean(axis=-2, keepdims=True)
+    R = so3.project(np.swapaxes(points_a - mean_a, -1, -2) @ (points_b - mean_b))
+    return se3.from_rotation_translation(R, mean_a[..., 0, :] - (R @ mean_b[..., 0, :, None])[..., 0])
+
+
+def ransac(
+    points_a: Array, points_b: Array, inlier_m: float, hypotheses: int, rng: np.random.Generator
+) -> tuple[Array, NDArray[np.bool_]]:
+    """The motion that most matched points agree on.
+
+    Args:
+        points_a, points_b: paired points [n, 3], n >= 3, camera frames, metres.
+        inlier_m: largest distance at one metre of depth; it grows with depth as the noise of a depth camera does.
+        hypotheses: three-point samples drawn.
+    Returns:
+        T_a_b [4, 4], fitted to its inliers, and the inliers [n].
+    """
+    n = len(points_a)
+    # three different indices per row, without rejection: the second and third skip those before them
+    i = rng.integers(0, n, hypotheses)
+    j = rng.integers(0, n - 1, hypotheses)
+    k = rng.integers(0, n - 2, hypotheses)
+    j += j >= i
+    low, high = np.minimum(i, j), np.maximum(i, j)
+    k += k >= low
+    k += k >= high
+    triples = np.stack([i, j, k], axis=1)
+    limit_m = inlier_m * np.maximum(1.0, np.maximum(points_a[:, 2], points_b[:, 2]))
+
+    def agreeing(T: Array) -> NDArray[np.bool_]:
+        return np.linalg.norm(points_a - se3.transform(T, points_b), axis=-1) < limit_m
+
+    T = fit(points_a[triples], points_b[triples])
+    counts = agreeing(T).sum(axis=1)
+    best = T[int(np.argmax(counts))]
+    inliers = agreeing(best)
+    for _ in range(REFINEMENT_ROUNDS):
+        if inliers.sum() < 3:
+            break
+        best = fit(points_a[inliers], points_b[inliers])
+        inliers = agreeing(best)
+    return best, inliers
