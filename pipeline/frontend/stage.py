@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pipeline import progress as progress_bar
 from pipeline.errors import DuagError
 from pipeline.frontend.config import FrontendConfig, is_held_out
-from pipeline.frontend.keyframes import KeyframePair, Refined, refine, relative_information
+from pipeline.frontend.keyframes import KeyframePair, Refined, refine
 from pipeline.frontend.tracking import Status, TrackedFrame, TrackedKeyframe, Tracker
 from pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
 from pipeline.recording import LogWriter, RgbdLog, open_rgbd
@@ -95,7 +95,7 @@ def _keyframe_messages(robot: str, keyframes: Sequence[TrackedKeyframe], refined
         T_previous_keyframe, information = np.eye(4), np.zeros((6, 6))
         if previous >= 0:
             T_previous_keyframe = np.linalg.solve(T_map_keyframes[previous], T)
-            information = relative_information(T_map_keyframes, refined.covariance, previous, index)
+            information = refined.relative_information(previous, index)
         gain, offset = keyframe.exposure
         messages.append(
             Keyframe(
