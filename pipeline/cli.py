@@ -277,6 +277,44 @@ def view(
 
 
 @app.command()
+def inspect(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", show_default=False)],
+    round_: Annotated[
+        int | None, typer.Option("--round", metavar="K", help="Where every robot stood.", show_default=False)
+    ] = None,
+    packet: Annotated[
+        int | None,
+        typer.Option("--packet", metavar="N", help="By its place in exchange.mcap.", show_default=False),
+    ] = None,
+    gaussian: Annotated[
+        str | None,
+        typer.Option("--gaussian", metavar="ROBOT:ID", help="Of a robot's own map.", show_default=False),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """What happened to one round, one packet or one Gaussian of a run, in words and numbers.
+
+    Example: duagc inspect outputs/demo/run --gaussian alpha:1200
+    """
+    from pipeline.inspection import Inspector, format_facts
+    from pipeline.run_folder import RunFolder
+
+    if [round_, packet, gaussian].count(None) != 2:
+        raise typer.BadParameter("expected exactly one of --round, --packet, --gaussian")
+    inspector = Inspector(RunFolder(run_folder))
+    if round_ is not None:
+        facts = inspector.round(round_)
+    elif packet is not None:
+        facts = inspector.packet(packet)
+    else:
+        robot, colon, number = str(gaussian).partition(":")
+        if not colon or not number.isdecimal():
+            raise typer.BadParameter(f"{gaussian!r} is not like alpha:1200", param_hint="--gaussian")
+        facts = inspector.gaussian(robot, int(number))
+    print(json.dumps(facts, indent=2) if as_json else format_facts(facts))
+
+
+@app.command()
 def convert(
     dataset: Annotated[str | None, typer.Argument(help="Name of the dataset; see --list.")] = None,
     source: Annotated[Path | None, typer.Argument(metavar="SRC", help="Where its files are.")] = None,
@@ -378,8 +416,8 @@ def bench_consensus(
     contrast: Annotated[str, typer.Option(help="Largest over smallest information.")] = "47,1e4",
     unknown: Annotated[str, typer.Option(help="Shares of tracks that a robot knows nothing of.")] = "0,0.2",
     mode: Annotated[
-        str, typer.Option(help="evidence, evidence_float32, admm, paper.")
-    ] = "evidence,evidence_float32,admm,paper",
+        str, typer.Option(help="evidence (compact), evidence_float32, evidence_float64, admm, paper.")
+    ] = "evidence,evidence_float64,admm,paper",
     tracks: Annotated[int, typer.Option(min=1, help="Matched Gaussians.")] = 200,
     max_rounds: Annotated[int, typer.Option(min=1, help="A session ends here.")] = 3000,
     seed: Annotated[int, typer.Option(help="Seed of evidence and links.")] = 0,

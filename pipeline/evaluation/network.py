@@ -36,6 +36,7 @@ PURPOSE = {  # of a message, by its kind
     "ANCHORS": "set-up",
     "EVIDENCE": "Gaussians",
     "EVIDENCE_EXACT": "Gaussians",
+    "EVIDENCE_DOUBLE": "Gaussians",
     "STATE": "poses",
     "ACK": "acknowledgements",
 }
@@ -120,7 +121,7 @@ class Session:
                     f"{self.run.path / 'exchange.mcap'}: packet {p.sequence} of {p.robot} is cut from {found}, "
                     f"expected one of {', '.join(PURPOSE)}"
                 )
-            rows.append((p.round, p.robot, p.receiver, PURPOSE[kind], len(p.header) + p.length, p.delivered))
+            rows.append((p.round, p.robot, p.receiver, PURPOSE[kind], _size(p), p.delivered))
         columns = list(zip(*rows, strict=True)) or [()] * 6
         return Packets(
             np.array(columns[0], dtype=np.int64),
@@ -266,6 +267,11 @@ class Session:
             "primal": {robot: _columns(rows, 2) for robot, rows in sorted(change.items())},
             "bytes": spent,
         }
+
+
+def _size(packet: Any) -> int:
+    """Bytes of a duagc.v1.PeerPacket on the air."""
+    return len(packet.header) + int(packet.length) + len(packet.signature)
 
 
 def _columns(

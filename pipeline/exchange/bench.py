@@ -1,10 +1,10 @@
 """How much it costs a team to agree on matched Gaussians: rounds, bytes and time of every mode, against one optimum.
 
 Made teams: every robot has evidence on every track, with information spread over a contrast and a share of it
-missing. `evidence` travels as in an exchange, over the real transport with acknowledgements, compact or in float32;
-`admm` and `paper` send float64 values in every round. Loss is drawn by the link model. The optimum is computed with
-everybody's evidence at hand, which no robot has; for `paper`, whose weights are per coordinate, it is that of those
-weights.
+missing. `evidence` travels as in an exchange, over the real transport with acknowledgements, compact, in float32 or in
+float64; `admm` and `paper` send float64 values in every round. Loss is drawn by the link model. The optimum is
+computed with everybody's evidence at hand, which no robot has; for `paper`, whose weights are per coordinate, it is
+that of those weights.
 """
 
 from __future__ import annotations
@@ -37,7 +37,12 @@ from pipeline.exchange.transport import Message, Transport
 
 Array = NDArray[np.float64]
 PERIOD_NS = 100_000_000
-MODES = ("evidence", "evidence_float32", "admm", "paper")
+EVIDENCE_MODES = {
+    "evidence": Kind.EVIDENCE,
+    "evidence_float32": Kind.EVIDENCE_EXACT,
+    "evidence_float64": Kind.EVIDENCE_DOUBLE,
+}
+MODES = (*EVIDENCE_MODES, "admm", "paper")
 PAPER_BYTES_PER_PAIR = 28 * 4  # what the paper counts per matched pair and round
 _PACKET_HEAD_BYTES = 12  # sequence, first row, counts
 _NEAR_SIGMA, _AT_SIGMA = 0.05, 1e-6
@@ -197,11 +202,12 @@ def _rounds(team: _Team, model: LinkModel, case: dict[str, Any], plan: Plan) -> 
 
 def _evidence(team: _Team, model: LinkModel, case: dict[str, Any], plan: Plan) -> _Cost:
     """Every robot's evidence goes once along the shortest ways to everybody; each sums up what it has."""
-    kind = Kind.EVIDENCE if case["mode"] == "evidence" else Kind.EVIDENCE_EXACT
+    kind = EVIDENCE_MODES[case["mode"]]
     index = {name: k for k, name in enumerate(team.names)}
     children = {owner: _tree(owner, team.linked) for owner in team.names}
     payloads = {
-        n: wire.write_evidence(kind, index[n], 1, wire.to_body(kind, _records(team, n))) for n in team.names
+        n: wire.write_evidence(kind, index[n], 1, wire.to_body(kind, _records(team, n, kind)))
+        for n in team.names
     }
     ids = {name: itertools.count(1) for name in team.names}
     ends = {
@@ -274,10 +280,10 @@ def _tree(owner: str, linked: dict[str, tuple[str, ...]]) -> dict[str, list[str]
     return children
 
 
-def _records(team: _Team, name: str) -> NDArray[Any]:
+def _records(team: _Team, name: str, kind: Kind) -> NDArray[Any]:
     """A robot's evidence as records of the wire."""
     W, theta = team.weights[name], team.theta[name]
-    out = np.zeros(len(theta), wire.RECORD)
+    out = np.zeros(len(theta), wire.record_dtype(kind))
     out["id"] = np.arange(len(theta))
     out["theta"] = theta
     out["information"] = pack_information(W.position, W.shape, W.color, W.opacity)
