@@ -140,6 +140,11 @@ class _Residuals:
         Jw = J * self.weight[:, None]
         return Jw.T @ J, Jw.T @ self.residual.astype(np.float64)
 
+    def nothing(self) -> _Residuals:
+        """The same kind and scale without any residual."""
+        u, v = self.pixels
+        return _Residuals(self.jacobian[:0], self.residual[:0], self.weight[:0], self.scale, (u[:0], v[:0]))
+
     def rms(self) -> float:
         """Root of the weighted mean square of the residuals, Huber's weight only, in units of the noise given."""
         if not len(self.residual):
@@ -178,7 +183,8 @@ def register(
 
     Args:
         reference: samples per level; at least as many levels as `pyramid`.
-        pyramid: the target view.
+        pyramid: the target view. `without_depth`, grey values alone are used, and every sample inside the image
+            counts as seen: overlap is then the view.
         T_reference_target_guess: where to start, [4, 4].
         config: limits and noise.
         prior_information: [6, 6] in the right tangent of the guess; pulls towards it, is not part of the
@@ -249,7 +255,8 @@ def _linearise(
 
     gray, gu, gv, inverse_depth = _interpolate(level, u, v)
     with np.errstate(invalid="ignore"):
-        z = 1 / inverse_depth
+        # without a depth image every sample may be what is seen there
+        z = 1 / inverse_depth if level.has_depth else q[2]
         gate = np.maximum(np.float32(config.depth_gate_m), np.float32(config.depth_gate_relative) * q[2])
         off = z - q[2]
         agree = np.abs(off) < gate
@@ -270,6 +277,8 @@ def _linearise(
     sigma = _depth_sigma(z, config)
     floor = config.depth_sigma_floor * 4.0**index
     depth = _depth_residuals(surface, q, m, sigma, floor, (u, v), config)
+    if not level.has_depth:
+        depth = depth.nothing()
     floor = max(config.gray_sigma_floor, config.gray_sigma_of_depth * depth.scale)
     images = gray, gu, gv
     photometric = _gray_residuals(camera, images, intensities, q, exposure, floor, (u, v), config)
@@ -437,8 +446,8 @@ def _overstatement(system: _Linearisation, H: Array) -> float:
     (Birge ratio).
     """
     columns, rows = TILES
-    parts = (system.depth, system.gray)
-    if any(len(part.residual) == 0 for part in parts):
+    parts = [part for part in (system.depth, system.gray) if len(part.residual)]
+    if not parts:
         return 1.0
     u_max = max(float(part.pixels[0].max()) for part in parts) + 1
     v_max = max(float(part.pixels[1].max()) for part in parts) + 1
@@ -449,7 +458,7 @@ def _overstatement(system: _Linearisation, H: Array) -> float:
         scaled = part.jacobian * (part.weight * part.residual)[:, None]
         sums = np.stack([np.bincount(tile, scaled[:, k], rows * columns) for k in range(8)])
         outer = outer + sums @ sums.T
-    for part in parts:
+    for part in parts if len(parts) == 2 else []:
         H_part, gradient = part.normal_equations()
         answer = np.linalg.solve(_regular(H_part[:6, :6] + 1e-3 * H[:6, :6]), gradient[:6])
         tension += float(gradient[:6] @ answer)
