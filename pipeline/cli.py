@@ -105,7 +105,13 @@ def simulate(
     out: Out,
     robots: Annotated[int, typer.Option(min=1, max=8, help="Number of robots.")] = 2,
     frames: Annotated[int, typer.Option(min=2, help="Frames per robot.")] = 160,
-    scene: Annotated[str, typer.Option(help="Name of a procedural scene.")] = "room",
+    scene: Annotated[
+        str, typer.Option(help="room, or a folder of textured meshes (GLB, glTF, OBJ, PLY).")
+    ] = "room",
+    up: Annotated[
+        str,
+        typer.Option(help="Axis that is up in the meshes: y, z, or auto (y for GLB, glTF, OBJ; z for PLY)."),
+    ] = "auto",
     width: Annotated[int, typer.Option(min=32, help="Pixels.")] = 480,
     height: Annotated[int, typer.Option(min=32, help="Pixels.")] = 360,
     overlap: Annotated[
@@ -116,9 +122,11 @@ def simulate(
     workers: Workers = 2,
     force: Force = False,
 ) -> None:
-    """Render a recording of a robot team in a procedural room, with exact ground truth.
+    """Render a recording of a robot team, in a procedural room or among textured meshes, with exact ground truth.
 
-    Example: `duagc simulate --robots 3 --noise kinect --out recordings/room`
+    Examples:
+    `duagc simulate --robots 3 --noise kinect --out recordings/room`,
+    `duagc simulate --scene scans/house --width 640 --height 480 --frames 300 --out recordings/house`
     """
     from converters.simulate import simulate as simulate_recording
 
@@ -127,6 +135,7 @@ def simulate(
         robots=robots,
         frames=frames,
         scene=scene,
+        up=up,
         size=(width, height),
         overlap=overlap,
         noise=noise,
@@ -277,6 +286,44 @@ def view(
 
 
 @app.command()
+def inspect(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", show_default=False)],
+    round_: Annotated[
+        int | None, typer.Option("--round", metavar="K", help="Where every robot stood.", show_default=False)
+    ] = None,
+    packet: Annotated[
+        int | None,
+        typer.Option("--packet", metavar="N", help="By its place in exchange.mcap.", show_default=False),
+    ] = None,
+    gaussian: Annotated[
+        str | None,
+        typer.Option("--gaussian", metavar="ROBOT:ID", help="Of a robot's own map.", show_default=False),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """What happened to one round, one packet or one Gaussian of a run, in words and numbers.
+
+    Example: duagc inspect outputs/demo/run --gaussian alpha:1200
+    """
+    from pipeline.inspection import Inspector, format_facts
+    from pipeline.run_folder import RunFolder
+
+    if [round_, packet, gaussian].count(None) != 2:
+        raise typer.BadParameter("expected exactly one of --round, --packet, --gaussian")
+    inspector = Inspector(RunFolder(run_folder))
+    if round_ is not None:
+        facts = inspector.round(round_)
+    elif packet is not None:
+        facts = inspector.packet(packet)
+    else:
+        robot, colon, number = str(gaussian).partition(":")
+        if not colon or not number.isdecimal():
+            raise typer.BadParameter(f"{gaussian!r} is not like alpha:1200", param_hint="--gaussian")
+        facts = inspector.gaussian(robot, int(number))
+    print(json.dumps(facts, indent=2) if as_json else format_facts(facts))
+
+
+@app.command()
 def convert(
     dataset: Annotated[str | None, typer.Argument(help="Name of the dataset; see --list.")] = None,
     source: Annotated[Path | None, typer.Argument(metavar="SRC", help="Where its files are.")] = None,
@@ -368,6 +415,65 @@ def bench_raster(
     )
     result = bench.run(plan)
     print(json.dumps(result, indent=2) if as_json else bench.format_tables(result))
+
+
+@bench_app.command("consensus")
+def bench_consensus(
+    robots: Annotated[str, typer.Option(help="Numbers of robots.")] = "2,4,8",
+    topology: Annotated[str, typer.Option(help="full, ring, chain, star.")] = "full,ring,chain",
+    loss: Annotated[str, typer.Option(help="Chances that a packet is lost.")] = "0,0.3,0.6,0.9",
+    contrast: Annotated[str, typer.Option(help="Largest over smallest information.")] = "47,1e4",
+    unknown: Annotated[str, typer.Option(help="Shares of tracks that a robot knows nothing of.")] = "0,0.2",
+    mode: Annotated[
+        str, typer.Option(help="evidence (compact), evidence_float32, evidence_float64, admm, paper.")
+    ] = "evidence,evidence_float64,admm,paper",
+    tracks: Annotated[int, typer.Option(min=1, help="Matched Gaussians.")] = 200,
+    max_rounds: Annotated[int, typer.Option(min=1, help="A session ends here.")] = 3000,
+    seed: Annotated[int, typer.Option(help="Seed of evidence and links.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """What it costs a team to agree on matched Gaussians, mode by mode, against the central optimum.
+
+    Lists are separated by commas; every combination is a row. The defaults take some minutes.
+
+    Example: duagc bench consensus --robots 4 --topology chain --loss 0,0.9 --contrast 47
+    """
+    from pipeline.exchange import bench
+
+    for option, words, known in (
+        ("--topology", topology.split(","), ("full", "ring", "chain", "star")),
+        ("--mode", mode.split(","), bench.MODES),
+    ):
+        for word in words:
+            if word not in known:
+                raise typer.BadParameter(f"{word!r} is not one of {', '.join(known)}", param_hint=option)
+    plan = bench.Plan(
+        robots=tuple(_counts("--robots", robots)),
+        topologies=tuple(topology.split(",")),
+        losses=tuple(_numbers("--loss", loss, 0.0, 0.99)),
+        contrasts=tuple(_numbers("--contrast", contrast, 1.0, 1e8)),
+        unknown=tuple(_numbers("--unknown", unknown, 0.0, 0.99)),
+        modes=tuple(mode.split(",")),
+        tracks=tracks,
+        max_rounds=max_rounds,
+        seed=seed,
+    )
+    result = bench.run(plan)
+    print(json.dumps(result, indent=2) if as_json else bench.format_table(result))
+
+
+def _numbers(option: str, text: str, low: float, high: float) -> list[float]:
+    """Numbers within limits out of text like 0,0.3."""
+    numbers = []
+    for word in text.split(","):
+        try:
+            number = float(word)
+        except ValueError:
+            number = float("nan")
+        if not low <= number <= high:
+            raise typer.BadParameter(f"{word!r} is not a number from {low:g} to {high:g}", param_hint=option)
+        numbers.append(number)
+    return numbers
 
 
 def _counts(option: str, text: str) -> list[int]:

@@ -18,7 +18,7 @@ import schemas
 from pipeline.errors import DuagError
 from pipeline.geometry import se3, so3
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.gaussians import DEPTH_KINDS, DepthKind, Gaussians
 
 Array = NDArray[np.float64]
 NANOSECONDS = 1_000_000_000
@@ -423,7 +423,10 @@ class GaussianInformation:
 
 @dataclass(frozen=True, eq=False)
 class GaussianMap:
-    """A complete map in the frame `frame_id`, with the information of its Gaussians where it is known."""
+    """A complete map in the frame `frame_id`, with the information of its Gaussians where it is known.
+
+    depth: which depth of a Gaussian at a pixel the map was made with (DepthKind).
+    """
 
     schema: ClassVar[str] = "duagc.v1.GaussianMap"
 
@@ -432,6 +435,7 @@ class GaussianMap:
     frame_id: str
     gaussians: Gaussians
     information: GaussianInformation | None = None
+    depth: DepthKind = "blended"
 
     def pack(self) -> Any:
         """duagc.v1.GaussianMap."""
@@ -441,6 +445,7 @@ class GaussianMap:
             robot=self.robot,
             gaussians=pack_gaussians(self.gaussians),
             information=None if self.information is None else self.information.pack(),
+            depth=self.depth,
         )
         pack_stamp(message, self.stamp_ns)
         return message
@@ -454,7 +459,16 @@ class GaussianMap:
             frame_id=m.frame_id,
             gaussians=unpack_gaussians(m.gaussians),
             information=GaussianInformation.unpack(m.information) if m.HasField("information") else None,
+            depth=_depth_kind(m.depth),
         )
+
+
+def _depth_kind(name: str) -> DepthKind:
+    """The kind of depth of a map; maps written before it was recorded are blended."""
+    for kind in DEPTH_KINDS:
+        if kind == (name or "blended"):
+            return kind
+    raise DuagError(f"GaussianMap.depth is {name!r}, expected one of {', '.join(DEPTH_KINDS)}")
 
 
 @dataclass(frozen=True, eq=False)

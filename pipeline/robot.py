@@ -14,7 +14,7 @@ from pipeline.consensus.factors import Factors
 from pipeline.errors import DuagError
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.messages import GaussianInformation, GaussianMap, Keyframe, KeyframeFactor
-from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.gaussians import DepthKind, Gaussians
 from schemas import topics
 
 Array = NDArray[np.float64]
@@ -48,7 +48,7 @@ class RobotData:
     T_map_keyframe: [n, 4, 4] by keyframe index. odometry: from the keyframe that each was tracked against, refined,
     with its marginal information. registrations: the measurements behind it, independent of each other. images: gives
     colour uint8 RGB [h, w, 3] and depth float32 [h, w] (m, 0 = unknown) of a keyframe. information: of the Gaussians,
-    in the map frame, by the same ids.
+    in the map frame, by the same ids. depth: of a Gaussian at a pixel, as the map was made.
     """
 
     robot: str
@@ -59,6 +59,7 @@ class RobotData:
     images: Callable[[int], Images]
     gaussians: Gaussians
     information: GaussianInformation
+    depth: DepthKind = "blended"
 
     @property
     def keyframes(self) -> int:
@@ -211,4 +212,5 @@ def load(source: AgentInput) -> RobotData:
         images,
         gaussian_map.gaussians,
         information,
+        gaussian_map.depth,
     )

@@ -73,6 +73,12 @@ class RobotRun:
         return self._last("frontend.mcap", topics.MAP)
 
     @cached_property
+    def unrefined_map(self) -> GaussianMap | None:
+        """The own map before its final refinement; None if the front end wrote none."""
+        maps = self._all("frontend.mcap", topics.UNREFINED_MAP)
+        return maps[-1] if maps else None
+
+    @cached_property
     def information(self) -> GaussianInformation:
         """Fisher information of the own map."""
         return self._last("information.mcap", topics.INFORMATION)

@@ -84,6 +84,13 @@ MAP_UPDATE = Topic(
     "/<robot>/map_update", "duagc.v1.MapUpdate", "frontend", Scope.ROBOT, "what one keyframe did to the map"
 )
 MAP = Topic("/<robot>/map", "duagc.v1.GaussianMap", "frontend", Scope.ROBOT, "the robot's own map")
+UNREFINED_MAP = Topic(
+    "/<robot>/map/unrefined",
+    "duagc.v1.GaussianMap",
+    "frontend",
+    Scope.ROBOT,
+    "the robot's own map before its final refinement, for comparison",
+)
 INFORMATION = Topic(
     "/<robot>/information",
     "duagc.v1.GaussianInformation",
@@ -150,6 +157,7 @@ TOPICS: tuple[Topic, ...] = (
     KEYFRAME_FACTOR,
     MAP_UPDATE,
     MAP,
+    UNREFINED_MAP,
     INFORMATION,
     FUSED_MAP,
     CORRECTED_KEYFRAMES,

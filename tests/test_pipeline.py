@@ -11,7 +11,10 @@ from pipeline.config import load
 from pipeline.digest import digest, digest_file, result_files
 from pipeline.errors import DuagError
 from pipeline.evaluation import evaluate
+from pipeline.evaluation.network import Session
+from pipeline.inspection import Inspector, format_facts
 from pipeline.replay import replay
+from pipeline.run_folder import RunFolder
 from pipeline.runner import RunConfig, run
 
 SMALL = (
@@ -60,6 +63,7 @@ def test_the_team_meets_and_everything_is_written(finished: Path) -> None:
     assert metrics["team"]["ate_rmse_m"] < 0.01
     assert metrics["consensus"]["gap_to_oracle_m"] < 1e-4  # ten times the tolerance at which the robots stop
     assert metrics["consensus"]["gap_to_oracle_rad"] < 1e-4
+    assert 0 < metrics["consensus"]["gap_to_oracle_sigma_p99"] <= metrics["consensus"]["gap_to_oracle_sigma"]
     for name in (
         "report/index.html",
         "run.rrd",
@@ -154,3 +158,35 @@ def test_nothing_delivered_is_nothing_said(folder: Path, recording: Path, finish
         assert changed[f"robots/{robot}/odometry.tum"] == own[f"robots/{robot}/odometry.tum"]
         assert changed[f"robots/{robot}/fused.ply"] != own[f"robots/{robot}/fused.ply"]
     assert changed["robots/bravo/trajectory.tum"] != own["robots/bravo/trajectory.tum"]
+
+
+def test_what_happened_can_be_asked_for(finished: Path) -> None:
+    """A Gaussian's evidence is where its packets say, and the round says what was on the air."""
+    inspector = Inspector(RunFolder(finished))
+    robots = inspector.run.robots
+    pairs = next(iter(Session(inspector.run).pairs.values()))
+    gaussian = int(pairs[0, 0])
+    facts = inspector.gaussian("alpha", gaussian)
+    assert facts["matches"] == {"bravo": int(pairs[0, 1])}
+    assert facts["fused_map"]["robots_in_it"] == 2
+    assert facts["own_map"]["mean_m"] == pytest.approx(
+        robots["alpha"].own_map.gaussians.means[robots["alpha"].own_map.gaussians.ids == gaussian][0].tolist()
+    )
+    journey = facts["evidence_sent"][0]
+    packet = inspector.packet(journey["packet"])
+    assert (packet["sender"], packet["receiver"], packet["round"]) == ("alpha", "bravo", journey["round"])
+    assert gaussian in packet["content"]["gaussians"]
+    air = inspector.round(journey["round"])["links"]["alpha to bravo"]
+    assert air["kinds"]["EVIDENCE"] > 0
+    assert air["packets"] == sum(air["kinds"].values())
+    last = inspector.round(inspector.round(0)["rounds"] - 1)
+    assert all(robot["agreed"] for robot in last["robots"].values())
+    assert "robots in it" in format_facts(facts)
+    for ask, complaint in (
+        (lambda: inspector.gaussian("zulu", 1), "no robot 'zulu', expected one of alpha, bravo"),
+        (lambda: inspector.gaussian("alpha", 1 << 40), "no Gaussian 1099511627776 in the map of alpha"),
+        (lambda: inspector.packet(1 << 40), "found --packet"),
+        (lambda: inspector.round(1 << 40), "found --round"),
+    ):
+        with pytest.raises(DuagError, match=complaint):
+            ask()

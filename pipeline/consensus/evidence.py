@@ -60,6 +60,19 @@ def pack_symmetric(matrix: Array) -> Array:
     return matrix[..., rows, columns]
 
 
+def theta_of(gaussians: Gaussians) -> Array:
+    """theta [n, 13] of Gaussians, in their frame."""
+    return np.concatenate(
+        [
+            gaussians.means.astype(np.float64),
+            spd.log_covariance(gaussians.quats_wxyz, gaussians.log_scales),
+            gaussians.colors.astype(np.float64),
+            gaussians.opacity_logits.astype(np.float64)[:, None],
+        ],
+        axis=1,
+    )
+
+
 @dataclass(frozen=True)
 class Evidence:
     """A robot's own evidence on n of its Gaussians. It never contains what came from a neighbour.
@@ -101,16 +114,7 @@ class Evidence:
                 if None.
             T_map_keyframe: [k, 4, 4], by anchor.
         """
-        n = len(gaussians)
-        theta = np.concatenate(
-            [
-                gaussians.means.astype(np.float64),
-                spd.log_covariance(gaussians.quats_wxyz, gaussians.log_scales),
-                gaussians.colors.astype(np.float64),
-                gaussians.opacity_logits.astype(np.float64)[:, None],
-            ],
-            axis=1,
-        )
+        n, theta = len(gaussians), theta_of(gaussians)
         packed = np.zeros((n, 31))
         if information is not None and len(information.ids):
             order = np.argsort(information.ids, kind="stable")

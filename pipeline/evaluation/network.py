@@ -36,13 +36,13 @@ PURPOSE = {  # of a message, by its kind
     "ANCHORS": "set-up",
     "EVIDENCE": "Gaussians",
     "EVIDENCE_EXACT": "Gaussians",
+    "EVIDENCE_DOUBLE": "Gaussians",
     "STATE": "poses",
     "ACK": "acknowledgements",
 }
 PURPOSES = ("Gaussians", "poses", "set-up", "acknowledgements")
 PAPER_BYTES_PER_PAIR = 2 * 28 * 4  # 28 float32 from each of the two robots
 NO_EXCHANGE = Absent("the robots exchanged nothing")
-NO_ORACLE = Absent("the centralised answer about Gaussians is not computed; that about poses is")
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class Session:
                     f"{self.run.path / 'exchange.mcap'}: packet {p.sequence} of {p.robot} is cut from {found}, "
                     f"expected one of {', '.join(PURPOSE)}"
                 )
-            rows.append((p.round, p.robot, p.receiver, PURPOSE[kind], len(p.header) + p.length, p.delivered))
+            rows.append((p.round, p.robot, p.receiver, PURPOSE[kind], _size(p), p.delivered))
         columns = list(zip(*rows, strict=True)) or [()] * 6
         return Packets(
             np.array(columns[0], dtype=np.int64),
@@ -167,18 +167,24 @@ class Session:
         tried = sum(counts(closure) or measured(closure) for closure in self.closures)
         return {"inter_robot_closures": kept, "inter_robot_closures_rejected": tried - kept}
 
-    def matched_pairs(self) -> int:
-        """Pairs of matched Gaussians over all pairs of robots, from the pair lists that were sent; each list once."""
-        from pipeline.exchange.wire import read_pairs
+    @cached_property
+    def pairs(self) -> dict[tuple[str, str], NDArray[np.int64]]:
+        """Ids of matched Gaussians [n, 2] by robots, lower name first: the newest pair lists that were sent."""
+        from pipeline.exchange.wire import PairList, read_pairs
 
-        newest: dict[tuple[int, int], tuple[int, int]] = {}
+        newest: dict[tuple[int, int], PairList] = {}
         for message in self._log("exchange.mcap", topics.PEER_MESSAGE):
             if message.kind_name == "PAIRS" and message.payload:
                 pairs = read_pairs(message.payload, len(self.run.robots))
-                newest[pairs.lower, pairs.higher] = max(
-                    newest.get((pairs.lower, pairs.higher), (-1, 0)), (pairs.version, len(pairs.ids))
-                )
-        return sum(count for _, count in newest.values())
+                key = (pairs.lower, pairs.higher)
+                if key not in newest or newest[key].version < pairs.version:
+                    newest[key] = pairs
+        names = sorted(self.run.robots)
+        return {(names[a], names[b]): newest[a, b].ids for a, b in sorted(newest)}
+
+    def matched_pairs(self) -> int:
+        """Pairs of matched Gaussians over all pairs of robots."""
+        return sum(len(ids) for ids in self.pairs.values())
 
     @cached_property
     def summary(self) -> Any:
@@ -218,9 +224,10 @@ class Session:
 
     def consensus_section(self) -> dict[str, Any]:
         """The section `consensus` of metrics.json."""
-        gap = gap_to_oracle(self.run, self.closures)
+        gap = gap_to_oracle(self.run, self.closures, self.pairs)
         gaps = {
-            "gap_to_oracle_sigma": NO_ORACLE,
+            "gap_to_oracle_sigma": gap if isinstance(gap, Absent) else gap.sigma,
+            "gap_to_oracle_sigma_p99": gap if isinstance(gap, Absent) else gap.sigma_p99,
             "gap_to_oracle_m": gap if isinstance(gap, Absent) else gap.metres,
             "gap_to_oracle_rad": gap if isinstance(gap, Absent) else gap.radians,
         }
@@ -260,6 +267,11 @@ class Session:
             "primal": {robot: _columns(rows, 2) for robot, rows in sorted(change.items())},
             "bytes": spent,
         }
+
+
+def _size(packet: Any) -> int:
+    """Bytes of a duagc.v1.PeerPacket on the air."""
+    return len(packet.header) + int(packet.length) + len(packet.signature)
 
 
 def _columns(

@@ -1,8 +1,9 @@
-"""How far the robots' poses are from the centralised answer: the same objective, solved in one place.
+"""How far the robots are from the centralised answer: the same objective, solved in one place.
 
 The objective is rebuilt from what the run recorded: registrations between own keyframes from every frontend.mcap,
-closures with their information and final robust weights from consensus.mcap, noise floors from config.toml. Only who
-computes differs.
+closures with their information and final robust weights from consensus.mcap, noise floors from config.toml; for the
+Gaussians the robots' maps and information as they are, not as they were rounded for the wire, and the matches of the
+session. Only who computes differs.
 """
 
 from __future__ import annotations
@@ -15,14 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from pipeline.config import Model
 from pipeline.consensus.central import solve_central, team_graph
 from pipeline.consensus.closures import Closure
-from pipeline.consensus.config import PoseConsensusConfig
+from pipeline.consensus.config import MatchingConfig, PoseConsensusConfig
+from pipeline.consensus.evidence import Evidence, theta_of
 from pipeline.consensus.factors import Factors
+from pipeline.consensus.gaussians import Weights
 from pipeline.consensus.poses import with_floor
 from pipeline.errors import DuagError
 from pipeline.evaluation.results import Absent
+from pipeline.fusion.config import FusionConfig
+from pipeline.fusion.fuse import fuse
 from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
 from pipeline.messages import unpack_pose
 from pipeline.recording import read_log
 from pipeline.robot import Step, factors_of, registrations_of
@@ -31,15 +38,23 @@ from schemas import topics
 
 Array = NDArray[np.float64]
 NOBODY = Absent("no two robots share a world")
+NO_MATCHES = Absent("no Gaussians were matched")
 NO_INFORMATION = Absent("consensus.mcap does not hold the information of the closures")
 
 
 @dataclass(frozen=True)
 class Gap:
-    """Largest difference of a keyframe pose from the centralised answer: metres, radians."""
+    """Largest difference of a keyframe pose from the centralised answer: metres, radians.
+
+    sigma, sigma_p99: of the coordinates of matched Gaussians in their standard deviations, the largest and the 99th
+    percentile of each Gaussian's largest; absent where nothing was matched. The largest tells of fusion's own
+    decisions: where members contradict each other, rounding on the wire may tip them.
+    """
 
     metres: float
     radians: float
+    sigma: float | Absent
+    sigma_p99: float | Absent
 
 
 @dataclass(frozen=True)
@@ -52,15 +67,17 @@ class WeightedClosure:
     weight: float
 
 
-def gap_to_oracle(run: RunFolder, decisions: Sequence[Any]) -> Gap | Absent:
+def gap_to_oracle(
+    run: RunFolder, decisions: Sequence[Any], pairs: Mapping[tuple[str, str], NDArray[np.int64]]
+) -> Gap | Absent:
     """Largest gap over all components of two robots or more.
 
     Args:
-        decisions: every duagc.v1.ClosureDecision of the run.
+        decisions: every duagc.v1.ClosureDecision of the run. pairs: ids of matched Gaussians [n, 2] by robots.
     Raises:
         DuagError: the settings of the run are not what they should be.
     """
-    config = _config(run)
+    config = _section(run, PoseConsensusConfig, "exchange", "consensus")
     claims = {robot.component for robot in run.robots.values() if len(robot.component) > 1}
     gaps = []
     for members in sorted(claims):
@@ -73,22 +90,90 @@ def gap_to_oracle(run: RunFolder, decisions: Sequence[Any]) -> Gap | Absent:
         odometry = {
             name: with_floor(factors_of(_registrations(run.robots[name])), config) for name in members
         }
-        gaps.append(gap_of_component(poses, odometry, closures, config))
+        central = solve_component(poses, odometry, closures, config)
+        gaps.append(central if isinstance(central, Absent) else _gap(run, members, poses, central, pairs))
     found = [gap for gap in gaps if isinstance(gap, Gap)]
     if len(found) < len(gaps):
         return next(gap for gap in gaps if isinstance(gap, Absent))
     if not found:
         return NOBODY
-    return Gap(max(gap.metres for gap in found), max(gap.radians for gap in found))
+    return Gap(
+        max(gap.metres for gap in found),
+        max(gap.radians for gap in found),
+        _largest([gap.sigma for gap in found]),
+        _largest([gap.sigma_p99 for gap in found]),
+    )
 
 
-def gap_of_component(
+def _largest(values: Sequence[float | Absent]) -> float | Absent:
+    return max((v for v in values if not isinstance(v, Absent)), default=NO_MATCHES)
+
+
+def _gap(
+    run: RunFolder,
+    members: Sequence[str],
+    poses: Mapping[str, Array],
+    central: Mapping[str, Array],
+    pairs: Mapping[tuple[str, str], NDArray[np.int64]],
+) -> Gap:
+    """The gap of one component whose centralised poses are known."""
+    metres, radians = pose_gap(poses, central)
+    among = {key: ids for key, ids in pairs.items() if key[0] in members and key[1] in members}
+    gaps = np.concatenate([_gaussian_gaps(run, name, members, central, among) for name in members])
+    if not len(gaps):
+        return Gap(metres, radians, NO_MATCHES, NO_MATCHES)
+    return Gap(metres, radians, float(gaps.max()), float(np.percentile(gaps, 99)))
+
+
+def pose_gap(poses: Mapping[str, Array], central: Mapping[str, Array]) -> tuple[float, float]:
+    """Largest distance (m) and angle (rad) between two sets of keyframes [n, 4, 4] by robot."""
+    apart = [se3.distance(central[name], poses[name]) for name in poses]
+    return max(float(np.max(m)) for m, _ in apart), max(float(np.max(r)) for _, r in apart)
+
+
+def _gaussian_gaps(
+    run: RunFolder,
+    robot: str,
+    members: Sequence[str],
+    central: Mapping[str, Array],
+    pairs: Mapping[tuple[str, str], NDArray[np.int64]],
+) -> Array:
+    """Largest |x - x*| sqrt(diagonal of the information at x*) of each of a robot's matched Gaussians [m]."""
+    evidence = {
+        name: Evidence.from_map(
+            name, r.own_map.gaussians, r.information, np.array([k.T_map_camera for k in r.keyframes])
+        )
+        for name in members
+        if (r := run.robots[name])
+    }
+    own = run.robots[robot].own_map.gaussians
+    best = fuse(
+        robot,
+        own,
+        np.array([k.T_map_camera for k in run.robots[robot].keyframes]),
+        evidence,
+        central,
+        pairs,
+        (),
+        PinholeCamera(2, 2, 1.0, 1.0, 0.5, 0.5),  # looks at nothing: what is taken over is not compared
+        _section(run, FusionConfig, "fusion").model_copy(update={"coverage": "overlap"}),
+        _section(run, MatchingConfig, "exchange", "matching"),
+    )
+    matched = best.members[: len(own)] > 1
+    theta = theta_of(run.robots[robot].fused_map.gaussians.select(slice(0, len(own))))
+    information = Evidence("", own.ids, own.anchors, theta, best.information[: len(own)])
+    roots = np.sqrt(Weights.of(information).diagonal())
+    gaps = np.abs(theta - theta_of(best.gaussians)[: len(own)]) * roots
+    return np.asarray(gaps[matched].max(axis=1, initial=0.0))
+
+
+def solve_component(
     T_world_keyframe: Mapping[str, Array],
     odometry: Mapping[str, Factors],
     closures: Sequence[WeightedClosure],
     config: PoseConsensusConfig,
-) -> Gap | Absent:
-    """The gap of one component.
+) -> dict[str, Array] | Absent:
+    """Keyframe poses [n, 4, 4] of every robot by the centralised answer.
 
     The central solver starts from the robots' own answer and goes downhill from there, so that the gap is that to the
     minimum whose basin the robots are in. Its answer is moved so that the first keyframe of the lowest-named robot is
@@ -108,8 +193,10 @@ def gap_of_component(
         return Absent(f"the centralised solver did not converge in {solution.iterations} steps")
     root = team.first[min(T_world_keyframe)]
     gauge = team.T_start[root] @ se3.inverse(solution.poses[root])
-    metres, radians = se3.distance(gauge @ solution.poses, team.T_start)
-    return Gap(float(np.max(metres)), float(np.max(radians)))
+    return {
+        name: gauge @ solution.poses[first : first + len(T_world_keyframe[name])]
+        for name, first in team.first.items()
+    }
 
 
 def _registrations(robot: RobotRun) -> list[Step]:
@@ -133,12 +220,14 @@ def _closures(members: Sequence[str], decisions: Sequence[Any]) -> list[Weighted
     return out
 
 
-def _config(run: RunFolder) -> PoseConsensusConfig:
-    section = run.config.get("exchange", {}).get("consensus", {})
+def _section(run: RunFolder, model: type[Model], *names: str) -> Model:
+    """One section of the run's settings."""
+    section = run.config
+    for name in names:
+        section = section.get(name, {})
     try:
-        return PoseConsensusConfig.model_validate(section)
+        return model.model_validate(section)
     except ValidationError as error:
         first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"])
-        path = run.path / "config.toml"
-        raise DuagError(f"{path}: exchange.consensus.{name}: {first['msg']}") from error
+        setting = ".".join([*names, *(str(part) for part in first["loc"])])
+        raise DuagError(f"{run.path / 'config.toml'}: {setting}: {first['msg']}") from error

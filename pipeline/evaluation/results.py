@@ -61,7 +61,7 @@ def mean(values: list[float | Absent]) -> float | Absent:
 
 def unit_of(name: str) -> str:
     """The unit of a metric, from the words of its name; "1" for counts, shares and scores."""
-    words = name.split("_")
+    words = name.removesuffix("_p99").split("_")
     if words[0] in ("bytes", "nll"):
         return {"bytes": "B", "nll": "nat"}[words[0]]
     if words[-1] in ("db", "sigma"):

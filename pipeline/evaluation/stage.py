@@ -28,7 +28,7 @@ from pipeline.geometry.trajectory import Trajectory
 from pipeline.progress import track
 from pipeline.recording import Recording, RgbdLog, open_rgbd
 from pipeline.run_folder import RobotRun, RunFolder
-from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.gaussians import DepthKind, Gaussians
 
 SCHEMA = 1
 MAPS = ("own", "fused")
@@ -50,7 +50,9 @@ PROTOCOL = {
     "ssim": "one scale, 11x11 Gaussian window of sigma 1.5, windows inside the image",
     "ms_ssim": "five scales, weights of Wang et al. 2003",
     "oracle": "same factors and final closure weights solved in one place, from the robots' answer downhill",
-    "depth": "blended depth / alpha where alpha >= 0.5; mean over pixels with both depths, then over views",
+    "depth": "blended depth / alpha where alpha >= 0.5, of a Gaussian as its map says: that of its centre or of its "
+    "plane; mean over pixels with both depths, then over views",
+    "own_unrefined": "the own map before its final refinement, seen as the own map",
     "calibration": "distance of fused Gaussians from the true surface against sigma along its normal; mean of robots",
 }
 
@@ -203,14 +205,35 @@ def _rendering_section(
             maps = _maps_in_world(robot) if of_peer else _maps(robot)
             poses = dict.fromkeys(MAPS, camera_robot.trajectory) if of_peer else _own_poses(robot)
             for kind in MAPS:
-                task = _RenderTask(maps[kind], camera_robot, poses[kind], keyframes=not of_peer)
+                task = _RenderTask(
+                    maps[kind], camera_robot, poses[kind], keyframes=not of_peer, depth=robot.own_map.depth
+                )
                 title = f"render {kind} map of {name}" + (f" from {camera_robot.robot}" if of_peer else "")
                 for index, score in task.scores(source, threads, title if progress else None):
                     view_set = "peers" if of_peer else "held_out" if index in robot.held_out else "training"
                     scores[kind, view_set].append(score)
                     rows += _view_rows(name, f"{kind}/{view_set}", index, score)
     reasons = dict.fromkeys(VIEW_SETS, "there is no such view") | {"peers": "no two robots met"}
-    return {m: {s: views.summary(scores[m, s], reasons[s]) for s in VIEW_SETS} for m in MAPS}
+    sections = {m: {s: views.summary(scores[m, s], reasons[s]) for s in VIEW_SETS} for m in MAPS}
+    return sections | {"own_unrefined": {"held_out": _unrefined(run, source, threads, progress, rows)}}
+
+
+def _unrefined(
+    run: RunFolder, source: Recording, threads: int, progress: bool, rows: list[Row]
+) -> dict[str, Any]:
+    """Scores of the own maps before their final refinement, over the robots' own held-out views."""
+    scores = []
+    for name, robot in run.robots.items():
+        unrefined = robot.unrefined_map
+        if unrefined is None:
+            continue
+        task = _RenderTask(unrefined.gaussians, robot, robot.odometry, keyframes=False, depth=unrefined.depth)
+        for index, score in task.scores(
+            source, threads, f"render unrefined map of {name}" if progress else None
+        ):
+            scores.append(score)
+            rows += _view_rows(name, "own_unrefined/held_out", index, score)
+    return views.summary(scores, "the front end wrote no map before its refinement")
 
 
 def _maps(robot: RobotRun) -> dict[str, Gaussians]:
@@ -238,6 +261,7 @@ class _RenderTask:
     camera_robot: RobotRun
     trajectory: Trajectory
     keyframes: bool
+    depth: DepthKind
 
     def scores(
         self, source: Recording, threads: int, title: str | None
@@ -252,7 +276,7 @@ class _RenderTask:
             exact = groundtruth.exact_depths(source, name, stamps)
             frames = _views(log, sorted(chosen), exact, groundtruth.recorded_depth_is_exact(source, name))
             found = views.score_map(
-                self.gaussians, log.camera, frames, poses_by_stamp(self.trajectory), threads
+                self.gaussians, log.camera, frames, poses_by_stamp(self.trajectory), threads, self.depth
             )
             yield from track(found, title, total=len(chosen)) if title else found
 

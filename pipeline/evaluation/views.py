@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline.evaluation.results import Absent, mean
 from pipeline.geometry import se3
 from pipeline.splat import losses
-from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.gaussians import DepthKind, Gaussians
 
 if TYPE_CHECKING:
     from pipeline.geometry.camera import PinholeCamera
@@ -98,12 +98,14 @@ def score_map(
     views: Iterable[View],
     poses: Mapping[int, NDArray[np.float64]],
     threads: int,
+    depth: DepthKind = "blended",
 ) -> Iterator[tuple[int, ViewScore | Absent]]:
     """Render a map from every view and score it, in order of the views.
 
     Args:
         gaussians: the map. camera: of the views.
         poses: T_map_camera [4, 4] by time stamp in ns; a view without a pose is Absent.
+        depth: of a Gaussian at a pixel, as the map was made.
         threads: views at a time, each with a rasterizer of one thread; changes no bit of the result.
     Yields:
         Frame index and scores.
@@ -118,7 +120,7 @@ def score_map(
             return view.frame.index, Absent("the trajectory has no pose of this frame")
         if not hasattr(own, "rasterizer"):
             own.rasterizer = Rasterizer(threads=1)
-        render = own.rasterizer.forward(gaussians, camera, se3.inverse(T_map_camera))
+        render = own.rasterizer.forward(gaussians, camera, se3.inverse(T_map_camera), depth=depth)
         return view.frame.index, score_view(render, view.frame.color, view.frame.depth, view.exact_depth_m)
 
     with ThreadPoolExecutor(threads) as pool:

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from pipeline.consensus.closures import Closure, plausible
 from pipeline.consensus.poses import COUNTS, PoseAgent
-from pipeline.exchange import wire
+from pipeline.exchange import injection, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.evidence import (
     best_first,
@@ -53,6 +53,11 @@ from pipeline.robot import AgentResult, ClosureRecord, RobotData
 
 Array = NDArray[np.float64]
 EVERYWHERE = 255  # a hop count that has reached the whole component, for good
+EVIDENCE_WIRES = {
+    "compact": Kind.EVIDENCE,
+    "float32": Kind.EVIDENCE_EXACT,
+    "float64": Kind.EVIDENCE_DOUBLE,
+}
 MEETING_KINDS = frozenset({Kind.DESCRIPTORS, Kind.REQUEST, Kind.SAMPLE, Kind.CLOSURES})
 
 
@@ -117,7 +122,7 @@ class Agent:
         self.neighbours = {self.team.index(name): self._neighbour(name) for name in sorted(neighbours)}
         self.round = -1
         self.refused: Counter[str] = Counter()
-        self.evidence_kind = Kind.EVIDENCE if config.evidence_wire == "compact" else Kind.EVIDENCE_EXACT
+        self.evidence_kind = EVIDENCE_WIRES[config.evidence_wire]
         self.knowledge = Knowledge(self.own, len(self.team), self.evidence_kind)
         self.frame = Frame(self.own, wire.WHOLE, 0, np.eye(4))
         self.members = 1 << self.own
@@ -299,7 +304,11 @@ class Agent:
             )
         )
         payloads = [state]
-        if self.poses is not None and neighbour.name in self.poses.links and not self._all_agreed():
+        missing = injection.poses_are_missing(
+            self.config.injection, self.seed, self.data.robot, neighbour.name, self.round
+        )
+        speaks = self.poses is not None and neighbour.name in self.poses.links and not missing
+        if self.poses is not None and speaks and not self._all_agreed():
             packet = self.poses.outgoing(neighbour.name)
             double = packet.translations.dtype == np.float64
             per = wire.poses_per_packet(MAX_PAYLOAD_BYTES - len(state), double)
@@ -486,7 +495,7 @@ class Agent:
     def _own_body(self) -> NDArray[Any]:
         """Own evidence as it is sent, best first."""
         if self._body is None:
-            records = own_records(self.data)
+            records = own_records(self.data, self.evidence_kind)
             self._body = wire.to_body(self.evidence_kind, records[best_first(records)])
         return self._body
 
@@ -545,6 +554,9 @@ class Agent:
                     k.sound_records(other),
                     k.anchors[other].T_common_keyframe,
                     self.config.matching,
+                )
+                ids = injection.false_matches(
+                    ids, self.config.injection, self.seed, self.data.robot, self.team[other]
                 )
                 pairs = PairList(self.own, other, 1, ids)
                 k.pairs[self.own, other] = pairs

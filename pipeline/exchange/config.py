@@ -140,6 +140,19 @@ class VerificationConfig(Config):
     """Largest rotation by which the registration may change what RANSAC found."""
 
 
+class InjectionConfig(Config):
+    """Faults made on purpose; all off unless asked for."""
+
+    false_closures: float = Field(default=0.0, ge=0.0, lt=1.0)
+    """Share of false ones among all closures of a pair of robots that found any."""
+    false_closure_m: float = Field(default=3.0, gt=0.0)
+    """Largest coordinate of the translation of a false closure; its rotation is any."""
+    false_matches: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Share of the matched Gaussians of a pair of robots whose partners are exchanged."""
+    pose_dropouts: float = Field(default=0.0, ge=0.0, lt=1.0)
+    """Chance that a robot says nothing of its poses to a neighbour in a round."""
+
+
 class ExchangeConfig(Config):
     """One session of the team."""
 
@@ -149,8 +162,8 @@ class ExchangeConfig(Config):
     """The session ends here, whatever has been agreed."""
     coverage: Literal["all", "overlap"] = "all"
     """Send every Gaussian to everybody, or only those in space that the receiver's keyframes saw."""
-    evidence_wire: Literal["compact", "float32"] = "compact"
-    """100 bytes per Gaussian, rounded far below its uncertainty, or 188 bytes."""
+    evidence_wire: Literal["compact", "float32", "float64"] = "compact"
+    """100 bytes per Gaussian, rounded far below its uncertainty, or 188, or 364 bytes and not rounded at all."""
     overlap_voxel_m: float = Field(default=0.25, gt=0.0)
     """Edge of the voxels that say which space a robot saw (coverage = overlap)."""
     link: LinkConfig = LinkConfig()
@@ -159,3 +172,4 @@ class ExchangeConfig(Config):
     verification: VerificationConfig = VerificationConfig()
     consensus: PoseConsensusConfig = PoseConsensusConfig()
     matching: MatchingConfig = MatchingConfig()
+    injection: InjectionConfig = InjectionConfig()

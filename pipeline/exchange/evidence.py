@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from pipeline.consensus.config import MatchingConfig
 from pipeline.consensus.evidence import Evidence
 from pipeline.consensus.matching import match
-from pipeline.exchange.wire import RECORD
+from pipeline.exchange.packets import Kind
+from pipeline.exchange.wire import record_dtype
 from pipeline.geometry import se3
 from pipeline.robot import RobotData
 from pipeline.splat.gaussians import Gaussians
@@ -25,15 +26,15 @@ DIAGONAL = np.array([0, 3, 5, 6, 12, 17, 21, 24, 26, 27, 28, 29, 30])
 VOXEL_BITS = 20  # per axis; voxels beyond +-2^19 share those at the border
 
 
-def own_records(data: RobotData) -> Records:
-    """A robot's own evidence in the frames of its anchors, float32 as it is sent."""
+def own_records(data: RobotData, kind: Kind) -> Records:
+    """A robot's own evidence in the frames of its anchors, in the precision of this kind of evidence."""
     evidence = Evidence.from_map(data.robot, data.gaussians, data.information, data.T_map_keyframe)
-    return to_records(evidence)
+    return to_records(evidence, kind)
 
 
-def to_records(evidence: Evidence) -> Records:
+def to_records(evidence: Evidence, kind: Kind) -> Records:
     """Records of evidence, in the same order."""
-    records = np.zeros(len(evidence), RECORD)
+    records = np.zeros(len(evidence), record_dtype(kind))
     records["id"], records["anchor"] = evidence.ids, evidence.anchors
     records["theta"], records["information"] = evidence.theta, evidence.information
     return records

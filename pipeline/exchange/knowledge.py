@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.exchange import wire
 from pipeline.exchange.packets import Kind, MalformedError
-from pipeline.exchange.wire import RECORD, Anchors, PairList
+from pipeline.exchange.wire import Anchors, PairList
 
 Records = NDArray[Any]
 
@@ -117,13 +117,13 @@ class Knowledge:
                         parts.append(wire.read_evidence(self.kind, chunk, self.team)[2])
                     except MalformedError:
                         continue
-            records = np.concatenate(parts) if parts else np.zeros(0, RECORD)
+            records = np.concatenate(parts) if parts else np.zeros(0, wire.record_dtype(self.kind))
         _, first = np.unique(records["id"], return_index=True)
         return records[first]
 
     def sound_records(self, owner: int) -> Records:
         """`records` whose anchor is among the owner's agreed poses; none without agreed poses."""
         if owner not in self.anchors:
-            return np.zeros(0, RECORD)
+            return np.zeros(0, wire.record_dtype(self.kind))
         records = self.records(owner)
         return records[records["anchor"] < len(self.anchors[owner].T_common_keyframe)]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pipeline import streams
 from pipeline.consensus.closures import Closure, consistent, drift
 from pipeline.consensus.poses import PoseAgent, SharedKeyframes
-from pipeline.exchange import places, wire
+from pipeline.exchange import injection, places, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.packets import Kind, MalformedError
 from pipeline.exchange.places import Candidate
@@ -208,9 +208,21 @@ class LowerEnd(Meeting):
             )
             self.tried.append(Tried(candidate, result))
 
+    def _inject(self) -> None:
+        """Add the false closures that the configuration asks for."""
+        assert self.book is not None
+        found = [t.result.closure for t in self.tried if t.result.closure is not None]
+        ends = self.places.data.keyframes, len(self.book.descriptors)
+        for c in injection.false_closures(
+            found, *ends, self.config.injection, self.seed, self.own, self.peer
+        ):
+            result = Verified(Verdict.KEPT, 0, 0, injection.DETAIL, c)
+            self.tried.append(Tried(Candidate(c.own_keyframe, c.peer_keyframe, 0), result))
+
     def _decide(self, send: Send) -> None:
         """Pairwise consistency, the relative frame, and the message that says so."""
         assert self.book is not None
+        self._inject()
         self.tried.sort(key=lambda t: (t.candidate.peer_keyframe, t.candidate.own_keyframe))
         closures = [t.result.closure for t in self.tried if t.result.closure is not None]
         agreement = consistent(
@@ -226,6 +238,8 @@ class LowerEnd(Meeting):
             if t.result.closure is not None:
                 keep, reason = next(verdicts)
                 if not keep:
+                    if t.result.detail == injection.DETAIL:
+                        reason = f"{reason}; {injection.DETAIL}"
                     result = replace(t.result, verdict=Verdict.INCONSISTENT, detail=reason)
                     self.tried[at] = Tried(t.candidate, result)
         T = agreement.T_ownmap_peermap

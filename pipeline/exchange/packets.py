@@ -32,7 +32,7 @@ HEADER_BYTES = _FIELDS.size + _CRC.size
 MAX_PAYLOAD_BYTES = MAX_PACKET_BYTES - HEADER_BYTES
 
 EVIDENCE_HEAD_BYTES = 8
-EVIDENCE_BYTES, EVIDENCE_EXACT_BYTES = 100, 188  # of one record
+EVIDENCE_BYTES, EVIDENCE_EXACT_BYTES, EVIDENCE_DOUBLE_BYTES = 100, 188, 364  # of one record
 
 
 class Kind(IntEnum):
@@ -50,6 +50,7 @@ class Kind(IntEnum):
     PAIRS = 10  # matched Gaussians of two robots
     EVIDENCE = 11  # Gaussians of one robot with their information, compact
     EVIDENCE_EXACT = 12  # the same in float32
+    EVIDENCE_DOUBLE = 13  # the same in float64
 
 
 FIRE_AND_FORGET = frozenset({Kind.ACK, Kind.STATE})
@@ -75,7 +76,11 @@ class Packet:
     payload: bytes
 
 
-EVIDENCE_KINDS = {Kind.EVIDENCE: EVIDENCE_BYTES, Kind.EVIDENCE_EXACT: EVIDENCE_EXACT_BYTES}
+EVIDENCE_KINDS = {
+    Kind.EVIDENCE: EVIDENCE_BYTES,
+    Kind.EVIDENCE_EXACT: EVIDENCE_EXACT_BYTES,
+    Kind.EVIDENCE_DOUBLE: EVIDENCE_DOUBLE_BYTES,
+}
 """Kinds whose packets hold whole records, each useful alone, and the bytes of a record."""
 
 

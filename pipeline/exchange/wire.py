@@ -18,6 +18,7 @@ from pipeline.consensus.poses import PosePacket, SharedKeyframes
 from pipeline.exchange.compact import COMPACT, decode, encode
 from pipeline.exchange.packets import (
     EVIDENCE_BYTES,
+    EVIDENCE_DOUBLE_BYTES,
     EVIDENCE_EXACT_BYTES,
     EVIDENCE_HEAD_BYTES,
     EVIDENCE_KINDS,
@@ -573,10 +574,17 @@ def read_pairs(data: bytes, team: int) -> PairList:
 # --- evidence
 
 RECORD = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f4", 13), ("information", "<f4", 31)])
+RECORD_DOUBLE = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f8", 13), ("information", "<f8", 31)])
 _EVIDENCE = struct.Struct("<HHI")  # owner, version, records of the whole message
 assert RECORD.itemsize == EVIDENCE_EXACT_BYTES
+assert RECORD_DOUBLE.itemsize == EVIDENCE_DOUBLE_BYTES
 assert COMPACT.itemsize == EVIDENCE_BYTES
 assert _EVIDENCE.size == EVIDENCE_HEAD_BYTES
+
+
+def record_dtype(kind: Kind) -> np.dtype[Any]:
+    """Records as they are made and read for this kind of evidence."""
+    return RECORD_DOUBLE if kind is Kind.EVIDENCE_DOUBLE else RECORD
 
 
 def to_body(kind: Kind, records: NDArray[Any]) -> NDArray[Any]:
@@ -590,7 +598,7 @@ def from_body(kind: Kind, body: NDArray[Any]) -> NDArray[Any]:
 
 
 def write_evidence(kind: Kind, owner: int, version: int, body: NDArray[Any]) -> bytes:
-    """Bytes of EVIDENCE or EVIDENCE_EXACT: chunks of whole records, each with its own head, as they are cut."""
+    """Bytes of evidence of any kind: chunks of whole records, each with its own head, as they are cut."""
     n, per, size = len(body), records_per_chunk(kind), body.itemsize
     head = _EVIDENCE.pack(owner, version, n)
     chunks = max(1, -(-n // per))
@@ -627,13 +635,13 @@ def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any]
     if odd or n > announced:
         raise MalformedError(f"evidence: {len(data)} bytes are no {announced} records")
     flat = np.ascontiguousarray(rows[:, EVIDENCE_HEAD_BYTES:]).reshape(-1)
-    body: NDArray[Any] = flat.view(COMPACT if kind is Kind.EVIDENCE else RECORD)[:n].copy()
+    body: NDArray[Any] = flat.view(COMPACT if kind is Kind.EVIDENCE else record_dtype(kind))[:n].copy()
     for name in body.dtype.names or ():
         if body[name].dtype.kind == "f" and not np.isfinite(body[name]).all():
             raise MalformedError("evidence: not a finite number")
     records = from_body(kind, body)
     check_evidence(records)
-    if kind is Kind.EVIDENCE_EXACT:  # the factors of the compact kind cannot say anything impossible
+    if kind is not Kind.EVIDENCE:  # the factors of the compact kind cannot say anything impossible
         check_information(records["information"].astype(np.float64))
     return owner, body, records
 

@@ -8,7 +8,7 @@ threads. See docs/mapping.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,11 +18,11 @@ from pipeline import streams
 from pipeline.frontend.mapping_config import MappingConfig
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import CompiledAdam, FisherSums, LossWeights, Rasterizer, Render
+from pipeline.kernels import CompiledAdam, FisherSums, Gradients, LossWeights, Rasterizer, Render, ViewLoss
 from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.losses import Loss, halve, rgbd_loss
+from pipeline.splat.losses import halve
 from pipeline.splat.optimiser import BETA_1, BETA_2, LearningRates
-from pipeline.splat.seeding import seed_discs, unexplained
+from pipeline.splat.seeding import seed_discs, unexplained, worst_drawn
 
 Image = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -52,11 +52,17 @@ class _View:
     half_color: Image
     half_depth_m: Image
     T_map_camera: NDArray[np.float64]
+    median_depth_m: float
     mask: NDArray[np.bool_] | None = None
     half_mask: NDArray[np.bool_] | None = None
     exposure: tuple[float, float] = (0.0, 0.0)
     exposure_moments: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 2)))
     exposure_steps: int = 0
+
+    @property
+    def centre_map(self) -> NDArray[np.float64]:
+        """The point [3] that the camera looks at: on its axis, at the median depth."""
+        return self.T_map_camera[:3, 3] + self.median_depth_m * self.T_map_camera[:3, 2]
 
     def images(self, level: int) -> tuple[Image, Image]:
         if level == 0:
@@ -96,6 +102,7 @@ class Mapper:
         self._views: list[_View] = []
         self._support: list[tuple[_View, NDArray[np.float64]]] = []  # with T_keyframe_camera
         self._next_id = 0
+        self._contribution = np.zeros(0)  # of every Gaussian, as last measured; infinite if never
 
     @property
     def gaussians(self) -> Gaussians:
@@ -128,14 +135,15 @@ class Mapper:
             raise ValueError(f"keyframe {keyframe_index} added after {len(self._views)} keyframes")
         view = _view(keyframe_index, color, depth_m, T_map_camera, mask)
         self._views.append(view)
+        self._adam.freeze_after(self.config.stable_steps or None)
         inserted, pruned = self._seed(
             view, self.config.first_share if keyframe_index == 0 else self.config.keyframe_share
         )
-        before = self._loss(view, self.config.iterations_level).value
+        before = self._loss(view, self.config.iterations_level)
         for other in self._window(view):
             self._optimise(other, self.config.iterations_level, self.config.rates)
         pruned += self._prune_degenerate()
-        after = self._loss(view, self.config.iterations_level).value
+        after = self._loss(view, self.config.iterations_level)
         return MappingStats(inserted, pruned, len(self._gaussians), before, after)
 
     def set_keyframe_poses(
@@ -178,7 +186,8 @@ class Mapper:
     def finish(self) -> MappingStats:
         """Refine geometry and colour over all views: `final_iterations` steps for each keyframe, at full size.
 
-        The views come in random order, each once before any comes again. Halfway, what contributes nothing goes.
+        The views come in random order, each once before any comes again. In the first half, what contributes
+        nothing is replaced `densify_rounds` times by discs where the keyframes are drawn worst.
 
         Returns:
             Counts of the whole refinement, losses as means over all keyframes at full size.
@@ -186,37 +195,42 @@ class Mapper:
         config = self.config
         views = [*self._views, *(view for view, _ in self._support)]
         before = self._mean_loss()
-        pruned = 0
+        inserted = pruned = 0
         steps = min(config.final_iterations * len(self._views), config.final_iterations_max)
+        rounds = {steps * (k + 1) // (2 * config.densify_rounds + 2) for k in range(config.densify_rounds)}
+        self._adam.freeze_after(None)
         order = np.zeros(0, np.int64)
         for step in range(steps):
             position = step % len(views)
             if position == 0:
                 order = streams.generator(self.seed, "mapping.finish", start=step).permutation(len(views))
-            if step == steps // 2:
-                pruned += self._keep(self._contributions() >= config.min_contribution)
+            if step in rounds:
+                came, went = self._densify()
+                inserted, pruned = inserted + came, pruned + went
+            elif step == steps // 2:
+                pruned += self._keep(self._contributions(self._views)[0] >= config.min_contribution)
             rates = config.rates.times(config.final_rate_decay ** (step / max(steps - 1, 1)))
             self._optimise(views[order[position]], 0, rates)
         pruned += self._prune_degenerate()
-        return MappingStats(0, pruned, len(self._gaussians), before, self._mean_loss())
+        return MappingStats(inserted, pruned, len(self._gaussians), before, self._mean_loss())
 
     # --- one view -----------------------------------------------------------------------------------------------
 
-    def _render(self, view: _View, level: int) -> tuple[Render, Loss]:
+    def _draw(self, view: _View, level: int, mask: NDArray[np.bool_] | None = None) -> Render:
+        return self.rasterizer.forward(
+            self._gaussians,
+            self.cameras[level],
+            se3.inverse(view.T_map_camera),
+            mask=mask,
+            depth=self.config.depth,
+        )
+
+    def _loss(self, view: _View, level: int) -> float:
+        return self._view_gradients(view, level)[0].value
+
+    def _view_gradients(self, view: _View, level: int) -> tuple[ViewLoss, Gradients]:
         color, depth_m = view.images(level)
-        render = self.rasterizer.forward(self._gaussians, self.cameras[level], se3.inverse(view.T_map_camera))
-        return render, rgbd_loss(render, color, depth_m, self.config.loss, view.exposure, view.usable(level))
-
-    def _loss(self, view: _View, level: int) -> Loss:
-        return self._render(view, level)[1]
-
-    def _mean_loss(self) -> float:
-        return float(np.mean([self._loss(view, 0).value for view in self._views])) if self._views else 0.0
-
-    def _optimise(self, view: _View, level: int, rates: LearningRates) -> None:
-        """One Adam step of all Gaussians in one view."""
-        color, depth_m = view.images(level)
-        loss, gradients = self.rasterizer.view_gradients(
+        return self.rasterizer.view_gradients(
             self._gaussians,
             self.cameras[level],
             se3.inverse(view.T_map_camera),
@@ -225,7 +239,15 @@ class Mapper:
             self._loss_weights,
             exposure=view.exposure,
             mask=view.usable(level),
+            depth=self.config.depth,
         )
+
+    def _mean_loss(self) -> float:
+        return float(np.mean([self._loss(view, 0) for view in self._views])) if self._views else 0.0
+
+    def _optimise(self, view: _View, level: int, rates: LearningRates) -> None:
+        """One Adam step of all Gaussians in one view."""
+        loss, gradients = self._view_gradients(view, level)
         if self.config.exposure and view is not self._views[0]:
             view.step_exposure(loss.d_exposure, self.config.exposure_rate)
         stepped = self._adam.step(self._gaussians, gradients, rates)
@@ -242,19 +264,30 @@ class Mapper:
         config = self.config
         budget = int(share * config.max_gaussians)
         color, depth_m = view.images(0)
+        wanted = depth_m > 0  # zero where the mask forbids a pixel
         if len(self._gaussians):
-            render = self.rasterizer.forward(self._gaussians, self.cameras[0], se3.inverse(view.T_map_camera))
+            render = self._draw(view, 0)
             if config.exposure:
                 view.exposure = _first_exposure(render, color, view.mask)
-            color = (color - np.float32(view.exposure[1])) * np.float32(np.exp(-view.exposure[0]))
-            if (
-                view.mask is not None
-            ):  # errors are smoothed: a masked pixel must not speak through its neighbours
-                color = np.where(view.mask[..., None], color, render.color)
+            color = self._as_drawn(view, color, render)
             wanted = unexplained(render, color, depth_m, config.seeding)
-        else:
-            wanted = depth_m > 0  # zero where the mask forbids a pixel
-        new = seed_discs(
+        new = self._discs(view, color, depth_m, wanted, budget)
+        excess = len(self._gaussians) + len(new) - config.max_gaussians
+        self._measure(self._covisible(view, config.sweep_keyframes))
+        pruned = self._prune_least(excess) if excess > 0 else 0
+        self._append(new)
+        return len(new), pruned
+
+    def _as_drawn(self, view: _View, color: Image, render: Render) -> Image:
+        """The view's colours in the map's exposure; where the mask forbids a pixel, those of the render."""
+        color = (color - np.float32(view.exposure[1])) * np.float32(np.exp(-view.exposure[0]))
+        # errors are smoothed: a masked pixel must not speak through its neighbours
+        return color if view.mask is None else np.where(view.mask[..., None], color, render.color)
+
+    def _discs(
+        self, view: _View, color: Image, depth_m: Image, wanted: NDArray[np.bool_], budget: int
+    ) -> Gaussians:
+        return seed_discs(
             color,
             depth_m,
             wanted,
@@ -263,17 +296,47 @@ class Mapper:
             budget,
             self._next_id,
             view.index,
-            config.seeding,
+            self.config.seeding,
         )
-        excess = len(self._gaussians) + len(new) - config.max_gaussians
-        pruned = self._prune_least(excess) if excess > 0 else 0
+
+    def _append(self, new: Gaussians) -> None:
         self._next_id += len(new)
         self._gaussians = Gaussians.concatenate([self._gaussians, new])
         self._adam.extend(len(new))
-        return len(new), pruned
+        self._contribution = np.concatenate([self._contribution, np.full(len(new), np.inf)])
 
-    def _contributions(self) -> NDArray[np.float64]:
-        """Squared change of all keyframes' images, in units of the noise, if a Gaussian was removed, [n].
+    def _densify(self) -> tuple[int, int]:
+        """Replace what contributes nothing by discs where keyframes are drawn worst; how many came and went.
+
+        Every keyframe gets an equal part of the room, in turn, and sees what those before it inserted.
+        """
+        config = self.config
+        contributions, _ = self._contributions(self._views)
+        keep = contributions >= config.min_contribution
+        wanted = int(config.densify_share * config.max_gaussians)
+        excess = (
+            int(np.count_nonzero(keep))
+            + int(config.relocate_share * config.max_gaussians)
+            - config.max_gaussians
+        )
+        if excess > 0:
+            order = np.argsort(np.where(keep, contributions, np.inf), kind="stable")
+            keep[order[:excess]] = False
+        pruned = self._keep(keep)
+        room = min(config.max_gaussians - len(self._gaussians), wanted)
+        inserted = 0
+        for k, view in enumerate(self._views):
+            budget = room * (k + 1) // len(self._views) - room * k // len(self._views)
+            color, depth_m = view.images(0)
+            render = self._draw(view, 0)
+            color = self._as_drawn(view, color, render)
+            new = self._discs(view, color, depth_m, worst_drawn(render, color, depth_m, 4 * budget), budget)
+            self._append(new)
+            inserted += len(new)
+        return inserted, pruned
+
+    def _contributions(self, views: Sequence[_View]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Squared change of these views' images, in units of the noise, if a Gaussian was removed; and if any saw it.
 
         A pixel is linear in each Gaussian's blending factor, and the derivative by the opacity logit is that
         factor's derivative times (1 - opacity), so the Gauss-Newton information of the logit divided by
@@ -284,17 +347,26 @@ class Mapper:
         inverse_color = np.full(
             (camera.height, camera.width), self.config.contribution_color_sigma**-2, np.float32
         )
-        for view in self._views:
-            T_camera_map = se3.inverse(view.T_map_camera)
-            self.rasterizer.forward(self._gaussians, camera, T_camera_map, mask=view.half_mask)
+        for view in views:
+            self._draw(view, 1, view.half_mask)
             inverse_depth = (view.half_depth_m > 0) * np.float32(self.config.contribution_depth_sigma_m**-2)
             self.rasterizer.fisher(inverse_color, inverse_depth, sums)
         transparency = 1.0 / (1.0 + np.exp(self._gaussians.opacity_logits.astype(np.float64)))
-        return sums.opacity / transparency**2
+        return sums.opacity / transparency**2, sums.observations > 0
+
+    def _measure(self, views: Sequence[_View]) -> None:
+        """Measure again what the Gaussians that these views see contribute; the others keep what was found before.
+
+        Views that are left out may still need a Gaussian: what it was found to contribute fades by a tenth at a
+        time. What no sweep has seen yet counts as needed.
+        """
+        found, seen = self._contributions(views)
+        faded = np.where(np.isinf(self._contribution), 0.0, 0.9 * self._contribution)
+        self._contribution = np.where(seen, np.maximum(found, faded), self._contribution)
 
     def _prune_least(self, count: int) -> int:
-        """Remove the `count` Gaussians that contribute least; ties go by position."""
-        order = np.argsort(self._contributions(), kind="stable")
+        """Remove the `count` Gaussians that were last found to contribute least; ties go by position."""
+        order = np.argsort(self._contribution, kind="stable")
         keep = np.ones(len(self._gaussians), bool)
         keep[order[:count]] = False
         return self._keep(keep)
@@ -310,26 +382,43 @@ class Mapper:
         if not mask.all():
             self._gaussians = self._gaussians.select(mask)
             self._adam.select(mask)
+            self._contribution = self._contribution[mask]
         return int(np.count_nonzero(~mask))
 
     # --- which views --------------------------------------------------------------------------------------------
 
     def _window(self, newest: _View) -> list[_View]:
         """The views of this keyframe's iterations: every second one the newest, the others in turn."""
-        older = self._views[: newest.index]
-        overlaps = [
-            overlap(newest.depth_m, newest.T_map_camera, v.depth_m, v.T_map_camera, self.cameras[0])
-            for v in older
-        ]
-        ranked = sorted(range(len(older)), key=lambda k: (-overlaps[k], -k))
-        chosen, rest = ranked[: self.config.window - 1], sorted(ranked[self.config.window - 1 :])
+        chosen = self._covisible(newest, self.config.window)[1:]
+        taken = {view.index for view in chosen}
+        rest = [view for view in self._views[: newest.index] if view.index not in taken]
         draw = streams.generator(self.seed, "mapping.window", keyframe=newest.index)
         lot = draw.permutation(len(rest))[: self.config.random_keyframes]
-        others = [older[k] for k in chosen] + [older[rest[k]] for k in lot]
+        others = [*chosen, *(rest[k] for k in lot)]
         steps = self.config.iterations
         if not others:
             return [newest] * steps
         return [newest if k % 2 == 0 else others[(k // 2) % len(others)] for k in range(steps)]
+
+    def _covisible(self, newest: _View, count: int) -> list[_View]:
+        """A view, the keyframe before it, and the older ones that see most of what it sees, best first.
+
+        `count` in all, ties to the later. Only the `candidates` keyframes whose centre of view is nearest are compared.
+        """
+        older = self._views[: newest.index]
+        if len(older) > self.config.candidates:
+            centres = np.stack([view.centre_map for view in older])
+            distance = np.linalg.norm(centres - newest.centre_map, axis=1)
+            distance[-1] = 0.0
+            nearest = np.sort(np.argsort(distance, kind="stable")[: self.config.candidates])
+            older = [older[k] for k in nearest]
+        overlaps = [
+            overlap(newest.depth_m, newest.T_map_camera, v.depth_m, v.T_map_camera, self.cameras[0])
+            for v in older
+        ]
+        latest = len(older) - 1  # takes part whatever it sees: nobody else saw what it brought
+        ranked = sorted(range(len(older)), key=lambda k: (k != latest, -overlaps[k], -k))
+        return [newest, *(older[k] for k in ranked[: count - 1])]
 
 
 def overlap(
@@ -373,6 +462,7 @@ def _view(
     depth_m = np.asarray(depth_m, dtype=np.float32)
     if mask is not None:
         depth_m = np.where(mask, depth_m, np.float32(0))
+    near = depth_m[::8, ::8]
     return _View(
         index=index,
         color=color,
@@ -380,6 +470,7 @@ def _view(
         half_color=halve(_from_bytes(color)),
         half_depth_m=_halve_depth(depth_m),
         T_map_camera=np.array(T_map_camera, dtype=np.float64),
+        median_depth_m=float(np.median(near[near > 0])) if near.any() else 0.0,
         mask=mask,
         half_mask=None if mask is None else _halve_mask(mask),
     )

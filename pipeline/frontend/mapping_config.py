@@ -1,6 +1,7 @@
 """Configuration of the mapping."""
 
 from pipeline.config import Config
+from pipeline.splat.gaussians import DepthKind
 from pipeline.splat.losses import LossConfig
 from pipeline.splat.optimiser import LearningRates
 from pipeline.splat.seeding import SeedingConfig
@@ -17,6 +18,8 @@ class MappingConfig(Config):
     """Share of the cap that any later keyframe may add."""
     window: int = 8
     """Keyframes optimised together: the newest and those that see most of what it sees."""
+    candidates: int = 24
+    """Most older keyframes, by the places they look at, whose overlap with a new one is computed."""
     random_keyframes: int = 2
     """Older keyframes added to the window by lot, against forgetting."""
     iterations: int = 16
@@ -29,17 +32,31 @@ class MappingConfig(Config):
     """Most steps of the final refinement in all."""
     support_views: int = 40
     """Most tracked frames between keyframes that take part in the final refinement; 0: keyframes only."""
+    densify_rounds: int = 4
+    """Times, in the first half of the final refinement, that Gaussians that contribute nothing are replaced by new
+    ones where the images are drawn worst; 0: never."""
+    densify_share: float = 0.08
+    """Most of the cap that one such round may seed."""
+    relocate_share: float = 0.0
+    """Least of the cap that one such round makes free, whatever the Gaussians that go contribute."""
     rates: LearningRates = LearningRates()
     final_rate_decay: float = 0.05
     """The final refinement's learning rates fall exponentially to this share."""
+    stable_steps: int = 0
+    """Steps after which a Gaussian is stable: frozen until the final refinement; 0: never."""
+    depth: DepthKind = "blended"
+    """Depth of a Gaussian at a pixel: that of its centre (`blended`), or of its disc along the ray (`ray_plane`)."""
     loss: LossConfig = LossConfig()
     seeding: SeedingConfig = SeedingConfig()
     min_opacity: float = 0.03
     """Gaussians below are pruned."""
     max_scale_m: float = 0.5
     """Gaussians that grew beyond are pruned."""
+    sweep_keyframes: int = 6
+    """Keyframes, the newest and those that see most of what it sees, in whose images every keyframe measures again
+    what the Gaussians contribute."""
     min_contribution: float = 0.25
-    """Gaussians whose removal changes all keyframes together by less are pruned, halfway through the final
+    """Gaussians whose removal changes all keyframes together by less are pruned in the first half of the final
     refinement: the squared change of half-size images, in units of the noise below."""
     contribution_color_sigma: float = 0.03
     contribution_depth_sigma_m: float = 0.02

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from pipeline.frontend.keyframes import KeyframePair, Refined, refine, relative_
 from pipeline.frontend.tracking import Status, TrackedFrame, TrackedKeyframe, Tracker
 from pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
 from pipeline.recording import LogWriter, RgbdLog, open_rgbd
-from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.gaussians import DepthKind, Gaussians
 from schemas import topics
 
 LATENCY_NS = 30_000_000
@@ -47,7 +48,7 @@ def run_frontend(
         seed: of the run, for the mapping. threads: of the rasterizer; changes no bit of the result.
         progress: show it on standard error.
     Returns:
-        Wall times in seconds of tracking, refinement, mapping and writing.
+        Wall times in seconds of tracking, refinement of the poses, mapping, final refinement of the map and writing.
     Raises:
         DuagError: the log is broken or empty.
     """
@@ -71,10 +72,10 @@ def run_frontend(
         keyframes = _keyframe_messages(log.robot, tracker.keyframes, refined)
         factors = _factor_messages(log.robot, tracker.keyframes, tracker.pairs, refined)
         clock.lap("refinement_s")
-        updates, gaussians = _map(log, keyframes, frames, config, seed, threads, progress)
-        clock.lap("mapping_s")
+        updates, maps = _map(log, keyframes, frames, config, seed, threads, progress, clock)
+        clock.lap("final_refinement_s")
     odometry = [_odometry(log.robot, frame, refined.T_map_keyframe) for frame in frames]
-    _write(out_path, log.robot, odometry, keyframes, factors, updates, gaussians)
+    _write(out_path, log.robot, odometry, keyframes, factors, updates, maps)
     clock.lap("writing_s")
     return clock.laps
 
@@ -145,13 +146,15 @@ def _map(
     seed: int,
     threads: int,
     progress: bool,
-) -> tuple[list[MapUpdate], Gaussians]:
+    clock: _Clock,
+) -> tuple[list[MapUpdate], _Maps]:
     """Grow the map at the keyframes' poses; one update per keyframe, and one for the final refinement.
 
     Other tracked frames support that refinement; held-out frames are not even decoded.
     """
     if not config.mapping_enabled:
-        return [], Gaussians.empty()
+        clock.lap("mapping_s")
+        return [], _Maps(Gaussians.empty(), None, config.mapping.depth)
     from pipeline.frontend.mapping import Mapper, MappingStats
 
     def update(keyframe: Keyframe, stats: MappingStats) -> MapUpdate:
@@ -184,8 +187,19 @@ def _map(
             supporting.T_keyframe_camera,
             mask=frame.mask,
         )
+    unrefined = mapper.gaussians
+    clock.lap("mapping_s")
     updates.append(update(keyframes[-1], mapper.finish()))
-    return updates, mapper.gaussians
+    return updates, _Maps(mapper.gaussians, unrefined, config.mapping.depth)
+
+
+@dataclass(frozen=True)
+class _Maps:
+    """The robot's map after and before its final refinement, and the depth that its Gaussians are drawn with."""
+
+    final: Gaussians
+    unrefined: Gaussians | None
+    depth: DepthKind
 
 
 def _support(
@@ -231,9 +245,9 @@ def _write(
     keyframes: Sequence[Keyframe],
     factors: Sequence[KeyframeFactor],
     updates: Sequence[MapUpdate],
-    gaussians: Gaussians,
+    maps: _Maps,
 ) -> None:
-    """One message per frame, then what its keyframe did, in the order of time; the map at the end."""
+    """One message per frame, then what its keyframe did, in the order of time; the maps at the end."""
     keyframe_of = {keyframe.frame_index: keyframe for keyframe in keyframes}
     factors_of: dict[int, list[KeyframeFactor]] = {}
     for factor in factors:
@@ -256,8 +270,10 @@ def _write(
                 for update in updates_of.get(keyframe.keyframe_index, []):
                     log.write(topics.MAP_UPDATE.of(robot), update, time_ns, message.stamp_ns)
         last = odometry[-1].stamp_ns
-        final = GaussianMap(last, robot, map_frame(robot), gaussians, None)
-        log.write(topics.MAP.of(robot), final, last + LATENCY_NS, last)
+        for topic, gaussians in ((topics.UNREFINED_MAP, maps.unrefined), (topics.MAP, maps.final)):
+            if gaussians is not None:
+                whole = GaussianMap(last, robot, map_frame(robot), gaussians, depth=maps.depth)
+                log.write(topic.of(robot), whole, last + LATENCY_NS, last)
 
 
 def _settle_opencv() -> None:

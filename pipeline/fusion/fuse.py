@@ -35,7 +35,7 @@ from pipeline.consensus.matching import Pairs, held_thickness, tracks
 from pipeline.fusion.config import FusionConfig
 from pipeline.geometry import se3, spd
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.gaussians import DepthKind, Gaussians
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -47,12 +47,14 @@ class FusedMap:
     """A robot's fused map in the world frame: its own Gaussians first, in their order, then those taken over.
 
     gaussians: ids of own ones are kept; those taken over count on from the largest own id. Anchors are keyframes of
-    the source robot. information: float64 [n, 31] as in `consensus.evidence`, world frame, the sum over members.
+    the source robot. theta: float64 [n, 13], the same before rounding to float32. information: float64 [n, 31] as in
+    `consensus.evidence`, world frame, the sum over members.
     robots: names. source: int32 [n], index into robots: whose Gaussian it was. source_ids: int64 [n], its id there.
     members: int32 [n], robots whose evidence is in it. matched: own Gaussians fused with others. added: taken over.
     """
 
     gaussians: Gaussians
+    theta: Array
     information: Array
     robots: tuple[str, ...]
     source: NDArray[np.int32]
@@ -223,6 +225,7 @@ def fuse(
     camera: PinholeCamera,
     config: FusionConfig,
     matching: MatchingConfig,
+    depth: DepthKind = "blended",
 ) -> FusedMap:
     """Fuse what a robot knows into one map in the world frame.
 
@@ -236,6 +239,7 @@ def fuse(
         depth_images: (own keyframe index, depth [H, W] in metres, 0 invalid), read once; for `coverage = all`.
         camera: of these depth images.
         matching: as the pairs were found; for splitting tracks that hold two Gaussians of one robot.
+        depth: of a Gaussian at a pixel, as the own map was made.
     """
     own = evidence[robot]
     if not np.array_equal(np.sort(own.ids), np.sort(gaussians.ids)):
@@ -273,7 +277,7 @@ def fuse(
     moved = gaussians if same_frame else gaussians.moved(T_map_keyframe, T_world_keyframe[robot])
     added = np.zeros(0, np.int64)
     if config.coverage == "all" and len(foreign):
-        surfaces = _surfaces(moved, T_world_keyframe[robot], depth_images, camera, config)
+        surfaces = _surfaces(moved, T_world_keyframe[robot], depth_images, camera, config, depth)
         added = _to_add(foreign, rows, sums, T_world_keyframe[robot], surfaces, camera, config)
 
     kept = _applied(moved, move[own_rows], rows.theta[own_rows, LOG_COVARIANCE])
@@ -284,6 +288,7 @@ def fuse(
     order = np.concatenate([own_rows, added])
     return FusedMap(
         gaussians=Gaussians.concatenate([kept, taken]),
+        theta=rows.theta[order] + move[order],
         information=sums[order],
         robots=names,
         source=owner[order].astype(np.int32),
@@ -361,6 +366,7 @@ def _surfaces(
     depth_images: Iterable[tuple[int, NDArray[np.float32]]],
     camera: PinholeCamera,
     config: FusionConfig,
+    depth: DepthKind,
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """What own keyframes know of surfaces: measured depth, rendered where it is missing, the farthest close by."""
     from scipy.ndimage import maximum_filter
@@ -368,10 +374,11 @@ def _surfaces(
     from pipeline.kernels import Rasterizer
 
     rasterizer = Rasterizer()
-    for keyframe, depth in depth_images:
-        render = rasterizer.forward(own_world, camera, se3.inverse(T_world_keyframe[keyframe]))
-        stands_in = (depth <= 0) & (render.alpha > config.explained_opacity)
-        filled = np.where(stands_in, render.depth / np.maximum(render.alpha, np.float32(1e-3)), depth)
+    for keyframe, measured in depth_images:
+        T_camera_world = se3.inverse(T_world_keyframe[keyframe])
+        render = rasterizer.forward(own_world, camera, T_camera_world, depth=depth)
+        stands_in = (measured <= 0) & (render.alpha > config.explained_opacity)
+        filled = np.where(stands_in, render.depth / np.maximum(render.alpha, np.float32(1e-3)), measured)
         yield keyframe, maximum_filter(filled, 2 * config.explained_px + 1)
 
 

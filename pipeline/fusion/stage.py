@@ -17,6 +17,7 @@ from pipeline.geometry.trajectory import Trajectory, write_tum
 from pipeline.messages import WORLD_FRAME, CorrectedKeyframes, GaussianInformation, GaussianMap, Odometry
 from pipeline.recording import LogWriter, read_log
 from pipeline.robot import AgentInput, AgentResult, RobotData, load
+from pipeline.splat.gaussians import DepthKind
 from pipeline.splat.ply import write_ply
 from schemas import topics
 
@@ -48,11 +49,12 @@ def run_fusion(
         own.camera,
         config,
         matching,
+        own.depth,
     )
     frames = _frames(source)
     stamp_ns = frames[-1].stamp_ns
     write_ply(folder / "fused.ply", fused.gaussians)
-    _write_log(folder / "fused.mcap", result, fused, stamp_ns)
+    _write_log(folder / "fused.mcap", result, fused, stamp_ns, own.depth)
     stamps = np.array([f.stamp_ns for f in frames], dtype=np.int64)
     before = np.array([f.T_map_camera for f in frames])
     write_tum(folder / "odometry.tum", Trajectory(stamps, before))
@@ -76,7 +78,7 @@ def _frames(source: AgentInput) -> list[Odometry]:
     return placed
 
 
-def _write_log(path: Path, result: AgentResult, fused: FusedMap, stamp_ns: int) -> None:
+def _write_log(path: Path, result: AgentResult, fused: FusedMap, stamp_ns: int, depth: DepthKind) -> None:
     robot = result.robot
     keyframes = CorrectedKeyframes(
         stamp_ns=stamp_ns,
@@ -86,7 +88,7 @@ def _write_log(path: Path, result: AgentResult, fused: FusedMap, stamp_ns: int) 
         T_world_keyframe=result.T_world_keyframe,
     )
     fused_map = GaussianMap(
-        stamp_ns, robot, WORLD_FRAME, fused.gaussians, _information(robot, fused, stamp_ns)
+        stamp_ns, robot, WORLD_FRAME, fused.gaussians, _information(robot, fused, stamp_ns), depth
     )
     with LogWriter(path, robot) as log:
         log.write(topics.CORRECTED_KEYFRAMES.of(robot), keyframes, stamp_ns, stamp_ns)

@@ -20,7 +20,7 @@ from pipeline.information.config import InformationConfig
 from pipeline.kernels import FisherSums, Rasterizer
 from pipeline.messages import GaussianInformation, GaussianMap, Keyframe, Odometry
 from pipeline.recording import LogWriter, open_rgbd, read_log
-from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.gaussians import DepthKind, Gaussians
 from schemas import topics
 
 MAD_TO_SIGMA = 1.4826
@@ -89,8 +89,8 @@ def run_information(
             frame = log.frame(keyframe.frame_index)
             views.append(View(frame.color, frame.depth, keyframe.T_map_camera, frame.mask))
         camera = log.camera
-    noise = estimate_noise(final.gaussians, camera, views, config, threads)
-    sums = sum_information(final.gaussians, camera, views, noise, config, threads)
+    noise = estimate_noise(final.gaussians, camera, views, config, threads, depth=final.depth)
+    sums = sum_information(final.gaussians, camera, views, noise, config, threads, depth=final.depth)
     result = GaussianInformation(
         stamp_ns=final.stamp_ns,
         robot=final.robot,
@@ -155,6 +155,7 @@ def estimate_noise(
     config: InformationConfig,
     threads: int = 1,
     every: int = 4,
+    depth: DepthKind = "blended",
 ) -> Noise:
     """Noise from the residuals of the map's own renders: 1.4826 times the median absolute residual.
 
@@ -171,7 +172,9 @@ def estimate_noise(
     mask[sample] = True
     for view in views:
         usable = mask if view.mask is None else mask & view.mask  # alpha is 0 elsewhere: not covered
-        render = rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera), mask=usable)
+        render = rasterizer.forward(
+            gaussians, camera, se3.inverse(view.T_map_camera), mask=usable, depth=depth
+        )
         alpha, z = render.alpha[sample].astype(np.float64), view.depth_m[sample].astype(np.float64)
         covered = alpha > 0.9
         difference = render.color[sample].astype(np.float64) - view.color[sample] / 255.0
@@ -179,11 +182,11 @@ def estimate_noise(
         both = covered & (z > 0)
         residual = render.depth[sample][both] / alpha[both] - z[both]
         depths.append(np.abs(residual) / unit.depth_sigma_m(z[both]))
-    color, depth = np.concatenate(colors), np.concatenate(depths)
+    color, units = np.concatenate(colors), np.concatenate(depths)
     color_sigma = MAD_TO_SIGMA * float(np.median(color)) if len(color) else 0.0
     factor = 1.0
-    if config.depth_factor_from_residuals and len(depth):
-        factor = MAD_TO_SIGMA * float(np.median(depth))
+    if config.depth_factor_from_residuals and len(units):
+        factor = MAD_TO_SIGMA * float(np.median(units))
         factor = float(np.clip(factor, config.depth_factor_min, config.depth_factor_max))
     return Noise(
         color_sigma=max(color_sigma, config.color_sigma_floor),
@@ -206,6 +209,7 @@ def sum_information(
     noise: Noise,
     config: InformationConfig,
     threads: int = 1,
+    depth: DepthKind = "blended",
 ) -> FisherSums:
     """One sweep over the views at the current Gaussians; the newest view is the last.
 
@@ -220,7 +224,7 @@ def sum_information(
     for view in reversed(chosen):
         inverse_variance = 1.0 / np.square(noise.depth_sigma_m(view.depth_m))
         inverse_depth = np.where(view.depth_m > 0, inverse_variance, 0.0).astype(np.float32)
-        rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera), mask=view.mask)
+        rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera), mask=view.mask, depth=depth)
         if config.window == "per_gaussian":
             one = FisherSums(len(gaussians))
             rasterizer.fisher(inverse_color, inverse_depth, one)

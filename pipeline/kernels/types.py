@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.splat.gaussians import DEPTH_KINDS, DepthKind
+
+__all__ = ["DEPTH_KINDS", "DepthKind"]
 
 FISHER_DIAGONAL_COLUMNS = 14
 GEOMETRY_COLUMNS = 45
 SMALLEST_HUBER = 1e-9  # its inverse, in float32, must leave room for residuals
 LARGEST_LOSS_WEIGHT = 1e9
-
-DepthKind: TypeAlias = Literal["blended", "ray_plane"]
-"""Depth of a Gaussian at a pixel: that of its centre, or of its mean along the ray (a flat disc: of its plane)."""
-DEPTH_KINDS: tuple[DepthKind, ...] = ("blended", "ray_plane")
 
 MaybeNone: TypeAlias = Any
 """Marks what is None on request only, so that the many who never ask need not check."""

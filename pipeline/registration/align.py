@@ -9,12 +9,16 @@ are each divided by their noise, weighted by Huber's function at a scale from th
 minimised together over the right tangent (translation, rotation) of T_reference_target and (gain, offset), from
 the coarsest pyramid level to the finest. Point-to-plane alone slides along walls, grey values alone know no scale;
 together they hold all six directions (Steinbruecker et al. 2011; Kerl et al. 2013; Park et al. 2017).
+
+Directions that the images do not determine (a bare wall) stay where the guess or its prior has them and carry zero
+information (solution remapping: Zhang, Kaess and Singh 2016).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +39,8 @@ TILES = (10, 8)  # columns and rows of the tiles over which correlated residuals
 class RegistrationConfig(Config):
     """Joint point-to-plane and photometric registration."""
 
+    residuals: Literal["joint", "depth", "gray"] = "joint"
+    """Which residuals count: both, point-to-plane only, or grey values only (for comparisons)."""
     iterations: tuple[int, ...] = (4, 5, 6)
     """Gauss-Newton steps per pyramid level, finest first."""
     depth_gate_m: float = 0.1
@@ -75,7 +81,8 @@ class RegistrationConfig(Config):
     max_gain: float = 2.0
     """The gain must lie between 1 / max_gain and max_gain; else RESIDUAL (covered lens, other scene)."""
     max_sigma_m: float = 0.03
-    """Largest standard deviation of the weakest direction at the median depth; more is ILL_CONDITIONED."""
+    """Directions with a larger standard deviation at the median depth are weak: they stay at the guess, or where the
+    prior pulls them, and carry no information. The outcome is ILL_CONDITIONED unless the prior knows them better."""
     max_translation_m: float = 0.3
     """Largest correction of the guess; more is JUMP."""
     max_rotation_rad: float = 0.35
@@ -102,7 +109,8 @@ class Registration:
     the told samples that stand in free space. rms_depth_m, rms_gray: weighted residuals. exposure: (gain, offset)
     with target grey = gain * reference grey + offset. samples: how many agree. overstated: factor by which the
     normal matrix was divided to give the information. condition: ratio of the largest to the smallest eigenvalue
-    of the information, rotations scaled by the median depth.
+    of the information before weak directions were taken out, rotations scaled by the median depth. weak: [m, 6],
+    directions in the right tangent that the images do not determine; the information is zero along them.
     """
 
     T_reference_target: Array
@@ -117,11 +125,17 @@ class Registration:
     samples: int
     overstated: float
     condition: float
+    weak: Array = field(default_factory=lambda: np.zeros((0, 6)))
 
     @property
     def ok(self) -> bool:
         """Whether the result may be used as a measurement."""
         return self.outcome is Outcome.OK
+
+    def weak_names(self) -> list[str]:
+        """The largest part of every weak direction in words, for example "translation x"."""
+        names = [f"{kind} {axis}" for kind in ("translation", "rotation") for axis in "xyz"]
+        return [names[int(np.argmax(np.abs(direction)))] for direction in self.weak]
 
 
 @dataclass(frozen=True)
@@ -194,6 +208,32 @@ def register(
     """
     config = config or RegistrationConfig()
     guess = _orthonormal(np.asarray(T_reference_target_guess, dtype=np.float64))
+    T, exposure, system = _minimise(reference, pyramid, guess, config, prior_information, _ALL_DIRECTIONS)
+    found = _Determined.by(system, config)
+    if len(found.weak) and system.agreeing >= config.min_samples:
+        # once more without the weak directions: what was found along them is noise
+        T, exposure, system = _minimise(
+            reference, pyramid, guess, config, prior_information, found.projection
+        )
+        found = _Determined.by(system, config).without(found)
+    return _judge(system, found, T, guess, exposure, config, prior_information)
+
+
+_ALL_DIRECTIONS = np.eye(6)
+
+
+def _minimise(
+    reference: Reference,
+    pyramid: RgbdPyramid,
+    guess: Array,
+    config: RegistrationConfig,
+    prior_information: Array | None,
+    projection: Array,
+) -> tuple[Array, Array, _Linearisation]:
+    """Pose, (gain, offset) and residuals at the minimum, from the coarsest level to the finest.
+
+    projection: [6, 6] P; the images count only along P x of a step x.
+    """
     T, exposure = guess, np.array([1.0, 0.0])
     levels = min(len(pyramid.levels), len(config.iterations), len(reference.levels))
     for index in reversed(range(levels)):
@@ -201,13 +241,12 @@ def register(
             system = _linearise(reference, pyramid, index, T, exposure, config)
             if system.agreeing < config.min_samples:
                 break
-            step = _step(system, T, guess, prior_information)
+            step = _step(system, T, guess, prior_information, projection)
             T = _orthonormal(T @ se3.exp(step[:6]))
             exposure = exposure + step[6:]
             if np.max(np.abs(step[:6])) < 1e-6:
                 break
-    system = _linearise(reference, pyramid, 0, T, exposure, config)
-    return _judge(system, T, guess, exposure, config)
+    return T, exposure, _linearise(reference, pyramid, 0, T, exposure, config)
 
 
 def _orthonormal(T: Array) -> Array:
@@ -215,15 +254,23 @@ def _orthonormal(T: Array) -> Array:
     return se3.from_rotation_translation(so3.project(T[:3, :3]), T[:3, 3])
 
 
-def _step(system: _Linearisation, T: Array, guess: Array, prior_information: Array | None) -> Array:
+def _step(
+    system: _Linearisation, T: Array, guess: Array, prior_information: Array | None, projection: Array
+) -> Array:
     """Gauss-Newton step [8], slightly damped, limited to 0.3 m and 0.3 rad."""
     H, gradient = system.normal_equations()
+    if projection is not _ALL_DIRECTIONS:
+        P = np.eye(8)
+        P[:6, :6] = projection
+        H, gradient = P.T @ H @ P, P.T @ gradient
     if prior_information is not None:
         H[:6, :6] += prior_information
         gradient[:6] += prior_information @ se3.log(se3.inverse(guess) @ T)
     # brightness is not observable on an untextured view: a weak pull keeps the system regular
     H[6:, 6:] += np.eye(2)
     step = -np.linalg.solve(_regular(H + 1e-6 * np.diag(np.diag(H))), gradient)
+    if prior_information is None:
+        step[:6] = projection @ step[:6]
     largest = np.max(np.abs(step[:6]))
     return np.asarray(step * min(1.0, 0.3 / largest) if largest > 0 else step)
 
@@ -283,8 +330,8 @@ def _linearise(
     images = gray, gu, gv
     photometric = _gray_residuals(camera, images, intensities, q, exposure, floor, (u, v), config)
     return _Linearisation(
-        depth,
-        photometric,
+        depth.nothing() if config.residuals == "gray" else depth,
+        photometric.nothing() if config.residuals == "depth" else photometric,
         overlap=len(agreeing) / max(total, 1),
         view=len(seen) / max(len(samples), 1),
         conflict=conflicts / max(told, 1),
@@ -387,18 +434,70 @@ def _weighted(
     return _Residuals(J, residual, weight, scale, pixels)
 
 
+@dataclass(frozen=True)
+class _Determined:
+    """What the residuals at one pose determine.
+
+    information: [6, 6]. weak: [m, 6] directions that are not determined. projection: [6, 6], takes a tangent to its
+    part along the other directions. sigma_m: of the weakest direction at the median depth, weak ones included.
+    """
+
+    information: Array
+    weak: Array
+    projection: Array
+    overstated: float
+    condition: float
+
+    @staticmethod
+    def by(system: _Linearisation, config: RegistrationConfig) -> _Determined:
+        H, _ = system.normal_equations()
+        overstated = _overstatement(system, H)
+        # the brightness was estimated with the pose: its uncertainty is the pose's too (Schur complement)
+        information = (H[:6, :6] - H[:6, 6:] @ np.linalg.solve(H[6:, 6:] + np.eye(2), H[6:, :6])) / overstated
+        information = 0.5 * (information + information.T)
+        lever = _lever(system)
+        values, vectors = np.linalg.eigh(information * np.outer(lever, lever))
+        known = values * config.max_sigma_m**2 >= 1
+        strong, projection = vectors[:, known], _ALL_DIRECTIONS
+        if not known.all():
+            projection = (lever[:, None] * strong) @ (strong.T / lever)
+            information = (strong * values[known]) @ strong.T / np.outer(lever, lever)
+        weak = (vectors[:, ~known] * lever[:, None]).T
+        weak = weak / np.linalg.norm(weak, axis=1, keepdims=True)
+        condition = float(values[-1] / values[0]) if values[0] > 0 else float("inf")
+        return _Determined(information, weak, projection, overstated, condition)
+
+    def without(self, before: _Determined) -> _Determined:
+        """The same with nothing known along the directions that were weak before."""
+        P = before.projection
+        information = P.T @ self.information @ P
+        return replace(
+            self,
+            information=0.5 * (information + information.T),
+            weak=before.weak,
+            projection=P,
+            condition=before.condition,
+        )
+
+
+def _lever(system: _Linearisation) -> Array:
+    """Scales of the tangent [6] by which a rotation counts as the displacement at the median depth."""
+    return np.array([1.0, 1.0, 1.0, *[1.0 / max(system.median_depth_m, 0.1)] * 3])
+
+
 def _judge(
-    system: _Linearisation, T: Array, guess: Array, exposure: Array, config: RegistrationConfig
+    system: _Linearisation,
+    found: _Determined,
+    T: Array,
+    guess: Array,
+    exposure: Array,
+    config: RegistrationConfig,
+    prior_information: Array | None,
 ) -> Registration:
-    """Information, outcome and figures of the final pose."""
-    H, _ = system.normal_equations()
-    overstated = _overstatement(system, H)
-    # the brightness was estimated with the pose: its uncertainty is the pose's too (Schur complement)
-    information = (H[:6, :6] - H[:6, 6:] @ np.linalg.solve(H[6:, 6:] + np.eye(2), H[6:, :6])) / overstated
-    information = 0.5 * (information + information.T)
-    lever = np.array([1.0, 1.0, 1.0, *[1.0 / max(system.median_depth_m, 0.1)] * 3])
-    values = np.linalg.eigvalsh(information * np.outer(lever, lever))
-    sigma_m = 1 / np.sqrt(values[0]) if values[0] > 0 else np.inf
+    """Outcome and figures of the final pose."""
+    lever = _lever(system)
+    known = found.information if prior_information is None else found.information + prior_information
+    weakest = float(np.linalg.eigvalsh(known * np.outer(lever, lever))[0])
     moved_m, turned_rad = se3.distance(guess, T)
     gain = exposure[0]
     if system.agreeing < config.min_samples or system.overlap < config.min_overlap:
@@ -410,7 +509,7 @@ def _judge(
         or not 1 / config.max_gain < gain < config.max_gain
     ):
         outcome = Outcome.RESIDUAL
-    elif not sigma_m < config.max_sigma_m:
+    elif weakest * config.max_sigma_m**2 < 1 - 1e-9:
         outcome = Outcome.ILL_CONDITIONED
     elif moved_m > config.max_translation_m or turned_rad > config.max_rotation_rad:
         outcome = Outcome.JUMP
@@ -418,7 +517,7 @@ def _judge(
         outcome = Outcome.OK
     return Registration(
         T,
-        information if system.agreeing >= config.min_samples else np.zeros((6, 6)),
+        found.information if system.agreeing >= config.min_samples else np.zeros((6, 6)),
         outcome,
         overlap=system.overlap,
         view=system.view,
@@ -427,8 +526,9 @@ def _judge(
         rms_gray=system.gray.rms(),
         exposure=(float(exposure[0]), float(exposure[1])),
         samples=system.agreeing,
-        overstated=overstated,
-        condition=float(values[-1] / values[0]) if values[0] > 0 else float("inf"),
+        overstated=found.overstated,
+        condition=found.condition,
+        weak=found.weak,
     )
 
 

@@ -269,12 +269,16 @@ def _view(robot: RobotRun, log: RgbdLog, frame: RgbdFrame, rasterizer: Rasterize
     """Image, own render, fused render; their depths; their errors."""
     renders = {
         "own": rasterizer.forward(
-            robot.own_map.gaussians, log.camera, se3.inverse(poses_by_stamp(robot.odometry)[frame.stamp_ns])
+            robot.own_map.gaussians,
+            log.camera,
+            se3.inverse(poses_by_stamp(robot.odometry)[frame.stamp_ns]),
+            depth=robot.own_map.depth,
         ),
         "fused": rasterizer.forward(
             robot.fused_map.gaussians,
             log.camera,
             se3.inverse(poses_by_stamp(robot.trajectory)[frame.stamp_ns]),
+            depth=robot.own_map.depth,
         ),
     }
     measured = frame.depth > 0

@@ -109,6 +109,7 @@ CONSENSUS = {
     "converged": ("Converged", "every robot agreed with its component before the last allowed round"),
     "rounds_to_tolerance": ("Rounds to tolerance", "until no pose moved by more than the tolerance"),
     "gap_to_oracle_sigma": ("Gap to oracle, Gaussians", "largest difference from the centralised answer"),
+    "gap_to_oracle_sigma_p99": ("Gap to oracle, 99 %", "of the matched Gaussians differ by less"),
     "gap_to_oracle_m": ("Gap to oracle, position", "largest difference of a keyframe from the centralised answer"),
     "gap_to_oracle_rad": ("Gap to oracle, rotation", "largest turn of a keyframe from the centralised answer"),
 }  # fmt: skip

@@ -68,10 +68,20 @@ class Adam:
         # running products, not powers: the same on every machine
         unbias_1 = 1.0 / (1.0 - np.cumprod(np.full(_LONGEST, BETA_1)))
         unbias_2 = 1.0 / (1.0 - np.cumprod(np.full(_LONGEST, BETA_2)))
-        self._corrections = (unbias_1 / np.sqrt(unbias_2)).astype(np.float32)
+        self._unbiased = (unbias_1 / np.sqrt(unbias_2)).astype(np.float32)
+        self._corrections = self._unbiased
 
     def __len__(self) -> int:
         return len(self._steps)
+
+    def freeze_after(self, steps: int | None) -> None:
+        """From now on leave Gaussians as they are, and their moments, once they took so many steps; None: never.
+
+        Their steps go on being counted.
+        """
+        self._corrections = self._unbiased.copy()
+        if steps is not None:
+            self._corrections[steps:] = 0.0
 
     def select(self, index: NDArray) -> None:
         """Keep the state of the Gaussians of a mask or an index array, in that order."""
@@ -94,6 +104,7 @@ class Adam:
         touched = (gradients.opacity_logits != 0) | (gradients.colors != 0).any(axis=1)
         rows = np.flatnonzero(touched)
         self._steps[rows] = np.minimum(self._steps[rows] + 1, _LONGEST)
+        rows = rows[self._corrections[self._steps[rows] - 1] > 0]
         correction = self._corrections[self._steps[rows] - 1]
         values = {name: getattr(gaussians, name).copy() for name in _SHAPES}
         for name, value in values.items():

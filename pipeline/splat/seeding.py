@@ -60,6 +60,17 @@ def unexplained(render: Rendered, color: Image, depth_m: Image, config: SeedingC
     return (depth_m > 0) & (thin | displaced | (error > config.color_error))
 
 
+def worst_drawn(render: Rendered, color: Image, depth_m: Image, pixels: int) -> NDArray[np.bool_]:
+    """The measured pixels [H, W], about `pixels` of them, whose squared colour error, smoothed, is largest."""
+    from scipy.ndimage import uniform_filter
+
+    error = uniform_filter(_mean_of_channels((render.color - color) ** 2), 3) * (depth_m > 0)
+    if not 0 < pixels < error.size:
+        return (error > 0) & (pixels > 0)
+    threshold = np.partition(error, error.size - pixels, axis=None)[error.size - pixels]
+    return (error >= threshold) & (error > 0)
+
+
 def _mean_of_channels(rgb: NDArray) -> NDArray:
     return (rgb[..., 0] + rgb[..., 1] + rgb[..., 2]) / 3  # numpy takes longer over so short an axis
 

@@ -193,6 +193,8 @@ def _write_robot(folder: Path, robot: str, index: int, component: list[str], joi
                     log.write(topics.KEYFRAME_FACTOR.of(robot), factor, int(stamps[k]))
                 update = MapUpdate(int(stamps[k]), robot, i, 100, 3, 100 * (i + 1), 0.5, 0.2)
                 log.write(topics.MAP_UPDATE.of(robot), update, int(stamps[k]))
+        dull = own.replace(colors=0.9 * own.colors)
+        log.write(topics.UNREFINED_MAP.of(robot), GaussianMap(end, robot, map_frame(robot), dull), end)
         log.write(topics.MAP.of(robot), GaussianMap(end, robot, map_frame(robot), own), end)
     with LogWriter(folder / "information.mcap", robot) as log:
         log.write(topics.INFORMATION.of(robot), information(robot, own), end)

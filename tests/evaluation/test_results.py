@@ -44,7 +44,8 @@ def test_mean_leaves_out_what_is_absent():
     [
         ("ate_rmse_m", "m"), ("ate_rmse_m_before_consensus", "m"), ("rpe_rot_rad", "rad"), ("psnr_db", "dB"),
         ("ms_ssim", "1"), ("depth_l1_exact_m", "m"), ("depth_completeness", "1"), ("bytes_sent", "B"), ("nll", "nat"),
-        ("gap_to_oracle_sigma", "sigma"), ("gap_to_oracle_m", "m"), ("rounds", "1"), ("sigma_scale", "1"),
+        ("gap_to_oracle_sigma", "sigma"), ("gap_to_oracle_sigma_p99", "sigma"),
+        ("gap_to_oracle_m", "m"), ("rounds", "1"), ("sigma_scale", "1"),
     ],
 )  # fmt: skip
 def test_units_follow_from_names(name, unit):

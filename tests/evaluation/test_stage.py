@@ -29,7 +29,10 @@ SCHEMA = {
         "robots": int, "robots_in_largest_component": int, "ate_rmse_m": NUMBER, "ate_rmse_m_mean_of_robots": NUMBER,
         "inter_robot_closures": int, "inter_robot_closures_rejected": int,
     },
-    "rendering": {kind: {"held_out": VIEWS, "training": VIEWS, "peers": VIEWS} for kind in ("own", "fused")},
+    "rendering": {
+        **{kind: {"held_out": VIEWS, "training": VIEWS, "peers": VIEWS} for kind in ("own", "fused")},
+        "own_unrefined": {"held_out": VIEWS},
+    },
     "calibration": dict.fromkeys(
         ("ece_paper", "ece_rank", "ece_rank_shuffled", "spearman", "ause", "nll", "coverage_95", "nll_scaled",
          "coverage_95_scaled", "sigma_scale", "gaussians", "gaussians_without_information"),
@@ -43,11 +46,11 @@ SCHEMA = {
     },
     "consensus": {
         "solver": str, "converged": bool, "rounds_to_tolerance": int, "gap_to_oracle_sigma": NUMBER,
-        "gap_to_oracle_m": NUMBER, "gap_to_oracle_rad": NUMBER,
+        "gap_to_oracle_sigma_p99": NUMBER, "gap_to_oracle_m": NUMBER, "gap_to_oracle_rad": NUMBER,
     },
     "protocol": dict.fromkeys(
         ("alignment", "ate", "team_ate", "rpe", "initial_relative_poses", "held_out", "peers", "training", "poses",
-         "exposure", "background", "psnr", "ssim", "ms_ssim", "depth", "calibration",
+         "exposure", "own_unrefined", "background", "psnr", "ssim", "ms_ssim", "depth", "calibration",
          "oracle"),
         str,
     ),
@@ -111,6 +114,10 @@ def test_trajectories_are_measured(metrics):
 
 def test_maps_are_rendered_from_held_out_and_training_views(metrics):
     fused, own = metrics["rendering"]["fused"], metrics["rendering"]["own"]
+    unrefined = metrics["rendering"]["own_unrefined"]["held_out"]
+    assert unrefined["views"] == own["held_out"]["views"]
+    assert unrefined["psnr_db"] < own["held_out"]["psnr_db"]  # the same map, a tenth darker
+    assert unrefined["depth_l1_m"] == own["held_out"]["depth_l1_m"]
     assert fused["held_out"]["views"] == 2 * 3  # frames 4, 12 and 20 of two robots
     assert fused["training"]["views"] == 2 * len(KEYFRAMES)
     for view_set in ("held_out", "training"):

@@ -13,7 +13,7 @@ import pytest
 
 from pipeline.consensus.config import PoseConsensusConfig
 from pipeline.exchange.agent import Agent
-from pipeline.exchange.config import ExchangeConfig, LinkConfig, TransportConfig
+from pipeline.exchange.config import ExchangeConfig, InjectionConfig, LinkConfig, TransportConfig
 from pipeline.exchange.packets import Kind, Packet, chunk_bytes, parse, serialise
 from pipeline.exchange.record import read_session
 from pipeline.exchange.replay import replay_agent_of
@@ -228,6 +228,40 @@ def test_a_copy_made_by_the_network_changes_nothing(
     assert all(same(results[robot], undisturbed[robot]) for robot in undisturbed)
     summary = next(iter(read_log(tmp_path / "exchange.mcap", ["/exchange/summary"]))).message()
     assert summary.bytes_delivered == 2 * summary.bytes_sent
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_injected_false_closures_are_found_out(
+    team: Any, undisturbed: dict[str, AgentResult], tmp_path: Path, seed: int
+) -> None:
+    faults = InjectionConfig(false_closures=0.3)
+    results = meet(team, 2, tmp_path, seed=seed, injection=faults)
+    closures = results["alpha"].closures
+    false = [c for c in closures if "injected" in c.detail]
+    true = [c for c in closures if c.T_own_peer is not None and "injected" not in c.detail]
+    assert len(false) == round(3 / 7 * len(true)) > 1
+    assert all(c.weight == 0.0 for c in false)  # they took part and lost
+    assert sum(c.weight is not None and c.weight > 0.5 for c in true) >= 0.9 * len(true)
+    for name, result in results.items():
+        assert result.converged
+        moved_m, _ = se3.distance(result.T_world_keyframe, undisturbed[name].T_world_keyframe)
+        assert moved_m.max() < 2e-3
+
+
+def test_missing_poses_cost_rounds_and_false_matches_are_as_many_as_asked_for(
+    team: Any, undisturbed: dict[str, AgentResult], tmp_path: Path
+) -> None:
+    faults = InjectionConfig(pose_dropouts=0.5, false_matches=0.4)
+    results = meet(team, 2, tmp_path, injection=faults)
+    for name, result in results.items():
+        assert result.converged
+        assert result.rounds > undisturbed[name].rounds
+        moved_m, _ = se3.distance(result.T_world_keyframe, undisturbed[name].T_world_keyframe)
+        assert moved_m.max() < 1e-4
+    true, mixed = (r["alpha"].pairs["alpha", "bravo"] for r in (undisturbed, results))
+    assert len(true) == len(mixed)
+    assert 0.2 < np.mean(np.any(true != mixed, axis=1)) < 0.6
+    assert np.array_equal(np.sort(true[:, 1]), np.sort(mixed[:, 1]))
 
 
 def test_a_link_that_dies_leaves_the_way_around(team: Any, tmp_path: Path) -> None:

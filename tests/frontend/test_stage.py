@@ -113,12 +113,12 @@ def test_two_runs_write_the_same_log(sensor_log: Path, frontend_log: Path) -> No
     again = sensor_log.with_name("again.mcap")
     timing = run_frontend(sensor_log, again, TRACKING)
     assert content_digest(again) == content_digest(frontend_log)
-    assert set(timing) == {"tracking_s", "refinement_s", "mapping_s", "writing_s"}
+    assert set(timing) == {"tracking_s", "refinement_s", "mapping_s", "final_refinement_s", "writing_s"}
 
 
 def test_map_is_grown_at_the_refined_keyframes(sensor_log: Path) -> None:
     out = sensor_log.with_name("mapped.mcap")
-    small = MappingConfig(max_gaussians=300, iterations=2, final_iterations=1)
+    small = MappingConfig(max_gaussians=300, iterations=2, final_iterations=1, depth="ray_plane")
     run_frontend(sensor_log, out, TRACKING.model_copy(update={"mapping_enabled": True, "mapping": small}))
     final = messages(out, topics.MAP)
     updates = messages(out, topics.MAP_UPDATE)
@@ -131,6 +131,13 @@ def test_map_is_grown_at_the_refined_keyframes(sensor_log: Path) -> None:
         [m.keyframe_index for m in keyframes] + [keyframes[-1].keyframe_index]
     )
     assert updates[-1].total == len(final[0].gaussians)
+    (unrefined,) = messages(out, topics.UNREFINED_MAP)
+    assert final[0].depth == unrefined.depth == "ray_plane"
+    assert len(unrefined.gaussians) == updates[-2].total
+    common = np.intersect1d(unrefined.gaussians.ids, final[0].gaussians.ids)
+    assert len(common) > 50  # the refinement replaces some and moves the others
+    colors = [m.gaussians.colors[np.isin(m.gaussians.ids, common)] for m in (unrefined, final[0])]
+    assert not np.array_equal(*colors)
 
 
 def test_held_out_and_lost_frames_never_support_the_map(frontend_log: Path) -> None:

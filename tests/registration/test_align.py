@@ -140,6 +140,58 @@ def test_untextured_wall_is_ill_conditioned():
     assert result.outcome is Outcome.ILL_CONDITIONED
 
 
+def wall(shift_px: float, textured: bool = True) -> RgbdPyramid:
+    """A plain wall 2 m away with vertical stripes 20 px wide, seen from `shift_px` further to the right."""
+    depth = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32)
+    u = np.arange(CAMERA.width) + shift_px
+    stripes = 0.5 + (0.3 if textured else 0.0) * np.sin(2 * np.pi * u / 20)
+    return RgbdPyramid.build(np.tile(stripes.astype(np.float32), (CAMERA.height, 1)), depth, CAMERA)
+
+
+def test_weak_directions_stay_at_the_guess_and_carry_no_information():
+    """On stripes the height is unknown; everything else is known and found, nothing is made up."""
+    moved_m = 2.0 * 2.0 / CAMERA.fx  # 2 px
+    guess = se3.exp(np.array([0, 0.05, 0.01, 0, 0, 0]))
+    result = register(Reference.from_pyramid(wall(0), STRIDES), wall(2.0), guess)
+    assert result.outcome is Outcome.ILL_CONDITIONED
+    assert result.weak_names() == ["translation y"]
+    assert np.abs(result.information @ result.weak[0]).max() < 1e-6 * np.abs(result.information).max()
+    assert np.linalg.matrix_rank(result.information, tol=1.0) == 5
+    found = se3.log(result.T_reference_target)
+    np.testing.assert_allclose(found, [moved_m, 0.05, 0, 0, 0, 0], atol=2e-3)
+
+
+def test_a_prior_that_knows_the_weak_directions_makes_a_measurement():
+    reference, target = Reference.from_pyramid(wall(0), STRIDES), wall(2.0)
+    guess = se3.exp(np.array([0, 0.05, 0.01, 0, 0, 0]))
+    prior = np.diag([1.0, 1e4, 1.0, 1.0, 1.0, 1.0])  # the height to 1 cm, the rest to 1 m
+    result = register(reference, target, guess, prior_information=prior)
+    assert result.ok
+    assert result.weak_names() == ["translation y"]
+    assert np.abs(result.information @ result.weak[0]).max() < 1e-6 * np.abs(result.information).max()
+    assert abs(se3.log(result.T_reference_target)[1] - 0.05) < 1e-3
+
+
+def test_bare_wall_names_three_weak_directions():
+    bare = wall(0, textured=False)
+    result = register(Reference.from_pyramid(bare, STRIDES), bare, np.eye(4))
+    assert result.outcome is Outcome.ILL_CONDITIONED
+    assert set(result.weak_names()) == {"translation x", "translation y", "rotation z"}
+    assert np.linalg.matrix_rank(result.information, tol=1e-3 * result.information.max()) == 3
+
+
+@pytest.mark.parametrize(("residuals", "limit_m"), [("depth", 0.05), ("gray", 3e-3)])
+def test_each_kind_of_residual_can_be_used_alone(reference, end, residuals, limit_m):
+    config = RegistrationConfig(residuals=residuals, max_sigma_m=1.0)
+    result = register(reference, end, np.eye(4), config)
+    joint = register(reference, end, np.eye(4))
+    error_m = se3.distance(T_START_END, result.T_reference_target)[0]
+    assert error_m < limit_m
+    unused = {"depth": result.rms_gray, "gray": result.rms_depth_m}[residuals]
+    assert unused == 0 < min(joint.rms_gray, joint.rms_depth_m)
+    assert np.trace(result.information) < np.trace(joint.information) * joint.overstated / result.overstated
+
+
 def test_no_depth_is_low_overlap_and_carries_no_information(reference):
     gray, depth = render(END)
     result = register(reference, RgbdPyramid.build(gray, np.zeros_like(depth), CAMERA), np.eye(4))

@@ -43,7 +43,6 @@ def test_the_page_shows_numbers_with_units_pictures_and_reasons(html):
         "800 B",
         "alpha, frame 4",
         "bravo, frame 20",
-        "the centralised answer about Gaussians is not computed",
         "LPIPS needs the weights of a trained network",
         "tolerance = 1e-5",
         "index % 8 == 4",

@@ -78,6 +78,24 @@ def test_a_gaussian_does_not_depend_on_its_neighbours(adam_of: type[Adam]) -> No
 
 
 @pytest.mark.parametrize("adam_of", [Adam, CompiledAdam])
+def test_a_stable_gaussian_stays_until_it_is_freed(adam_of: type[Adam]) -> None:
+    gaussians, adam = some(3), adam_of(2)
+    first = gaussians.select([0, 1])
+    adam.freeze_after(2)
+    for k in range(2):
+        first = adam.step(first, gradients(2, k), LearningRates())
+    adam.extend(1)
+    both = Gaussians.concatenate([first, gaussians.select([2])])
+    after = adam.step(both, gradients(3, 5), LearningRates())
+    for name in NAMES:
+        np.testing.assert_array_equal(getattr(after, name)[:2], getattr(first, name))
+        assert (getattr(after, name)[2] != getattr(gaussians, name)[2]).all()
+    adam.freeze_after(None)
+    freed = adam.step(after, gradients(3, 6), LearningRates())
+    assert all((getattr(freed, name)[:2] != getattr(first, name)).all() for name in NAMES)
+
+
+@pytest.mark.parametrize("adam_of", [Adam, CompiledAdam])
 def test_a_new_gaussian_starts_afresh(adam_of: type[Adam]) -> None:
     gaussians, adam = some(3), adam_of(2)
     first = gaussians.select(slice(2))

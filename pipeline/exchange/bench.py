@@ -1,0 +1,320 @@
+"""How much it costs a team to agree on matched Gaussians: rounds, bytes and time of every mode, against one optimum.
+
+Made teams: every robot has evidence on every track, with information spread over a contrast and a share of it
+missing. `evidence` travels as in an exchange, over the real transport with acknowledgements, compact, in float32 or in
+float64; `admm` and `paper` send float64 values in every round. Loss is drawn by the link model. The optimum is
+computed with everybody's evidence at hand, which no robot has; for `paper`, whose weights are per coordinate, it is
+that of those weights.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import progress, streams
+from pipeline.consensus.evidence import Evidence, pack_information
+from pipeline.consensus.gaussians import (
+    COORDINATES,
+    GaussianAgent,
+    GaussianConsensusConfig,
+    Shares,
+    Weights,
+    optimum,
+    total_weights,
+)
+from pipeline.exchange import wire
+from pipeline.exchange.config import LinkConfig, TransportConfig
+from pipeline.exchange.links import LinkModel, neighbours
+from pipeline.exchange.packets import EVIDENCE_HEAD_BYTES, HEADER_BYTES, MAX_PAYLOAD_BYTES, Kind, parse
+from pipeline.exchange.transport import Message, Transport
+
+Array = NDArray[np.float64]
+PERIOD_NS = 100_000_000
+EVIDENCE_MODES = {
+    "evidence": Kind.EVIDENCE,
+    "evidence_float32": Kind.EVIDENCE_EXACT,
+    "evidence_float64": Kind.EVIDENCE_DOUBLE,
+}
+MODES = (*EVIDENCE_MODES, "admm", "paper")
+PAPER_BYTES_PER_PAIR = 28 * 4  # what the paper counts per matched pair and round
+_PACKET_HEAD_BYTES = 12  # sequence, first row, counts
+_NEAR_SIGMA, _AT_SIGMA = 0.05, 1e-6
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to measure; every combination."""
+
+    robots: tuple[int, ...] = (2, 4, 8)
+    topologies: tuple[str, ...] = ("full", "ring", "chain")
+    losses: tuple[float, ...] = (0.0, 0.3, 0.6, 0.9)
+    contrasts: tuple[float, ...] = (47.0, 1e4)
+    unknown: tuple[float, ...] = (0.0, 0.2)
+    modes: tuple[str, ...] = MODES
+    tracks: int = 200
+    max_rounds: int = 3000
+    seed: int = 0
+
+    def cases(self) -> list[dict[str, Any]]:
+        """One entry per row of the result; a ring of two is left out."""
+        names = ("topology", "robots", "contrast", "unknown", "loss", "mode")
+        values = itertools.product(
+            self.topologies, self.robots, self.contrasts, self.unknown, self.losses, self.modes
+        )
+        cases: list[dict[str, Any]] = [dict(zip(names, row, strict=True)) for row in values]
+        return [c for c in cases if c["robots"] > 2 or c["topology"] == "full"]
+
+
+@dataclass
+class _Team:
+    """Evidence of a made team in the common frame."""
+
+    names: list[str]
+    linked: dict[str, tuple[str, ...]]
+    theta: dict[str, Array]
+    weights: dict[str, Weights]
+    best: Array = field(init=False)
+    roots: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        tracks = len(self.theta[self.names[0]])
+        weights, rows = [self.weights[n] for n in self.names], [np.arange(tracks)] * len(self.names)
+        self.best = optimum([self.theta[n] for n in self.names], weights, rows, tracks)
+        self.roots = np.sqrt(total_weights(weights, rows, tracks).diagonal())
+
+    @staticmethod
+    def made(case: dict[str, Any], plan: Plan) -> _Team:
+        names = [f"robot_{k}" for k in range(case["robots"])]
+        link = LinkConfig(topology=case["topology"])
+        theta, weights = {}, {}
+        shape = (plan.tracks, COORDINATES)
+        truth = streams.generator(plan.seed, "bench.truth").normal(size=shape)
+        for name in names:
+            rng = streams.generator(plan.seed, "bench.evidence", robot=name)
+            diagonal = 100 * np.exp(rng.uniform(0, np.log(case["contrast"]), shape))
+            diagonal[rng.random(plan.tracks) < case["unknown"]] = 0.0
+            W = Weights.of_diagonal(diagonal)
+            if case["mode"] != "paper":
+                for blocks, size in ((W.position, 3), (W.shape, 6)):
+                    Q = np.linalg.qr(rng.normal(size=(plan.tracks, size, size)))[0]
+                    blocks[:] = Q @ blocks @ Q.swapaxes(1, 2)
+            spread = W.inverse().diagonal()
+            weights[name] = W
+            theta[name] = truth + np.sqrt(np.where(spread > 0, spread, 1.0)) * rng.normal(size=shape)
+        return _Team(names, neighbours(link, names), theta, weights)
+
+    def gap_sigma(self, name: str, x: Array) -> float:
+        return float(np.max(np.abs(x - self.best) * self.roots, initial=0.0))
+
+
+@dataclass
+class _Cost:
+    """What a session cost so far."""
+
+    rounds: int = 0
+    bytes: int = 0
+    seconds: float = 0.0
+    gap_sigma: float = np.inf
+    rounds_near: int | None = None
+    bytes_near: int | None = None
+    rounds_at: int | None = None
+
+    def note(self, gap_sigma: float) -> None:
+        self.gap_sigma = gap_sigma
+        if gap_sigma < _NEAR_SIGMA and self.rounds_near is None:
+            self.rounds_near, self.bytes_near = self.rounds, self.bytes
+        if gap_sigma < _AT_SIGMA and self.rounds_at is None:
+            self.rounds_at = self.rounds
+
+
+def run(plan: Plan) -> dict[str, Any]:
+    """Measure; see `Plan`. One row per case: times are CPU time of all robots together."""
+    rows = []
+    cases = plan.cases()
+    for case in progress.track(iter(cases), "consensus of Gaussians", len(cases)):
+        team = _Team.made(case, plan)
+        model = LinkModel(LinkConfig(topology=case["topology"], loss_probability=case["loss"]), plan.seed)
+        cost = (_rounds if case["mode"] in ("admm", "paper") else _evidence)(team, model, case, plan)
+        pairs = plan.tracks * sum(len(peers) for peers in team.linked.values()) // 2
+        rows.append(
+            {
+                **case,
+                "rounds_to_0.05_sigma": cost.rounds_near,
+                "rounds_to_1e-6_sigma": cost.rounds_at,
+                "bytes_to_0.05_sigma": cost.bytes_near,
+                "gap_sigma": cost.gap_sigma,
+                "rounds": cost.rounds,
+                "bytes": cost.bytes,
+                "bytes_paper_accounting": None
+                if case["mode"].startswith("evidence")
+                else pairs * PAPER_BYTES_PER_PAIR * cost.rounds,
+                "cpu_s": cost.seconds,
+            }
+        )
+    return {"plan": {k: list(v) if isinstance(v, tuple) else v for k, v in vars(plan).items()}, "rows": rows}
+
+
+def _rounds(team: _Team, model: LinkModel, case: dict[str, Any], plan: Plan) -> _Cost:
+    """Rounds of `admm` or `paper` until the optimum, or until nothing moves any more."""
+    config = GaussianConsensusConfig(mode=case["mode"], wire="float64")
+    shares = Shares.of({n: np.arange(plan.tracks) for n in team.names}, team.linked)
+    agents = {
+        n: GaussianAgent(
+            team.theta[n],
+            team.weights[n],
+            {peer: shares.shared[min(n, peer), max(n, peer)] for peer in team.linked[n]},
+            config,
+        )
+        for n in team.names
+    }
+    cost = _Cost()
+    sequences: dict[tuple[str, str], Iterator[int]] = {}
+    for round_index in range(plan.max_rounds):
+        begun = time.process_time()
+        sent = []
+        for name, agent in agents.items():
+            for peer in team.linked[name]:
+                counter = sequences.setdefault((name, peer), itertools.count())
+                for part in agent.outgoing(peer).parts(MAX_PAYLOAD_BYTES - _PACKET_HEAD_BYTES):
+                    size = HEADER_BYTES + _PACKET_HEAD_BYTES + part.size_bytes
+                    cost.bytes += size
+                    if model.fate(name, peer, next(counter), round_index * PERIOD_NS, size).delivered:
+                        sent.append((name, peer, part))
+        for name, peer, part in sent:
+            agents[peer].receive(name, part)
+        for agent in agents.values():
+            agent.step()
+        cost.seconds += time.process_time() - begun
+        cost.rounds = round_index + 1
+        cost.note(max(team.gap_sigma(n, agent.x) for n, agent in agents.items()))
+        still = max(agent.change_sigma for agent in agents.values()) < 1e-12
+        if cost.rounds_at is not None or (still and round_index > 200):
+            break
+    return cost
+
+
+def _evidence(team: _Team, model: LinkModel, case: dict[str, Any], plan: Plan) -> _Cost:
+    """Every robot's evidence goes once along the shortest ways to everybody; each sums up what it has."""
+    kind = EVIDENCE_MODES[case["mode"]]
+    index = {name: k for k, name in enumerate(team.names)}
+    children = {owner: _tree(owner, team.linked) for owner in team.names}
+    payloads = {
+        n: wire.write_evidence(kind, index[n], 1, wire.to_body(kind, _records(team, n, kind)))
+        for n in team.names
+    }
+    ids = {name: itertools.count(1) for name in team.names}
+    ends = {
+        (n, peer): Transport(index[n], index[peer], peer, TransportConfig(), ids[n].__next__)
+        for n in team.names
+        for peer in team.linked[n]
+    }
+    known = {name: {name: payloads[name]} for name in team.names}
+    for name in team.names:
+        for child in children[name][name]:
+            ends[name, child].send(Message(next(ids[name]), kind, payloads[name]))
+    cost = _Cost()
+    for round_index in range(plan.max_rounds):
+        begun = time.process_time()
+        sent = []
+        for (name, peer), end in ends.items():
+            beacon = [] if end.idle and round_index else [Message(next(ids[name]), Kind.STATE, b"")]
+            for out in end.burst(round_index, beacon, LinkConfig().budget_bytes):
+                packet = parse(out.packet)
+                size = len(out.packet)
+                cost.bytes += size
+                if model.fate(name, peer, packet.sequence, round_index * PERIOD_NS, size).delivered:
+                    sent.append((name, peer, packet))
+        for name, peer, packet in sent:
+            arrival = ends[peer, name].receive(packet, round_index)
+            if arrival is None or not arrival.complete or arrival.kind is not kind:
+                continue
+            owner = team.names[
+                wire.read_evidence_head(kind, arrival.payload[:EVIDENCE_HEAD_BYTES], len(team.names))[0]
+            ]
+            known[peer][owner] = arrival.payload
+            for child in children[owner][peer]:
+                ends[peer, child].send(Message(next(ids[peer]), kind, arrival.payload))
+        cost.rounds = round_index + 1
+        complete = all(len(k) == len(team.names) for k in known.values())
+        if complete:
+            sums = {name: _sum(kind, payload, len(team.names)) for name, payload in known.items()}
+        cost.seconds += time.process_time() - begun
+        if complete:
+            cost.note(max(team.gap_sigma(n, x) for n, x in sums.items()))
+            break
+    return cost
+
+
+def _sum(kind: Kind, payloads: dict[str, bytes], team: int) -> Array:
+    """What a robot makes of the evidence that it has, its own as the others read it."""
+    theta, weights = [], []
+    for _, payload in sorted(payloads.items()):
+        _, _, records = wire.read_evidence(kind, payload, team)
+        theta.append(records["theta"].astype(np.float64))
+        evidence = Evidence(
+            "", records["id"], records["anchor"], theta[-1], records["information"].astype(np.float64)
+        )
+        weights.append(Weights.of(evidence))
+    tracks = len(theta[0])
+    return optimum(theta, weights, [np.arange(tracks)] * len(theta), tracks)
+
+
+def _tree(owner: str, linked: dict[str, tuple[str, ...]]) -> dict[str, list[str]]:
+    """To whom each robot hands on what came from `owner`: a tree of shortest ways, ties by name."""
+    children: dict[str, list[str]] = {name: [] for name in linked}
+    seen, queue = {owner}, [owner]
+    while queue:
+        name = queue.pop(0)
+        for peer in linked[name]:
+            if peer not in seen:
+                seen.add(peer)
+                queue.append(peer)
+                children[name].append(peer)
+    return children
+
+
+def _records(team: _Team, name: str, kind: Kind) -> NDArray[Any]:
+    """A robot's evidence as records of the wire."""
+    W, theta = team.weights[name], team.theta[name]
+    out = np.zeros(len(theta), wire.record_dtype(kind))
+    out["id"] = np.arange(len(theta))
+    out["theta"] = theta
+    out["information"] = pack_information(W.position, W.shape, W.color, W.opacity)
+    return out
+
+
+def format_table(result: dict[str, Any]) -> str:
+    """The rows as a Markdown table."""
+    head = ["topology", "robots", "contrast", "unknown", "loss", "mode", "rounds to 0.05 sigma", "to 1e-6"]
+    head += ["end, rounds", "gap, sigma", "kB", "kB as the paper counts", "CPU s"]
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    for r in result["rows"]:
+        paper = r["bytes_paper_accounting"]
+        cells = [
+            r["topology"],
+            r["robots"],
+            f"{r['contrast']:g}",
+            f"{r['unknown']:g}",
+            f"{r['loss']:g}",
+            r["mode"],
+            _or_dash(r["rounds_to_0.05_sigma"]),
+            _or_dash(r["rounds_to_1e-6_sigma"]),
+            r["rounds"],
+            f"{r['gap_sigma']:.1e}",
+            round(r["bytes"] / 1000),
+            "-" if paper is None else round(paper / 1000),
+            f"{r['cpu_s']:.2f}",
+        ]
+        lines.append("| " + " | ".join(str(c) for c in cells) + " |")
+    return "\n".join(lines)
+
+
+def _or_dash(value: int | None) -> str:
+    return "-" if value is None else str(value)

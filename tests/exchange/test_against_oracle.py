@@ -1,0 +1,122 @@
+"""On a wire that rounds nothing, what robots agree on is what one computer with everybody's data would say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.consensus.closures import Closure
+from pipeline.consensus.config import MatchingConfig, PoseConsensusConfig
+from pipeline.consensus.evidence import Evidence
+from pipeline.consensus.gaussians import Weights
+from pipeline.consensus.poses import with_floor
+from pipeline.evaluation.oracle import WeightedClosure, pose_gap, solve_component
+from pipeline.exchange.config import ExchangeConfig, LinkConfig
+from pipeline.exchange.session import run_session_of
+from pipeline.fusion.config import FusionConfig
+from pipeline.fusion.fuse import fuse
+from pipeline.geometry import se3
+from pipeline.robot import AgentResult, RobotData, factors_of
+
+NAMES = ("alpha", "bravo", "charlie", "delta", "echo", "foxtrot", "golf", "hotel")
+BURSTS = {"burst_gap_ns": 900_000_000, "burst_length_ns": 300_000_000}
+
+
+def meet(data: list[RobotData], folder: Path, **link: Any) -> tuple[dict[str, AgentResult], ExchangeConfig]:
+    config = ExchangeConfig(
+        link=LinkConfig(**link),
+        evidence_wire="float64",
+        consensus=PoseConsensusConfig(wire="float64", tolerance=1e-12),
+        max_rounds=20_000,
+    )
+    results = run_session_of(
+        data, config, seed=0, exchange_path=folder / "exchange.mcap", consensus_path=folder / "consensus.mcap"
+    )
+    return results, config
+
+
+def oracle_poses(
+    data: list[RobotData], results: dict[str, AgentResult], config: PoseConsensusConfig
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The robots' poses, and the centralised answer to the same factors, closures and final weights."""
+    poses = {d.robot: results[d.robot].T_world_keyframe for d in data}
+    odometry = {d.robot: with_floor(factors_of(d.registrations), config) for d in data}
+    closures = [
+        WeightedClosure(
+            c.robot, c.peer, Closure(c.own_keyframe, c.peer_keyframe, c.T_own_peer, c.information), c.weight
+        )
+        for result in results.values()
+        for c in result.closures
+        if c.weight is not None and c.T_own_peer is not None and c.information is not None
+    ]
+    rng = np.random.default_rng(0)
+    start = {}
+    for name, T in poses.items():  # another start, so that nobody is right by standing still
+        start[name] = T @ se3.exp(0.003 * rng.normal(size=(len(T), 6)))
+    start[min(start)][0] = poses[min(start)][0]  # which fixes the gauge
+    central = solve_component(start, odometry, closures, config)
+    assert isinstance(central, dict)
+    return poses, central
+
+
+def fused_theta(
+    data: list[RobotData], name: str, evidence: dict[str, Evidence], poses: dict[str, np.ndarray], pairs: Any
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """theta of a robot's own Gaussians after fusion, roots of their information, and which were matched."""
+    own = next(d for d in data if d.robot == name)
+    fused = fuse(
+        name,
+        own.gaussians,
+        own.T_map_keyframe,
+        evidence,
+        poses,
+        pairs,
+        (),
+        own.camera,
+        FusionConfig(coverage="overlap"),
+        MatchingConfig(),
+    )
+    n = len(own.gaussians)
+    whole = Evidence(name, own.gaussians.ids, own.gaussians.anchors, fused.theta[:n], fused.information[:n])
+    return whole.theta, np.sqrt(Weights.of(whole).diagonal()), fused.members[:n] > 1
+
+
+@pytest.mark.parametrize(
+    ("robots", "link"),
+    [
+        (2, {}),
+        (2, {"loss_probability": 0.3, **BURSTS}),
+        (3, {"topology": "chain", "loss_probability": 0.3}),
+        pytest.param(4, {"topology": "ring", "loss_probability": 0.6}, marks=pytest.mark.slow),
+        pytest.param(4, {"topology": "full", "loss_probability": 0.9}, marks=pytest.mark.slow),
+        pytest.param(8, {"topology": "chain"}, marks=pytest.mark.slow),
+        pytest.param(8, {"topology": "full", "loss_probability": 0.3, **BURSTS}, marks=pytest.mark.slow),
+    ],
+)
+def test_the_team_is_at_the_oracle(
+    make_robot: Any, tmp_path: Path, robots: int, link: dict[str, Any]
+) -> None:
+    data = [make_robot(name, 0.6 * i, keyframes=4)[0] for i, name in enumerate(NAMES[:robots])]
+    results, config = meet(data, tmp_path, **link)
+    assert all(result.converged for result in results.values())
+    assert all(result.component == NAMES[:robots] for result in results.values())
+    poses, central = oracle_poses(data, results, config.consensus)
+    metres, radians = pose_gap(poses, central)
+    assert metres < 1e-9
+    assert radians < 1e-9
+    exact = {d.robot: Evidence.from_map(d.robot, d.gaussians, d.information, d.T_map_keyframe) for d in data}
+    gaps = []
+    for d in data:
+        result = results[d.robot]
+        heard = {d.robot: result.own_evidence, **result.evidence}
+        theta, _, matched = fused_theta(data, d.robot, heard, result.T_world_keyframe_of, result.pairs)
+        best, roots, _ = fused_theta(data, d.robot, exact, central, result.pairs)
+        gaps.append((np.abs(theta - best) * roots)[matched])
+    gap_sigma = np.concatenate(gaps)
+    rounds = max(r.rounds for r in results.values())
+    print(f"{robots} robots, {link}: {rounds} rounds, {metres:.1e} m, {gap_sigma.max():.1e} sigma")
+    assert len(gap_sigma) > 10
+    assert gap_sigma.max() < 1e-6
