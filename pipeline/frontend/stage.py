@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pipeline import progress as progress_bar
 from pipeline.errors import DuagError
 from pipeline.frontend.config import FrontendConfig, is_held_out
+from pipeline.frontend.failure import Reason
 from pipeline.frontend.keyframes import KeyframePair, Refined, refine, relative_information
 from pipeline.frontend.tracking import Status, TrackedFrame, TrackedKeyframe, Tracker
 from pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
@@ -57,6 +58,11 @@ def run_frontend(
         if len(log) == 0:
             raise DuagError(f"{log_path}: has no image, expected at least one")
         tracker, frames = _track(log, config, progress)
+        if not tracker.keyframes:
+            reasons = sorted({frame.reason.value for frame in frames})
+            raise DuagError(
+                f"{log_path}: found no frame to begin a map with ({', '.join(reasons)}), expected one with depth"
+            )
         clock.lap("tracking_s")
         refined = refine(
             np.array([k.T_map_keyframe for k in tracker.keyframes]),
@@ -205,6 +211,7 @@ def _support(
         frame
         for frame in frames
         if frame.status is not Status.LOST
+        and frame.reason is Reason.NONE  # its depth belongs to it
         and frame.frame_index not in taken
         and not is_held_out(frame.frame_index)
     ]
@@ -227,6 +234,7 @@ def _odometry(robot: str, frame: TrackedFrame, T_map_keyframes: Array) -> Odomet
         overlap=frame.overlap,
         rms_depth_m=frame.rms_depth_m,
         rms_color=frame.rms_gray,
+        reason=frame.reason.value,
     )
 
 
