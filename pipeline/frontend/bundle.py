@@ -11,7 +11,7 @@ find wrong ones. The quadratics of the last round are the factors of the robot's
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,33 +31,22 @@ from pipeline.registration import (
     linearise,
     register,
 )
-from pipeline.registration.features import DIMENSIONS, Features, extract, matches, ransac
+from pipeline.registration.features import Features, matches, ransac
 
 Array = NDArray[np.float64]
-NO_FEATURES = Features(np.zeros((0, DIMENSIONS), np.uint8), np.zeros((0, 3), np.float32))
 SETTLED = 1e-4  # m, rad: Gauss-Newton steps shrink fast, what is left after such a one is far smaller
 UNUSABLE = (Outcome.LOW_OVERLAP, Outcome.RESIDUAL)  # weak directions carry no information and do no harm
 
 
-@dataclass(frozen=True)
-class View:
-    """What is kept of a keyframe in memory: samples at all levels, the coarsest image, features if loops are sought."""
+class View(Protocol):
+    """What is kept of a keyframe in memory: samples at all levels, the coarsest image, features."""
 
-    reference: Reference
-    coarsest: Level
-    features: Features
-
-    @staticmethod
-    def of(reference: Reference, pyramid: RgbdPyramid, config: LoopConfig) -> View:
-        """The view of a keyframe; features come from the finest image that is not wider than the limit."""
-        if not config.enabled:
-            return View(reference, pyramid.levels[-1], NO_FEATURES)
-        level = next((x for x in pyramid.levels if x.camera.width <= config.max_width_px), pyramid.levels[-1])
-        image = np.rint(level.gray * 255).clip(0, 255).astype(np.uint8)
-        known = level.inverse_depth > 0
-        depth = np.where(known, 1 / np.where(known, level.inverse_depth, 1), 0).astype(np.float32)
-        features = extract(np.repeat(image[..., None], 3, axis=2), depth, level.camera, config.features)
-        return View(reference, pyramid.levels[-1], features)
+    @property
+    def reference(self) -> Reference: ...
+    @property
+    def coarsest(self) -> Level: ...
+    @property
+    def features(self) -> Features: ...
 
 
 Images = Callable[[int], RgbdPyramid]

@@ -19,6 +19,7 @@ from pipeline import progress as progress_bar
 from pipeline.errors import DuagError
 from pipeline.frontend import bundle
 from pipeline.frontend.config import FrontendConfig, is_held_out
+from pipeline.frontend.failure import Reason
 from pipeline.frontend.keyframes import KeyframePair, Refined, refine
 from pipeline.frontend.tracking import Status, TrackedFrame, TrackedKeyframe, Tracker
 from pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
@@ -59,6 +60,11 @@ def run_frontend(
         if len(log) == 0:
             raise DuagError(f"{log_path}: has no image, expected at least one")
         tracker, frames = _track(log, config, progress)
+        if not tracker.keyframes:
+            reasons = sorted({frame.reason.value for frame in frames})
+            raise DuagError(
+                f"{log_path}: found no frame to begin a map with ({', '.join(reasons)}), expected one with depth"
+            )
         clock.lap("tracking_s")
         refined, pairs = _refine(log, tracker, config, seed)
         keyframes = _keyframe_messages(log.robot, tracker.keyframes, refined)
@@ -100,19 +106,15 @@ def _refine(
         return RgbdPyramid.build(frame.color * np.float32(1 / 255), depth, log.camera, levels)
 
     registration, levels = config.tracking.registration, len(config.tracking.strides)
-    views = [
-        bundle.View.of(keyframe.reference, images(index, levels), settings.loops)
-        for index, keyframe in enumerate(keyframes)
-    ]
     pairs = list(tracker.pairs)
     if settings.loops.enabled:
         tracked = refine(start, pairs, settings.huber_sigmas).T_map_keyframe
         pairs += bundle.find_loops(
-            tracked, views, lambda k: images(k, levels), settings.loops, registration, seed, log.robot
+            tracked, keyframes, lambda k: images(k, levels), settings.loops, registration, seed, log.robot
         )
     if not settings.local_optimisation:
         return refine(start, pairs, settings.huber_sigmas), pairs
-    return bundle.optimise(start, views, images, pairs, settings, registration)
+    return bundle.optimise(start, keyframes, images, pairs, settings, registration)
 
 
 def _keyframe_messages(robot: str, keyframes: Sequence[TrackedKeyframe], refined: Refined) -> list[Keyframe]:
@@ -233,6 +235,7 @@ def _support(
         frame
         for frame in frames
         if frame.status is not Status.LOST
+        and frame.reason is Reason.NONE  # its depth belongs to it
         and frame.frame_index not in taken
         and not is_held_out(frame.frame_index)
     ]
@@ -255,6 +258,7 @@ def _odometry(robot: str, frame: TrackedFrame, T_map_keyframes: Array) -> Odomet
         overlap=frame.overlap,
         rms_depth_m=frame.rms_depth_m,
         rms_color=frame.rms_gray,
+        reason=frame.reason.value,
     )
 
 

@@ -1,14 +1,18 @@
 """Joint optimisation of keyframes by their images, and loops: truth found, contradictions refused, bits repeated."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
-from pipeline.frontend.bundle import View, find_loops, optimise, overlapping
-from pipeline.frontend.config import KeyframeConfig, LoopConfig
+from pipeline.frontend.bundle import find_loops, optimise, overlapping
+from pipeline.frontend.config import KeyframeConfig, LoopConfig, RelocalisationConfig
 from pipeline.frontend.keyframes import KeyframePair, refine
+from pipeline.frontend.relocalisation import features_of
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.registration import Reference, RegistrationConfig, RgbdPyramid, register
+from pipeline.registration import Level, Reference, RegistrationConfig, RgbdPyramid, register
+from pipeline.registration.features import Features
 from tests.registration.room import pose, render
 
 CAMERA = PinholeCamera(320, 240, 220.0, 220.0, 159.5, 119.5)
@@ -27,18 +31,29 @@ def picture(T_world_camera: np.ndarray, noise: np.random.Generator | None = None
     return RgbdPyramid.build(gray, depth, CAMERA)
 
 
+@dataclass(frozen=True)
+class View:
+    reference: Reference
+    coarsest: Level
+    features: Features
+
+    @staticmethod
+    def of(pyramid: RgbdPyramid) -> "View":
+        reference = Reference.from_pyramid(pyramid, STRIDES)
+        return View(reference, pyramid.levels[-1], features_of(pyramid, RelocalisationConfig()))
+
+
 class Walk:
     """Keyframes at known poses, with their images and the registrations of each to the one before."""
 
     def __init__(self, world: list[np.ndarray], noise: np.random.Generator | None = None) -> None:
         self.truth = np.array([se3.inverse(world[0]) @ T for T in world])
         self.pyramids = [picture(T, noise) for T in world]
-        references = [Reference.from_pyramid(p, STRIDES) for p in self.pyramids]
-        self.views = [View.of(r, p, CONFIG.loops) for r, p in zip(references, self.pyramids, strict=True)]
+        self.views = [View.of(p) for p in self.pyramids]
         self.pairs = []
         for k in range(1, len(world)):
             guess = se3.inverse(self.truth[k - 1]) @ self.truth[k]
-            found = register(references[k - 1], self.pyramids[k], guess)
+            found = register(self.views[k - 1].reference, self.pyramids[k], guess)
             assert found.ok
             self.pairs.append(KeyframePair(k - 1, k, found.T_reference_target, found.information))
 
@@ -99,7 +114,7 @@ def test_factors_say_what_the_optimisation_found(noisy: Walk) -> None:
 
 def test_keyframe_that_shows_nothing_keeps_what_tracking_said(noisy: Walk) -> None:
     dark = RgbdPyramid.build(np.zeros((240, 320), np.float32), np.zeros((240, 320), np.float32), CAMERA)
-    views = [*noisy.views[:7], View.of(Reference.from_pyramid(dark, STRIDES), dark, CONFIG.loops)]
+    views = [*noisy.views[:7], View.of(dark)]
     images = [*noisy.pyramids[:7], dark]
     found, factors = optimise(noisy.truth, views, images.__getitem__, noisy.pairs, CONFIG, REGISTRATION)
     of_dark = [f for f in factors if 7 in (f.first, f.second)]
