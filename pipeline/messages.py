@@ -101,7 +101,8 @@ class Odometry:
     keyframe_index: keyframe it was tracked against. T_map_camera, T_keyframe_camera: [4, 4].
     information: [6, 6] of T_keyframe_camera, right tangent (translation m, rotation rad); zero when lost.
     status: "ok", "lost" or "relocalised". overlap: share of the reference seen, 0..1.
-    rms_depth_m, rms_color: residuals, metres and image units.
+    rms_depth_m, rms_color: residuals, metres and image units. reason: why it is lost, or tracked by colour
+    alone, else "".
     """
 
     schema: ClassVar[str] = "duagc.v1.Odometry"
@@ -118,6 +119,7 @@ class Odometry:
     overlap: float
     rms_depth_m: float
     rms_color: float
+    reason: str = ""
 
     def pack(self) -> Any:
         """duagc.v1.Odometry."""
@@ -135,6 +137,7 @@ class Odometry:
             overlap=float(self.overlap),
             rms_depth_m=float(self.rms_depth_m),
             rms_color=float(self.rms_color),
+            reason=self.reason,
         )
         pack_stamp(message, self.stamp_ns)
         return message
@@ -157,6 +160,7 @@ class Odometry:
             overlap=m.overlap,
             rms_depth_m=m.rms_depth_m,
             rms_color=m.rms_color,
+            reason=m.reason,
         )
 
 
