@@ -33,6 +33,11 @@ def robots_of(factors, owner):
     return parts
 
 
+def ancestors(tree, robot):
+    """A robot and all above it."""
+    return [robot] if tree[robot] is None else [robot, *ancestors(tree, tree[robot])]
+
+
 @pytest.mark.parametrize("tree", [{0: None, 1: 0, 2: 1}, {0: None, 1: 0, 2: 0}])
 @pytest.mark.parametrize("damping", [0.0, 1e-2])
 def test_fronts_take_the_step_of_the_whole_graph(tree, damping):
@@ -42,21 +47,13 @@ def test_fronts_take_the_step_of_the_whole_graph(tree, damping):
     for a, (variables, _, _) in parts.items():
         for v in variables:
             masks[v] = masks.get(v, 0) | 1 << a
-    subtree = {
-        a: sum(1 << b for b in tree if b == a or tree[b] == a or (tree[b] and tree[tree[b]] == a))
-        for a in tree
-    }
+    subtree = {a: sum(1 << b for b in tree if a in ancestors(tree, b)) for a in tree}
     shared, fronts, H, g = {}, {}, {}, {}
     for a in (2, 1, 0):  # children first
         variables, own, poses = parts[a]
         children = [c for c in tree if tree[c] == a]
-        known = {v: masks[v] if v[0] == a else 0 for v in variables}
-        for c in children:
-            known.update(
-                {v: masks[v] if v[0] == c or known.get(v) or subtree[c] >> v[0] & 1 else 0 for v in shared[c]}
-            )
-        for v in known:
-            known[v] = masks[v] if subtree[a] >> v[0] & 1 else 0
+        here = {*variables, *(v for c in children for v in shared[c])}
+        known = {v: masks[v] if subtree[a] >> v[0] & 1 else 0 for v in here}  # owners below say who has it
         shared[a] = shared_variables(known, subtree[a])
         fronts[a] = Front(variables, {c: shared[c] for c in children}, shared[a])
         gradient, jacobians = pose_factors.gradient(own, np.ones(len(own)), T[poses])
