@@ -46,6 +46,7 @@ class EliminationAgent(GraphAgent):
         ] = []  # to be used in `advance`: some come before the start
 
     def start(self) -> None:
+        self.first_round = self.round
         names = [self.team[m] for m in self.T_world_map]
         support = {(self.team[a], self.team[b]): float(f.support) for (a, b), f in self._frames.items()}
         tree = {
@@ -157,8 +158,6 @@ class EliminationAgent(GraphAgent):
         if self._sent == self.exchange:
             return
         self._sent = self.exchange
-        if self.first_round is None:
-            self.first_round = self.round
         reweighted = self._weigh()
         weights, blocks = self._weights(), self._blocks.values()
         g, jacobians = pose_factors.gradient(self._factors, weights, self._x)
