@@ -49,7 +49,7 @@ def test_the_same_pairs_judge_all(depths) -> None:
 def test_unknown_depth_is_not_compared(depths) -> None:
     holes = [d.copy() for d in depths]
     for d in holes:
-        d[:, 7::8] = 0
+        d[30:42, 40:60] = 0
     pairs, values = depth_agreement(holes, CAMERA, {"true": TRUTH})
     assert pairs >= MIN_PAIRS
     assert values["true"] < 1e-5
