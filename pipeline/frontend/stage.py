@@ -8,7 +8,7 @@ The stage is offline in this sense; times in the log are those of the recording 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,15 +72,19 @@ def run_frontend(
         clock.lap("refinement_s")
         updates, maps = _map(log, keyframes, frames, config, seed, threads, progress, clock)
         clock.lap("final_refinement_s")
+        alone = {
+            "color_without_depth": str(len(log.pairing.color_alone)),
+            "depth_without_color": str(len(log.pairing.depth_alone)),
+        }
     odometry = [_odometry(log.robot, frame, refined.T_map_keyframe) for frame in frames]
-    _write(out_path, log.robot, odometry, keyframes, factors, updates, maps)
+    _write(out_path, log.robot, odometry, keyframes, factors, updates, maps, alone)
     clock.lap("writing_s")
     return clock.laps
 
 
 def _track(log: RgbdLog, config: FrontendConfig, progress: bool) -> tuple[Tracker, list[TrackedFrame]]:
     """Track all frames in order."""
-    tracker = Tracker(log.camera, config)
+    tracker = Tracker(log.camera, config, log.motion_prior())
     source = log.frames()
     if progress:
         source = progress_bar.track(source, f"tracking {log.robot}", len(log))
@@ -270,6 +274,7 @@ def _write(
     factors: Sequence[KeyframeFactor],
     updates: Sequence[MapUpdate],
     maps: _Maps,
+    alone: Mapping[str, str],
 ) -> None:
     """One message per frame, then what its keyframe did, in the order of time; the maps at the end."""
     keyframe_of = {keyframe.frame_index: keyframe for keyframe in keyframes}
@@ -281,7 +286,7 @@ def _write(
         updates_of.setdefault(update.keyframe_index, []).append(update)
     tracked = sum(message.status != Status.LOST.value for message in odometry)
     with LogWriter(
-        out_path, robot=robot, metadata={"frames": str(len(odometry)), "tracked": str(tracked)}
+        out_path, robot=robot, metadata={"frames": str(len(odometry)), "tracked": str(tracked), **alone}
     ) as log:
         for message in odometry:
             time_ns = message.stamp_ns + LATENCY_NS
