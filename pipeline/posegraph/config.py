@@ -42,8 +42,8 @@ class PoseGraphConfig(Config):
     """The exact steps end when nothing moves more than this (m, rad)."""
     elimination_wire: Literal["float32", "float64"] = "float64"
     """Precision of the matrices on the wire; float32 halves the bytes, and slows ill-conditioned graphs."""
-    paper_penalty: float = Field(default=1.0, gt=0.0)
-    """rho of the printed iteration, as a multiple of the closures' information."""
+    paper_penalty: float = Field(default=0.01, gt=0.0)
+    """rho of the printed iteration, as a multiple of the closures' information; larger ones diverge sooner."""
 
 
 def settings(
