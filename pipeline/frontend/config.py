@@ -14,6 +14,38 @@ def is_held_out(frame_index: int) -> bool:
     return frame_index % HELD_OUT_PERIOD == HELD_OUT_OFFSET
 
 
+class LoopConfig(Config):
+    """Recognising places of the robot's own path."""
+
+    enabled: bool = True
+    min_gap: int = 3
+    """Keyframes that lie between the two at least, less one."""
+    known_overlap: float = 0.3
+    """Overlap by the tracked poses from which a pair needs no recognition."""
+    features_compared: int = 120
+    """The strongest features, by which earlier keyframes are ranked."""
+    ratio: float = 0.8
+    """Nearest over second-nearest distance of descriptors below which a match counts."""
+    min_matches: int = 10
+    """Matches among them from which a pair is a candidate."""
+    candidates: int = 2
+    """Earlier keyframes tried per keyframe, those with most matches."""
+    hypotheses: int = 300
+    """Three-point samples of RANSAC."""
+    inlier_m: float = 0.05
+    """Distance below which a match agrees with a motion, at one metre of depth; grows with depth."""
+    min_inliers: int = 15
+    """Matches that must agree on one motion."""
+    min_inlier_share: float = 0.3
+    """The same as a share of the matches; the larger number holds."""
+    min_overlap: float = 0.4
+    """Overlap that the registrations must find."""
+    max_disagreement_m: float = 0.03
+    """Largest distance between the registration one way and the other."""
+    max_disagreement_rad: float = 0.03
+    """The same for the rotation."""
+
+
 class KeyframeConfig(Config):
     """When a frame becomes a keyframe, and how keyframe poses are refined together."""
 
@@ -29,6 +61,15 @@ class KeyframeConfig(Config):
     """Least overlap, predicted and found, of such a registration."""
     huber_sigmas: float = 3.0
     """Registrations that disagree by more than this with the refined poses count linearly."""
+    local_optimisation: bool = True
+    """Optimise all keyframe poses jointly on the images; without, only the registrations made in tracking count."""
+    optimisation_rounds: int = 10
+    """Linearisations of all pairs at most; it ends when no pose moves by more than 0.1 mm and 0.1 mrad."""
+    optimisation_overlap: float = 0.3
+    """Least overlap, at the present poses, of two keyframes that are compared."""
+    optimisation_neighbours: int = 8
+    """Earlier keyframes that a keyframe is compared with at most, those with most overlap."""
+    loops: LoopConfig = LoopConfig()
 
 
 class FailureConfig(Config):

@@ -219,6 +219,31 @@ def register(
     return _judge(system, found, T, guess, exposure, config, prior_information)
 
 
+def linearise(
+    reference: Reference,
+    pyramid: RgbdPyramid,
+    T_reference_target: Array,
+    exposure: tuple[float, float] = (1.0, 0.0),
+    config: RegistrationConfig | None = None,
+) -> Registration:
+    """The cost of a pair near one pose, as a quadratic: for whoever minimises the costs of many pairs together.
+
+    Args:
+        reference, pyramid: as for `register`; only their finest level is used.
+        T_reference_target: where the cost is expanded. exposure: (gain, offset) there.
+    Returns:
+        Information at that pose, and the pose and exposure one Gauss-Newton step from it: the minimum of the
+        quadratic. Along weak directions there is no step and no information. The outcome is that of `register`.
+    """
+    config = config or RegistrationConfig()
+    T = _orthonormal(np.asarray(T_reference_target, dtype=np.float64))
+    start = np.array(exposure)
+    system = _linearise(reference, pyramid, 0, T, start, config)
+    found = _Determined.by(system, config)
+    step = _step(system, T, T, None, found.projection)
+    return _judge(system, found, T @ se3.exp(step[:6]), T, start + step[6:], config, None)
+
+
 _ALL_DIRECTIONS = np.eye(6)
 
 
