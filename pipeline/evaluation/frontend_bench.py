@@ -49,6 +49,9 @@ ABLATION: dict[str, dict[str, Any]] = {
         "tracking.registration.residuals": "gray",
         "tracking.recovery.residuals": "gray",
     },
+    "no local optimisation": {"keyframes.local_optimisation": False},
+    "no loops": {"keyframes.loops.enabled": False},
+    "neither": {"keyframes.local_optimisation": False, "keyframes.loops.enabled": False},
 }
 FRAME_PARTS = {"pyramid": ("tracking.RgbdPyramid", "build"), "registration": ("tracking", "register")}
 KEYFRAME_PARTS = {"seeding": ("mapping.Mapper", "_seed"), "optimisation": ("mapping.Mapper", "_optimise")}
@@ -207,9 +210,9 @@ def _timed(calls: Calls, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _functions(parts: Mapping[str, tuple[str, str]]) -> dict[str, tuple[Any, str]]:
-    from pipeline.frontend import mapping, tracking
+    from pipeline.frontend import mapping, stage, tracking
 
-    modules: dict[str, ModuleType] = {"mapping": mapping, "tracking": tracking}
+    modules: dict[str, ModuleType] = {"mapping": mapping, "stage": stage, "tracking": tracking}
     found = {}
     for label, (path, name) in parts.items():
         module, _, owner = path.partition(".")
@@ -258,7 +261,7 @@ def measure(log: Path, folder: Path, config: FrontendConfig, seed: int, threads:
     """Run the front end on a log into folder/frontend.mcap, in a fresh process; times and peak memory."""
     from pipeline.frontend.stage import run_frontend
 
-    whole = {"frame": ("tracking.Tracker", "track")}
+    whole = {"frame": ("tracking.Tracker", "track"), "poses": ("stage", "_refine")}
     if config.mapping_enabled:
         whole |= {"keyframe": ("mapping.Mapper", "add_keyframe"), "final": ("mapping.Mapper", "finish")}
     with Stopwatch(_functions(whole)) as outer, _in_turn(config) as inner:
@@ -267,6 +270,7 @@ def measure(log: Path, folder: Path, config: FrontendConfig, seed: int, threads:
         cpu_s = time.process_time() - start
     frame = outer.calls["frame"]
     times: dict[str, Any] = {"frame": summary(frame) | {"parts_cpu_ms": _parts(frame, inner.of("frame"))}}
+    times["pose_optimisation_cpu_s"] = sum(outer.calls["poses"].cpu_s)
     if config.mapping_enabled:
         keyframe = outer.calls["keyframe"]
         times["keyframe"] = summary(keyframe) | {"parts_cpu_ms": _parts(keyframe, inner.of("keyframe"))}
@@ -431,7 +435,7 @@ def format_tables(result: dict[str, Any]) -> str:
     ]
     about += [f"load {machine['load_average']:.1f}", "processor time"]
     head = ["robot", "", "frames", "lost", "keyframes", "ATE mm", "RPE mm", "RPE mrad"]
-    head += ["ms/frame", "p95", "first, last quarter", "peak MB"]
+    head += ["ms/frame", "p95", "first, last quarter", "poses s", "peak MB"]
     lines = [", ".join(about), "", "Tracking"]
     lines += _table(head, [_tracking_cells(row) for row in rows if row["name"] != "map"])
     mapped = [row for row in rows if row["name"] == "map"]
@@ -465,7 +469,7 @@ def _tracking_cells(row: dict[str, Any]) -> list[Any]:
             _number(row["rpe_rot_rad"], 1e3, 3),
         ),
         *(f"{frame['cpu_ms']:.1f}", f"{frame['cpu_ms_p95']:.1f}", _quarters(frame)),
-        f"{row['peak_memory_mb']:.0f}",
+        *(_number(row["times"].get("pose_optimisation_cpu_s"), 1, 1), f"{row['peak_memory_mb']:.0f}"),
     ]
 
 
