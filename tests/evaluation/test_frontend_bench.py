@@ -1,6 +1,8 @@
 """`duagc bench frontend`: it runs the stage itself, times what it names, and measures against the ground truth."""
 
 import json
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -85,6 +87,22 @@ def test_without_ground_truth_errors_are_absent(recording: Path, tmp_path: Path)
     assert row["ate_rmse_m"] is None
     assert "no ground truth" in result["reasons"]["rows.0.ate_rmse_m"]
     assert "-" in bench.format_tables(result)
+
+
+def test_the_command_prints_json(recording: Path) -> None:
+    command = [
+        sys.executable,
+        "-c",
+        "from pipeline.cli import main; main()",
+        "bench",
+        "frontend",
+        str(recording),
+    ]
+    command += ["--robot", "alpha", "--caps", "none", "--no-ablation", "--no-open3d", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[2])
+    (row,) = json.loads(done.stdout)["rows"]
+    assert (row["robot"], row["name"], row["lost"]) == ("alpha", "all", 0)
+    assert "psnr" not in done.stdout
 
 
 def test_unknown_robots_and_settings_are_refused(recording: Path) -> None:
