@@ -275,7 +275,7 @@ def _refined(
         mates = [run.robots[r] for r in robot.component if r != name]
         for camera_robot in (robot, *(mate for mate in mates if mate.component == robot.component)):
             view_set = "held_out" if camera_robot is robot else "peers"
-            task = _RenderTask(
+            task = RenderTask(
                 refined.gaussians, camera_robot, camera_robot.trajectory, keyframes=False, depth=refined.depth
             )
             title = f"render refined map of {name} from {camera_robot.robot}"
