@@ -245,7 +245,7 @@ def _rendering_section(
             maps = _maps_in_world(robot) if of_peer else _maps(robot)
             poses = dict.fromkeys(MAPS, camera_robot.trajectory) if of_peer else _own_poses(robot)
             for kind in MAPS:
-                task = _RenderTask(
+                task = RenderTask(
                     maps[kind], camera_robot, poses[kind], keyframes=not of_peer, depth=robot.own_map.depth
                 )
                 title = f"render {kind} map of {name}" + (f" from {camera_robot.robot}" if of_peer else "")
@@ -267,7 +267,7 @@ def _unrefined(
         unrefined = robot.unrefined_map
         if unrefined is None:
             continue
-        task = _RenderTask(unrefined.gaussians, robot, robot.odometry, keyframes=False, depth=unrefined.depth)
+        task = RenderTask(unrefined.gaussians, robot, robot.odometry, keyframes=False, depth=unrefined.depth)
         for index, score in task.scores(
             source, threads, f"render unrefined map of {name}" if progress else None
         ):
@@ -294,7 +294,7 @@ def _maps_in_world(robot: RobotRun) -> dict[str, Gaussians]:
 
 
 @dataclass(frozen=True)
-class _RenderTask:
+class RenderTask:
     """A map to be rendered where one robot's camera stood: at its held-out frames, and at its keyframes if asked."""
 
     gaussians: Gaussians
