@@ -228,11 +228,12 @@ def linearise(
     T_reference_target: Array,
     exposure: tuple[float, float] = (1.0, 0.0),
     config: RegistrationConfig | None = None,
+    level: int = 0,
 ) -> Registration:
     """The cost of a pair near one pose, as a quadratic: for whoever minimises the costs of many pairs together.
 
     Args:
-        reference, pyramid: as for `register`; only their finest level is used.
+        reference, pyramid: as for `register`. level: the one that is used, 0 = finest.
         T_reference_target: where the cost is expanded. exposure: (gain, offset) there.
     Returns:
         Information at that pose, and the pose and exposure one Gauss-Newton step from it: the minimum of the
@@ -241,7 +242,7 @@ def linearise(
     config = config or RegistrationConfig()
     T = _orthonormal(np.asarray(T_reference_target, dtype=np.float64))
     start = np.array(exposure)
-    system = _linearise(reference, pyramid, 0, T, start, config)
+    system = _linearise(reference, pyramid, level, T, start, config)
     found = _Determined.by(system, config)
     step = _step(system, T, T, None, found.projection)
     return _judge(system, found, T @ se3.exp(step[:6]), T, start + step[6:], config, None)
