@@ -26,8 +26,8 @@ from converters.tum_layout import AssociationOptions, Listed, associate
 from pipeline import numeric
 from pipeline.errors import DuagError
 from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
 from pipeline.progress import track
+from pipeline.recording.register_depth import register_depth
 
 Array = NDArray[np.float64]
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -450,7 +450,7 @@ def _write(robot: RobotWriter, bag: Bag) -> dict[str, Any]:
                 f"{bag.depth_camera.camera.width}x{bag.depth_camera.camera.height} as in its CameraInfo"
             )
         if bag.T_color_depth is not None:
-            metres = registered(metres, bag.depth_camera.camera, camera, bag.T_color_depth)
+            metres = register_depth(metres, bag.depth_camera.camera, bag.T_color_depth, camera)
         elif maps is not None:
             metres = np.asarray(cv2.remap(metres, *maps, cv2.INTER_NEAREST), dtype=np.float32)
         units = np.rint(metres / bag.depth_scale)
@@ -472,33 +472,6 @@ def _pose_at(truth: tuple[list[int], Array] | None, stamp_ns: int, max_gap_s: fl
     if truth is None or not truth[0]:
         return None
     return Poses(np.array(truth[0], dtype=np.int64), truth[1], 0).at(stamp_ns, max_gap_s)
-
-
-def registered(
-    depth: NDArray[np.float32], camera: PinholeCamera, target: PinholeCamera, T_target_camera: Array
-) -> NDArray[np.float32]:
-    """Depth [h, w] (m, 0 = none) of one camera as another sees it; of several surfaces on a pixel the nearest.
-
-    Every pixel covers as much of the target as it is wide there, so that a surface has no cracks.
-    """
-    rows, columns = np.nonzero(depth > 0)
-    z = depth[rows, columns].astype(np.float64)
-    points = camera.rays()[rows, columns] * z[:, None]
-    moved = se3.transform(T_target_camera, points)
-    moved, z = moved[moved[:, 2] > 0.01], z[moved[:, 2] > 0.01]
-    pixels = target.project(moved)
-    half = 0.5 * max(target.fx / camera.fx, target.fy / camera.fy) * z / moved[:, 2]
-    first = np.ceil(pixels - half[:, None] - 1e-9).astype(np.int64)
-    last = np.ceil(pixels + half[:, None] - 1e-9).astype(np.int64)  # one behind
-    out = np.full(target.height * target.width, np.inf)
-    reach = int((last - first).max(initial=0))
-    for dv in range(reach):
-        for du in range(reach):
-            u, v = first[:, 0] + du, first[:, 1] + dv
-            on = (u < last[:, 0]) & (v < last[:, 1]) & (u >= 0) & (u < target.width)
-            on &= (v >= 0) & (v < target.height)
-            np.minimum.at(out, v[on] * target.width + u[on], moved[on, 2])
-    return np.where(np.isfinite(out), out, 0.0).reshape(target.height, target.width).astype(np.float32)
 
 
 def _shared_parts(a: str, b: str) -> int:

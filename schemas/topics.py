@@ -92,6 +92,21 @@ LIDAR_TRANSFORM = Topic(
     Scope.SENSOR,
     "pose of the LiDAR in the colour camera, constant",
 )
+ODOMETRY_PRIOR = Topic(
+    "/<robot>/odometry_prior",
+    "foxglove.PoseInFrame",
+    "converters",
+    Scope.SENSOR,
+    "pose of the colour camera by another odometry (wheels, legs), in a frame of its own",
+)
+IMU = Topic("/<robot>/imu", "duagc.v1.Imu", "converters", Scope.SENSOR, "rates and accelerations of an IMU")
+IMU_TRANSFORM = Topic(
+    "/<robot>/imu/transform",
+    "foxglove.FrameTransform",
+    "converters",
+    Scope.SENSOR,
+    "pose of the IMU in the colour camera, constant",
+)
 GROUNDTRUTH_POSE = Topic(
     "/<robot>/groundtruth/pose",
     "foxglove.PoseInFrame",
@@ -134,6 +149,13 @@ INFORMATION = Topic(
     "Fisher information of the robot's own map",
 )
 FUSED_MAP = Topic("/<robot>/fused_map", "duagc.v1.GaussianMap", "fusion", Scope.ROBOT, "the map after fusion")
+REFINED_MAP = Topic(
+    "/<robot>/refined_map",
+    "duagc.v1.GaussianMap",
+    "fusion",
+    Scope.ROBOT,
+    "the fused map trained again on the robot's own images",
+)
 CORRECTED_KEYFRAMES = Topic(
     "/<robot>/corrected_keyframes",
     "duagc.v1.CorrectedKeyframes",
@@ -190,6 +212,9 @@ TOPICS: tuple[Topic, ...] = (
     RAW_DEPTH_TRANSFORM,
     LIDAR,
     LIDAR_TRANSFORM,
+    ODOMETRY_PRIOR,
+    IMU,
+    IMU_TRANSFORM,
     GROUNDTRUTH_POSE,
     GROUNDTRUTH_DEPTH,
     ODOMETRY,
@@ -200,6 +225,7 @@ TOPICS: tuple[Topic, ...] = (
     UNREFINED_MAP,
     INFORMATION,
     FUSED_MAP,
+    REFINED_MAP,
     CORRECTED_KEYFRAMES,
     PEER_MESSAGE,
     PEER_PACKET,

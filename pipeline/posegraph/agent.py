@@ -69,7 +69,12 @@ class Neighbour:
 
 
 class GraphAgent:
-    """Set-up of one robot; a solver adds what follows it."""
+    """Set-up of one robot; a solver adds what follows it.
+
+    precision: of the keyframes that neighbours tell each other in the set-up.
+    """
+
+    precision = "float32"
 
     def __init__(self, graph: RobotGraph, team: Sequence[str], config: PoseGraphConfig) -> None:
         """graph: what this robot measured. team: names of all robots that may exist, sorted."""
@@ -196,7 +201,7 @@ class GraphAgent:
             if self._frames.setdefault((frame.lower, frame.higher), frame) is frame:
                 self._pass_on(n, payload)
         elif code == Code.KEYFRAMES:
-            n.told = wire.read_keyframes(payload, n.peer_keyframes)
+            n.told = wire.read_keyframes(payload, n.peer_keyframes, self.precision)
         elif code == Code.VERDICT:
             n.keep = wire.read_verdict(payload, len(n.closures))
         else:
@@ -214,11 +219,9 @@ class GraphAgent:
         self.send(everyone, wire.write_roster(self._rosters[self.own]))
         self.drift = drift(self.graph.odometry, self.graph.keyframes, self.config.consensus.closures)
         for n in everyone:
-            named = n.own_keyframes
-            self.send(
-                [n],
-                wire.write_keyframes(NamedKeyframes(named, self.T_map_keyframe[named], self.drift[named])),
-            )
+            own = n.own_keyframes
+            named = NamedKeyframes(own, self.T_map_keyframe[own], self.drift[own])
+            self.send([n], wire.write_keyframes(named, self.precision))
 
     def _set_up(self) -> None:
         """Decide on pairs of which this is the lower end; start once all is known."""

@@ -31,7 +31,12 @@ _ROUNDING = 1e-10  # relative rise of the cost that is no rise
 
 
 class EliminationAgent(GraphAgent):
-    """A node of the tree."""
+    """A node of the tree.
+
+    Copies must start where their owners are to the last bit but a few: every step moves both alike.
+    """
+
+    precision = "float64"
 
     def __init__(self, graph: RobotGraph, team: Sequence[str], config: PoseGraphConfig) -> None:
         super().__init__(graph, team, config)
@@ -41,6 +46,7 @@ class EliminationAgent(GraphAgent):
         ] = []  # to be used in `advance`: some come before the start
 
     def start(self) -> None:
+        self.first_round = self.round
         names = [self.team[m] for m in self.T_world_map]
         support = {(self.team[a], self.team[b]): float(f.support) for (a, b), f in self._frames.items()}
         tree = {
@@ -57,7 +63,8 @@ class EliminationAgent(GraphAgent):
             self._subtree |= (at == self.own) << robot
         self._fronts: dict[int, dict[Variable, int]] = {}
         self._blocks: dict[int, Block] = {}
-        self._damping = self._damped = self._largest_step = self._moved_rad = 0.0
+        self._damping = self._damped = self._largest_step = 0.0
+        self._moved_rad = np.inf  # since the last linearisation
         self._matrices: dict[int, Array] = {}  # by child: the last one that came
         self._step_before = np.inf
         self._cost: float | None = None  # at the root: of the last accepted poses
@@ -104,7 +111,10 @@ class EliminationAgent(GraphAgent):
     def advance(self) -> None:
         arrived, self._arrived = self._arrived, []
         for n, payload in arrived:
-            self._use(n, payload)
+            try:
+                self._use(n, payload)
+            except MalformedError as error:
+                self.refused.append(str(error))
         if not self._laid_out and set(self._fronts) == set(self._children):
             self._lay_out()
         if self._laid_out and not self.finished and set(self._blocks) == set(self._children):
@@ -120,6 +130,10 @@ class EliminationAgent(GraphAgent):
             exchange, block = wire.read_block(payload, len(self._fronts[n.index]))
             if exchange != self.exchange:
                 raise MalformedError(f"block of exchange {exchange} in exchange {self.exchange}")
+            if block.H is not None:
+                self._matrices[n.index] = block.H
+            elif n.index not in self._matrices:
+                raise MalformedError("block without its first matrix")
             self._blocks[n.index] = block
         else:
             raise MalformedError(f"message {code} does not come from there, or not now")
@@ -144,8 +158,6 @@ class EliminationAgent(GraphAgent):
         if self._sent == self.exchange:
             return
         self._sent = self.exchange
-        if self.first_round is None:
-            self.first_round = self.round
         reweighted = self._weigh()
         weights, blocks = self._weights(), self._blocks.values()
         g, jacobians = pose_factors.gradient(self._factors, weights, self._x)
@@ -166,19 +178,14 @@ class EliminationAgent(GraphAgent):
 
     def _relinearised(self, jacobians: tuple[Array, Array], reweighted: bool) -> Array | None:
         """The eliminated matrix, or None if the last one still holds: here, and everywhere below."""
-        for child, block in self._blocks.items():
-            if block.H is not None:
-                self._matrices[child] = block.H
-            elif child not in self._matrices:
-                raise MalformedError("a block without its first matrix")
-        below = any(block.H is not None for block in self._blocks.values())
         moved = self._moved_rad > self.config.consensus.relinearise_rad
-        if not (below or moved or reweighted or self._damping != self._damped or self.exchange == 0):
-            return None
-        if moved or reweighted or self._damping != self._damped or self.exchange == 0:
+        stale = moved or reweighted or self._damping != self._damped
+        if stale:
             anchor = 0 if self._parent is None else None
             self._H_own = damped(self._factors, jacobians, len(self._x), self._damping, anchor)
             self._moved_rad, self._damped = 0.0, self._damping
+        if not stale and all(block.H is None for block in self._blocks.values()):
+            return None
         return self._front.factorise(self._H_own, self._matrices)
 
     def _decide_step(self, block: Block) -> None:

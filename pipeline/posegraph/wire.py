@@ -78,27 +78,27 @@ def read_roster(data: bytes, team: int) -> Roster:
     return Roster(robot, neighbours)
 
 
-def write_keyframes(named: NamedKeyframes) -> bytes:
-    """Bytes of KEYFRAMES: 40 per keyframe, float32."""
+def write_keyframes(named: NamedKeyframes, precision: str) -> bytes:
+    """Bytes of KEYFRAMES: 40 per keyframe with poses in float32, 68 in float64."""
     T = named.T_map_keyframe
     return b"".join(
         [
             _COUNT.pack(Code.KEYFRAMES, len(named.keyframes)),
             array_bytes(named.keyframes, "int32"),
-            _motion_bytes(T),
+            _motion_bytes(T, precision),
             array_bytes(named.drift, "float32"),
         ]
     )
 
 
-def read_keyframes(data: bytes, expected: NDArray[np.int32]) -> NamedKeyframes:
+def read_keyframes(data: bytes, expected: NDArray[np.int32], precision: str) -> NamedKeyframes:
     """From KEYFRAMES about exactly the keyframes that the closures name."""
     reader = Reader(data, "keyframes")
     _, n = reader.fields(_COUNT)
     if n != len(expected):
         raise MalformedError(f"keyframes: {n}, the closures name {len(expected)}")
     keyframes = reader.array("int32", (n,))
-    T = _read_motions(reader, n)
+    T = _read_motions(reader, n, precision)
     drift = reader.array("float32", (n, 2)).astype(np.float64)
     reader.done()
     if not np.array_equal(keyframes, expected) or drift.min(initial=0.0) < 0:
@@ -125,27 +125,27 @@ def read_verdict(data: bytes, closures: int) -> NDArray[np.bool_]:
 def write_frame(frame: PairFrame) -> bytes:
     """Bytes of FRAME."""
     head = _FRAME.pack(Code.FRAME, frame.lower, frame.higher, frame.support)
-    return head + _motion_bytes(frame.T_lower_higher[None])
+    return head + _motion_bytes(frame.T_lower_higher[None], "float32")
 
 
 def read_frame(data: bytes, team: int) -> PairFrame:
     """From FRAME."""
     reader = Reader(data, "frame")
     _, lower, higher, support = reader.fields(_FRAME)
-    T = _read_motions(reader, 1)[0]
+    T = _read_motions(reader, 1, "float32")[0]
     reader.done()
     if not lower < higher < team:
         raise MalformedError("frame: the two robots must be in the team, lower first")
     return PairFrame(lower, higher, support, T)
 
 
-def _motion_bytes(T: Array) -> bytes:
-    """Motions [n, 4, 4] as quaternions and translations, float32."""
-    return array_bytes(so3.to_quat_wxyz(T[:, :3, :3]), "float32") + array_bytes(T[:, :3, 3], "float32")
+def _motion_bytes(T: Array, precision: str) -> bytes:
+    """Motions [n, 4, 4] as quaternions and translations."""
+    return array_bytes(so3.to_quat_wxyz(T[:, :3, :3]), precision) + array_bytes(T[:, :3, 3], precision)
 
 
-def _read_motions(reader: Reader, n: int) -> Array:
-    quats, t = reader.array("float32", (n, 4)).astype(np.float64), reader.array("float32", (n, 3))
+def _read_motions(reader: Reader, n: int, precision: str) -> Array:
+    quats, t = reader.array(precision, (n, 4)).astype(np.float64), reader.array(precision, (n, 3))
     if n and np.abs((quats**2).sum(axis=1) - 1).max() > 1e-3:
         raise MalformedError(f"{reader.what}: not rigid motions")
     return se3.from_quat_translation(quats, t.astype(np.float64))

@@ -18,12 +18,13 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import converters
-from converters import ros, ros_images
+from converters import ros_images
 from pipeline import messages as m
 from pipeline.errors import DuagError
 from pipeline.geometry import se3, so3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.recording import open_rgbd, read_log
+from pipeline.recording.register_depth import register_depth
 from schemas import topics
 from tests.converters.box_room import path, render
 
@@ -232,8 +233,8 @@ def test_depth_that_is_not_moved_is_wrong(tmp_path: Path) -> None:
     """The extrinsics matter: taken as registered, the depth does not fit."""
     z = render(DEPTH, path(1)[0] @ T_COLOR_DEPTH)[1].astype(np.float32)
     _, true = render(COLOR, path(1)[0])
-    moved = ros.registered(z, DEPTH, COLOR, T_COLOR_DEPTH)
-    still = ros.registered(z, DEPTH, COLOR, np.eye(4))
+    moved = register_depth(z, DEPTH, T_COLOR_DEPTH, COLOR)
+    still = register_depth(z, DEPTH, np.eye(4), COLOR)
 
     def error(depth: np.ndarray) -> float:
         return float(np.percentile(np.abs(depth - true)[depth > 0], 90))

@@ -71,8 +71,10 @@ def test_set_up_messages_come_back():
     roster = Roster(2, 0b1011)
     assert wire.read_roster(wire.write_roster(roster), 4) == roster
     named = NamedKeyframes(np.array([1, 5], np.int32), poses(rng, 2), np.array([[0.0, 0.1], [0.5, 0.2]]))
-    read = wire.read_keyframes(wire.write_keyframes(named), named.keyframes)
-    np.testing.assert_allclose(read.T_map_keyframe, named.T_map_keyframe, atol=1e-5)
+    for precision, atol in (("float32", 1e-5), ("float64", 1e-14)):
+        data = wire.write_keyframes(named, precision)
+        read = wire.read_keyframes(data, named.keyframes, precision)
+        np.testing.assert_allclose(read.T_map_keyframe, named.T_map_keyframe, atol=atol)
     np.testing.assert_allclose(read.drift, named.drift, rtol=1e-6)
     keep = np.array([True, False, True] * 5)
     np.testing.assert_array_equal(wire.read_verdict(wire.write_verdict(keep), 15), keep)
@@ -126,7 +128,10 @@ def test_what_is_cut_short_or_does_not_fit_is_refused():
     messages = [
         (wire.write_poses(packet, 0, 6, True), lambda d: wire.read_poses(d, packet.keyframes, True)),
         (wire.write_roster(Roster(0, 2)), lambda d: wire.read_roster(d, 2)),
-        (wire.write_keyframes(named), lambda d: wire.read_keyframes(d, named.keyframes)),
+        (
+            wire.write_keyframes(named, "float32"),
+            lambda d: wire.read_keyframes(d, named.keyframes, "float32"),
+        ),
         (wire.write_verdict(np.ones(9, bool)), lambda d: wire.read_verdict(d, 9)),
         (wire.write_frame(PairFrame(0, 1, 2, np.eye(4))), lambda d: wire.read_frame(d, 2)),
         (wire.write_front({(0, 1): 3}), lambda d: wire.read_front(d, 2)),
