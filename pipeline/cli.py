@@ -177,8 +177,8 @@ def run(
 def _print_outputs(run_folder: Path) -> None:
     print(f"report     {run_folder / 'report' / 'index.html'}")
     print(f"view       {run_folder / 'run.rrd'}")
-    for path in sorted(run_folder.glob("robots/*/fused.ply")):
-        print(f"fused map  {path}")
+    for path in sorted(run_folder.glob("robots/*/refined.ply")):
+        print(f"map        {path}")
     print(f"metrics    {run_folder / 'metrics.json'}")
 
 
@@ -510,6 +510,53 @@ def bench_consensus(
     )
     result = bench.run(plan)
     print(json.dumps(result, indent=2) if as_json else bench.format_table(result))
+
+
+@bench_app.command("frontend")
+def bench_frontend(
+    recording: Annotated[
+        Path | None, typer.Argument(help="Folder of a recording; a small room is simulated without one.")
+    ] = None,
+    caps: Annotated[
+        str, typer.Option(help="Most Gaussians of a map, each a run; k and M are understood; none = no maps.")
+    ] = "60k",
+    ablation: Annotated[bool, typer.Option(help="Tracking without one of its parts at a time.")] = True,
+    open3d: Annotated[bool, typer.Option(help="Open3D's RGB-D odometry, in the same run.")] = True,
+    robot: Annotated[str | None, typer.Option(help="One robot; all by default.")] = None,
+    threads: Annotated[int, typer.Option(min=1, help="Of the kernels.")] = 1,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    as_json: Json = False,
+) -> None:
+    """Time, memory and accuracy of tracking and mapping, part by part, beside Open3D's odometry.
+
+    Examples: `duagc bench frontend recordings/house --caps 30k,60k,200k,600k`,
+    `duagc bench frontend recordings/redkitchen --no-ablation --json`
+    """
+    import tempfile
+
+    from converters.simulate import simulate as simulate_recording
+    from pipeline.config import load
+    from pipeline.evaluation import frontend_bench
+    from pipeline.runner import RunConfig
+
+    settings = load(RunConfig, config, overrides or [])
+    with tempfile.TemporaryDirectory(prefix="duagc-bench-") as folder:
+        if recording is None:
+            recording = Path(folder) / "room"
+            simulate_recording(recording, robots=1, frames=60, seed=settings.seed)
+        plan = frontend_bench.Plan(
+            recording,
+            settings.frontend,
+            () if caps == "none" else tuple(_counts("--caps", caps)),
+            ablation,
+            open3d,
+            threads,
+            settings.seed,
+            (robot,) if robot else (),
+        )
+        result = frontend_bench.run(plan)
+    print(json.dumps(result, indent=2) if as_json else frontend_bench.format_tables(result))
 
 
 def _numbers(option: str, text: str, low: float, high: float) -> list[float]:

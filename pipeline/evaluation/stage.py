@@ -63,6 +63,7 @@ PROTOCOL = {
     "depth": "blended depth / alpha where alpha >= 0.5, of a Gaussian as its map says: that of its centre or of its "
     "plane; mean over pixels with both depths, then over views",
     "own_unrefined": "the own map before its final refinement, seen as the own map",
+    "refined": "the fused map trained again on the robot's own images, seen as the fused map",
     "calibration": "distance of fused Gaussians from the true surface against sigma along its normal; mean of robots",
 }
 
@@ -245,7 +246,7 @@ def _rendering_section(
             maps = _maps_in_world(robot) if of_peer else _maps(robot)
             poses = dict.fromkeys(MAPS, camera_robot.trajectory) if of_peer else _own_poses(robot)
             for kind in MAPS:
-                task = _RenderTask(
+                task = RenderTask(
                     maps[kind], camera_robot, poses[kind], keyframes=not of_peer, depth=robot.own_map.depth
                 )
                 title = f"render {kind} map of {name}" + (f" from {camera_robot.robot}" if of_peer else "")
@@ -255,7 +256,33 @@ def _rendering_section(
                     rows += _view_rows(name, f"{kind}/{view_set}", index, score)
     reasons = dict.fromkeys(VIEW_SETS, "there is no such view") | {"peers": "no two robots met"}
     sections = {m: {s: views.summary(scores[m, s], reasons[s]) for s in VIEW_SETS} for m in MAPS}
-    return sections | {"own_unrefined": {"held_out": _unrefined(run, source, threads, progress, rows)}}
+    return (
+        sections
+        | {"own_unrefined": {"held_out": _unrefined(run, source, threads, progress, rows)}}
+        | {"refined": _refined(run, source, threads, progress, rows)}
+    )
+
+
+def _refined(
+    run: RunFolder, source: Recording, threads: int, progress: bool, rows: list[Row]
+) -> dict[str, Any]:
+    """Scores of the fused maps after their training, over own held-out views and those of the peers."""
+    scores: dict[str, list[Any]] = {"held_out": [], "peers": []}
+    for name, robot in run.robots.items():
+        refined = robot.refined_map
+        if refined is None:
+            continue
+        mates = [run.robots[r] for r in robot.component if r != name]
+        for camera_robot in (robot, *(mate for mate in mates if mate.component == robot.component)):
+            view_set = "held_out" if camera_robot is robot else "peers"
+            task = RenderTask(
+                refined.gaussians, camera_robot, camera_robot.trajectory, keyframes=False, depth=refined.depth
+            )
+            title = f"render refined map of {name} from {camera_robot.robot}"
+            for index, score in task.scores(source, threads, title if progress else None):
+                scores[view_set].append(score)
+                rows += _view_rows(name, f"refined/{view_set}", index, score)
+    return {s: views.summary(found, "no robot met another") for s, found in scores.items()}
 
 
 def _unrefined(
@@ -267,7 +294,7 @@ def _unrefined(
         unrefined = robot.unrefined_map
         if unrefined is None:
             continue
-        task = _RenderTask(unrefined.gaussians, robot, robot.odometry, keyframes=False, depth=unrefined.depth)
+        task = RenderTask(unrefined.gaussians, robot, robot.odometry, keyframes=False, depth=unrefined.depth)
         for index, score in task.scores(
             source, threads, f"render unrefined map of {name}" if progress else None
         ):
@@ -294,7 +321,7 @@ def _maps_in_world(robot: RobotRun) -> dict[str, Gaussians]:
 
 
 @dataclass(frozen=True)
-class _RenderTask:
+class RenderTask:
     """A map to be rendered where one robot's camera stood: at its held-out frames, and at its keyframes if asked."""
 
     gaussians: Gaussians
