@@ -212,6 +212,8 @@ class Mapper:
             rates = config.rates.times(config.final_rate_decay ** (step / max(steps - 1, 1)))
             self._optimise(views[order[position]], 0, rates)
         pruned += self._prune_degenerate()
+        if config.exposure and self._views:
+            self._centre_exposures(views)
         return MappingStats(inserted, pruned, len(self._gaussians), before, self._mean_loss())
 
     # --- one view -----------------------------------------------------------------------------------------------
@@ -249,13 +251,27 @@ class Mapper:
         """One Adam step of all Gaussians in one view."""
         loss, gradients = self._view_gradients(view, level)
         if self.config.exposure and view is not self._views[0]:
-            view.step_exposure(loss.d_exposure, self.config.exposure_rate)
+            decay = rates.colors / self.config.rates.colors
+            view.step_exposure(loss.d_exposure, self.config.exposure_rate * decay)
         stepped = self._adam.step(self._gaussians, gradients, rates)
         floor = np.float32(np.log(self.config.seeding.thickness_m))
         self._gaussians = stepped.replace(
             log_scales=np.maximum(stepped.log_scales, floor),
             opacity_logits=np.clip(stepped.opacity_logits, np.float32(-6), np.float32(6)),
         )
+
+    def _centre_exposures(self, views: Sequence[_View]) -> None:
+        """Give the map the keyframes' mean exposure, so that (0, 0) is the best guess for an image that has none.
+
+        Nothing that is drawn in an exposure changes, but for what shines through from the background.
+        """
+        gain, offset = np.array([view.exposure for view in self._views]).mean(axis=0)
+        shift = offset / np.mean([np.exp(view.exposure[0] - gain) for view in self._views])
+        for view in views:
+            a, b = view.exposure
+            view.exposure = (float(a - gain), float(b - np.exp(a - gain) * shift))
+        colors = np.float32(np.exp(gain)) * self._gaussians.colors + np.float32(shift)
+        self._gaussians = self._gaussians.replace(colors=colors)
 
     # --- what is in the map -------------------------------------------------------------------------------------
 

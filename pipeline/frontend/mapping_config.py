@@ -61,5 +61,5 @@ class MappingConfig(Config):
     contribution_color_sigma: float = 0.03
     contribution_depth_sigma_m: float = 0.02
     exposure: bool = False
-    """Fit a gain and an offset per keyframe (the first keyframe's stay 1 and 0)."""
+    """Fit a gain and an offset per view; the map ends in the mean exposure of its keyframes."""
     exposure_rate: float = 2e-3

@@ -75,12 +75,15 @@ class Adam:
         return len(self._steps)
 
     def freeze_after(self, steps: int | None) -> None:
-        """From now on leave Gaussians as they are, and their moments, once they took so many steps; None: never.
+        """From now on Gaussians settle: their step lengths fall to a tenth over their first `steps` steps, and then
+        they stay as they are, and their moments too. None: they never settle.
 
-        Their steps go on being counted.
+        Steps go on being counted.
         """
         self._corrections = self._unbiased.copy()
         if steps is not None:
+            decay = np.cumprod(np.full(_LONGEST, 0.1 ** (1.0 / steps)))
+            self._corrections *= decay.astype(np.float32)
             self._corrections[steps:] = 0.0
 
     def select(self, index: NDArray) -> None:

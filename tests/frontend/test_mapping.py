@@ -230,7 +230,7 @@ def test_exposure_is_found() -> None:
         dimmed = np.rint(color * (0.8 if k == 1 else 1.0)).astype(np.uint8)
         mapper.add_keyframe(k, dimmed, depth, POSES[k])
     mapper.finish()
-    assert mapper.exposures[0] == (0.0, 0.0)
+    assert np.allclose(np.mean(list(mapper.exposures.values()), axis=0), 0.0, atol=1e-6)
     gains = [np.exp(a) * 0.5 + b for a, b in mapper.exposures.values()]  # at mid grey
     assert gains[1] / gains[0] == pytest.approx(0.8, abs=0.02)
     assert gains[2] / gains[0] == pytest.approx(1.0, abs=0.02)
