@@ -10,7 +10,17 @@ from typing import Any
 from pipeline.errors import DuagError
 
 # name on the command line -> module with `Options` and `convert(src, out, robots=, force=, **options)`
-DATASETS = {"7scenes": "converters.seven_scenes"}
+DATASETS = {
+    "7scenes": "converters.seven_scenes",
+    "aria-multiagent": "converters.aria_multiagent",
+    "bonn": "converters.bonn",
+    "icl-nuim": "converters.icl_nuim",
+    "replica": "converters.replica",
+    "replica-multiagent": "converters.replica_multiagent",
+    "scannet": "converters.scannet",
+    "scannetpp": "converters.scannetpp",
+    "tum": "converters.tum",
+}
 
 
 def _module(dataset: str) -> ModuleType:
@@ -20,19 +30,25 @@ def _module(dataset: str) -> ModuleType:
 
 
 def convert(
-    dataset: str, src: Path, out: Path, robots: int = 1, force: bool = False, options: Sequence[str] = ()
+    dataset: str,
+    src: Path,
+    out: Path,
+    robots: int | None = None,
+    force: bool = False,
+    options: Sequence[str] = (),
 ) -> None:
     """Convert a dataset into a recording.
 
     Args:
         dataset: a name in `DATASETS`.
         src: where its files are. out: the folder to write.
-        robots: how many robots to make of it.
+        robots: how many robots to make of it; None: one, or as many as the dataset has.
         force: replace a recording that is there.
         options: `name=value` of the converter, values in TOML notation.
     """
     module = _module(dataset)
-    module.convert(Path(src), Path(out), robots=robots, force=force, **_parse(options))
+    count = {} if robots is None else {"robots": robots}
+    module.convert(Path(src), Path(out), force=force, **count, **_parse(options))
 
 
 def _parse(options: Sequence[str]) -> dict[str, Any]:

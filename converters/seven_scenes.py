@@ -15,13 +15,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from converters.base import NANOSECONDS, RecordingWriter, RobotWriter, robot_names
+from converters.image_files import options_of, read_color, read_depth, read_text, rigid
+from converters.self_check import ReprojectionCheck
 from pipeline import numeric
 from pipeline.config import Config
 from pipeline.errors import DuagError
-from pipeline.geometry import se3, so3
+from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.progress import track
 
@@ -37,12 +39,6 @@ KINDS = ("color", "depth", "pose")
 CONNECTED_RATIO = (
     0.03  # neighbouring depths that differ by less than this share of the nearer are one surface
 )
-SELF_CHECK_GAP = 10  # frames
-SELF_CHECK_PAIRS = 8
-SELF_CHECK_STRIDE = 6  # pixels
-SELF_CHECK_MIN_PIXELS = 200
-SELF_CHECK_MAX_RATIO = 0.02  # of the median depth (rule 1 of the converters)
-MAX_ROTATION_DEFECT = 0.01  # largest entry of |R - nearest rotation|; the data has 4e-4
 
 
 class Options(Config):
@@ -103,7 +99,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         DuagError: names the file, what was found and what was expected.
     """
     numeric.settle_opencv()
-    settings = _options(options)
+    settings = options_of(Options, options, "7scenes")
     parts, skipped = _parts(Path(src), robots, settings)
     source = {
         "dataset": "7-Scenes",
@@ -127,18 +123,6 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
             }
             if frames[0].pose is None:
                 recording.warnings.append(f"{name}: the sequence has no poses: no ground truth")
-
-
-def _options(values: dict[str, Any]) -> Options:
-    try:
-        return Options(**values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(str(part) for part in first["loc"])
-        known = ", ".join(Options.model_fields)
-        raise DuagError(
-            f"7scenes: {name} = {first['input']!r}: {first['msg']}; options are {known}"
-        ) from error
 
 
 # --- which frames make which robot ----------------------------------------------------------------------------------
@@ -223,11 +207,11 @@ def _write_robot(
     """Write all frames of a robot; returns what the self-check measured."""
     T_depth_color = se3.from_rotation_translation(np.eye(3), [options.baseline_m, 0.0, 0.0])
     register = Registration(options.depth_camera(), options.color_camera(), options.baseline_m)
-    check = _ReprojectionCheck(options.color_camera(), len(frames))
+    check = ReprojectionCheck(options.color_camera(), len(frames))
     holes = invalid = 0
     for index, files in enumerate(track(frames, f"convert {robot.name}")):
-        depth = register(_read_depth(files.depth))
-        color, color_format = _read_color(files.color)
+        depth = register(_depth_m(files.depth))
+        color, color_format = read_color(files.color, (WIDTH, HEIGHT))
         T_world_camera = None
         if files.pose is not None:
             T_world_camera = _read_pose(files.pose) @ T_depth_color
@@ -251,59 +235,19 @@ def _count_holes(depth: NDArray[np.uint16]) -> int:
     return int(crack.sum())
 
 
-def _read_color(path: Path) -> tuple[bytes, str]:
-    """The encoded bytes as they are, once they are known to decode to the size of the dataset."""
-    import cv2
-
-    data = _read_bytes(path)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-    if image is None:
-        raise DuagError(f"{path}: {len(data)} bytes that no decoder reads, expected a colour image")
-    _check_size(path, image.shape)
-    return data, "png" if data.startswith(b"\x89PNG") else "jpeg"
-
-
-def _read_depth(path: Path) -> Depth:
+def _depth_m(path: Path) -> Depth:
     """Depth [480, 640] in metres, 0 where there is none."""
-    import cv2
-
-    data = _read_bytes(path)
-    raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    if raw is None:
-        raise DuagError(f"{path}: {len(data)} bytes that no decoder reads, expected a depth image")
-    if raw.dtype != np.uint16 or raw.ndim != 2:
-        raise DuagError(f"{path}: is {raw.dtype} with {raw.ndim} axes, expected 16-bit depth in millimetres")
-    _check_size(path, raw.shape)
+    raw = read_depth(path, (WIDTH, HEIGHT), "depth in millimetres")
     return np.where(np.isin(raw, NO_DEPTH), 0, raw) * DEPTH_SCALE
-
-
-def _check_size(path: Path, shape: tuple[int, ...]) -> None:
-    if shape[:2] != (HEIGHT, WIDTH):
-        raise DuagError(f"{path}: is {shape[1]}x{shape[0]}, expected {WIDTH}x{HEIGHT}")
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DuagError(f"{path}: {error.strerror or error}, expected a file of 7-Scenes") from error
 
 
 def _read_pose(path: Path) -> NDArray[np.float64]:
     """T_world_depth [4, 4], its rotation made exactly orthonormal."""
     try:
-        T = np.array(_read_bytes(path).decode().split(), dtype=np.float64).reshape(4, 4)
+        T = np.array(read_text(path, "4x4 numbers").split(), dtype=np.float64).reshape(4, 4)
     except ValueError as error:
         raise DuagError(f"{path}: {error}, expected 4x4 numbers") from error
-    if not np.all(np.isfinite(T)):
-        raise DuagError(f"{path}: found numbers that are not finite, expected a pose")
-    R = so3.project(T[:3, :3])
-    defect = float(np.abs(T[:3, :3] - R).max())
-    if defect > MAX_ROTATION_DEFECT or not np.allclose(T[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
-        raise DuagError(
-            f"{path}: its rotation is off by {defect:.2g}, expected a rigid motion (within {MAX_ROTATION_DEFECT})"
-        )
-    return se3.from_rotation_translation(R, T[:3, 3])
+    return rigid(T, str(path))
 
 
 # --- depth into the colour camera -----------------------------------------------------------------------------------
@@ -373,57 +317,3 @@ class Registration:
 def _connected(w_a: Depth, w_b: Depth) -> NDArray[np.bool_]:
     """Whether two inverse depths belong to one surface; no measurement belongs to none."""
     return (w_a > 0) & (w_b > 0) & (np.abs(w_a - w_b) <= CONNECTED_RATIO * np.minimum(w_a, w_b))
-
-
-# --- self-check -----------------------------------------------------------------------------------------------------
-
-
-class _ReprojectionCheck:
-    """Moves the depth of a frame into a later one by the poses and compares: one number for axes, direction of poses,
-    scale, intrinsics and association."""
-
-    def __init__(self, camera: PinholeCamera, frames: int) -> None:
-        self._camera = camera
-        gap = min(SELF_CHECK_GAP, frames - 1)
-        starts: list[int] = []
-        if gap > 0:
-            starts = np.linspace(0, frames - 1 - gap, SELF_CHECK_PAIRS).astype(int).tolist()
-        self._second = {start + gap: start for start in starts}  # second frame of a pair -> first
-        self._kept: dict[int, tuple[Depth, NDArray[np.float64]]] = {}
-        self._residuals: list[Depth] = []
-        self._depths: list[Depth] = []
-
-    def add(self, index: int, depth: Depth, T_world_camera: NDArray[np.float64]) -> None:
-        if index in self._second.values():
-            self._kept[index] = (depth, T_world_camera)
-        if index in self._second:
-            first, T_world_first = self._kept.pop(self._second[index])
-            self._compare(first, T_world_first, depth, T_world_camera)
-
-    def _compare(self, first: Depth, T_world_first: Depth, second: Depth, T_world_second: Depth) -> None:
-        points = self._camera.back_project(first)[::SELF_CHECK_STRIDE, ::SELF_CHECK_STRIDE].reshape(-1, 3)
-        points = se3.transform(se3.inverse(T_world_second) @ T_world_first, points[points[:, 2] > 0])
-        points = points[points[:, 2] > 0.05]
-        pixels = np.rint(self._camera.project(points)).astype(int)
-        inside = ((pixels >= 0) & (pixels < (WIDTH, HEIGHT))).all(axis=1)
-        found = second[pixels[inside, 1], pixels[inside, 0]]
-        expected = points[inside, 2]
-        self._residuals.append(np.abs(found - expected)[found > 0])
-        self._depths.append(found[found > 0])
-
-    def result(self, label: str) -> dict[str, Any]:
-        """Median residual and median depth in metres, None where too little overlaps.
-
-        Raises:
-            DuagError: the residual is too large: poses, depth and intrinsics do not belong together.
-        """
-        residuals = np.concatenate([*self._residuals, np.zeros(0)])
-        if len(residuals) < SELF_CHECK_MIN_PIXELS:
-            return {"reprojection_median_m": None, "median_depth_m": None}
-        residual, depth = float(np.median(residuals)), float(np.median(np.concatenate(self._depths)))
-        if residual > SELF_CHECK_MAX_RATIO * depth:
-            raise DuagError(
-                f"{label}: depth moved by the poses differs by {residual:.3f} m at {depth:.2f} m (medians), expected "
-                f"less than {SELF_CHECK_MAX_RATIO:.0%}: poses, intrinsics and depth do not belong together"
-            )
-        return {"reprojection_median_m": residual, "median_depth_m": depth}

@@ -105,7 +105,13 @@ def simulate(
     out: Out,
     robots: Annotated[int, typer.Option(min=1, max=8, help="Number of robots.")] = 2,
     frames: Annotated[int, typer.Option(min=2, help="Frames per robot.")] = 160,
-    scene: Annotated[str, typer.Option(help="Name of a procedural scene.")] = "room",
+    scene: Annotated[
+        str, typer.Option(help="room, or a folder of textured meshes (GLB, glTF, OBJ, PLY).")
+    ] = "room",
+    up: Annotated[
+        str,
+        typer.Option(help="Axis that is up in the meshes: y, z, or auto (y for GLB, glTF, OBJ; z for PLY)."),
+    ] = "auto",
     width: Annotated[int, typer.Option(min=32, help="Pixels.")] = 480,
     height: Annotated[int, typer.Option(min=32, help="Pixels.")] = 360,
     overlap: Annotated[
@@ -116,9 +122,11 @@ def simulate(
     workers: Workers = 2,
     force: Force = False,
 ) -> None:
-    """Render a recording of a robot team in a procedural room, with exact ground truth.
+    """Render a recording of a robot team, in a procedural room or among textured meshes, with exact ground truth.
 
-    Example: `duagc simulate --robots 3 --noise kinect --out recordings/room`
+    Examples:
+    `duagc simulate --robots 3 --noise kinect --out recordings/room`,
+    `duagc simulate --scene scans/house --width 640 --height 480 --frames 300 --out recordings/house`
     """
     from converters.simulate import simulate as simulate_recording
 
@@ -127,6 +135,7 @@ def simulate(
         robots=robots,
         frames=frames,
         scene=scene,
+        up=up,
         size=(width, height),
         overlap=overlap,
         noise=noise,
@@ -319,7 +328,14 @@ def convert(
     dataset: Annotated[str | None, typer.Argument(help="Name of the dataset; see --list.")] = None,
     source: Annotated[Path | None, typer.Argument(metavar="SRC", help="Where its files are.")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write; must not exist.")] = None,
-    robots: Annotated[int, typer.Option(min=1, help="Cut one sequence into this many robots.")] = 1,
+    robots: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Cut one sequence into this many robots; else one, or as many as the dataset has.",
+            show_default=False,
+        ),
+    ] = None,
     options: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Option of the converter; repeatable."),

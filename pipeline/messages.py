@@ -101,7 +101,8 @@ class Odometry:
     keyframe_index: keyframe it was tracked against. T_map_camera, T_keyframe_camera: [4, 4].
     information: [6, 6] of T_keyframe_camera, right tangent (translation m, rotation rad); zero when lost.
     status: "ok", "lost" or "relocalised". overlap: share of the reference seen, 0..1.
-    rms_depth_m, rms_color: residuals, metres and image units.
+    rms_depth_m, rms_color: residuals, metres and image units. reason: why it is lost, or tracked by colour
+    alone, else "".
     """
 
     schema: ClassVar[str] = "duagc.v1.Odometry"
@@ -118,6 +119,7 @@ class Odometry:
     overlap: float
     rms_depth_m: float
     rms_color: float
+    reason: str = ""
 
     def pack(self) -> Any:
         """duagc.v1.Odometry."""
@@ -135,6 +137,7 @@ class Odometry:
             overlap=float(self.overlap),
             rms_depth_m=float(self.rms_depth_m),
             rms_color=float(self.rms_color),
+            reason=self.reason,
         )
         pack_stamp(message, self.stamp_ns)
         return message
@@ -157,6 +160,7 @@ class Odometry:
             overlap=m.overlap,
             rms_depth_m=m.rms_depth_m,
             rms_color=m.rms_color,
+            reason=m.reason,
         )
 
 
@@ -635,6 +639,79 @@ def unpack_calibration(m: Any) -> PinholeCamera:
     return PinholeCamera(m.width, m.height, *(float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))))
 
 
+def pack_transform(stamp_ns: int, parent: str, child: str, T_parent_child: ArrayLike) -> Any:
+    """foxglove.FrameTransform of a motion [4, 4] that takes coordinates of frame `child` to frame `parent`."""
+    T = np.asarray(T_parent_child, dtype=np.float64)
+    w, x, y, z = so3.to_quat_wxyz(T[:3, :3]).tolist()
+    tx, ty, tz = T[:3, 3].tolist()
+    message: Any = schemas.message_class("foxglove.FrameTransform")(
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation={"x": tx, "y": ty, "z": tz},
+        rotation={"x": x, "y": y, "z": z, "w": w},
+    )
+    pack_stamp(message, stamp_ns)
+    return message
+
+
+def unpack_transform(m: Any) -> Array:
+    """Motion T_parent_child [4, 4] of a foxglove.FrameTransform.
+
+    Raises:
+        DuagError: numbers that are not finite, or a quaternion of no length.
+    """
+    return _rigid(m.translation, m.rotation, "transform")
+
+
+_NUMBER_TYPES = {7: "float32", 8: "float64"}  # foxglove.PackedElementField.NumericType
+
+
+def pack_points(stamp_ns: int, frame_id: str, points_m: ArrayLike) -> Any:
+    """foxglove.PointCloud of points [n, 3], float32 metres."""
+    fields = [{"name": name, "offset": 4 * k, "type": 7} for k, name in enumerate("xyz")]
+    data = pack_array(points_m, "float32")
+    pose = {"orientation": {"w": 1.0}}
+    return _foxglove("PointCloud", stamp_ns, frame_id, pose=pose, point_stride=12, fields=fields, data=data)
+
+
+def unpack_points(m: Any, where: str) -> Array:
+    """Points [n, 3] in metres, in the frame of the message, of a foxglove.PointCloud; not finite ones are left out.
+
+    `where` begins the line of an error.
+    """
+    fields = {field.name: field for field in m.fields}
+    missing = [name for name in "xyz" if name not in fields or fields[name].type not in _NUMBER_TYPES]
+    if missing or m.point_stride == 0 or len(m.data) % m.point_stride:
+        raise DuagError(
+            f"{where} has fields {sorted(fields)} and {len(m.data)} bytes at {m.point_stride} per point, "
+            "expected x, y, z as float32 or float64"
+        )
+    columns = []
+    rows = np.frombuffer(m.data, np.uint8).reshape(-1, m.point_stride)
+    for name in "xyz":
+        dtype = np.dtype(_NUMBER_TYPES[fields[name].type]).newbyteorder("<")
+        offset = fields[name].offset
+        if offset + dtype.itemsize > m.point_stride:
+            raise DuagError(f"{where}: field {name} ends beyond the {m.point_stride} bytes of a point")
+        column = np.ascontiguousarray(rows[:, offset : offset + dtype.itemsize]).view(dtype).ravel()
+        columns.append(column.astype(np.float64))
+    points = np.stack(columns, axis=-1)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not m.HasField("pose"):
+        return points
+    return se3.transform(_rigid(m.pose.position, m.pose.orientation, where), points)
+
+
+def _rigid(p: Any, q: Any, what: str) -> Array:
+    """T [4, 4] of a translation and a quaternion message."""
+    quat = np.array([q.w, q.x, q.y, q.z])
+    if not np.all(np.isfinite([p.x, p.y, p.z, *quat])) or not 0.9 < np.linalg.norm(quat) < 1.1:
+        raise DuagError(
+            f"{what} is {(p.x, p.y, p.z)}, wxyz {tuple(quat.tolist())}, expected a finite rigid motion"
+        )
+    return se3.from_quat_translation(quat, [p.x, p.y, p.z])
+
+
 def pack_pose_in_frame(stamp_ns: int, frame_id: str, T_frame_body: ArrayLike) -> Any:
     """foxglove.PoseInFrame of a motion [4, 4]; its rotation is kept as a unit quaternion."""
     T = np.asarray(T_frame_body, dtype=np.float64)
@@ -650,10 +727,4 @@ def unpack_pose_in_frame(m: Any) -> Array:
     Raises:
         DuagError: numbers that are not finite, or a quaternion of no length.
     """
-    p, q = m.pose.position, m.pose.orientation
-    quat = np.array([q.w, q.x, q.y, q.z])
-    if not np.all(np.isfinite([p.x, p.y, p.z, *quat])) or not 0.9 < np.linalg.norm(quat) < 1.1:
-        raise DuagError(
-            f"pose is {(p.x, p.y, p.z)}, wxyz {tuple(quat.tolist())}, expected a finite rigid motion"
-        )
-    return se3.from_quat_translation(quat, [p.x, p.y, p.z])
+    return _rigid(m.pose.position, m.pose.orientation, "pose")

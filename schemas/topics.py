@@ -57,6 +57,41 @@ CALIBRATION = Topic(
     Scope.SENSOR,
     "pinhole intrinsics of the colour camera",
 )
+RAW_DEPTH = Topic(
+    "/<robot>/depth_camera/depth",
+    "foxglove.RawImage",
+    "converters",
+    Scope.SENSOR,
+    "16UC1 depth along z of a camera of its own, read where there is no registered depth; depth_scale as above",
+)
+RAW_DEPTH_CALIBRATION = Topic(
+    "/<robot>/depth_camera/calibration",
+    "foxglove.CameraCalibration",
+    "converters",
+    Scope.SENSOR,
+    "pinhole intrinsics of the depth camera",
+)
+RAW_DEPTH_TRANSFORM = Topic(
+    "/<robot>/depth_camera/transform",
+    "foxglove.FrameTransform",
+    "converters",
+    Scope.SENSOR,
+    "pose of the depth camera in the colour camera, constant",
+)
+LIDAR = Topic(
+    "/<robot>/lidar/points",
+    "foxglove.PointCloud",
+    "converters",
+    Scope.SENSOR,
+    "points of one sweep, x y z in metres, read where there is no depth image",
+)
+LIDAR_TRANSFORM = Topic(
+    "/<robot>/lidar/transform",
+    "foxglove.FrameTransform",
+    "converters",
+    Scope.SENSOR,
+    "pose of the LiDAR in the colour camera, constant",
+)
 GROUNDTRUTH_POSE = Topic(
     "/<robot>/groundtruth/pose",
     "foxglove.PoseInFrame",
@@ -150,6 +185,11 @@ TOPICS: tuple[Topic, ...] = (
     DEPTH,
     MASK,
     CALIBRATION,
+    RAW_DEPTH,
+    RAW_DEPTH_CALIBRATION,
+    RAW_DEPTH_TRANSFORM,
+    LIDAR,
+    LIDAR_TRANSFORM,
     GROUNDTRUTH_POSE,
     GROUNDTRUTH_DEPTH,
     ODOMETRY,

@@ -1,4 +1,4 @@
-"""Simulated recordings: a team of robots with RGB-D cameras in a procedural room, with exact ground truth."""
+"""Simulated recordings: a team of robots with RGB-D cameras in a procedural room or in a scene of textured meshes."""
 
 import tempfile
 from collections import deque
@@ -25,8 +25,6 @@ DEPTH_SCALE_M = 1 / 5000
 FRAME_RATE_HZ = 30
 START_NS = 1_000_000_000
 FOCAL_OF_WIDTH = 0.82  # focal length as a share of the image width: 63 degrees across
-TEXEL_M = 0.004
-GEOMETRY_POINTS = 200_000
 NOISES = ("none", "kinect")
 PNG_LEVEL = 1
 MAX_ROBOTS = 8
@@ -43,51 +41,52 @@ def simulate(
     overlap: float = 0.6,
     workers: int = 2,
     force: bool = False,
+    up: str = "auto",
 ) -> None:
     """Render a recording of a robot team, with exact depth, poses and geometry as ground truth.
 
     Args:
         out: folder of the recording, made here.
-        robots: how many; each follows a path of its own, 22 mm per frame.
+        robots: how many; each follows a path of its own, 22 mm per frame in a room, 28 mm among meshes.
         frames: per robot, at 30 Hz.
-        scene: one of `SCENES`.
+        scene: one of `SCENES`, or else a folder of textured meshes.
         size: width and height of the images, pixels.
         noise: "none" or "kinect" (then the exact depth goes to the ground truth).
         seed: of scene, paths and noise; the same bytes for the same arguments, whatever the workers.
         overlap: share of what a robot sees that the next one sees as well.
         workers: processes that render.
         force: replace a recording that is there.
+        up: of meshes, the axis that is up in the files: "y", "z", or "auto", as is custom for their format.
     Raises:
-        DuagError: an argument is out of range, or `out` exists.
+        DuagError: an argument is out of range, `out` exists, or a mesh cannot be used.
     """
     _check(robots, frames, scene, size, noise, overlap, workers)
     numeric.settle()
     numeric.settle_opencv()
-    from converters.simulate import bake, paths
-    from converters.simulate.render import Renderer
-    from converters.simulate.scene import build
+    from converters.simulate import paths
 
     camera = _camera(size)
     names = robot_names(robots)
-    parameters = {"scene": scene, "robots": robots, "frames": frames, "size": list(size)}
+    source, parameters = _about(scene, up)
+    parameters |= {"robots": robots, "frames": frames, "size": list(size)}
     parameters |= {"noise": noise, "seed": seed, "overlap": overlap}
-    with RecordingWriter(out, "", {"kind": "simulation"}, "simulate", parameters, force) as recording:
-        room = build(scene, seed)
-        atlas = bake.bake(room, TEXEL_M)
-        ways = paths.plan(room, robots, frames, overlap, camera)
-        small = Renderer(room, None, camera.scaled(*paths.OVERLAP_IMAGE))
+    with (
+        RecordingWriter(out, "", source, "simulate", parameters, force) as recording,
+        tempfile.TemporaryDirectory(prefix="duagc-scene-") as cache,
+    ):
+        stage = _stage(scene, parameters.get("up", ""), seed, Path(cache))
+        ways = stage.plan(robots, frames, overlap, camera)
+        small = stage.eye(camera.scaled(*paths.OVERLAP_IMAGE))
         recording.checks["clearance_m"] = {
-            name: float(room.clearance(way[:, :3, 3]).min()) for name, way in zip(names, ways, strict=True)
+            name: float(stage.clearance(way[:, :3, 3]).min()) for name, way in zip(names, ways, strict=True)
         }
         recording.checks["shared_view"] = {
             f"{names[i]}-{names[i + 1]}": paths.shared_view(small, ways[i], ways[i + 1])
             for i in range(robots - 1)
         }
-        recording.add_geometry(
-            lambda path: write_points(path, *bake.surface_points(room, atlas, GEOMETRY_POINTS))
-        )
+        recording.add_geometry(lambda path: write_points(path, *stage.points()))
         jobs = [_Job(name, i, way[i]) for name, way in zip(names, ways, strict=True) for i in range(frames)]
-        with _Studio(room, atlas, camera, noise, workers) as studio:
+        with _Studio(stage, camera, noise, seed, workers) as studio:
             images = track(studio.images(jobs), "simulate", len(jobs))
             for name, way in zip(names, ways, strict=True):
                 with recording.robot(name, camera, DEPTH_SCALE_M, {"depth_noise": noise}) as robot:
@@ -95,6 +94,29 @@ def simulate(
                         image = next(images)
                         stamp_ns = START_NS + round(i * 1e9 / FRAME_RATE_HZ)
                         robot.add_frame(stamp_ns, image.png, "png", image.depth, way[i], image.exact_depth)
+
+
+def _about(scene: str, up: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What `recording.json` says about a scene: source and parameters, no path of this machine."""
+    if scene in SCENES:
+        return {"kind": "simulation"}, {"scene": scene}
+    from converters.simulate import meshes
+
+    folder = Path(scene).resolve()
+    files = meshes.mesh_files(folder)
+    source = {"kind": "simulation", "scene": folder.name, "files_sha256": meshes.digests(files)}
+    return source, {"scene": folder.name, "up": meshes.up_axis(files, up)}
+
+
+def _stage(scene: str, up: str, seed: int, cache: Path) -> Any:
+    """The scene, ready to be rendered; meshes are read into `cache`."""
+    from converters.simulate import meshes
+    from converters.simulate.stages import MeshStage, RoomStage
+
+    if scene in SCENES:
+        return RoomStage(scene, seed)
+    meshes.read(Path(scene), up, cache)
+    return MeshStage(seed, cache)
 
 
 def _check(
@@ -113,8 +135,10 @@ def _check(
             raise DuagError(f"simulate: {name} is {value}, expected {low} to {high}")
     if noise not in NOISES:
         raise DuagError(f"simulate: noise is {noise!r}, expected one of {', '.join(NOISES)}")
-    if scene not in SCENES:
-        raise DuagError(f"simulate: scene is {scene!r}, expected one of {', '.join(sorted(SCENES))}")
+    if scene not in SCENES and not Path(scene).is_dir():
+        raise DuagError(
+            f"simulate: scene is {scene!r}, expected {', '.join(sorted(SCENES))} or a folder of textured meshes"
+        )
 
 
 def _camera(size: tuple[int, int]) -> PinholeCamera:
@@ -145,15 +169,8 @@ class _Images:
 class _Artist:
     """Renders, disturbs and encodes frames; what it makes of a job depends on nothing but the job."""
 
-    def __init__(self, scene: Any, atlas: Any, camera: PinholeCamera, noise: str) -> None:
-        from converters.simulate.render import Renderer
-
-        self.renderer, self.camera, self.noise, self.seed = (
-            Renderer(scene, atlas, camera),
-            camera,
-            noise,
-            scene.seed,
-        )
+    def __init__(self, stage: Any, camera: PinholeCamera, noise: str, seed: int) -> None:
+        self.eye, self.camera, self.noise, self.seed = stage.eye(camera), camera, noise, seed
 
     def draw(self, job: _Job) -> _Images:
         """The images of one frame."""
@@ -161,7 +178,7 @@ class _Artist:
 
         from converters.simulate import noise
 
-        view = self.renderer.render(job.pose)
+        view = self.eye.render(job.pose)
         color, exact = view.color, _units(view.depth)
         depth = exact
         if self.noise == "kinect":
@@ -180,36 +197,25 @@ def _units(depth_m: NDArray[np.float64]) -> NDArray[np.uint16]:
 
 
 class _Studio:
-    """Artists in as many processes as asked for, which share one atlas on disk; one worker paints right here."""
+    """Artists in as many processes as asked for, which share one scene on disk; one worker paints right here."""
 
-    def __init__(self, scene: Any, atlas: Any, camera: PinholeCamera, noise: str, workers: int) -> None:
-        self.workers = workers
-        self._about = (scene, atlas, camera, noise)
+    def __init__(self, stage: Any, camera: PinholeCamera, noise: str, seed: int, workers: int) -> None:
+        self.stage, self.workers = stage, workers
+        self._about = (camera, noise, seed)
         self._pool: ProcessPoolExecutor | None = None
         self._open = ExitStack()
 
     def __enter__(self) -> "_Studio":
-        scene, atlas, camera, noise = self._about
         if self.workers > 1:
             folder = self._open.enter_context(tempfile.TemporaryDirectory(prefix="duagc-atlas-"))
-            for k, level in enumerate(atlas.levels):
-                np.save(Path(folder) / f"{k}.npy", level)
-            start = (
-                scene.name,
-                scene.seed,
-                folder,
-                len(atlas.levels),
-                atlas.origin,
-                camera,
-                noise,
-            )
+            start = (self.stage.store(Path(folder)), *self._about)
             self._pool = self._open.enter_context(worker_pool(self.workers, _start_worker, start))
         return self
 
     def images(self, jobs: list[_Job]) -> Iterator[_Images]:
         """The images of all jobs, in their order; a few are in work ahead of the one that is asked for."""
         if self._pool is None:
-            artist = _Artist(*self._about)
+            artist = _Artist(self.stage, *self._about)
             yield from map(artist.draw, jobs)
             return
         waiting: deque[Future[_Images]] = deque()
@@ -229,23 +235,11 @@ class _Studio:
 _artist: _Artist | None = None
 
 
-def _start_worker(
-    scene: str,
-    seed: int,
-    folder: str,
-    levels: int,
-    origin: NDArray[np.float64],
-    camera: PinholeCamera,
-    noise: str,
-) -> None:
+def _start_worker(stored: Any, camera: PinholeCamera, noise: str, seed: int) -> None:
     """Set up the artist of a worker process."""
     global _artist
     numeric.settle_opencv()
-    from converters.simulate.bake import Atlas
-    from converters.simulate.scene import build
-
-    maps = [np.asarray(np.load(Path(folder) / f"{k}.npy", mmap_mode="r")) for k in range(levels)]
-    _artist = _Artist(build(scene, seed), Atlas(maps, origin, TEXEL_M), camera, noise)
+    _artist = _Artist(stored.open(), camera, noise, seed)
 
 
 def _draw(job: _Job) -> _Images:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from converters.simulate.render import Renderer
+from converters.simulate.render import Eye, Renderer
 from converters.simulate.scene import UP, Scene
 from pipeline import streams
 from pipeline.errors import DuagError
@@ -140,7 +140,7 @@ def _loop(scene: Scene, robot: int) -> Loop:
     )
 
 
-def shared_view(renderer: Renderer, poses_a: Array, poses_b: Array) -> float:
+def shared_view(renderer: Eye, poses_a: Array, poses_b: Array) -> float:
     """Share of the pixels of path a [n, 4, 4] whose points path b sees too, and the other way round, averaged."""
     picked = [
         poses[np.unique(np.linspace(0, len(poses) - 1, OVERLAP_VIEWS).round().astype(np.int64))]

@@ -7,6 +7,7 @@ whatever each of them hits; textures are read at the mip level whose texels are 
 """
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -28,11 +29,23 @@ BORDER_OFFSETS = np.array(
 
 @dataclass(frozen=True)
 class View:
-    """What a camera sees: colour uint8 [h, w, 3] RGB; depth float64 [h, w], z in m, 0 = nothing; surface int16."""
+    """What a camera sees: colour uint8 [h, w, 3] RGB; depth float64 [h, w], z in m, 0 = nothing; surface its index."""
 
     color: NDArray[np.uint8]
     depth: Array
-    surface: NDArray[np.int16]
+    surface: NDArray[np.integer]
+
+
+class Eye(Protocol):
+    """Renders one scene with one camera."""
+
+    camera: PinholeCamera
+
+    def depth(self, T_world_camera: ArrayLike) -> tuple[Array, Any]:
+        """Depth (z, m, [h, w]; 0 = nothing) at the pixel centres, and what is seen there (-1 = nothing)."""
+
+    def render(self, T_world_camera: ArrayLike) -> View:
+        """Colour and depth from a camera pose T_world_camera [4, 4]."""
 
 
 class Renderer:

@@ -45,6 +45,7 @@ EVIDENCE_MODES = {
 MODES = (*EVIDENCE_MODES, "admm", "paper")
 PAPER_BYTES_PER_PAIR = 28 * 4  # what the paper counts per matched pair and round
 _PACKET_HEAD_BYTES = 12  # sequence, first row, counts
+STILL_ROUNDS = 100  # in a row without any change, lost packets or not: it will not come nearer
 _NEAR_SIGMA, _AT_SIGMA = 0.05, 1e-6
 
 
@@ -174,7 +175,7 @@ def _rounds(team: _Team, model: LinkModel, case: dict[str, Any], plan: Plan) -> 
         )
         for n in team.names
     }
-    cost = _Cost()
+    cost, still = _Cost(), 0
     sequences: dict[tuple[str, str], Iterator[int]] = {}
     for round_index in range(plan.max_rounds):
         begun = time.process_time()
@@ -194,8 +195,9 @@ def _rounds(team: _Team, model: LinkModel, case: dict[str, Any], plan: Plan) -> 
         cost.seconds += time.process_time() - begun
         cost.rounds = round_index + 1
         cost.note(max(team.gap_sigma(n, agent.x) for n, agent in agents.items()))
-        still = max(agent.change_sigma for agent in agents.values()) < 1e-12
-        if cost.rounds_at is not None or (still and round_index > 200):
+        moving = max(agent.change_sigma for agent in agents.values()) > 1e-12
+        still = 0 if moving else still + 1
+        if cost.rounds_at is not None or still > STILL_ROUNDS:
             break
     return cost
 

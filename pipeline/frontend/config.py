@@ -14,6 +14,38 @@ def is_held_out(frame_index: int) -> bool:
     return frame_index % HELD_OUT_PERIOD == HELD_OUT_OFFSET
 
 
+class LoopConfig(Config):
+    """Recognising places of the robot's own path."""
+
+    enabled: bool = True
+    min_gap: int = 3
+    """Keyframes that lie between the two at least, less one."""
+    known_overlap: float = 0.3
+    """Overlap by the tracked poses from which a pair needs no recognition."""
+    features_compared: int = 120
+    """The strongest features, by which earlier keyframes are ranked."""
+    ratio: float = 0.8
+    """Nearest over second-nearest distance of descriptors below which a match counts."""
+    min_matches: int = 10
+    """Matches among them from which a pair is a candidate."""
+    candidates: int = 2
+    """Earlier keyframes tried per keyframe, those with most matches."""
+    hypotheses: int = 300
+    """Three-point samples of RANSAC."""
+    inlier_m: float = 0.05
+    """Distance below which a match agrees with a motion, at one metre of depth; grows with depth."""
+    min_inliers: int = 15
+    """Matches that must agree on one motion."""
+    min_inlier_share: float = 0.3
+    """The same as a share of the matches; the larger number holds."""
+    min_overlap: float = 0.4
+    """Overlap that the registrations must find."""
+    max_disagreement_m: float = 0.03
+    """Largest distance between the registration one way and the other."""
+    max_disagreement_rad: float = 0.03
+    """The same for the rotation."""
+
+
 class KeyframeConfig(Config):
     """When a frame becomes a keyframe, and how keyframe poses are refined together."""
 
@@ -29,6 +61,81 @@ class KeyframeConfig(Config):
     """Least overlap, predicted and found, of such a registration."""
     huber_sigmas: float = 3.0
     """Registrations that disagree by more than this with the refined poses count linearly."""
+    local_optimisation: bool = True
+    """Optimise all keyframe poses jointly on the images; without, only the registrations made in tracking count."""
+    optimisation_rounds: int = 10
+    """Linearisations of all pairs at most; it ends when no pose moves by more than 0.1 mm and 0.1 mrad."""
+    optimisation_overlap: float = 0.3
+    """Least overlap, at the present poses, of two keyframes that are compared."""
+    optimisation_neighbours: int = 8
+    """Earlier keyframes that a keyframe is compared with at most, those with most overlap."""
+    loops: LoopConfig = LoopConfig()
+
+
+class FailureConfig(Config):
+    """Tests of whether what the camera shows can be true."""
+
+    max_frames_without_depth: int = 15
+    """Frames in a row that are tracked by colour alone, because their depth is missing or stuck."""
+    stuck_share: float = 0.99
+    """An image is stuck if this share of its measured pixels has the very values of the image before."""
+    stuck_gray_change: float = 0.25
+    """Change of a grey value of the coarsest image, in standard deviations of that image, that counts as one."""
+    stuck_gray_share: float = 0.05
+    """Share of changed grey values from which a stuck depth image no longer belongs to the colour."""
+    stuck_depth_change: float = 0.02
+    """Relative change of a depth of the coarsest image that counts as one."""
+    stuck_depth_share: float = 0.1
+    """Share of changed depths from which a stuck colour image no longer belongs to the depth."""
+    intruder_gate_m: float = 0.15
+    """A point nearer by this than what a keyframe saw there stands in space that was free."""
+    intruder_gate_relative: float = 0.1
+    """The same as a fraction of the depth; the larger limit holds."""
+    max_intruders: float = 0.1
+    """Largest share of such points in a frame that becomes a keyframe, or by which a lost camera is found again."""
+    min_told: float = 0.65
+    """Share of a frame's points that its keyframe must be able to judge to say that what stood before it is gone."""
+    max_speed_m_s: float = 3.0
+    """Greatest speed of the camera: a lost one is not found farther away than it can have come."""
+    slack_m: float = 0.1
+    """Added to that distance."""
+    slack_rad: float = 0.1
+    """With `slack_m`, how far from where it was expected a camera may be found on a surface without features."""
+
+
+class RelocalisationConfig(Config):
+    """Finding a lost camera again by features of its image."""
+
+    features: int = 400
+    """Features kept per keyframe."""
+    features_compared: int = 120
+    """The strongest of them, by which keyframes are ranked."""
+    max_width_px: int = 400
+    """Features come from the finest image of the pyramid that is not wider."""
+    ratio: float = 0.8
+    """Nearest over second-nearest distance of descriptors below which a match counts."""
+    candidates: int = 3
+    """Keyframes tried per frame, those with most matches."""
+    min_matches: int = 6
+    """Matches among the strongest features from which a keyframe is tried."""
+    hypotheses: int = 300
+    """Three-point samples of RANSAC."""
+    inlier_m: float = 0.05
+    """Distance below which a match agrees with a motion, at one metre of depth; grows with depth."""
+    min_inliers: int = 10
+    """Matches that must agree on one motion."""
+    min_inlier_share: float = 0.25
+    """The same as a share of the matches; the larger number holds."""
+    min_overlap: float = 0.5
+    """Overlap by which a place must be seen to be believed."""
+    max_conflict: float = 0.1
+    """Largest fraction of a keyframe's seen samples in space that the frame saw to be free, to be believed."""
+    max_gray_rms: float = 0.03
+    """Largest grey residual of a place that is believed, plus `max_gray_rms_of_usual` times the usual one: that of the
+    frames tracked before. Rooms built alike agree in shape, not in their pictures."""
+    max_gray_rms_of_usual: float = 2.0
+    confirmations: int = 1
+    """Later frames that must be tracked from there before the camera counts as found."""
 
 
 class TrackingConfig(Config):
@@ -46,8 +153,16 @@ class TrackingConfig(Config):
     """The second attempt: one more pyramid level, wider gates; its result is checked by the usual registration."""
     strides: tuple[int, ...] = (4, 2, 1, 1)
     """Pixels between samples of a keyframe, per pyramid level, finest first."""
-    relocalisation_keyframes: int = 8
-    """Latest keyframes that a lost camera is compared with."""
+    max_extrapolation_s: float = 0.2
+    """Longest gap in time over which the last velocity is believed."""
+    equalise_from_gain: float = 1.2
+    """A frame that failed is tried again with brightness and contrast brought to those of the keyframe if the contrast
+    differs by more than this factor."""
+    max_keyframe_gain: float = 1.5
+    """A frame brighter or darker than its keyframe by more than this factor becomes one only below
+    `relocalisation.min_overlap`."""
+    failure: FailureConfig = FailureConfig()
+    relocalisation: RelocalisationConfig = RelocalisationConfig()
 
 
 class FrontendConfig(Config):

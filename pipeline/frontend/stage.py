@@ -1,14 +1,14 @@
 """The front-end stage: from one robot's sensor log to its odometry, keyframes and Gaussian map.
 
-Three passes over the log: all frames are tracked; the keyframe poses are refined together; the map is grown at the
-refined poses. Frames hang on keyframes, so their poses are final before the first message is written. The stage is
-offline in this sense; times in the log are those of the recording all the same.
+Three passes over the log: all frames are tracked; the keyframe poses are optimised together, loops included; the map
+is grown at the poses found. Frames hang on keyframes, so their poses are final before the first message is written.
+The stage is offline in this sense; times in the log are those of the recording all the same.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,11 +17,14 @@ from numpy.typing import NDArray
 
 from pipeline import progress as progress_bar
 from pipeline.errors import DuagError
+from pipeline.frontend import bundle
 from pipeline.frontend.config import FrontendConfig, is_held_out
-from pipeline.frontend.keyframes import KeyframePair, Refined, refine, relative_information
+from pipeline.frontend.failure import Reason
+from pipeline.frontend.keyframes import KeyframePair, Refined, refine
 from pipeline.frontend.tracking import Status, TrackedFrame, TrackedKeyframe, Tracker
 from pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
 from pipeline.recording import LogWriter, RgbdLog, open_rgbd
+from pipeline.registration import RgbdPyramid
 from pipeline.splat.gaussians import DepthKind, Gaussians
 from schemas import topics
 
@@ -57,19 +60,24 @@ def run_frontend(
         if len(log) == 0:
             raise DuagError(f"{log_path}: has no image, expected at least one")
         tracker, frames = _track(log, config, progress)
+        if not tracker.keyframes:
+            reasons = sorted({frame.reason.value for frame in frames})
+            raise DuagError(
+                f"{log_path}: found no frame to begin a map with ({', '.join(reasons)}), expected one with depth"
+            )
         clock.lap("tracking_s")
-        refined = refine(
-            np.array([k.T_map_keyframe for k in tracker.keyframes]),
-            tracker.pairs,
-            config.keyframes.huber_sigmas,
-        )
+        refined, pairs = _refine(log, tracker, config, seed)
         keyframes = _keyframe_messages(log.robot, tracker.keyframes, refined)
-        factors = _factor_messages(log.robot, tracker.keyframes, tracker.pairs, refined)
+        factors = _factor_messages(log.robot, tracker.keyframes, pairs, refined)
         clock.lap("refinement_s")
         updates, maps = _map(log, keyframes, frames, config, seed, threads, progress, clock)
         clock.lap("final_refinement_s")
+        alone = {
+            "color_without_depth": str(len(log.pairing.color_alone)),
+            "depth_without_color": str(len(log.pairing.depth_alone)),
+        }
     odometry = [_odometry(log.robot, frame, refined.T_map_keyframe) for frame in frames]
-    _write(out_path, log.robot, odometry, keyframes, factors, updates, maps)
+    _write(out_path, log.robot, odometry, keyframes, factors, updates, maps, alone)
     clock.lap("writing_s")
     return clock.laps
 
@@ -87,6 +95,32 @@ def _track(log: RgbdLog, config: FrontendConfig, progress: bool) -> tuple[Tracke
     return tracker, tracked
 
 
+def _refine(
+    log: RgbdLog, tracker: Tracker, config: FrontendConfig, seed: int
+) -> tuple[Refined, Sequence[KeyframePair]]:
+    """Keyframe poses from all that their images say together, and the factors that say the same."""
+    keyframes, settings = tracker.keyframes, config.keyframes
+    start = np.array([keyframe.T_map_keyframe for keyframe in keyframes])
+    if len(keyframes) < 2 or not (settings.local_optimisation or settings.loops.enabled):
+        return refine(start, tracker.pairs, settings.huber_sigmas), tracker.pairs
+
+    def images(index: int, levels: int = 1) -> RgbdPyramid:
+        frame = log.frame(keyframes[index].frame_index)
+        depth = frame.depth if frame.mask is None else np.where(frame.mask, frame.depth, np.float32(0))
+        return RgbdPyramid.build(frame.color * np.float32(1 / 255), depth, log.camera, levels)
+
+    registration, levels = config.tracking.registration, len(config.tracking.strides)
+    pairs = list(tracker.pairs)
+    if settings.loops.enabled:
+        tracked = refine(start, pairs, settings.huber_sigmas).T_map_keyframe
+        pairs += bundle.find_loops(
+            tracked, keyframes, lambda k: images(k, levels), settings.loops, registration, seed, log.robot
+        )
+    if not settings.local_optimisation:
+        return refine(start, pairs, settings.huber_sigmas), pairs
+    return bundle.optimise(start, keyframes, images, pairs, settings, registration)
+
+
 def _keyframe_messages(robot: str, keyframes: Sequence[TrackedKeyframe], refined: Refined) -> list[Keyframe]:
     """Keyframes at their refined poses, with the information of the refined relative motion."""
     messages = []
@@ -96,7 +130,7 @@ def _keyframe_messages(robot: str, keyframes: Sequence[TrackedKeyframe], refined
         T_previous_keyframe, information = np.eye(4), np.zeros((6, 6))
         if previous >= 0:
             T_previous_keyframe = np.linalg.solve(T_map_keyframes[previous], T)
-            information = relative_information(T_map_keyframes, refined.covariance, previous, index)
+            information = refined.relative_information(previous, index)
         gain, offset = keyframe.exposure
         messages.append(
             Keyframe(
@@ -205,6 +239,7 @@ def _support(
         frame
         for frame in frames
         if frame.status is not Status.LOST
+        and frame.reason is Reason.NONE  # its depth belongs to it
         and frame.frame_index not in taken
         and not is_held_out(frame.frame_index)
     ]
@@ -227,6 +262,7 @@ def _odometry(robot: str, frame: TrackedFrame, T_map_keyframes: Array) -> Odomet
         overlap=frame.overlap,
         rms_depth_m=frame.rms_depth_m,
         rms_color=frame.rms_gray,
+        reason=frame.reason.value,
     )
 
 
@@ -238,6 +274,7 @@ def _write(
     factors: Sequence[KeyframeFactor],
     updates: Sequence[MapUpdate],
     maps: _Maps,
+    alone: Mapping[str, str],
 ) -> None:
     """One message per frame, then what its keyframe did, in the order of time; the maps at the end."""
     keyframe_of = {keyframe.frame_index: keyframe for keyframe in keyframes}
@@ -249,7 +286,7 @@ def _write(
         updates_of.setdefault(update.keyframe_index, []).append(update)
     tracked = sum(message.status != Status.LOST.value for message in odometry)
     with LogWriter(
-        out_path, robot=robot, metadata={"frames": str(len(odometry)), "tracked": str(tracked)}
+        out_path, robot=robot, metadata={"frames": str(len(odometry)), "tracked": str(tracked), **alone}
     ) as log:
         for message in odometry:
             time_ns = message.stamp_ns + LATENCY_NS

@@ -1,27 +1,42 @@
 """Tracking of one RGB-D camera, frame to keyframe, without rendering.
 
-Every frame is registered to the latest keyframe from a constant-velocity guess. If that fails, it is tried again
-from other starts and with wider gates, then against earlier keyframes; if all fail the frame is `lost`, which the
-log says, and nothing is made of it.
+Every frame is registered to the latest keyframe from a constant-velocity guess. If that fails, it is tried again from
+other starts and with wider gates. If all fail the frame is `lost`: the log says so and why, and nothing is made of it.
+A lost camera is looked for where it was last, and among all keyframes by features. What is found so counts only when
+the next frame agrees.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.frontend.config import FrontendConfig, is_held_out
+from pipeline.frontend.failure import Reason, StuckImages, has_enough_depth, intruders
 from pipeline.frontend.keyframes import KeyframePair, becomes_keyframe, predicted_overlap
+from pipeline.frontend.relocalisation import features_of, guesses, supports
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.registration import Reference, Registration, RegistrationConfig, RgbdPyramid, register
+from pipeline.registration import (
+    Level,
+    Outcome,
+    Reference,
+    Registration,
+    RegistrationConfig,
+    RgbdPyramid,
+    register,
+)
+from pipeline.registration.features import Features
 
 Array = NDArray[np.float64]
 Image = NDArray[np.floating]
+SETTLING_ROUNDS = 3
+USUAL_FRAMES = 50  # whose residuals are the usual ones
+FEATURES_TO_SAY = 3  # times the inliers needed: a keyframe with fewer features cannot say where a view is
+SETTLED_M, SETTLED_RAD = 0.01, 0.01  # a registration that moves less from its own answer has settled
 
 
 class Status(Enum):
@@ -37,7 +52,8 @@ class TrackedFrame:
     """Where a frame was, relative to a keyframe.
 
     keyframe_index: the keyframe that it hangs on. T_keyframe_camera: [4, 4]; the last known one if lost.
-    information: [6, 6] of T_keyframe_camera, right tangent (translation m, rotation rad); zero if lost.
+    information: [6, 6] of T_keyframe_camera, right tangent (translation m, rotation rad); zero if lost. reason: why
+    it is lost, or why only its colour was used.
     """
 
     frame_index: int
@@ -49,11 +65,15 @@ class TrackedFrame:
     overlap: float
     rms_depth_m: float
     rms_gray: float
+    reason: Reason = Reason.NONE
 
 
 @dataclass(frozen=True)
 class TrackedKeyframe:
-    """A keyframe as it was tracked. exposure: (gain, offset) of its grey values relative to keyframe 0."""
+    """A keyframe as it was tracked. exposure: (gain, offset) of its grey values relative to keyframe 0.
+
+    features: by which a lost camera is found here. coarsest: the coarsest image of its pyramid.
+    """
 
     keyframe_index: int
     frame_index: int
@@ -61,7 +81,31 @@ class TrackedKeyframe:
     previous_index: int
     T_map_keyframe: Array
     reference: Reference = field(repr=False)
+    features: Features = field(repr=False)
+    coarsest: Level = field(repr=False)
     exposure: tuple[float, float] = (1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A registration of a frame to a keyframe. without: why only its colour was used."""
+
+    keyframe_index: int
+    result: Registration
+    without: Reason = Reason.NONE
+
+    def why_not(self) -> Reason:
+        """Why it is not believed: the registration failed, or it ended well in a place that cannot be."""
+        return Reason.OBSTRUCTED if self.result.ok else Reason(self.result.outcome.value)
+
+
+@dataclass(frozen=True)
+class _Unconfirmed:
+    """A place where a lost camera may be, as of a time, and how many later frames agreed."""
+
+    found: _Found
+    stamp_ns: int
+    agreed: int
 
 
 class Tracker:
@@ -72,10 +116,16 @@ class Tracker:
         self.keyframes: list[TrackedKeyframe] = []
         self.pairs: list[KeyframePair] = []
         """Registrations between keyframes, for `keyframes.refine`."""
+        self._stuck = StuckImages(config.tracking.failure)
         self._current = 0  # keyframe that frames are tracked against
         self._T_keyframe_camera = np.eye(4)  # of the last frame that was tracked
-        self._motion = np.eye(4)  # T_camera_next of the two frames before, identity after a loss
+        self._stamp_ns = 0  # of the same
+        self._velocity = np.zeros(6)  # right tangent per second, of the two frames before; zero after a loss
         self._lost = False
+        self._unconfirmed: _Unconfirmed | None = None
+        self._gray_rms: list[float] = []  # of the last frames that were followed
+        self._obstructed = False  # something stands before the camera
+        self._without_depth = 0  # frames in a row without usable depth
 
     def track(
         self,
@@ -86,79 +136,250 @@ class Tracker:
         *,
         mask: NDArray[np.bool_] | None = None,
     ) -> TrackedFrame:
-        """Track one frame; the first becomes keyframe 0 and the origin of the map.
+        """Track one frame; the first that can be used becomes keyframe 0 and the origin of the map.
 
         Args:
+            stamp_ns: time of the frame, increasing.
             image: colour [h, w, 3] or grey [h, w], 0..1. depth_m: [h, w], metres, 0 = unknown.
             mask: bool [h, w], False where a pixel must not be used; its depth counts as unknown. None = all may.
         """
         if mask is not None:
             depth_m = np.where(mask, depth_m, 0)
         pyramid = RgbdPyramid.build(image, depth_m, self.camera, levels=len(self.config.tracking.strides))
-        if not self.keyframes:
-            self._add_keyframe(frame_index, stamp_ns, pyramid, -1, np.eye(4), None)
-            nothing = np.zeros((6, 6))
-            return TrackedFrame(frame_index, stamp_ns, 0, np.eye(4), nothing, Status.OK, 1.0, 0.0, 0.0)
-        found = self._register(pyramid)
+        found = self._examine(frame_index, stamp_ns, pyramid)
         if found is None:
-            self._motion, self._lost = np.eye(4), True
-            return self._lost_frame(frame_index, stamp_ns)
-        keyframe_index, result = found
+            return self._begin(frame_index, stamp_ns, pyramid)
+        if isinstance(found, Reason):
+            return self._lose(frame_index, stamp_ns, found)
+        return self._accept(frame_index, stamp_ns, pyramid, found)
+
+    def _examine(self, frame_index: int, stamp_ns: int, pyramid: RgbdPyramid) -> _Found | Reason | None:
+        """Where a frame is, or why that is not known; None if it may become the first keyframe."""
+        failure = self.config.tracking.failure
+        stuck = self._stuck.look(pyramid)
+        if stuck is Reason.STUCK_COLOR:
+            return stuck
+        without = stuck
+        if not has_enough_depth(pyramid, self.config.tracking.registration):
+            without = Reason.NO_DEPTH
+        if without is Reason.NONE:
+            self._without_depth = 0
+            return self._find(frame_index, stamp_ns, pyramid) if self.keyframes else None
+        self._without_depth += 1
+        enough = self._without_depth > failure.max_frames_without_depth
+        if enough or not self.keyframes or self._long_lost(stamp_ns):
+            return without
+        found = self._find_near(stamp_ns, pyramid.without_depth())
+        return replace(found, without=without) if isinstance(found, _Found) else without
+
+    def _begin(self, frame_index: int, stamp_ns: int, pyramid: RgbdPyramid) -> TrackedFrame:
+        """Make the first keyframe, unless the frame is held out or shows too little surface."""
+        reference = Reference.from_pyramid(pyramid, self.config.tracking.strides)
+        limits = self.config.tracking.registration
+        used = reference.levels[: len(limits.iterations)]
+        if is_held_out(frame_index) or any(len(level) < limits.min_samples for level in used):
+            return self._lose(frame_index, stamp_ns, Reason.NO_DEPTH)
+        self._add_keyframe(frame_index, stamp_ns, pyramid, -1, np.eye(4), None)
+        self._stamp_ns, self._lost = stamp_ns, False
+        nothing = np.zeros((6, 6))
+        return TrackedFrame(frame_index, stamp_ns, 0, np.eye(4), nothing, Status.OK, 1.0, 0.0, 0.0)
+
+    def _accept(self, frame_index: int, stamp_ns: int, pyramid: RgbdPyramid, found: _Found) -> TrackedFrame:
+        """Take over the pose of a frame; it becomes a keyframe if it sees much that is new."""
+        keyframe_index, result = found.keyframe_index, found.result
         status = Status.RELOCALISED if self._lost else Status.OK
-        followed = keyframe_index == self._current and not self._lost
-        self._motion = (
-            se3.inverse(self._T_keyframe_camera) @ result.T_reference_target if followed else np.eye(4)
-        )
+        elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
+        followed = keyframe_index == self._current and not self._lost and elapsed_s > 0
+        step = se3.inverse(self._T_keyframe_camera) @ result.T_reference_target
+        self._velocity = se3.log(step) / elapsed_s if followed else np.zeros(6)
         self._current, self._T_keyframe_camera, self._lost = keyframe_index, result.T_reference_target, False
-        if not is_held_out(frame_index) and becomes_keyframe(result, pyramid, self.config.keyframes):
+        self._stamp_ns, self._unconfirmed = stamp_ns, None
+        if followed:
+            self._gray_rms = [*self._gray_rms[1 - USUAL_FRAMES :], result.rms_gray]
+        if (
+            not is_held_out(frame_index)
+            and found.without is Reason.NONE
+            and becomes_keyframe(result, pyramid, self.config.keyframes)
+            and self._well_exposed(result)
+            and self._unobstructed(pyramid, found)
+        ):
             return self._promote(frame_index, stamp_ns, pyramid, keyframe_index, result, status)
-        return _tracked(frame_index, stamp_ns, keyframe_index, result, status)
+        return _tracked(frame_index, stamp_ns, keyframe_index, result, status, found.without)
+
+    def _lose(self, frame_index: int, stamp_ns: int, reason: Reason) -> TrackedFrame:
+        """A frame without a pose: it keeps the last known one, and says that it means nothing."""
+        self._lost = True
+        T, nothing = self._T_keyframe_camera, np.zeros((6, 6))
+        return TrackedFrame(
+            frame_index, stamp_ns, self._current, T, nothing, Status.LOST, 0.0, 0.0, 0.0, reason
+        )
 
     # --- one frame ------------------------------------------------------------------------------------------------
 
-    def _register(self, pyramid: RgbdPyramid) -> tuple[int, Registration] | None:
-        """The first registration that is OK: its keyframe and result."""
+    def _find(self, frame_index: int, stamp_ns: int, pyramid: RgbdPyramid) -> _Found | Reason:
+        """Where a frame is, or why that is not known.
+
+        Long lost, a camera is found when one frame and then as many as must confirm it are tracked from one place.
+        """
         tracking = self.config.tracking
-        for index, guess, config in self._attempts():
-            reference = self.keyframes[index].reference
-            result = register(reference, pyramid, guess, config)
-            if result.ok and config is tracking.recovery:
-                # wide gates let wrong surfaces in: what they found must hold with the usual ones
-                result = register(reference, pyramid, result.T_reference_target, tracking.registration)
-            if result.ok:
-                return index, result
+        if not self._long_lost(stamp_ns):
+            return self._find_near(stamp_ns, pyramid)
+        view = features_of(pyramid, tracking.relocalisation)
+        if self._unconfirmed is not None:
+            found = self._confirm(stamp_ns, pyramid, view)
+            if found is not None:
+                return found
+        near = self._find_near(stamp_ns, pyramid, view)
+        place = near if isinstance(near, _Found) else self._find_place(frame_index, stamp_ns, pyramid, view)
+        if place is None:
+            return near if isinstance(near, Reason) else Reason.UNCONFIRMED
+        if tracking.relocalisation.confirmations == 0:
+            return place
+        self._unconfirmed = _Unconfirmed(place, stamp_ns, 0)
+        return Reason.UNCONFIRMED
+
+    def _long_lost(self, stamp_ns: int) -> bool:
+        """Whether the camera is lost for so long that its last velocity says nothing any more."""
+        elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
+        return self._lost and elapsed_s > self.config.tracking.max_extrapolation_s
+
+    def _find_near(
+        self, stamp_ns: int, pyramid: RgbdPyramid, view: Features | None = None
+    ) -> _Found | Reason:
+        """The first registration that is OK from where the camera was last, or why the first one failed."""
+        tracking, keyframe = self.config.tracking, self.keyframes[self._current]
+        last, elapsed_s = self._T_keyframe_camera, (stamp_ns - self._stamp_ns) * 1e-9
+        starts = [last]
+        if elapsed_s <= tracking.max_extrapolation_s:
+            starts.insert(0, last @ se3.exp(self._velocity * elapsed_s))
+        reason = Reason.NONE
+        if not self._lost:
+            for guess in starts:
+                result = register(keyframe.reference, pyramid, guess, tracking.registration)
+                if result.ok:
+                    return _Found(self._current, result)
+                reason = reason if reason is not Reason.NONE else Reason(result.outcome.value)
+        view = features_of(pyramid, tracking.relocalisation) if view is None else view
+        for guess in starts:
+            found = _Found(self._current, self._settle(keyframe, pyramid, guess, tracking.recovery))
+            if found.result.ok and self._believable(stamp_ns, pyramid, found, view):
+                return found
+            reason = reason if reason is not Reason.NONE else found.why_not()
+        return reason
+
+    def _settle(
+        self, keyframe: TrackedKeyframe, pyramid: RgbdPyramid, guess: Array, config: RegistrationConfig
+    ) -> Registration:
+        """Register from a poor guess; OK only if the usual registration, started from the answer, stays there.
+
+        Wide gates let wrong surfaces in, and a start too far away ends on the way. The brightness is brought to that
+        of the keyframe first.
+        """
+        gain, offset = _equalising(pyramid, keyframe, self.config.tracking.equalise_from_gain)
+        if gain != 1:
+            pyramid = pyramid.with_exposure(gain, offset)
+        result = register(keyframe.reference, pyramid, guess, config)
+        for _ in range(SETTLING_ROUNDS):
+            if not result.ok:
+                break
+            before = result.T_reference_target
+            result = register(keyframe.reference, pyramid, before, self.config.tracking.registration)
+            moved_m, turned_rad = se3.distance(before, result.T_reference_target)
+            if moved_m < SETTLED_M and turned_rad < SETTLED_RAD:
+                return _with_exposure(result, gain, offset)
+        return replace(result, outcome=Outcome.JUMP) if result.ok else result
+
+    def _find_place(
+        self, frame_index: int, stamp_ns: int, pyramid: RgbdPyramid, view: Features
+    ) -> _Found | None:
+        """The first keyframe, in the order of matching features, that the frame can be registered to."""
+        config = self.config.tracking
+        features = [keyframe.features for keyframe in self.keyframes]
+        for index, guess in guesses(view, features, frame_index, config.relocalisation):
+            found = _Found(index, self._settle(self.keyframes[index], pyramid, guess, config.registration))
+            if found.result.ok and self._believable(stamp_ns, pyramid, found, view):
+                return found
         return None
 
-    def _attempts(self) -> Iterator[tuple[int, Array, RegistrationConfig]]:
-        """Keyframe, guess of T_keyframe_camera and limits of every attempt, the likeliest first."""
-        tracking, last = self.config.tracking, self._T_keyframe_camera
-        predicted = last @ self._motion
-        yield self._current, predicted, tracking.registration
-        yield self._current, last, tracking.registration
-        yield self._current, last, tracking.recovery
-        yield self._current, predicted, tracking.recovery
-        T_map_last = self.keyframes[self._current].T_map_keyframe @ last
-        for keyframe in self.keyframes[: -tracking.relocalisation_keyframes - 1 : -1]:
-            if keyframe.keyframe_index != self._current:
-                yield (
-                    keyframe.keyframe_index,
-                    se3.inverse(keyframe.T_map_keyframe) @ T_map_last,
-                    tracking.recovery,
-                )
-            yield keyframe.keyframe_index, np.eye(4), tracking.recovery
+    def _confirm(self, stamp_ns: int, pyramid: RgbdPyramid, view: Features) -> _Found | Reason | None:
+        """Track on from a place that was found; None if the frame does not agree with it."""
+        assert self._unconfirmed is not None
+        before, self._unconfirmed = self._unconfirmed, None
+        index, last = before.found.keyframe_index, before.found.result.T_reference_target
+        result = self._settle(self.keyframes[index], pyramid, last, self.config.tracking.registration)
+        found = _Found(index, result)
+        moved_m, _ = se3.distance(last, result.T_reference_target)
+        reach_m = self.config.tracking.failure.max_speed_m_s * (stamp_ns - before.stamp_ns) * 1e-9
+        if not result.ok or moved_m > reach_m or not self._believable(stamp_ns, pyramid, found, view):
+            return None
+        if before.agreed + 1 >= self.config.tracking.relocalisation.confirmations:
+            return found
+        self._unconfirmed = _Unconfirmed(found, stamp_ns, before.agreed + 1)
+        return Reason.UNCONFIRMED
 
-    def _lost_frame(self, frame_index: int, stamp_ns: int) -> TrackedFrame:
-        return TrackedFrame(
-            frame_index,
-            stamp_ns,
-            self._current,
-            self._T_keyframe_camera,
-            np.zeros((6, 6)),
-            Status.LOST,
-            0.0,
-            0.0,
-            0.0,
-        )
+    def _believable(self, stamp_ns: int, pyramid: RgbdPyramid, found: _Found, view: Features) -> bool:
+        """Whether a pose that was not simply followed can be true.
+
+        It must be near enough, look much like the keyframe, intrude on no free space, and the features of the frame
+        (`view`) must be where the keyframe has them. Where a keyframe has too few features to say, only a camera that
+        was lost for a moment and is where it was expected is believed.
+        """
+        failure, relocalisation = self.config.tracking.failure, self.config.tracking.relocalisation
+        keyframe, T = self.keyframes[found.keyframe_index], found.result.T_reference_target
+        T_last_now = se3.inverse(self._expected(stamp_ns)) @ keyframe.T_map_keyframe @ T
+        moved_m, turned_rad = se3.distance(np.eye(4), T_last_now)
+        elapsed_s = max((stamp_ns - self._stamp_ns) * 1e-9, 0.0)
+        intruding, told = intruders(pyramid.levels[-1], keyframe.coarsest, T, failure)
+        if (
+            found.result.overlap < relocalisation.min_overlap
+            or found.result.conflict > relocalisation.max_conflict
+            or found.result.rms_gray > self._largest_gray_rms()
+            or intruding > failure.max_intruders * told
+            or moved_m > failure.max_speed_m_s * elapsed_s + failure.slack_m
+        ):
+            return False
+        if len(keyframe.features) >= FEATURES_TO_SAY * relocalisation.min_inliers:
+            return supports(view, keyframe.features, T, relocalisation)
+        expected = moved_m <= failure.slack_m and turned_rad <= failure.slack_rad
+        return bool(expected) and not self._long_lost(stamp_ns)
+
+    def _largest_gray_rms(self) -> float:
+        config = self.config.tracking.relocalisation
+        usual = float(np.median(self._gray_rms)) if self._gray_rms else 0.0
+        return config.max_gray_rms + config.max_gray_rms_of_usual * usual
+
+    def _expected(self, stamp_ns: int) -> Array:
+        """Where the camera would be by its last velocity, if that is not too old."""
+        T = self.keyframes[self._current].T_map_keyframe @ self._T_keyframe_camera
+        elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
+        if elapsed_s > self.config.tracking.max_extrapolation_s:
+            return T
+        return T @ se3.exp(self._velocity * elapsed_s)
+
+    def _well_exposed(self, result: Registration) -> bool:
+        """Whether a frame is as bright as its keyframe, or that keyframe must be left all the same.
+
+        Where the exposure jumps, too dark and too bright images pass. They make poor keyframes.
+        """
+        limit = self.config.tracking.max_keyframe_gain
+        alike = 1 / limit < result.exposure[0] < limit
+        return alike or min(result.overlap, result.view) < self.config.tracking.relocalisation.min_overlap
+
+    def _unobstructed(self, pyramid: RgbdPyramid, found: _Found) -> bool:
+        """Whether little of a view stands in space that the keyframe saw to be free.
+
+        Once something stands before the camera it is gone only when the keyframe can judge most of the view: what
+        moves with the camera soon stands beside the keyframe's view.
+        """
+        config, coarsest = self.config.tracking.failure, pyramid.levels[-1]
+        keyframe = self.keyframes[found.keyframe_index].coarsest
+        intruding, told = intruders(coarsest, keyframe, found.result.T_reference_target, config)
+        known = int(np.count_nonzero(coarsest.inverse_depth))
+        if intruding > config.max_intruders * told:
+            self._obstructed = True
+        elif told >= config.min_told * known:
+            self._obstructed = False
+        return not self._obstructed
 
     # --- keyframes ------------------------------------------------------------------------------------------------
 
@@ -235,13 +456,20 @@ class Tracker:
                 previous,
                 T_map_keyframe,
                 Reference.from_pyramid(pyramid, self.config.tracking.strides),
+                features_of(pyramid, self.config.tracking.relocalisation),
+                pyramid.levels[-1],
                 (gain, offset),
             )
         )
 
 
 def _tracked(
-    frame_index: int, stamp_ns: int, keyframe_index: int, result: Registration, status: Status
+    frame_index: int,
+    stamp_ns: int,
+    keyframe_index: int,
+    result: Registration,
+    status: Status,
+    reason: Reason,
 ) -> TrackedFrame:
     return TrackedFrame(
         frame_index,
@@ -253,4 +481,25 @@ def _tracked(
         result.overlap,
         result.rms_depth_m,
         result.rms_gray,
+        reason,
     )
+
+
+def _equalising(pyramid: RgbdPyramid, keyframe: TrackedKeyframe, from_gain: float) -> tuple[float, float]:
+    """Gain and offset that give a view the mean and spread of grey values of a keyframe; (1, 0) if nearly so.
+
+    No more than fivefold: a black image does not become one that shows something.
+    """
+    there, here = keyframe.coarsest.gray, pyramid.levels[-1].gray
+    gain = float(there.std()) / max(float(here.std()), 1e-3)
+    if 1 / from_gain < gain < from_gain or not 0.2 < gain < 5:
+        return 1.0, 0.0
+    return gain, float(there.mean()) - gain * float(here.mean())
+
+
+def _with_exposure(result: Registration, gain: float, offset: float) -> Registration:
+    """A registration of an equalised view, gain * grey + offset, with the exposure of the view as it was."""
+    if gain == 1:
+        return result
+    a, b = result.exposure
+    return replace(result, exposure=(a / gain, (b - offset) / gain))

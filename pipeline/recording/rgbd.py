@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,8 @@ from numpy.typing import NDArray
 from pipeline import messages
 from pipeline.errors import DuagError
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording.names import DEPTH_SCALE_KEY
+from pipeline.recording.depth_sources import check_size, constant, depth_source
+from pipeline.recording.pairing import TOLERANCE_NS, pair
 from pipeline.recording.read import LogFile, Record
 from schemas import topics as topic_table
 
@@ -22,9 +22,9 @@ from schemas import topics as topic_table
 class RgbdFrame:
     """One colour image with its depth.
 
-    index: position in the log. stamp_ns: when both were taken. color: uint8 [H, W, 3], RGB.
+    index: position in the log. stamp_ns: when the colour was taken. color: uint8 [H, W, 3], RGB.
     depth: float32 [H, W], metres along z, 0 where nothing was measured. mask: bool [H, W], True = usable, False = a
-    moving object or otherwise to be ignored; None = all usable.
+    moving object or otherwise to be ignored; None = all usable. depth_offset_ns: how much later the depth was taken.
     """
 
     index: int
@@ -32,6 +32,7 @@ class RgbdFrame:
     color: NDArray[np.uint8]
     depth: NDArray[np.float32]
     mask: NDArray[np.bool_] | None = None
+    depth_offset_ns: int = 0
 
     @property
     def usable_depth(self) -> NDArray[np.float32]:
@@ -40,7 +41,10 @@ class RgbdFrame:
 
 
 class RgbdLog:
-    """Registered colour and depth of one robot; frames are paired by equal publish time, masks too where there are any.
+    """Colour and depth of one robot: a frame is a colour image and the depth nearest to it, if that is near enough.
+
+    Images without a partner are no frames; `pairing` has their times. Depth may be registered already, or of another
+    camera, or a LiDAR's (`depth_sources`). Masks belong to the colour image of the same publish time.
 
     `robot`, `camera`, `depth_scale` (metres per unit). Reads what is asked for and keeps no more than a few frames.
     """
@@ -62,69 +66,31 @@ class RgbdLog:
             raise DuagError(f"{self.path}: {pattern} found for robots {robots}, expected exactly one robot")
         self.robot = robots[0]
         self._color_topic = topic_table.COLOR.of(self.robot)
-        self._depth_topic = topic_table.DEPTH.of(self.robot)
-        self._color = self._log.entries(self._color_topic)
-        self._depth = self._log.entries(self._depth_topic)
-        if not self._color and not self._depth:
+        if not self._log.entries(self._color_topic):
             raise DuagError(f"{self.path}: {self._color_topic} has no message, expected images")
-        if len(self._color) != len(self._depth):
-            raise DuagError(self._unpaired())
         self.camera = self._read_camera()
-        self.depth_scale = self._read_depth_scale()
+        self._source = depth_source(self._log, self.robot, self.camera)
+        self.depth_scale = self._source.scale
+        self._color_at = self._log.entries_by_time(self._color_topic)
+        self._depth_at = self._log.entries_by_time(self._source.topic)
+        self.pairing = pair(self._color_at, self._depth_at)
+        if not self.pairing.pairs:
+            raise DuagError(
+                f"{self.path}: {self._color_topic} has {len(self._color_at)} images and {self._source.topic} "
+                f"{len(self._depth_at)}, none of them within {TOLERANCE_NS / 1e6:g} ms of each other, expected pairs"
+            )
         self._mask_topic = topic_table.MASK.of(self.robot)
         self._mask_at = self._read_mask_times()
 
-    def _unpaired(self) -> str:
-        """The line that names the first image without a partner."""
-        stamps = {
-            topic: {r.publish_time_ns for r in self._log.records([topic])}
-            for topic in (self._color_topic, self._depth_topic)
-        }
-        color, depth = stamps[self._color_topic], stamps[self._depth_topic]
-        for stamp in sorted(color ^ depth):
-            here, there = self._color_topic, self._depth_topic
-            if stamp in depth:
-                here, there = there, here
-            return f"{self.path}: {here} has an image at {stamp} ns, expected one in {there} at the same time"
-        counts = f"{len(self._color)} and {len(self._depth)}"
-        return (
-            f"{self.path}: {self._color_topic} and {self._depth_topic} have {counts} images, expected as many"
-        )
-
     def _read_camera(self) -> PinholeCamera:
         topic = topic_table.CALIBRATION.of(self.robot)
-        cameras = []
-        for entry in self._log.entries(topic):
-            record = self._log.record_at(topic, entry)
-            calibration = record.proto()
-            try:
-                cameras.append((record.log_time_ns, messages.unpack_calibration(calibration)))
-            except DuagError as error:
-                raise DuagError(f"{self.path}: {topic}: {error}") from error
-        if not cameras:
-            raise DuagError(f"{self.path}: {topic} has no message, expected the calibration of the camera")
-        if cameras[0][0] > self._color[0][0]:
-            first, image = cameras[0][0], self._color[0][0]
+        camera = constant(self._log, topic, messages.unpack_calibration)
+        first, image = self._log.entries(topic)[0][0], self._log.entries(self._color_topic)[0][0]
+        if first > image:
             raise DuagError(
                 f"{self.path}: {topic} begins at {first} ns, expected no later than the images ({image} ns)"
             )
-        for time, camera in cameras:
-            if camera != cameras[0][1]:
-                raise DuagError(
-                    f"{self.path}: {topic} changes at {time} ns to {camera}, expected {cameras[0][1]}"
-                )
-        return cameras[0][1]
-
-    def _read_depth_scale(self) -> float:
-        text = self._log.channels[self._depth_topic].metadata.get(DEPTH_SCALE_KEY)
-        try:
-            scale = float(text or "missing")
-        except ValueError:
-            scale = math.nan
-        if not (math.isfinite(scale) and scale > 0):
-            where = f"{self.path}: {self._depth_topic}: channel metadata {DEPTH_SCALE_KEY}"
-            raise DuagError(f"{where} is {text!r}, expected metres per unit, for example '0.001'")
-        return scale
+        return camera
 
     def _read_mask_times(self) -> dict[int, tuple[int, int, int]]:
         """The entry of every mask by its publish time.
@@ -143,7 +109,7 @@ class RgbdLog:
         return at
 
     def __len__(self) -> int:
-        return len(self._color)
+        return len(self.pairing.pairs)
 
     def __enter__(self) -> RgbdLog:
         return self
@@ -164,17 +130,12 @@ class RgbdLog:
         """Frame `index`, 0 <= index < len(self)."""
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
-        color = self._log.record_at(self._color_topic, self._color[index])
-        depth = self._log.record_at(self._depth_topic, self._depth[index])
-        if color.publish_time_ns != depth.publish_time_ns:
-            raise DuagError(
-                f"{self.path}: {depth.topic} number {index} is of {depth.publish_time_ns} ns, "
-                f"expected {color.publish_time_ns} ns as in {color.topic}"
-            )
-        stamp = color.publish_time_ns
-        return RgbdFrame(
-            index, stamp, self._decode_color(color), self._decode_depth(depth), self._mask_of(stamp)
-        )
+        stamp, depth_stamp = self.pairing.pairs[index]
+        color = self._log.record_at(self._color_topic, self._color_at[stamp])
+        depth = self._log.record_at(self._source.topic, self._depth_at[depth_stamp])
+        image = self._decode_color(color)
+        offset = depth_stamp - stamp
+        return RgbdFrame(index, stamp, image, self._source.read(depth), self._mask_of(stamp), offset)
 
     def _decode_color(self, record: Record) -> NDArray[np.uint8]:
         import cv2
@@ -184,15 +145,8 @@ class RgbdLog:
         if image is None:
             where = f"{self.path}: {record.topic} at {record.publish_time_ns} ns"
             raise DuagError(f"{where} has {len(data)} bytes that no decoder reads, expected JPEG or PNG")
-        self._check_size(record, image.shape[1], image.shape[0])
+        check_size(record, image.shape[1], image.shape[0], self.camera)
         return np.ascontiguousarray(image[:, :, ::-1])
-
-    def _decode_depth(self, record: Record) -> NDArray[np.float32]:
-        raw = messages.unpack_depth(
-            record.proto(), f"{self.path}: {record.topic} at {record.publish_time_ns} ns"
-        )
-        self._check_size(record, raw.shape[1], raw.shape[0])
-        return raw.astype(np.float32) * np.float32(self.depth_scale)
 
     def _mask_of(self, stamp_ns: int) -> NDArray[np.bool_] | None:
         entry = self._mask_at.get(stamp_ns)
@@ -200,15 +154,8 @@ class RgbdLog:
             return None
         record = self._log.record_at(self._mask_topic, entry)
         mask = messages.unpack_mask(record.proto(), f"{self.path}: {record.topic} at {stamp_ns} ns")
-        self._check_size(record, mask.shape[1], mask.shape[0])
+        check_size(record, mask.shape[1], mask.shape[0], self.camera)
         return mask
-
-    def _check_size(self, record: Record, width: int, height: int) -> None:
-        if (width, height) != (self.camera.width, self.camera.height):
-            raise DuagError(
-                f"{self.path}: {record.topic} at {record.publish_time_ns} ns is {width}x{height}, "
-                f"expected {self.camera.width}x{self.camera.height} as in the calibration"
-            )
 
 
 def open_rgbd(path: Path) -> RgbdLog:

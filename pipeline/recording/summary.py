@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.errors import DuagError
 from pipeline.recording.folder import Recording
 from pipeline.recording.names import DIGEST_RECORD, LOG_RECORD, RECORDING_FILE, ROBOT_KEY
+from pipeline.recording.pairing import TOLERANCE_NS, pair
 from pipeline.recording.read import LogFile, parsing
 from schemas import topics as topic_table
 
@@ -41,6 +42,7 @@ def _log_info(path: Path) -> dict[str, Any]:
         topics = {topic: _topic_info(log, topic) for topic in sorted(log.channels)}
         times = [t[key] for t in topics.values() for key in ("start_ns", "end_ns") if t[key] is not None]
         warnings = [f"{topic}: {w}" for topic, t in topics.items() for w in t.pop("warnings")]
+        warnings += _pairing_warnings(log)
         return {
             "robot": metadata.get(LOG_RECORD, {}).get(ROBOT_KEY) or None,
             "bytes": path.stat().st_size,
@@ -51,6 +53,27 @@ def _log_info(path: Path) -> dict[str, Any]:
             "topics": topics,
             "warnings": warnings,
         }
+
+
+def _pairing_warnings(log: LogFile) -> list[str]:
+    """Images of a camera without a partner: they are no frames."""
+    out = []
+    for topic in sorted(log.channels):
+        row = topic_table.find(topic)
+        if row is None or row[0] is not topic_table.COLOR:
+            continue
+        sources = (topic_table.DEPTH, topic_table.RAW_DEPTH, topic_table.LIDAR)
+        depth = next((name for s in sources if log.entries(name := s.of(row[1]))), None)
+        if depth is None:
+            continue
+        found = pair(log.entries_by_time(topic), log.entries_by_time(depth))
+        for name, other, alone in ((topic, depth, found.color_alone), (depth, topic, found.depth_alone)):
+            if alone:
+                near = f"within {TOLERANCE_NS / 1e6:g} ms"
+                out.append(f"{name}: {len(alone)} images have none of {other} {near} and are no frames")
+        if found.largest_offset_ns:
+            out.append(f"{depth}: up to {found.largest_offset_ns / 1e6:.1f} ms from {topic}")
+    return out
 
 
 def _topic_info(log: LogFile, topic: str) -> dict[str, Any]:

@@ -5,7 +5,7 @@
 robots with the about 2000 samples that a peer sent.
 """
 
-from pipeline.registration.align import Outcome, Registration, RegistrationConfig, register
+from pipeline.registration.align import Outcome, Registration, RegistrationConfig, linearise, register
 from pipeline.registration.pyramid import Level, RgbdPyramid
 from pipeline.registration.reference import Reference, ReferenceLevel
 
@@ -17,5 +17,6 @@ __all__ = [
     "Registration",
     "RegistrationConfig",
     "RgbdPyramid",
+    "linearise",
     "register",
 ]

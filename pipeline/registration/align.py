@@ -197,7 +197,8 @@ def register(
 
     Args:
         reference: samples per level; at least as many levels as `pyramid`.
-        pyramid: the target view.
+        pyramid: the target view. `without_depth`, grey values alone are used, and every sample inside the image
+            counts as seen: overlap is then the view.
         T_reference_target_guess: where to start, [4, 4].
         config: limits and noise.
         prior_information: [6, 6] in the right tangent of the guess; pulls towards it, is not part of the
@@ -216,6 +217,31 @@ def register(
         )
         found = _Determined.by(system, config).without(found)
     return _judge(system, found, T, guess, exposure, config, prior_information)
+
+
+def linearise(
+    reference: Reference,
+    pyramid: RgbdPyramid,
+    T_reference_target: Array,
+    exposure: tuple[float, float] = (1.0, 0.0),
+    config: RegistrationConfig | None = None,
+) -> Registration:
+    """The cost of a pair near one pose, as a quadratic: for whoever minimises the costs of many pairs together.
+
+    Args:
+        reference, pyramid: as for `register`; only their finest level is used.
+        T_reference_target: where the cost is expanded. exposure: (gain, offset) there.
+    Returns:
+        Information at that pose, and the pose and exposure one Gauss-Newton step from it: the minimum of the
+        quadratic. Along weak directions there is no step and no information. The outcome is that of `register`.
+    """
+    config = config or RegistrationConfig()
+    T = _orthonormal(np.asarray(T_reference_target, dtype=np.float64))
+    start = np.array(exposure)
+    system = _linearise(reference, pyramid, 0, T, start, config)
+    found = _Determined.by(system, config)
+    step = _step(system, T, T, None, found.projection)
+    return _judge(system, found, T @ se3.exp(step[:6]), T, start + step[6:], config, None)
 
 
 _ALL_DIRECTIONS = np.eye(6)
@@ -301,7 +327,8 @@ def _linearise(
 
     gray, gu, gv, inverse_depth = _interpolate(level, u, v)
     with np.errstate(invalid="ignore"):
-        z = 1 / inverse_depth
+        # without a depth image every sample may be what is seen there
+        z = 1 / inverse_depth if level.has_depth else q[2]
         gate = np.maximum(np.float32(config.depth_gate_m), np.float32(config.depth_gate_relative) * q[2])
         off = z - q[2]
         agree = np.abs(off) < gate
@@ -322,6 +349,8 @@ def _linearise(
     sigma = _depth_sigma(z, config)
     floor = config.depth_sigma_floor * 4.0**index
     depth = _depth_residuals(surface, q, m, sigma, floor, (u, v), config)
+    if not level.has_depth:
+        depth = depth.nothing()
     floor = max(config.gray_sigma_floor, config.gray_sigma_of_depth * depth.scale)
     images = gray, gu, gv
     photometric = _gray_residuals(camera, images, intensities, q, exposure, floor, (u, v), config)

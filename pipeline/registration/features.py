@@ -46,7 +46,16 @@ def extract(
     """
     import cv2
 
-    gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
+    gray = np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    return extract_from_gray(gray, depth_m, camera, most)
+
+
+def extract_from_gray(
+    gray: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera, most: int
+) -> Features:
+    """`extract` from a grey image [h, w]."""
+    import cv2
+
     keypoints, sift = cv2.SIFT.create(nfeatures=2 * most).detectAndCompute(gray, None)
     if not keypoints:
         return Features(np.zeros((0, DIMENSIONS), np.uint8), np.zeros((0, 3), np.float32))

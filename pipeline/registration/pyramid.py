@@ -6,7 +6,8 @@ coordinates: averages over a block, bilinear interpolation and finite difference
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -26,12 +27,13 @@ class Level:
     """One resolution of a frame.
 
     camera: intrinsics of this resolution. gray: float32 [h, w], 0..1. inverse_depth: float32 [h, w], 1/m, 0 where
-    the depth is unknown.
+    the depth is unknown. has_depth: False if there is no depth image, which is not the same as one that is empty.
     """
 
     camera: PinholeCamera
     gray: Image
     inverse_depth: Image
+    has_depth: bool = True
 
     @cached_property
     def gradients(self) -> tuple[Image, Image]:
@@ -92,6 +94,20 @@ class RgbdPyramid:
     """A frame at several resolutions; levels[0] is the full one, each next one has half the size."""
 
     levels: tuple[Level, ...]
+
+    def without_depth(self) -> RgbdPyramid:
+        """The grey values alone, of a frame without a depth image."""
+        return self._changed(
+            lambda level: Level(level.camera, level.gray, np.zeros_like(level.inverse_depth), has_depth=False)
+        )
+
+    def with_exposure(self, gain: float, offset: float) -> RgbdPyramid:
+        """The same with grey values gain * grey + offset."""
+        g, o = np.float32(gain), np.float32(offset)
+        return self._changed(lambda level: replace(level, gray=g * level.gray + o))
+
+    def _changed(self, change: Callable[[Level], Level]) -> RgbdPyramid:
+        return RgbdPyramid(tuple(change(level) for level in self.levels))
 
     @staticmethod
     def build(image: Image, depth_m: Image, camera: PinholeCamera, levels: int = 3) -> RgbdPyramid:

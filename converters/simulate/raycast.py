@@ -1,0 +1,119 @@
+"""Ray casting of textured meshes: exact depth at the pixel centres, colour averaged over the pixel.
+
+Rays meet triangles in Embree (Open3D's `RaycastingScene`), in float32. Colour is the mean of 2 x 2 rays per pixel,
+each with a texture sample of its own (bilinear, between the two mip levels around the distance of the samples on the
+surface). Means are taken of the stored values (sRGB), as a Gaussian map blends them, and as in the procedural room.
+Where no ray hits there is a hole of the scan: depth 0, black.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from converters.simulate.meshes import LEVELS, MeshScene
+from converters.simulate.render import View
+from pipeline.geometry.camera import PinholeCamera
+
+Array = NDArray[np.float64]
+
+OFFSETS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
+SAMPLE_SPACING_PX = 0.5
+LEAST_COSINE = 0.1  # a texture seen at a more grazing angle is blurred no further
+
+
+class Caster:
+    """Rays through a scene and distances to it, on one thread: the same numbers whatever the machine does besides."""
+
+    def __init__(self, scene: MeshScene) -> None:
+        import open3d as o3d
+
+        self.scene = scene
+        self._tensor = o3d.core.Tensor.from_numpy
+        self._embree = o3d.t.geometry.RaycastingScene(nthreads=1)
+        self._embree.add_triangles(
+            self._tensor(scene.vertices.astype(np.float32)), self._tensor(scene.triangles.astype(np.uint32))
+        )
+
+    def hits(self, origins: Array, directions: Array) -> dict[str, NDArray]:
+        """Where rays [n, 3] first meet the scene.
+
+        Returns:
+            t [n], in lengths of the direction, inf = nothing; triangle [n]; weights [n, 2] of its second and third
+            corner; normals [n, 3].
+        """
+        rays = np.empty((len(directions), 6), dtype=np.float32)
+        rays[:, :3], rays[:, 3:] = origins, directions
+        hit = self._embree.cast_rays(self._tensor(rays), nthreads=1)
+        return {
+            "t": hit["t_hit"].numpy(),
+            "triangle": hit["primitive_ids"].numpy(),
+            "weights": hit["primitive_uvs"].numpy(),
+            "normals": hit["primitive_normals"].numpy(),
+        }
+
+    def clearance(self, points: Array) -> Array:
+        """Distance (m) of world points [..., 3] to the nearest surface."""
+        flat = np.asarray(points).reshape(-1, 3).astype(np.float32)
+        distance = self._embree.compute_distance(self._tensor(flat), nthreads=1).numpy()
+        return distance.astype(np.float64).reshape(np.shape(points)[:-1])
+
+
+class MeshRenderer:
+    """Renders a scene of meshes with one camera."""
+
+    def __init__(self, caster: Caster, camera: PinholeCamera) -> None:
+        self.caster, self.scene, self.camera = caster, caster.scene, camera
+        rays = camera.rays().reshape(-1, 3)
+        step = np.array([1 / camera.fx, 1 / camera.fy, 0.0])
+        self._centers = rays
+        self._samples = np.concatenate([rays + step * (*offset, 0.0) for offset in OFFSETS])
+        self._texel_density = _texel_density(self.scene)
+
+    def depth(self, T_world_camera: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
+        """Depth (z, m, [h, w]; 0 = nothing) and triangle seen (-1 = nothing) at the pixel centres."""
+        T = np.asarray(T_world_camera, dtype=np.float64)
+        hit = self.caster.hits(T[:3, 3], self._centers @ T[:3, :3].T)
+        seen = np.isfinite(hit["t"])
+        depth = np.where(seen, hit["t"], 0.0).astype(np.float64)
+        triangle = np.where(seen, hit["triangle"].astype(np.int64), -1)
+        shape = (self.camera.height, self.camera.width)
+        return depth.reshape(shape), triangle.reshape(shape)
+
+    def render(self, T_world_camera: ArrayLike) -> View:
+        """Colour and depth from a camera pose T_world_camera [4, 4]."""
+        depth, triangle = self.depth(T_world_camera)
+        T = np.asarray(T_world_camera, dtype=np.float64)
+        directions = self._samples @ T[:3, :3].T
+        hit = self.caster.hits(T[:3, 3], directions)
+        missed = np.flatnonzero(~np.isfinite(hit["t"]))
+        hit["t"][missed], hit["triangle"][missed] = 0.0, 0  # black in the end
+        index = hit["triangle"].view(np.int32)
+        level = self._level(hit["t"], index, directions, hit["normals"])
+        colors = self.scene.sample(index, hit["weights"], level)
+        colors[missed] = 0.0
+        mean = colors.reshape(len(OFFSETS), *depth.shape, 3).mean(axis=0)
+        return View(np.clip(np.rint(mean), 0, 255).astype(np.uint8), depth, triangle)
+
+    def _level(
+        self,
+        depth: NDArray[np.float32],
+        triangle: NDArray[np.int32],
+        directions: Array,
+        normals: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """Mip level [n] whose texels are as large as samples are apart on the surface (geometric mean of both ways)."""
+        way = directions.astype(np.float32)
+        cosine = np.abs(np.einsum("ij,ij->i", normals, way)) / np.sqrt(np.einsum("ij,ij->i", way, way))
+        focal = np.sqrt(self.camera.fx * self.camera.fy)
+        apart_m = SAMPLE_SPACING_PX / focal * depth / np.sqrt(np.clip(cosine, LEAST_COSINE, 1.0))
+        texels = np.maximum(apart_m * self._texel_density[triangle], 1.0)
+        return np.minimum(np.log2(texels), LEVELS - 1).astype(np.float32)
+
+
+def _texel_density(scene: MeshScene) -> NDArray[np.float32]:
+    """Texels per metre on every triangle, [m]; 0 without texture or without area."""
+    a, b, c = np.moveaxis(scene.texels.astype(np.float64), 1, 0)
+    p, q = b - a, c - a
+    texels2 = 0.5 * np.abs(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
+    areas = scene.areas()
+    density = np.sqrt(np.divide(texels2, areas, out=np.zeros_like(areas), where=areas > 1e-12))
+    return np.minimum(density, 1e6).astype(np.float32)

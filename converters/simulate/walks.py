@@ -1,0 +1,284 @@
+"""Smooth walks through the free space of a scene of meshes, looking ahead, overlapping in what the cameras see.
+
+Free is where a robot can stand: the scene closes round it, and from 0.6 m above the floor up to its head nothing is
+nearer than MIN_CLEARANCE_M. A walk visits places drawn by the seed, along the middle of rooms and doors (shortest way
+on a grid, dear beside obstacles), and is then smoothed. The camera looks at the way ahead, wavers, and turns slowly.
+Walks that come too near to something, or look at a hole or a bare wall from close by, are drawn again. Of the walks
+that pass, the first robot takes the one whose dullest view shows most; each other robot the one that shares the asked
+part of its view with the robot before.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d, label
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from converters.simulate.paths import HEIGHTS_M, OVERLAP_IMAGE, look_at, shared_view
+from converters.simulate.raycast import Caster, MeshRenderer
+from pipeline import streams
+from pipeline.errors import DuagError
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.progress import track
+
+Array = NDArray[np.float64]
+
+STEP_M = 0.028
+MAX_TURN_RAD = np.deg2rad(1.5)
+MIN_CLEARANCE_M = 0.3
+CELL_M = 0.1
+BODY_HEIGHTS_M = (0.6, 1.75, 0.23)  # above the floor, from, to, step: where a robot is in the way
+FLOOR_BIN_M = 0.05
+FLOOR_COSINE = 0.95
+FLOOR_SHARE = 0.25  # of the largest level; the lowest of the levels so large is the floor
+CLOSED_SHARE = 0.85  # of the directions around a place inside the scene meet a surface
+DIRECTIONS = 48
+LEAST_FREE_M2 = 1.0
+HOP_M = 2.0  # least distance between places that a walk visits
+SMOOTH_M = 0.35
+AHEAD_M = 1.3
+GAZE_SMOOTH_FRAMES = (14, 22, 32, 45, 60)
+TRIES, ENOUGH = 400, 16
+VIEWS = 12
+VIEW_IMAGE = (80, 60)
+NEAR_M, MAX_NEAR_SHARE = 0.6, 0.25
+MAX_HOLE_SHARE = 0.05
+LEAST_MEDIAN_M = 1.0
+EDGE_GREY = 6.0  # of 255, between neighbouring pixels of VIEW_IMAGE
+
+
+@dataclass(frozen=True)
+class FreeSpace:
+    """Where a robot can stand.
+
+    floor_m: height of the floor. cells: [n, 2], x and y (m) of the middles of free cells, all connected. clearance:
+    [n], m. graph: cost of the way between neighbouring cells.
+    """
+
+    floor_m: float
+    cells: Array
+    clearance: Array
+    graph: coo_array
+
+
+def plan(
+    caster: Caster, robots: int, frames: int, overlap: float, camera: PinholeCamera, seed: int
+) -> list[Array]:
+    """Walks T_world_camera [frames, 4, 4] of every robot.
+
+    Args:
+        caster: of the scene where they move.
+        robots: how many.
+        frames: poses per robot, STEP_M apart.
+        overlap: share, 0 to 1, of what a robot sees that the one before sees as well; met as nearly as may be.
+        camera: of all robots.
+        seed: of the walks.
+    Raises:
+        DuagError: there is no free space, or no walk in it that keeps clear and sees something.
+    """
+    space = free_space(caster)
+    small = MeshRenderer(caster, camera.scaled(*OVERLAP_IMAGE))
+    walks: list[Array] = []
+    for robot in track(range(robots), "plan walks"):
+        found = _candidates(caster, space, robot, frames, camera, seed)
+        if robot == 0:
+            walks.append(max(found, key=lambda each: each[0])[1])
+        else:
+            before = walks[-1]
+            walks.append(min(found, key=lambda each: abs(shared_view(small, before, each[1]) - overlap))[1])
+    return walks
+
+
+def floor_height(caster: Caster) -> float:
+    """Height (m) of the floor: the lowest of the levels that hold much horizontal surface."""
+    a, b, c = np.moveaxis(caster.scene.corners, 1, 0)
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    level = np.abs(normals[:, 2]) > FLOOR_COSINE * lengths
+    heights, areas = ((a + b + c) / 3)[level, 2], 0.5 * lengths[level]
+    if not areas.sum() > 0:
+        raise DuagError("the scene has no horizontal surface, expected a floor; is the right axis up (--up)?")
+    bins = np.floor((heights - heights.min()) / FLOOR_BIN_M).astype(np.int64)
+    area = np.bincount(bins, weights=areas)
+    smooth = np.convolve(area, np.ones(3), mode="same")
+    lowest = int(np.argmax(smooth > FLOOR_SHARE * smooth.max()))
+    around = np.abs(bins - lowest - 1) <= 1
+    return float(np.average(heights[around], weights=areas[around]))
+
+
+def free_space(caster: Caster) -> FreeSpace:
+    """The largest connected free space of a scene.
+
+    Raises:
+        DuagError: it is smaller than LEAST_FREE_M2.
+    """
+    floor = floor_height(caster)
+    low, high = caster.scene.vertices[:, :2].min(axis=0), caster.scene.vertices[:, :2].max(axis=0)
+    nx, ny = np.maximum(np.ceil((high - low) / CELL_M).astype(np.int64), 1)
+    x, y = low[0] + (np.arange(nx) + 0.5) * CELL_M, low[1] + (np.arange(ny) + 0.5) * CELL_M
+    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+    clearance = _body_clearance(caster, places, floor)
+    free = clearance >= MIN_CLEARANCE_M
+    free[free] = _closed_in(caster, places[free], floor)
+    parts, count = label(free, structure=np.ones((3, 3)))
+    sizes = np.bincount(parts.ravel(), minlength=count + 1)[1:]
+    area = sizes.max(initial=0) * CELL_M**2
+    if area < LEAST_FREE_M2:
+        raise DuagError(
+            f"found {area:.1f} m^2 of free floor {floor:.2f} m high in the scene, expected at least "
+            f"{LEAST_FREE_M2} m^2; is it a room in metres, and the right axis up (--up)?"
+        )
+    inside = parts == 1 + int(np.argmax(sizes))
+    return FreeSpace(floor, places[inside], clearance[inside], _graph(inside, clearance))
+
+
+def _body_clearance(caster: Caster, places: Array, floor: float) -> Array:
+    """Least distance (m) from a robot that stands at places [..., 2] to anything."""
+    heights = floor + np.arange(*BODY_HEIGHTS_M)
+    clearance = np.full(places.shape[:-1], np.inf)
+    for z in heights:
+        points = np.concatenate([places, np.full((*places.shape[:-1], 1), z)], axis=-1)
+        clearance = np.minimum(clearance, caster.clearance(points))
+    return clearance
+
+
+def _closed_in(caster: Caster, places: Array, floor: float) -> NDArray[np.bool_]:
+    """Whether the scene closes round places [n, 2] at eye height, with a floor below."""
+    k = np.arange(DIRECTIONS) + 0.5
+    polar, turn = np.arccos(1 - 2 * k / DIRECTIONS), np.pi * (1 + 5**0.5) * k
+    sphere = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=1)
+    eyes = np.concatenate([places, np.full((len(places), 1), floor + HEIGHTS_M[0])], axis=1)
+    hit = np.zeros(len(places))
+    for direction in sphere:
+        hit += np.isfinite(caster.hits(eyes, np.broadcast_to(direction, eyes.shape))["t"])
+    below = caster.hits(eyes, np.broadcast_to([0.0, 0.0, -1.0], eyes.shape))["t"]
+    return (hit >= CLOSED_SHARE * DIRECTIONS) & (below < 1.5 * HEIGHTS_M[0])
+
+
+def _graph(inside: NDArray[np.bool_], clearance: Array) -> coo_array:
+    """Costs of steps between neighbouring cells of a grid; dear near obstacles."""
+    number = np.full(inside.shape, -1)
+    number[inside] = np.arange(inside.sum())
+    price = 1 + (0.45 / np.maximum(clearance, 0.1)) ** 4
+    rows, columns, costs = [], [], []
+    for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):
+        here = (slice(0, -dx or None), slice(max(-dy, 0), -max(dy, 0) or None))
+        there = (slice(dx, None), slice(max(dy, 0), -max(-dy, 0) or None))
+        both = inside[here] & inside[there]
+        rows.append(number[here][both])
+        columns.append(number[there][both])
+        costs.append(CELL_M * np.hypot(dx, dy) * 0.5 * (price[here] + price[there])[both])
+    n = int(inside.sum())
+    return coo_array((np.concatenate(costs), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n))
+
+
+def _candidates(
+    caster: Caster, space: FreeSpace, robot: int, frames: int, camera: PinholeCamera, seed: int
+) -> list[tuple[float, Array]]:
+    """Walks of a robot that keep clear and see something, each with how much its dullest view shows."""
+    graph = space.graph.tocsr()
+    eye = MeshRenderer(caster, camera.scaled(*VIEW_IMAGE))
+    found: list[tuple[float, Array]] = []
+    reasons = {"too near to something": 0, "turns too fast": 0, "sees holes or a near wall": 0}
+    for attempt in range(TRIES):
+        rng = streams.generator(seed, "simulate.walk", robot=robot, attempt=attempt)
+        floor_way = _route(space, graph, frames * STEP_M + 2 * AHEAD_M + 1.0, rng)
+        poses = _look_ahead(floor_way, space.floor_m, robot, frames, rng)
+        if poses is None:
+            reasons["turns too fast"] += 1
+        elif _body_clearance(caster, poses[:, :2, 3], space.floor_m).min() < MIN_CLEARANCE_M - 0.05:
+            reasons["too near to something"] += 1
+        else:
+            shown = _least_shown(eye, poses)
+            if shown is None:
+                reasons["sees holes or a near wall"] += 1
+            else:
+                found.append((shown, poses))
+        if len(found) == ENOUGH:
+            break
+    if not found:
+        why = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+        raise DuagError(
+            f"no walk for robot {robot} in {TRIES} tries ({why}) in {len(space.cells) * CELL_M**2:.1f} m^2 of free "
+            "floor, expected one; give another --seed, or fewer frames"
+        )
+    return found
+
+
+def _route(space: FreeSpace, graph: coo_array, length_m: float, rng: np.random.Generator) -> Array:
+    """A way over the floor [n, 2] of at least a length, through places drawn at random, smoothed, 25 mm apart."""
+    here = int(rng.integers(len(space.cells)))
+    cells, total = [here], 0.0
+    while total < length_m:
+        _, before = dijkstra(graph, directed=False, indices=here, return_predecessors=True)
+        far = np.linalg.norm(space.cells - space.cells[here], axis=1) >= HOP_M
+        choice = np.flatnonzero(far) if far.any() else np.setdiff1d(np.arange(len(space.cells)), [here])
+        leg = [int(rng.choice(choice))]
+        while leg[-1] != here:
+            leg.append(int(before[leg[-1]]))
+        cells += leg[-2::-1]
+        here = cells[-1]
+        total = float(np.linalg.norm(np.diff(space.cells[cells], axis=0), axis=1).sum())
+    way = _resampled(space.cells[cells], 0.025)
+    return _resampled(gaussian_filter1d(way, SMOOTH_M / 0.025, axis=0, mode="nearest"), 0.025)
+
+
+def _resampled(way: Array, step_m: float) -> Array:
+    """Points of a polyline [n, 2] at equal distances along it."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+    keep = np.concatenate([[True], np.diff(along) > 1e-9])
+    wanted = np.arange(0.0, along[-1], step_m)
+    return np.stack([np.interp(wanted, along[keep], way[keep, k]) for k in range(2)], axis=1)
+
+
+def _look_ahead(way: Array, floor: float, robot: int, frames: int, rng: np.random.Generator) -> Array | None:
+    """Poses [frames, 4, 4] along a way, STEP_M apart, or None if they turn too fast or the way is too short."""
+    along = 0.025 * np.arange(len(way))
+    spline = CubicSpline(along, way)
+    start = AHEAD_M
+    margin = max(GAZE_SMOOTH_FRAMES)
+    index = np.arange(-margin, frames + margin)
+    s = np.clip(start + index * STEP_M, 0.0, along[-1] - AHEAD_M)
+    if along[-1] - AHEAD_M < start + (frames - 1) * STEP_M:
+        return None
+    waver = rng.uniform((0.02, 0.15, 0.02), (0.05, 0.4, 0.1))  # height m, yaw rad, pitch rad
+    periods = rng.uniform((2.0, 3.0, 2.5), (3.5, 6.0, 5.0))
+    phases = rng.uniform(0, 2 * np.pi, 3)
+    swing = waver[:, None] * np.sin(2 * np.pi * s / periods[:, None] + phases[:, None])
+    height = floor + HEIGHTS_M[robot % len(HEIGHTS_M)] + rng.uniform(-0.05, 0.05) + swing[0]
+    position = np.concatenate([spline(s), height[:, None]], axis=1)
+    ahead = spline(s + AHEAD_M) - position[:, :2]
+    yaw = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])) + swing[1]
+    pitch = np.deg2rad(-9) + swing[2]
+    middle = slice(margin, margin + frames)
+    for sigma in GAZE_SMOOTH_FRAMES:
+        smooth = gaussian_filter1d(yaw, sigma, mode="nearest")
+        gaze = np.stack(
+            [np.cos(smooth) * np.cos(pitch), np.sin(smooth) * np.cos(pitch), np.sin(pitch)], axis=1
+        )
+        poses = look_at(position[middle], position[middle] + gaze[middle])
+        _, turn = se3.distance(poses[:-1], poses[1:])
+        if turn.max() < MAX_TURN_RAD:
+            return poses
+    return None
+
+
+def _least_shown(eye: MeshRenderer, poses: Array) -> float | None:
+    """Share of edges in the view of a walk that has fewest of them; None if a view shows holes or a near wall."""
+    least = 1.0
+    for k in np.unique(np.linspace(0, len(poses) - 1, VIEWS).round().astype(np.int64)):
+        depth, _ = eye.depth(poses[k])
+        seen = depth > 0
+        if 1 - seen.mean() > MAX_HOLE_SHARE or np.mean(seen & (depth < NEAR_M)) > MAX_NEAR_SHARE:
+            return None
+        if np.median(depth[seen]) < LEAST_MEDIAN_M:
+            return None
+    for k in np.unique(np.linspace(0, len(poses) - 1, VIEWS).round().astype(np.int64)):
+        grey = eye.render(poses[k]).color.astype(np.float64).mean(axis=2)
+        edges = np.hypot(*np.gradient(grey)) > EDGE_GREY / 2
+        least = min(least, float(edges.mean()))
+    return least

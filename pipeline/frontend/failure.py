@@ -1,0 +1,131 @@
+"""What tells that a camera is lost, or that what it says cannot be believed.
+
+A registration can end well and be wrong: two images that do not belong together make a compromise, a hand that moves
+with the camera takes the pose along, a foreign room has walls too. The tests here do not ask how well the images fit,
+but whether they can be true: of a rigid world, seen by two sensors that both go on, by a camera of finite speed.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.frontend.config import FailureConfig
+from pipeline.geometry import se3
+from pipeline.registration import Level, RegistrationConfig, RgbdPyramid
+
+Array = NDArray[np.float64]
+Image = NDArray[np.floating]
+
+
+class Reason(Enum):
+    """Why a frame has no pose; the values stand in the log. The first five are outcomes of the registration."""
+
+    NONE = ""
+    LOW_OVERLAP = "low_overlap"
+    ILL_CONDITIONED = "ill_conditioned"
+    RESIDUAL = "residual"
+    JUMP = "jump"
+    NO_DEPTH = "no_depth"
+    STUCK_DEPTH = "stuck_depth"
+    STUCK_COLOR = "stuck_color"
+    OBSTRUCTED = "obstructed"
+    UNCONFIRMED = "unconfirmed"
+
+
+class StuckImages:
+    """Notices that one image of the camera has stopped while the other goes on.
+
+    An image that is the same to the last bit as the one before it shows the place where it was taken first. That is
+    no harm while the camera stands still. So each stuck image is held against the other one at the time when it came
+    first: as soon as that has changed, the two no longer belong together. Drivers do that under load: RedKitchen
+    repeats one depth image in fifty.
+    """
+
+    def __init__(self, config: FailureConfig) -> None:
+        self.config = config
+        self._before: Level | None = None
+        self._depth_came = self._color_came = np.zeros(
+            (0, 0), dtype=np.float32
+        )  # the other image then, coarse
+
+    def look(self, pyramid: RgbdPyramid) -> Reason:
+        """Look at the next frame; STUCK_DEPTH, STUCK_COLOR or NONE."""
+        finest, coarsest = pyramid.levels[0], pyramid.levels[-1]
+        before, self._before = self._before, finest
+        same_depth = before is not None and self._same(finest.inverse_depth, before.inverse_depth)
+        same_color = before is not None and self._same(finest.gray, before.gray)
+        if not same_depth:
+            self._depth_came = _normalised(coarsest.gray)
+        if not same_color:
+            self._color_came = coarsest.inverse_depth
+        if same_depth and not same_color:
+            changed = np.abs(_normalised(coarsest.gray) - self._depth_came) > self.config.stuck_gray_change
+            if changed.mean() > self.config.stuck_gray_share:
+                return Reason.STUCK_DEPTH
+        if (
+            same_color
+            and not same_depth
+            and _depth_changed(coarsest.inverse_depth, self._color_came, self.config)
+        ):
+            return Reason.STUCK_COLOR
+        return Reason.NONE
+
+    def _same(self, image: Image, before: Image) -> bool:
+        """Whether nearly all measured pixels have the very value that they had before."""
+        known = int(np.count_nonzero(image))
+        same = int(np.count_nonzero((image == before) & (image != 0)))
+        return known > 0 and same >= self.config.stuck_share * known
+
+
+def _normalised(gray: Image) -> Image:
+    """Grey values without their mean and spread: what is left does not depend on the exposure."""
+    return (gray - gray.mean()) / max(float(gray.std()), 1e-3)
+
+
+def _depth_changed(now: Image, then: Image, config: FailureConfig) -> bool:
+    """Whether more than a share of the inverse depths known both times has changed."""
+    known = (now > 0) & (then > 0)
+    changed = known & (np.abs(now - then) > config.stuck_depth_change * then)
+    return int(changed.sum()) > config.stuck_depth_share * max(int(known.sum()), 1)
+
+
+def has_enough_depth(pyramid: RgbdPyramid, config: RegistrationConfig) -> bool:
+    """Whether the coarsest image that a registration begins with has as many known depths as it needs."""
+    level = pyramid.levels[min(len(config.iterations), len(pyramid.levels)) - 1]
+    return int(np.count_nonzero(level.inverse_depth)) >= config.min_samples
+
+
+def intruders(
+    level: Level, keyframe: Level, T_keyframe_camera: Array, config: FailureConfig
+) -> tuple[int, int]:
+    """How many pixels of a view stand where a keyframe saw free space, and how many the keyframe could tell at all.
+
+    In a rigid world a surface inside a keyframe's view is never nearer than what the keyframe saw there. A pixel
+    intrudes if its point is nearer than all that the keyframe measured in the 3x3 pixels around its projection, by
+    more than the gate. Surfaces that come in from the side are outside the keyframe's view: it cannot tell.
+
+    Args:
+        level, keyframe: one resolution of the view and the same of the keyframe. T_keyframe_camera: [4, 4].
+    """
+    v, u = np.nonzero(level.inverse_depth)
+    z = 1 / level.inverse_depth[v, u].astype(np.float64)
+    camera = level.camera
+    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
+    points = se3.transform(T_keyframe_camera, points)
+    points = points[points[:, 2] > 0.05]
+    uv = np.rint(camera.project(points)).astype(np.int64)
+    inside = (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
+    nearest = _largest_of_3x3(keyframe.inverse_depth)[uv[inside, 1], uv[inside, 0]]
+    told = nearest > 0
+    z_keyframe, z_seen = 1 / nearest[told].astype(np.float64), points[inside, 2][told]
+    gate_m = np.maximum(config.intruder_gate_m, config.intruder_gate_relative * z_keyframe)
+    return int(np.count_nonzero(z_seen < z_keyframe - gate_m)), len(z_seen)
+
+
+def _largest_of_3x3(image: Image) -> Image:
+    padded = np.pad(image, 1)
+    rows = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
+    return np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])

@@ -1,0 +1,112 @@
+"""Depth of another sensor as a depth image of the colour camera. Arrays in, arrays out."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+SAME_SURFACE = 0.03  # relative step of depth up to which neighbours are one surface
+ONE_LAYER = 0.01  # relative depth behind the nearest sample of a pixel up to which samples are averaged
+NEAREST_M = 0.05
+
+
+def register_depth(
+    depth_m: Image, depth_camera: PinholeCamera, T_camera_depth: Array, camera: PinholeCamera
+) -> Image:
+    """The depth image of one camera as another one would see it.
+
+    Inverse depth is interpolated between the pixels of one surface (exact on planes), dense enough to leave no gaps,
+    never across a step; every point falls on one pixel, where the nearest surface wins. What the depth camera did not
+    see stays 0.
+
+    Args:
+        depth_m: [h, w], metres along z of the depth camera, 0 = unknown. T_camera_depth: [4, 4].
+    Returns:
+        float32 [camera.height, camera.width], metres along z of `camera`, 0 = unknown.
+    """
+    known = depth_m > 0
+    inverse = np.where(known, 1 / np.where(known, depth_m, 1), 0).astype(np.float64)
+    growth = max(camera.fx / depth_camera.fx, camera.fy / depth_camera.fy)
+    steps = max(1, int(np.ceil(1.5 * growth)))
+    points = []
+    for b in range(steps):
+        for a in range(steps):
+            rho = inverse if a == b == 0 else _between(inverse, a / steps, b / steps)
+            v, u = np.nonzero(rho)
+            z = 1 / rho[v, u]
+            x = (u + a / steps - depth_camera.cx) / depth_camera.fx * z
+            y = (v + b / steps - depth_camera.cy) / depth_camera.fy * z
+            points.append(np.stack([x, y, z], axis=-1))
+    return draw_points(se3.transform(T_camera_depth, np.concatenate(points)), camera)
+
+
+def _between(inverse: Array, a: float, b: float) -> Array:
+    """Inverse depth a px right of and b px below every pixel, 0 where its four neighbours are not one surface."""
+    corners = np.stack([inverse[:-1, :-1], inverse[:-1, 1:], inverse[1:, :-1], inverse[1:, 1:]])
+    lowest, highest = corners.min(axis=0), corners.max(axis=0)
+    weights = np.array([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
+    out = np.zeros_like(inverse)
+    whole = (lowest > 0) & (highest <= (1 + SAME_SURFACE) * lowest)
+    out[:-1, :-1] = np.where(whole, np.tensordot(weights, corners, axes=1), 0)
+    return out
+
+
+def draw_points(points_camera: Array, camera: PinholeCamera) -> Image:
+    """Points [n, 3] of the camera frame as a depth image: the nearest of every pixel, 0 where there is none.
+
+    The samples of the nearest surface in a pixel are averaged in inverse depth.
+    """
+    points = points_camera[points_camera[:, 2] > NEAREST_M]
+    u, v = np.rint(camera.project(points)).T
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    pixel = (v[inside] * camera.width + u[inside]).astype(np.int64)
+    z = points[inside, 2]
+    size = camera.width * camera.height
+    nearest = np.full(size, np.inf)
+    np.minimum.at(nearest, pixel, z)
+    front = z <= (1 + ONE_LAYER) * nearest[pixel]
+    count = np.bincount(pixel[front], minlength=size)
+    total = np.bincount(pixel[front], 1 / z[front], size)
+    depth = np.where(count > 0, count / np.where(count > 0, total, 1), 0)
+    return depth.reshape(camera.height, camera.width).astype(np.float32)
+
+
+def fill_between(
+    points_camera: Array, camera: PinholeCamera, longest_px: float = 24.0, step: float = 0.05
+) -> Image:
+    """A depth image from sparse points, as of a LiDAR: measured points and the surface between them.
+
+    The points' pixels are triangulated; over a triangle whose corners are near each other in the image and in depth,
+    inverse depth is linear (exact on planes). The rest stays 0.
+
+    Args:
+        points_camera: [n, 3]. longest_px: longest side of a triangle. step: relative step of depth in a triangle.
+    """
+    from scipy.interpolate import LinearNDInterpolator
+    from scipy.spatial import Delaunay, QhullError
+
+    sparse = draw_points(points_camera, camera)
+    v, u = np.nonzero(sparse)
+    if len(v) < 3:
+        return sparse
+    pixels, inverse = np.stack([u, v], axis=-1).astype(np.float64), 1 / sparse[v, u].astype(np.float64)
+    try:
+        mesh = Delaunay(pixels)
+    except QhullError:  # all on one line
+        return sparse
+    corners, depths = pixels[mesh.simplices], inverse[mesh.simplices]
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+    sound = (sides.max(axis=1) <= longest_px) & (depths.max(axis=1) <= (1 + step) * depths.min(axis=1))
+    rows, columns = np.mgrid[: camera.height, : camera.width]
+    wanted = np.stack([columns.ravel(), rows.ravel()], axis=-1).astype(np.float64)
+    triangle = mesh.find_simplex(wanted)
+    inside = np.flatnonzero((triangle >= 0) & sound[np.maximum(triangle, 0)])
+    filled = np.zeros(camera.height * camera.width, dtype=np.float64)
+    filled[inside] = 1 / LinearNDInterpolator(mesh, inverse)(wanted[inside])
+    image = filled.reshape(camera.height, camera.width).astype(np.float32)
+    return np.where(sparse > 0, sparse, image)

@@ -1,0 +1,384 @@
+"""Datasets that are folders of images: fixtures in their own files, true to the last bit where they are lossless."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import converters
+from converters import bonn, icl_nuim, tum, tum_layout
+from pipeline import messages as m
+from pipeline.errors import DuagError
+from pipeline.geometry import se3, so3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.recording import open_rgbd, read_log
+from schemas import topics
+from tests.converters.box_room import look, path, render, save
+
+REPLICA = PinholeCamera(1200, 680, 600.0, 600.0, 599.5, 339.5)
+SMALL = REPLICA.scaled(150, 85)
+ARIA = PinholeCamera(512, 512, 280.0, 280.0, 255.5, 255.5).scaled(128, 128)
+FRAMES = 4
+REAL = Path(__file__).parents[3] / "shared" / "data" / "replica_office0" / "office0"
+
+
+def traj_line(T: np.ndarray) -> str:
+    return " ".join(f"{v:.18e}" for v in T.ravel())
+
+
+def make_part(folder: Path, camera: PinholeCamera, poses: list[np.ndarray], scale: float) -> None:
+    """One part in the layout of NICE-SLAM, with one pose more than images."""
+    for i, T in enumerate(poses):
+        color, z = render(camera, T)
+        save(folder / "results" / f"frame{i:06d}.jpg", color)
+        save(folder / "results" / f"depth{i:06d}.png", np.rint(z * scale).astype(np.uint16))
+    (folder / "traj.txt").write_text("\n".join(traj_line(T) for T in [*poses, poses[-1]]) + "\n")
+
+
+def make_replica(root: Path) -> Path:
+    make_part(root / "room0", SMALL, path(FRAMES), 6553.5)
+    camera = {k: getattr(SMALL, k) for k in ("fx", "fy", "cx", "cy")}
+    camera |= {"w": SMALL.width, "h": SMALL.height, "scale": 6553.5}
+    (root / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    return root / "room0"
+
+
+def make_replica_multiagent(root: Path) -> Path:
+    for part in (1, 2):
+        make_part(root / "Office-0" / f"office_0_part{part}", SMALL, path(FRAMES, 0.1 * part), 6553.5)
+    return root / "Office-0"
+
+
+def make_aria(root: Path) -> Path:
+    for agent in range(3):
+        make_part(root / "room0" / f"agent_{agent}", ARIA, path(FRAMES, 0.1 * agent), 6553.5)
+    return root / "room0"
+
+
+def tum_line(stamp: float, T: np.ndarray) -> str:
+    w, x, y, z = so3.to_quat_wxyz(T[:3, :3])
+    return f"{stamp:.4f} " + " ".join(f"{v:.9f}" for v in (*T[:3, 3], x, y, z, w))
+
+
+def smooth(t: float) -> np.ndarray:
+    """T_world_camera at a time (s) after the start."""
+    a = 0.4 * t
+    return look([1.5 * np.cos(a), 1.5 * np.sin(a), 0.2], [4.0, 3.0, -0.5])
+
+
+def make_tum_files(
+    root: Path,
+    camera: PinholeCamera,
+    distortion: tuple[float, ...],
+    marker_of: Callable[[np.ndarray], np.ndarray] = lambda T: T,
+) -> Path:
+    """Six colour images at 30 Hz, depth 15 ms later; the last depth is 50 ms late; poses at 100 Hz."""
+    start = 1305031452.0
+    rgb, depth = ["# color images", "# file: 'x.bag'", "# timestamp filename"], ["# depth maps", "#", "#"]
+    for i in range(6):
+        t = 0.05 + i / 30
+        late = 0.05 if i == 5 else 0.015
+        color, _ = render(camera, smooth(t), distortion)
+        _, z = render(camera, smooth(t), distortion)
+        names = f"rgb/{start + t:.6f}.png", f"depth/{start + t + late:.6f}.png"
+        save(root / names[0], color)
+        save(root / names[1], np.rint(z * 5000).astype(np.uint16))
+        rgb.append(f"{start + t:.6f} {names[0]}")
+        depth.append(f"{start + t + late:.6f} {names[1]}")
+    (root / "rgb.txt").write_text("\n".join(rgb) + "\n")
+    (root / "depth.txt").write_text("\n".join(depth) + "\n")
+    poses = [tum_line(start + t, marker_of(smooth(t))) for t in np.arange(0, 0.3, 0.01)]
+    poses.insert(3, f"{start + 0.025:.4f} nan nan nan nan nan nan nan")
+    (root / "groundtruth.txt").write_text("\n".join(["#", "#", "# timestamp tx", *poses]) + "\n")
+    return root
+
+
+def make_tum(root: Path) -> Path:
+    camera, distortion = tum.CAMERAS["freiburg1"]
+    return make_tum_files(root / "rgbd_dataset_freiburg1_box", camera, distortion)
+
+
+def make_bonn(root: Path) -> Path:
+    def marker_of(T: np.ndarray) -> np.ndarray:
+        return bonn.T_ROS @ T @ se3.inverse(bonn.T_MARKER_CAMERA) @ se3.inverse(bonn.T_ROS)
+
+    return make_tum_files(root / "rgbd_bonn_box", bonn.CAMERA, bonn.DISTORTION, marker_of)
+
+
+def make_icl(root: Path) -> Path:
+    folder = root / "living_room_traj0_frei_png"
+    lines, poses = [], []
+    for i, T in enumerate(path(FRAMES)):
+        color, z = render(icl_nuim.CAMERA, T)
+        save(folder / "rgb" / f"{i}.png", color)
+        save(folder / "depth" / f"{i}.png", np.rint(z * 5000).astype(np.uint16))
+        lines.append(f"{i} depth/{i}.png {i} rgb/{i}.png")
+        poses.append(tum_line(i + 1, icl_nuim.S @ T @ icl_nuim.S).replace(".0000", "", 1))
+    (folder / "associations.txt").write_text("\n".join(lines) + "\n")
+    (folder / "traj0.gt.freiburg").write_text("\n".join(poses) + "\n")
+    return folder
+
+
+DEPTH_CAMERA = PinholeCamera(160, 120, 145.0, 145.2, 79.6, 60.1)
+COLOR_CAMERA = PinholeCamera(324, 242, 292.4, 291.8, 161.6, 122.5)
+
+
+def intrinsics(camera: PinholeCamera) -> str:
+    K = np.eye(4)
+    K[0, 0], K[1, 1], K[0, 2], K[1, 2] = camera.fx, camera.fy, camera.cx, camera.cy
+    return "\n".join(" ".join(f"{v:.6f}" for v in row) for row in K)
+
+
+def make_scannet(root: Path) -> Path:
+    folder = root / "scene0000_00"
+    for i, T in zip((0, 1, 2, 10), path(FRAMES), strict=True):
+        save(folder / "color" / f"{i}.jpg", render(COLOR_CAMERA, T)[0])
+        save(folder / "depth" / f"{i}.png", np.rint(render(DEPTH_CAMERA, T)[1] * 1000).astype(np.uint16))
+        (folder / "pose").mkdir(exist_ok=True)
+        values = np.full((4, 4), -np.inf) if i == 2 else T
+        (folder / "pose" / f"{i}.txt").write_text("\n".join(" ".join(map(str, row)) for row in values))
+    (folder / "intrinsic").mkdir()
+    (folder / "intrinsic" / "intrinsic_depth.txt").write_text(intrinsics(DEPTH_CAMERA))
+    (folder / "intrinsic" / "intrinsic_color.txt").write_text(intrinsics(COLOR_CAMERA))
+    return folder
+
+
+def make_scannetpp(root: Path) -> Path:
+    folder = root / "b20a261fdf"
+    camera = DEPTH_CAMERA
+    frames = []
+    for i, T in enumerate(path(FRAMES)):
+        color, z = render(camera, T)
+        save(folder / "dslr" / "undistorted_images" / f"DSC{i:05d}.JPG", color)
+        save(folder / "dslr" / "undistorted_depths" / f"DSC{i:05d}.png", np.rint(z * 1000).astype(np.uint16))
+        matrix = (T @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
+        frames.append({"file_path": f"DSC{i:05d}.JPG", "transform_matrix": matrix, "is_bad": i == 3})
+    content = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx + 0.5, "cy": camera.cy + 0.5}
+    content |= {"w": camera.width, "h": camera.height, "frames": frames[1:], "test_frames": frames[:1]}
+    where = folder / "dslr" / "nerfstudio" / "transforms_undistorted.json"
+    where.parent.mkdir()
+    where.write_text(json.dumps(content))
+    return folder
+
+
+# dataset: how its fixture is made, options, robots, frames of the first, its true poses
+CASES = {
+    "replica": (make_replica, [], 1, path(FRAMES)),
+    "replica-multiagent": (make_replica_multiagent, ["size=150x85"], 2, path(FRAMES, 0.1)),
+    "aria-multiagent": (make_aria, ["size=128x128"], 3, path(FRAMES)),
+    "tum": (make_tum, [], 1, [smooth(0.05 + i / 30) for i in range(5)]),
+    "bonn": (make_bonn, [], 1, [smooth(0.05 + i / 30) for i in range(5)]),
+    "icl-nuim": (make_icl, [], 1, path(FRAMES)),
+    "scannet": (make_scannet, [], 1, [path(FRAMES)[i] for i in (0, 1, 3)]),
+    "scannetpp": (make_scannetpp, [], 1, path(FRAMES)[:3]),
+}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Path]]:
+    """Dataset -> its fixture and the recording made of it."""
+    out = {}
+    for name, (make, options, _, _) in CASES.items():
+        root = tmp_path_factory.mktemp(name.replace("-", "_"))
+        src = make(root / "data")
+        converters.convert(name, src, root / "recording", options=options)
+        out[name] = src, root / "recording"
+    return out
+
+
+def true_poses(recording: Path, robot: str) -> list[np.ndarray]:
+    topic = topics.GROUNDTRUTH_POSE.of(robot)
+    records = read_log(recording / f"{robot}.groundtruth.mcap", topics=[topic])
+    return [m.unpack_pose_in_frame(record.proto()) for record in records]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_is_in_the_recording_is_what_was_rendered(made: dict[str, tuple[Path, Path]], name: str) -> None:
+    _, _, robots, poses = CASES[name]
+    _, recording = made[name]
+    description = json.loads((recording / "recording.json").read_text())
+    assert len(description["robots"]) == robots
+    found = true_poses(recording, "alpha")
+    assert len(found) == len(poses)
+    for T, expected in zip(found, poses, strict=True):
+        assert np.allclose(T, expected, atol=2e-5)
+    with open_rgbd(recording / "alpha.mcap") as log:
+        frame = log.frame(0)
+        color, z = render(log.camera, poses[0])
+        seen = frame.depth > 0
+        assert seen.mean() > 0.85
+        error = np.abs(frame.depth - z)[seen]
+        assert np.median(error) < 2e-3
+        assert np.median(np.abs(frame.color[seen].astype(int) - color[seen])) <= 3
+        assert log.frame(1).stamp_ns > frame.stamp_ns == 0
+    check = description["checks"]["alpha"]
+    assert check["reprojection_median_m"] < 0.01
+
+
+@pytest.mark.parametrize("name", ["replica", "replica-multiagent", "icl-nuim", "scannetpp"])
+def test_lossless_is_lossless(made: dict[str, tuple[Path, Path]], name: str) -> None:
+    """Where nothing has to be resampled, colour is the file's bytes and depth its numbers."""
+    src, recording = made[name]
+    color_file = sorted([*src.rglob("frame*.jpg"), *src.rglob("rgb/*.png"), *src.rglob("*.JPG")])[0]
+    depth_file = sorted([*src.rglob("depth0*.png"), *src.rglob("depth/*.png"), *src.rglob("*depths/*.png")])[
+        0
+    ]
+    color = next(iter(read_log(recording / "alpha.mcap", topics=[topics.COLOR.of("alpha")]))).proto()
+    depth = next(iter(read_log(recording / "alpha.mcap", topics=[topics.DEPTH.of("alpha")]))).proto()
+    assert color.data == color_file.read_bytes()
+    stored = m.unpack_depth(depth, "depth")
+    assert np.array_equal(stored, cv2.imread(str(depth_file), cv2.IMREAD_UNCHANGED))
+
+
+def test_times_and_warnings(made: dict[str, tuple[Path, Path]]) -> None:
+    def told(name: str) -> str:
+        return " ".join(json.loads((made[name][1] / "recording.json").read_text())["warnings"])
+
+    with open_rgbd(made["tum"][1] / "alpha.mcap") as log:
+        assert len(log) == 5
+        assert log.frame(1).stamp_ns == 33_333_000
+    assert "1 of 6 colour images have no depth" in told("tum")
+    assert "1 lines of groundtruth.txt hold no pose" in told("tum")
+    with open_rgbd(made["scannet"][1] / "alpha.mcap") as log:
+        assert log.frame(3).stamp_ns == 10 * 10**9 // 30
+    assert "1 of 4 frames have no true pose" in told("scannet")
+    assert "1 images are marked as bad" in told("scannetpp")
+    assert "not recorded at the same time" in told("aria-multiagent")
+    assert "poses count from 1" in told("icl-nuim")
+    assert "5 poses for frames up to 3" in told("replica")
+
+
+def test_association_policies(made: dict[str, tuple[Path, Path]], tmp_path: Path) -> None:
+    src, _ = made["tum"]
+    converters.convert("tum", src, tmp_path / "near", options=["association=nearest"])
+    with open_rgbd(tmp_path / "near" / "alpha.mcap") as log:
+        assert len(log) == 6
+    listed = [tum_layout.Listed(t * 10**6, Path(str(t))) for t in (0, 10, 30)]
+    other = [tum_layout.Listed(t * 10**6, Path(str(t))) for t in (8, 12, 100)]
+    official = tum_layout.associate(listed, other, tum_layout.AssociationOptions())
+    pairs = [(int(a.path.name), int(b.path.name)) for a, b in official]
+    assert pairs == [(0, 12), (10, 8)]  # each image once: what is taken is taken
+    nearest = tum_layout.AssociationOptions(association="nearest")
+    pairs = [(int(a.path.name), int(b.path.name)) for a, b in tum_layout.associate(listed, other, nearest)]
+    assert pairs == [(0, 8), (10, 8), (30, 12)]
+
+
+def test_poses_are_interpolated_and_never_extrapolated() -> None:
+    T = np.array([se3.exp(np.array([s, 0, 0, 0, 0, s])) for s in (0.0, 0.2)])
+    poses = tum_layout.Poses(np.array([0, 100_000_000]), T, 0)
+    between = poses.at(50_000_000, 0.2)
+    assert between is not None
+    assert np.allclose(between[:3, :3], so3.exp([0, 0, 0.1]))
+    assert np.allclose(between[:3, 3], T[1, :3, 3] / 2)
+    assert poses.at(50_000_000, 0.05) is None
+    assert poses.at(-1, 1.0) is None
+    assert poses.at(100_000_001, 1.0) is None
+    assert np.array_equal(poses.at(100_000_000, 0.01), T[1])  # type: ignore[arg-type]
+
+
+def test_distortion_matters(made: dict[str, tuple[Path, Path]], tmp_path: Path) -> None:
+    """Left in, it shows in the depth along a wall."""
+    src, recording = made["tum"]
+    converters.convert("tum", src, tmp_path / "raw", options=["undistort=false"])
+    errors = []
+    for folder in (recording, tmp_path / "raw"):
+        with open_rgbd(folder / "alpha.mcap") as log:
+            frame = log.frame(0)
+            _, z = render(log.camera, smooth(0.05))
+        seen = frame.depth > 0
+        errors.append(np.percentile(np.abs(frame.depth - z)[seen], 90))
+    assert errors[0] < 0.01
+    assert errors[1] > 3 * errors[0]
+
+
+def edit(path: Path, change: Callable[[str], str]) -> None:
+    path.write_text(change(path.read_text()))
+
+
+BROKEN = [
+    ("replica", lambda p: (p.parent / "cam_params.json").unlink(), "cam_params.json: not found"),
+    ("replica", lambda p: (p / "results" / "depth000001.png").unlink(), "has no partner, expected depth000001"),
+    ("replica", lambda p: edit(p / "traj.txt", lambda t: "\n".join(t.splitlines()[:2])), "has 2 poses"),
+    ("replica", lambda p: edit(p / "traj.txt", lambda t: t.replace("e", "x", 1)), "traj.txt:1"),
+    ("replica", lambda p: save(p / "results" / "frame000000.jpg", np.zeros((9, 9, 3), np.uint8)), "is 9x9"),
+    ("replica-multiagent", lambda p: shutil.rmtree(p / "office_0_part2"), "found 1 parts for 2 robots"),
+    ("aria-multiagent", lambda p: [shutil.rmtree(a) for a in p.iterdir()], "found no folder agent_N"),
+    ("tum", lambda p: (p / "depth.txt").unlink(), "depth.txt: No such file"),
+    ("tum", lambda p: edit(p / "rgb.txt", lambda t: t + "x rgb/y.png\n"), "expected a time in seconds"),
+    ("tum", lambda p: edit(p / "groundtruth.txt", lambda t: t + "1 2 3\n"), "expected eight numbers"),
+    ("bonn", lambda p: edit(p / "groundtruth.txt", lambda t: "# nothing\n"), "found no pose"),
+    ("icl-nuim", lambda p: (p / "traj0.gt.freiburg").unlink(), "found 0 files *.gt.freiburg"),
+    ("icl-nuim", lambda p: edit(p / "traj0.gt.freiburg", lambda t: t[: len(t) // 2].rsplit("\n", 1)[0]), "has no pose"),
+    ("scannet", lambda p: (p / "intrinsic" / "intrinsic_depth.txt").write_text("1 2"), "expected 4x4 numbers"),
+    ("scannet", lambda p: shutil.rmtree(p / "depth"), "depth: no such folder"),
+    ("scannetpp", lambda p: shutil.rmtree(p / "dslr" / "undistorted_depths"), "are not shipped"),
+    ("scannetpp", lambda p: edit(next(p.rglob("*.json")), lambda t: t.replace("fl_x", "f")), "KeyError 'fl_x'"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "spoil", "message"), BROKEN, ids=[f"{b[0]}: {b[2]}" for b in BROKEN])
+def test_broken_data_is_named_and_leaves_nothing(
+    made: dict[str, tuple[Path, Path]],
+    tmp_path: Path,
+    name: str,
+    spoil: Callable[[Path], object],
+    message: str,
+) -> None:
+    src, _ = made[name]
+    copy = tmp_path / src.parent.name / src.name
+    shutil.copytree(src.parent, copy.parent)
+    spoil(copy)
+    _, options, robots, _ = CASES[name]
+    with pytest.raises(DuagError) as caught:
+        converters.convert(name, copy, tmp_path / "out", robots=robots, options=options)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert [p.name for p in tmp_path.iterdir()] == [copy.parent.name]
+
+
+@pytest.mark.parametrize(
+    ("name", "convention"),
+    [
+        ("replica", lambda T: np.linalg.inv(T)),
+        ("replica", lambda T: T @ np.diag([1.0, -1.0, -1.0, 1.0])),
+        ("icl-nuim", lambda T: icl_nuim.S @ T @ icl_nuim.S),
+    ],
+)
+def test_a_wrong_convention_is_found_out(
+    made: dict[str, tuple[Path, Path]],
+    tmp_path: Path,
+    name: str,
+    convention: Callable[[np.ndarray], np.ndarray],
+) -> None:
+    """Inverted poses, OpenGL axes, or poses that were not reflected: depth does not fit."""
+    src, _ = made[name]
+    copy = tmp_path / src.parent.name / src.name
+    shutil.copytree(src.parent, copy.parent)
+    if name == "replica":
+        edit(copy / "traj.txt", lambda _: "\n".join(traj_line(convention(T)) for T in path(FRAMES)))
+    else:
+        poses = [tum_line(i + 1, T).replace(".0000", "", 1) for i, T in enumerate(path(FRAMES))]
+        edit(copy / "traj0.gt.freiburg", lambda _: "\n".join(poses))
+    with pytest.raises(DuagError, match="do not belong together"):
+        converters.convert(name, copy, tmp_path / "out")
+
+
+def test_the_rotation_of_bonn_is_one() -> None:
+    R = bonn.T_MARKER_CAMERA[:3, :3]
+    assert np.allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real Replica scene is not there")
+def test_the_real_replica_scene(tmp_path: Path) -> None:
+    converters.convert("replica", REAL, tmp_path / "office0")
+    check = json.loads((tmp_path / "office0" / "recording.json").read_text())["checks"]["alpha"]
+    assert check["reprojection_median_m"] < 0.002
+    with open_rgbd(tmp_path / "office0" / "alpha.mcap") as log:
+        assert (log.camera.width, len(log)) == (1200, 4)

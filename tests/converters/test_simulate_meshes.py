@@ -1,0 +1,460 @@
+"""The simulator on textured meshes: a box room with a table, whose depth and colours are known by other formulas."""
+
+import json
+import shutil
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from converters.simulate import _camera, meshes, simulate, walks
+from converters.simulate.paths import look_at, shared_view
+from converters.simulate.raycast import Caster, MeshRenderer
+from converters.simulate.stages import MeshStage
+from pipeline.errors import DuagError
+from pipeline.geometry import se3
+from pipeline.recording import Recording, open_rgbd
+
+HOUSE = Path(__file__).parents[3] / "shared" / "data" / "scenes" / "house_upper"
+ROOM = np.array([5.0, 4.0, 2.6])
+TABLE = np.array([[2.0, 1.6, 0.0], [3.0, 2.4, 0.7]])
+TEXEL_M = 0.01
+
+
+@dataclass(frozen=True)
+class Quad:
+    """A rectangle corner + s axis_s + t axis_t, 0 <= s, t <= size, painted by `color`."""
+
+    corner: np.ndarray
+    axis_s: np.ndarray
+    axis_t: np.ndarray
+    size: tuple[float, float]
+    phase: float
+
+    def color(self, s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """RGB at surface coordinates (m); every 12 cm or more a wave, different in s and t, and on every quad."""
+        waves = np.stack(
+            [
+                np.sin(2 * np.pi * s / 0.5 + self.phase),
+                np.sin(2 * np.pi * t / 0.35 + 2 * self.phase),
+                np.cos(2 * np.pi * (s + 2 * t) / 0.6 + 3 * self.phase),
+            ],
+            axis=-1,
+        )
+        return 128 + 90 * waves
+
+
+def box(low: np.ndarray, high: np.ndarray, first: int) -> list[Quad]:
+    quads = []
+    for axis in range(3):
+        for end in (low, high):
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            corner = low.copy()
+            corner[axis] = end[axis]
+            size = (high - low)[[i, j]]
+            quads.append(
+                Quad(corner, np.eye(3)[i], np.eye(3)[j], (size[0], size[1]), 0.7 * (first + len(quads)))
+            )
+    return quads
+
+
+QUADS = box(np.zeros(3), ROOM, 0) + box(TABLE[0], TABLE[1], 6)
+
+
+def texture(quad: Quad) -> np.ndarray:
+    w, h = (round(size / TEXEL_M) for size in quad.size)
+    s, t = np.meshgrid((np.arange(w) + 0.5) * TEXEL_M, (np.arange(h) + 0.5) * TEXEL_M)
+    return np.rint(quad.color(s, t)).astype(np.uint8)
+
+
+def corners(quad: Quad) -> np.ndarray:
+    s, t = quad.size
+    steps = [(0, 0), (s, 0), (s, t), (0, t)]
+    return np.stack([quad.corner + a * quad.axis_s + b * quad.axis_t for a, b in steps])
+
+
+def y_up(points: np.ndarray) -> np.ndarray:
+    return np.stack([points[:, 0], points[:, 2], -points[:, 1]], axis=1)
+
+
+def png(image: np.ndarray) -> bytes:
+    return cv2.imencode(".png", image[..., ::-1])[1].tobytes()
+
+
+UVS = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], dtype=np.float32)  # down from the top, as glTF counts
+FACES = np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32)
+
+
+def write_glb(path: Path, quads: list[Quad], plain: bool = False) -> None:
+    """A binary glTF file by its specification; `plain` leaves the textures out."""
+    blob, views, accessors, materials, parts = b"", [], [], [], []
+
+    def add(data: bytes) -> int:
+        nonlocal blob
+        views.append({"buffer": 0, "byteOffset": len(blob), "byteLength": len(data)})
+        blob += data + bytes(-len(data) % 4)
+        return len(views) - 1
+
+    images = []
+    for quad in quads:
+        points = y_up(corners(quad)).astype(np.float32)
+        bounds = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
+        shape = {"componentType": 5126, "count": 4}
+        accessors.append({"bufferView": add(points.tobytes()), "type": "VEC3", **shape, **bounds})
+        accessors.append({"bufferView": add(UVS.tobytes()), "type": "VEC2", **shape})
+        accessors.append(
+            {"bufferView": add(FACES.tobytes()), "type": "SCALAR", "componentType": 5125, "count": 6}
+        )
+        k = len(materials)
+        about = {} if plain else {"pbrMetallicRoughness": {"baseColorTexture": {"index": k}}}
+        materials.append(about)
+        if not plain:
+            images.append({"bufferView": add(png(texture(quad))), "mimeType": "image/png"})
+        attributes = {"POSITION": 3 * k, "TEXCOORD_0": 3 * k + 1}
+        parts.append({"primitives": [{"attributes": attributes, "indices": 3 * k + 2, "material": k}]})
+    content = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": list(range(len(parts)))}],
+        "nodes": [{"mesh": k} for k in range(len(parts))],
+        "meshes": parts,
+        "materials": materials,
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(blob)}],
+    }
+    if images:
+        content |= {"images": images, "textures": [{"source": k} for k in range(len(images))]}
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    size = 12 + 8 + len(text) + 8 + len(blob)
+    path.write_bytes(
+        struct.pack("<4sII", b"glTF", 2, size)
+        + struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(blob), b"BIN\0")
+        + blob
+    )
+
+
+def write_obj(path: Path, quads: list[Quad]) -> None:
+    lines, materials = [f"mtllib {path.stem}.mtl"], []
+    for k, quad in enumerate(quads):
+        image = f"{path.stem}{k}.png"
+        (path.parent / image).write_bytes(png(texture(quad)))
+        materials.append(f"newmtl m{k}\nKd 1 1 1\nmap_Kd {image}\n")
+        lines += [f"usemtl m{k}"]
+        lines += ["v {} {} {}".format(*point) for point in y_up(corners(quad))]
+        lines += [f"vt {u} {1 - v}" for u, v in UVS]  # up from the bottom, as OBJ counts
+        lines += ["f " + " ".join(f"{4 * k + i + 1}/{4 * k + i + 1}" for i in face) for face in FACES]
+    path.write_text("\n".join(lines) + "\n")
+    path.with_suffix(".mtl").write_text("\n".join(materials))
+
+
+def write_ply(path: Path, quads: list[Quad], colors: bool = True) -> None:
+    """Vertices every 25 mm, coloured; z up."""
+    points, paints, faces = [], [], []
+    for quad in quads:
+        n, m = (round(size / 0.025) + 1 for size in quad.size)
+        across, down = np.linspace(0, quad.size[0], n), np.linspace(0, quad.size[1], m)
+        s, t = (grid.ravel() for grid in np.meshgrid(across, down))
+        first = sum(map(len, points))
+        points.append(quad.corner + s[:, None] * quad.axis_s + t[:, None] * quad.axis_t)
+        paints.append(np.rint(quad.color(s, t)).astype(np.uint8))
+        a = first + (np.arange(m - 1)[:, None] * n + np.arange(n - 1)).ravel()
+        faces += [np.stack([a, a + 1, a + n + 1], axis=1), np.stack([a, a + n + 1, a + n], axis=1)]
+    vertices, triangles = np.concatenate(points), np.concatenate(faces)
+    row = np.dtype([("p", "<f4", 3)] + ([("c", "u1", 3)] if colors else []))
+    rows = np.zeros(len(vertices), dtype=row)
+    rows["p"] = vertices
+    if colors:
+        rows["c"] = np.concatenate(paints)
+    face_rows = np.zeros(len(triangles), dtype=[("n", "u1"), ("i", "<i4", 3)])
+    face_rows["n"], face_rows["i"] = 3, triangles
+    names = [f"property float {c}" for c in "xyz"]
+    names += [f"property uchar {c}" for c in ("red", "green", "blue")] if colors else []
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *names]
+    header += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header", ""]
+    path.write_bytes("\n".join(header).encode() + rows.tobytes() + face_rows.tobytes())
+
+
+WRITERS = {"glb": write_glb, "obj": write_obj, "ply": write_ply}
+
+
+def folder_of(path: Path, kind: str) -> Path:
+    """The room in two chunks."""
+    path.mkdir(parents=True)
+    WRITERS[kind](path / f"walls.{kind}", QUADS[:6])
+    WRITERS[kind](path / f"table.{kind}", QUADS[6:])
+    return path
+
+
+@pytest.fixture(scope="module", params=sorted(WRITERS))
+def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> MeshStage:
+    where = tmp_path_factory.mktemp("scene")
+    folder = folder_of(where / "room", request.param)
+    files = meshes.mesh_files(folder)
+    (where / "cache").mkdir()
+    meshes.read(folder, meshes.up_axis(files, "auto"), where / "cache")
+    return MeshStage(0, where / "cache")
+
+
+def some_poses() -> np.ndarray:
+    at = np.array([(1.0, 1.0, 1.4), (4.2, 0.9, 1.1), (2.5, 3.3, 1.9)])
+    to = np.array([(3.2, 2.6, 0.5), (1.8, 2.9, 0.9), (2.6, 1.0, 0.2)])
+    return look_at(at, to)
+
+
+def true_view(origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth, quad and colour of rays [n, 3] through the room, in float64."""
+    nearest, index = np.full(len(directions), np.inf), np.full(len(directions), -1)
+    color = np.zeros((len(directions), 3))
+    for k, quad in enumerate(QUADS):
+        normal = np.cross(quad.axis_s, quad.axis_t)
+        along = directions @ normal
+        z = (quad.corner - origin) @ normal / np.where(along == 0, 1e-30, along)
+        p = origin + z[:, None] * directions - quad.corner
+        s, t = p @ quad.axis_s, p @ quad.axis_t
+        hit = (z > 0) & (z < nearest) & (s >= 0) & (s <= quad.size[0]) & (t >= 0) & (t <= quad.size[1])
+        nearest[hit], index[hit] = z[hit], k
+        color[hit] = quad.color(s, t)[hit]
+    return nearest, index, color
+
+
+def test_depth_and_colour_are_those_of_the_room(stage):
+    camera = _camera((240, 180))
+    eye = MeshRenderer(stage.caster, camera)
+    for T in some_poses():
+        view = eye.render(T)
+        depth, quad, color = true_view(T[:3, 3], camera.rays().reshape(-1, 3) @ T[:3, :3].T)
+        depth, quad = depth.reshape(view.depth.shape), quad.reshape(view.depth.shape).astype(np.int16)
+        window = np.ones((3, 3), dtype=np.uint8)
+        inside = cv2.dilate(quad, window) == cv2.erode(quad, window)
+        assert inside.mean() > 0.9
+        assert np.abs(view.depth - depth)[inside].max() < 5e-6  # float32 rays over a few metres
+        error = np.abs(view.color - color.reshape(view.color.shape))[inside]
+        assert np.percentile(error, 99) < 6  # of 255; filtering dampens the shortest waves by some
+        assert error.mean() < 2.0  # between vertices 25 mm apart the colours are straight lines
+
+
+def test_colour_is_the_mean_over_the_pixel(stage):
+    """The same view at five times the size, averaged in blocks, is the view."""
+    camera = _camera((160, 120))
+    T = some_poses()[1]
+    view = MeshRenderer(stage.caster, camera).render(T)
+    large = MeshRenderer(stage.caster, camera.scaled(800, 600)).render(T)
+    blocks = large.color.reshape(120, 5, 160, 5, 3).mean(axis=(1, 3))
+    difference = np.abs(view.color - blocks).mean(axis=2)
+    assert np.median(difference) < 1.0
+    assert np.percentile(difference, 98) < 12  # at borders, 4 samples against 100
+    assert np.abs(large.depth[2::5, 2::5] - view.depth).max() < 5e-6
+
+
+def test_points_lie_on_the_surfaces_and_have_their_colours(stage):
+    points, normals, colors = stage.points()
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0)
+    assert stage.clearance(points).max() < 1e-5
+    counted = np.zeros(len(QUADS))
+    for k, quad in enumerate(QUADS[:6]):
+        p = points - quad.corner
+        on = np.abs(p @ np.cross(quad.axis_s, quad.axis_t)) < 1e-4
+        counted[k] = on.sum() / (quad.size[0] * quad.size[1])
+        error = np.abs(colors[on] - quad.color(p[on] @ quad.axis_s, p[on] @ quad.axis_t))
+        assert np.median(error) < 1.0
+    assert counted[:6] == pytest.approx(np.full(6, counted[:6].mean()), rel=0.05)  # the table adds little
+
+
+@pytest.mark.parametrize("stage", ["obj"], indirect=True)
+def test_walks_are_smooth_clear_and_overlap(stage):
+    camera = _camera((160, 120))
+    ways = stage.plan(2, 40, 0.6, camera)
+    for way in ways:
+        step, turn = se3.distance(way[:-1], way[1:])
+        assert step == pytest.approx(walks.STEP_M, rel=0.02)
+        assert turn.max() < walks.MAX_TURN_RAD
+        position = way[:, :3, 3]
+        assert (position > walks.MIN_CLEARANCE_M - 0.06).all()
+        assert (position < ROOM - walks.MIN_CLEARANCE_M + 0.06).all()
+        beside = np.maximum(TABLE[0] - position, position - TABLE[1])[:, :2].max(axis=1)
+        assert beside.min() > walks.MIN_CLEARANCE_M - 0.06  # the body does not stand in the table
+        assert np.abs(way[:, 2, 0]).max() < 1e-9  # upright
+    eye = MeshRenderer(stage.caster, camera.scaled(48, 36))
+    assert abs(shared_view(eye, *ways) - 0.6) < 0.2
+    again = stage.plan(2, 40, 0.6, camera)
+    assert all(np.array_equal(a, b) for a, b in zip(ways, again, strict=True))
+
+
+@pytest.mark.parametrize("stage", ["obj"], indirect=True)
+def test_free_space_is_the_floor_without_the_table(stage):
+    space = walks.free_space(stage.caster)
+    assert space.floor_m == pytest.approx(0.0, abs=0.01)
+    kept = walks.MIN_CLEARANCE_M
+    low, high = space.cells.min(axis=0), space.cells.max(axis=0)
+    assert np.abs(low - kept).max() < 0.1 + 1e-6
+    assert np.abs(high - (ROOM[:2] - kept)).max() < 0.1 + 1e-6
+    beside = np.maximum(TABLE[0, :2] - space.cells, space.cells - TABLE[1, :2]).max(axis=1)
+    assert beside.min() > 0.2
+
+
+@pytest.mark.parametrize("kind", ["glb", "ply"])
+def test_the_same_bytes_for_any_number_of_workers(tmp_path, kind):
+    folder = folder_of(tmp_path / "flat", kind)
+    settings = {"scene": str(folder), "frames": 3, "size": (64, 48), "noise": "kinect", "seed": 2}
+    simulate(tmp_path / "one" / "rec", workers=1, **settings)
+    simulate(tmp_path / "two" / "rec", workers=2, **settings)
+    names = sorted(path.name for path in (tmp_path / "one" / "rec").iterdir())
+    assert len(names) == 6
+    for name in names:
+        one, two = ((tmp_path / each / "rec" / name).read_bytes() for each in ("one", "two"))
+        assert one == two, name
+    text = (tmp_path / "one" / "rec" / "recording.json").read_text()
+    description = json.loads(text)
+    assert str(tmp_path) not in text
+    assert description["parameters"]["scene"] == description["source"]["scene"] == "flat"
+    assert description["parameters"]["up"] == {"glb": "y", "ply": "z"}[kind]
+    assert sorted(description["source"]["files_sha256"]) == [f"table.{kind}", f"walls.{kind}"]
+    recording = Recording(tmp_path / "one" / "rec")
+    assert recording.geometry() is not None
+    with open_rgbd(recording.log("bravo")) as log:
+        assert len(log) == 3
+
+
+def test_a_hole_has_no_depth_and_is_black(tmp_path):
+    (tmp_path / "cache").mkdir()
+    write_glb(tmp_path / "floor.glb", QUADS[4:5])
+    scene = meshes.read(tmp_path, "y", tmp_path / "cache")
+    T = look_at(np.array([[2.5, 1.0, 1.0]]), np.array([[2.5, 3.0, 1.0]]))[0]
+    view = MeshRenderer(Caster(scene), _camera((64, 48))).render(T)
+    up = slice(0, 20)  # above the horizon there is nothing
+    assert (view.depth[up] == 0).all()
+    assert (view.surface[up] == -1).all()
+    assert (view.color[up] == 0).all()
+    assert (view.depth[40:] > 0).any()
+
+
+def test_a_texture_goes_on_beyond_its_border(tmp_path):
+    scene = one_quad(tmp_path, np.zeros((8, 8, 3), np.uint8) + np.arange(8, dtype=np.uint8)[:, None] * 20)
+    inside = scene.sample(np.array([0]), np.array([[0.3, 0.3]], np.float32), np.zeros(1, np.float32))
+    moved = meshes.MeshScene(
+        scene.vertices, scene.triangles, scene.texels + 8, scene.texture_of, scene.colors, scene.textures
+    )
+    beyond = moved.sample(np.array([0]), np.array([[0.3, 0.3]], np.float32), np.zeros(1, np.float32))
+    assert np.array_equal(inside, beyond)
+
+
+def one_quad(folder: Path, image: np.ndarray) -> meshes.MeshScene:
+    (folder / "cache").mkdir()
+    write_obj(folder / "quad.obj", QUADS[:1])
+    (folder / "quad0.png").write_bytes(png(image))
+    return meshes.read(folder, "y", folder / "cache")
+
+
+def test_a_far_texture_is_blurred_to_its_mean(tmp_path):
+    """A checkerboard of single texels, seen from where a pixel holds many of them, is even grey."""
+    board = ((np.indices((512, 512)).sum(axis=0) % 2) * 200).astype(np.uint8)
+    scene = one_quad(tmp_path, np.repeat(board[..., None], 3, axis=2))
+    T = look_at(np.array([[3.0, 2.0, 1.3]]), np.array([[0.0, 2.0, 1.3]]))[0]
+    color = MeshRenderer(Caster(scene), _camera((48, 36))).render(T).color
+    assert np.abs(color[16:20, 22:26].astype(int) - 100).max() <= 2
+
+
+@pytest.mark.parametrize("kind", sorted(WRITERS))
+def test_a_scene_may_be_turned(tmp_path, kind):
+    """The other axis up: the room lies on its side, and x stays."""
+    folder = folder_of(tmp_path / "room", kind)
+    scenes = {}
+    for up in ("y", "z"):
+        (tmp_path / up).mkdir()
+        scenes[up] = meshes.read(folder, up, tmp_path / up)
+    p = scenes["z"].vertices
+    assert scenes["y"].vertices == pytest.approx(np.stack([p[:, 0], -p[:, 2], p[:, 1]], axis=1))
+
+
+def plain_glb(folder: Path) -> None:
+    write_glb(folder / "plain.glb", QUADS, plain=True)
+
+
+def plain_ply(folder: Path) -> None:
+    write_ply(folder / "plain.ply", QUADS, colors=False)
+
+
+def torn_ply(folder: Path) -> None:
+    write_ply(folder / "torn.ply", QUADS)
+    data = (folder / "torn.ply").read_bytes()
+    (folder / "torn.ply").write_bytes(data[: len(data) // 3])
+
+
+def torn_glb(folder: Path) -> None:
+    write_glb(folder / "torn.glb", QUADS)
+    data = (folder / "torn.glb").read_bytes()
+    (folder / "torn.glb").write_bytes(data[: len(data) // 3])
+
+
+def words(folder: Path) -> None:
+    (folder / "words.obj").write_text("no mesh at all\n")
+
+
+def mixed(folder: Path) -> None:
+    write_ply(folder / "a.ply", QUADS)
+    write_glb(folder / "b.glb", QUADS)
+
+
+def nothing(folder: Path) -> None:
+    (folder / "readme.txt").write_text("no mesh here")
+
+
+def small(folder: Path) -> None:
+    write_glb(folder / "small.glb", QUADS[6:])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (nothing, "found no mesh, expected files"),
+        (plain_glb, "neither a texture nor colours"),
+        (plain_ply, "neither a texture nor colours"),
+        (torn_ply, "torn.ply: .*cannot be read"),
+        (torn_glb, "torn.glb: .*cannot be read"),
+        (words, "words.obj: .*cannot be read"),
+        (mixed, "give --up y or --up z"),
+        (small, "free floor"),
+    ],
+)
+def test_what_cannot_be_simulated_is_said_in_one_line(
+    tmp_path, capfd, make: Callable[[Path], None], message: str
+):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    make(folder)
+    with pytest.raises(DuagError, match=message) as caught:
+        simulate(tmp_path / "rec", scene=str(folder), frames=2, size=(64, 48), workers=1)
+    assert "\n" not in str(caught.value)
+    assert "rror" not in capfd.readouterr().err  # libraries add nothing to it
+    assert not (tmp_path / "rec").exists()
+
+
+def test_a_scene_that_is_not_there(tmp_path):
+    with pytest.raises(DuagError, match="expected room or a folder"):
+        simulate(tmp_path / "rec", scene=str(tmp_path / "nowhere"))
+    with pytest.raises(DuagError, match="up is 'x'"):
+        simulate(tmp_path / "rec", scene=str(folder_of(tmp_path / "room", "obj")), up="x")
+
+
+@pytest.mark.skipif(not HOUSE.is_dir(), reason="the scanned house is not on this machine")
+def test_a_chunk_of_a_real_scan(tmp_path):
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "scan").mkdir()
+    shutil.copy(HOUSE / "room3_chunk3.glb", tmp_path / "scan")
+    scene = meshes.read(tmp_path / "scan", "y", tmp_path / "cache")
+    assert len(scene.triangles) == 28247
+    assert [level.shape[0] for level in scene.textures[0]] == [4096, 2048, 1024, 512, 256, 128]
+    caster = Caster(scene)
+    assert walks.floor_height(caster) == pytest.approx(0.02, abs=0.05)
+    T = look_at(np.array([[9.4, -7.0, 1.4]]), np.array([[10.6, -8.2, 0.9]]))[0]
+    view = MeshRenderer(caster, _camera((160, 120))).render(T)
+    assert np.mean(view.depth > 0) > 0.95
+    assert view.color[view.depth > 0].std() > 20

@@ -1,0 +1,228 @@
+"""A camera that is disturbed: noticed, tracked on or declared lost, found again, and never silently wrong.
+
+Frames of the demo's room; the pose of each is compared with that of the undisturbed run. RedKitchen, where it is, in
+a slow test.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from converters.simulate import _camera, bake, paths
+from converters.simulate.render import Renderer
+from converters.simulate.scene import build
+from pipeline.frontend.config import FrontendConfig, TrackingConfig
+from pipeline.frontend.failure import Reason, StuckImages, intruders
+from pipeline.frontend.tracking import Status, Tracker
+from pipeline.geometry import se3
+from pipeline.recording import open_rgbd
+from pipeline.registration import RgbdPyramid
+from tests.frontend import disturbances as d
+from tests.frontend.disturbances import Row, Shot, Undisturbed
+
+FRAME_NS = 33_333_333
+CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)))
+CAMERA = _camera((240, 180))
+STARTS = (17, 34, 50)
+FRAMES = 95
+RED_KITCHEN = Path(__file__).parents[2] / "recordings" / "redkitchen"
+
+
+def filmed(seed: int, frames: int) -> list[Shot]:
+    """Frames of a robot in a simulated room, 22 mm apart."""
+    room = build("room", seed)
+    renderer = Renderer(room, bake.bake(room, 0.008), CAMERA)
+    way = paths.plan(room, 1, 160, 0.6, CAMERA)[0]
+    views = [renderer.render(T) for T in way[:frames]]
+    return [Shot(k, k * FRAME_NS, view.color, view.depth.astype(np.float32)) for k, view in enumerate(views)]
+
+
+@pytest.fixture(scope="module")
+def run() -> Undisturbed:
+    return Undisturbed(Tracker(CAMERA, CONFIG), filmed(0, FRAMES), STARTS)
+
+
+@pytest.fixture(scope="module")
+def other_room() -> list[Shot]:
+    return filmed(5, 30)
+
+
+def during(rows: Sequence[Row]) -> list[Row]:
+    return [row for row in rows if row.shot.disturbed]
+
+
+def after(rows: Sequence[Row]) -> list[Row]:
+    return [row for row in rows if not row.shot.disturbed]
+
+
+def assert_found_again(rows: Sequence[Row], within: int) -> None:
+    """Some frame soon after the disturbance has a pose, and from then on all have."""
+    good = [row.good for row in after(rows)]
+    assert any(good[:within])
+    first = good.index(True)
+    assert all(good[first:])
+
+
+def test_the_undisturbed_run_is_sound(run: Undisturbed) -> None:
+    assert [frame.status for frame in run.frames] == [Status.OK] * FRAMES
+    assert all(frame.reason is Reason.NONE for frame in run.frames)
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_a_covered_lens_is_lost_and_found_again(run: Undisturbed, start: int) -> None:
+    rows = run.disturbed(start, d.covered)
+    assert not any(row.wrong for row in rows)
+    for row in during(rows):
+        assert (row.frame.status, row.frame.reason) == (Status.LOST, Reason.NO_DEPTH)
+        np.testing.assert_array_equal(row.frame.information, 0)
+    assert_found_again(rows, within=4)
+    assert next(row for row in after(rows) if row.good).frame.status is Status.RELOCALISED
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_a_hand_before_the_lens_does_not_take_the_pose_along(run: Undisturbed, start: int) -> None:
+    rows = run.disturbed(start, d.hand)
+    assert not any(row.wrong for row in rows)
+    assert sum(row.good for row in during(rows)) >= 8
+    assert_found_again(rows, within=4)
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_a_foreign_room_is_nowhere(run: Undisturbed, other_room: list[Shot], start: int) -> None:
+    for disturbance in (d.foreign(other_room), d.mirrored):
+        rows = run.disturbed(start, disturbance)
+        assert not any(row.good for row in during(rows))
+        assert not any(row.wrong for row in rows)
+        assert_found_again(rows, within=4)
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_dropped_frames_change_nothing(run: Undisturbed, start: int) -> None:
+    rows = run.disturbed(start, d.dropped)
+    assert [row.frame.status for row in rows] == [Status.OK] * len(rows)
+    assert max(row.moved_m for row in rows) < 2e-3
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_stuck_depth_is_noticed_and_the_colour_goes_on(run: Undisturbed, start: int) -> None:
+    rows = run.disturbed(start, d.frozen)
+    assert not any(row.wrong for row in rows)
+    for row in during(rows)[1:]:  # the first of them is in fact the right one
+        assert row.frame.reason is Reason.STUCK_DEPTH
+    assert sum(row.good for row in during(rows)) >= 5
+    assert_found_again(rows, within=4)
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_without_depth_the_camera_goes_on_for_a_while(run: Undisturbed, start: int) -> None:
+    rows = run.disturbed(start, d.depthless)
+    assert not any(row.wrong for row in rows)
+    assert all(row.frame.reason is Reason.NO_DEPTH for row in during(rows))
+    most = CONFIG.tracking.failure.max_frames_without_depth
+    assert 5 <= sum(row.good for row in during(rows)) <= most
+    assert_found_again(rows, within=4)
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_stuck_colour_is_noticed(run: Undisturbed, start: int) -> None:
+    rows = run.disturbed(start, d.frozen_color)
+    assert not any(row.wrong for row in rows)
+    assert all(row.frame.reason is Reason.STUCK_COLOR for row in during(rows)[8:])
+    assert_found_again(rows, within=4)
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_flipped_exposure_is_followed_or_lost(run: Undisturbed, start: int) -> None:
+    rows = run.disturbed(start, d.flipped)
+    assert not any(row.wrong for row in rows)
+    assert sum(row.good for row in during(rows)) >= 15
+    assert_found_again(rows, within=4)
+
+
+def test_a_covered_beginning_is_waited_out(run: Undisturbed) -> None:
+    """The map begins with the first frame that shows something, and never with one that is held out."""
+    tracker = Tracker(CAMERA, CONFIG)
+    frames = []
+    for shot in run.shots[:8]:
+        if shot.index < 4:
+            shot = next(d.covered([shot], np.random.default_rng(0)))
+        frames.append(d.track(tracker, shot)[0])
+    assert [f.status for f in frames] == [Status.LOST] * 5 + [Status.OK] * 3
+    assert tracker.keyframes[0].frame_index == 5
+
+
+def test_a_standing_camera_is_not_stuck(run: Undisturbed) -> None:
+    """Without noise the images of a camera at rest repeat bit by bit, both or one of them."""
+    watch = StuckImages(CONFIG.tracking.failure)
+    rng = np.random.default_rng(0)
+    shot = run.shots[0]
+    for k in range(6):
+        color = shot.color.astype(np.float32) / 255
+        depth = shot.depth
+        if k in (2, 3):
+            color = color + np.float32(0.01) * rng.standard_normal(color.shape, dtype=np.float32)
+        if k in (4, 5):
+            depth = depth * (1 + np.float32(0.003) * rng.standard_normal(depth.shape, dtype=np.float32))
+        assert watch.look(RgbdPyramid.build(color, depth, CAMERA, 4)) is Reason.NONE
+
+
+def test_intruders_are_what_stands_in_free_space(run: Undisturbed) -> None:
+    limits = CONFIG.tracking.failure
+    one, other = (
+        RgbdPyramid.build(s.color.astype(np.float32) / 255, s.depth, CAMERA, 4).levels[-1]
+        for s in (run.shots[0], run.shots[6])
+    )
+    T_one_other = se3.inverse(run.poses[0]) @ run.poses[6]
+    intruding, told = intruders(other, one, T_one_other, limits)
+    assert told > 0.7 * other.inverse_depth.size
+    assert intruding < 0.01 * told
+    near = other.inverse_depth.copy()
+    near[:, : near.shape[1] // 3] = 1 / 0.4
+    intruding, told = intruders(type(other)(other.camera, other.gray, near), one, T_one_other, limits)
+    assert intruding > 0.2 * told
+
+
+@pytest.mark.slow
+def test_red_kitchen_is_never_silently_wrong(other_room: list[Shot]) -> None:
+    """A real sensor: nine disturbances at four places of the log of the first robot."""
+    if not (RED_KITCHEN / "alpha.mcap").is_file():
+        pytest.skip("needs recordings/redkitchen")
+    starts = (60, 120, 180, 240)
+    with open_rgbd(RED_KITCHEN / "alpha.mcap") as log:
+        camera = log.camera
+        shots = [Shot(f.index, f.stamp_ns, f.color, f.depth) for f in map(log.frame, range(starts[-1] + 45))]
+    run = Undisturbed(Tracker(camera, FrontendConfig()), shots, starts)
+    lost = [frame.frame_index for frame in run.frames if frame.status is Status.LOST]
+    assert not lost
+    size = (camera.width, camera.height)
+    there = [
+        Shot(
+            s.index,
+            s.stamp_ns,
+            cv2.resize(s.color, size),
+            cv2.resize(s.depth, size, interpolation=cv2.INTER_NEAREST),
+        )
+        for s in other_room
+    ]
+    every = (
+        d.covered,
+        d.hand,
+        d.foreign(there),
+        d.mirrored,
+        d.dropped,
+        d.frozen,
+        d.frozen_color,
+        d.flipped,
+        d.depthless,
+    )
+    wrong, found = [], 0
+    for start in starts:
+        for disturbance in every:
+            rows = run.disturbed(start, disturbance)
+            wrong += [(disturbance.__name__, start, row.shot.index, row.moved_m) for row in rows if row.wrong]
+            found += rows[-1].good
+    assert not wrong
+    assert found >= 0.9 * len(starts) * len(every)
