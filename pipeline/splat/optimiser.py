@@ -40,11 +40,11 @@ class GaussianGradients(Protocol):
 class LearningRates(Config):
     """Step lengths of Adam: about the change of a parameter per step while its gradient keeps its sign."""
 
-    means: float = 3e-3
+    means: float = 2e-3
     """Metres."""
     quats_wxyz: float = 2e-2
     """Of a unit quaternion."""
-    log_scales: float = 0.12
+    log_scales: float = 0.08
     colors: float = 2e-2
     """RGB in 0..1."""
     opacity_logits: float = 3e-2
