@@ -16,6 +16,7 @@ DATASETS = {
     "bonn": "converters.bonn",
     "icl-nuim": "converters.icl_nuim",
     "replica": "converters.replica",
+    "ros": "converters.ros",
     "replica-multiagent": "converters.replica_multiagent",
     "scannet": "converters.scannet",
     "scannetpp": "converters.scannetpp",

@@ -3,7 +3,7 @@
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -205,6 +205,49 @@ def replay(
         print(f"{c.robot:<10} {c.name:<17} {verdict}")
     if not all(c.equal for c in comparisons):
         raise typer.Exit(EXIT_DIFFERENT)
+
+
+@app.command()
+def posegraph(
+    path: Annotated[
+        Path, typer.Argument(help="A .g2o file, or a folder of a team's pose graphs.", show_default=False)
+    ],
+    robots: Annotated[
+        int | None, typer.Option(min=1, help="Cut a single graph into so many robots. [default: 4]")
+    ] = None,
+    loss: Annotated[float, typer.Option(min=0, max=1, help="Share of the packets that are lost.")] = 0.0,
+    solver: Annotated[
+        Literal["admm", "elimination", "paper"],
+        typer.Option(help="Edge-ADMM, exact elimination along a tree of robots, or the printed iteration."),
+    ] = "admm",
+    robust: Annotated[
+        Literal["none", "gnc"],
+        typer.Option(help="gnc: closures and loops may be false, odometry is trusted."),
+    ] = "none",
+    only_reference: Annotated[
+        bool,
+        typer.Option("--only-reference", help="Leave out what the reference beside the graph calls false."),
+    ] = False,
+    max_rounds: Annotated[int, typer.Option(min=1, help="Give up after so many rounds.")] = 5000,
+    seed: Annotated[int, typer.Option(help="Of the losses; nothing else is random.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Let a team of agents solve a public 3-D pose graph over lossy links, and compare with the optimum.
+
+    Reads `.g2o`, folders of one `.g2o` per robot (gtsam symbols as keys), and Kimera-Multi `robot*/measurements.csv`.
+
+    Examples:
+    `duagc posegraph sphere2500.g2o --robots 8`,
+    `duagc posegraph parking-garage.g2o --solver elimination`,
+    `duagc posegraph kimera_campus_outdoor --robust gnc --loss 0.3 --json`
+    """
+    from pipeline.posegraph.config import settings
+    from pipeline.posegraph.solve import solve
+    from pipeline.posegraph.table import format_result
+
+    config = settings(solver, robust, loss, seed, max_rounds)
+    result = solve(path, config, robots, only_reference=only_reference)
+    print(json.dumps(result, indent=2) if as_json else format_result(result))
 
 
 @app.command()
@@ -467,6 +510,53 @@ def bench_consensus(
     )
     result = bench.run(plan)
     print(json.dumps(result, indent=2) if as_json else bench.format_table(result))
+
+
+@bench_app.command("frontend")
+def bench_frontend(
+    recording: Annotated[
+        Path | None, typer.Argument(help="Folder of a recording; a small room is simulated without one.")
+    ] = None,
+    caps: Annotated[
+        str, typer.Option(help="Most Gaussians of a map, each a run; k and M are understood; none = no maps.")
+    ] = "60k",
+    ablation: Annotated[bool, typer.Option(help="Tracking without one of its parts at a time.")] = True,
+    open3d: Annotated[bool, typer.Option(help="Open3D's RGB-D odometry, in the same run.")] = True,
+    robot: Annotated[str | None, typer.Option(help="One robot; all by default.")] = None,
+    threads: Annotated[int, typer.Option(min=1, help="Of the kernels.")] = 1,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    as_json: Json = False,
+) -> None:
+    """Time, memory and accuracy of tracking and mapping, part by part, beside Open3D's odometry.
+
+    Examples: `duagc bench frontend recordings/house --caps 30k,60k,200k,600k`,
+    `duagc bench frontend recordings/redkitchen --no-ablation --json`
+    """
+    import tempfile
+
+    from converters.simulate import simulate as simulate_recording
+    from pipeline.config import load
+    from pipeline.evaluation import frontend_bench
+    from pipeline.runner import RunConfig
+
+    settings = load(RunConfig, config, overrides or [])
+    with tempfile.TemporaryDirectory(prefix="duagc-bench-") as folder:
+        if recording is None:
+            recording = Path(folder) / "room"
+            simulate_recording(recording, robots=1, frames=60, seed=settings.seed)
+        plan = frontend_bench.Plan(
+            recording,
+            settings.frontend,
+            () if caps == "none" else tuple(_counts("--caps", caps)),
+            ablation,
+            open3d,
+            threads,
+            settings.seed,
+            (robot,) if robot else (),
+        )
+        result = frontend_bench.run(plan)
+    print(json.dumps(result, indent=2) if as_json else frontend_bench.format_tables(result))
 
 
 def _numbers(option: str, text: str, low: float, high: float) -> list[float]:

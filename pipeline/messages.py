@@ -712,6 +712,21 @@ def _rigid(p: Any, q: Any, what: str) -> Array:
     return se3.from_quat_translation(quat, [p.x, p.y, p.z])
 
 
+def pack_imu(stamp_ns: int, robot: str, rates_rad_s: ArrayLike, accelerations_m_s2: ArrayLike) -> Any:
+    """duagc.v1.Imu of angular velocity [3] and linear acceleration [3] in the frame of the unit."""
+    message = schemas.new(
+        "Imu",
+        frame_id=f"{robot}/imu",
+        robot=robot,
+        angular_velocity=dict(zip("xyz", np.asarray(rates_rad_s, np.float64).tolist(), strict=True)),
+        linear_acceleration=dict(
+            zip("xyz", np.asarray(accelerations_m_s2, np.float64).tolist(), strict=True)
+        ),
+    )
+    pack_stamp(message, stamp_ns)
+    return message
+
+
 def pack_pose_in_frame(stamp_ns: int, frame_id: str, T_frame_body: ArrayLike) -> Any:
     """foxglove.PoseInFrame of a motion [4, 4]; its rotation is kept as a unit quaternion."""
     T = np.asarray(T_frame_body, dtype=np.float64)

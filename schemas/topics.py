@@ -92,6 +92,21 @@ LIDAR_TRANSFORM = Topic(
     Scope.SENSOR,
     "pose of the LiDAR in the colour camera, constant",
 )
+ODOMETRY_PRIOR = Topic(
+    "/<robot>/odometry_prior",
+    "foxglove.PoseInFrame",
+    "converters",
+    Scope.SENSOR,
+    "pose of the colour camera by another odometry (wheels, legs), in a frame of its own",
+)
+IMU = Topic("/<robot>/imu", "duagc.v1.Imu", "converters", Scope.SENSOR, "rates and accelerations of an IMU")
+IMU_TRANSFORM = Topic(
+    "/<robot>/imu/transform",
+    "foxglove.FrameTransform",
+    "converters",
+    Scope.SENSOR,
+    "pose of the IMU in the colour camera, constant",
+)
 GROUNDTRUTH_POSE = Topic(
     "/<robot>/groundtruth/pose",
     "foxglove.PoseInFrame",
@@ -190,6 +205,9 @@ TOPICS: tuple[Topic, ...] = (
     RAW_DEPTH_TRANSFORM,
     LIDAR,
     LIDAR_TRANSFORM,
+    ODOMETRY_PRIOR,
+    IMU,
+    IMU_TRANSFORM,
     GROUNDTRUTH_POSE,
     GROUNDTRUTH_DEPTH,
     ODOMETRY,

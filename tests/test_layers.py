@@ -27,6 +27,7 @@ ALLOWED = {
     "robot": MATHEMATICS | LOGS | {"consensus"},
     "fusion": MATHEMATICS | LOGS | {"consensus", "robot"},
     "exchange": MATHEMATICS | LOGS | {"consensus", "robot"},
+    "posegraph": FOUNDATION | {"consensus", "exchange"},
 }
 ESTIMATOR = sorted(set(ALLOWED) - {"messages", "recording", "digest"})
 

@@ -1,4 +1,4 @@
-"""The team's pose graph solved in one place: what the decentralised solver must reach. Tests and evaluation only."""
+"""A pose graph solved in one place: a robot's own, or the team's, which the decentralised solver must reach."""
 
 from __future__ import annotations
 

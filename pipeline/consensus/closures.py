@@ -272,21 +272,33 @@ def chain_frames(
     Returns:
         T_world_map [4, 4] of every robot; the identity for every root, a robot without a partner included.
     """
-    edges = {}
-    for (a, b), (T_a_b, support) in pairs.items():
-        edges[a, b] = (support, np.asarray(T_a_b))
-        edges.setdefault((b, a), (support, se3.inverse(T_a_b)))
+    motion = {}
+    for (a, b), (T_a_b, _) in pairs.items():
+        motion[a, b] = np.asarray(T_a_b)
+        motion.setdefault((b, a), se3.inverse(T_a_b))
+    parent = spanning_tree({pair: support for pair, (_, support) in pairs.items()}, robots)
     T_world_map: dict[str, Array] = {}
-    for root in sorted(robots):
-        if root in T_world_map:
-            continue
-        T_world_map[root] = np.eye(4)
-        component = {root}
-        while True:
-            border = [(-edges[e][0], e) for e in edges if e[0] in component and e[1] not in component]
-            if not border:
-                break
-            a, b = min(border)[1]
-            T_world_map[b] = T_world_map[a] @ edges[a, b][1]
-            component.add(b)
+    for robot, nearer in parent.items():
+        T_world_map[robot] = np.eye(4) if nearer is None else T_world_map[nearer] @ motion[nearer, robot]
     return T_world_map
+
+
+def spanning_tree(pairs: Mapping[tuple[str, str], float], robots: Sequence[str]) -> dict[str, str | None]:
+    """Parent of every robot in its component's best supported tree, parents first; None for every root.
+
+    Args:
+        pairs: (a, b) -> support; one direction of each pair is enough.
+        robots: all names; the lowest of a component is its root.
+    """
+    support = {**{(b, a): value for (a, b), value in pairs.items()}, **pairs}
+    parent: dict[str, str | None] = {}
+    for root in sorted(robots):
+        if root in parent:
+            continue
+        parent[root] = None
+        component = {root}
+        while border := [(-support[e], e) for e in support if e[0] in component and e[1] not in component]:
+            a, b = min(border)[1]
+            parent[b] = a
+            component.add(b)
+    return parent

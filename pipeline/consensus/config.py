@@ -59,6 +59,9 @@ class PoseConsensusConfig(Config):
     """A closure whose whitened residual is longer than this counts as an outlier."""
     robust_warm_up: int = Field(default=40, ge=0)
     """Packets received with the start weights before the graduated weights begin (fewer if the link is steady)."""
+    robust_skip: bool = True
+    """A link on which nothing is in doubt after the warm-up skips the graduated weights. That saves rounds; in a larger
+    team a false closure may fit until others' weights have changed."""
     robust_packets: int = Field(default=5, ge=1)
     """Packets received per step of the graduated weights."""
     robust_growth: float = Field(default=1.4, gt=1.0)

@@ -33,7 +33,6 @@ decider, as if lost. Keeping the force keeps every fixed point: there m = y befo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -41,141 +40,58 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.consensus import factors as pose_factors
 from pipeline.consensus.closures import Closure, closure_factors
-from pipeline.consensus.config import ClosureConfig, PoseConsensusConfig
+from pipeline.consensus.config import PoseConsensusConfig
 from pipeline.consensus.factors import Factors, difference, inflated, retract
+from pipeline.consensus.links import BLOCK, Link, PosePacket, SharedKeyframes, link_metric
+from pipeline.consensus.robust import COUNTS, RobustWeights
 from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
-_BLOCK = [0, 0, 0, 1, 1, 1]  # translation, rotation -> the six rows of a tangent
-COUNTS = 0.5
-"""Robust weight from which a closure counts as kept."""
 _STEADY = 1e-3  # m, rad: a link that moves less has left its start behind
-
-
-@dataclass(frozen=True)
-class SharedKeyframes:
-    """Set-up message of a link, from the end that holds the closures to the end that owns the keyframes.
-
-    keyframes: int32 [s], indices of the receiver's keyframes, ascending. metric: float32 [s, 6], diagonal of the
-    information (translation, rotation) that the pair's closures have about each, isotropic per block, so that it
-    holds in every frame; both ends must use the same numbers.
-    """
-
-    keyframes: NDArray[np.int32]
-    metric: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class PosePacket:
-    """One direction of one link in one round. It may be cut by keyframe; every part is useful alone.
-
-    sequence: counts the sender's packets on this link. version: of the penalties. keyframes: int32 [s], indices of
-    the non-holder's keyframes. quats_wxyz [s, 4], translations [s, 3] (m): 2 x - y in the sender's world frame.
-    penalties: float32 [2] (translation, rotation) of this version. curvature: float32 [2] or None, the stiffness that
-    the sender met in this version. converged: the sender is settled.
-    """
-
-    sequence: int
-    version: int
-    keyframes: NDArray[np.int32]
-    quats_wxyz: NDArray[Any]
-    translations: NDArray[Any]
-    penalties: NDArray[np.float32]
-    curvature: NDArray[np.float32] | None
-    converged: bool
-
-    def part(self, index: slice | NDArray[np.int64]) -> PosePacket:
-        """The packet with some of its keyframes only."""
-        return PosePacket(
-            self.sequence,
-            self.version,
-            self.keyframes[index],
-            self.quats_wxyz[index],
-            self.translations[index],
-            self.penalties,
-            self.curvature,
-            self.converged,
-        )
-
-
-@dataclass
-class _Link:
-    """One end of a link. Arrays over its s shared keyframes, which belong to the end that holds no closures."""
-
-    peer: str
-    decides: bool
-    keyframes: NDArray[np.int32]
-    metric: Array
-    slots: NDArray[np.int64]  # [s] where the shared keyframes stand among this robot's variables
-    closures: tuple[Closure, ...]  # held ones; none at the other end
-    factors: Factors  # the same, between this robot's variables
-    weights: Array
-    penalties: Array  # [2] translation, rotation
-    offset: Array = field(
-        default_factory=lambda: np.zeros((0, 6))
-    )  # [s, 6] d = x - y (translation, rotation)
-    version: int = 0
-    sent: int = 0
-    received: float = 0.0  # packets since the last change of penalties, parts counted by their share
-    received_total: float = 0.0
-    newest: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # [s] sequence last used
-    newest_header: int = 0
-    change: Array = field(default_factory=lambda: np.zeros(0))  # [s] last change by an arrival (m, rad)
-    reference: tuple[Array, Array] | None = None  # force and poses when the curvature window began
-    peer_curvature: Array | None = None
-    peer_converged: bool = False
-    robust_step: int = -1  # -1 while warming up
-    robust_next: float = 0.0  # received_total at which the next step is due
-    robust_done: bool = True
-
-    def __post_init__(self) -> None:
-        self.offset = np.zeros((len(self.keyframes), 6))
-        self.newest = np.zeros(len(self.keyframes), np.int64)
-        self.change = np.full(len(self.keyframes), np.inf)
-
-    @property
-    def holds(self) -> bool:
-        return bool(self.closures)
-
-    def penalty(self) -> Array:
-        """Diagonal penalty [s, 6]."""
-        return self.metric * self.penalties[_BLOCK]
-
-    def largest_change(self) -> float:
-        return float(self.change.max())
 
 
 class PoseAgent:
     """One robot's side of the pose consensus: own keyframes, copies of the neighbours', and what packets brought.
 
-    Robots have names that sort; the lower name of a pair decides on penalties, the lowest of a component (the root)
-    on the gauge. Nobody is held during the iteration; results are expressed in the root's map frame afterwards
-    (`gauge_correction` at the root, `apply_gauge` everywhere).
+    Robots have names that sort; the lower name of a pair decides on penalties. Nobody is held during the iteration;
+    results may be expressed in any frame afterwards (`docs/consensus.md`, gauge).
     """
 
     def __init__(
-        self, robot: str, T_map_keyframe: ArrayLike, odometry: Factors, config: PoseConsensusConfig
+        self,
+        robot: str,
+        T_map_keyframe: ArrayLike,
+        odometry: Factors,
+        config: PoseConsensusConfig,
+        *,
+        loops: Factors | None = None,
+        keep_loops: ArrayLike | None = None,
     ) -> None:
         """Take a robot's own graph.
 
         Args:
             robot: its name.
             T_map_keyframe: [n, 4, 4], keyframes in its own map; also the start of the iteration.
-            odometry: factors between own keyframes (by index), loops within the robot included.
+            odometry: factors between own keyframes (by index) that are trusted.
             config: the same at all robots.
+            loops: factors between own keyframes that get robust weights like closures do; default none.
+            keep_loops: bool per loop, start of the robust weights (default: all).
         """
         self.robot, self.config = robot, config
         self.T_map_keyframe = np.array(T_map_keyframe, dtype=np.float64)
         self.odometry = with_floor(odometry, config)
+        self.loops = Factors.empty() if loops is None else with_floor(loops, config)
+        kept = np.ones(len(self.loops)) if keep_loops is None else np.array(keep_loops, dtype=np.float64)
+        self.loop_weights = RobustWeights(kept, config)
         self.T_world_map = np.eye(4)
-        self.gauge = np.eye(4)
-        self.links: dict[str, _Link] = {}
+        self.links: dict[str, Link] = {}
         self.rounds = self.factorisations = 0
         self.step_change = np.inf
         self._copies_start: dict[str, Array] = {}
         self._started = False
         self._x = self.T_map_keyframe.copy()
-        self._factors, self._weights = self.odometry, np.ones(len(self.odometry))
+        self._factors = Factors.concatenate([self.odometry, self.loops])
+        self._collect_weights()
         self._solve: Callable[[Array], Array] | None = None
         self._moved_rad = 0.0
         self._dual_change = 0.0
@@ -222,10 +138,10 @@ class PoseAgent:
         if shared is None:
             keyframes = np.unique([c.peer_keyframe for c in closures])
             shared = SharedKeyframes(
-                keyframes.astype(np.int32), _metric(closures, keyframes, self.config.closures)
+                keyframes.astype(np.int32), link_metric(closures, keyframes, self.config.closures)
             )
             self._copies_start[peer] = self._copies(closures, kept, keyframes, T_world_keyframe_peer or {})
-        self.links[peer] = _Link(
+        self.links[peer] = Link(
             peer=peer,
             decides=self.robot < peer,
             keyframes=np.asarray(shared.keyframes, dtype=np.int32),
@@ -233,9 +149,8 @@ class PoseAgent:
             slots=np.asarray(shared.keyframes, dtype=np.int64),
             closures=closures,
             factors=Factors.empty(),
-            weights=kept.astype(np.float64),
+            robust=RobustWeights(kept.astype(np.float64), self.config),
             penalties=np.full(2, np.float64(np.float32(self.config.penalty_start))),
-            robust_done=not (self.config.robust and bool(closures)),
         )
         self.links = {name: self.links[name] for name in sorted(self.links)}
         return shared
@@ -262,7 +177,7 @@ class PoseAgent:
     def _start(self) -> None:
         """Lay out the variables: own keyframes, then copies by neighbour; factors over all of them."""
         self._started = True
-        poses, parts, count = [self.T_map_keyframe], [self.odometry], len(self.T_map_keyframe)
+        poses, parts, count = [self.T_map_keyframe], [self._factors], len(self.T_map_keyframe)
         for link in self.links.values():
             if link.holds:
                 copies = self._copies_start[link.peer]
@@ -278,8 +193,8 @@ class PoseAgent:
         self._collect_weights()
 
     def _collect_weights(self) -> None:
-        held = [link.weights for link in self.links.values() if link.holds]
-        self._weights = np.concatenate([np.ones(len(self.odometry)), *held])
+        held = [link.robust.weights for link in self.links.values() if link.holds]
+        self._weights = np.concatenate([np.ones(len(self.odometry)), self.loop_weights.weights, *held])
         self._solve = None
 
     # ---- one round ----
@@ -292,10 +207,11 @@ class PoseAgent:
             return 0.0
         if not self._started:
             self._start()
+        self._weigh_loops()
         for link in self.links.values():
             self._weigh(link)
             self._decide(link)
-        force_before = {peer: self._force(link) for peer, link in self.links.items()}
+        force_before = {peer: link.force() for peer, link in self.links.items()}
         g, jacobians = pose_factors.gradient(self._factors, self._weights, self._x)
         for peer, link in self.links.items():
             g[link.slots] += force_before[peer]
@@ -317,7 +233,7 @@ class PoseAgent:
         self._moved_rad += float(np.abs(delta[:, 3:]).max())
         self.step_change = float(np.abs(delta).max())
         self._dual_change = max(
-            float(np.abs((self._force(link) - force_before[peer]) / np.sqrt(link.metric)).max())
+            float(np.abs((link.force() - force_before[peer]) / np.sqrt(link.metric)).max())
             for peer, link in self.links.items()
         )
         return self.step_change
@@ -376,11 +292,7 @@ class PoseAgent:
 
     # ---- penalties ----
 
-    def _force(self, link: _Link) -> Array:
-        """W (x - y) [s, 6]: the multiplier of this end (dual)."""
-        return link.penalty() * link.offset
-
-    def _curvature(self, link: _Link) -> Array | None:
+    def _curvature(self, link: Link) -> Array | None:
         """Stiffness [2] met on the way since the last change of penalties: |change of force| / |change of pose|.
 
         In the metric, for translation and rotation apart; None before enough was received or if nothing moved.
@@ -392,7 +304,7 @@ class PoseAgent:
             return None
         force, poses = link.reference
         root = np.sqrt(link.metric)
-        d_force = (self._force(link) - force) / root
+        d_force = (link.force() - force) / root
         d_pose = difference(self._x[link.slots], poses) * root
         stiffness = []
         for block in (slice(0, 3), slice(3, 6)):
@@ -403,13 +315,13 @@ class PoseAgent:
             stiffness.append(changed / moved)
         return np.array(stiffness)
 
-    def _mark(self, link: _Link) -> None:
+    def _mark(self, link: Link) -> None:
         """Begin a new window of the curvature."""
-        link.reference = (self._force(link), self._x[link.slots].copy())
+        link.reference = (link.force(), self._x[link.slots].copy())
         link.received = 0.0
         link.peer_curvature = None
 
-    def _decide(self, link: _Link) -> None:
+    def _decide(self, link: Link) -> None:
         """At the lower end: take new penalties once both ends have met enough of the path in this version."""
         if not link.decides:
             return
@@ -417,58 +329,62 @@ class PoseAgent:
         if own is None or link.peer_curvature is None:
             return
         c = self.config
-        limit = 1.0 + 2.0 / max(1.0, link.received_total / c.penalty_decay)
+        received = link.received_total - link.adapting_from
+        limit = 1.0 + 2.0 / max(1.0, received / c.penalty_decay)
         penalties = np.sqrt(own * link.peer_curvature)
         penalties = np.clip(penalties, link.penalties / limit, link.penalties * limit)
         penalties = np.clip(penalties, c.penalty_min, c.penalty_max).astype(np.float32).astype(np.float64)
         self._change_penalties(link, penalties, link.version + 1)
 
-    def _change_penalties(self, link: _Link, penalties: Array, version: int) -> None:
+    def _change_penalties(self, link: Link, penalties: Array, version: int) -> None:
         """Change W and move y so that the force W (x - y) stays."""
-        link.offset = link.offset * (link.penalties / penalties)[_BLOCK]
+        link.offset = link.offset * (link.penalties / penalties)[BLOCK]
         link.penalties, link.version = penalties, version
         self._solve = None
         self._mark(link)
 
     # ---- robust weights of held closures ----
 
-    def _weigh(self, link: _Link) -> None:
-        """Graduated non-convexity, truncated least squares, paced by what arrives on the link."""
-        if link.robust_done:
-            return
-        c = self.config
-        if link.robust_step < 0:
-            steady = link.received_total >= c.penalty_period and link.largest_change() < _STEADY
-            if link.received_total < c.robust_warm_up and not steady:
-                return
-            squared, c2 = pose_factors.squared_residuals(link.factors, self._x), c.truncation**2
-            link.robust_step = 0
-            if np.all(squared <= c2):  # no closure is in doubt: every truncated weight is one
-                self._finish_weights(link, np.ones(len(squared)))
-                return
-        if link.received_total < link.robust_next:
-            return
-        link.robust_next = link.received_total + c.robust_packets
-        schedule = [mu * c.robust_growth**k for mu, steps in c.robust_passes for k in range(steps)]
-        squared, c2 = pose_factors.squared_residuals(link.factors, self._x), c.truncation**2
-        if link.robust_step == len(schedule):
-            self._finish_weights(link, (squared <= c2).astype(np.float64))
-            return
-        link.weights = graduated_weights(squared, c2, schedule[link.robust_step])
-        link.robust_step += 1
-        self._collect_weights()
+    def _weigh(self, link: Link) -> None:
+        """Robust weights of a link's held closures, paced by what arrives on it."""
 
-    def _finish_weights(self, link: _Link, weights: Array) -> None:
-        link.weights, link.robust_done = weights, True
-        link.reference, link.received = None, 0.0
+        def squared() -> Array:
+            return pose_factors.squared_residuals(link.factors, self._x)
+
+        if link.robust.advance(link.received_total, self._steady(link), squared):
+            self._reweighted()
+            if link.robust.done:
+                link.reference, link.received = None, 0.0
+
+    def _weigh_loops(self) -> None:
+        """Robust weights of own loops, paced by the link on which least arrives."""
+        links = self.links.values()
+
+        def squared() -> Array:
+            return pose_factors.squared_residuals(self.loops, self._x)
+
+        received = min(link.received_total for link in links)
+        if self.loop_weights.advance(received, all(self._steady(link) for link in links), squared):
+            self._reweighted()
+
+    def _reweighted(self) -> None:
+        """Some weights changed; when the last are final, penalties begin to adapt as if the links were new."""
         self._collect_weights()
+        groups = [self.loop_weights, *(link.robust for link in self.links.values())]
+        if self.robust_done and any(group.graduated for group in groups):
+            for link in self.links.values():
+                link.adapting_from = link.received_total
+
+    def _steady(self, link: Link) -> bool:
+        """Whether a link has left its start behind."""
+        return link.received_total >= self.config.penalty_period and link.largest_change() < _STEADY
 
     # ---- results ----
 
     @property
     def robust_done(self) -> bool:
-        """Whether the weights of all held closures are final."""
-        return all(link.robust_done for link in self.links.values())
+        """Whether the weights of all held closures and own loops are final."""
+        return self.loop_weights.done and all(link.robust.done for link in self.links.values())
 
     @property
     def largest_change(self) -> float:
@@ -487,28 +403,16 @@ class PoseAgent:
 
     @property
     def T_world_keyframe(self) -> Array:  # noqa: N802
-        """Own keyframes [n, 4, 4]; in the root's map frame once the gauge was applied. Odometry if without links."""
+        """Own keyframes [n, 4, 4] in the common frame; those of the own map, bit for bit, if without links."""
         if not self.links:
             return self.T_map_keyframe.copy()
         if not self._started:
             self._start()
-        return self.gauge @ self._x[: len(self.T_map_keyframe)]
-
-    def gauge_correction(self) -> Array:
-        """At the root: T [4, 4] with T @ (own estimate of keyframe 0) = T_map_keyframe[0]; to be told to everybody."""
-        if not self.links:
-            return np.eye(4)
-        if not self._started:
-            self._start()
-        return self.T_map_keyframe[0] @ se3.inverse(self._x[0])
-
-    def apply_gauge(self, T: ArrayLike) -> None:
-        """Express results (not the iteration) in the frame that the root's correction leads to."""
-        self.gauge = np.array(T, dtype=np.float64)
+        return self._x[: len(self.T_map_keyframe)].copy()
 
     def weights(self, peer: str) -> Array:
         """Weight [m] of every closure held with a neighbour, in the order given."""
-        return self.links[peer].weights.copy()
+        return self.links[peer].robust.weights.copy()
 
     def refuted(self, peer: str) -> bool:
         """Whether the closures held with a neighbour join nobody any more: final weights, too few of which count.
@@ -516,8 +420,8 @@ class PoseAgent:
         It takes `closures.min_support` to join two robots, and as many to keep them joined.
         """
         link = self.links[peer]
-        kept = int(np.count_nonzero(link.weights >= COUNTS))
-        return link.holds and link.robust_done and kept < self.config.closures.min_support
+        kept = int(np.count_nonzero(link.robust.weights >= COUNTS))
+        return link.holds and link.robust.done and kept < self.config.closures.min_support
 
     def residuals(self) -> dict[str, Any]:
         """What a round looked like, for the record.
@@ -534,7 +438,9 @@ class PoseAgent:
             "step": self.step_change,
             "penalties": {peer: tuple(link.penalties.tolist()) for peer, link in self.links.items()},
             "versions": {peer: link.version for peer, link in self.links.items()},
-            "weights": {peer: link.weights.tolist() for peer, link in self.links.items() if link.holds},
+            "weights": {
+                peer: link.robust.weights.tolist() for peer, link in self.links.items() if link.holds
+            },
             "factorisations": self.factorisations,
         }
 
@@ -543,24 +449,3 @@ def with_floor(odometry: Factors, config: PoseConsensusConfig) -> Factors:
     """Odometry as it counts in the objective: its covariance plus the floor of the settings."""
     floor = np.repeat([config.odometry_floor_m**2, config.odometry_floor_rad**2], 3) * np.eye(6)
     return Factors(odometry.i, odometry.j, odometry.T_i_j, inflated(odometry.information, floor))
-
-
-def graduated_weights(squared: Array, c2: float, mu: float) -> Array:
-    """Weights of truncated least squares at control parameter mu (Yang et al. 2020): mu -> infinity truncates at c2."""
-    low, high = mu / (mu + 1) * c2, (mu + 1) / mu * c2
-    between = np.sqrt(c2 * mu * (mu + 1) / np.maximum(squared, low)) - mu
-    return np.where(squared <= low, 1.0, np.where(squared >= high, 0.0, between))
-
-
-def _metric(
-    closures: Sequence[Closure], keyframes: NDArray[np.int64], config: ClosureConfig
-) -> NDArray[np.float32]:
-    """Information [s, 6] of the closures about each copied keyframe, averaged over directions per block."""
-    position = np.searchsorted(keyframes, [c.peer_keyframe for c in closures])
-    information = closure_factors(closures, np.zeros(len(closures)), position, config).information
-    blocks = np.diagonal(information, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)
-    total = np.zeros((len(keyframes), 2))
-    np.add.at(total, position, blocks)
-    if not np.all(total > 0):
-        raise ValueError("a closure without information about translation or rotation cannot join two robots")
-    return total[:, _BLOCK].astype(np.float32)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.poses import COUNTS
+from pipeline.consensus.robust import COUNTS
 from pipeline.errors import DuagError
 from pipeline.evaluation.oracle import gap_to_oracle
 from pipeline.evaluation.results import Absent

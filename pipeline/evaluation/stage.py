@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import DuagError
-from pipeline.evaluation import calibration, groundtruth, map_errors, trajectory_errors, views
+from pipeline.evaluation import (
+    calibration,
+    depth_agreement,
+    groundtruth,
+    map_errors,
+    trajectory_errors,
+    views,
+)
 from pipeline.evaluation.network import Session
 from pipeline.evaluation.results import (
     Absent,
@@ -31,6 +38,8 @@ from pipeline.run_folder import RobotRun, RunFolder
 from pipeline.splat.gaussians import DepthKind, Gaussians
 
 SCHEMA = 1
+AGREEMENT_VIEWS = 40
+"""Held-out views, evenly spread, whose depth is compared in pairs."""
 MAPS = ("own", "fused")
 VIEW_SETS = ("held_out", "training", "peers")
 
@@ -39,6 +48,7 @@ PROTOCOL = {
     "ate": "root mean square over all frames that have ground truth within 20 ms; robots: own alignment each",
     "team_ate": "one alignment for all robots of the largest component, pooled root mean square",
     "rpe": "root mean square from each frame to the next",
+    "depth_agreement": "pairs of at most 40 held-out views that share 30 % under all poses compared; median of medians",
     "initial_relative_poses": "unknown",
     "held_out": "index % 8 == 4",
     "training": "keyframes",
@@ -77,7 +87,10 @@ def evaluate(run_dir: Path, recording: Path, threads: int = 2, progress: bool = 
     rows: list[Row] = []
     tree = {
         "schema": SCHEMA,
-        "robots": {name: _robot_section(robot, truth) for name, robot in run.robots.items()},
+        "robots": {
+            name: _robot_section(robot, truth) | _agreement_section(robot, source, truth)
+            for name, robot in run.robots.items()
+        },
         "team": _team_section(run, truth) | session.closure_counts(),
         "rendering": _rendering_section(run, source, threads, progress, rows),
         "calibration": _calibration_section(run, source, truth, rows),
@@ -160,6 +173,33 @@ def _robot_section(robot: RobotRun, truth: TruePaths) -> dict[str, Any]:
     }
 
 
+def _agreement_section(robot: RobotRun, source: Recording, truth: TruePaths) -> dict[str, Any]:
+    """How well the depth of held-out views agrees under the estimate, and under the ground truth where there is one."""
+    stamp_of = {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
+    paths = {
+        "depth_agreement_m": poses_by_stamp(robot.trajectory),
+        "depth_agreement_m_before_consensus": poses_by_stamp(robot.odometry),
+    }
+    section: dict[str, Any] = {}
+    paired = truth.after[robot.robot]
+    if isinstance(paired, Absent):
+        section["depth_agreement_m_of_truth"] = paired
+    else:
+        paths["depth_agreement_m_of_truth"] = dict(zip(paired.stamps_ns.tolist(), paired.true, strict=True))
+    known = [i for i, stamp in stamp_of.items() if all(stamp in path for path in paths.values())]
+    most = min(AGREEMENT_VIEWS, len(known))
+    chosen = [known[(2 * k + 1) * len(known) // (2 * most)] for k in range(most)]
+    with open_rgbd(source.log(robot.robot)) as log:
+        frames = [log.frame(index) for index in chosen]
+        depths = [f.depth if f.mask is None else np.where(f.mask, f.depth, np.float32(0)) for f in frames]
+        poses = {
+            name: np.array([path[stamp_of[index]] for index in chosen]).reshape(-1, 4, 4)
+            for name, path in paths.items()
+        }
+        pairs, values = depth_agreement.depth_agreement(depths, log.camera, poses)
+    return {"depth_agreement_pairs": pairs} | values | section
+
+
 def _ate_of_keyframes(robot: RobotRun, pairs: Paired) -> float | Absent:
     """The ATE that many published tables give: keyframes only."""
     stamps = {keyframe.stamp_ns for keyframe in robot.keyframes}
@@ -205,7 +245,7 @@ def _rendering_section(
             maps = _maps_in_world(robot) if of_peer else _maps(robot)
             poses = dict.fromkeys(MAPS, camera_robot.trajectory) if of_peer else _own_poses(robot)
             for kind in MAPS:
-                task = _RenderTask(
+                task = RenderTask(
                     maps[kind], camera_robot, poses[kind], keyframes=not of_peer, depth=robot.own_map.depth
                 )
                 title = f"render {kind} map of {name}" + (f" from {camera_robot.robot}" if of_peer else "")
@@ -227,7 +267,7 @@ def _unrefined(
         unrefined = robot.unrefined_map
         if unrefined is None:
             continue
-        task = _RenderTask(unrefined.gaussians, robot, robot.odometry, keyframes=False, depth=unrefined.depth)
+        task = RenderTask(unrefined.gaussians, robot, robot.odometry, keyframes=False, depth=unrefined.depth)
         for index, score in task.scores(
             source, threads, f"render unrefined map of {name}" if progress else None
         ):
@@ -254,7 +294,7 @@ def _maps_in_world(robot: RobotRun) -> dict[str, Gaussians]:
 
 
 @dataclass(frozen=True)
-class _RenderTask:
+class RenderTask:
     """A map to be rendered where one robot's camera stood: at its held-out frames, and at its keyframes if asked."""
 
     gaussians: Gaussians

@@ -30,7 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.consensus.closures import Closure, plausible
-from pipeline.consensus.poses import COUNTS, PoseAgent
+from pipeline.consensus.poses import PoseAgent
+from pipeline.consensus.robust import COUNTS
 from pipeline.exchange import injection, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.evidence import (

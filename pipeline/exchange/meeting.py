@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from pipeline import streams
 from pipeline.consensus.closures import Closure, consistent, drift
-from pipeline.consensus.poses import PoseAgent, SharedKeyframes
+from pipeline.consensus.links import SharedKeyframes
+from pipeline.consensus.poses import PoseAgent
 from pipeline.exchange import injection, places, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.packets import Kind, MalformedError

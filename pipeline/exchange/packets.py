@@ -51,6 +51,7 @@ class Kind(IntEnum):
     EVIDENCE = 11  # Gaussians of one robot with their information, compact
     EVIDENCE_EXACT = 12  # the same in float32
     EVIDENCE_DOUBLE = 13  # the same in float64
+    POSE_GRAPH = 14  # `duagc posegraph` only: frames and eliminated graphs; its first byte says which
 
 
 FIRE_AND_FORGET = frozenset({Kind.ACK, Kind.STATE})

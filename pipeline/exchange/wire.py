@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.consensus.evidence import unpack_symmetric
-from pipeline.consensus.poses import PosePacket, SharedKeyframes
+from pipeline.consensus.links import PosePacket, SharedKeyframes
 from pipeline.exchange.compact import COMPACT, decode, encode
 from pipeline.exchange.packets import (
     EVIDENCE_BYTES,

@@ -103,6 +103,20 @@ class FailureConfig(Config):
     """With `slack_m`, how far from where it was expected a camera may be found on a surface without features."""
 
 
+class MotionPriorConfig(Config):
+    """How far a motion prior of the log is believed: standard deviations of a motion between two frames."""
+
+    odometry_sigma_m: float = 0.005
+    odometry_sigma_of_path: float = 0.05
+    """Plus this share of the path."""
+    odometry_sigma_rad: float = 0.005
+    odometry_sigma_of_angle: float = 0.05
+    """Plus this share of the angle."""
+    gyro_sigma_rad: float = 0.002
+    gyro_sigma_rad_per_s: float = 0.01
+    """Plus this for every second: the bias."""
+
+
 class RelocalisationConfig(Config):
     """Finding a lost camera again by features of its image."""
 
@@ -163,6 +177,7 @@ class TrackingConfig(Config):
     `relocalisation.min_overlap`."""
     failure: FailureConfig = FailureConfig()
     relocalisation: RelocalisationConfig = RelocalisationConfig()
+    prior: MotionPriorConfig = MotionPriorConfig()
 
 
 class FrontendConfig(Config):

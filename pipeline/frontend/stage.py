@@ -84,7 +84,7 @@ def run_frontend(
 
 def _track(log: RgbdLog, config: FrontendConfig, progress: bool) -> tuple[Tracker, list[TrackedFrame]]:
     """Track all frames in order."""
-    tracker = Tracker(log.camera, config)
+    tracker = Tracker(log.camera, config, log.motion_prior())
     source = log.frames()
     if progress:
         source = progress_bar.track(source, f"tracking {log.robot}", len(log))

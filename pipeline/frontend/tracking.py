@@ -20,6 +20,7 @@ from pipeline.frontend.keyframes import KeyframePair, becomes_keyframe, predicte
 from pipeline.frontend.relocalisation import features_of, guesses, supports
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
+from pipeline.recording import MotionPrior
 from pipeline.registration import (
     Level,
     Outcome,
@@ -111,8 +112,13 @@ class _Unconfirmed:
 class Tracker:
     """Tracks one camera. Feed it the frames in order."""
 
-    def __init__(self, camera: PinholeCamera, config: FrontendConfig) -> None:
-        self.camera, self.config = camera, config
+    def __init__(
+        self, camera: PinholeCamera, config: FrontendConfig, motion: MotionPrior | None = None
+    ) -> None:
+        """Args:
+        motion: how the camera moved by other sensors, where the log has any.
+        """
+        self.camera, self.config, self.motion = camera, config, motion
         self.keyframes: list[TrackedKeyframe] = []
         self.pairs: list[KeyframePair] = []
         """Registrations between keyframes, for `keyframes.refine`."""
@@ -248,14 +254,13 @@ class Tracker:
     ) -> _Found | Reason:
         """The first registration that is OK from where the camera was last, or why the first one failed."""
         tracking, keyframe = self.config.tracking, self.keyframes[self._current]
-        last, elapsed_s = self._T_keyframe_camera, (stamp_ns - self._stamp_ns) * 1e-9
-        starts = [last]
-        if elapsed_s <= tracking.max_extrapolation_s:
-            starts.insert(0, last @ se3.exp(self._velocity * elapsed_s))
+        last, predicted, known = self._T_keyframe_camera, *self._predicted(stamp_ns)
+        starts = [last] if predicted is last else [predicted, last]
         reason = Reason.NONE
         if not self._lost:
             for guess in starts:
-                result = register(keyframe.reference, pyramid, guess, tracking.registration)
+                information = known if guess is predicted else None
+                result = register(keyframe.reference, pyramid, guess, tracking.registration, information)
                 if result.ok:
                     return _Found(self._current, result)
                 reason = reason if reason is not Reason.NONE else Reason(result.outcome.value)
@@ -326,8 +331,8 @@ class Tracker:
         """
         failure, relocalisation = self.config.tracking.failure, self.config.tracking.relocalisation
         keyframe, T = self.keyframes[found.keyframe_index], found.result.T_reference_target
-        T_last_now = se3.inverse(self._expected(stamp_ns)) @ keyframe.T_map_keyframe @ T
-        moved_m, turned_rad = se3.distance(np.eye(4), T_last_now)
+        T_map_expected = self.keyframes[self._current].T_map_keyframe @ self._predicted(stamp_ns)[0]
+        moved_m, turned_rad = se3.distance(T_map_expected, keyframe.T_map_keyframe @ T)
         elapsed_s = max((stamp_ns - self._stamp_ns) * 1e-9, 0.0)
         intruding, told = intruders(pyramid.levels[-1], keyframe.coarsest, T, failure)
         if (
@@ -348,13 +353,28 @@ class Tracker:
         usual = float(np.median(self._gray_rms)) if self._gray_rms else 0.0
         return config.max_gray_rms + config.max_gray_rms_of_usual * usual
 
-    def _expected(self, stamp_ns: int) -> Array:
-        """Where the camera would be by its last velocity, if that is not too old."""
-        T = self.keyframes[self._current].T_map_keyframe @ self._T_keyframe_camera
-        elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
-        if elapsed_s > self.config.tracking.max_extrapolation_s:
-            return T
-        return T @ se3.exp(self._velocity * elapsed_s)
+    def _predicted(self, stamp_ns: int) -> tuple[Array, Array | None]:
+        """Where the camera should be in its keyframe, T_keyframe_camera [4, 4], and the information [6, 6] of that.
+
+        By the motion prior of the log, else by the last velocity if that is not too old, which is no measurement
+        (None), else where it was.
+        """
+        last, elapsed_s = self._T_keyframe_camera, (stamp_ns - self._stamp_ns) * 1e-9
+        fresh = elapsed_s <= self.config.tracking.max_extrapolation_s
+        followed = last @ se3.exp(self._velocity * elapsed_s) if fresh else last
+        motion = self.motion.between(self._stamp_ns, stamp_ns) if self.motion is not None else None
+        if motion is None:
+            return followed, None
+        config, T = self.config.tracking.prior, motion.T_start_stop
+        path_m, angle_rad = se3.distance(np.eye(4), T)
+        if motion.knows_translation:
+            sigma_m = config.odometry_sigma_m + config.odometry_sigma_of_path * float(path_m)
+            sigma_rad = config.odometry_sigma_rad + config.odometry_sigma_of_angle * float(angle_rad)
+            return last @ T, np.diag([sigma_m**-2.0] * 3 + [sigma_rad**-2.0] * 3)
+        sigma_rad = config.gyro_sigma_rad + config.gyro_sigma_rad_per_s * elapsed_s
+        predicted = last @ T
+        predicted[:3, 3] = followed[:3, 3]
+        return predicted, np.diag([0.0] * 3 + [sigma_rad**-2.0] * 3)
 
     def _well_exposed(self, result: Registration) -> bool:
         """Whether a frame is as bright as its keyframe, or that keyframe must be left all the same.

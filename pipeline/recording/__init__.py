@@ -6,6 +6,7 @@ The identity of a log is its content digest: the bytes of the file depend on the
 """
 
 from pipeline.recording.folder import Recording
+from pipeline.recording.motion import Motion, MotionPrior
 from pipeline.recording.names import (
     DEPTH_SCALE_KEY,
     RECORDING_FILE,
@@ -23,6 +24,8 @@ __all__ = [
     "RECORDING_FORMAT",
     "RECORDING_SCHEMA",
     "LogWriter",
+    "Motion",
+    "MotionPrior",
     "Record",
     "Recording",
     "RgbdFrame",

@@ -65,7 +65,7 @@ class OtherCamera:
         calibration = topic_table.RAW_DEPTH_CALIBRATION.of(robot)
         self.depth_camera = constant(log, calibration, messages.unpack_calibration)
         transform = topic_table.RAW_DEPTH_TRANSFORM.of(robot)
-        self.T_camera_depth = np.array(constant(log, transform, _transform))
+        self.T_camera_depth = np.array(constant(log, transform, transform_rows))
 
     def read(self, record: Record) -> NDArray[np.float32]:
         depth_m = _depth_image(record, self.scale, self.depth_camera)
@@ -80,7 +80,7 @@ class Lidar:
     def __init__(self, log: LogFile, robot: str, camera: PinholeCamera) -> None:
         self.topic, self.camera = topic_table.LIDAR.of(robot), camera
         transform = topic_table.LIDAR_TRANSFORM.of(robot)
-        self.T_camera_lidar = np.array(constant(log, transform, _transform))
+        self.T_camera_lidar = np.array(constant(log, transform, transform_rows))
 
     def read(self, record: Record) -> NDArray[np.float32]:
         points = messages.unpack_points(record.proto(), _where(record))
@@ -109,7 +109,7 @@ def constant(log: LogFile, topic: str, unpack: Callable[[Any], Value]) -> Value:
     return found[0][1]
 
 
-def _transform(message: Any) -> tuple[tuple[float, ...], ...]:
+def transform_rows(message: Any) -> tuple[tuple[float, ...], ...]:
     """Rows of a transform: unlike arrays they can be compared as a whole."""
     return tuple(tuple(row) for row in messages.unpack_transform(message).tolist())
 

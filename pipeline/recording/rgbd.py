@@ -13,6 +13,7 @@ from pipeline import messages
 from pipeline.errors import DuagError
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.recording.depth_sources import check_size, constant, depth_source
+from pipeline.recording.motion import MotionPrior, motion_prior
 from pipeline.recording.pairing import TOLERANCE_NS, pair
 from pipeline.recording.read import LogFile, Record
 from schemas import topics as topic_table
@@ -120,6 +121,10 @@ class RgbdLog:
     def close(self) -> None:
         """Close the file."""
         self._log.close()
+
+    def motion_prior(self) -> MotionPrior | None:
+        """How the camera moved by other sensors of the log; None if it has none."""
+        return motion_prior(self._log, self.robot)
 
     def frames(self) -> Iterator[RgbdFrame]:
         """Every frame in order of time."""

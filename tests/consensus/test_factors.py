@@ -6,8 +6,9 @@ import pytest
 from pipeline.consensus import factors as pose_factors
 from pipeline.consensus.central import solve_central
 from pipeline.consensus.factors import Factors, difference, inflated, isotropic_information, retract
+from pipeline.consensus.start import chordal
 from pipeline.geometry import se3
-from tests.consensus.worlds import chordal, random_information, random_poses, read_g2o
+from tests.consensus.worlds import benchmark, random_information, random_poses
 
 
 def scattered(seed, n=6, m=9):
@@ -98,7 +99,7 @@ def test_gauge_does_not_change_the_cost():
     ("name", "optimum"), [("tinyGrid3D.g2o", 18.51936642), ("smallGrid3D.g2o", 1025.398056)]
 )
 def test_central_solution_is_the_certified_optimum(name, optimum):
-    factors = read_g2o(name)
+    (factors,) = benchmark(name, 1).odometry.values()
     n = int(max(factors.i.max(), factors.j.max())) + 1
     solution = solve_central(factors, chordal(factors, n))
     assert solution.converged

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse import linalg as sparse_linalg
 
 from pipeline.consensus import factors as pose_factors
 from pipeline.consensus.central import CentralSolution, solve_central, team_graph
 from pipeline.consensus.closures import Closure, ClosureConfig, chain_frames, holder, robust_frame
-from pipeline.consensus.factors import Factors, isotropic_information
+from pipeline.consensus.factors import Factors
+from pipeline.consensus.graphs import read_team
 from pipeline.consensus.poses import PoseAgent, PoseConsensusConfig
-from pipeline.geometry import se3, so3
+from pipeline.consensus.start import chordal
+from pipeline.geometry import se3
 
 Array = NDArray[np.float64]
 EXACT = ClosureConfig(sigma_floor_m=0, sigma_floor_rad=0, min_support=1, frame_sigma_m=1.0)
@@ -140,12 +140,16 @@ def talk(agents: dict[str, PoseAgent], rounds: int, loss: float = 0.0, seed: int
     return rounds
 
 
+def in_root_frame(agents: dict[str, PoseAgent]) -> dict[str, Array]:
+    """Keyframes by robot in the map frame of the lowest name, whose first keyframe stays where its own map has it."""
+    root = agents[min(agents)]
+    T = root.T_map_keyframe[0] @ se3.inverse(root.T_world_keyframe[0])
+    return {robot: T @ agents[robot].T_world_keyframe for robot in sorted(agents)}
+
+
 def team_poses(agents: dict[str, PoseAgent]) -> Array:
     """All keyframes one after the other, in order of name, in the root's map frame."""
-    root = agents[min(agents)]
-    for agent in agents.values():
-        agent.apply_gauge(root.gauge_correction())
-    return np.concatenate([agents[r].T_world_keyframe for r in sorted(agents)])
+    return np.concatenate(list(in_root_frame(agents).values()))
 
 
 def from_first(poses: Array) -> Array:
@@ -156,66 +160,17 @@ def from_first(poses: Array) -> Array:
 # ---- benchmark graphs ----
 
 
-def read_g2o(name: str) -> Factors:
-    """A benchmark graph with SE-Sync's isotropic weights; skips the test if it is not there."""
+def benchmark(name: str, robots: int | None = None) -> TeamWorld:
+    """A public graph cut into robots, each with its own optimum in its own frame; skips the test if not there."""
     path = POSE_GRAPHS / name
     if not path.exists():
         pytest.skip(f"needs {name} in ../shared/data/pose_graphs, which is not distributed with the project")
-    rows = [line.split() for line in path.read_text().splitlines() if line.startswith("EDGE_SE3:QUAT")]
-    values = np.array([[float(x) for x in row[3:]] for row in rows])
-    upper = np.triu_indices(6)
-    full = np.zeros((len(rows), 6, 6))
-    full[:, upper[0], upper[1]] = values[:, 7:28]
-    full[:, upper[1], upper[0]] = values[:, 7:28]
-    tau = 3 / np.trace(np.linalg.inv(full[:, :3, :3]), axis1=1, axis2=2)
-    kappa = 3 / (2 * np.trace(np.linalg.inv(full[:, 3:, 3:]), axis1=1, axis2=2))
-    T = se3.from_quat_translation(values[:, [6, 3, 4, 5]], values[:, :3])
-    i, j = np.array([int(row[1]) for row in rows]), np.array([int(row[2]) for row in rows])
-    return Factors(i, j, T, isotropic_information(kappa, tau))
-
-
-def chordal(factors: Factors, n: int) -> Array:
-    """Chordal start [n, 4, 4] of a connected isotropic graph: linear rotations, then linear translations."""
-    m, R = len(factors), factors.T_i_j[:, :3, :3]
-    root = np.sqrt(factors.information[:, 3, 3] / 2)
-    rows, columns, values = [], [], []
-    for a in range(3):
-        e = 3 * np.arange(m) + a
-        rows += [e] * 4
-        columns += [3 * factors.j + a, *(3 * factors.i + b for b in range(3))]
-        values += [root, *(-root * R[:, b, a] for b in range(3))]
-    index = (np.concatenate(rows), np.concatenate(columns))
-    M = sparse.csc_matrix((np.concatenate(values), index), shape=(3 * m, 3 * n))
-    Y = np.concatenate([np.eye(3), np.zeros((3 * n - 3, 3))])
-    Y[3:] = sparse_linalg.splu((M[:, 3:].T @ M[:, 3:]).tocsc()).solve(-(M[:, 3:].T @ M[:, :3]).toarray())
-    rotations = so3.project(Y.reshape(n, 3, 3).swapaxes(-1, -2))
-    e, root = np.arange(m), np.sqrt(factors.information[:, 0, 0])
-    index = (np.concatenate([e, e]), np.concatenate([factors.j, factors.i]))
-    B = sparse.csc_matrix((np.concatenate([root, -root]), index), shape=(m, n))[:, 1:]
-    right = root[:, None] * (rotations[factors.i] @ factors.T_i_j[:, :3, 3:])[..., 0]
-    t = np.concatenate([np.zeros((1, 3)), sparse_linalg.splu((B.T @ B).tocsc()).solve(B.T @ right)])
-    return se3.from_rotation_translation(rotations, t)
-
-
-def cut(factors: Factors, robots: int) -> TeamWorld:
-    """Cut a graph by vertex number into equal robots, each with its own optimum in its own frame."""
-    n = int(max(factors.i.max(), factors.j.max())) + 1
-    owner = np.minimum(np.arange(n) * robots // n, robots - 1)
-    first = np.searchsorted(owner, np.arange(robots))
-    names = [f"robot{a}" for a in range(robots)]
-    maps, odometry, pairs = {}, {}, {}
-    for a, name in enumerate(names):
-        own = factors.select((owner[factors.i] == a) & (owner[factors.j] == a))
-        odometry[name] = Factors(own.i - first[a], own.j - first[a], own.T_i_j, own.information)
-        maps[name] = solve_central(odometry[name], chordal(odometry[name], int((owner == a).sum()))).poses
-    for k in np.flatnonzero(owner[factors.i] != owner[factors.j]):
-        a, b = int(owner[factors.i[k]]), int(owner[factors.j[k]])
-        i, j = int(factors.i[k] - first[a]), int(factors.j[k] - first[b])
-        closure = Closure(i, j, factors.T_i_j[k], factors.information[k])
-        if a > b:
-            a, b, closure = b, a, closure.reversed()
-        pairs.setdefault((names[a], names[b]), []).append(closure)
-    return TeamWorld(maps, odometry, pairs)
+    team = read_team(path, robots)
+    odometry = {r: Factors.concatenate([g.odometry, g.loops]) for r, g in team.robots.items()}
+    maps = {
+        r: solve_central(odometry[r], chordal(odometry[r], g.keyframes)).poses for r, g in team.robots.items()
+    }
+    return TeamWorld(maps, odometry, {(a, b): team.robots[a].closures[b] for a, b in team.pairs})
 
 
 def team_cost(factors: Factors, agents: dict[str, PoseAgent]) -> float:

@@ -28,7 +28,7 @@ def agreed():
         WeightedClosure(agent.robot, link.peer, closure, weight)
         for agent in agents.values()
         for link in agent.links.values()
-        for closure, weight in zip(link.closures, link.weights.tolist(), strict=True)
+        for closure, weight in zip(link.closures, link.robust.weights.tolist(), strict=True)
     ]
     return poses, odometry, closures
 

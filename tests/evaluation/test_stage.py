@@ -16,7 +16,8 @@ ROBOT = {
     "frames": int, "tracked": int, "keyframes": int, "gaussians": int, "gaussians_fused": int,
     "robots_in_component": int, "frames_with_truth": int, "ate_rmse_m": NUMBER,
     "ate_rmse_m_before_consensus": NUMBER, "ate_rmse_m_keyframes": NUMBER, "ate_rmse_m_joint": NUMBER,
-    "rpe_trans_m": NUMBER, "rpe_rot_rad": NUMBER,
+    "rpe_trans_m": NUMBER, "rpe_rot_rad": NUMBER, "depth_agreement_pairs": int, "depth_agreement_m": NUMBER,
+    "depth_agreement_m_before_consensus": NUMBER, "depth_agreement_m_of_truth": NUMBER,
 }  # fmt: skip
 VIEWS = {
     "views": int, "views_without_pose": int, "psnr_db": NUMBER, "ssim": NUMBER, "ms_ssim": NUMBER, "lpips": NUMBER,
@@ -49,7 +50,8 @@ SCHEMA = {
         "gap_to_oracle_sigma_p99": NUMBER, "gap_to_oracle_m": NUMBER, "gap_to_oracle_rad": NUMBER,
     },
     "protocol": dict.fromkeys(
-        ("alignment", "ate", "team_ate", "rpe", "initial_relative_poses", "held_out", "peers", "training", "poses",
+        ("alignment", "ate", "team_ate", "rpe", "depth_agreement",
+         "initial_relative_poses", "held_out", "peers", "training", "poses",
          "exposure", "own_unrefined", "background", "psnr", "ssim", "ms_ssim", "depth", "calibration",
          "oracle"),
         str,

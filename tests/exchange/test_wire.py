@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.consensus.evidence import pack_symmetric, unpack_symmetric
-from pipeline.consensus.poses import PosePacket, SharedKeyframes
+from pipeline.consensus.links import PosePacket, SharedKeyframes
 from pipeline.exchange import wire
 from pipeline.exchange.packets import EVIDENCE_KINDS, Kind, MalformedError, chunk_bytes
 from pipeline.geometry import se3, so3

@@ -1,5 +1,7 @@
 """Tracking of a camera that walks through an exact room, and what happens when the images fail it."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from pipeline.frontend.keyframes import KeyframePair, refine
 from pipeline.frontend.tracking import Status, TrackedFrame, Tracker
 from pipeline.geometry import se3
 from pipeline.geometry.trajectory import ate_rmse_m
+from pipeline.recording import Motion
 from tests.registration.room import CAMERA, pose, render
 
 CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)))
@@ -124,6 +127,63 @@ def test_too_large_a_motion_is_not_called_tracked() -> None:
     tracker.track(0, 0, *render(walk(0)))
     turned = tracker.track(1, 33_333_333, *render(pose(x=0.9, z=0.3, yaw=-1.2)))
     assert turned.status is Status.LOST
+
+
+class Walked:
+    """A motion prior that knows the walk, a little wrongly."""
+
+    def __init__(self, pose_at: Callable[[int], np.ndarray], knows_translation: bool) -> None:
+        self.pose_at, self.knows_translation = pose_at, knows_translation
+
+    def between(self, start_ns: int, stop_ns: int) -> Motion:
+        T = se3.inverse(self.pose_at(start_ns)) @ self.pose_at(stop_ns)
+        xi = se3.log(T) * 1.02
+        if not self.knows_translation:
+            xi[:3] = 0
+        return Motion(se3.exp(xi), self.knows_translation)
+
+
+def test_a_prior_carries_over_what_the_images_do_not_tell() -> None:
+    """Before one bare wall three directions are unknown: lost, but with an odometry they come from it."""
+    gray = np.full((CAMERA.height, CAMERA.width), 0.5, np.float32)
+    truth = [pose(x=-0.2 + 0.01 * k, y=0.3, z=0.4, yaw=0.0) for k in range(8)]
+    depth = [np.full_like(gray, 2.0 - T[2, 3]) for T in truth]
+    prior = Walked(lambda ns: truth[round(ns / 33_333_333)], knows_translation=True)
+    for motion, status in ((None, Status.LOST), (prior, Status.OK)):
+        tracker = Tracker(CAMERA, CONFIG, motion)
+        frames = [tracker.track(k, 33_333_333 * k, gray, depth[k]) for k in range(len(truth))]
+        assert [f.status for f in frames[1:]] == [status] * 7
+    expected = se3.inverse(truth[0]) @ truth[-1]
+    moved_m, turned_rad = se3.distance(expected, frames[-1].T_keyframe_camera)
+    assert moved_m < 0.003  # 2 % of 7 cm, which is what the prior is wrong by
+    assert turned_rad < 0.01
+    # what the images say is their own: nothing along the wall
+    assert np.linalg.eigvalsh(frames[-1].information)[0] < 1.0
+
+
+@pytest.mark.parametrize("knows_translation", [False, True])
+def test_a_prior_does_not_spoil_what_the_images_tell(walked, knows_translation: bool) -> None:
+    _, _, truth = walked
+    prior = Walked(lambda ns: truth[round(ns / 33_333_333)], knows_translation)
+    tracker = Tracker(CAMERA, CONFIG, prior)
+    frames = [tracker.track(k, 33_333_333 * k, *render(truth[k])) for k in range(16)]
+    assert [f.status for f in frames] == [Status.OK] * 16
+    assert ate_rmse_m(np.array(truth)[:16, :3, 3], positions(tracker, frames)) < 1e-3
+
+
+def test_a_prior_follows_a_jerky_turn() -> None:
+    """23 degrees a frame, every frame to the other side: no velocity predicts that, and alone it is lost."""
+    truth = [pose(x=-0.2, z=-0.9, yaw=0.4 * (k % 2)) for k in range(7)]
+    prior = Walked(lambda ns: truth[round(ns / 33_333_333)], knows_translation=False)
+    for motion, statuses in ((None, {Status.LOST}), (prior, {Status.OK})):
+        tracker = Tracker(CAMERA, CONFIG, motion)
+        frames = [tracker.track(k, 33_333_333 * k, *render(truth[k])) for k in range(len(truth))]
+        assert {frame.status for frame in frames[1::2]} == statuses
+    for frame, T in zip(frames, truth, strict=True):
+        found = tracker.keyframes[frame.keyframe_index].T_map_keyframe @ frame.T_keyframe_camera
+        moved_m, turned_rad = se3.distance(se3.inverse(truth[0]) @ T, found)
+        assert moved_m < 2e-3
+        assert turned_rad < 2e-3
 
 
 def test_equal_frames_give_equal_bits(walked) -> None:

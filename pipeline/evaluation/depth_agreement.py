@@ -1,0 +1,103 @@
+"""How well depth images agree with each other under a trajectory: a measure that needs no ground truth.
+
+Points of one view are moved into another by the poses and compared with the depth measured there. Noise and calibration
+of the depth camera bound the number from below; beyond that it is the error of the relative poses. It also judges the
+ground truth, whose poses may be worse than the estimate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.evaluation.results import Absent
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+
+Array = NDArray[np.float64]
+Depth = NDArray[np.float32]
+
+STRIDE_PX = 8
+MIN_VIEW = 0.3
+"""Share of a view's points that must fall into the other image, under every trajectory that is compared."""
+MIN_POINTS = 200
+MIN_PAIRS = 10
+SAME_SURFACE = 0.05
+"""Relative difference up to which neighbouring depths are interpolated."""
+
+
+def depth_agreement(
+    depths_m: Sequence[Depth], camera: PinholeCamera, trajectories: Mapping[str, Array]
+) -> tuple[int, dict[str, float | Absent]]:
+    """Median over pairs of views of the median absolute difference of predicted and measured depth, metres.
+
+    All trajectories are judged on the same pairs: those of which each view shows enough of the other under all of them.
+    No gate: what is hidden counts too, and the median bears it.
+
+    Args:
+        depths_m: [h, w] of every view, 0 = unknown. trajectories: T_frame_camera [n, 4, 4] of the same views, by name.
+    Returns:
+        Number of pairs, and the value of every trajectory.
+    """
+    inverse = [np.where(d > 0, 1 / np.where(d > 0, d, 1), np.nan) for d in depths_m]
+    clouds = [_points(d, camera) for d in depths_m]
+    medians: dict[str, list[float]] = {name: [] for name in trajectories}
+    for a, b in combinations(range(len(depths_m)), 2):
+        found = {
+            name: _difference_m(
+                inverse[a], inverse[b], clouds[a], clouds[b], se3.inverse(T[a]) @ T[b], camera
+            )
+            for name, T in trajectories.items()
+        }
+        if all(value is not None for value in found.values()):
+            for name, value in found.items():
+                assert value is not None
+                medians[name].append(value)
+    pairs = len(next(iter(medians.values()), []))
+    if pairs < MIN_PAIRS:
+        absent = Absent(f"only {pairs} pairs of held-out views overlap, {MIN_PAIRS} are needed")
+        return pairs, dict.fromkeys(trajectories, absent)
+    return pairs, {name: float(np.median(values)) for name, values in medians.items()}
+
+
+def _points(depth_m: Depth, camera: PinholeCamera) -> Array:
+    """Points [n, 3] of every STRIDE_PX-th pixel with depth, camera frame."""
+    part = np.zeros(depth_m.shape, dtype=bool)
+    part[STRIDE_PX // 2 :: STRIDE_PX, STRIDE_PX // 2 :: STRIDE_PX] = True
+    part &= depth_m > 0
+    return np.asarray(camera.rays()[part] * depth_m[part][:, None].astype(np.float64))
+
+
+def _difference_m(
+    inverse_a: Array, inverse_b: Array, points_a: Array, points_b: Array, T_a_b: Array, camera: PinholeCamera
+) -> float | None:
+    """Median absolute difference of depth of a pair, both ways together; None if it shows too little in common."""
+    there = _compare(inverse_a, se3.transform(T_a_b, points_b), camera)
+    back = _compare(inverse_b, se3.transform(se3.inverse(T_a_b), points_a), camera)
+    if there is None or back is None:
+        return None
+    return float(np.median(np.abs(np.concatenate([there, back]))))
+
+
+def _compare(inverse_depth: Array, points: Array, camera: PinholeCamera) -> Array | None:
+    """Measured minus predicted depth of points in the frame of an image, where it was measured."""
+    if not len(points):
+        return None
+    front = points[points[:, 2] > 0.05]
+    u, v = camera.project(front).T
+    inside = (u >= 0) & (u < camera.width - 1) & (v >= 0) & (v < camera.height - 1)
+    if np.count_nonzero(inside) < MIN_VIEW * len(points):
+        return None
+    u, v, z = u[inside], v[inside], front[inside, 2]
+    i, j = v.astype(np.int64), u.astype(np.int64)
+    a, b = u - j, v - i
+    corners = np.stack(
+        [inverse_depth[i, j], inverse_depth[i, j + 1], inverse_depth[i + 1, j], inverse_depth[i + 1, j + 1]]
+    )
+    known = corners.max(axis=0) - corners.min(axis=0) < SAME_SURFACE * corners[0]  # false for NaN
+    weights = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
+    measured = 1 / np.sum(weights * corners, axis=0)
+    return np.asarray((measured - z)[known]) if np.count_nonzero(known) >= MIN_POINTS else None

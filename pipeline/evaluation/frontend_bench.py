@@ -1,0 +1,505 @@
+"""Time, memory and accuracy of the front end on a recording, its ablation, and Open3D's odometry in the same run.
+
+Every run of the front end has a process of its own, so that its peak memory is its own, and runs the stage that
+`duagc run` runs; calls of named functions are timed on the way, nothing is taken apart. Ground truth is opened here,
+after the stage has written its log. Runs come one after the other. Processor time is that of the process, all its
+threads together; it suffers less from other load on the machine than wall time does, but also shows it.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import os
+import resource
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import DuagError
+from pipeline.evaluation import groundtruth, trajectory_errors, views
+from pipeline.evaluation.results import Absent, split_reasons
+from pipeline.evaluation.stage import RenderTask
+from pipeline.frontend.config import FrontendConfig
+from pipeline.geometry.trajectory import Trajectory
+from pipeline.progress import track
+from pipeline.recording import Recording, open_rgbd
+from pipeline.run_folder import RobotRun
+from pipeline.workers import worker_pool
+
+SCHEMA = 1
+OPEN3D = {"Open3D, hybrid": "Hybrid", "Open3D, point-to-plane": "PointToPlane"}
+DEPTH_MAX_M = 10.0
+
+# What changes against the configuration given; tracking only. The order is that of the table.
+ABLATION: dict[str, dict[str, Any]] = {
+    "all": {},
+    "point-to-plane only": {
+        "tracking.registration.residuals": "depth",
+        "tracking.recovery.residuals": "depth",
+    },
+    "photometric only": {
+        "tracking.registration.residuals": "gray",
+        "tracking.recovery.residuals": "gray",
+    },
+    "no local optimisation": {"keyframes.local_optimisation": False},
+    "no loops": {"keyframes.loops.enabled": False},
+    "neither": {"keyframes.local_optimisation": False, "keyframes.loops.enabled": False},
+}
+FRAME_PARTS = {"pyramid": ("tracking.RgbdPyramid", "build"), "registration": ("tracking", "register")}
+KEYFRAME_PARTS = {"seeding": ("mapping.Mapper", "_seed"), "optimisation": ("mapping.Mapper", "_optimise")}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to measure.
+
+    config: of the front end; the ablation and the caps change it. caps: numbers of Gaussians, the first is that of the
+    table of times; empty = no mapping. ablation, open3d: whether to run them. threads: of the kernels.
+    robots: names; empty = all of the recording.
+    """
+
+    recording: Path
+    config: FrontendConfig
+    caps: tuple[int, ...] = ()
+    ablation: bool = True
+    open3d: bool = True
+    threads: int = 1
+    seed: int = 0
+    robots: tuple[str, ...] = ()
+
+
+def run(plan: Plan) -> dict[str, Any]:
+    """Measure; the result as {"machine", "recording", "rows", "reasons"}, ready for JSON.
+
+    Raises:
+        DuagError: the recording is broken, or has no such robot.
+    """
+    from pipeline.kernels.bench import cpu_name
+
+    source = Recording(plan.recording)
+    robots = list(plan.robots) or source.robots
+    for robot in robots:
+        if robot not in source.robots:
+            raise DuagError(
+                f"{plan.recording}: has no robot {robot}, expected one of {', '.join(source.robots)}"
+            )
+    jobs = [job for robot in robots for job in _jobs(plan, robot)]
+    rows = [_row(plan, source, job) for job in track(jobs, "bench frontend", len(jobs))]
+    tree = {
+        "schema": SCHEMA,
+        "machine": {
+            "cpu": cpu_name(),
+            "cores": len(os.sched_getaffinity(0)),
+            "threads": plan.threads,
+            "load_average": os.getloadavg()[0],
+        },
+        "recording": source.description["name"],
+        "digests": {robot: source.digest(source.log(robot).name) for robot in robots},
+        "rows": {str(k): row for k, row in enumerate(rows)},
+    }
+    content, reasons = split_reasons(tree)
+    return content | {"rows": list(content["rows"].values()), "reasons": reasons}
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One run: of the front end with a configuration, or of the named odometry of Open3D (config None)."""
+
+    robot: str
+    name: str
+    config: FrontendConfig | None
+
+
+def _jobs(plan: Plan, robot: str) -> Iterator[_Job]:
+    tracking_only = plan.config.model_copy(update={"mapping_enabled": False})
+    for cap in plan.caps:
+        yield _Job(
+            robot, "map", changed(plan.config, {"mapping_enabled": True, "mapping.max_gaussians": cap})
+        )
+    names = list(ABLATION) if plan.ablation else ["all"]
+    for name in names:
+        yield _Job(robot, name, changed(tracking_only, ABLATION[name]))
+    if plan.open3d:
+        for name in OPEN3D:
+            yield _Job(robot, name, None)
+
+
+def changed(config: FrontendConfig, values: Mapping[str, Any]) -> FrontendConfig:
+    """A configuration with other values, by dotted names.
+
+    Raises:
+        DuagError: there is no such setting.
+    """
+    content = config.model_dump()
+    for name, value in values.items():
+        *sections, last = name.split(".")
+        section = content
+        for key in sections:
+            section = section.get(key, {})
+        if last not in section:
+            raise DuagError(f"frontend.{name}: no such setting, expected one of {', '.join(section)}")
+        section[last] = value
+    return FrontendConfig.model_validate(content)
+
+
+# --- times -------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Calls:
+    """Processor and wall time of every call of a function, seconds."""
+
+    cpu_s: list[float] = field(default_factory=list)
+    wall_s: list[float] = field(default_factory=list)
+
+
+class Stopwatch:
+    """Times every call of named functions for as long as it is open; a function that is not there is an error."""
+
+    def __init__(self, functions: Mapping[str, tuple[Any, str]]) -> None:
+        """functions: label to (module or class, name of the function in it)."""
+        self.calls = {label: Calls() for label in functions}
+        self._functions = dict(functions)
+        self._open = ExitStack()
+
+    def __enter__(self) -> Stopwatch:
+        with ExitStack() as stack:
+            for label, (owner, name) in self._functions.items():
+                stack.enter_context(_replaced(owner, name, functools.partial(_timed, self.calls[label])))
+            self._open = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+
+@contextmanager
+def _replaced(
+    owner: Any, name: str, change: Callable[[Callable[..., Any]], Callable[..., Any]]
+) -> Iterator[None]:
+    original = inspect.getattr_static(owner, name)
+    if isinstance(original, staticmethod | classmethod):
+        setattr(owner, name, type(original)(change(original.__func__)))
+    else:
+        setattr(owner, name, change(original))
+    try:
+        yield
+    finally:
+        setattr(owner, name, original)
+
+
+def _timed(calls: Calls, function: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        wall, cpu = time.perf_counter(), time.process_time()
+        try:
+            return function(*args, **kwargs)
+        finally:
+            calls.cpu_s.append(time.process_time() - cpu)
+            calls.wall_s.append(time.perf_counter() - wall)
+
+    return call
+
+
+def _functions(parts: Mapping[str, tuple[str, str]]) -> dict[str, tuple[Any, str]]:
+    from pipeline.frontend import mapping, stage, tracking
+
+    modules: dict[str, ModuleType] = {"mapping": mapping, "stage": stage, "tracking": tracking}
+    found = {}
+    for label, (path, name) in parts.items():
+        module, _, owner = path.partition(".")
+        found[label] = (getattr(modules[module], owner) if owner else modules[module], name)
+    return found
+
+
+def summary(calls: Calls) -> dict[str, float]:
+    """Milliseconds of a call: mean, median, 95th percentile and the means of the first and the last quarter.
+
+    Means are those of processor time; `wall_ms` is the mean of wall time.
+    """
+    ms = 1000 * np.array(calls.cpu_s)
+    quarter = max(1, len(ms) // 4)
+    return {
+        "calls": len(ms),
+        "cpu_ms": float(ms.mean()),
+        "cpu_ms_median": float(np.median(ms)),
+        "cpu_ms_p95": float(np.quantile(ms, 0.95)),
+        "cpu_ms_first_quarter": float(ms[:quarter].mean()),
+        "cpu_ms_last_quarter": float(ms[-quarter:].mean()),
+        "wall_ms": float(1000 * np.mean(calls.wall_s)),
+    }
+
+
+def _parts(whole: Calls, parts: Mapping[str, Calls]) -> dict[str, float]:
+    """Milliseconds of processor time that parts of a call take of it on average, and what is left."""
+    shares = {label: 1000 * sum(calls.cpu_s) / len(whole.cpu_s) for label, calls in parts.items()}
+    return shares | {"other": 1000 * sum(whole.cpu_s) / len(whole.cpu_s) - sum(shares.values())}
+
+
+def peak_memory_mb() -> float:
+    """Most memory that this process has held. `getrusage` would count the parent that it was started from."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+# --- one run -----------------------------------------------------------------------------------------------------
+
+
+def measure(log: Path, folder: Path, config: FrontendConfig, seed: int, threads: int) -> dict[str, Any]:
+    """Run the front end on a log into folder/frontend.mcap, in a fresh process; times and peak memory."""
+    from pipeline.frontend.stage import run_frontend
+
+    whole = {"frame": ("tracking.Tracker", "track"), "poses": ("stage", "_refine")}
+    if config.mapping_enabled:
+        whole |= {"keyframe": ("mapping.Mapper", "add_keyframe"), "final": ("mapping.Mapper", "finish")}
+    with Stopwatch(_functions(whole)) as outer, _in_turn(config) as inner:
+        start = time.process_time()
+        laps = run_frontend(log, folder / "frontend.mcap", config, seed=seed, threads=threads)
+        cpu_s = time.process_time() - start
+    frame = outer.calls["frame"]
+    times: dict[str, Any] = {"frame": summary(frame) | {"parts_cpu_ms": _parts(frame, inner.of("frame"))}}
+    times["pose_optimisation_cpu_s"] = sum(outer.calls["poses"].cpu_s)
+    if config.mapping_enabled:
+        keyframe = outer.calls["keyframe"]
+        times["keyframe"] = summary(keyframe) | {"parts_cpu_ms": _parts(keyframe, inner.of("keyframe"))}
+        times["final_refinement_cpu_s"] = sum(outer.calls["final"].cpu_s)
+    return {"times": times, "laps_wall_s": laps, "cpu_s": cpu_s, "peak_memory_mb": peak_memory_mb()}
+
+
+class _Inner:
+    """Times of the parts of a frame and of a keyframe; calls outside of the whole, as in `finish`, do not count."""
+
+    def __init__(self, whole: Mapping[str, Stopwatch]) -> None:
+        self._of = whole
+
+    def of(self, whole: str) -> dict[str, Calls]:
+        return self._of[whole].calls
+
+
+@contextmanager
+def _in_turn(config: FrontendConfig) -> Iterator[_Inner]:
+    """Stopwatches of parts, which run only while the whole that they belong to does."""
+    watches = {"frame": Stopwatch(_functions(FRAME_PARTS))}
+    wholes = {"frame": ("tracking.Tracker", "track")}
+    if config.mapping_enabled:
+        watches["keyframe"] = Stopwatch(_functions(KEYFRAME_PARTS))
+        wholes["keyframe"] = ("mapping.Mapper", "add_keyframe")
+    with ExitStack() as stack:
+        for label, (owner, name) in _functions(wholes).items():
+            stack.enter_context(_replaced(owner, name, functools.partial(_within, watches[label])))
+        yield _Inner(watches)
+
+
+def _within(watch: Stopwatch, function: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        with watch:
+            return function(*args, **kwargs)
+
+    return call
+
+
+def measure_open3d(log: Path, method: str) -> dict[str, Any]:
+    """Open3D's RGB-D odometry (tensors, CPU, its defaults) from each frame to the next, in a fresh process.
+
+    It starts from the motion before, as the tracker does: from rest it is worse.
+
+    Args:
+        method: "Hybrid" or "PointToPlane".
+    Returns:
+        Times, peak memory, stamps_ns and poses T_first_camera [n, 4, 4]; `failed` frames keep the pose before.
+    """
+    import open3d as o3d
+
+    odometry = o3d.t.pipelines.odometry
+    how, tensor = getattr(odometry.Method, method), o3d.core.Tensor.from_numpy
+    calls = Calls()
+    T, motion = np.eye(4), np.eye(4)
+    poses, stamps, failed, before = [], [], 0, None
+    with open_rgbd(log) as source:
+        intrinsics = tensor(source.camera.matrix())
+        for frame in source.frames():
+            wall, cpu = time.perf_counter(), time.process_time()
+            color, depth = (
+                np.ascontiguousarray(frame.color),
+                np.ascontiguousarray(frame.usable_depth[..., None]),
+            )
+            image = o3d.t.geometry.RGBDImage(
+                o3d.t.geometry.Image(tensor(color)), o3d.t.geometry.Image(tensor(depth))
+            )
+            if before is not None:
+                try:
+                    found = odometry.rgbd_odometry_multi_scale(
+                        image, before, intrinsics, tensor(motion), 1.0, DEPTH_MAX_M, method=how
+                    )
+                    motion = found.transformation.numpy()
+                except RuntimeError:  # a singular system
+                    failed, motion = failed + 1, np.eye(4)
+            T, before = T @ motion, image
+            calls.cpu_s.append(time.process_time() - cpu)
+            calls.wall_s.append(time.perf_counter() - wall)
+            poses.append(T)
+            stamps.append(frame.stamp_ns)
+    return {
+        "times": {"frame": summary(calls)},
+        "peak_memory_mb": peak_memory_mb(),
+        "stamps_ns": np.array(stamps, dtype=np.int64),
+        "poses": np.array(poses),
+        "failed": failed,
+    }
+
+
+def _row(plan: Plan, source: Recording, job: _Job) -> dict[str, Any]:
+    """One run in a process of its own, and its accuracy."""
+    log = source.log(job.robot)
+    row: dict[str, Any] = {"robot": job.robot, "name": job.name}
+    with tempfile.TemporaryDirectory(prefix="duagc-bench-") as name, worker_pool(1) as pool:
+        folder = Path(name)
+        if job.config is None:
+            measured = pool.submit(measure_open3d, log, OPEN3D[job.name]).result()
+            estimated = Trajectory(measured.pop("stamps_ns"), measured.pop("poses"))
+            return (
+                row | measured | {"frames": len(estimated)} | _trajectory_errors(source, job.robot, estimated)
+            )
+        measured = pool.submit(measure, log, folder, job.config, plan.seed, plan.threads).result()
+        robot = RobotRun(job.robot, folder)
+        placed = [f for f in robot.frames if f.status != "lost"]
+        estimated = Trajectory(
+            np.array([f.stamp_ns for f in placed], dtype=np.int64), np.array([f.T_map_camera for f in placed])
+        )
+        row |= measured | {
+            "frames": len(robot.frames),
+            "lost": len(robot.frames) - len(placed),
+            "keyframes": len(robot.keyframes),
+        }
+        row |= _trajectory_errors(source, job.robot, estimated)
+        if job.config.mapping_enabled:
+            row |= {"max_gaussians": job.config.mapping.max_gaussians}
+            row |= _map_errors(source, robot, estimated, plan.threads)
+    return row
+
+
+def _trajectory_errors(source: Recording, robot: str, estimated: Trajectory) -> dict[str, Any]:
+    """ATE after an SE(3) alignment of its own and relative errors frame to frame, where there is ground truth."""
+    true = groundtruth.trajectory(source, robot)
+    if isinstance(true, Absent):
+        return dict.fromkeys(("ate_rmse_m", "rpe_trans_m", "rpe_rot_rad"), true)
+    pairs = trajectory_errors.pair(true, estimated)
+    relative = trajectory_errors.rpe(pairs)
+    trans_m, rot_rad = (relative, relative) if isinstance(relative, Absent) else relative
+    return {
+        "ate_rmse_m": trajectory_errors.ate_rmse_m(pairs),
+        "rpe_trans_m": trans_m,
+        "rpe_rot_rad": rot_rad,
+    }
+
+
+def _map_errors(source: Recording, robot: RobotRun, estimated: Trajectory, threads: int) -> dict[str, Any]:
+    """Scores of the map over the held-out views, after and before its final refinement."""
+    maps = {"refined": robot.own_map, "unrefined": robot.unrefined_map}
+    row: dict[str, Any] = {"gaussians": len(robot.own_map.gaussians)}
+    for name, found in maps.items():
+        if found is None:
+            row[name] = Absent("the front end wrote no map before its refinement")
+            continue
+        task = RenderTask(found.gaussians, robot, estimated, keyframes=False, depth=found.depth)
+        scores = views.summary([s for _, s in task.scores(source, threads, None)], "no view is held out")
+        kept = ("views", "psnr_db", "ssim", "depth_l1_m", "depth_l1_exact_m", "depth_completeness")
+        row[name] = {key: scores[key] for key in kept}
+    return row
+
+
+# --- words -------------------------------------------------------------------------------------------------------
+
+
+def format_tables(result: dict[str, Any]) -> str:
+    """The rows as Markdown tables: tracking, mapping by cap, parts."""
+    machine, rows = result["machine"], result["rows"]
+    about = [
+        result["recording"],
+        machine["cpu"],
+        f"{machine['cores']} cores",
+        f"{machine['threads']} threads",
+    ]
+    about += [f"load {machine['load_average']:.1f}", "processor time"]
+    head = ["robot", "", "frames", "lost", "keyframes", "ATE mm", "RPE mm", "RPE mrad"]
+    head += ["ms/frame", "p95", "first, last quarter", "poses s", "peak MB"]
+    lines = [", ".join(about), "", "Tracking"]
+    lines += _table(head, [_tracking_cells(row) for row in rows if row["name"] != "map"])
+    mapped = [row for row in rows if row["name"] == "map"]
+    if mapped:
+        head = ["robot", "cap", "Gaussians", "PSNR dB", "before refinement", "depth L1 mm", "exact mm"]
+        head += ["ms/keyframe", "p95", "first, last quarter", "refinement s", "all s", "peak MB"]
+        lines += ["", "Mapping; scores of held-out views", *_table(head, [_map_cells(row) for row in mapped])]
+    parts = [
+        [row["robot"], row.get("max_gaussians", row["name"]), whole, _parts_text(row["times"][whole])]
+        for row in rows
+        for whole in ("frame", "keyframe")
+        if whole in row["times"] and row["name"] in ("map", "all")
+    ]
+    lines += ["", "Parts, ms", *_table(["robot", "cap", "of a", "parts"], parts)]
+    return "\n".join(lines)
+
+
+def _tracking_cells(row: dict[str, Any]) -> list[Any]:
+    frame = row["times"]["frame"]
+    return [
+        *(
+            row["robot"],
+            row["name"],
+            row["frames"],
+            row.get("lost", row.get("failed")),
+            row.get("keyframes", "-"),
+        ),
+        *(
+            _number(row["ate_rmse_m"], 1e3, 3),
+            _number(row["rpe_trans_m"], 1e3, 3),
+            _number(row["rpe_rot_rad"], 1e3, 3),
+        ),
+        *(f"{frame['cpu_ms']:.1f}", f"{frame['cpu_ms_p95']:.1f}", _quarters(frame)),
+        *(_number(row["times"].get("pose_optimisation_cpu_s"), 1, 1), f"{row['peak_memory_mb']:.0f}"),
+    ]
+
+
+def _map_cells(row: dict[str, Any]) -> list[Any]:
+    keyframe, refined, unrefined = row["times"]["keyframe"], row["refined"], row["unrefined"] or {}
+    return [
+        *(row["robot"], row["max_gaussians"], row["gaussians"], _number(refined["psnr_db"], 1, 2)),
+        _number(unrefined.get("psnr_db"), 1, 2),
+        *(_number(refined["depth_l1_m"], 1e3, 2), _number(refined["depth_l1_exact_m"], 1e3, 2)),
+        *(f"{keyframe['cpu_ms']:.0f}", f"{keyframe['cpu_ms_p95']:.0f}", _quarters(keyframe)),
+        *(
+            f"{row['times']['final_refinement_cpu_s']:.1f}",
+            f"{row['cpu_s']:.1f}",
+            f"{row['peak_memory_mb']:.0f}",
+        ),
+    ]
+
+
+def _quarters(times: dict[str, float]) -> str:
+    return f"{times['cpu_ms_first_quarter']:.1f}, {times['cpu_ms_last_quarter']:.1f}"
+
+
+def _parts_text(times: dict[str, Any]) -> str:
+    return ", ".join(f"{label} {value:.1f}" for label, value in times["parts_cpu_ms"].items())
+
+
+def _number(value: float | None, scale: float, digits: int) -> str:
+    return "-" if value is None else f"{scale * value:.{digits}f}"
+
+
+def _table(head: list[str], rows: list[list[Any]]) -> list[str]:
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    return lines + ["| " + " | ".join(str(cell) for cell in row) + " |" for row in rows]

@@ -1,0 +1,126 @@
+"""How a camera moved between two times by sensors other than itself: an odometry, or the gyroscope of an IMU."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import messages
+from pipeline.errors import DuagError
+from pipeline.geometry import se3, so3
+from pipeline.recording.depth_sources import constant, transform_rows
+from pipeline.recording.read import LogFile
+from schemas import topics as topic_table
+
+Array = NDArray[np.float64]
+LONGEST_POSE_GAP_NS = 250_000_000
+LONGEST_RATE_GAP_NS = 50_000_000
+
+
+@dataclass(frozen=True)
+class Motion:
+    """T_start_stop [4, 4] of the camera. knows_translation: False if only its rotation means anything."""
+
+    T_start_stop: Array
+    knows_translation: bool
+
+
+class MotionPrior(Protocol):
+    """Says how the camera moved."""
+
+    def between(self, start_ns: int, stop_ns: int) -> Motion | None:
+        """The motion from one time to a later one; None where the sensor does not reach or has a gap."""
+        ...
+
+
+class OdometryPrior:
+    """Poses of the camera by another odometry, in a frame of its own, interpolated between its messages."""
+
+    def __init__(self, stamps_ns: Sequence[int], T_odometry_camera: Array) -> None:
+        """Args:
+        stamps_ns: increasing. T_odometry_camera: [n, 4, 4].
+        """
+        self.stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
+        self.T_odometry_camera = np.asarray(T_odometry_camera, dtype=np.float64)
+
+    def between(self, start_ns: int, stop_ns: int) -> Motion | None:
+        start, stop = self._at(start_ns), self._at(stop_ns)
+        if start is None or stop is None:
+            return None
+        return Motion(se3.inverse(start) @ stop, knows_translation=True)
+
+    def _at(self, time_ns: int) -> Array | None:
+        after = int(np.searchsorted(self.stamps_ns, time_ns))
+        if after < len(self.stamps_ns) and self.stamps_ns[after] == time_ns:
+            return np.asarray(self.T_odometry_camera[after])
+        if after in (0, len(self.stamps_ns)):
+            return None
+        first, last = int(self.stamps_ns[after - 1]), int(self.stamps_ns[after])
+        if last - first > LONGEST_POSE_GAP_NS:
+            return None
+        T_first, T_last = self.T_odometry_camera[after - 1], self.T_odometry_camera[after]
+        share = (time_ns - first) / (last - first)
+        return np.asarray(T_first @ se3.exp(share * se3.log(se3.inverse(T_first) @ T_last)))
+
+
+class GyroPrior:
+    """Rotation by the integrated rates of a gyroscope; a rate holds from the middle before it to the middle after."""
+
+    def __init__(self, stamps_ns: Sequence[int], rates_camera: Array) -> None:
+        """Args:
+        stamps_ns: increasing. rates_camera: [n, 3], rad/s, about the axes of the camera.
+        """
+        self.stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
+        self.rates_camera = np.asarray(rates_camera, dtype=np.float64)
+
+    def between(self, start_ns: int, stop_ns: int) -> Motion | None:
+        stamps = self.stamps_ns
+        first, last = (int(np.searchsorted(stamps, t)) for t in (start_ns, stop_ns))
+        if len(stamps) < 2 or start_ns < stamps[0] or stop_ns > stamps[-1]:
+            return None
+        used = slice(max(first - 1, 0), last + 1)
+        if np.any(np.diff(stamps[used]) > LONGEST_RATE_GAP_NS):
+            return None
+        middles = (stamps[used][:-1] + stamps[used][1:]) // 2
+        edges = np.clip(np.concatenate([[start_ns], middles, [stop_ns]]), start_ns, stop_ns)
+        R = np.eye(3)
+        for rate, seconds in zip(self.rates_camera[used], np.diff(edges) * 1e-9, strict=True):
+            R = R @ so3.exp(rate * seconds)
+        return Motion(se3.from_rotation_translation(R, np.zeros(3)), knows_translation=False)
+
+
+def motion_prior(log: LogFile, robot: str) -> MotionPrior | None:
+    """The best prior that a log has: an odometry, then an IMU; None if it has neither.
+
+    Raises:
+        DuagError: a message that cannot be read, or an IMU without its pose in the camera.
+    """
+    topic = topic_table.ODOMETRY_PRIOR.of(robot)
+    if log.entries(topic):
+        at = log.entries_by_time(topic)
+        times = sorted(at)
+        poses = []
+        for time in times:
+            try:
+                poses.append(messages.unpack_pose_in_frame(log.record_at(topic, at[time]).proto()))
+            except DuagError as error:
+                raise DuagError(f"{log.path}: {topic} at {time} ns: {error}") from error
+        return OdometryPrior(times, np.array(poses))
+    topic = topic_table.IMU.of(robot)
+    if not log.entries(topic):
+        return None
+    rows = constant(log, topic_table.IMU_TRANSFORM.of(robot), transform_rows)
+    R_camera_imu = np.array(rows)[:3, :3]
+    at = log.entries_by_time(topic)
+    times = sorted(at)
+    rates = []
+    for time in times:
+        rate = log.record_at(topic, at[time]).proto().angular_velocity
+        rates.append([rate.x, rate.y, rate.z])
+    if not np.all(np.isfinite(rates)):
+        raise DuagError(f"{log.path}: {topic} has a rate that is not finite, expected rad/s")
+    return GyroPrior(times, np.array(rates) @ R_camera_imu.T)

@@ -1,0 +1,190 @@
+"""Readers of public pose graphs: who gets what, and what is refused in one line."""
+
+import numpy as np
+import pytest
+
+from pipeline.consensus import factors as pose_factors
+from pipeline.consensus.central import team_graph
+from pipeline.consensus.config import ClosureConfig
+from pipeline.consensus.factors import Factors
+from pipeline.consensus.graphs import read_team
+from pipeline.errors import DuagError
+from tests.posegraph.graphs import KAPPA, TAU, g2o_line, helix, helix_edges, symbol, write_g2o, write_team
+
+EXACT = ClosureConfig(sigma_floor_m=0, sigma_floor_rad=0)
+
+
+def team_cost(team, T_by_robot):
+    """Cost of all that all robots were told, each closure once."""
+    own = {r: Factors.concatenate([g.odometry, g.loops]) for r, g in team.robots.items()}
+    closures = [(a, b, team.robots[a].closures[b]) for a, b in team.pairs]
+    whole = team_graph(T_by_robot, own, closures, EXACT)
+    return pose_factors.cost(whole.factors, whole.T_start), len(whole.factors)
+
+
+def chordal_cost(rows, T):
+    """SE-Sync's cost, written down independently."""
+    total = 0.0
+    for i, j, M in rows:
+        turned = T[j][:3, :3] - T[i][:3, :3] @ M[:3, :3]
+        moved = T[j][:3, 3] - T[i][:3, 3] - T[i][:3, :3] @ M[:3, 3]
+        total += KAPPA * (turned**2).sum() + TAU * (moved**2).sum()
+    return total
+
+
+@pytest.mark.parametrize("robots", [1, 3, 5])
+def test_no_factor_is_lost_however_a_graph_is_cut(tmp_path, robots):
+    rows, T = helix_edges(40), helix(40)
+    team = read_team(write_g2o(tmp_path / "helix.g2o", rows), robots)
+    assert len(team.robots) == robots
+    sizes = [g.keyframes for g in team.robots.values()]
+    assert sum(sizes) == 40
+    assert max(sizes) - min(sizes) <= 1
+    first = np.cumsum([0, *sizes])
+    cost, count = team_cost(team, {r: T[first[k] : first[k + 1]] for k, r in enumerate(team.robots)})
+    assert count == len(rows)
+    np.testing.assert_allclose(cost, chordal_cost(rows, T), rtol=1e-12)
+
+
+def test_a_teams_files_say_the_same_as_one_file_that_is_cut(tmp_path):
+    rows, T = helix_edges(40), helix(40)
+    cut = read_team(write_g2o(tmp_path / "helix.g2o", rows), 4)
+    team = read_team(write_team(tmp_path / "team", rows, 4, 40))
+    assert list(team.robots) == ["a", "b", "c", "d"]
+    costs = [team_cost(t, {r: T[10 * k : 10 * k + 10] for k, r in enumerate(t.robots)}) for t in (cut, team)]
+    assert costs[0] == costs[1]
+
+
+def test_both_ends_know_the_same_closures(tmp_path):
+    team = read_team(write_g2o(tmp_path / "helix.g2o", helix_edges(40)), 4)
+    assert team.pairs
+    for a, b in team.pairs:
+        for one, other in zip(team.robots[a].closures[b], team.robots[b].closures[a], strict=True):
+            back = other.reversed()
+            assert (one.own_keyframe, one.peer_keyframe) == (back.own_keyframe, back.peer_keyframe)
+            assert one.measured_from_peer == back.measured_from_peer
+            np.testing.assert_allclose(one.T_own_peer, back.T_own_peer, atol=1e-15)
+
+
+def test_consecutive_keyframes_are_odometry_and_the_rest_is_not(tmp_path):
+    team = read_team(write_g2o(tmp_path / "helix.g2o", helix_edges(40)), 2)
+    for graph in team.robots.values():
+        assert np.all(np.abs(graph.odometry.j - graph.odometry.i) == 1)
+        assert np.all(np.abs(graph.loops.j - graph.loops.i) == 8)
+
+
+def test_a_loop_that_alone_holds_a_robot_together_is_trusted(tmp_path):
+    rows = [row for row in helix_edges(16) if row[:2] != (11, 12)]
+    team = read_team(write_g2o(tmp_path / "gap.g2o", rows), 1)
+    (graph,) = team.robots.values()
+    assert (4, 12) in zip(graph.odometry.i.tolist(), graph.odometry.j.tolist(), strict=True)
+    assert len(graph.odometry) + len(graph.loops) == len(rows)
+
+
+def test_kimera_tables_with_their_reference(tmp_path):
+    rows, owner = helix_edges(20), [0] * 10 + [1] * 10
+    head = "robot_src,pose_src,robot_dst,pose_dst,qx,qy,qz,qw,tx,ty,tz,kappa,tau,is_known_inlier,weight\n"
+    for a in range(2):
+        (tmp_path / f"robot{a}").mkdir()
+        lines = [head]
+        for i, j, T in rows:
+            if a in (owner[i], owner[j]):
+                quat = g2o_line(i, j, T).split()[6:10]
+                pose = ",".join([*quat, *(repr(float(x)) for x in T[:3, 3])])
+                lines.append(f"{owner[i]},{i},{owner[j]},{j},{pose},{KAPPA},{TAU},0,0.5\n")
+        (tmp_path / f"robot{a}" / "measurements.csv").write_text("".join(lines))
+    flags = [f"{owner[i]},{i},{owner[j]},{j},{int(i != 4)}\n" for i, j, _ in rows if j - i > 1]
+    (tmp_path / "reference_inliers.csv").write_text(
+        "robot_src,pose_src,robot_dst,pose_dst,inlier\n" + "".join(flags)
+    )
+    team, T = read_team(tmp_path), helix(20)
+    cost, count = team_cost(team, {"robot0": T[:10], "robot1": T[10:]})
+    assert count == len(rows)
+    np.testing.assert_allclose(cost, chordal_cost(rows, T), rtol=1e-9)
+    false = [
+        (c.own_keyframe, c.peer_keyframe)
+        for c, true in zip(
+            team.robots["robot0"].closures["robot1"], team.closures_true["robot0", "robot1"], strict=True
+        )
+        if not true
+    ]
+    assert false == [(9, 0), (4, 2)]  # the first is not named by the reference at all
+    without = read_team(tmp_path, only_reference=True)
+    assert team_cost(without, {"robot0": T[:10], "robot1": T[10:]})[1] == count - 2
+
+
+def test_edges_that_the_reference_names_false_by_number(tmp_path):
+    rows = helix_edges(24)
+    path = write_g2o(tmp_path / "measurements.g2o", rows)
+    false = len(rows)  # numbers start from one: the last edge
+    (tmp_path / "gt_info.xml").write_text(
+        f"<struct>\n <outlier_lc_indices>{false}</outlier_lc_indices>\n</struct>\n"
+    )
+    team = read_team(path, 2)
+    (truth,) = team.closures_true.values()
+    loops = np.concatenate(list(team.loops_true.values()))
+    assert (~truth).sum() + (~loops).sum() == 1
+
+
+def test_robots_that_nothing_joins_are_components_of_their_own(tmp_path):
+    rows = [(i, j, T) for i, j, T in helix_edges(40) if (i < 20) == (j < 20)]
+    team = read_team(write_g2o(tmp_path / "two.g2o", rows), 4)
+    assert team.components() == [("robot0", "robot1"), ("robot2", "robot3")]
+
+
+def test_a_graph_of_the_whole_team_in_its_folder_is_left_out(tmp_path):
+    folder = write_team(tmp_path / "team", helix_edges(40), 2, 40)
+    write_g2o(folder / "fullGraph.g2o", helix_edges(40))
+    team = read_team(folder)
+    assert list(team.robots) == ["a", "b"]
+    assert team.ignored == ("fullGraph.g2o",)
+
+
+SE2 = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n"
+FINE = g2o_line(0, 1, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    ("text", "robots", "words"),
+    [
+        (SE2, None, ["line 1", "EDGE_SE2", "2-D"]),
+        ("VERTEX_SE2 0 0 0 0\n" + FINE, None, ["line 1", "2-D"]),
+        (FINE + "EDGE_SE3:QUAT 0 x 0\n", None, ["line 2", "not a number"]),
+        (FINE + "EDGE_SE3:QUAT 0 2 1 2 3\n", None, ["line 2", "28"]),
+        (FINE.replace(repr(TAU), "nan"), None, ["line 1", "finite"]),
+        (g2o_line(0, 1, np.eye(4), tau=0.0), None, ["information", "edge 1"]),
+        ("EDGE_SE3_PRIOR 0 1\n", None, ["EDGE_SE3_PRIOR"]),
+        ("", None, ["no EDGE_SE3:QUAT"]),
+        (FINE, 2, ["cannot be cut"]),
+        (FINE + g2o_line(2, 3, np.eye(4)), 1, ["pieces"]),
+        (g2o_line(symbol("a", 0), symbol("a", 1), np.eye(4)), 3, ["--robots 3", "1 robots"]),
+    ],
+)
+def test_what_cannot_be_read_is_said_in_one_line(tmp_path, text, robots, words):
+    path = tmp_path / "graph.g2o"
+    path.write_text(text)
+    with pytest.raises(DuagError) as error:
+        read_team(path, robots)
+    message = str(error.value)
+    assert "\n" not in message
+    assert str(path) in message
+    assert all(word in message for word in words), message
+
+
+def test_a_folder_without_graphs_is_refused(tmp_path):
+    with pytest.raises(DuagError, match="neither"):
+        read_team(tmp_path)
+    with pytest.raises(DuagError, match="not found"):
+        read_team(tmp_path / "absent.g2o")
+    (tmp_path / "robot0").mkdir()
+    (tmp_path / "robot0" / "measurements.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(DuagError, match="no column robot_src"):
+        read_team(tmp_path)
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    write_g2o(plain / "0.g2o", helix_edges(8, 4))
+    write_g2o(plain / "1.g2o", helix_edges(8, 4))
+    with pytest.raises(DuagError, match="gtsam symbols"):
+        read_team(plain)
+    with pytest.raises(DuagError, match="no reference"):
+        read_team(plain / "0.g2o", 2, only_reference=True)

@@ -1,0 +1,495 @@
+"""Bags of ROS 1 and ROS 2 made in the test, of every container and encoding, and real ones where they are."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+import converters
+from converters import ros_images
+from pipeline import messages as m
+from pipeline.errors import DuagError
+from pipeline.geometry import se3, so3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.recording import open_rgbd, read_log
+from pipeline.recording.register_depth import register_depth
+from schemas import topics
+from tests.converters.box_room import path, render
+
+COLOR = PinholeCamera(160, 120, 140.0, 141.0, 79.2, 60.3)
+DEPTH = PinholeCamera(120, 90, 92.0, 92.0, 60.1, 44.2)
+DISTORTION = (0.12, -0.2, 0.001, -0.002, 0.05)
+T_COLOR_DEPTH = se3.from_rotation_translation(so3.exp([0.004, -0.003, 0.002]), [-0.059, 0.001, 0.002])
+REAL = Path(__file__).parents[3] / "shared" / "data" / "logs"
+START_NS = 1_700_000_000_000_000_000
+STEP_NS = 50_000_000
+FRAMES = 4
+
+
+class Ros:
+    """Messages of one of the two ROS versions."""
+
+    def __init__(self, version: int) -> None:
+        self.version = version
+        self.store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+        if version == 1:
+            text = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
+
+    def make(self, name: str, **values: Any) -> Any:
+        return self.store.types[name](**values)
+
+    def header(self, stamp_ns: int, frame: str) -> Any:
+        time = self.make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        more = {"seq": 0} if self.version == 1 else {}
+        return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame, **more)
+
+    def image(
+        self, stamp_ns: int, frame: str, pixels: np.ndarray, encoding: str, pad: int = 0, big: bool = False
+    ) -> Any:
+        rows = pixels.astype(pixels.dtype.newbyteorder(">" if big else "<"))
+        raw = np.frombuffer(rows.tobytes(), np.uint8).reshape(pixels.shape[0], -1)
+        raw = np.pad(raw, ((0, 0), (0, pad)), constant_values=77)
+        return self.make(
+            "sensor_msgs/msg/Image",
+            header=self.header(stamp_ns, frame),
+            height=pixels.shape[0],
+            width=pixels.shape[1],
+            encoding=encoding,
+            is_bigendian=int(big),
+            step=raw.shape[1],
+            data=raw.ravel(),
+        )
+
+    def compressed(self, stamp_ns: int, frame: str, data: bytes, text: str) -> Any:
+        return self.make(
+            "sensor_msgs/msg/CompressedImage",
+            header=self.header(stamp_ns, frame),
+            format=text,
+            data=np.frombuffer(data, np.uint8),
+        )
+
+    def info(self, stamp_ns: int, frame: str, c: PinholeCamera, D: tuple[float, ...] = ()) -> Any:
+        K = np.array([c.fx, 0, c.cx, 0, c.fy, c.cy, 0, 0, 1])
+        P = np.array([c.fx, 0, c.cx, 0, 0, c.fy, c.cy, 0, 0, 0, 1, 0])
+        values = {"D": np.array(D or [0.0] * 5), "K": K, "R": np.eye(3).ravel(), "P": P}
+        if self.version == 2:
+            values = {name.lower(): value for name, value in values.items()}
+        region = self.make(
+            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        return self.make(
+            "sensor_msgs/msg/CameraInfo",
+            header=self.header(stamp_ns, frame),
+            height=c.height,
+            width=c.width,
+            distortion_model="plumb_bob",
+            binning_x=0,
+            binning_y=0,
+            roi=region,
+            **values,
+        )
+
+    def transform(self, stamp_ns: int, parent: str, child: str, T: np.ndarray) -> Any:
+        q = so3.to_quat_wxyz(T[:3, :3])
+        t = self.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", T[:3, 3].tolist(), strict=True)))
+        r = self.make("geometry_msgs/msg/Quaternion", **dict(zip("wxyz", q.tolist(), strict=True)))
+        return self.make(
+            "geometry_msgs/msg/TransformStamped",
+            header=self.header(stamp_ns, parent),
+            child_frame_id=child,
+            transform=self.make("geometry_msgs/msg/Transform", translation=t, rotation=r),
+        )
+
+    def tf(self, *transforms: Any) -> Any:
+        return self.make("tf2_msgs/msg/TFMessage", transforms=list(transforms))
+
+    def write(self, out: Path, rows: list[tuple[str, int, Any]], container: str) -> Path:
+        """Write messages (topic, time of recording, message) into a bag; returns what to convert."""
+        if self.version == 1:
+            writer = Writer1(out.with_suffix(".bag"))
+            if container != "plain":
+                writer.set_compression(Writer1.CompressionFormat[container.upper()])
+            with writer as bag:
+                self._fill(bag, rows, self.store.serialize_ros1)
+            return out.with_suffix(".bag")
+        plugin = StoragePlugin.MCAP if container == "mcap" else StoragePlugin.SQLITE3
+        with Writer2(out, version=9, storage_plugin=plugin) as bag:
+            self._fill(bag, rows, self.store.serialize_cdr)
+        return out
+
+    def _fill(self, bag: Any, rows: list[tuple[str, int, Any]], serialise: Callable[..., Any]) -> None:
+        connections: dict[str, Any] = {}
+        for topic, log_ns, message in rows:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = bag.add_connection(topic, kind, typestore=self.store)
+            bag.write(connections[topic], log_ns, serialise(message, kind))
+
+
+def scene(
+    r: Ros,
+    prefix: str = "",
+    late_ns: int = 3_000_000,
+    poses: list[np.ndarray] | None = None,
+) -> list[tuple[str, int, Any]]:
+    """Distorted colour, depth of its own camera a little later, CameraInfo once, static tf, odometry of the base."""
+    T_base_color = se3.from_rotation_translation(so3.exp([-1.2, 1.2, -1.2]), [0.1, 0.0, 0.3])
+    frames = f"{prefix.strip('/')}_color", f"{prefix.strip('/')}_depth", f"{prefix.strip('/')}_base"
+    rows: list[tuple[str, int, Any]] = [
+        (f"{prefix}/camera/color/camera_info", START_NS, r.info(START_NS, frames[0], COLOR, DISTORTION)),
+        (f"{prefix}/camera/depth/camera_info", START_NS, r.info(START_NS, frames[1], DEPTH)),
+        (
+            "/tf_static",
+            START_NS,
+            r.tf(
+                r.transform(START_NS, frames[1], frames[0], se3.inverse(T_COLOR_DEPTH)),
+                r.transform(START_NS, frames[2], frames[0], T_base_color),
+            ),
+        ),
+    ]
+    for i, T in enumerate(poses or path(FRAMES)):
+        at = START_NS + (i + 1) * STEP_NS
+        color, _ = render(COLOR, T, DISTORTION)
+        _, z = render(DEPTH, T @ T_COLOR_DEPTH)
+        raw = np.rint(z * 1000).astype(np.uint16)
+        rows += [
+            (
+                f"{prefix}/camera/color/image_raw",
+                at + 5_000_000,
+                r.image(at, frames[0], color, "rgb8", pad=3),
+            ),
+            (
+                f"{prefix}/camera/depth/image_rect_raw",
+                at + 9_000_000,
+                r.image(at + late_ns, frames[1], raw, "16UC1", pad=2, big=i == 1),
+            ),
+            (f"{prefix}/odom", at, odometry(r, at, frames[2], T @ se3.inverse(T_base_color))),
+        ]
+    return rows
+
+
+def odometry(r: Ros, stamp_ns: int, child: str, T: np.ndarray) -> Any:
+    q = so3.to_quat_wxyz(T[:3, :3])
+    vector = r.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    pose = r.make(
+        "geometry_msgs/msg/Pose",
+        position=r.make("geometry_msgs/msg/Point", **dict(zip("xyz", T[:3, 3].tolist(), strict=True))),
+        orientation=r.make("geometry_msgs/msg/Quaternion", **dict(zip("wxyz", q.tolist(), strict=True))),
+    )
+    twist = r.make("geometry_msgs/msg/Twist", linear=vector, angular=vector)
+    return r.make(
+        "nav_msgs/msg/Odometry",
+        header=r.header(stamp_ns, "world"),
+        child_frame_id=child,
+        pose=r.make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
+        twist=r.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("version", "container"), [(1, "plain"), (1, "bz2"), (1, "lz4"), (2, "sqlite3"), (2, "mcap")]
+)
+def test_every_container_gives_the_same_recording(tmp_path: Path, version: int, container: str) -> None:
+    r = Ros(version)
+    bag = r.write(tmp_path / "bag", scene(r), container)
+    converters.convert("ros", bag, tmp_path / "rec", options=["truth=/odom"])
+    records = read_log(
+        tmp_path / "rec" / "alpha.groundtruth.mcap", topics=[topics.GROUNDTRUTH_POSE.of("alpha")]
+    )
+    poses = [m.unpack_pose_in_frame(record.proto()) for record in records]
+    assert np.allclose(poses, path(FRAMES), atol=1e-9)
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
+        assert len(log) == FRAMES
+        assert log.camera == COLOR
+        for i in (0, 1):
+            frame = log.frame(i)
+            assert frame.stamp_ns == START_NS + (i + 1) * STEP_NS
+            color, z = render(COLOR, path(FRAMES)[i])
+            seen = frame.depth > 0
+            assert seen.mean() > 0.6
+            error = np.abs(frame.depth - z)[seen]
+            assert np.median(error) < 0.02
+            assert np.percentile(error, 95) < 0.15
+            inner = np.s_[20:-20, 20:-20]
+            assert np.median(np.abs(frame.color[inner].astype(int) - color[inner])) <= 2
+    check = json.loads((tmp_path / "rec" / "recording.json").read_text())["checks"]["alpha"]
+    assert check["reprojection_median_m"] < 0.05
+
+
+def test_depth_that_is_not_moved_is_wrong(tmp_path: Path) -> None:
+    """The extrinsics matter: taken as registered, the depth does not fit."""
+    z = render(DEPTH, path(1)[0] @ T_COLOR_DEPTH)[1].astype(np.float32)
+    _, true = render(COLOR, path(1)[0])
+    moved = register_depth(z, DEPTH, T_COLOR_DEPTH, COLOR)
+    still = register_depth(z, DEPTH, np.eye(4), COLOR)
+
+    def error(depth: np.ndarray) -> float:
+        return float(np.percentile(np.abs(depth - true)[depth > 0], 90))
+
+    assert error(still) > 2 * error(moved)
+    holes = (moved[30:-30, 40:-40] == 0).mean()
+    assert holes < 0.01
+
+
+def test_two_robots_in_one_bag_and_in_two(tmp_path: Path) -> None:
+    r = Ros(2)
+    both = sorted(
+        scene(r, prefix="/jackal") + scene(r, prefix="/husky", poses=path(FRAMES, 0.2)), key=lambda x: x[1]
+    )
+    bag = r.write(tmp_path / "one", both, "mcap")
+    with pytest.raises(DuagError, match="expected --set depth=TOPIC"):
+        converters.convert("ros", bag, tmp_path / "rec")
+    converters.convert("ros", bag, tmp_path / "rec", options=["namespaces=/husky,/jackal"])
+    (tmp_path / "two").mkdir()
+    r.write(tmp_path / "two" / "a", scene(r, prefix="/husky", poses=path(FRAMES, 0.2)), "sqlite3")
+    r.write(tmp_path / "two" / "b", scene(r, prefix="/jackal"), "sqlite3")
+    converters.convert("ros", tmp_path / "two", tmp_path / "rec2", robots=2)
+    for name in ("alpha", "bravo"):
+        with (
+            open_rgbd(tmp_path / "rec" / f"{name}.mcap") as one,
+            open_rgbd(tmp_path / "rec2" / f"{name}.mcap") as two,
+        ):
+            assert np.array_equal(one.frame(2).depth, two.frame(2).depth)
+            assert np.array_equal(one.frame(2).color, two.frame(2).color)
+    with pytest.raises(DuagError, match="found 2 robots, expected --robots 2"):
+        converters.convert("ros", tmp_path / "two", tmp_path / "rec3", robots=3)
+
+
+def test_times(tmp_path: Path) -> None:
+    """Late depth is no partner; recording times are used only if asked for; times that go back are told."""
+    r = Ros(1)
+    bag = r.write(tmp_path / "late", scene(r, late_ns=23_000_000), "plain")
+    with pytest.raises(DuagError, match=r"no image on /camera/depth/image_rect_raw within 0.02 s"):
+        converters.convert("ros", bag, tmp_path / "rec")
+    converters.convert("ros", bag, tmp_path / "log", options=["time_source=log"])
+    with open_rgbd(tmp_path / "log" / "alpha.mcap") as log:
+        assert log.frame(0).stamp_ns == START_NS + STEP_NS + 5_000_000
+    rows = scene(r)
+    times = [row[1] for row in rows]
+    backwards = [(t, times[k], msg) for k, (t, _, msg) in enumerate(rows[:3] + rows[9:] + rows[3:9])]
+    bag = r.write(tmp_path / "backwards", sorted(backwards, key=lambda x: x[1]), "plain")
+    converters.convert("ros", bag, tmp_path / "sorted")
+    warnings = json.loads((tmp_path / "sorted" / "recording.json").read_text())["warnings"]
+    assert any("times go backwards" in w for w in warnings)
+    with open_rgbd(tmp_path / "sorted" / "alpha.mcap") as log:
+        assert [log.frame(i).stamp_ns for i in range(FRAMES)] == [
+            START_NS + (i + 1) * STEP_NS for i in range(FRAMES)
+        ]
+
+
+def test_a_frame_tied_to_nothing_needs_extrinsics(tmp_path: Path) -> None:
+    r = Ros(2)
+    rows = [row for row in scene(r) if row[0] != "/tf_static"]
+    bag = r.write(tmp_path / "bag", rows, "sqlite3")
+    with pytest.raises(DuagError, match="/tf_static does not tie them"):
+        converters.convert("ros", bag, tmp_path / "rec")
+    q, t = so3.to_quat_wxyz(T_COLOR_DEPTH[:3, :3]), T_COLOR_DEPTH[:3, 3]
+    numbers = " ".join(repr(float(v)) for v in (*t, *q))
+    converters.convert("ros", bag, tmp_path / "rec", options=[f"T_color_depth='{numbers}'"])
+    with_tf = r.write(tmp_path / "with", scene(r), "sqlite3")
+    converters.convert("ros", with_tf, tmp_path / "rec2")
+    with (
+        open_rgbd(tmp_path / "rec" / "alpha.mcap") as one,
+        open_rgbd(tmp_path / "rec2" / "alpha.mcap") as two,
+    ):
+        assert np.array_equal(one.frame(0).depth, two.frame(0).depth)
+    with pytest.raises(DuagError, match="expected 'x y z qw qx qy qz'"):
+        converters.convert("ros", bag, tmp_path / "rec3", options=["T_color_depth='1 2'"])
+
+
+# --- encodings
+
+
+def gray_card() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return cv2.GaussianBlur(rng.integers(0, 256, (12, 16, 3)).astype(np.uint8), (5, 5), 0)
+
+
+def decoded(message: Any) -> np.ndarray:
+    data, _ = ros_images.color_bytes(message, "here")
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "rgba8", "bgra8", "mono8"])
+def test_colour_encodings(encoding: str) -> None:
+    card = gray_card()
+    alpha = np.full((12, 16, 1), 255, np.uint8)
+    pixels = {
+        "rgb8": card,
+        "bgr8": card[..., ::-1],
+        "rgba8": np.concatenate([card, alpha], axis=2),
+        "bgra8": np.concatenate([card[..., ::-1], alpha], axis=2),
+        "mono8": card[..., 0],
+    }[encoding]
+    expected = np.repeat(card[..., :1], 3, axis=2) if encoding == "mono8" else card
+    assert np.array_equal(
+        decoded(Ros(2).image(1, "c", np.ascontiguousarray(pixels), encoding, pad=5)), expected
+    )
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_bayer_patterns_have_the_right_red(pattern: str) -> None:
+    """A red card stays red whatever the pattern."""
+    tile = {"r": 200, "g": 30, "b": 10}
+    pixels = np.tile(np.array([tile[c] for c in pattern], np.uint8).reshape(2, 2), (6, 8))
+    rgb = decoded(Ros(1).image(1, "c", pixels, f"bayer_{pattern}8"))[3:-3, 3:-3]
+    assert np.allclose(rgb.reshape(-1, 3).mean(axis=0), [200, 30, 10], atol=2)
+
+
+def depth_image() -> np.ndarray:
+    raw = (1000 + 37 * np.arange(12)[:, None] + 11 * np.arange(16)).astype(np.uint16)
+    raw[2:4, 3:9] = 0
+    return raw
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_depth_of_sixteen_bits_and_of_floats(big: bool) -> None:
+    raw = depth_image()
+    sixteen = Ros(1).image(1, "d", raw, "16UC1", pad=4, big=big)
+    assert np.array_equal(
+        ros_images.depth_m(sixteen, "here", 0.001), raw.astype(np.float32) * np.float32(0.001)
+    )
+    metres = raw.astype(np.float32) / 1000
+    metres[0, :4] = [np.nan, np.inf, -1.0, 0.0]
+    floats = Ros(2).image(1, "d", metres, "32FC1", big=big)
+    got = ros_images.depth_m(floats, "here", 0.001)
+    assert (got[0, :4] == 0).all()
+    assert np.array_equal(got[1:], metres[1:])
+
+
+def rvl(raw: np.ndarray) -> bytes:
+    """RVL encoder, as the paper has it."""
+    nibbles: list[int] = []
+
+    def put(value: int) -> None:
+        while True:
+            nibble, value = value & 7, value >> 3
+            nibbles.append(nibble | (8 if value else 0))
+            if not value:
+                return
+
+    flat, at, previous = raw.ravel().astype(int).tolist(), 0, 0
+    while at < len(flat):
+        zeros = at
+        while at < len(flat) and flat[at] == 0:
+            at += 1
+        put(at - zeros)
+        end = at
+        while end < len(flat) and flat[end] != 0:
+            end += 1
+        put(end - at)
+        for value in flat[at:end]:
+            delta = value - previous
+            put((delta << 1) ^ (delta >> 63))
+            previous = value
+        at = end
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [
+        sum(n << (28 - 4 * k) for k, n in enumerate(nibbles[i : i + 8])) for i in range(0, len(nibbles), 8)
+    ]
+    return struct.pack("<II", raw.shape[1], raw.shape[0]) + struct.pack(f"<{len(words)}I", *words)
+
+
+def test_compressed_depth() -> None:
+    raw = depth_image()
+    r = Ros(2)
+    head = struct.pack("<iff", 0, 0.0, 0.0)
+    png = cv2.imencode(".png", raw)[1].tobytes()
+    for text, data in (
+        ("16UC1; compressedDepth png", head + png),
+        ("16UC1; compressedDepth", head + png),
+        ("16UC1; compressedDepth rvl", head + rvl(raw)),
+        ("16UC1; compressedDepth png", png),
+    ):
+        got = ros_images.depth_m(r.compressed(1, "d", data, text), "here", 0.001)
+        assert np.array_equal(got, raw.astype(np.float32) * np.float32(0.001)), text
+    metres = raw / 1000.0
+    a, b = 100.0 * 101.0, 1 - 100.0 * 101.0 / 10.0
+    inverse = np.where(raw > 0, np.rint(a / np.where(raw > 0, metres, 1.0) + b), 0).astype(np.uint16)
+    data = struct.pack("<iff", 0, a, b) + cv2.imencode(".png", inverse)[1].tobytes()
+    got = ros_images.depth_m(r.compressed(1, "d", data, "32FC1; compressedDepth png"), "here", 0.001)
+    assert np.abs(got - metres).max() < 3e-4
+    jpeg = cv2.imencode(".jpg", (raw >> 8).astype(np.uint8))[1].tobytes()
+    for data, message in ((jpeg, "depth as JPEG"), (head + b"\0" * 40, "broken RVL"), (b"123", "3 bytes")):
+        with pytest.raises(DuagError, match=message):
+            ros_images.depth_m(r.compressed(1, "d", data, "16UC1; compressedDepth png"), "here", 0.001)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_broken_rvl_is_an_error_or_depth(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    data = bytearray(rvl(depth_image()))
+    for _ in range(5):
+        data[rng.integers(8, len(data))] = int(rng.integers(256))
+    with contextlib.suppress(DuagError):  # the only error it may raise
+        assert ros_images._rvl(bytes(data[: rng.integers(8, len(data) + 1)]), "here").shape == (12, 16)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda rows: [r for r in rows if "color/image" not in r[0]], "color images on none"),
+        (lambda rows: [r for r in rows if "camera_info" not in r[0]], "has CameraInfo on no topic"),
+        (lambda rows: [r for r in rows if "image" not in r[0]], "found no topic of images"),
+    ],
+)
+def test_what_is_missing_is_named(tmp_path: Path, change: Callable[[Any], Any], message: str) -> None:
+    r = Ros(2)
+    bag = r.write(tmp_path / "bag", change(scene(r)), "sqlite3")
+    with pytest.raises(DuagError, match=message):
+        converters.convert("ros", bag, tmp_path / "rec")
+    assert not (tmp_path / "rec").exists()
+
+
+@pytest.mark.parametrize("keep", [0.3, 0.7, 0.95])
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_truncated_bag_is_an_error(tmp_path: Path, version: int, keep: float) -> None:
+    r = Ros(version)
+    bag = r.write(tmp_path / "bag", scene(r), "plain" if version == 1 else "mcap")
+    file = bag if bag.is_file() else next(bag.glob("*.mcap"))
+    data = file.read_bytes()
+    file.write_bytes(data[: int(len(data) * keep)])
+    with pytest.raises(DuagError):
+        converters.convert("ros", bag, tmp_path / "rec")
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real bags are not there")
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("foxglove_example.bag", [], "found no topic of images"),
+        ("pj_rosbag2.db3", [], "found no topic of images"),
+        ("lichtblick_custom-camera-model.mcap", [], "expected a bag of ROS 1 or ROS 2"),
+        ("realsense_single_depth_color.bag", [], "/tf_static does not tie them"),
+        ("realsense_single_depth_color.bag", ["registered=yes"], r"within 0.02 s"),
+    ],
+)
+def test_real_bags_are_refused_for_the_right_reason(
+    tmp_path: Path, name: str, options: list[str], message: str
+) -> None:
+    with pytest.raises(DuagError, match=message):
+        converters.convert("ros", REAL / name, tmp_path / "rec", options=options)
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="the real bags are not there")
+def test_a_real_bag_converts_when_told_what_it_lacks(tmp_path: Path) -> None:
+    options = ["max_difference_s=0.2", "T_color_depth='0.0143 0.0006 0.0006 0.99997 -0.00005 0.0065 0.0052'"]
+    converters.convert("ros", REAL / "realsense_single_depth_color.bag", tmp_path / "rec", options=options)
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
+        frame = log.frame(0)
+        assert (log.camera.width, log.camera.height) == (640, 480)
+    assert 0.2 < (frame.depth > 0).mean() < 1
+    assert 0.2 < np.median(frame.depth[frame.depth > 0]) < 5

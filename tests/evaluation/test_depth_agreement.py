@@ -1,0 +1,57 @@
+"""The agreement of depth images sees wrong poses, bears hidden surfaces, and says when it knows nothing."""
+
+import numpy as np
+import pytest
+
+from pipeline.evaluation.depth_agreement import MIN_PAIRS, depth_agreement
+from pipeline.evaluation.results import Absent
+from pipeline.geometry import se3
+from tests.registration.room import CAMERA, pose, render
+
+TRUTH = np.array([pose(x=-0.4 + 0.1 * k, z=-0.9, yaw=0.3 - 0.05 * k) for k in range(7)])
+
+
+@pytest.fixture(scope="module")
+def depths() -> list[np.ndarray]:
+    return [render(T)[1] for T in TRUTH]
+
+
+def test_exact_poses_agree_and_wrong_ones_do_not(depths) -> None:
+    rng = np.random.default_rng(0)
+    wrong = TRUTH @ se3.exp(0.01 * rng.standard_normal((len(TRUTH), 6)))
+    pairs, values = depth_agreement(depths, CAMERA, {"true": TRUTH, "wrong": wrong})
+    assert pairs >= MIN_PAIRS
+    assert values["true"] < 1e-5  # inverse depth is interpolated exactly on planes; a box hides some of it
+    assert 3e-3 < values["wrong"] < 5e-2
+
+
+def test_frame_of_the_poses_does_not_matter(depths) -> None:
+    moved = se3.exp(np.array([3.0, -2.0, 1.0, 0.5, -0.4, 0.3])) @ TRUTH
+    noisy = [
+        d + 0.01 * np.random.default_rng(k).standard_normal(d.shape).astype(np.float32)
+        for k, d in enumerate(depths)
+    ]
+    _, values = depth_agreement(noisy, CAMERA, {"a": TRUTH, "b": moved})
+    assert values["b"] == pytest.approx(values["a"], rel=1e-6)
+    # the difference of two depths with 1 cm of noise, one of them interpolated: 0.6745 x (1.2 to 1.4) cm
+    assert 7.5e-3 < values["a"] < 1e-2
+
+
+def test_the_same_pairs_judge_all(depths) -> None:
+    """A trajectory under which the views see nothing of each other leaves no pair for anybody."""
+    apart = TRUTH.copy()
+    apart[:, 0, 3] += 10 * np.arange(len(TRUTH))
+    pairs, values = depth_agreement(depths, CAMERA, {"true": TRUTH, "apart": apart})
+    assert pairs == 0
+    assert all(isinstance(v, Absent) for v in values.values())
+
+
+def test_unknown_depth_is_not_compared(depths) -> None:
+    holes = [d.copy() for d in depths]
+    for d in holes:
+        d[30:42, 40:60] = 0
+    pairs, values = depth_agreement(holes, CAMERA, {"true": TRUTH})
+    assert pairs >= MIN_PAIRS
+    assert values["true"] < 1e-5
+    _, values = depth_agreement([np.zeros_like(d) for d in depths], CAMERA, {"true": TRUTH})
+    assert isinstance(values["true"], Absent)

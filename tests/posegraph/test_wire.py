@@ -1,0 +1,151 @@
+"""Messages of the set-up, of rounds and of elimination: what is written is read, what is broken is refused."""
+
+import numpy as np
+import pytest
+
+from pipeline.consensus.elimination import Block
+from pipeline.consensus.links import PosePacket
+from pipeline.exchange.packets import MalformedError
+from pipeline.geometry import se3, so3
+from pipeline.posegraph import wire
+from pipeline.posegraph.wire import NamedKeyframes, PairFrame, Roster, Step
+
+
+def poses(rng, n):
+    return se3.from_quat_translation(rng.normal(size=(n, 4)), 10 * rng.normal(size=(n, 3)))
+
+
+def pose_packet(rng, n, dtype="float32", curvature=None):
+    T = poses(rng, n)
+    return PosePacket(
+        sequence=7,
+        version=3,
+        keyframes=(2 * np.arange(n)).astype(np.int32),
+        quats_wxyz=so3.to_quat_wxyz(T[:, :3, :3]).astype(dtype),
+        translations=T[:, :3, 3].astype(dtype),
+        penalties=np.array([0.5, 0.25], np.float32),
+        curvature=curvature,
+        converged=True,
+    )
+
+
+@pytest.mark.parametrize(("dtype", "atol"), [("float32", 3e-7), ("float64", 1e-15)])
+def test_poses_come_back_whichever_component_was_left_out(dtype, atol):
+    rng = np.random.default_rng(0)
+    packet = pose_packet(rng, 41, dtype)
+    assert len(set(np.argmax(np.abs(packet.quats_wxyz), axis=1).tolist())) == 4
+    data = wire.write_poses(packet, 3, 30, decides=True)
+    read = wire.read_poses(data, packet.keyframes, from_decider=True)
+    np.testing.assert_array_equal(read.keyframes, packet.keyframes[3:33])
+    np.testing.assert_array_equal(read.translations, packet.translations[3:33])
+    np.testing.assert_array_equal(read.penalties, packet.penalties)
+    assert (read.sequence, read.version, read.converged, read.curvature) == (7, 3, True, None)
+    dots = np.abs(np.sum(read.quats_wxyz * packet.quats_wxyz[3:33].astype(np.float64), axis=1))
+    np.testing.assert_allclose(dots, 1.0, atol=atol)
+    angle = so3.log(
+        so3.from_quat_wxyz(read.quats_wxyz).swapaxes(1, 2) @ so3.from_quat_wxyz(packet.quats_wxyz[3:33])
+    )
+    assert np.abs(angle).max() < 10 * atol
+
+
+def test_a_full_packet_of_poses_fits():
+    for dtype in ("float32", "float64"):
+        n = wire.poses_per_packet(1166, dtype == "float64")
+        packet = pose_packet(np.random.default_rng(1), n, dtype)
+        assert 1166 - 60 < len(wire.write_poses(packet, 0, n, decides=False)) <= 1166
+
+
+def test_the_other_end_sends_its_curvature_instead():
+    rng, curvature = np.random.default_rng(2), np.array([2.0, 3.0], np.float32)
+    packet = pose_packet(rng, 5, curvature=curvature)
+    data = wire.write_poses(packet, 0, 5, decides=False)
+    np.testing.assert_array_equal(
+        wire.read_poses(data, packet.keyframes, from_decider=False).curvature, curvature
+    )
+    with pytest.raises(MalformedError, match="not from this end"):
+        wire.read_poses(data, packet.keyframes, from_decider=True)
+
+
+def test_set_up_messages_come_back():
+    rng = np.random.default_rng(3)
+    roster = Roster(2, 0b1011)
+    assert wire.read_roster(wire.write_roster(roster), 4) == roster
+    named = NamedKeyframes(np.array([1, 5], np.int32), poses(rng, 2), np.array([[0.0, 0.1], [0.5, 0.2]]))
+    for precision, atol in (("float32", 1e-5), ("float64", 1e-14)):
+        data = wire.write_keyframes(named, precision)
+        read = wire.read_keyframes(data, named.keyframes, precision)
+        np.testing.assert_allclose(read.T_map_keyframe, named.T_map_keyframe, atol=atol)
+    np.testing.assert_allclose(read.drift, named.drift, rtol=1e-6)
+    keep = np.array([True, False, True] * 5)
+    np.testing.assert_array_equal(wire.read_verdict(wire.write_verdict(keep), 15), keep)
+    frame = PairFrame(1, 3, 12, poses(rng, 1)[0])
+    back = wire.read_frame(wire.write_frame(frame), 4)
+    assert (back.lower, back.higher, back.support) == (1, 3, 12)
+    np.testing.assert_allclose(back.T_lower_higher, frame.T_lower_higher, atol=1e-5)
+    front = {(0, 4): 0b11, (2, 1): 0, (0, 9): 0b101}
+    assert wire.read_front(wire.write_front(front), 3) == front
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_blocks_and_steps_come_back_and_zeros_cost_nothing(precision):
+    rng = np.random.default_rng(4)
+    n = 5
+    A = rng.normal(size=(6 * n, 6 * n)).astype(precision).astype(np.float64)
+    H = A + A.T
+    H[:6, 12:18] = H[12:18, :6] = 0.0
+    H = H.astype(precision).astype(np.float64)
+    block = Block(H, rng.normal(size=6 * n), 3.5, 0.25, reweighted=True, unsure=False)
+    data = wire.write_block(9, block, precision)
+    exchange, read = wire.read_block(data, n)
+    assert exchange == 9
+    np.testing.assert_array_equal(read.H, H)
+    np.testing.assert_array_equal(read.g, block.g)
+    assert (read.cost, read.largest_step, read.reweighted, read.unsure) == (3.5, 0.25, True, False)
+    dense = Block(np.where(H == 0, 1.0, H), block.g, 3.5, 0.25, reweighted=True, unsure=False)
+    assert len(wire.write_block(9, dense, precision)) - len(data) == 36 * (4 if precision == "float32" else 8)
+    same = Block(None, block.g, 3.5, 0.25, reweighted=False, unsure=True)
+    short = wire.write_block(10, same, precision)
+    assert len(short) < 400
+    assert wire.read_block(short, n)[1].H is None
+    step = Step(4, accepted=True, finished=False, fresh=True, damping=1e-3, delta=rng.normal(size=(3, 6)))
+    back = wire.read_step(wire.write_step(step), 3)
+    np.testing.assert_array_equal(back.delta, step.delta)
+    assert (back.exchange, back.accepted, back.finished, back.fresh, back.damping) == (
+        4,
+        True,
+        False,
+        True,
+        1e-3,
+    )
+
+
+def test_what_is_cut_short_or_does_not_fit_is_refused():
+    rng = np.random.default_rng(5)
+    packet = pose_packet(rng, 6)
+    named = NamedKeyframes(np.array([1, 5], np.int32), poses(rng, 2), np.zeros((2, 2)))
+    block = Block(np.eye(12), np.zeros(12), 1.0, 0.0, reweighted=False, unsure=False)
+    step = Step(0, accepted=True, finished=False, fresh=False, damping=0.0, delta=np.zeros((2, 6)))
+    messages = [
+        (wire.write_poses(packet, 0, 6, True), lambda d: wire.read_poses(d, packet.keyframes, True)),
+        (wire.write_roster(Roster(0, 2)), lambda d: wire.read_roster(d, 2)),
+        (
+            wire.write_keyframes(named, "float32"),
+            lambda d: wire.read_keyframes(d, named.keyframes, "float32"),
+        ),
+        (wire.write_verdict(np.ones(9, bool)), lambda d: wire.read_verdict(d, 9)),
+        (wire.write_frame(PairFrame(0, 1, 2, np.eye(4))), lambda d: wire.read_frame(d, 2)),
+        (wire.write_front({(0, 1): 3}), lambda d: wire.read_front(d, 2)),
+        (wire.write_block(0, block, "float64"), lambda d: wire.read_block(d, 2)),
+        (wire.write_step(step), lambda d: wire.read_step(d, 2)),
+    ]
+    for data, read in messages:
+        read(data)
+        for broken in (data[:-1], data + b"\0"):
+            with pytest.raises(MalformedError):
+                read(broken)
+    with pytest.raises(MalformedError, match="shared"):
+        wire.read_poses(wire.write_poses(packet, 0, 6, True), packet.keyframes[:5], True)
+    with pytest.raises(MalformedError, match="team"):
+        wire.read_roster(wire.write_roster(Roster(0, 0b1000)), 3)
+    with pytest.raises(MalformedError, match="expected 3"):
+        wire.read_block(wire.write_block(0, block, "float64"), 3)
