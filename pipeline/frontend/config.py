@@ -79,11 +79,11 @@ class FailureConfig(Config):
     """Frames in a row that are tracked by colour alone, because their depth is missing or stuck."""
     stuck_share: float = 0.99
     """An image is stuck if this share of its measured pixels has the very values of the image before."""
-    stuck_gray_change: float = 0.25
+    stuck_gray_change: float = 0.08
     """Change of a grey value of the coarsest image, in standard deviations of that image, that counts as one."""
-    stuck_gray_share: float = 0.05
+    stuck_gray_share: float = 0.02
     """Share of changed grey values from which a stuck depth image no longer belongs to the colour."""
-    stuck_depth_change: float = 0.02
+    stuck_depth_change: float = 0.01
     """Relative change of a depth of the coarsest image that counts as one."""
     stuck_depth_share: float = 0.1
     """Share of changed depths from which a stuck colour image no longer belongs to the depth."""
@@ -173,8 +173,11 @@ class TrackingConfig(Config):
     """A frame that failed is tried again with brightness and contrast brought to those of the keyframe if the contrast
     differs by more than this factor."""
     max_keyframe_gain: float = 1.5
-    """A frame brighter or darker than its keyframe by more than this factor becomes one only below
-    `relocalisation.min_overlap`."""
+    """A frame brighter or darker than its keyframe by more than this factor, or with a grey residual that would not be
+    believed of a place found again, becomes a keyframe only below `relocalisation.min_overlap`, and only if little of
+    it is saturated."""
+    max_saturated: float = 0.1
+    """Share of black and white pixels up to which that is so."""
     failure: FailureConfig = FailureConfig()
     relocalisation: RelocalisationConfig = RelocalisationConfig()
     prior: MotionPriorConfig = MotionPriorConfig()

@@ -61,15 +61,11 @@ class StuckImages:
             self._depth_came = _normalised(coarsest.gray)
         if not same_color:
             self._color_came = coarsest.inverse_depth
-        if same_depth and not same_color:
+        if same_depth:
             changed = np.abs(_normalised(coarsest.gray) - self._depth_came) > self.config.stuck_gray_change
             if changed.mean() > self.config.stuck_gray_share:
                 return Reason.STUCK_DEPTH
-        if (
-            same_color
-            and not same_depth
-            and _depth_changed(coarsest.inverse_depth, self._color_came, self.config)
-        ):
+        if same_color and _depth_changed(coarsest.inverse_depth, self._color_came, self.config):
             return Reason.STUCK_COLOR
         return Reason.NONE
 
@@ -90,6 +86,11 @@ def _depth_changed(now: Image, then: Image, config: FailureConfig) -> bool:
     known = (now > 0) & (then > 0)
     changed = known & (np.abs(now - then) > config.stuck_depth_change * then)
     return int(changed.sum()) > config.stuck_depth_share * max(int(known.sum()), 1)
+
+
+def saturated_share(level: Level) -> float:
+    """Share of pixels that are as dark or as bright as an image can be."""
+    return float(np.mean((level.gray <= 0.01) | (level.gray >= 0.99)))
 
 
 def has_enough_depth(pyramid: RgbdPyramid, config: RegistrationConfig) -> bool:

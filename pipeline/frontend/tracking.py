@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.frontend.config import FrontendConfig, is_held_out
-from pipeline.frontend.failure import Reason, StuckImages, has_enough_depth, intruders
+from pipeline.frontend.failure import Reason, StuckImages, has_enough_depth, intruders, saturated_share
 from pipeline.frontend.keyframes import KeyframePair, becomes_keyframe, predicted_overlap
 from pipeline.frontend.relocalisation import features_of, guesses, supports
 from pipeline.geometry import se3
@@ -206,7 +206,7 @@ class Tracker:
             not is_held_out(frame_index)
             and found.without is Reason.NONE
             and becomes_keyframe(result, pyramid, self.config.keyframes)
-            and self._well_exposed(result)
+            and self._well_exposed(pyramid, result)
             and self._unobstructed(pyramid, found)
         ):
             return self._promote(frame_index, stamp_ns, pyramid, keyframe_index, result, status)
@@ -376,14 +376,17 @@ class Tracker:
         predicted[:3, 3] = followed[:3, 3]
         return predicted, np.diag([0.0] * 3 + [sigma_rad**-2.0] * 3)
 
-    def _well_exposed(self, result: Registration) -> bool:
-        """Whether a frame is as bright as its keyframe, or that keyframe must be left all the same.
+    def _well_exposed(self, pyramid: RgbdPyramid, result: Registration) -> bool:
+        """Whether a frame looks as its keyframe does, or that must be left and the frame is not burnt out.
 
         Where the exposure jumps, too dark and too bright images pass. They make poor keyframes.
         """
-        limit = self.config.tracking.max_keyframe_gain
-        alike = 1 / limit < result.exposure[0] < limit
-        return alike or min(result.overlap, result.view) < self.config.tracking.relocalisation.min_overlap
+        config = self.config.tracking
+        alike = 1 / config.max_keyframe_gain < result.exposure[0] < config.max_keyframe_gain
+        if alike and result.rms_gray <= self._largest_gray_rms():
+            return True
+        leaving = min(result.overlap, result.view) < config.relocalisation.min_overlap
+        return leaving and saturated_share(pyramid.levels[0]) <= config.max_saturated
 
     def _unobstructed(self, pyramid: RgbdPyramid, found: _Found) -> bool:
         """Whether little of a view stands in space that the keyframe saw to be free.
