@@ -177,8 +177,8 @@ def run(
 def _print_outputs(run_folder: Path) -> None:
     print(f"report     {run_folder / 'report' / 'index.html'}")
     print(f"view       {run_folder / 'run.rrd'}")
-    for path in sorted(run_folder.glob("robots/*/fused.ply")):
-        print(f"fused map  {path}")
+    for path in sorted(run_folder.glob("robots/*/refined.ply")):
+        print(f"map        {path}")
     print(f"metrics    {run_folder / 'metrics.json'}")
 
 

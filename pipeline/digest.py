@@ -13,6 +13,7 @@ ROBOT_RESULTS = (
     "information.mcap",
     "fused.mcap",
     "fused.ply",
+    "refined.ply",
     "trajectory.tum",
     "odometry.tum",
 )

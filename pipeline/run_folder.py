@@ -89,6 +89,12 @@ class RobotRun:
         return self._last("fused.mcap", topics.FUSED_MAP)
 
     @cached_property
+    def refined_map(self) -> GaussianMap | None:
+        """The fused map trained again on the robot's own images, world frame; None if it met nobody."""
+        maps = self._all("fused.mcap", topics.REFINED_MAP)
+        return maps[-1] if maps else None
+
+    @cached_property
     def corrected(self) -> CorrectedKeyframes:
         """Keyframe poses after consensus, and the component that the robot believes to be in."""
         return self._last("fused.mcap", topics.CORRECTED_KEYFRAMES)

@@ -198,10 +198,18 @@ def agent_input(robot: str, log: Path, folder: Path) -> AgentInput:
 
 
 def fuse_robot(robot: str, log: Path, folder: Path, result: AgentResult, config: RunConfig) -> None:
-    """Fused map and corrected trajectory of one robot, into the folder of its own results."""
+    """Fused map and corrected trajectory of one robot, into the folder of its own results; one robot at a time."""
     from pipeline.fusion.stage import run_fusion
 
-    run_fusion(agent_input(robot, log, folder), result, folder, config.fusion, config.exchange.matching)
+    run_fusion(
+        agent_input(robot, log, folder),
+        result,
+        folder,
+        config.fusion,
+        config.exchange.matching,
+        seed=config.seed,
+        threads=threads_per_worker(1),
+    )
 
 
 def _evaluate(folder: Path, recording: Path, timing: Timing) -> None:

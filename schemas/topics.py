@@ -149,6 +149,13 @@ INFORMATION = Topic(
     "Fisher information of the robot's own map",
 )
 FUSED_MAP = Topic("/<robot>/fused_map", "duagc.v1.GaussianMap", "fusion", Scope.ROBOT, "the map after fusion")
+REFINED_MAP = Topic(
+    "/<robot>/refined_map",
+    "duagc.v1.GaussianMap",
+    "fusion",
+    Scope.ROBOT,
+    "the fused map trained again on the robot's own images",
+)
 CORRECTED_KEYFRAMES = Topic(
     "/<robot>/corrected_keyframes",
     "duagc.v1.CorrectedKeyframes",
@@ -218,6 +225,7 @@ TOPICS: tuple[Topic, ...] = (
     UNREFINED_MAP,
     INFORMATION,
     FUSED_MAP,
+    REFINED_MAP,
     CORRECTED_KEYFRAMES,
     PEER_MESSAGE,
     PEER_PACKET,

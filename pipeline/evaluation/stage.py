@@ -63,6 +63,7 @@ PROTOCOL = {
     "depth": "blended depth / alpha where alpha >= 0.5, of a Gaussian as its map says: that of its centre or of its "
     "plane; mean over pixels with both depths, then over views",
     "own_unrefined": "the own map before its final refinement, seen as the own map",
+    "refined": "the fused map trained again on the robot's own images, seen as the fused map",
     "calibration": "distance of fused Gaussians from the true surface against sigma along its normal; mean of robots",
 }
 
@@ -255,7 +256,33 @@ def _rendering_section(
                     rows += _view_rows(name, f"{kind}/{view_set}", index, score)
     reasons = dict.fromkeys(VIEW_SETS, "there is no such view") | {"peers": "no two robots met"}
     sections = {m: {s: views.summary(scores[m, s], reasons[s]) for s in VIEW_SETS} for m in MAPS}
-    return sections | {"own_unrefined": {"held_out": _unrefined(run, source, threads, progress, rows)}}
+    return (
+        sections
+        | {"own_unrefined": {"held_out": _unrefined(run, source, threads, progress, rows)}}
+        | {"refined": _refined(run, source, threads, progress, rows)}
+    )
+
+
+def _refined(
+    run: RunFolder, source: Recording, threads: int, progress: bool, rows: list[Row]
+) -> dict[str, Any]:
+    """Scores of the fused maps after their training, over own held-out views and those of the peers."""
+    scores: dict[str, list[Any]] = {"held_out": [], "peers": []}
+    for name, robot in run.robots.items():
+        refined = robot.refined_map
+        if refined is None:
+            continue
+        mates = [run.robots[r] for r in robot.component if r != name]
+        for camera_robot in (robot, *(mate for mate in mates if mate.component == robot.component)):
+            view_set = "held_out" if camera_robot is robot else "peers"
+            task = RenderTask(
+                refined.gaussians, camera_robot, camera_robot.trajectory, keyframes=False, depth=refined.depth
+            )
+            title = f"render refined map of {name} from {camera_robot.robot}"
+            for index, score in task.scores(source, threads, title if progress else None):
+                scores[view_set].append(score)
+                rows += _view_rows(name, f"refined/{view_set}", index, score)
+    return {s: views.summary(found, "no robot met another") for s, found in scores.items()}
 
 
 def _unrefined(

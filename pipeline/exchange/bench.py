@@ -226,8 +226,10 @@ def _evidence(team: _Team, model: LinkModel, case: dict[str, Any], plan: Plan) -
         begun = time.process_time()
         sent = []
         for (name, peer), end in ends.items():
-            beacon = [] if end.idle and round_index else [Message(next(ids[name]), Kind.STATE, b"")]
-            for out in end.burst(round_index, beacon, LinkConfig().budget_bytes):
+            beacon = Message(
+                next(ids[name]), Kind.STATE, b""
+            )  # as agents do: silence would be taken for absence
+            for out in end.burst(round_index, [beacon], LinkConfig().budget_bytes):
                 packet = parse(out.packet)
                 size = len(out.packet)
                 cost.bytes += size

@@ -35,6 +35,10 @@ from pipeline.registration.features import Features, matches, ransac
 
 Array = NDArray[np.float64]
 SETTLED = 1e-4  # m, rad: Gauss-Newton steps shrink fast, what is left after such a one is far smaller
+COARSE_ROUNDS = (
+    2  # first rounds, on levels 2 and 1, after a loop: far from the minimum small images lead there faster
+)
+FAR = 0.02  # m, rad: a registration that contradicts the start by more says that it is far
 UNUSABLE = (Outcome.LOW_OVERLAP, Outcome.RESIDUAL)  # weak directions carry no information and do no harm
 
 
@@ -49,8 +53,9 @@ class View(Protocol):
     def features(self) -> Features: ...
 
 
-Images = Callable[[int], RgbdPyramid]
-"""The images of a keyframe, by its index; read again from the log in every round, so that memory stays bounded."""
+Images = Callable[[int, int], RgbdPyramid]
+"""The images of a keyframe, by its index and the number of levels; read again from the log in every round, so that
+memory stays bounded."""
 
 
 def optimise(
@@ -64,7 +69,7 @@ def optimise(
     """Keyframe poses that explain the images of all overlapping keyframes best; the first keyframe stays.
 
     Args:
-        T_map_keyframes: [k, 4, 4], start. views: of the k keyframes. images: full-resolution image of a keyframe.
+        T_map_keyframes: [k, 4, 4], start. views: of the k keyframes. images: of a keyframe.
         tracked: registrations that connect the keyframes, and loops; they stay where the images say nothing better.
     Returns:
         The poses, and one factor per pair of keyframes: sum of factors = the joint cost at the answer, to second order.
@@ -74,19 +79,27 @@ def optimise(
     exposures: dict[tuple[int, int], tuple[float, float]] = {}
     connected = {(pair.first, pair.second): pair for pair in tracked}
     ends: list[tuple[int, int]] = []
+    coarse_rounds = COARSE_ROUNDS if _far(T_map_keyframes, tracked) else 0
     for index in range(config.optimisation_rounds):
         T = refined.T_map_keyframe
-        if index in (0, config.optimisation_rounds // 2):
+        if index in (0, coarse_rounds, config.optimisation_rounds // 2):
             ends = sorted(
                 {(pair.first, pair.second) for pair in tracked} | set(overlapping(T, views, config)),
                 key=lambda pair: (pair[1], pair[0]),
             )
-        factors = _linearised(T, views, images, ends, connected, exposures, config, registration)
+        level = max(0, coarse_rounds - index)
+        factors = _linearised(T, views, images, ends, connected, exposures, config, registration, level)
         before, refined = T, refine(T, factors, config.huber_sigmas)
         moved_m, turned_rad = se3.distance(before, refined.T_map_keyframe)
-        if index > 0 and max(moved_m.max(), turned_rad.max()) < SETTLED:
+        if index > coarse_rounds and max(moved_m.max(), turned_rad.max()) < SETTLED:
             break
     return refined, factors
+
+
+def _far(T: Array, pairs: Sequence[KeyframePair]) -> bool:
+    """Whether some registration contradicts the poses by more than `FAR`."""
+    found = (se3.distance(pair.T_first_second, se3.inverse(T[pair.first]) @ T[pair.second]) for pair in pairs)
+    return any(max(moved_m, turned_rad) > FAR for moved_m, turned_rad in found)
 
 
 def _linearised(
@@ -98,6 +111,7 @@ def _linearised(
     exposures: dict[tuple[int, int], tuple[float, float]],
     config: KeyframeConfig,
     registration: RegistrationConfig,
+    level: int,
 ) -> list[KeyframePair]:
     """The quadratics of all pairs at the poses T; of a pair that cannot be compared there, what tracking said."""
     results: dict[tuple[int, int], Registration] = {}
@@ -105,15 +119,17 @@ def _linearised(
     loaded, pyramid = -1, None
     for reference_index, target in both_ways:
         if target != loaded:
-            loaded, pyramid = target, images(target)
+            loaded, pyramid = target, images(target, level + 1)
         assert pyramid is not None
         reference = views[reference_index].reference
         T_reference_target = se3.inverse(T[reference_index]) @ T[target]
         known = exposures.get((reference_index, target))
         if known is None:
             # gain and offset first: with wrong ones the weights of the grey values are wrong
-            known = linearise(reference, pyramid, T_reference_target, config=registration).exposure
-        result = linearise(reference, pyramid, T_reference_target, known, registration)
+            known = linearise(
+                reference, pyramid, T_reference_target, config=registration, level=level
+            ).exposure
+        result = linearise(reference, pyramid, T_reference_target, known, registration, level)
         if _comparable(result, config.optimisation_overlap):
             exposures[reference_index, target] = result.exposure
             results[reference_index, target] = result
@@ -261,8 +277,9 @@ def _verified(
     guess, agree = ransac(*points, config.inlier_m, config.hypotheses, rng)
     if agree.sum() < max(config.min_inliers, config.min_inlier_share * len(pairs)):
         return None
-    forth = register(views[first].reference, images(second), guess, registration)
-    back = register(views[second].reference, images(first), se3.inverse(guess), registration)
+    levels = len(registration.iterations)
+    forth = register(views[first].reference, images(second, levels), guess, registration)
+    back = register(views[second].reference, images(first, levels), se3.inverse(guess), registration)
     if not (forth.ok and back.ok) or min(forth.overlap, back.overlap) < config.min_overlap:
         return None
     apart_m, apart_rad = se3.distance(forth.T_reference_target, se3.inverse(back.T_reference_target))

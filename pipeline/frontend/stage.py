@@ -104,18 +104,16 @@ def _refine(
     if len(keyframes) < 2 or not (settings.local_optimisation or settings.loops.enabled):
         return refine(start, tracker.pairs, settings.huber_sigmas), tracker.pairs
 
-    def images(index: int, levels: int = 1) -> RgbdPyramid:
+    def images(index: int, levels: int) -> RgbdPyramid:
         frame = log.frame(keyframes[index].frame_index)
         depth = frame.depth if frame.mask is None else np.where(frame.mask, frame.depth, np.float32(0))
         return RgbdPyramid.build(frame.color * np.float32(1 / 255), depth, log.camera, levels)
 
-    registration, levels = config.tracking.registration, len(config.tracking.strides)
+    registration = config.tracking.registration
     pairs = list(tracker.pairs)
     if settings.loops.enabled:
         tracked = refine(start, pairs, settings.huber_sigmas).T_map_keyframe
-        pairs += bundle.find_loops(
-            tracked, keyframes, lambda k: images(k, levels), settings.loops, registration, seed, log.robot
-        )
+        pairs += bundle.find_loops(tracked, keyframes, images, settings.loops, registration, seed, log.robot)
     if not settings.local_optimisation:
         return refine(start, pairs, settings.huber_sigmas), pairs
     return bundle.optimise(start, keyframes, images, pairs, settings, registration)

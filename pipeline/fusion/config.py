@@ -5,6 +5,27 @@ from typing import Literal
 from pydantic import Field
 
 from pipeline.config import Config
+from pipeline.splat.losses import LossConfig
+from pipeline.splat.optimiser import LearningRates
+
+
+class RefineConfig(Config):
+    """Training of the fused map on the robot's own images."""
+
+    steps_per_view: int = Field(default=6, ge=0)
+    """Steps for each view; 0: the fused map stays as fusion left it."""
+    steps_max: int = Field(default=400, ge=0)
+    """Most steps in all."""
+    support_views: int = Field(default=40, ge=0)
+    """Most tracked frames between keyframes that take part."""
+    rate: float = Field(default=0.3, gt=0.0)
+    """First learning rates as a share of the mapper's."""
+    rate_decay: float = Field(default=0.1, gt=0.0, le=1.0)
+    """They fall exponentially to this share."""
+    rates: LearningRates = LearningRates()
+    loss: LossConfig = LossConfig()
+    thickness_m: float = Field(default=0.001, gt=0.0)
+    """Gaussians do not become thinner than this."""
 
 
 class FusionConfig(Config):
@@ -47,5 +68,6 @@ class FusionConfig(Config):
     """Where a keyframe has no depth but the own map renders more opaque than this, the rendered depth stands in."""
     added_need_information: bool = True
     """Take over only Gaussians on whose position their owner's pixels said something."""
+    refine: RefineConfig = RefineConfig()
     max_added: int | None = Field(default=None, ge=0)
     """At most so many Gaussians of neighbours are taken over, those of most position information first."""

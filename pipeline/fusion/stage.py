@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +13,12 @@ from pipeline.consensus.evidence import unpack_symmetric
 from pipeline.errors import DuagError
 from pipeline.fusion.config import FusionConfig
 from pipeline.fusion.fuse import FusedMap, fuse
+from pipeline.fusion.refine import View, refine
 from pipeline.geometry.trajectory import Trajectory, write_tum
 from pipeline.messages import WORLD_FRAME, CorrectedKeyframes, GaussianInformation, GaussianMap, Odometry
-from pipeline.recording import LogWriter, read_log
+from pipeline.recording import LogWriter, open_rgbd, read_log
 from pipeline.robot import AgentInput, AgentResult, RobotData, load
-from pipeline.splat.gaussians import DepthKind
+from pipeline.splat.gaussians import DepthKind, Gaussians
 from pipeline.splat.ply import write_ply
 from schemas import topics
 
@@ -25,15 +26,23 @@ FUSED_KIND = "gauss_newton"
 
 
 def run_fusion(
-    source: AgentInput, result: AgentResult, folder: Path, config: FusionConfig, matching: MatchingConfig
+    source: AgentInput,
+    result: AgentResult,
+    folder: Path,
+    config: FusionConfig,
+    matching: MatchingConfig,
+    *,
+    seed: int = 0,
+    threads: int = 1,
 ) -> FusedMap:
-    """Write fused.mcap, fused.ply, trajectory.tum and odometry.tum of one robot.
+    """Write fused.mcap, fused.ply, refined.ply, trajectory.tum and odometry.tum of one robot.
 
     Args:
         source: the robot's own files.
         result: what it took home from the session.
         folder: where the results go.
         matching: as the pairs of the session were found.
+        seed: of the run. threads: of the rasterizer; changes no bit.
     Returns:
         The fused map, in the world frame.
     """
@@ -53,14 +62,35 @@ def run_fusion(
     )
     frames = _frames(source)
     stamp_ns = frames[-1].stamp_ns
+    refined = None
+    if len(result.component) > 1 and config.refine.steps_per_view:
+        views = _views(source, frames, result, config.refine.support_views)
+        refined = refine(fused.gaussians, views, own.camera, config.refine, own.depth, seed, threads)
     write_ply(folder / "fused.ply", fused.gaussians)
-    _write_log(folder / "fused.mcap", result, fused, stamp_ns, own.depth)
+    write_ply(folder / "refined.ply", fused.gaussians if refined is None else refined)
+    _write_log(folder / "fused.mcap", result, fused, refined, stamp_ns, own.depth)
     stamps = np.array([f.stamp_ns for f in frames], dtype=np.int64)
     before = np.array([f.T_map_camera for f in frames])
     write_tum(folder / "odometry.tum", Trajectory(stamps, before))
     hung = np.array([result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera for f in frames])
     write_tum(folder / "trajectory.tum", Trajectory(stamps, hung))
     return fused
+
+
+def _views(source: AgentInput, frames: Sequence[Odometry], result: AgentResult, support: int) -> list[View]:
+    """The robot's keyframes and, evenly spread, frames between them, at their corrected poses; none held out."""
+    topic = topics.KEYFRAME.of(source.robot)
+    keyframes = {record.message().frame_index for record in read_log(source.frontend, (topic,))}
+    others = [f for f in frames if f.frame_index not in keyframes and not f.held_out]
+    count = min(support, len(others))
+    middles = [others[(2 * k + 1) * len(others) // (2 * count)] for k in range(count)]
+    views = []
+    with open_rgbd(source.log) as log:
+        for f in [*(f for f in frames if f.frame_index in keyframes), *middles]:
+            frame = log.frame(f.frame_index)
+            T_world_camera = result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera
+            views.append(View(frame.color, frame.usable_depth, T_world_camera, frame.mask))
+    return views
 
 
 def _depth_images(own: RobotData) -> Iterator[tuple[int, NDArray[np.float32]]]:
@@ -78,7 +108,14 @@ def _frames(source: AgentInput) -> list[Odometry]:
     return placed
 
 
-def _write_log(path: Path, result: AgentResult, fused: FusedMap, stamp_ns: int, depth: DepthKind) -> None:
+def _write_log(
+    path: Path,
+    result: AgentResult,
+    fused: FusedMap,
+    refined: Gaussians | None,
+    stamp_ns: int,
+    depth: DepthKind,
+) -> None:
     robot = result.robot
     keyframes = CorrectedKeyframes(
         stamp_ns=stamp_ns,
@@ -93,6 +130,9 @@ def _write_log(path: Path, result: AgentResult, fused: FusedMap, stamp_ns: int, 
     with LogWriter(path, robot) as log:
         log.write(topics.CORRECTED_KEYFRAMES.of(robot), keyframes, stamp_ns, stamp_ns)
         log.write(topics.FUSED_MAP.of(robot), fused_map, stamp_ns, stamp_ns)
+        if refined is not None:
+            refined_map = GaussianMap(stamp_ns, robot, WORLD_FRAME, refined, None, depth)
+            log.write(topics.REFINED_MAP.of(robot), refined_map, stamp_ns, stamp_ns)
 
 
 def _information(robot: str, fused: FusedMap, stamp_ns: int) -> GaussianInformation:

@@ -33,6 +33,9 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 
 MAD_TO_SIGMA = 1.4826  # of a normal distribution
+MAD_STRIDE = 4  # residuals between those that estimate a scale, where there are thousands
+SETTLED = 4e-6  # m, rad: steps shrink by a third or more each, so less than half of the last one is left
+SETTLED_COARSE = 4e-5  # the next level begins with an error of its own size anyway
 TILES = (10, 8)  # columns and rows of the tiles over which correlated residuals are summed
 
 
@@ -225,11 +228,12 @@ def linearise(
     T_reference_target: Array,
     exposure: tuple[float, float] = (1.0, 0.0),
     config: RegistrationConfig | None = None,
+    level: int = 0,
 ) -> Registration:
     """The cost of a pair near one pose, as a quadratic: for whoever minimises the costs of many pairs together.
 
     Args:
-        reference, pyramid: as for `register`; only their finest level is used.
+        reference, pyramid: as for `register`. level: the one that is used, 0 = finest.
         T_reference_target: where the cost is expanded. exposure: (gain, offset) there.
     Returns:
         Information at that pose, and the pose and exposure one Gauss-Newton step from it: the minimum of the
@@ -238,7 +242,7 @@ def linearise(
     config = config or RegistrationConfig()
     T = _orthonormal(np.asarray(T_reference_target, dtype=np.float64))
     start = np.array(exposure)
-    system = _linearise(reference, pyramid, 0, T, start, config)
+    system = _linearise(reference, pyramid, level, T, start, config)
     found = _Determined.by(system, config)
     step = _step(system, T, T, None, found.projection)
     return _judge(system, found, T @ se3.exp(step[:6]), T, start + step[6:], config, None)
@@ -269,7 +273,7 @@ def _minimise(
             step = _step(system, T, guess, prior_information, projection)
             T = _orthonormal(T @ se3.exp(step[:6]))
             exposure = exposure + step[6:]
-            if np.max(np.abs(step[:6])) < 1e-6:
+            if np.max(np.abs(step[:6])) < (SETTLED if index == 0 else SETTLED_COARSE):
                 break
     return T, exposure, _linearise(reference, pyramid, 0, T, exposure, config)
 
@@ -452,7 +456,8 @@ def _weighted(
 ) -> _Residuals:
     """Scale by the median absolute deviation, weights by Huber: w = 1 / (scale^2 max(1, |r| / (k scale)))."""
     magnitude = np.abs(residual)
-    scale = max(MAD_TO_SIGMA * float(np.median(magnitude)), floor) if len(residual) else floor
+    part = magnitude[::MAD_STRIDE] if len(magnitude) > 1000 * MAD_STRIDE else magnitude
+    scale = max(MAD_TO_SIGMA * float(np.median(part)), floor) if len(residual) else floor
     weight = 1 / (
         np.maximum(np.float32(1), magnitude / np.float32(huber_sigmas * scale)) * np.float32(scale**2)
     )

@@ -225,14 +225,15 @@ def _top_view(ways: Sequence[Path3], names: Sequence[str]) -> str:
 def _rendering_rows(metrics: dict[str, Any]) -> list[dict[str, Any]]:
     return [
         {
-            "map": kind,
+            "map": kind.replace("_", ", "),
             "view_set": view_set.replace("_", " "),
             "values": [
                 words.text(name, metrics["rendering"][kind][view_set][name]) for name in words.RENDERING
             ],
         }
-        for kind in ("own", "fused")
+        for kind in ("own", "own_unrefined", "fused", "refined")
         for view_set in ("held_out", "training", "peers")
+        if view_set in metrics["rendering"].get(kind, {})
     ]
 
 

@@ -201,6 +201,8 @@ def _write_robot(folder: Path, robot: str, index: int, component: list[str], joi
     with LogWriter(folder / "fused.mcap", robot) as log:
         fused_map = GaussianMap(end, robot, "world", fused, information(robot, fused, known=joined))
         log.write(topics.FUSED_MAP.of(robot), fused_map, end)
+        if joined:
+            log.write(topics.REFINED_MAP.of(robot), GaussianMap(end, robot, "world", fused), end)
         indices = np.arange(len(KEYFRAMES), dtype=np.int32)
         corrected = CorrectedKeyframes(end, robot, component, indices, after[list(KEYFRAMES)])
         log.write(topics.CORRECTED_KEYFRAMES.of(robot), corrected, end)

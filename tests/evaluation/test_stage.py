@@ -33,6 +33,7 @@ SCHEMA = {
     "rendering": {
         **{kind: {"held_out": VIEWS, "training": VIEWS, "peers": VIEWS} for kind in ("own", "fused")},
         "own_unrefined": {"held_out": VIEWS},
+        "refined": {"held_out": VIEWS, "peers": VIEWS},
     },
     "calibration": dict.fromkeys(
         ("ece_paper", "ece_rank", "ece_rank_shuffled", "spearman", "ause", "nll", "coverage_95", "nll_scaled",
@@ -52,7 +53,7 @@ SCHEMA = {
     "protocol": dict.fromkeys(
         ("alignment", "ate", "team_ate", "rpe", "depth_agreement",
          "initial_relative_poses", "held_out", "peers", "training", "poses",
-         "exposure", "own_unrefined", "background", "psnr", "ssim", "ms_ssim", "depth", "calibration",
+         "exposure", "own_unrefined", "refined", "background", "psnr", "ssim", "ms_ssim", "depth", "calibration",
          "oracle"),
         str,
     ),

@@ -57,7 +57,7 @@ class Walk:
             assert found.ok
             self.pairs.append(KeyframePair(k - 1, k, found.T_reference_target, found.information))
 
-    def images(self, index: int) -> RgbdPyramid:
+    def images(self, index: int, levels: int) -> RgbdPyramid:
         return self.pyramids[index]
 
     def chained(self, pairs: list[KeyframePair]) -> np.ndarray:
@@ -116,7 +116,9 @@ def test_keyframe_that_shows_nothing_keeps_what_tracking_said(noisy: Walk) -> No
     dark = RgbdPyramid.build(np.zeros((240, 320), np.float32), np.zeros((240, 320), np.float32), CAMERA)
     views = [*noisy.views[:7], View.of(dark)]
     images = [*noisy.pyramids[:7], dark]
-    found, factors = optimise(noisy.truth, views, images.__getitem__, noisy.pairs, CONFIG, REGISTRATION)
+    found, factors = optimise(
+        noisy.truth, views, lambda k, levels: images[k], noisy.pairs, CONFIG, REGISTRATION
+    )
     of_dark = [f for f in factors if 7 in (f.first, f.second)]
     assert of_dark == [noisy.pairs[-1]]
     moved = se3.inverse(found.T_map_keyframe[6]) @ found.T_map_keyframe[7]
@@ -157,8 +159,8 @@ def test_loop_is_found_and_closes_the_drift(circle: Walk) -> None:
         assert se3.distance(truth, loop.T_first_second)[0] < 5e-3
     assert circle.error_m(start) > 0.07
     closed, _ = optimise(start, circle.views, circle.images, [*wrong, *loops], CONFIG, REGISTRATION)
-    # association is projective: rounds converge as ICP does; 40 of them end at 4 mm, ten at 17
-    assert circle.error_m(closed.T_map_keyframe) < 0.25 * circle.error_m(start)
+    # association is projective, rounds converge as ICP does: ten of them end at 6 mm, forty at 2
+    assert circle.error_m(closed.T_map_keyframe) < 0.01 < 0.2 * circle.error_m(start)
 
 
 def test_known_overlaps_and_foreign_places_are_no_loops(circle: Walk) -> None:
@@ -170,7 +172,7 @@ def test_known_overlaps_and_foreign_places_are_no_loops(circle: Walk) -> None:
     images = [circle.pyramids[k] for k in half]
     far = circle.truth[half]
     far[-1, :3, 3] += 5
-    assert find_loops(far, views, images.__getitem__, LoopConfig(), REGISTRATION, 0, "alpha") == []
+    assert find_loops(far, views, lambda k, levels: images[k], LoopConfig(), REGISTRATION, 0, "alpha") == []
 
 
 def test_overlapping_pairs_are_those_that_see_each_other(circle: Walk) -> None:

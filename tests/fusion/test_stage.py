@@ -136,7 +136,8 @@ def robot(tmp_path_factory):
 def fuse_files(robot, result, folder):
     source = AgentInput("bravo", robot.log, robot.frontend, robot.information)
     run_fusion(source, result, folder, FusionConfig(), MatchingConfig())
-    return {type(r.message()): r.message() for r in read_log(folder / "fused.mcap")}
+    fused = [topics.FUSED_MAP.of("bravo"), topics.CORRECTED_KEYFRAMES.of("bravo")]
+    return {type(r.message()): r.message() for r in read_log(folder / "fused.mcap", topics=fused)}
 
 
 def test_alone_everything_stays(robot, tmp_path):

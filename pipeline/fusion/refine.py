@@ -1,0 +1,81 @@
+"""A fused map trained again on what the robot itself saw, at its corrected poses.
+
+Consensus moves keyframes and fusion moves Gaussians; nobody asks the images whether the result still draws them. Some
+steps of the mapper's own kind do: colour and depth loss of the robot's keyframes and frames between them, never of
+held-out ones. What no own view sees gets no gradient and stays as it was taken over. The information is that of before:
+what is learned here comes from the same pixels and is not counted again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import streams
+from pipeline.fusion.config import RefineConfig
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
+from pipeline.splat.gaussians import DepthKind, Gaussians
+
+
+@dataclass(frozen=True)
+class View:
+    """An own image: colour uint8 [H, W, 3], depth (m, 0 = none) [H, W], T_world_camera [4, 4], pixels that count."""
+
+    color: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    T_world_camera: NDArray[np.float64]
+    mask: NDArray[np.bool_] | None = None
+
+
+def refine(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    camera: PinholeCamera,
+    config: RefineConfig,
+    depth: DepthKind,
+    seed: int,
+    threads: int = 1,
+) -> Gaussians:
+    """The map after `config.steps_per_view` steps for each view, in random order, each once before any comes again.
+
+    Args:
+        gaussians: in the world frame of the views. threads: changes no bit.
+    Returns:
+        As many Gaussians, in the same order, with the same ids and anchors.
+    """
+    steps = min(config.steps_per_view * len(views), config.steps_max)
+    if not steps or not len(gaussians):
+        return gaussians
+    rasterizer, adam = Rasterizer(threads=threads), CompiledAdam(len(gaussians), threads=threads)
+    weights = LossWeights(**config.loss.model_dump())
+    floor = np.minimum(
+        gaussians.log_scales, np.float32(np.log(config.thickness_m))
+    )  # thinner ones stay as they are
+    order = np.zeros(0, np.int64)
+    for step in range(steps):
+        position = step % len(views)
+        if position == 0:
+            order = streams.generator(seed, "fusion.refine", start=step).permutation(len(views))
+        view = views[order[position]]
+        _, gradients = rasterizer.view_gradients(
+            gaussians,
+            camera,
+            se3.inverse(view.T_world_camera),
+            view.color.astype(np.float32) * np.float32(1 / 255),
+            view.depth_m,
+            weights,
+            mask=view.mask,
+            depth=depth,
+        )
+        share = config.rate * config.rate_decay ** (step / max(steps - 1, 1))
+        stepped = adam.step(gaussians, gradients, config.rates.times(share))
+        gaussians = stepped.replace(
+            log_scales=np.maximum(stepped.log_scales, floor),
+            opacity_logits=np.clip(stepped.opacity_logits, np.float32(-6), np.float32(6)),
+        )
+    return gaussians

@@ -1,0 +1,94 @@
+"""Training of a fused map: better on the own images, elsewhere as it was, and the same each time."""
+
+import numpy as np
+import pytest
+
+from pipeline.fusion.config import RefineConfig
+from pipeline.fusion.refine import View, refine
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.kernels import Rasterizer
+from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.losses import psnr
+
+CAMERA = PinholeCamera(64, 48, 55.0, 55.0, 31.5, 23.5)
+POSES = [se3.exp(np.array([0.05 * k, 0.02 * k, 0, 0, -0.02 * k, 0])) for k in range(6)]
+
+
+def wall(n: int = 400) -> Gaussians:
+    """Discs on a wall 2 m away, and ten behind the camera."""
+    rng = np.random.default_rng(0)
+    means = np.column_stack([rng.uniform(-1.6, 1.6, n), rng.uniform(-1.2, 1.2, n), np.full(n, 2.0)])
+    means[-10:, 2] = -3.0
+    return Gaussians(
+        np.arange(n),
+        np.zeros(n, np.int32),
+        means,
+        np.tile([1.0, 0, 0, 0], (n, 1)),
+        np.tile(np.log([0.08, 0.08, 0.001]), (n, 1)),
+        rng.uniform(0.1, 0.9, (n, 3)),
+        np.full(n, 1.5),
+    )
+
+
+@pytest.fixture(scope="module")
+def spoilt() -> tuple[Gaussians, list[View]]:
+    """A wall whose Gaussians were moved and dulled after its images were taken."""
+    true = wall()
+    views = []
+    for T in POSES:
+        render = Rasterizer().forward(true, CAMERA, se3.inverse(T))
+        depth = np.where(render.alpha > 0.9, render.depth / np.maximum(render.alpha, 1e-6), 0)
+        color = np.clip(np.rint(255 * render.color), 0, 255).astype(np.uint8)
+        views.append(View(color, depth.astype(np.float32), T))
+    rng = np.random.default_rng(1)
+    moved = true.means + rng.normal(0, 0.01, true.means.shape).astype(np.float32)
+    return true.replace(means=moved, colors=0.8 * true.colors), views
+
+
+def score(gaussians: Gaussians, views: list[View]) -> float:
+    drawn = [Rasterizer().forward(gaussians, CAMERA, se3.inverse(v.T_world_camera)) for v in views]
+    return float(np.mean([psnr(r.color, v.color / 255) for r, v in zip(drawn, views, strict=True)]))
+
+
+def test_it_draws_better_also_where_it_was_not_trained(spoilt: tuple[Gaussians, list[View]]) -> None:
+    gaussians, views = spoilt
+    train, held_out = views[::2], views[1::2]
+    better = refine(gaussians, train, CAMERA, RefineConfig(steps_per_view=30), "blended", seed=0)
+    assert score(better, train) > score(gaussians, train) + 5
+    assert score(better, held_out) > score(gaussians, held_out) + 3
+    assert np.array_equal(better.ids, gaussians.ids)
+
+
+def test_what_no_view_sees_stays(spoilt: tuple[Gaussians, list[View]]) -> None:
+    gaussians, views = spoilt
+    better = refine(gaussians, views, CAMERA, RefineConfig(), "blended", seed=0)
+    for name in ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits"):
+        before, after = getattr(gaussians, name), getattr(better, name)
+        assert np.array_equal(before[-10:], after[-10:])
+        assert not np.array_equal(before[:-10], after[:-10])
+
+
+def test_masked_pixels_teach_nothing(spoilt: tuple[Gaussians, list[View]]) -> None:
+    gaussians, views = spoilt
+    nothing = [View(v.color, v.depth_m, v.T_world_camera, np.zeros((48, 64), bool)) for v in views]
+    same = refine(gaussians, nothing, CAMERA, RefineConfig(), "blended", seed=0)
+    assert np.array_equal(same.means, gaussians.means)
+    assert np.array_equal(same.colors, gaussians.colors)
+
+
+def test_the_same_bits_on_any_number_of_threads(spoilt: tuple[Gaussians, list[View]]) -> None:
+    gaussians, views = spoilt
+    one, three, other = (
+        refine(gaussians, views, CAMERA, RefineConfig(), "ray_plane", seed=seed, threads=threads)
+        for seed, threads in ((0, 1), (0, 3), (1, 1))
+    )
+    assert np.array_equal(one.means, three.means)
+    assert np.array_equal(one.colors, three.colors)
+    assert not np.array_equal(one.means, other.means)
+
+
+def test_no_steps_change_nothing(spoilt: tuple[Gaussians, list[View]]) -> None:
+    gaussians, views = spoilt
+    assert refine(gaussians, views, CAMERA, RefineConfig(steps_per_view=0), "blended", seed=0) is gaussians
+    assert refine(gaussians, [], CAMERA, RefineConfig(), "blended", seed=0) is gaussians
