@@ -33,7 +33,7 @@ class Caster:
             self._tensor(scene.vertices.astype(np.float32)), self._tensor(scene.triangles.astype(np.uint32))
         )
 
-    def hits(self, origins: Array, directions: Array) -> dict[str, NDArray]:
+    def hits(self, origins: Array, directions: NDArray[np.floating]) -> dict[str, NDArray]:
         """Where rays [n, 3] first meet the scene.
 
         Returns:
@@ -62,16 +62,12 @@ class MeshRenderer:
 
     def __init__(self, caster: Caster, camera: PinholeCamera) -> None:
         self.caster, self.scene, self.camera = caster, caster.scene, camera
-        rays = camera.rays().reshape(-1, 3)
-        step = np.array([1 / camera.fx, 1 / camera.fy, 0.0])
-        self._centers = rays
-        self._samples = np.concatenate([rays + step * (*offset, 0.0) for offset in OFFSETS])
         self._texel_density = _texel_density(self.scene)
 
     def depth(self, T_world_camera: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
         """Depth (z, m, [h, w]; 0 = nothing) and triangle seen (-1 = nothing) at the pixel centres."""
         T = np.asarray(T_world_camera, dtype=np.float64)
-        hit = self.caster.hits(T[:3, 3], self._centers @ T[:3, :3].T)
+        hit = self.caster.hits(T[:3, 3], self._directions(T, 0.0, 0.0))
         seen = np.isfinite(hit["t"])
         depth = np.where(seen, hit["t"], 0.0).astype(np.float64)
         triangle = np.where(seen, hit["triangle"].astype(np.int64), -1)
@@ -82,7 +78,7 @@ class MeshRenderer:
         """Colour and depth from a camera pose T_world_camera [4, 4]."""
         depth, triangle = self.depth(T_world_camera)
         T = np.asarray(T_world_camera, dtype=np.float64)
-        directions = self._samples @ T[:3, :3].T
+        directions = np.concatenate([self._directions(T, *offset) for offset in OFFSETS])
         hit = self.caster.hits(T[:3, 3], directions)
         missed = np.flatnonzero(~np.isfinite(hit["t"]))
         hit["t"][missed], hit["triangle"][missed] = 0.0, 0  # black in the end
@@ -93,16 +89,29 @@ class MeshRenderer:
         mean = colors.reshape(len(OFFSETS), *depth.shape, 3).mean(axis=0)
         return View(np.clip(np.rint(mean), 0, 255).astype(np.uint8), depth, triangle)
 
+    def _directions(self, T_world_camera: Array, du: float, dv: float) -> NDArray[np.float32]:
+        """World directions [h * w, 3] of rays beside the pixel centres by (du, dv) px, one metre along z.
+
+        Column by column: a product of matrices so narrow takes twenty times as long.
+        """
+        camera = self.camera
+        x = (np.arange(camera.width) + du - camera.cx) / camera.fx
+        y = ((np.arange(camera.height) + dv - camera.cy) / camera.fy)[:, None]
+        directions = np.empty((camera.height, camera.width, 3), dtype=np.float32)
+        for k, (a, b, c) in enumerate(T_world_camera[:3, :3]):
+            directions[..., k] = x * a + (y * b + c)
+        return directions.reshape(-1, 3)
+
     def _level(
         self,
         depth: NDArray[np.float32],
         triangle: NDArray[np.int32],
-        directions: Array,
+        directions: NDArray[np.float32],
         normals: NDArray[np.float32],
     ) -> NDArray[np.float32]:
         """Mip level [n] whose texels are as large as samples are apart on the surface (geometric mean of both ways)."""
-        way = directions.astype(np.float32)
-        cosine = np.abs(np.einsum("ij,ij->i", normals, way)) / np.sqrt(np.einsum("ij,ij->i", way, way))
+        length = np.sqrt(np.einsum("ij,ij->i", directions, directions))
+        cosine = np.abs(np.einsum("ij,ij->i", normals, directions)) / length
         focal = np.sqrt(self.camera.fx * self.camera.fy)
         apart_m = SAMPLE_SPACING_PX / focal * depth / np.sqrt(np.clip(cosine, LEAST_COSINE, 1.0))
         texels = np.maximum(apart_m * self._texel_density[triangle], 1.0)
