@@ -176,7 +176,9 @@ class Tracker:
         if enough or not self.keyframes or self._long_lost(stamp_ns):
             return without
         found = self._find_near(stamp_ns, pyramid.without_depth())
-        return replace(found, without=without) if isinstance(found, _Found) else without
+        if isinstance(found, Reason) or found.result.view < failure.min_view_without_depth:
+            return without
+        return replace(found, without=without)
 
     def _follow_by_depth(self, stamp_ns: int, pyramid: RgbdPyramid) -> _Found | Reason:
         """Follow a frame whose colour is stuck by its depth alone, for a few frames: walls do not hold it long."""
