@@ -101,8 +101,8 @@ class Odometry:
     keyframe_index: keyframe it was tracked against. T_map_camera, T_keyframe_camera: [4, 4].
     information: [6, 6] of T_keyframe_camera, right tangent (translation m, rotation rad); zero when lost.
     status: "ok", "lost" or "relocalised". overlap: share of the reference seen, 0..1.
-    rms_depth_m, rms_color: residuals, metres and image units. reason: why it is lost, or tracked by colour
-    alone, else "".
+    rms_depth_m, rms_color: residuals, metres and image units. reason: why it is lost, or tracked by one
+    image alone, else "".
     """
 
     schema: ClassVar[str] = "duagc.v1.Odometry"

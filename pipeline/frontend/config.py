@@ -77,6 +77,10 @@ class FailureConfig(Config):
 
     max_frames_without_depth: int = 15
     """Frames in a row that are tracked by colour alone, because their depth is missing or stuck."""
+    min_view_without_depth: float = 0.6
+    """Share of the keyframe's samples that must be inside such a frame: colour alone is poor where little is shared."""
+    max_frames_without_color: int = 3
+    """Frames in a row that are tracked by depth alone, because their colour is stuck; walls do not hold it long."""
     stuck_share: float = 0.99
     """An image is stuck if this share of its measured pixels has the very values of the image before."""
     stuck_gray_change: float = 0.08

@@ -197,7 +197,7 @@ class Mapper:
         before = self._mean_loss()
         inserted = pruned = 0
         steps = min(config.final_iterations * len(self._views), config.final_iterations_max)
-        rounds = {steps * (k + 1) // (2 * config.densify_rounds + 2) for k in range(config.densify_rounds)}
+        rounds = [steps * (k + 1) // (2 * config.densify_rounds + 2) for k in range(config.densify_rounds)]
         self._adam.freeze_after(None)
         order = np.zeros(0, np.int64)
         for step in range(steps):
@@ -205,13 +205,15 @@ class Mapper:
             if position == 0:
                 order = streams.generator(self.seed, "mapping.finish", start=step).permutation(len(views))
             if step in rounds:
-                came, went = self._densify()
+                came, went = self._densify(1.0 / (len(rounds) - rounds.index(step)))
                 inserted, pruned = inserted + came, pruned + went
             elif step == steps // 2:
                 pruned += self._keep(self._contributions(self._views)[0] >= config.min_contribution)
             rates = config.rates.times(config.final_rate_decay ** (step / max(steps - 1, 1)))
             self._optimise(views[order[position]], 0, rates)
         pruned += self._prune_degenerate()
+        if config.exposure and self._views:
+            self._centre_exposures(views)
         return MappingStats(inserted, pruned, len(self._gaussians), before, self._mean_loss())
 
     # --- one view -----------------------------------------------------------------------------------------------
@@ -249,13 +251,27 @@ class Mapper:
         """One Adam step of all Gaussians in one view."""
         loss, gradients = self._view_gradients(view, level)
         if self.config.exposure and view is not self._views[0]:
-            view.step_exposure(loss.d_exposure, self.config.exposure_rate)
+            decay = rates.colors / self.config.rates.colors
+            view.step_exposure(loss.d_exposure, self.config.exposure_rate * decay)
         stepped = self._adam.step(self._gaussians, gradients, rates)
         floor = np.float32(np.log(self.config.seeding.thickness_m))
         self._gaussians = stepped.replace(
             log_scales=np.maximum(stepped.log_scales, floor),
             opacity_logits=np.clip(stepped.opacity_logits, np.float32(-6), np.float32(6)),
         )
+
+    def _centre_exposures(self, views: Sequence[_View]) -> None:
+        """Give the map the keyframes' mean exposure, so that (0, 0) is the best guess for an image that has none.
+
+        Nothing that is drawn in an exposure changes, but for what shines through from the background.
+        """
+        gain, offset = np.array([view.exposure for view in self._views]).mean(axis=0)
+        shift = offset / np.mean([np.exp(view.exposure[0] - gain) for view in self._views])
+        for view in views:
+            a, b = view.exposure
+            view.exposure = (float(a - gain), float(b - np.exp(a - gain) * shift))
+        colors = np.float32(np.exp(gain)) * self._gaussians.colors + np.float32(shift)
+        self._gaussians = self._gaussians.replace(colors=colors)
 
     # --- what is in the map -------------------------------------------------------------------------------------
 
@@ -305,32 +321,23 @@ class Mapper:
         self._adam.extend(len(new))
         self._contribution = np.concatenate([self._contribution, np.full(len(new), np.inf)])
 
-    def _densify(self) -> tuple[int, int]:
+    def _densify(self, share: float) -> tuple[int, int]:
         """Replace what contributes nothing by discs where keyframes are drawn worst; how many came and went.
 
-        Every keyframe gets an equal part of the room, in turn, and sees what those before it inserted.
+        `share` of the room below the cap is used. Every keyframe gets an equal part of it, in turn, and sees what
+        those before it inserted; no more than an eighth of its finest cells is seeded.
         """
-        config = self.config
-        contributions, _ = self._contributions(self._views)
-        keep = contributions >= config.min_contribution
-        wanted = int(config.densify_share * config.max_gaussians)
-        excess = (
-            int(np.count_nonzero(keep))
-            + int(config.relocate_share * config.max_gaussians)
-            - config.max_gaussians
-        )
-        if excess > 0:
-            order = np.argsort(np.where(keep, contributions, np.inf), kind="stable")
-            keep[order[:excess]] = False
-        pruned = self._keep(keep)
-        room = min(config.max_gaussians - len(self._gaussians), wanted)
+        pruned = self._keep(self._contributions(self._views)[0] >= self.config.min_contribution)
+        room = int(share * (self.config.max_gaussians - len(self._gaussians)))
         inserted = 0
         for k, view in enumerate(self._views):
             budget = room * (k + 1) // len(self._views) - room * k // len(self._views)
-            color, depth_m = view.images(0)
             render = self._draw(view, 0)
+            color, depth_m = view.images(0)
             color = self._as_drawn(view, color, render)
-            new = self._discs(view, color, depth_m, worst_drawn(render, color, depth_m, 4 * budget), budget)
+            budget = min(budget, depth_m.size // (8 * self.config.seeding.cell_sizes_px[-1] ** 2))
+            wanted = worst_drawn(render, color, depth_m, budget, self.config.seeding)
+            new = self._discs(view, color, depth_m, wanted, budget)
             self._append(new)
             inserted += len(new)
         return inserted, pruned

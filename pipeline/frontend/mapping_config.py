@@ -22,9 +22,9 @@ class MappingConfig(Config):
     """Most older keyframes, by the places they look at, whose overlap with a new one is computed."""
     random_keyframes: int = 2
     """Older keyframes added to the window by lot, against forgetting."""
-    iterations: int = 16
+    iterations: int = 24
     """Optimisation steps (one view each) at a keyframe; every second one is on the newest keyframe."""
-    iterations_level: int = 1
+    iterations_level: int = 0
     """Image pyramid level of these steps: 0 full size, 1 half size."""
     final_iterations: int = 60
     """Steps of the final refinement for every keyframe, at full size, shared by all views."""
@@ -33,12 +33,8 @@ class MappingConfig(Config):
     support_views: int = 40
     """Most tracked frames between keyframes that take part in the final refinement; 0: keyframes only."""
     densify_rounds: int = 4
-    """Times, in the first half of the final refinement, that Gaussians that contribute nothing are replaced by new
-    ones where the images are drawn worst; 0: never."""
-    densify_share: float = 0.08
-    """Most of the cap that one such round may seed."""
-    relocate_share: float = 0.0
-    """Least of the cap that one such round makes free, whatever the Gaussians that go contribute."""
+    """Times, in the first half of the final refinement, that Gaussians that contribute nothing are pruned and the
+    room below the cap is seeded where the keyframes are drawn worst; 0: never. The last round fills the cap."""
     rates: LearningRates = LearningRates()
     final_rate_decay: float = 0.05
     """The final refinement's learning rates fall exponentially to this share."""
@@ -61,5 +57,5 @@ class MappingConfig(Config):
     contribution_color_sigma: float = 0.03
     contribution_depth_sigma_m: float = 0.02
     exposure: bool = False
-    """Fit a gain and an offset per keyframe (the first keyframe's stay 1 and 0)."""
+    """Fit a gain and an offset per view; the map ends in the mean exposure of its keyframes."""
     exposure_rate: float = 2e-3

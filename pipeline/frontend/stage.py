@@ -237,7 +237,7 @@ def _support(
         frame
         for frame in frames
         if frame.status is not Status.LOST
-        and frame.reason is Reason.NONE  # its depth belongs to it
+        and frame.reason is Reason.NONE  # its depth and its colour belong together
         and frame.frame_index not in taken
         and not is_held_out(frame.frame_index)
     ]

@@ -54,7 +54,7 @@ class TrackedFrame:
 
     keyframe_index: the keyframe that it hangs on. T_keyframe_camera: [4, 4]; the last known one if lost.
     information: [6, 6] of T_keyframe_camera, right tangent (translation m, rotation rad); zero if lost. reason: why
-    it is lost, or why only its colour was used.
+    it is lost, or why only its colour or only its depth was used.
     """
 
     frame_index: int
@@ -89,7 +89,7 @@ class TrackedKeyframe:
 
 @dataclass(frozen=True)
 class _Found:
-    """A registration of a frame to a keyframe. without: why only its colour was used."""
+    """A registration of a frame to a keyframe. without: why only its colour, or only its depth, was used."""
 
     keyframe_index: int
     result: Registration
@@ -131,7 +131,7 @@ class Tracker:
         self._unconfirmed: _Unconfirmed | None = None
         self._gray_rms: list[float] = []  # of the last frames that were followed
         self._obstructed = False  # something stands before the camera
-        self._without_depth = 0  # frames in a row without usable depth
+        self._without_depth = self._without_color = 0  # frames in a row without a usable image
 
     def track(
         self,
@@ -164,8 +164,8 @@ class Tracker:
         failure = self.config.tracking.failure
         stuck = self._stuck.look(pyramid)
         if stuck is Reason.STUCK_COLOR:
-            return stuck
-        without = stuck
+            return self._follow_by_depth(stamp_ns, pyramid)
+        self._without_color, without = 0, stuck
         if not has_enough_depth(pyramid, self.config.tracking.registration):
             without = Reason.NO_DEPTH
         if without is Reason.NONE:
@@ -176,7 +176,27 @@ class Tracker:
         if enough or not self.keyframes or self._long_lost(stamp_ns):
             return without
         found = self._find_near(stamp_ns, pyramid.without_depth())
-        return replace(found, without=without) if isinstance(found, _Found) else without
+        if isinstance(found, Reason) or found.result.view < failure.min_view_without_depth:
+            return without
+        return replace(found, without=without)
+
+    def _follow_by_depth(self, stamp_ns: int, pyramid: RgbdPyramid) -> _Found | Reason:
+        """Follow a frame whose colour is stuck by its depth alone, for a few frames: walls do not hold it long."""
+        self._without_color += 1
+        tracking = self.config.tracking
+        if (
+            self._lost
+            or not self.keyframes
+            or self._without_color > tracking.failure.max_frames_without_color
+        ):
+            return Reason.STUCK_COLOR
+        predicted, known = self._predicted(stamp_ns)
+        by_depth = tracking.registration.model_copy(update={"residuals": "depth"})
+        reference = self.keyframes[self._current].reference
+        found = _Found(
+            self._current, register(reference, pyramid, predicted, by_depth, known), Reason.STUCK_COLOR
+        )
+        return found if found.result.ok else Reason.STUCK_COLOR
 
     def _begin(self, frame_index: int, stamp_ns: int, pyramid: RgbdPyramid) -> TrackedFrame:
         """Make the first keyframe, unless the frame is held out or shows too little surface."""
@@ -200,7 +220,7 @@ class Tracker:
         self._velocity = se3.log(step) / elapsed_s if followed else np.zeros(6)
         self._current, self._T_keyframe_camera, self._lost = keyframe_index, result.T_reference_target, False
         self._stamp_ns, self._unconfirmed = stamp_ns, None
-        if followed:
+        if followed and found.without is Reason.NONE:
             self._gray_rms = [*self._gray_rms[1 - USUAL_FRAMES :], result.rms_gray]
         if (
             not is_held_out(frame_index)

@@ -14,6 +14,7 @@ _AS_GIVEN = ClosureConfig(
     sigma_floor_m=0, sigma_floor_rad=0, drift_floor_m=0, drift_floor_rad=0, min_support=1,
     frame_sigma_m=5.0, frame_sigma_rad=0.1,
 )  # fmt: skip
+_ROBUST_PENALTY = 0.1
 
 
 class PoseGraphConfig(Config):
@@ -41,8 +42,8 @@ class PoseGraphConfig(Config):
     """The exact steps end when nothing moves more than this (m, rad)."""
     elimination_wire: Literal["float32", "float64"] = "float64"
     """Precision of the matrices on the wire; float32 halves the bytes, and slows ill-conditioned graphs."""
-    paper_penalty: float = Field(default=1.0, gt=0.0)
-    """rho of the printed iteration, as a multiple of the closures' information."""
+    paper_penalty: float = Field(default=0.01, gt=0.0)
+    """rho of the printed iteration, as a multiple of the closures' information; larger ones diverge sooner."""
 
 
 def settings(
@@ -50,7 +51,9 @@ def settings(
 ) -> PoseGraphConfig:
     """Settings of the command line."""
     default = PoseGraphConfig()
-    consensus = default.consensus.model_copy(update={"robust": robust == "gnc"})
+    consensus = default.consensus
+    if robust == "gnc":  # penalties stay as they are while weights change, and long chains want small ones
+        consensus = consensus.model_copy(update={"robust": True, "penalty_start": _ROBUST_PENALTY})
     return PoseGraphConfig(
         solver=solver, loss_probability=loss, seed=seed, max_rounds=max_rounds, consensus=consensus
     )

@@ -37,7 +37,7 @@ class LossConfig(Config):
 
     color_huber: float = 0.1
     """Colour residual (0..1) where the loss turns from quadratic to linear; the slope beyond is 1."""
-    depth_weight: float = 0.5
+    depth_weight: float = 1.0
     """Weight of one metre of depth error against one unit of colour."""
     depth_huber_m: float = 0.02
     """Depth residual in metres where the loss turns from quadratic to linear; the slope beyond is 1."""

@@ -40,11 +40,11 @@ class GaussianGradients(Protocol):
 class LearningRates(Config):
     """Step lengths of Adam: about the change of a parameter per step while its gradient keeps its sign."""
 
-    means: float = 3e-3
+    means: float = 2e-3
     """Metres."""
     quats_wxyz: float = 2e-2
     """Of a unit quaternion."""
-    log_scales: float = 0.12
+    log_scales: float = 0.08
     colors: float = 2e-2
     """RGB in 0..1."""
     opacity_logits: float = 3e-2
@@ -75,12 +75,15 @@ class Adam:
         return len(self._steps)
 
     def freeze_after(self, steps: int | None) -> None:
-        """From now on leave Gaussians as they are, and their moments, once they took so many steps; None: never.
+        """From now on Gaussians settle: their step lengths fall to a tenth over their first `steps` steps, and then
+        they stay as they are, and their moments too. None: they never settle.
 
-        Their steps go on being counted.
+        Steps go on being counted.
         """
         self._corrections = self._unbiased.copy()
         if steps is not None:
+            decay = np.cumprod(np.full(_LONGEST, 0.1 ** (1.0 / steps)))
+            self._corrections *= decay.astype(np.float32)
             self._corrections[steps:] = 0.0
 
     def select(self, index: NDArray) -> None:

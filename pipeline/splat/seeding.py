@@ -35,6 +35,8 @@ class SeedingConfig(Config):
     """Rendered opacity below which a pixel is not explained."""
     color_error: float = 0.1
     """Mean colour error (0..1), smoothed over a cell, above which a pixel is not explained."""
+    worst_color_error: float = 0.02
+    """Root mean square colour error (0..1) of a cell up to which no disc is added where images are drawn worst."""
     depth_error_m: float = 0.04
     """Depth error above which a pixel is not explained, plus depth_error_relative times the depth."""
     depth_error_relative: float = 0.02
@@ -60,15 +62,26 @@ def unexplained(render: Rendered, color: Image, depth_m: Image, config: SeedingC
     return (depth_m > 0) & (thin | displaced | (error > config.color_error))
 
 
-def worst_drawn(render: Rendered, color: Image, depth_m: Image, pixels: int) -> NDArray[np.bool_]:
-    """The measured pixels [H, W], about `pixels` of them, whose squared colour error, smoothed, is largest."""
-    from scipy.ndimage import uniform_filter
+def worst_drawn(
+    render: Rendered, color: Image, depth_m: Image, count: int, config: SeedingConfig
+) -> NDArray[np.bool_]:
+    """Pixels [H, W] of the `count` finest cells with the largest squared colour error, of those measured throughout."""
+    side = config.cell_sizes_px[-1]
+    h, w = (length // side for length in depth_m.shape)
 
-    error = uniform_filter(_mean_of_channels((render.color - color) ** 2), 3) * (depth_m > 0)
-    if not 0 < pixels < error.size:
-        return (error > 0) & (pixels > 0)
-    threshold = np.partition(error, error.size - pixels, axis=None)[error.size - pixels]
-    return (error >= threshold) & (error > 0)
+    def cells(image: NDArray) -> NDArray:
+        """[h, w, pixels of a cell]"""
+        whole = image[: h * side, : w * side].reshape(h, side, w, side)
+        return whole.swapaxes(1, 2).reshape(h, w, side * side)
+
+    error = cells(_mean_of_channels((render.color - color) ** 2)).mean(axis=2)
+    error = np.where((cells(depth_m) > 0).all(axis=2), error, np.float32(0))
+    order = np.argsort(-error, axis=None, kind="stable")[:count]
+    chosen = np.zeros(h * w, bool)
+    chosen[order] = error.ravel()[order] > config.worst_color_error**2
+    wanted = np.zeros(depth_m.shape, bool)
+    wanted[: h * side, : w * side] = chosen.reshape(h, w).repeat(side, axis=0).repeat(side, axis=1)
+    return wanted
 
 
 def _mean_of_channels(rgb: NDArray) -> NDArray:

@@ -1,0 +1,44 @@
+"""Packets whose payload was changed behind a correct CRC: refused with a reason, or used, but nobody crashes."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from pipeline.consensus.graphs import read_team
+from pipeline.exchange.packets import parse, serialise
+from pipeline.posegraph import network
+from pipeline.posegraph.config import settings
+from tests.posegraph.graphs import helix_edges, write_g2o
+
+
+@pytest.mark.parametrize("solver", ["admm", "elimination", "paper"])
+def test_changed_payloads_crash_nobody(tmp_path, solver):
+    team = read_team(write_g2o(tmp_path / "helix.g2o", helix_edges(24)), 3)
+    rng = np.random.default_rng(0)
+    refused = changed = 0
+    for _ in range(12):
+        config = settings(solver, max_rounds=40)
+        agents = {
+            n: network.SOLVERS[solver](team.robots[n], sorted(team.robots), config) for n in team.robots
+        }
+        waiting = {name: [] for name in agents}
+        for k in range(40):
+            sent = [out for name, agent in agents.items() for out in agent.tick(k, waiting[name])]
+            waiting = {name: [] for name in agents}
+            for out in sent:
+                packet = parse(out.packet)
+                if packet.payload and rng.random() < 0.3:
+                    payload = bytearray(packet.payload)
+                    for _ in range(int(rng.integers(1, 4))):
+                        payload[int(rng.integers(len(payload)))] = int(rng.integers(256))
+                    waiting[out.receiver].append(
+                        serialise(dataclasses.replace(packet, payload=bytes(payload)))
+                    )
+                    changed += 1
+                else:
+                    waiting[out.receiver].append(out.packet)
+        refused += sum(len(agent.refused) for agent in agents.values())
+        assert all(np.isfinite(agent.T_world_keyframe).all() for agent in agents.values())
+    assert changed > 50
+    assert refused > 10
