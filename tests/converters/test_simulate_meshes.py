@@ -3,6 +3,8 @@
 import json
 import shutil
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -442,6 +444,17 @@ def test_a_scene_that_is_not_there(tmp_path):
         simulate(tmp_path / "rec", scene=str(tmp_path / "nowhere"))
     with pytest.raises(DuagError, match="up is 'x'"):
         simulate(tmp_path / "rec", scene=str(folder_of(tmp_path / "room", "obj")), up="x")
+
+
+def test_the_command_takes_a_folder_and_an_axis(tmp_path):
+    folder = folder_of(tmp_path / "room", "obj")
+    command = [sys.executable, "-c", "from pipeline.cli import main; main()", "simulate", "--out", "rec"]
+    command += ["--scene", str(folder), "--up", "x", "--workers", "1"]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=root)
+    assert done.returncode == 1
+    assert done.stderr == "duagc: simulate: up is 'x', expected one of auto, y, z\n"
+    assert not (root / "rec").exists()
 
 
 @pytest.mark.skipif(not HOUSE.is_dir(), reason="the scanned house is not on this machine")
