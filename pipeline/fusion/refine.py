@@ -3,8 +3,8 @@
 Consensus moves keyframes and fusion moves Gaussians; nobody asks the images whether the result still draws them. Some
 steps of the mapper's own kind do: colour and depth loss of the robot's keyframes and frames between them, never of
 held-out ones. Only the robot's own Gaussians move; those taken over from neighbours stay, because the few own views
-that see one of them, from afar or through a door, know less of it than its owner's many (trained too, a house looks 2 dB
-worse from where the neighbour stood). The information is that of before: what is learned here comes from the same
+that see one of them, from afar or through a door, know less of it than its owner's many (trained too, a house looks
+2 dB worse from where the neighbour stood). The information is that of before: what is learned here comes from the same
 pixels and is not counted again.
 """
 
