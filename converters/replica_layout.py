@@ -7,13 +7,16 @@ numbers per frame, camera to world, x right, y down, z forward. There are no tim
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 
-from converters.image_files import read_text, rigid
-from converters.image_folder import Clip, FrameFiles, stamps_of
+from converters.image_files import options_of, read_text, rigid
+from converters.image_folder import Clip, FrameFiles, stamps_of, write
 from pipeline.config import Config
 from pipeline.errors import DuagError
 from pipeline.geometry.camera import PinholeCamera
@@ -28,6 +31,63 @@ class LayoutOptions(Config):
     """Frames per second; the dataset has no time stamps."""
     frame_limit: int = Field(0, ge=0)
     """Most frames of each part; 0: all. Published runs on Office-0 of ReplicaMultiagent stop at 1500."""
+
+
+class TeamOptions(LayoutOptions):
+    """Time, length and size of images."""
+
+    size: str = ""
+    """Of the images, WIDTHxHEIGHT, if they were scaled; the camera is that of the published size, scaled."""
+
+
+def convert_team(
+    dataset: str,
+    src: Path,
+    out: Path,
+    robots: int,
+    force: bool,
+    options: Mapping[str, Any],
+    part: re.Pattern[str],
+    camera: PinholeCamera,
+    depth_scale: float,
+    sensors: Mapping[str, str],
+    warnings: Sequence[str] = (),
+) -> None:
+    """Convert a scene with a folder for each robot.
+
+    Args:
+        part: of the folders' names; its first group is their number. camera: of images of the published size.
+        sensors, warnings: what is known of all parts.
+    Raises:
+        DuagError: names the file, what was found and what was expected.
+    """
+    settings = options_of(TeamOptions, options, dataset)
+    if not src.is_dir():
+        raise DuagError(f"{src}: no such folder, expected folders {part.pattern} in it")
+    folders = {int(m[1]): p for p in sorted(src.iterdir()) if (m := part.fullmatch(p.name)) and p.is_dir()}
+    if robots != len(folders):
+        raise DuagError(
+            f"{src}: found {len(folders)} folders {part.pattern} for {robots} robots, "
+            f"expected --robots {len(folders)}"
+            if folders
+            else f"{src}: found no folder {part.pattern}, expected one for each robot"
+        )
+    if settings.size:
+        camera = _scaled(camera, settings.size, dataset)
+    clips, notes = [], list(warnings)
+    for number in sorted(folders):
+        clip, told = read_part(folders[number], folders[number].name, camera, depth_scale, settings)
+        clips.append(replace(clip, sensors=sensors))
+        notes += told
+    write(out, dataset, src, clips, {"robots": robots, **settings.model_dump()}, notes, force)
+
+
+def _scaled(camera: PinholeCamera, size: str, dataset: str) -> PinholeCamera:
+    """The camera of images of another size, given as WIDTHxHEIGHT."""
+    width, cross, height = size.partition("x")
+    if not (cross and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise DuagError(f"{dataset}: size = {size!r}, expected WIDTHxHEIGHT")
+    return camera.scaled(int(width), int(height))
 
 
 def read_part(

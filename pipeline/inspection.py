@@ -15,7 +15,15 @@ from pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Ev
 from pipeline.consensus.gaussians import Weights
 from pipeline.errors import DuagError
 from pipeline.exchange import wire
-from pipeline.exchange.packets import EVIDENCE_HEAD_BYTES, EVIDENCE_KINDS, HEADER_BYTES, Kind, MalformedError
+from pipeline.exchange.packets import (
+    EVIDENCE_KINDS,
+    HEADER_BYTES,
+    Kind,
+    MalformedError,
+    Packet,
+    parse,
+    payload_bytes,
+)
 from pipeline.exchange.record import Recorded, RecordedPacket, read_session
 from pipeline.recording import read_log
 from pipeline.run_folder import RunFolder
@@ -124,7 +132,7 @@ class Inspector:
                 f"{self.run.path / 'exchange.mcap'}: has {len(packets)} packets, found --packet {number}"
             )
         p = packets[number]
-        payload = p.data[HEADER_BYTES:]
+        header = _parsed(p)
         return {
             "packet": number,
             "sender": p.sender,
@@ -133,18 +141,18 @@ class Inspector:
             "round": p.round,
             "kind": p.kind_name,
             "bytes": len(p.data),
-            "message": int.from_bytes(p.data[16:20], "little"),
-            "offset": int.from_bytes(p.data[20:24], "little"),
-            "message_bytes": int.from_bytes(p.data[24:28], "little"),
+            "message": header.message,
+            "offset": header.offset,
+            "message_bytes": header.total,
             "sent_s": p.send_ns / _NS_PER_S,
             "delivered_s": [at / _NS_PER_S for at in p.deliver_ns],
             "dropped": p.dropped or None,
-            "content": self._content(p, payload),
+            "content": self._content(header),
         }
 
-    def _content(self, p: RecordedPacket, payload: bytes) -> Facts:
+    def _content(self, packet: Packet) -> Facts:
         """What a packet says by itself; of a message in many packets only whole records can be read."""
-        kind, team = Kind[p.kind_name], len(self._session.team)
+        kind, payload, team = packet.kind, packet.payload, len(self._session.team)
         try:
             if kind is Kind.STATE:
                 state, poses = wire.read_state(payload, team)
@@ -222,18 +230,10 @@ class Inspector:
         """Packets that carried the Gaussian's evidence, in the order of the log."""
         out = []
         for number, p in enumerate(self._session.packets):
-            kind = Kind[p.kind_name]
-            if kind not in EVIDENCE_KINDS:
+            if Kind[p.kind_name] not in EVIDENCE_KINDS:
                 continue
-            payload = p.data[HEADER_BYTES : HEADER_BYTES + int.from_bytes(p.data[28:30], "little")]
-            owner = self._session.team[int.from_bytes(payload[:2], "little")]
-            if owner != robot:
-                continue
-            size = EVIDENCE_KINDS[kind]
-            width = 4 if kind is Kind.EVIDENCE else 8  # of the id at the head of a record
-            body = payload[EVIDENCE_HEAD_BYTES:]
-            ids = [int.from_bytes(body[k : k + width], "little") for k in range(0, len(body), size)]
-            if gaussian_id in ids:
+            told = self._content(_parsed(p))
+            if told.get("owner") == robot and gaussian_id in told["gaussians"]:
                 out.append(
                     {
                         "packet": number,
@@ -245,6 +245,11 @@ class Inspector:
                     }
                 )
         return out
+
+
+def _parsed(p: RecordedPacket) -> Packet:
+    """The packet without its signature."""
+    return parse(p.data[: HEADER_BYTES + payload_bytes(p.data)])
 
 
 def _described(theta: np.ndarray) -> Facts:

@@ -12,6 +12,7 @@ from pipeline.digest import digest, digest_file, result_files
 from pipeline.errors import DuagError
 from pipeline.evaluation import evaluate
 from pipeline.evaluation.network import Session
+from pipeline.exchange.record import read_session
 from pipeline.inspection import Inspector, format_facts
 from pipeline.replay import replay
 from pipeline.run_folder import RunFolder
@@ -190,3 +191,17 @@ def test_what_happened_can_be_asked_for(finished: Path) -> None:
     ):
         with pytest.raises(DuagError, match=complaint):
             ask()
+
+
+def test_a_signed_packet_can_be_asked_for(folder: Path, recording: Path) -> None:
+    """The signature is no part of what a packet says."""
+    run_folder = make_run(recording, folder / "run_signed", "exchange.transport.signatures=ed25519")
+    inspector = Inspector(RunFolder(run_folder))
+    packets = read_session(run_folder / "exchange.mcap").packets
+    number = next(k for k, p in enumerate(packets) if p.kind_name == "EVIDENCE")
+    facts = inspector.packet(number)
+    assert facts["content"]["owner"] in ("alpha", "bravo")
+    assert len(facts["content"]["gaussians"]) == 11
+    assert facts["bytes"] == 34 + 8 + 1100 + 64
+    state = next(k for k, p in enumerate(packets) if p.kind_name == "STATE")
+    assert inspector.packet(state)["content"]["bytes_of_poses"] == 0

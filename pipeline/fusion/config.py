@@ -24,8 +24,6 @@ class RefineConfig(Config):
     """They fall exponentially to this share."""
     rates: LearningRates = LearningRates()
     loss: LossConfig = LossConfig()
-    thickness_m: float = Field(default=0.001, gt=0.0)
-    """Gaussians do not become thinner than this."""
 
 
 class FusionConfig(Config):

@@ -43,6 +43,7 @@ def refine(
     views: Sequence[View],
     camera: PinholeCamera,
     config: RefineConfig,
+    thickness_floor_m: float,
     depth: DepthKind,
     seed: int,
     threads: int = 1,
@@ -50,7 +51,8 @@ def refine(
     """The map after `config.steps_per_view` steps for each view, in random order, each once before any comes again.
 
     Args:
-        gaussians: in the world frame of the views. own: [n], which of them may change. threads: changes no bit.
+        gaussians: in the world frame of the views. own: [n], which of them may change.
+        thickness_floor_m: none becomes thinner than this, or than it was. depth: as the map was made. threads: changes no bit.
     Returns:
         As many Gaussians, in the same order, with the same ids and anchors.
     """
@@ -60,7 +62,7 @@ def refine(
     rasterizer, adam = Rasterizer(threads=threads), CompiledAdam(len(gaussians), threads=threads)
     weights = LossWeights(**config.loss.model_dump())
     floor = np.minimum(
-        gaussians.log_scales, np.float32(np.log(config.thickness_m))
+        gaussians.log_scales, np.float32(np.log(thickness_floor_m))
     )  # thinner ones stay as they are
     order = np.zeros(0, np.int64)
     for step in range(steps):

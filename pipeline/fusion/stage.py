@@ -66,7 +66,10 @@ def run_fusion(
     if len(result.component) > 1 and config.refine.steps_per_view:
         views = _views(source, frames, result, config.refine.support_views)
         owned = fused.source == fused.robots.index(own.robot)
-        refined = refine(fused.gaussians, owned, views, own.camera, config.refine, own.depth, seed, threads)
+        floor_m = matching.thickness_floor_m
+        refined = refine(
+            fused.gaussians, owned, views, own.camera, config.refine, floor_m, own.depth, seed, threads
+        )
     write_ply(folder / "fused.ply", fused.gaussians)
     write_ply(folder / "refined.ply", fused.gaussians if refined is None else refined)
     _write_log(folder / "fused.mcap", result, fused, refined, stamp_ns, own.depth)

@@ -56,7 +56,7 @@ def test_it_draws_better_also_where_it_was_not_trained(spoilt: tuple[Gaussians, 
     gaussians, views = spoilt
     train, held_out = views[::2], views[1::2]
     better = refine(
-        gaussians, ALL, train, CAMERA, RefineConfig(steps_per_view=30, rate=0.3), "blended", seed=0
+        gaussians, ALL, train, CAMERA, RefineConfig(steps_per_view=30, rate=0.3), 1e-3, "blended", seed=0
     )
     assert score(better, train) > score(gaussians, train) + 5
     assert score(better, held_out) > score(gaussians, held_out) + 3
@@ -65,7 +65,7 @@ def test_it_draws_better_also_where_it_was_not_trained(spoilt: tuple[Gaussians, 
 
 def test_what_no_view_sees_stays(spoilt: tuple[Gaussians, list[View]]) -> None:
     gaussians, views = spoilt
-    better = refine(gaussians, ALL, views, CAMERA, RefineConfig(), "blended", seed=0)
+    better = refine(gaussians, ALL, views, CAMERA, RefineConfig(), 1e-3, "blended", seed=0)
     for name in ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits"):
         before, after = getattr(gaussians, name), getattr(better, name)
         assert np.array_equal(before[-10:], after[-10:])
@@ -75,7 +75,7 @@ def test_what_no_view_sees_stays(spoilt: tuple[Gaussians, list[View]]) -> None:
 def test_what_others_own_stays(spoilt: tuple[Gaussians, list[View]]) -> None:
     gaussians, views = spoilt
     own = np.arange(400) % 3 > 0
-    better = refine(gaussians, own, views, CAMERA, RefineConfig(), "blended", seed=0)
+    better = refine(gaussians, own, views, CAMERA, RefineConfig(), 1e-3, "blended", seed=0)
     for name in ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits"):
         before, after = getattr(gaussians, name), getattr(better, name)
         assert np.array_equal(before[~own], after[~own])
@@ -86,7 +86,7 @@ def test_what_others_own_stays(spoilt: tuple[Gaussians, list[View]]) -> None:
 def test_masked_pixels_teach_nothing(spoilt: tuple[Gaussians, list[View]]) -> None:
     gaussians, views = spoilt
     nothing = [View(v.color, v.depth_m, v.T_world_camera, np.zeros((48, 64), bool)) for v in views]
-    same = refine(gaussians, ALL, nothing, CAMERA, RefineConfig(), "blended", seed=0)
+    same = refine(gaussians, ALL, nothing, CAMERA, RefineConfig(), 1e-3, "blended", seed=0)
     assert np.array_equal(same.means, gaussians.means)
     assert np.array_equal(same.colors, gaussians.colors)
 
@@ -94,7 +94,7 @@ def test_masked_pixels_teach_nothing(spoilt: tuple[Gaussians, list[View]]) -> No
 def test_the_same_bits_on_any_number_of_threads(spoilt: tuple[Gaussians, list[View]]) -> None:
     gaussians, views = spoilt
     one, three, other = (
-        refine(gaussians, ALL, views, CAMERA, RefineConfig(), "ray_plane", seed=seed, threads=threads)
+        refine(gaussians, ALL, views, CAMERA, RefineConfig(), 1e-3, "ray_plane", seed=seed, threads=threads)
         for seed, threads in ((0, 1), (0, 3), (1, 1))
     )
     assert np.array_equal(one.means, three.means)
@@ -105,6 +105,7 @@ def test_the_same_bits_on_any_number_of_threads(spoilt: tuple[Gaussians, list[Vi
 def test_no_steps_change_nothing(spoilt: tuple[Gaussians, list[View]]) -> None:
     gaussians, views = spoilt
     assert (
-        refine(gaussians, ALL, views, CAMERA, RefineConfig(steps_per_view=0), "blended", seed=0) is gaussians
+        refine(gaussians, ALL, views, CAMERA, RefineConfig(steps_per_view=0), 1e-3, "blended", seed=0)
+        is gaussians
     )
-    assert refine(gaussians, ALL, [], CAMERA, RefineConfig(), "blended", seed=0) is gaussians
+    assert refine(gaussians, ALL, [], CAMERA, RefineConfig(), 1e-3, "blended", seed=0) is gaussians
