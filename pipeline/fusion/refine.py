@@ -52,7 +52,8 @@ def refine(
 
     Args:
         gaussians: in the world frame of the views. own: [n], which of them may change.
-        thickness_floor_m: none becomes thinner than this, or than it was. depth: as the map was made. threads: changes no bit.
+        thickness_floor_m: none becomes thinner than this, or than it was.
+        depth: as the map was made. threads: changes no bit.
     Returns:
         As many Gaussians, in the same order, with the same ids and anchors.
     """
