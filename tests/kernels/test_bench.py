@@ -140,4 +140,4 @@ def test_command_refuses_by_option(option, value, complaint):
 
 
 def test_counts_with_units():
-    assert cli._counts("--gaussians", "60k,1M,7") == [60_000, 1_000_000, 7]
+    assert cli.bench._counts("--gaussians", "60k,1M,7") == [60_000, 1_000_000, 7]

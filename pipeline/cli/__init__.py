@@ -1,0 +1,36 @@
+"""The command `duagc`. Every command imports what it needs when it runs, so that `--help` is quick."""
+
+import sys
+
+from pipeline import numeric
+from pipeline.cli.common import EXIT_FAILED, app
+from pipeline.errors import DuagError
+
+# each registers its commands, and `--help` lists them in this order
+# isort: off
+from pipeline.cli import recordings
+from pipeline.cli import runs
+from pipeline.cli import looking
+from pipeline.cli import posegraph
+from pipeline.cli import settings
+from pipeline.cli import bench
+# isort: on
+
+__all__ = ["app", "bench", "looking", "main", "posegraph", "recordings", "runs", "settings"]
+
+TYPER_INTERRUPTED = 130  # what typer makes of Ctrl-C, without a word
+
+
+def main() -> None:
+    """Entry point: one line and exit code 1 for whatever a user can fix."""
+    numeric.settle()
+    try:
+        app()
+    except DuagError as error:
+        print(f"duagc: {error}", file=sys.stderr)
+        sys.exit(EXIT_FAILED)
+    except SystemExit as stop:
+        if stop.code != TYPER_INTERRUPTED:
+            raise
+        print("duagc: interrupted", file=sys.stderr)
+        sys.exit(EXIT_FAILED)

@@ -1,0 +1,184 @@
+"""Commands that measure speed, side by side with something else in the same run."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.common import ConfigFile, Json, Overrides, bench_app
+
+
+@bench_app.command("raster")
+def bench_raster(
+    sizes: Annotated[str, typer.Option(help="Image sizes.")] = "320x240,640x480,1200x680",
+    gaussians: Annotated[
+        str, typer.Option(help="Numbers of Gaussians; k and M are understood.")
+    ] = "60k,300k",
+    threads: Annotated[str, typer.Option(help="Numbers of threads.")] = "1,2",
+    isa: Annotated[
+        str | None,
+        typer.Option(
+            help="Instruction sets; by default all, the portable one in one round only.", show_default=False
+        ),
+    ] = None,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds that are timed.")] = 7,
+    full: Annotated[
+        bool, typer.Option("--full", help="Also 1M Gaussians, and 15 rounds: some minutes.")
+    ] = False,
+    no_torch: Annotated[bool, typer.Option("--no-torch", help="Without the plain torch rasterizer.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Time the rasterizer, beside the machine's own peak and a plain torch rasterizer.
+
+    Lists are separated by commas. Takes about two minutes on an idle machine; a busy one gives other times.
+    """
+    from pipeline.kernels import available_isas, bench
+
+    isas = available_isas() if isa is None else isa.split(",")
+    for name in isas:
+        if name not in available_isas():
+            raise typer.BadParameter(
+                f"{name!r} is not one of {', '.join(available_isas())}", param_hint="--isa"
+            )
+    plan = bench.Plan(
+        sizes=tuple(_sizes(sizes)),
+        gaussians=tuple(_counts("--gaussians", "60k,300k,1M" if full else gaussians)),
+        threads=tuple(_counts("--threads", threads)),
+        rounds=max(rounds, 15) if full else rounds,
+        torch_too=not no_torch,
+        isas=tuple(isas),
+        portable_everywhere=isa is not None,
+    )
+    result = bench.run(plan)
+    print(json.dumps(result, indent=2) if as_json else bench.format_tables(result))
+
+
+@bench_app.command("consensus")
+def bench_consensus(
+    robots: Annotated[str, typer.Option(help="Numbers of robots.")] = "2,4,8",
+    topology: Annotated[str, typer.Option(help="full, ring, chain, star.")] = "full,ring,chain",
+    loss: Annotated[str, typer.Option(help="Chances that a packet is lost.")] = "0,0.3,0.6,0.9",
+    contrast: Annotated[str, typer.Option(help="Largest over smallest information.")] = "47,1e4",
+    unknown: Annotated[str, typer.Option(help="Shares of tracks that a robot knows nothing of.")] = "0,0.2",
+    mode: Annotated[
+        str, typer.Option(help="evidence (compact), evidence_float32, evidence_float64, admm, paper.")
+    ] = "evidence,evidence_float64,admm,paper",
+    tracks: Annotated[int, typer.Option(min=1, help="Matched Gaussians.")] = 200,
+    max_rounds: Annotated[int, typer.Option(min=1, help="A session ends here.")] = 3000,
+    seed: Annotated[int, typer.Option(help="Seed of evidence and links.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """What it costs a team to agree on matched Gaussians, mode by mode, against the central optimum.
+
+    Lists are separated by commas; every combination is a row. The defaults take some minutes.
+
+    Example: duagc bench consensus --robots 4 --topology chain --loss 0,0.9 --contrast 47
+    """
+    from pipeline.exchange import bench
+
+    for option, words, known in (
+        ("--topology", topology.split(","), ("full", "ring", "chain", "star")),
+        ("--mode", mode.split(","), bench.MODES),
+    ):
+        for word in words:
+            if word not in known:
+                raise typer.BadParameter(f"{word!r} is not one of {', '.join(known)}", param_hint=option)
+    plan = bench.Plan(
+        robots=tuple(_counts("--robots", robots)),
+        topologies=tuple(topology.split(",")),
+        losses=tuple(_numbers("--loss", loss, 0.0, 0.99)),
+        contrasts=tuple(_numbers("--contrast", contrast, 1.0, 1e8)),
+        unknown=tuple(_numbers("--unknown", unknown, 0.0, 0.99)),
+        modes=tuple(mode.split(",")),
+        tracks=tracks,
+        max_rounds=max_rounds,
+        seed=seed,
+    )
+    result = bench.run(plan)
+    print(json.dumps(result, indent=2) if as_json else bench.format_table(result))
+
+
+@bench_app.command("frontend")
+def bench_frontend(
+    recording: Annotated[
+        Path | None, typer.Argument(help="Folder of a recording; a small room is simulated without one.")
+    ] = None,
+    caps: Annotated[
+        str, typer.Option(help="Most Gaussians of a map, each a run; k and M are understood; none = no maps.")
+    ] = "60k",
+    ablation: Annotated[bool, typer.Option(help="Tracking without one of its parts at a time.")] = True,
+    open3d: Annotated[bool, typer.Option(help="Open3D's RGB-D odometry, in the same run.")] = True,
+    robot: Annotated[str | None, typer.Option(help="One robot; all by default.")] = None,
+    threads: Annotated[int, typer.Option(min=1, help="Of the kernels.")] = 1,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    as_json: Json = False,
+) -> None:
+    """Time, memory and accuracy of tracking and mapping, part by part, beside Open3D's odometry.
+
+    Examples: `duagc bench frontend recordings/house --caps 30k,60k,200k,600k`,
+    `duagc bench frontend recordings/redkitchen --no-ablation --json`
+    """
+    import tempfile
+
+    from converters.simulate import simulate as simulate_recording
+    from pipeline.config import load
+    from pipeline.evaluation import frontend_bench
+    from pipeline.runner import RunConfig
+
+    settings = load(RunConfig, config, overrides or [])
+    with tempfile.TemporaryDirectory(prefix="duagc-bench-") as folder:
+        if recording is None:
+            recording = Path(folder) / "room"
+            simulate_recording(recording, robots=1, frames=60, seed=settings.seed)
+        plan = frontend_bench.Plan(
+            recording,
+            settings.frontend,
+            () if caps == "none" else tuple(_counts("--caps", caps)),
+            ablation,
+            open3d,
+            threads,
+            settings.seed,
+            (robot,) if robot else (),
+        )
+        result = frontend_bench.run(plan)
+    print(json.dumps(result, indent=2) if as_json else frontend_bench.format_tables(result))
+
+
+def _numbers(option: str, text: str, low: float, high: float) -> list[float]:
+    """Numbers within limits out of text like 0,0.3."""
+    numbers = []
+    for word in text.split(","):
+        try:
+            number = float(word)
+        except ValueError:
+            number = float("nan")
+        if not low <= number <= high:
+            raise typer.BadParameter(f"{word!r} is not a number from {low:g} to {high:g}", param_hint=option)
+        numbers.append(number)
+    return numbers
+
+
+def _counts(option: str, text: str) -> list[int]:
+    """Positive numbers out of text like 60k,1M."""
+    counts = []
+    for word in text.split(","):
+        digits, unit = (word[:-1], word[-1]) if word[-1:] in ("k", "M") else (word, "")
+        if not digits.isdecimal() or int(digits) == 0:
+            raise typer.BadParameter(
+                f"{word!r} is not a positive number, such as 2, 60k or 1M", param_hint=option
+            )
+        counts.append(int(digits) * {"": 1, "k": 1000, "M": 1_000_000}[unit])
+    return counts
+
+
+def _sizes(text: str) -> list[tuple[int, int]]:
+    """Widths and heights out of text like 320x240,640x480."""
+    sizes = []
+    for word in text.split(","):
+        width, cross, height = word.partition("x")
+        if not (cross and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+            raise typer.BadParameter(f"{word!r} is not an image size, such as 640x480", param_hint="--sizes")
+        sizes.append((int(width), int(height)))
+    return sizes

@@ -1,0 +1,57 @@
+"""What the commands share: the application, options, how they speak. Light at import."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline import __version__
+
+EXIT_FAILED, EXIT_DIFFERENT = 1, 3
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+config_app = typer.Typer(no_args_is_help=True, help="Settings of a run and their documentation.")
+bench_app = typer.Typer(no_args_is_help=True, help="Speed, side by side with something else in the same run.")
+app.add_typer(config_app, name="config")
+app.add_typer(bench_app, name="bench")
+
+Out = Annotated[
+    Path, typer.Option("--out", "-o", help="Folder to write; must not exist.", show_default=False)
+]
+Force = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
+Workers = Annotated[int, typer.Option(min=1, help="Robots prepared at the same time; changes no result.")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", metavar="a.b=VALUE", help="Change one setting; repeatable.")
+]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="TOML file; see `duagc config show`.")]
+Json = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
+
+
+def say(line: str) -> None:
+    """Progress goes to standard error, results to standard output."""
+    print(f"duagc: {line}", file=sys.stderr, flush=True)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"duagc {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Recordings of a robot team to one uncertainty-weighted Gaussian map, without a central server.
+
+    Start with `duagc demo`, or with your own data: `duagc convert`, then `duagc run`.
+    """

@@ -1,0 +1,62 @@
+"""Commands that show what happened in a run."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.common import Json, app
+
+
+@app.command()
+def view(
+    path: Annotated[Path, typer.Argument(help="A run or a recording.", show_default=False)],
+    save: Annotated[Path | None, typer.Option(help="Write a .rrd file instead of opening a window.")] = None,
+    screenshot: Annotated[Path | None, typer.Option(help="Write a PNG instead of opening a window.")] = None,
+) -> None:
+    """Open a run or a recording in Rerun.
+
+    Example: `duagc view outputs/demo/run --save demo.rrd`
+    """
+    from pipeline import viewer
+
+    viewer.view(path, save=save, screenshot=screenshot)
+
+
+@app.command()
+def inspect(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", show_default=False)],
+    round_: Annotated[
+        int | None, typer.Option("--round", metavar="K", help="Where every robot stood.", show_default=False)
+    ] = None,
+    packet: Annotated[
+        int | None,
+        typer.Option("--packet", metavar="N", help="By its place in exchange.mcap.", show_default=False),
+    ] = None,
+    gaussian: Annotated[
+        str | None,
+        typer.Option("--gaussian", metavar="ROBOT:ID", help="Of a robot's own map.", show_default=False),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """What happened to one round, one packet or one Gaussian of a run, in words and numbers.
+
+    Example: duagc inspect outputs/demo/run --gaussian alpha:1200
+    """
+    from pipeline.inspection import Inspector, format_facts
+    from pipeline.run_folder import RunFolder
+
+    if [round_, packet, gaussian].count(None) != 2:
+        raise typer.BadParameter("expected exactly one of --round, --packet, --gaussian")
+    inspector = Inspector(RunFolder(run_folder))
+    if round_ is not None:
+        facts = inspector.round(round_)
+    elif packet is not None:
+        facts = inspector.packet(packet)
+    else:
+        robot, colon, number = str(gaussian).partition(":")
+        if not colon or not number.isdecimal():
+            raise typer.BadParameter(f"{gaussian!r} is not like alpha:1200", param_hint="--gaussian")
+        facts = inspector.gaussian(robot, int(number))
+    print(json.dumps(facts, indent=2) if as_json else format_facts(facts))

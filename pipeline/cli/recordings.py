@@ -1,0 +1,107 @@
+"""Commands that make recordings and say what is in them."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.common import Force, Json, Out, Workers, app
+
+
+@app.command()
+def simulate(
+    out: Out,
+    robots: Annotated[int, typer.Option(min=1, max=8, help="Number of robots.")] = 2,
+    frames: Annotated[int, typer.Option(min=2, help="Frames per robot.")] = 160,
+    scene: Annotated[
+        str, typer.Option(help="room, or a folder of textured meshes (GLB, glTF, OBJ, PLY).")
+    ] = "room",
+    up: Annotated[
+        str,
+        typer.Option(help="Axis that is up in the meshes: y, z, or auto (y for GLB, glTF, OBJ; z for PLY)."),
+    ] = "auto",
+    width: Annotated[int, typer.Option(min=32, help="Pixels.")] = 480,
+    height: Annotated[int, typer.Option(min=32, help="Pixels.")] = 360,
+    overlap: Annotated[
+        float, typer.Option(min=0, max=1, help="Share of the view that neighbours see.")
+    ] = 0.6,
+    noise: Annotated[str, typer.Option(help="none or kinect.")] = "none",
+    seed: Annotated[int, typer.Option(help="Seed of scene, paths and noise.")] = 0,
+    workers: Workers = 2,
+    force: Force = False,
+) -> None:
+    """Render a recording of a robot team, in a procedural room or among textured meshes, with exact ground truth.
+
+    Examples:
+    `duagc simulate --robots 3 --noise kinect --out recordings/room`,
+    `duagc simulate --scene scans/house --width 640 --height 480 --frames 300 --out recordings/house`
+    """
+    from converters.simulate import simulate as simulate_recording
+
+    simulate_recording(
+        out,
+        robots=robots,
+        frames=frames,
+        scene=scene,
+        up=up,
+        size=(width, height),
+        overlap=overlap,
+        noise=noise,
+        seed=seed,
+        workers=workers,
+        force=force,
+    )
+    print(out)
+
+
+@app.command()
+def convert(
+    dataset: Annotated[str | None, typer.Argument(help="Name of the dataset; see --list.")] = None,
+    source: Annotated[Path | None, typer.Argument(metavar="SRC", help="Where its files are.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write; must not exist.")] = None,
+    robots: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Cut one sequence into this many robots; else one, or as many as the dataset has.",
+            show_default=False,
+        ),
+    ] = None,
+    options: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Option of the converter; repeatable."),
+    ] = None,
+    force: Force = False,
+    list_datasets: Annotated[
+        bool, typer.Option("--list", help="List the datasets and their options.")
+    ] = False,
+) -> None:
+    """Convert a dataset, as it is distributed, into one log per robot.
+
+    Example: `duagc convert 7scenes ~/data/redkitchen --robots 2 --out recordings/redkitchen`
+    """
+    import converters
+
+    if list_datasets:
+        print(converters.describe())
+        return
+    if dataset is None or source is None or out is None:
+        raise typer.BadParameter("expected DATASET SRC --out REC, or --list")
+    converters.convert(dataset, source, out, robots=robots, force=force, options=options or [])
+    print(out)
+
+
+@app.command()
+def info(
+    path: Annotated[Path, typer.Argument(help="A recording, a run or a log.", show_default=False)],
+    as_json: Json = False,
+) -> None:
+    """Say what is in a recording, a run or a log.
+
+    Example: `duagc info recordings/redkitchen`
+    """
+    from pipeline import recording
+
+    content = recording.info(path)
+    print(json.dumps(content, indent=2) if as_json else recording.format_info(content))

@@ -1,0 +1,143 @@
+"""Commands that run the stages, one by one or all, and compare runs."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.common import EXIT_DIFFERENT, ConfigFile, Force, Json, Out, Overrides, Workers, app, say
+
+
+@app.command()
+def demo(
+    out: Out = Path("outputs/demo"),
+    robots: Annotated[int, typer.Option(min=2, max=4, help="Robots to simulate.")] = 2,
+    frames: Annotated[int, typer.Option(min=20, help="Frames per robot.")] = 160,
+    seed: Annotated[int, typer.Option(help="Seed of scene, paths and run.")] = 0,
+    workers: Workers = 2,
+    force: Force = False,
+) -> None:
+    """Simulate a team, fuse its maps, evaluate and report: the whole job on an embedded default.
+
+    Example: `duagc demo --out outputs/demo`
+    """
+    from converters.simulate import simulate as simulate_recording
+    from pipeline.new_folder import new_folder
+    from pipeline.runner import RunConfig
+    from pipeline.runner import run as run_stages
+
+    with new_folder(out, force) as folder:
+        say(f"simulate: {robots} robots, {frames} frames each")
+        simulate_recording(folder / "recording", robots=robots, frames=frames, seed=seed, workers=workers)
+        run_stages(folder / "recording", folder / "run", RunConfig(seed=seed), workers=workers, say=say)
+    _print_outputs(out / "run")
+
+
+@app.command()
+def run(
+    recording: Annotated[Path, typer.Argument(help="Folder of a recording.", show_default=False)],
+    out: Out,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    workers: Workers = 2,
+    force: Force = False,
+    no_cache: Annotated[
+        bool, typer.Option("--no-cache", help="Compute every stage (this version always does).")
+    ] = False,
+) -> None:
+    """Run all stages on a recording: maps, information, exchange, fusion, metrics, report, view.
+
+    Examples:
+    `duagc run recordings/redkitchen --out outputs/redkitchen`,
+    `duagc run recordings/room --out outputs/lossy --set exchange.link.loss_probability=0.3`
+    """
+    from pipeline.config import load
+    from pipeline.runner import RunConfig
+    from pipeline.runner import run as run_stages
+
+    run_stages(
+        recording, out, load(RunConfig, config, overrides or []), workers=workers, force=force, say=say
+    )
+    _print_outputs(out)
+
+
+def _print_outputs(run_folder: Path) -> None:
+    print(f"report     {run_folder / 'report' / 'index.html'}")
+    print(f"view       {run_folder / 'run.rrd'}")
+    for path in sorted(run_folder.glob("robots/*/refined.ply")):
+        print(f"map        {path}")
+    print(f"metrics    {run_folder / 'metrics.json'}")
+
+
+@app.command()
+def replay(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.", show_default=False)],
+    robot: Annotated[str | None, typer.Option(help="One robot; all by default.")] = None,
+    recording: Annotated[Path | None, typer.Option(help="Where the recording is now.")] = None,
+) -> None:
+    """Recompute each robot from its own log and the packets that reached it; compare bit for bit.
+
+    Exit code 3 if anything differs. Example: `duagc replay outputs/demo/run`
+    """
+    from pipeline.replay import replay as replay_robots
+    from pipeline.run_folder import RunFolder
+
+    run = RunFolder(run_folder)
+    robots = [robot] if robot else list(run.robots)
+    comparisons = replay_robots(run_folder, recording or run.recording, robots, say)
+    for c in comparisons:
+        verdict = (
+            "equal" if c.equal else f"DIFFERS: recorded {c.recorded[:12]}, recomputed {c.recomputed[:12]}"
+        )
+        print(f"{c.robot:<10} {c.name:<17} {verdict}")
+    if not all(c.equal for c in comparisons):
+        raise typer.Exit(EXIT_DIFFERENT)
+
+
+@app.command()
+def evaluate(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.", show_default=False)],
+    recording: Annotated[Path | None, typer.Option(help="Where the recording is now.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Measure a run against ground truth, where there is any, and write metrics.json.
+
+    Example: `duagc evaluate outputs/demo/run --json`
+    """
+    from pipeline.evaluation import evaluate as evaluate_run
+    from pipeline.run_folder import RunFolder
+    from pipeline.runner import threads_per_worker
+
+    metrics = evaluate_run(
+        run_folder, recording or RunFolder(run_folder).recording, threads=threads_per_worker(1)
+    )
+    print(json.dumps(metrics, indent=2) if as_json else run_folder / "metrics.json")
+
+
+@app.command()
+def report(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.", show_default=False)],
+    recording: Annotated[Path | None, typer.Option(help="Where the recording is now.")] = None,
+) -> None:
+    """Write the self-contained HTML report of a run.
+
+    Example: `duagc report outputs/demo/run`
+    """
+    from pipeline.report import write_report
+    from pipeline.run_folder import RunFolder
+
+    print(write_report(run_folder, recording or RunFolder(run_folder).recording))
+
+
+@app.command()
+def digest(
+    path: Annotated[Path, typer.Argument(help="A log, a recording or a run.", show_default=False)],
+) -> None:
+    """Print 64 hex characters that stand for the content: messages and results, not encoders or clocks.
+
+    Example: `duagc digest outputs/demo/run`
+    """
+    from pipeline.digest import digest as digest_path
+
+    print(digest_path(path))

@@ -1,0 +1,27 @@
+"""Commands about the settings of a run."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipeline.cli.common import ConfigFile, Overrides, config_app
+
+
+@config_app.command("show")
+def config_show(config: ConfigFile = None, overrides: Overrides = None) -> None:
+    """Print the resolved configuration as TOML, every setting with its documentation."""
+    from pipeline.config import dump, load
+    from pipeline.runner import RunConfig
+
+    print(dump(load(RunConfig, config, overrides or [])), end="")
+
+
+@config_app.command("check")
+def config_check(config: Annotated[Path, typer.Argument(show_default=False)]) -> None:
+    """Say whether a configuration file is sound."""
+    from pipeline.config import load
+    from pipeline.runner import RunConfig
+
+    load(RunConfig, config)
+    print(f"{config}: sound")
