@@ -100,7 +100,7 @@ def simulate(
         shared = np.mean(list(recording.checks["shared_view"].values())) if robots > 1 else overlap
         if abs(shared - overlap) > OVERLAP_TOLERANCE:
             recording.warnings.append(f"neighbours share {shared:.2f} of the view, expected {overlap:.2f}")
-        if robots > 1:
+        if robots > 1 and paradigm != "wander":
             recording.checks["robots_apart_m"] = paradigms.least_apart(ways)
         points = stage.points()
         recording.add_geometry(lambda path: write_points(path, *points))
@@ -159,7 +159,9 @@ def _check(
     if paradigm not in PARADIGMS:
         raise DuagError(f"simulate: paradigm is {paradigm!r}, expected one of {', '.join(PARADIGMS)}")
     if preview is not None and (preview.suffix != ".png" or not preview.absolute().parent.is_dir()):
-        raise DuagError(f"{preview}: found no such place for a picture, expected NAME.png in a folder that exists")
+        raise DuagError(
+            f"{preview}: found no such place for a picture, expected NAME.png in a folder that exists"
+        )
     if scene not in SCENES and not Path(scene).is_dir():
         raise DuagError(
             f"simulate: scene is {scene!r}, expected {', '.join(SCENES)} or a folder of textured meshes"

@@ -149,7 +149,11 @@ def exposure(scene: Scene, points: Array, normals: Array, blocked: Blocked | Non
             shine = lamp.strength / 4 * 3.2 * cosine * (0.3 + 0.7 * from_lamp) / (distance2 + 1.2)
             lit = np.flatnonzero(shine > 1e-3)
             # just short of the lamp: it is no obstacle to its own light
-            hidden = blocked(start[lit], 0.97 * way[lit]) if blocked else _blocked(scene, start[lit], way[lit], 1.0)
+            hidden = (
+                blocked(start[lit], 0.97 * way[lit])
+                if blocked
+                else _blocked(scene, start[lit], way[lit], 1.0)
+            )
             shine[lit] *= ~hidden
             total += shine
     return 1.28 * (1.0 - np.exp(-1.55 * total))

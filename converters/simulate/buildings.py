@@ -1,5 +1,7 @@
 """Scenes of several rooms: an office with doors, and a corridor with a hall in its middle."""
 
+from typing import Any
+
 import numpy as np
 
 from converters.simulate import furniture as fur
@@ -11,7 +13,14 @@ from pipeline import streams
 WALL_M = 0.12
 DOOR_M, DOOR_HEIGHT_M = 1.05, 2.1
 NORTH, WEST, SOUTH, EAST = 0.0, np.pi / 2, np.pi, -np.pi / 2
-PAINTS = ((206, 198, 180), (176, 190, 196), (198, 186, 160), (186, 198, 176), (200, 178, 166), (178, 176, 196))
+PAINTS = (
+    (206, 198, 180),
+    (176, 190, 196),
+    (198, 186, 160),
+    (186, 198, 176),
+    (200, 178, 166),
+    (178, 176, 196),
+)
 Rect = tuple[float, float, float, float]  # x0, y0, x1, y1
 
 
@@ -58,12 +67,14 @@ def corridor(seed: int) -> Scene:
             depth = south if side == "south" else d - north
             inner = "back" if side == "south" else "front"
             end = "right" if name == "west" else "left"
-            faces = {
+            faces: dict[str, Any] = {
                 inner: _with_doors(rng, x1 - x0, h),
                 end: fur.decorated(tex.bricks(), depth, h, rng),
             }
             scene.box(f"{side} {name}", (x0, y, 0), (x1 - x0, depth, h), tex.plaster(PAINTS[0]), **faces)
-    for k, (x, y, yaw) in enumerate(((2.4, south, SOUTH), (7.2, north, NORTH), (19.3, south, SOUTH), (23.4, north, NORTH))):
+    for k, (x, y, yaw) in enumerate(
+        ((2.4, south, SOUTH), (7.2, north, NORTH), (19.3, south, SOUTH), (23.4, north, NORTH))
+    ):
         place = Place(scene, f"side{k}", x, y, yaw)
         (fur.bench, fur.lockers, fur.copier, fur.bench)[k](place, rng)
     fur.plant(Place(scene, "plant west", 0.4, 3.0), rng, 1.2)
@@ -80,7 +91,9 @@ def corridor(seed: int) -> Scene:
     return scene
 
 
-def _shell(scene: Scene, rng: np.random.Generator, lamps: list[tuple[float, float]], floor: tex.Material) -> None:
+def _shell(
+    scene: Scene, rng: np.random.Generator, lamps: list[tuple[float, float]], floor: tex.Material
+) -> None:
     """Floor, ceiling with shining panels, and four outer walls with windows to the north and the south."""
     w, d, h = scene.size.tolist()
     x, y, z = np.eye(3)
@@ -127,7 +140,13 @@ def _with_doors(rng: np.random.Generator, width: float, height: float) -> tex.Ma
 
 
 def _wall_along_x(
-    scene: Scene, rng: np.random.Generator, name: str, x0: float, x1: float, y: float, doors: tuple[float, ...]
+    scene: Scene,
+    rng: np.random.Generator,
+    name: str,
+    x0: float,
+    x1: float,
+    y: float,
+    doors: tuple[float, ...],
 ) -> None:
     """A wall whose nearer face is at `y` (south wall: its north face), with open doors around the given x."""
     h = float(scene.size[2])
@@ -136,7 +155,9 @@ def _wall_along_x(
     trim = tex.wood((150, 118, 84))
     paints = [tex.plaster(PAINTS[int(k)]) for k in rng.integers(0, len(PAINTS), 2)]
     for k, (a, b) in enumerate(zip(edges[::2], edges[1::2], strict=True)):
-        faces = {side: fur.decorated(p, b - a, h, rng) for side, p in zip(("front", "back"), paints, strict=True)}
+        faces: dict[str, Any] = {
+            side: fur.decorated(p, b - a, h, rng) for side, p in zip(("front", "back"), paints, strict=True)
+        }
         scene.box(f"{name}/wall{k}", (a, low, 0), (b - a, WALL_M, h), trim, **faces)
     for k, x in enumerate(doors):
         size = (DOOR_M, WALL_M, h - DOOR_HEIGHT_M)
@@ -152,7 +173,9 @@ def _wall_along_y(scene: Scene, rng: np.random.Generator, name: str, x: float, y
     """A wall without doors between two rooms, from `x` to the east."""
     h = float(scene.size[2])
     paints = [tex.plaster(PAINTS[int(k)]) for k in rng.integers(0, len(PAINTS), 2)]
-    faces = {side: fur.decorated(p, y1 - y0, h, rng) for side, p in zip(("left", "right"), paints, strict=True)}
+    faces: dict[str, Any] = {
+        side: fur.decorated(p, y1 - y0, h, rng) for side, p in zip(("left", "right"), paints, strict=True)
+    }
     scene.box(f"{name}/partition", (x, y0, 0), (WALL_M, y1 - y0, h), paints[0], **faces)
 
 
@@ -171,7 +194,9 @@ def _study(scene: Scene, rng: np.random.Generator, name: str, room: Rect, window
     inner = y1 - WALL_M if window == SOUTH else y0
     inward = -0.35 if window == SOUTH else 0.35
     fur.cartons(Place(scene, f"{name}/cartons", x0 + 0.4, inner, NORTH if window == SOUTH else SOUTH), rng)
-    fur.plant(Place(scene, f"{name}/plant", x1 - 0.35, outer - inward, 0.0), rng, float(rng.uniform(0.9, 1.2)))
+    fur.plant(
+        Place(scene, f"{name}/plant", x1 - 0.35, outer - inward, 0.0), rng, float(rng.uniform(0.9, 1.2))
+    )
 
 
 def _meeting(scene: Scene, rng: np.random.Generator, room: Rect) -> None:
@@ -179,7 +204,9 @@ def _meeting(scene: Scene, rng: np.random.Generator, room: Rect) -> None:
     x0, y0, x1, y1 = room
     fur.meeting_table(Place(scene, "meeting/table", (x0 + x1) / 2, (y0 + y1) / 2 + 0.25), rng)
     screen = Place(scene, "meeting/screen", x0, (y0 + y1) / 2 + 0.25, WEST)
-    screen.box("display", (-0.8, -0.06, 0.95), (1.6, 0.06, 0.95), tex.plaster((38, 38, 42), 0.1), front=tex.screen)
+    screen.box(
+        "display", (-0.8, -0.06, 0.95), (1.6, 0.06, 0.95), tex.plaster((38, 38, 42), 0.1), front=tex.screen
+    )
     fur.cabinet(Place(scene, "meeting/cabinet", x1, (y0 + y1) / 2 + 0.4, EAST), rng, 1.5)
     fur.plant(Place(scene, "meeting/plant", x0 + 0.4, y1 - 0.4), rng, 1.1)
 

@@ -13,7 +13,11 @@ Array = NDArray[np.float64]
 
 OAK, DARK, PINE = (168, 124, 80), (92, 68, 50), (190, 152, 106)
 STEEL = tex.plaster((150, 154, 158), 0.08)
-CLOTHS = (((84, 102, 118), (132, 122, 100)), ((150, 84, 62), (196, 160, 110)), ((70, 104, 84), (180, 170, 130)))
+CLOTHS = (
+    ((84, 102, 118), (132, 122, 100)),
+    ((150, 84, 62), (196, 160, 110)),
+    ((70, 104, 84), (180, 170, 130)),
+)
 PICTURES = ("abstract", "landscape", "map", "page")
 
 
@@ -43,7 +47,7 @@ class Place:
         size: ArrayLike,
         material: tex.Material,
         yaw_rad: float = 0.0,
-        **faces: tex.Material,
+        **faces: Any,
     ) -> None:
         """A box with its low corner at `low`, turned about its own middle; faces as in `Scene.box`."""
         half = np.asarray(size, dtype=np.float64) / 2
@@ -76,7 +80,11 @@ def desk(at: Place, rng: np.random.Generator) -> None:
     at.box("top", (-0.75, -0.75, 0.71), (1.5, 0.75, 0.04), tex.wood(PINE))
     at.legs("leg", (-0.72, -0.72, 0), (1.44, 0.68, 0.71), 0.06, dark)
     at.box(
-        "drawers", (0.22, -0.68, 0.18), (0.42, 0.6, 0.52), tex.wood(OAK), front=tex.front((170, 126, 82), 1, 3)
+        "drawers",
+        (0.22, -0.68, 0.18),
+        (0.42, 0.6, 0.52),
+        tex.wood(OAK),
+        front=tex.front((170, 126, 82), 1, 3),
     )
     left = float(rng.uniform(-0.55, -0.25))
     black = tex.plaster((38, 38, 42), 0.1)
@@ -84,10 +92,13 @@ def desk(at: Place, rng: np.random.Generator) -> None:
     at.box("monitor/foot", (left + 0.2, -0.3, 0.75), (0.22, 0.16, 0.11), black)
     cover = tex.marbled((92, 70, 60), (124, 92, 74))
     at.box("books", (0.35, -0.24, 0.75), (0.34, 0.2, 0.26), cover, front=tex.spines)
-    at.box("paper", (0.05, -0.6, 0.75), (0.3, 0.22, 0.012), tex.picture("page"), yaw_rad=rng.uniform(-0.4, 0.4))
+    at.box(
+        "paper", (0.05, -0.6, 0.75), (0.3, 0.22, 0.012), tex.picture("page"), yaw_rad=rng.uniform(-0.4, 0.4)
+    )
     mug = tex.marbled((176, 66, 48), (226, 212, 186), 0.05)
     at.cylinder("mug", (-0.6, -0.5, 0.75), 0.045, 0.1, mug)
-    turned = Place(at.scene, f"{at.name}/chair", *at.world((0.0, -0.95, 0))[:2], at.yaw_rad)
+    x, y, _ = at.world((0.0, -0.95, 0))
+    turned = Place(at.scene, f"{at.name}/chair", x, y, at.yaw_rad)
     chair(turned, rng, float(rng.uniform(-0.5, 0.5)))
 
 
@@ -129,18 +140,26 @@ def cabinet(at: Place, rng: np.random.Generator, width: float = 1.2, height: flo
     columns = max(2, round(width / 0.45))
     tone = tex.shaded(rng, (182, 160, 126), 0.12)
     at.box(
-        "body", (-width / 2, -0.45, 0), (width, 0.45, height), tex.wood(tone), front=tex.front(tone, columns, 3)
+        "body",
+        (-width / 2, -0.45, 0),
+        (width, 0.45, height),
+        tex.wood(tone),
+        front=tex.front(tone, columns, 3),
     )
     cover = tex.marbled((92, 70, 60), (124, 92, 74))
     at.box("books", (-width / 2 + 0.08, -0.3, height), (0.36, 0.18, 0.25), cover, front=tex.spines)
     glaze = tex.marbled(tex.vivid(rng), (226, 206, 176), 0.08)
     at.cylinder("jar", (0.1 * width, -0.22, height), 0.09, float(rng.uniform(0.16, 0.3)), glaze)
-    at.sphere("ball", (0.36 * width, -0.22, height + 0.11), 0.11, tex.marbled(tex.vivid(rng), (70, 96, 130), 0.1))
+    at.sphere(
+        "ball", (0.36 * width, -0.22, height + 0.11), 0.11, tex.marbled(tex.vivid(rng), (70, 96, 130), 0.1)
+    )
 
 
 def plant(at: Place, rng: np.random.Generator, high: float = 1.0) -> None:
     """A plant in a pot, its middle at the place."""
-    at.cylinder("pot", (0, 0, 0), 0.2, 0.4, tex.marbled(tex.shaded(rng, (168, 96, 66), 0.15), (120, 70, 52), 0.1))
+    at.cylinder(
+        "pot", (0, 0, 0), 0.2, 0.4, tex.marbled(tex.shaded(rng, (168, 96, 66), 0.15), (120, 70, 52), 0.1)
+    )
     at.cylinder("stem", (0, 0, 0.4), 0.03, high - 0.6, tex.wood((96, 74, 50)))
     at.sphere("leaves", (0, 0, high), float(rng.uniform(0.26, 0.34)), tex.foliage)
 
@@ -175,13 +194,23 @@ def meeting_table(at: Place, rng: np.random.Generator, length: float = 2.4) -> N
     for side, turn in ((-1, 0.0), (1, np.pi)):
         for k in range(3):
             x, y, _ = at.world((-length / 3 + k * length / 3, side * 0.78, 0))
-            chair(Place(at.scene, f"{at.name}/chair{side}.{k}", x, y, at.yaw_rad + turn), rng, rng.uniform(-0.3, 0.3))
+            chair(
+                Place(at.scene, f"{at.name}/chair{side}.{k}", x, y, at.yaw_rad + turn),
+                rng,
+                rng.uniform(-0.3, 0.3),
+            )
 
 
 def copier(at: Place, rng: np.random.Generator) -> None:
     """A copying machine at the wall."""
     grey = tex.plaster(tex.shaded(rng, (204, 204, 198), 0.05), 0.05)
-    at.box("body", (-0.35, -0.62, 0), (0.7, 0.6, 0.85), grey, front=tex.front((186, 188, 190), 1, 4, (70, 72, 76)))
+    at.box(
+        "body",
+        (-0.35, -0.62, 0),
+        (0.7, 0.6, 0.85),
+        grey,
+        front=tex.front((186, 188, 190), 1, 4, (70, 72, 76)),
+    )
     at.box("lid", (-0.35, -0.62, 0.87), (0.7, 0.6, 0.12), tex.plaster((84, 88, 96), 0.1))
     at.box("panel", (-0.3, -0.72, 0.9), (0.4, 0.1, 0.05), tex.screen)
     at.box("paper", (-0.2, -0.5, 0.99), (0.3, 0.22, 0.05), tex.picture("page"), yaw_rad=0.2)
@@ -213,7 +242,11 @@ def cooler(at: Place, rng: np.random.Generator) -> None:
 
 
 def decorated(
-    base: tex.Material, width: float, height: float, rng: np.random.Generator, free: tuple[float, float] = (0.0, 0.0)
+    base: tex.Material,
+    width: float,
+    height: float,
+    rng: np.random.Generator,
+    free: tuple[float, float] = (0.0, 0.0),
 ) -> tex.Material:
     """A wall with a skirting board and pictures at eye height; none of them between the two `free` ends (m)."""
     patches: list[tuple[Any, float, float, float, float]] = [(tex.skirting, 0.0, height - 0.08, width, 0.08)]

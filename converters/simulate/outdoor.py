@@ -1,5 +1,7 @@
 """A block of a town under the sun: a square with trees and a fountain, a house with streets round it, cars, facades."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -28,7 +30,13 @@ def outdoor(seed: int) -> Scene:
             (tex.tiles((176, 168, 152), 0.5, (120, 114, 104)), 2.0, 2.0, 17.5, d - 4.0),
             (lawn, 5.0, 4.5, 4.0, 6.0),
             (lawn, 12.5, 23.0, 4.0, 6.5),
-            (tex.tiles((160, 156, 150), 0.4, (116, 112, 106)), HOUSE[0] - 1.6, d - HOUSE[3] - 1.6, 14.2, 14.2),
+            (
+                tex.tiles((160, 156, 150), 0.4, (116, 112, 106)),
+                HOUSE[0] - 1.6,
+                d - HOUSE[3] - 1.6,
+                14.2,
+                14.2,
+            ),
             (stripes, 19.8, 15.0, 2.6, 4.0),
             (stripes, 26.0, 3.2, 4.0, 2.6),
         ],
@@ -51,10 +59,17 @@ def _facades(scene: Scene, rng: np.random.Generator) -> None:
             wide = float(rng.uniform(5.5, 9.5))
             wide = length - at if length - at - wide < 5.0 else wide
             high, deep = float(rng.uniform(5.0, 9.0)), float(rng.uniform(1.2, 2.2))
-            faces = {front: facade(RENDERS[int(rng.integers(0, len(RENDERS)))])}
-            low = {"south": (at, 0, 0), "north": (at, d - deep, 0), "west": (0, at, 0), "east": (w - deep, at, 0)}
+            faces: dict[str, Any] = {front: facade(RENDERS[int(rng.integers(0, len(RENDERS)))])}
+            low = {
+                "south": (at, 0, 0),
+                "north": (at, d - deep, 0),
+                "west": (0, at, 0),
+                "east": (w - deep, at, 0),
+            }
             size = (wide, deep, high) if side in ("south", "north") else (deep, wide, high)
-            plain = tex.bricks() if rng.random() < 0.5 else tex.plaster(tex.shaded(rng, RENDERS[2], 0.15), 0.1)
+            plain = (
+                tex.bricks() if rng.random() < 0.5 else tex.plaster(tex.shaded(rng, RENDERS[2], 0.15), 0.1)
+            )
             scene.box(f"{side}{k}", low[side], size, plain, **faces)
             at += wide
             k += 1
@@ -63,15 +78,18 @@ def _facades(scene: Scene, rng: np.random.Generator) -> None:
 def _house(scene: Scene, rng: np.random.Generator) -> None:
     """The house in the middle of the block, with a shop window to the square."""
     x0, y0, x1, y1 = HOUSE
-    faces = {
-        side: facade(RENDERS[int(rng.integers(0, len(RENDERS)))]) for side in ("front", "back", "left", "right")
+    faces: dict[str, Any] = {
+        side: facade(RENDERS[int(rng.integers(0, len(RENDERS)))])
+        for side in ("front", "back", "left", "right")
     }
     scene.box("house", (x0, y0, 0), (x1 - x0, y1 - y0, 7.5), tex.bricks(), **faces)
     scene.box("house/step", (x0 - 0.5, y0 + 4.5, 0), (0.5, 2.0, 0.18), tex.plaster((150, 146, 138), 0.1))
     awning = tex.fabric((172, 60, 50), (226, 214, 190))
     scene.box("house/awning", (x0 - 1.1, y0 + 1.2, 2.35), (1.1, 3.0, 0.12), awning)
     for k, y in enumerate((y0 + 1.5, y0 + 3.4)):
-        Place(scene, f"house/crate{k}", x0 - 0.4, y).box("crate", (-0.3, -0.3, 0), (0.6, 0.6, 0.5), tex.carton)
+        Place(scene, f"house/crate{k}", x0 - 0.4, y).box(
+            "crate", (-0.3, -0.3, 0), (0.6, 0.6, 0.5), tex.carton
+        )
 
 
 def _square(scene: Scene, rng: np.random.Generator) -> None:
@@ -80,9 +98,13 @@ def _square(scene: Scene, rng: np.random.Generator) -> None:
     scene.cylinder("fountain", (10.5, 17.0, 0), 1.6, 0.55, stone)
     scene.cylinder("fountain/pillar", (10.5, 17.0, 0.55), 0.3, 1.1, stone)
     scene.sphere("fountain/ball", (10.5, 17.0, 2.0), 0.45, tex.marbled((92, 130, 140), (180, 190, 180), 0.2))
-    for k, (x, y) in enumerate(((5.2, 22.0), (7.8, 28.5), (14.5, 8.0), (6.0, 7.5), (16.4, 13.2), (16.2, 21.5))):
+    for k, (x, y) in enumerate(
+        ((5.2, 22.0), (7.8, 28.5), (14.5, 8.0), (6.0, 7.5), (16.4, 13.2), (16.2, 21.5))
+    ):
         _tree(Place(scene, f"tree{k}", x, y), rng)
-    for k, (x, y, yaw) in enumerate(((10.5, 13.6, 0.1), (13.8, 17.5, -1.5), (10.2, 20.6, 3.1), (7.0, 16.4, 1.6))):
+    for k, (x, y, yaw) in enumerate(
+        ((10.5, 13.6, 0.1), (13.8, 17.5, -1.5), (10.2, 20.6, 3.1), (7.0, 16.4, 1.6))
+    ):
         fur.bench(Place(scene, f"bench{k}", x, y, yaw), rng, 1.8)
     posters = tex.paint_onto(
         tex.plaster((196, 186, 160), 0.08),
@@ -100,7 +122,14 @@ def _square(scene: Scene, rng: np.random.Generator) -> None:
 
 def _street(scene: Scene, rng: np.random.Generator) -> None:
     """Parked cars, lamp posts, trees on the pavement, bins."""
-    spots = ((25.5, 8.0, 0.0), (30.8, 7.9, 0.0), (37.0, 12.5, 1.57), (37.1, 18.6, 1.57), (27.0, 26.2, 0.0), (33.0, 26.1, 0.05))
+    spots = (
+        (25.5, 8.0, 0.0),
+        (30.8, 7.9, 0.0),
+        (37.0, 12.5, 1.57),
+        (37.1, 18.6, 1.57),
+        (27.0, 26.2, 0.0),
+        (33.0, 26.1, 0.05),
+    )
     for k, (x, y, yaw) in enumerate(spots):
         _car(Place(scene, f"car{k}", x, y, yaw + float(rng.uniform(-0.05, 0.05))), rng)
     for k, (x, y) in enumerate(((20.8, 5.5), (20.8, 28.5), (36.0, 5.5), (36.0, 28.8), (21.0, 17.0))):

@@ -1,28 +1,29 @@
 """Paths of a team that draw a figure together: concentric circles, leader and followers, crossing or parallel lines.
 
-A figure is put somewhere into the free floor, as large as fits; curves give way to what stands near them. All robots
-of a figure look to the same side of their way, to where there is most to see. How far the curves are apart follows
-from the share of the view that neighbours shall have in common: it is measured, and the nearest is taken.
+A figure is put somewhere into the free floor, as large as fits; curves give way to what stands near them. Cameras look
+ahead or aside, all to the same side or neighbours to opposite ones. How far the curves are apart, and where the cameras
+look, follows from the share of the view that neighbours shall have in common: it is measured, and the nearest is taken.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d, map_coordinates
 
-from converters.simulate.paths import HEIGHTS_M, OVERLAP_IMAGE, look_at, shared_view
+from converters.simulate.paths import HEIGHTS_M, look_at, shared_view
 from converters.simulate.render import Eye
 from converters.simulate.walks import (
+    LEAST_MEDIAN_M,
     MAX_HOLE_SHARE,
     MAX_NEAR_SHARE,
     MAX_SKY_SHARE,
     MAX_TURN_RAD,
     MIN_CLEARANCE_M,
     NEAR_M,
-    FreeSpace,
     Terrain,
     route,
 )
@@ -35,12 +36,14 @@ Array = NDArray[np.float64]
 
 SIZES = (1.0, 0.8, 0.64, 0.5, 0.4, 0.3)  # of the way that frames and step would make
 DRAWS = 160  # figures drawn per size
-PLACES = 10  # figures looked at from the cameras, of all sizes
-SPREADS = 6  # halvings of the interval of spreads
-OVERLAP_NEAR_ENOUGH = 0.03
+PLACES, MOST_PLACES = 4, 16  # of each size, and of all, that are looked at from the cameras
+SPREADS, HALVINGS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0), 3
+OVERLAP_NEAR_ENOUGH = 0.04
 GIVE_WAY_M = 0.5  # what a curve may be moved by what stands there
-GAZES_RAD = tuple(np.deg2rad((0.0, 40.0, -40.0, 80.0, -80.0)))
-CHECKED_VIEWS = 8
+GAZES_RAD = [np.deg2rad((a, b)) for a in (0.0, 40.0, -40.0, 80.0, -80.0) for b in sorted({a, -a})]  # by turns
+SMOOTH_GAZE_M = 0.35
+CHECKED_VIEWS = 6
+SKETCH = (28, 21)  # pixels of the views that a planner looks at
 APART_M = 0.4  # between robots at the same time
 PITCH_RAD = np.deg2rad(-7.0)
 POINT_M = 0.05  # between the points of a curve
@@ -60,7 +63,7 @@ def _circles(figure: Figure, robots: int, spread: float) -> list[Array]:
     """Arcs of concentric circles, all with the same angular rate; `spread` turns each against the one before."""
     radii = figure.reach_m * (np.linspace(0.5, 1.0, robots) if robots > 1 else np.ones(1))
     sweep = min(figure.length_m / figure.reach_m, 1.9 * np.pi)
-    shift = (0.1 + 0.9 * spread) * np.pi
+    shift = spread * np.pi
     curves = []
     for k, radius in enumerate(radii):
         count = max(8, int(sweep * radius / POINT_M))
@@ -71,17 +74,21 @@ def _circles(figure: Figure, robots: int, spread: float) -> list[Array]:
 
 def _crossing(figure: Figure, robots: int, spread: float) -> list[Array]:
     """Straight ways through one point at different times, `spread` apart in direction."""
-    angle = np.deg2rad(12) + spread * (np.pi / max(robots, 2) - np.deg2rad(12)) * (1.6 if robots == 2 else 1.0)
+    angle = np.deg2rad(12) + spread * (np.pi / max(robots, 2) - np.deg2rad(12)) * (
+        1.6 if robots == 2 else 1.0
+    )
     gap = min(0.6, 0.8 * figure.length_m / max(robots, 1))
     turns = (np.arange(robots) - (robots - 1) / 2) * angle
-    starts = [(k - (robots - 1) / 2) * gap * (-1) ** k for k in range(robots)]
-    return [_line(figure, turn, 0.0, start) for turn, start in zip(turns, starts, strict=True)]
+    starts = (np.arange(robots) - (robots - 1) / 2) * gap
+    return [
+        _line(figure, turn, 0.0, start) for turn, start in zip(turns.tolist(), starts.tolist(), strict=True)
+    ]
 
 
 def _parallel(figure: Figure, robots: int, spread: float) -> list[Array]:
-    """Straight ways side by side, at first farther apart with `spread`, then behind each other too."""
+    """Straight ways side by side, with `spread` farther apart and farther behind each other."""
     apart = 0.45 + min(1.0, 1.6 * spread) * (2 * figure.reach_m / max(robots - 1, 1) - 0.45)
-    behind = max(0.0, spread - 0.4) * 0.7 * figure.length_m
+    behind = 0.8 * spread * figure.length_m
     sides = np.arange(robots) - (robots - 1) / 2
     return [_line(figure, 0.0, k * apart, -k * behind) for k in sides]
 
@@ -92,7 +99,7 @@ def _line(figure: Figure, turn_rad: float, aside_m: float, along_m: float) -> Ar
     ahead = np.array([np.cos(heading), np.sin(heading)])
     left = np.array([-ahead[1], ahead[0]])
     s = np.linspace(-0.5, 0.5, max(8, int(figure.length_m / POINT_M))) * figure.length_m + along_m
-    return figure.middle + aside_m * left + s[:, None] * ahead
+    return np.asarray(figure.middle + aside_m * left + s[:, None] * ahead)
 
 
 FIGURES: dict[str, Callable[[Figure, int, float], list[Array]]] = {
@@ -104,7 +111,13 @@ PARADIGMS = ("wander", "concentric", "leader-follower", "crossing", "parallel")
 
 
 def plan(
-    terrain: Terrain, paradigm: str, robots: int, frames: int, overlap: float, camera: PinholeCamera, seed: int
+    terrain: Terrain,
+    paradigm: str,
+    robots: int,
+    frames: int,
+    overlap: float,
+    camera: PinholeCamera,
+    seed: int,
 ) -> list[Array]:
     """Paths T_world_camera [frames, 4, 4] of every robot.
 
@@ -122,17 +135,17 @@ def plan(
     ground = _Ground(terrain, camera)
     draw = _followers if paradigm == "leader-follower" else _figures
     best: tuple[float, list[Array]] | None = None
-    for place in draw(ground, paradigm, robots, frames, seed):
-        for gaze in ground.gazes(place(0.5)):
-            error, ways = _nearest(ground, place, gaze, overlap)
+    for place in islice(draw(ground, paradigm, robots, frames, seed), MOST_PLACES):
+        for error, paths in _by_overlap(ground, place, overlap):
             if best is None or error < best[0]:
-                best = error, ways
-            if best[0] < OVERLAP_NEAR_ENOUGH:
-                return best[1]
+                best = error, paths
+            if error < OVERLAP_NEAR_ENOUGH:
+                return paths
     if best is None:
+        area = len(ground.space.cells) * ground.space.cell_m**2
         raise DuagError(
-            f"simulate: {paradigm} paths of {robots} robots fit nowhere in {len(ground.space.cells) * ground.space.cell_m**2:.1f} m^2 "
-            "of free floor, expected a larger scene, fewer robots, or another --paradigm"
+            f"simulate: {paradigm} paths of {robots} robots fit nowhere in {area:.1f} m^2 of free floor, expected "
+            "a larger scene, fewer robots, or another --paradigm"
         )
     return best[1]
 
@@ -160,7 +173,7 @@ class _Ground:
 
     def __init__(self, terrain: Terrain, camera: PinholeCamera) -> None:
         self.terrain, self.space = terrain, terrain.free_space()
-        self.eye = terrain.eye(camera.scaled(*OVERLAP_IMAGE))
+        self.eye = terrain.sketch(camera.scaled(*SKETCH))
         inside = np.pad(self.space.inside, 1)
         out, into = distance_transform_edt(~inside), distance_transform_edt(inside)
         self._margin = ((into - out) * self.space.cell_m).astype(np.float64)
@@ -186,8 +199,10 @@ class _Ground:
         moved = np.linalg.norm(way - curve, axis=1).max()
         return way if self.margin(way).min() > 0.0 and moved < GIVE_WAY_M else None
 
-    def way(self, curve: Array, start_m: float, length_m: float, robot: int, frames: int, seed: int) -> _Way | None:
-        """Even steps along a part of a curve [n, 2], at the robot's height, or None if they turn too fast or hit something."""
+    def way(
+        self, curve: Array, start_m: float, length_m: float, robot: int, frames: int, seed: int
+    ) -> _Way | None:
+        """Even steps along a part of a curve [n, 2] at the robot's height; None if too sharp or not clear."""
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
         if start_m < 0 or start_m + length_m > along[-1] + 1e-6:
             return None
@@ -195,8 +210,13 @@ class _Ground:
         s = start_m + np.linspace(0.0, length_m, frames)
         ahead = spline(s, 1)
         heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
+        heading = gaussian_filter1d(heading, SMOOTH_GAZE_M * frames / length_m, mode="nearest")
         rng = streams.generator(seed, "simulate.waver", robot=robot)
-        waves = rng.uniform((0.02, 0.03), (0.05, 0.08)), rng.uniform(1.5, 3.0, 2), rng.uniform(0, 2 * np.pi, 2)
+        waves = (
+            rng.uniform((0.02, 0.03), (0.05, 0.08)),
+            rng.uniform(1.5, 3.0, 2),
+            rng.uniform(0, 2 * np.pi, 2),
+        )
         bob, swing = (a * np.sin(2 * np.pi * s / p + f) for a, p, f in zip(*waves, strict=True))
         height = HEIGHTS_M[robot % len(HEIGHTS_M)] + 0.06 * (robot // len(HEIGHTS_M)) + bob
         position = np.column_stack([spline(s), self.space.floor_m + height])
@@ -206,35 +226,23 @@ class _Ground:
             return None
         return way
 
-    def gazes(self, ways: list[_Way] | None) -> list[float]:
-        """Directions to look in, beside the way, in which cameras see enough; the most open first."""
-        shown = [(self.shows(ways, gaze), gaze) for gaze in GAZES_RAD] if ways else []
-        return [gaze for _, gaze in sorted((-least, gaze) for least, gaze in shown if least is not None)]
-
-    def shows(self, ways: list[_Way], gaze_rad: float) -> float | None:
-        """Least median depth (m) of a view from the ways; None if one faces holes or a near wall."""
-        least = np.inf
-        for way in ways:
-            for pose in _some(way.poses(gaze_rad)):
-                depth = self._openness(pose)
-                if depth is None:
-                    return None
-                least = min(least, depth)
-        return float(least)
-
-    def _openness(self, pose: Array) -> float | None:
-        """Median depth (m) of a view, at most 3; None if it shows too much of nothing or of something near."""
-        depth, _ = self.eye.depth(pose)
-        seen = depth > 0
+    def shows(self, paths: list[Array]) -> bool:
+        """Whether no camera faces holes or something near."""
         most = MAX_SKY_SHARE if self.terrain.sky else MAX_HOLE_SHARE
-        if 1 - seen.mean() > most or np.mean(seen & (depth < NEAR_M)) > MAX_NEAR_SHARE:
-            return None
-        return min(3.0, float(np.median(depth[seen])))
+        for path in paths:
+            for pose in path[np.linspace(0, len(path) - 1, CHECKED_VIEWS).round().astype(np.int64)]:
+                depth, _ = self.eye.depth(pose)
+                seen = depth > 0
+                if 1 - seen.mean() > most or np.mean(seen & (depth < NEAR_M)) > MAX_NEAR_SHARE:
+                    return False
+                if np.median(depth[seen]) < LEAST_MEDIAN_M:
+                    return False
+        return True
 
 
-def _some(poses: Array) -> Array:
-    """A few of the poses of a path, evenly."""
-    return np.asarray(poses[np.linspace(0, len(poses) - 1, CHECKED_VIEWS).round().astype(np.int64)])
+def _poses(ways: list[_Way], gaze_rad: Array) -> list[Array]:
+    """Paths of all robots, which look aside by the two directions by turns."""
+    return [way.poses(float(gaze_rad[k % 2])) for k, way in enumerate(ways)]
 
 
 def _figures(ground: _Ground, paradigm: str, robots: int, frames: int, seed: int) -> Iterator[Place]:
@@ -242,11 +250,13 @@ def _figures(ground: _Ground, paradigm: str, robots: int, frames: int, seed: int
     space, shape = ground.space, FIGURES[paradigm]
     extent = float(np.ptp(space.cells, axis=0).max())
     share = space.clearance / space.clearance.sum()
-    found = 0
     for size in SIZES:
+        found = 0
         length = size * (frames - 1) * ground.terrain.step_m
         for attempt in range(DRAWS):
-            rng = streams.generator(seed, "simulate.figure", paradigm=paradigm, size=str(size), attempt=attempt)
+            rng = streams.generator(
+                seed, "simulate.figure", paradigm=paradigm, size=str(size), attempt=attempt
+            )
             middle = space.cells[rng.choice(len(share), p=share)]
             if paradigm == "concentric":
                 middle = middle + rng.normal(0, 0.1 * extent, 2)
@@ -257,9 +267,10 @@ def _figures(ground: _Ground, paradigm: str, robots: int, frames: int, seed: int
 
             def place(spread: float, figure: Figure = figure) -> list[_Way] | None:
                 ways = []
-                for robot, curve in enumerate(shape(figure, robots, spread)):
-                    if ground.margin(curve).min() < -0.35:
-                        return None
+                curves = shape(figure, robots, spread)
+                if ground.margin(np.concatenate(curves)).min() < GIVE_WAY_M - 0.95:
+                    return None
+                for robot, curve in enumerate(curves):
                     bent = ground.bent(curve)
                     if bent is None:
                         return None
@@ -270,26 +281,28 @@ def _figures(ground: _Ground, paradigm: str, robots: int, frames: int, seed: int
                     ways.append(way)
                 return ways
 
-            if place(0.5) is not None:
+            if place(SPREADS[1]) is not None:
                 yield place
                 found += 1
                 if found == PLACES:
-                    return
+                    break
 
 
 def _followers(ground: _Ground, paradigm: str, robots: int, frames: int, seed: int) -> Iterator[Place]:
     """Routes along which one robot leads and the others follow, each behind the one before by the spread."""
     graph = ground.space.graph.tocsr()
-    found = 0
     for size in SIZES:
+        found = 0
         length = size * (frames - 1) * ground.terrain.step_m
-        longest = min(1.0 * length, 6.0) if robots > 1 else 0.0
+        longest = min(length, 5.0, 15.0 / max(robots - 1, 1))
         for attempt in range(DRAWS // 8):
             rng = streams.generator(seed, "simulate.lead", size=str(size), attempt=attempt)
             total = length + (robots - 1) * longest
             curve = route(ground.space, graph, total + 1.5, rng)
 
-            def place(spread: float, curve: Array = curve, length: float = length, longest: float = longest) -> list[_Way] | None:
+            def place(
+                spread: float, curve: Array = curve, length: float = length, longest: float = longest
+            ) -> list[_Way] | None:
                 lag = min(APART_M, longest) + spread * (longest - min(APART_M, longest))
                 ways = []
                 for robot in range(robots):
@@ -300,40 +313,63 @@ def _followers(ground: _Ground, paradigm: str, robots: int, frames: int, seed: i
                     ways.append(way)
                 return ways
 
-            if place(0.5) is not None:
+            if place(SPREADS[1]) is not None:
                 yield place
                 found += 1
                 if found == PLACES:
-                    return
+                    break
 
 
-def _nearest(ground: _Ground, place: Place, gaze_rad: float, overlap: float) -> tuple[float, list[Array]]:
-    """The ways of a place whose overlap is nearest to the one asked for, and how far it is from it.
+def _by_overlap(ground: _Ground, place: Place, overlap: float) -> Iterator[tuple[float, list[Array]]]:
+    """For every direction to look in: the paths whose overlap is nearest to the one asked for, and their distance.
 
-    A larger spread shares less, by and large: the interval is halved, and the best of all that were seen is taken.
+    A few spreads are tried; where the overlap passes the one asked for between two of them, the interval is halved.
     """
-    low, high, spread = 0.0, 1.0, 0.5
-    best: tuple[float, list[Array]] = (np.inf, [])
-    for _ in range(SPREADS):
-        ways = place(spread)
-        poses = [way.poses(gaze_rad) for way in ways or []]
-        shared = _shared(ground.eye, poses) if poses else 0.0  # what is not free is too wide
-        error = abs(shared - overlap)
-        if ways and ground.shows(ways, gaze_rad) is not None:
-            crowded = max(0.0, 1 - least_apart(poses) / APART_M)
-            if error + 0.2 * crowded < best[0]:
-                best = (error + 0.2 * crowded, poses)
-        if len(poses) == 1 or error < OVERLAP_NEAR_ENOUGH / 2:
-            break
-        low, high = (spread, high) if shared > overlap else (low, spread)
+    ways_of = {spread: ways for spread in SPREADS if (ways := place(spread)) is not None}
+    for gaze in GAZES_RAD:
+        seen: dict[float, tuple[float, list[Array]]] = {}
+        for spread, ways in ways_of.items():
+            paths = _poses(ways, gaze)
+            if ground.shows(paths):
+                seen[spread] = _shared(ground.eye, paths), paths
+        for low, high in pairwise(sorted(seen)):
+            if (seen[low][0] - overlap) * (seen[high][0] - overlap) < 0:
+                _halve(ground, place, gaze, overlap, seen, low, high)
+                break
+        errors = [(_error(shared, paths, overlap), spread) for spread, (shared, paths) in seen.items()]
+        if errors:
+            error, spread = min(errors)
+            yield error, seen[spread][1]
+
+
+def _halve(
+    ground: _Ground,
+    place: Place,
+    gaze_rad: Array,
+    overlap: float,
+    seen: dict[float, tuple[float, list[Array]]],
+    low: float,
+    high: float,
+) -> None:
+    """Add spreads between `low` and `high` to what was `seen`, nearer and nearer to the overlap asked for."""
+    for _ in range(HALVINGS):
         spread = (low + high) / 2
-    return best
+        paths = _poses(place(spread) or [], gaze_rad)
+        if not paths or not ground.shows(paths):
+            return
+        seen[spread] = _shared(ground.eye, paths), paths
+        same_side = (seen[spread][0] > overlap) == (seen[low][0] > overlap)
+        low, high = (spread, high) if same_side else (low, spread)
+
+
+def _error(shared: float, paths: list[Array], overlap: float) -> float:
+    """How far an overlap is from the one asked for; robots that come too near to each other count as well."""
+    return abs(shared - overlap) + 0.2 * max(0.0, 1 - least_apart(paths) / APART_M)
 
 
 def _shared(eye: Eye, paths: list[Array]) -> float:
     """Mean share of the view that neighbours have in common; 1 for a robot alone."""
-    pairs = zip(paths[:-1], paths[1:], strict=True)
-    return float(np.mean([shared_view(eye, a, b) for a, b in pairs])) if len(paths) > 1 else 1.0
+    return float(np.mean([shared_view(eye, *pair) for pair in pairwise(paths)])) if len(paths) > 1 else 1.0
 
 
 def least_apart(paths: list[Array]) -> float:

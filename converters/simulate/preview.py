@@ -17,6 +17,7 @@ COLORS = (
 THUMBS, THUMB_WIDTH = 6, 240
 MAP_SIZE = (900, 720)  # at most
 CUT_M = 0.35  # above the lowest camera: what is higher is not drawn
+POINTS_PER_PIXEL = 4  # of the map, before it is enlarged
 MARGIN, PAPER, INK = 12, (250, 250, 248), (40, 40, 44)
 
 
@@ -85,10 +86,12 @@ class Preview:
                 at = way[index, :2, 3]
                 for side in (-0.5, 0.5):  # half the opening angle of a camera, about
                     c, s = np.cos(side), np.sin(side)
-                    edge = np.array([[c, -s], [s, c]]) @ way[index, :2, 2]
-                    cv2.line(image, pixel(at), pixel(at + 28 / scale * edge), color, 1, cv2.LINE_AA)
+                    end = at + 28 / scale * (np.array([[c, -s], [s, c]]) @ way[index, :2, 2])
+                    cv2.line(image, pixel(at), pixel(end), color, 1, cv2.LINE_AA)
             cv2.circle(image, pixel(way[0, :2, 3]), 7, color, -1, cv2.LINE_AA)
-            cv2.putText(image, self.names[k][0], pixel(way[0, :2, 3] + 10 / scale), 0, 0.6, color, 2, cv2.LINE_AA)
+            cv2.putText(
+                image, self.names[k][0], pixel(way[0, :2, 3] + 10 / scale), 0, 0.6, color, 2, cv2.LINE_AA
+            )
         metres = 10.0 ** np.floor(np.log10(200 / scale))
         bottom = image.shape[0] - 14
         cv2.line(image, (14, bottom), (14 + round(metres * scale), bottom), INK, 3)
@@ -98,6 +101,8 @@ class Preview:
 
 def _from_above(points: Array, colors: NDArray[np.uint8], low: Array, high: Array, scale: float) -> Image:
     """Points seen from above, the highest of each place; places without one have the colour of their surroundings."""
+    whole = tuple(max(1, int(n)) for n in scale * (high - low))
+    scale = min(scale, float(np.sqrt(len(points) / np.prod(high - low) / POINTS_PER_PIXEL)))
     width, height = (max(1, int(n)) for n in scale * (high - low))
     order = np.argsort(points[:, 2], kind="stable")
     u = (scale * (points[order, 0] - low[0])).astype(np.int64)
@@ -108,13 +113,12 @@ def _from_above(points: Array, colors: NDArray[np.uint8], low: Array, high: Arra
     image[v[inside], u[inside]] = colors[order][inside]  # the last one, the highest, stays
     known[v[inside], u[inside]] = 1
     window = np.ones((3, 3), dtype=np.uint8)
-    for _ in range(3):
-        grown = cv2.dilate(image, window)
-        empty = known == 0
+    for _ in range(2):
+        grown, empty = cv2.dilate(image, window), known == 0
         image[empty] = grown[empty]
-        known = cv2.dilate(known, window)
+        known = np.asarray(cv2.dilate(known, window), dtype=np.uint8)
     image[known == 0] = PAPER
-    return image
+    return np.asarray(cv2.resize(image, whole, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
 
 
 def _line(text: str, width: int) -> Image:

@@ -131,7 +131,9 @@ def sky_color(directions: NDArray[np.floating]) -> NDArray[np.float32]:
     blue = np.array((214, 224, 234)) * (1 - height) ** 2 + np.array((92, 144, 206)) * (1 - (1 - height) ** 2)
     x, y = d[:, 0] / (0.25 + height[:, 0]), d[:, 1] / (0.25 + height[:, 0])
     waves = sum(
-        np.sin(2.1**k * (x + 0.6 * (-1) ** k * y) + 1.7 * k) * np.sin(2.1**k * (y - 0.4 * x) + 2.3 * k) / 1.5**k
+        np.sin(2.1**k * (x + 0.6 * (-1) ** k * y) + 1.7 * k)
+        * np.sin(2.1**k * (y - 0.4 * x) + 2.3 * k)
+        / 1.5**k
         for k in range(1, 5)
     )
     cloud = np.clip(1.6 * waves - 0.35, 0, 1)[:, None]

@@ -92,6 +92,9 @@ class RoomStage:
     def eye(self, camera: PinholeCamera) -> Eye:
         return Renderer(self.scene, self.atlas, camera)
 
+    def sketch(self, camera: PinholeCamera) -> Eye:
+        return MeshRenderer(Caster(triangles.unpainted(self.scene)), camera)
+
     def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
         return paths.plan(self.scene, robots, frames, overlap, camera)
 
@@ -139,6 +142,9 @@ class MeshStage:
 
     def eye(self, camera: PinholeCamera) -> Eye:
         return MeshRenderer(self.caster, camera, self.sky)
+
+    def sketch(self, camera: PinholeCamera) -> Eye:
+        return self.eye(camera)
 
     def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
         return walks.plan(self, robots, frames, overlap, camera, self.seed)

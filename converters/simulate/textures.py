@@ -429,7 +429,9 @@ def paint_onto(base: Material, patches: Sequence[tuple[Material, float, float, f
         for material, left, top, patch_w, patch_h in patches:
             patch = material(rng, patch_w, patch_h, texel_m)
             x, y = round(left / texel_m), round(top / texel_m)
-            patch = patch[: max(0, image.shape[0] - y), : max(0, image.shape[1] - x)]  # what does not fit is cut
+            patch = patch[
+                : max(0, image.shape[0] - y), : max(0, image.shape[1] - x)
+            ]  # what does not fit is cut
             image[y : y + patch.shape[0], x : x + patch.shape[1]] = patch
         return image
 

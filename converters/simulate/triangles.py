@@ -17,27 +17,28 @@ SIDES = 48  # of a cylinder, a disc and the equator of a sphere; no coarser than
 def write(scene: Scene, texel_m: float, cache: Path) -> None:
     """Write a scene into an empty folder, to be read by `meshes.load`; its texture has texels of `texel_m`."""
     vertices, coordinates, triangles, surface_of = _triangles(scene)
-    bare = meshes.MeshScene(
-        vertices,
-        triangles,
-        np.zeros((len(triangles), 3, 2), dtype=np.float32),
-        np.full(len(triangles), meshes.NO_TEXTURE, dtype=np.int32),
-        np.zeros((len(vertices), 3), dtype=np.uint8),
-        [],
-    )
-    atlas = bake.bake(scene, texel_m, Caster(bare).blocked)
+    atlas = bake.bake(scene, texel_m, Caster(unpainted(scene)).blocked)
     for k, level in enumerate(atlas.levels):
         np.save(cache / meshes.texture_file(0, k), level)
     texels = atlas.origin[surface_of][:, None] + coordinates[triangles] / texel_m
-    arrays = {
+    arrays: dict[str, NDArray[np.generic]] = {
         "vertices": vertices,
         "triangles": triangles,
         "texels": texels.astype(np.float32),
         "texture_of": np.zeros(len(triangles), dtype=np.int32),
-        "colors": bare.colors,
+        "colors": np.zeros((len(vertices), 3), dtype=np.uint8),
     }
     for name, values in arrays.items():
         np.save(cache / f"{name}.npy", values)
+
+
+def unpainted(scene: Scene) -> meshes.MeshScene:
+    """The geometry alone, black."""
+    vertices, _, triangles, _ = _triangles(scene)
+    texels = np.zeros((len(triangles), 3, 2), dtype=np.float32)
+    texture_of = np.full(len(triangles), meshes.NO_TEXTURE, dtype=np.int32)
+    black = np.zeros((len(vertices), 3), dtype=np.uint8)
+    return meshes.MeshScene(vertices, triangles, texels, texture_of, black, [])
 
 
 def _triangles(scene: Scene) -> tuple[Array, Array, NDArray[np.int32], NDArray[np.int64]]:

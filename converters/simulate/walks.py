@@ -81,6 +81,9 @@ class Terrain(Protocol):
     def eye(self, camera: PinholeCamera) -> Eye:
         """A renderer."""
 
+    def sketch(self, camera: PinholeCamera) -> Eye:
+        """A renderer for depth alone, the quickest there is."""
+
     def clearance(self, points: Array) -> Array:
         """Distance (m) of world points [..., 3] to the nearest surface."""
 
@@ -235,7 +238,9 @@ def _candidates(
         poses = _look_ahead(floor_way, space.floor_m, robot, frames, terrain.step_m, rng)
         if poses is None:
             reasons["turns too fast"] += 1
-        elif _body_clearance(terrain.clearance, poses[:, :2, 3], space.floor_m).min() < MIN_CLEARANCE_M - 0.05:
+        elif (
+            _body_clearance(terrain.clearance, poses[:, :2, 3], space.floor_m).min() < MIN_CLEARANCE_M - 0.05
+        ):
             reasons["too near to something"] += 1
         else:
             shown = _least_shown(eye, poses, terrain.sky)
@@ -247,9 +252,10 @@ def _candidates(
             break
     if not found:
         why = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+        area = len(space.cells) * space.cell_m**2
         raise DuagError(
-            f"no walk for robot {robot} in {TRIES} tries ({why}) in {len(space.cells) * space.cell_m**2:.1f} m^2 of free "
-            "floor, expected one; give another --seed, or fewer frames"
+            f"no walk for robot {robot} in {TRIES} tries ({why}) in {area:.1f} m^2 of free floor, "
+            " expected one; give another --seed, or fewer frames"
         )
     return found
 
@@ -320,7 +326,10 @@ def _least_shown(eye: Eye, poses: Array, sky: bool) -> float | None:
     for k in np.unique(np.linspace(0, len(poses) - 1, VIEWS).round().astype(np.int64)):
         depth, _ = eye.depth(poses[k])
         seen = depth > 0
-        if 1 - seen.mean() > (MAX_SKY_SHARE if sky else MAX_HOLE_SHARE) or np.mean(seen & (depth < NEAR_M)) > MAX_NEAR_SHARE:
+        if (
+            1 - seen.mean() > (MAX_SKY_SHARE if sky else MAX_HOLE_SHARE)
+            or np.mean(seen & (depth < NEAR_M)) > MAX_NEAR_SHARE
+        ):
             return None
         if np.median(depth[seen]) < LEAST_MEDIAN_M:
             return None

@@ -21,7 +21,8 @@ def simulate(
         ),
     ] = "room",
     paradigm: Annotated[
-        str, typer.Option(help="wander, concentric, leader-follower, crossing or parallel: how the paths lie.")
+        str,
+        typer.Option(help="wander, concentric, leader-follower, crossing or parallel: how the paths lie."),
     ] = "wander",
     up: Annotated[
         str,
@@ -35,7 +36,8 @@ def simulate(
     noise: Annotated[str, typer.Option(help="none or kinect.")] = "none",
     seed: Annotated[int, typer.Option(help="Seed of scene, paths and noise.")] = 0,
     preview: Annotated[
-        Path | None, typer.Option(metavar="PNG", help="Contact sheet to write: paths from above, views over time.")
+        Path | None,
+        typer.Option(metavar="PNG", help="Contact sheet to write: paths from above, views over time."),
     ] = None,
     workers: Workers = 2,
     force: Force = False,

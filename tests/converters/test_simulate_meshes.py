@@ -440,7 +440,7 @@ def test_what_cannot_be_simulated_is_said_in_one_line(
 
 
 def test_a_scene_that_is_not_there(tmp_path):
-    with pytest.raises(DuagError, match="expected room or a folder"):
+    with pytest.raises(DuagError, match="expected room, office, corridor, outdoor or a folder"):
         simulate(tmp_path / "rec", scene=str(tmp_path / "nowhere"))
     with pytest.raises(DuagError, match="up is 'x'"):
         simulate(tmp_path / "rec", scene=str(folder_of(tmp_path / "room", "obj")), up="x")
