@@ -114,7 +114,7 @@ class RobotWriter:
         self._files = ExitStack()
         self._log = LogWriter(self.folder / f"{name}.mcap", name, self.sensors)
         self._truth: LogWriter | None = None
-        self._has_exact_depth = False
+        self._has_exact_depth = self._has_imu = False
         self._stamps: list[int] = []
         self._positions: list[NDArray[np.float64]] = []
 
@@ -176,6 +176,28 @@ class RobotWriter:
                 )
                 self._has_exact_depth = True
             truth.write(topic, messages.pack_depth(stamp_ns, name, exact_depth), stamp_ns)
+
+    def add_imu(
+        self,
+        stamp_ns: int,
+        rates_rad_s: NDArray[np.float64],
+        accelerations_m_s2: NDArray[np.float64],
+        T_camera_imu: NDArray[np.float64],
+    ) -> None:
+        """Append a reading [3], [3] of an IMU in its own axes; not earlier than what was added before."""
+        name = self.name
+        if not self._has_imu:
+            frames = messages.camera_frame(name), f"{name}/imu"
+            pose = messages.pack_transform(stamp_ns, *frames, T_camera_imu)
+            self._log.write(topics.IMU_TRANSFORM.of(name), pose, stamp_ns)
+            self._has_imu = True
+        reading = messages.pack_imu(stamp_ns, name, rates_rad_s, accelerations_m_s2)
+        self._log.write(topics.IMU.of(name), reading, stamp_ns)
+
+    def add_odometry(self, stamp_ns: int, T_odometry_camera: NDArray[np.float64]) -> None:
+        """Append a pose [4, 4] of the colour camera by another odometry; not earlier than what was added before."""
+        pose = messages.pack_pose_in_frame(stamp_ns, f"{self.name}/odometry", T_odometry_camera)
+        self._log.write(topics.ODOMETRY_PRIOR.of(self.name), pose, stamp_ns)
 
     def _check_size(self, image: NDArray[np.uint16] | NDArray[np.bool_]) -> None:
         if image.shape != (self.camera.height, self.camera.width):
