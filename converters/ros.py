@@ -194,6 +194,8 @@ class _Readings:
         self._stamps = np.concatenate([imu, odometry])
         self._order = np.argsort(self._stamps, kind="stable")
         self._imu_count, self._next = len(imu), 0
+        if self._imu:
+            robot.set_imu(self._imu.T_color_imu)
 
     def write_until(self, stamp_ns: int) -> None:
         """Write what was measured before a time."""
@@ -201,7 +203,7 @@ class _Readings:
             stamp = int(self._stamps[k])
             if k < self._imu_count and self._imu:
                 values = self._imu.values[k]
-                self._robot.add_imu(stamp, values[:3], values[3:], self._imu.T_color_imu)
+                self._robot.add_imu(stamp, values[:3], values[3:])
             elif self._odometry:
                 T_odometry_body = self._odometry.body.T_world_body[k - self._imu_count]
                 self._robot.add_odometry(stamp, T_odometry_body @ self._odometry.T_body_color)

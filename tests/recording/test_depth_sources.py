@@ -87,35 +87,6 @@ def test_unregistered_depth_is_read_by_its_calibration_and_transform(tmp_path: P
         open_rgbd(write(transforms=2))
 
 
-def test_points_of_a_lidar_are_filled_on_surfaces_only(tmp_path: Path) -> None:
-    """Rings of points on a wall and on a card before it: surfaces are closed and exact, the step stays open."""
-    rows, columns = np.mgrid[1:47:5, 1:63:3]
-    truth = plane_depth(WIDE, np.eye(4))
-    truth[:, 32:] *= 0.5
-    points = WIDE.back_project(truth)[rows.ravel(), columns.ravel()]
-    T_camera_lidar = se3.exp([0.1, 0.2, -0.05, 0.3, 1.2, -0.4])
-    path = tmp_path / "alpha.mcap"
-    with LogWriter(path, "alpha") as log:
-        log.write(CALIBRATION, m.pack_calibration(0, "alpha", WIDE), 0)
-        log.write(
-            COLOR,
-            m.pack_color(0, "alpha", png(np.zeros((WIDE.height, WIDE.width, 3), np.uint8)), "png"),
-            0,
-        )
-        log.write(
-            "/alpha/lidar/transform", m.pack_transform(0, "alpha/camera", "alpha/lidar", T_camera_lidar), 0
-        )
-        sweep = m.pack_points(5, "alpha/lidar", se3.transform(se3.inverse(T_camera_lidar), points))
-        log.write("/alpha/lidar/points", sweep, 5)
-    with open_rgbd(path) as log:
-        frame = log.frame(0)
-    filled = frame.depth > 0
-    assert filled[4:40, 4:26].all()
-    assert filled[4:40, 36:58].all()
-    np.testing.assert_allclose(frame.depth[filled], truth[filled], rtol=1e-4)
-    assert not filled[2:-2, 32].all()  # nothing is drawn across the step
-
-
 def test_points_without_coordinates_are_one_line() -> None:
     message = m.pack_points(0, "alpha/lidar", np.zeros((2, 3)))
     assert m.unpack_points(message, "here").shape == (2, 3)
