@@ -21,7 +21,7 @@ from converters.logs.files import SUFFIXES
 from converters.logs.options import LogOptions
 from converters.logs.robot_log import RobotLog
 from converters.ros_images import color_bytes, depth_m
-from converters.self_check import ReprojectionCheck
+from converters.self_check import GAP, MAX_RATIO, ReprojectionCheck
 from pipeline import numeric
 from pipeline.errors import DuagError
 from pipeline.progress import track
@@ -72,12 +72,17 @@ def sources_of(src: Path, settings: LogOptions) -> list[Source]:
     Raises:
         DuagError: there is no log.
     """
-    groups = _groups(src)
     spaces = [text.strip() for text in settings.namespaces.split(",") if text.strip()]
     if spaces or settings.pieces:
-        paths = tuple(path for group in groups.values() for path in group)
+        paths = tuple(logs_in(src))
         return [Source(paths, space, space) for space in spaces or [""]]
+    groups = _groups(src)
     return [Source(paths, "", label if len(groups) > 1 else "") for label, paths in groups.items()]
+
+
+def logs_in(src: Path) -> list[Path]:
+    """All logs of a folder, or the log itself, in the order of the numbers in their names."""
+    return [path for group in _groups(src).values() for path in group]
 
 
 def _groups(src: Path) -> dict[str, tuple[Path, ...]]:
@@ -90,7 +95,7 @@ def _groups(src: Path) -> dict[str, tuple[Path, ...]]:
         return {src.name: (src,)}
     groups = {}
     for path in sorted(src.iterdir(), key=_natural):
-        inner = (path,) if _is_log(path) else _logs_in(path)
+        inner = (path,) if _is_log(path) else _inside(path)
         if inner:
             groups[path.name] = inner
     if not groups:
@@ -98,7 +103,7 @@ def _groups(src: Path) -> dict[str, tuple[Path, ...]]:
     return groups
 
 
-def _logs_in(folder: Path) -> tuple[Path, ...]:
+def _inside(folder: Path) -> tuple[Path, ...]:
     if not folder.is_dir() or folder.name.startswith("."):
         return ()
     return tuple(path for path in sorted(folder.iterdir(), key=_natural) if _is_log(path))
@@ -115,21 +120,33 @@ def _natural(path: Path) -> list[Any]:
     return [(int(word), "") if word.isdigit() else (0, word) for word in re.split(r"(\d+)", path.name)]
 
 
-def write_robot(recording: RecordingWriter, name: str, source: RobotLog, label: str) -> None:
-    """Write all frames of a robot, what the self-check measured, and warnings."""
+def write_robot(
+    recording: RecordingWriter,
+    name: str,
+    source: RobotLog,
+    label: str,
+    max_ratio: float = MAX_RATIO,
+    gap: int = GAP,
+) -> None:
+    """Write all frames of a robot, what the self-check measured, and warnings.
+
+    Args:
+        label: which part of the source it was. max_ratio, gap: see `ReprojectionCheck`.
+    """
     sensors = {"part": label, **source.sensors()}
     with recording.robot(name, source.color_camera.camera, source.depth_scale, sensors) as robot:
-        recording.checks[name] = _write_frames(robot, source)
+        recording.checks[name] = _write_frames(robot, source, max_ratio, gap)
     recording.warnings += [f"{name}: {text}" for text in source.warnings]
 
 
-def _write_frames(robot: RobotWriter, source: RobotLog) -> dict[str, Any]:
+def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: int) -> dict[str, Any]:
     import cv2
 
     settings, log = source.settings, source.name
     pairs = source.pairs()
+    readings = _Readings(robot, source)
     camera, maps = source.color_camera.camera, source.color_maps
-    check = ReprojectionCheck(camera, len(pairs))
+    check = ReprojectionCheck(camera, len(pairs), gap)
     without = empty = 0
     progress = track(source.frames(pairs), f"convert {robot.name}", len(pairs))
     for index, (stamp_ns, color, depth) in enumerate(progress):
@@ -156,10 +173,38 @@ def _write_frames(robot: RobotWriter, source: RobotLog) -> dict[str, Any]:
         raw = np.where(units <= np.iinfo(np.uint16).max, units, 0).astype(np.uint16)
         T = source.truth.at(stamp_ns, settings.max_pose_gap_s) if source.truth else None
         without += T is None
+        readings.write_until(stamp_ns)
         robot.add_frame(stamp_ns, data, color_format, raw, T)
         check.add(index, raw.astype(np.float64) * source.depth_scale, T)
         empty += int((raw == 0).sum())
+    readings.write_until(np.iinfo(np.int64).max)
     if source.truth is not None and without:
         source.warnings.append(f"{without} of {len(pairs)} frames have no true pose")
     pixels = len(pairs) * camera.width * camera.height
-    return {"without_depth": empty / pixels, **check.result(log)}
+    return {"without_depth": empty / pixels, **check.result(log, max_ratio)}
+
+
+class _Readings:
+    """Writes IMU and odometry in order of time, between the frames."""
+
+    def __init__(self, robot: RobotWriter, source: RobotLog) -> None:
+        self._robot, self._imu, self._odometry = robot, source.imu, source.odometry
+        imu = self._imu.stamps_ns if self._imu else np.zeros(0, np.int64)
+        odometry = self._odometry.body.stamps_ns if self._odometry else np.zeros(0, np.int64)
+        self._stamps = np.concatenate([imu, odometry])
+        self._order = np.argsort(self._stamps, kind="stable")
+        self._imu_count, self._next = len(imu), 0
+        if self._imu:
+            robot.set_imu(self._imu.T_color_imu)
+
+    def write_until(self, stamp_ns: int) -> None:
+        """Write what was measured before a time."""
+        while self._next < len(self._order) and self._stamps[k := self._order[self._next]] < stamp_ns:
+            stamp = int(self._stamps[k])
+            if k < self._imu_count and self._imu:
+                values = self._imu.values[k]
+                self._robot.add_imu(stamp, values[:3], values[3:])
+            elif self._odometry:
+                T_odometry_body = self._odometry.body.T_world_body[k - self._imu_count]
+                self._robot.add_odometry(stamp, T_odometry_body @ self._odometry.T_body_color)
+            self._next += 1
