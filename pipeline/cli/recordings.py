@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import Force, Json, Out, Workers, app
+from pipeline.cli.common import EXIT_FAILED, Force, Json, Out, Workers, app
 
 
 @app.command()
@@ -112,3 +112,23 @@ def info(
 
     content = recording.info(path)
     print(json.dumps(content, indent=2) if as_json else recording.format_info(content))
+
+
+@app.command()
+def check(
+    path: Annotated[Path, typer.Argument(help="A recording, or the log of one robot.", show_default=False)],
+    as_json: Json = False,
+) -> None:
+    """Say whether a recording is sound: times, pairs, depth scale, calibration, what a run will take.
+
+    Exit code 1 if there is an error; warnings and notes leave it 0.
+
+    Example: `duagc check recordings/redkitchen`
+    """
+    from pipeline import checks, numeric
+
+    numeric.settle_opencv()
+    report = checks.check(path)
+    print(json.dumps(report.plain(), indent=2) if as_json else checks.format_report(report))
+    if not report.sound:
+        raise typer.Exit(EXIT_FAILED)
