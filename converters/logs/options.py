@@ -20,6 +20,10 @@ class LogOptions(AssociationOptions):
     """Topic of the colour camera's CameraInfo."""
     depth_info: str = ""
     """Topic of the depth camera's CameraInfo."""
+    imu: str = ""
+    """Topic of an IMU on the robot; its turning rates help tracking. None if empty."""
+    odometry: str = ""
+    """Topic of another odometry (wheels, legs: Odometry or PoseStamped) that helps tracking. None if empty."""
     truth: str = ""
     """Topic of true poses (Odometry, PoseStamped, TransformStamped), for evaluation; none if empty."""
     truth_frame: str = ""
@@ -30,12 +34,19 @@ class LogOptions(AssociationOptions):
     """Whether depth is seen from the colour camera; auto: by name of the topic, frame and camera."""
     T_color_depth: str = ""
     """Extrinsics "x y z qw qx qy qz" (m) of a depth camera that /tf_static does not know; x_color = T x_depth."""
-    depth_scale: float = Field(0.001, gt=0)
+    T_color_imu: str = ""
+    """Extrinsics of the IMU, likewise, where /tf_static does not know them."""
+    T_body_color: str = ""
+    """Pose of the colour camera in the body that odometry and true poses are of, likewise."""
+    depth_scale: float = Field(default=0.001, gt=0)
     """Metres per unit of 16-bit depth."""
     time_source: Literal["header", "log", "publish"] = "header"
     """Times of the headers, those of recording, or those of publication (which only MCAP knows)."""
-    clock_offset_s: float = Field(0.0, allow_inf_nan=False)
+    clock_offset_s: float = Field(default=0.0, allow_inf_nan=False)
     """Seconds to add to all times of the robot, for clocks that differ between robots."""
+    clocks: Literal["as_recorded", "estimated", "from_zero"] = "as_recorded"
+    """What becomes of the robots' clocks: kept (their difference is estimated and told), corrected by the estimated
+    difference where it matters, or every robot starts at time 0."""
     pieces: bool = False
     """All logs of the folder belong to one robot, or to several in different namespaces."""
     undistort: bool = True

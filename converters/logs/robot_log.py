@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -10,13 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.choice import REGISTERED, Chooser, closest
+from converters.logs.choice import REGISTERED, Chooser
+from converters.logs.clocks import RobotClock
 from converters.logs.files import NANOSECONDS, Entry, Log
 from converters.logs.frames import Transforms, frame_name, pose_matrix
 from converters.logs.options import LogOptions
 from converters.ros_images import RosCamera, size_of
 from converters.tum_layout import Listed, Poses, associate
-from pipeline.errors import DuagError
+from pipeline.errors import DuagError, closest
 from pipeline.geometry import se3
 
 Array = NDArray[np.float64]
@@ -26,8 +28,31 @@ POSE_TYPES = (
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/TransformStamped",
 )
+IMU_TYPE = "sensor_msgs/msg/Imu"
 RECTIFIED = ("image_rect", "image_rect_color", "rect")
 OUT_SCALE = 0.0005  # metres per unit of depth that was registered or came as floats
+
+
+@dataclass(frozen=True)
+class Imu:
+    """stamps_ns int64 [n], increasing; values [n, 6]: rad/s and m/s^2 in its own axes; T_color_imu [4, 4]."""
+
+    stamps_ns: NDArray[np.int64]
+    values: Array
+    T_color_imu: Array
+
+
+@dataclass(frozen=True)
+class CameraPoses:
+    """Poses of a body that holds the colour camera: it is the body that moves evenly between two of them."""
+
+    body: Poses
+    T_body_color: Array
+
+    def at(self, stamp_ns: int, max_gap_s: float) -> Array | None:
+        """Pose [4, 4] of the colour camera at a time; None where there is none near."""
+        T = self.body.at(stamp_ns, max_gap_s)
+        return None if T is None else T @ self.T_body_color
 
 
 class RobotLog:
@@ -41,6 +66,9 @@ class RobotLog:
         self.log, self.namespace, self.settings = log, namespace.rstrip("/"), settings
         self.name = log.name
         self.warnings: list[str] = []
+        self.shift_ns = round(
+            settings.clock_offset_s * NANOSECONDS
+        )  # added to all times when they are written
         self.transforms = Transforms(log, self.namespace)
         self._choose()
 
@@ -59,7 +87,7 @@ class RobotLog:
         raw16 = not hasattr(images[self.depth], "encoding") or images[self.depth].encoding != "32FC1"
         kept = raw16 and self.T_color_depth is None and self.color_maps is None
         self.depth_scale = s.depth_scale if kept else OUT_SCALE
-        self.truth = self._truth() if s.truth else None
+        self.truth: CameraPoses | None = self._poses(s.truth, "truth") if s.truth else None
 
     def _camera(self, topic: str, option: str, chooser: Chooser) -> RosCamera:
         """Camera of an image topic."""
@@ -94,7 +122,7 @@ class RobotLog:
                 )
             return None
         if s.T_color_depth:
-            return extrinsics_of(s.T_color_depth)
+            return extrinsics_of("T_color_depth", s.T_color_depth)
         named_frames = bool(color.frame_id and depth.frame_id)
         T = self.transforms.lookup(color.frame_id, depth.frame_id) if named_frames else None
         if T is None:
@@ -104,12 +132,30 @@ class RobotLog:
             )
         return T
 
-    def _truth(self) -> Poses:
-        """True poses of the colour camera."""
-        topic = self.settings.truth
+    def _body_camera(self, topic: str, body: str) -> Array:
+        """T_body_color [4, 4] of the frame that a topic of poses is of."""
+        frame = self.settings.truth_frame if topic == self.settings.truth else ""
+        frame = frame_name(frame or body or self.color_camera.frame_id)
+        if self.settings.T_body_color:
+            return extrinsics_of("T_body_color", self.settings.T_body_color)
+        if frame in ("camera", frame_name(self.color_camera.frame_id)):
+            return np.eye(4)
+        T = self.transforms.lookup(frame, self.color_camera.frame_id)
+        if T is None:
+            raise DuagError(
+                f"{self.name}: {topic} is of {frame!r}, and /tf_static does not tie it to "
+                f"{self.color_camera.frame_id!r}; expected --set T_body_color='x y z qw qx qy qz', or "
+                "truth_frame=camera if that is where it is"
+            )
+        return T
+
+    def _poses(self, topic: str, option: str) -> CameraPoses:
+        """Poses of the colour camera by a topic of poses of its body."""
         known = self.log.of_type(*POSE_TYPES)
         if topic not in known:
-            raise DuagError(f"{self.name}: truth topic {topic} not found, {closest(topic, known, 'poses')}")
+            raise DuagError(
+                f"{self.name}: {option} topic {topic} not found, {closest(topic, known, 'poses')}"
+            )
         poses: dict[int, Array] = {}
         body = ""
         for entry in self.log.entries(topic):
@@ -122,43 +168,74 @@ class RobotLog:
             body = getattr(m, "child_frame_id", "")
             if np.isfinite([position.x, position.y, position.z]).all():
                 poses[self.time_ns(entry)] = pose_matrix(position, orientation, where)
-        frame = self.settings.truth_frame or body or self.color_camera.frame_id
-        T_body_camera = (
-            np.eye(4)
-            if frame_name(frame) in ("camera", frame_name(self.color_camera.frame_id))
-            else self.transforms.lookup(frame, self.color_camera.frame_id)
-        )
-        if T_body_camera is None:
-            raise DuagError(
-                f"{self.name}: {topic} is of {frame!r}, and /tf_static does not tie it to "
-                f"{self.color_camera.frame_id!r}; expected --set truth_frame=camera if that is where it is"
-            )
         stamps = sorted(poses)
-        T = np.array([poses[stamp] for stamp in stamps]).reshape(-1, 4, 4) @ T_body_camera
-        return Poses(np.array(stamps, dtype=np.int64), T, 0)
+        T = np.array([poses[stamp] for stamp in stamps]).reshape(-1, 4, 4)
+        return CameraPoses(Poses(np.array(stamps, dtype=np.int64), T, 0), self._body_camera(topic, body))
+
+    @cached_property
+    def imu(self) -> Imu | None:
+        """What the IMU measured, in order of time."""
+        topic = self.settings.imu
+        if not topic:
+            return None
+        known = self.log.of_type(IMU_TYPE)
+        if topic not in known:
+            raise DuagError(f"{self.name}: imu topic {topic} not found, {closest(topic, known, 'an IMU')}")
+        stamps: list[int] = []
+        rows: list[list[float]] = []
+        frame = ""
+        for entry in self.log.entries(topic):
+            m = entry.read()
+            frame, w, a = m.header.frame_id, m.angular_velocity, m.linear_acceleration
+            stamps.append(self.time_ns(entry))
+            rows.append([w.x, w.y, w.z, a.x, a.y, a.z])
+        times, first = np.unique(np.array(stamps, dtype=np.int64), return_index=True)
+        values = np.array(rows, dtype=np.float64)[first]
+        if not np.isfinite(values).all():
+            raise DuagError(
+                f"{self.name}: {topic} holds numbers that are not finite, expected rad/s and m/s^2"
+            )
+        if self.settings.T_color_imu:
+            T = extrinsics_of("T_color_imu", self.settings.T_color_imu)
+        else:
+            found = self.transforms.lookup(self.color_camera.frame_id, frame)
+            if found is None:
+                raise DuagError(
+                    f"{self.name}: {topic} is of {frame!r}, and /tf_static does not tie it to "
+                    f"{self.color_camera.frame_id!r}; expected --set T_color_imu='x y z qw qx qy qz'"
+                )
+            T = found
+        return Imu(times, values, T)
+
+    @cached_property
+    def odometry(self) -> CameraPoses | None:
+        """Poses of the colour camera by another odometry."""
+        return self._poses(self.settings.odometry, "odometry") if self.settings.odometry else None
 
     # --- which messages
 
     def time_ns(self, entry: Entry) -> int:
-        """The time of a message by the clock that the options choose, corrected by the robot's offset."""
+        """The time of a message by the clock that the options choose."""
         source = self.settings.time_source
         if source == "header":
-            stamp = entry.header_ns()
-        elif source == "log":
-            stamp = entry.log_ns
-        elif entry.publish_ns is not None:
-            stamp = entry.publish_ns
-        else:
+            return entry.header_ns()
+        if source == "log":
+            return entry.log_ns
+        if entry.publish_ns is None:
             raise DuagError(
                 f"{self.name}: bags of ROS hold no times of publication, expected time_source=header or log"
             )
-        return stamp + round(self.settings.clock_offset_s * NANOSECONDS)
+        return entry.publish_ns
 
+    @cached_property
     def pairs(self) -> dict[int, int]:
         """Time of a colour image -> time of its depth image."""
         stamps: dict[str, list[int]] = {self.color: [], self.depth: []}
+        delays = []
         for entry in self.log.entries(self.color, self.depth):
             stamps[entry.topic].append(self.time_ns(entry))
+            delays.append(entry.log_ns - stamps[entry.topic][-1])
+        self._delays_ns = np.array(delays, dtype=np.int64)
         for topic, times in stamps.items():
             if times != sorted(times):
                 self.warnings.append(f"{topic}: times go backwards; images are taken in order of time")
@@ -184,8 +261,15 @@ class RobotLog:
             )
         return {c.stamp_ns: d.stamp_ns for c, d in found}
 
-    def frames(self, pairs: Mapping[int, int]) -> Iterator[tuple[int, Any, Any]]:
+    def clock(self, robot: str) -> RobotClock:
+        """What the times of the images say about the robot's clock."""
+        first, last = min(self.pairs), max(self.pairs)
+        header = self.settings.time_source == "header"
+        return RobotClock(robot, self.log, self.namespace, self._delays_ns, first, last, header)
+
+    def frames(self) -> Iterator[tuple[int, Any, Any]]:
         """Time, colour and depth message of every pair, in order of time; holds no more than it must."""
+        pairs = self.pairs
         used_by: dict[int, list[int]] = {}
         for color_ns, depth_ns in pairs.items():
             used_by.setdefault(depth_ns, []).append(color_ns)
@@ -213,10 +297,12 @@ class RobotLog:
         return {"color_topic": self.color, "depth_topic": self.depth, "depth": moved}
 
 
-def extrinsics_of(text: str) -> Array:
-    """Matrix [4, 4] of "x y z qw qx qy qz" (m)."""
+def extrinsics_of(option: str, text: str) -> Array:
+    """Matrix [4, 4] of "x y z qw qx qy qz" (m), the value of an option."""
     try:
         x, y, z, *q = np.array(text.split(), dtype=np.float64).tolist()
-        return np.asarray(se3.from_quat_translation(np.array(q), np.array([x, y, z])))
+        if len(q) != 4 or not np.isfinite([x, y, z]).all() or abs(np.linalg.norm(q) - 1) > 0.01:
+            raise ValueError("no rigid motion")
     except ValueError as error:
-        raise DuagError(f"ros: T_color_depth = {text!r}, expected 'x y z qw qx qy qz'") from error
+        raise DuagError(f"ros: {option} = {text!r}, expected 'x y z qw qx qy qz'") from error
+    return np.asarray(se3.from_quat_translation(np.array(q), np.array([x, y, z])))

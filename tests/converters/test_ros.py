@@ -48,8 +48,8 @@ class Ros:
             text = "geometry_msgs/TransformStamped[] transforms"
             self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
 
-    def make(self, name: str, **values: Any) -> Any:
-        return self.store.types[name](**values)
+    def make(self, kind: str, /, **values: Any) -> Any:
+        return self.store.types[kind](**values)
 
     def header(self, stamp_ns: int, frame: str) -> Any:
         time = self.make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
