@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
@@ -10,7 +9,7 @@ from typing import Any
 
 from converters.logs.files import Log
 from converters.ros_images import is_depth
-from pipeline.errors import DuagError
+from pipeline.errors import DuagError, closest
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
@@ -95,14 +94,6 @@ class Chooser:
                 f"{self.log.name}: {option} topic {wanted} not found, {closest(wanted, known, 'a topic')}"
             )
         return Choice(wanted, "told", tuple(known))
-
-
-def closest(word: str, known: Sequence[str], kind: str) -> str:
-    """The end of a message about a wrong name: what was meant perhaps, else what there is."""
-    near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
-    if near:
-        return f"expected perhaps {near[0]}"
-    return f"expected one of {', '.join(known)}" if known else f"expected {kind}, and there is none"
 
 
 def shared_parts(a: str, b: str) -> int:

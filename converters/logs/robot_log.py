@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.choice import REGISTERED, Chooser, closest
+from converters.logs.choice import REGISTERED, Chooser
+from converters.logs.clocks import RobotClock
 from converters.logs.files import NANOSECONDS, Entry, Log
 from converters.logs.frames import Transforms, frame_name, pose_matrix
 from converters.logs.options import LogOptions
 from converters.ros_images import RosCamera, size_of
 from converters.tum_layout import Listed, Poses, associate
-from pipeline.errors import DuagError
+from pipeline.errors import DuagError, closest
 from pipeline.geometry import se3
 
 Array = NDArray[np.float64]
@@ -65,6 +66,9 @@ class RobotLog:
         self.log, self.namespace, self.settings = log, namespace.rstrip("/"), settings
         self.name = log.name
         self.warnings: list[str] = []
+        self.shift_ns = round(
+            settings.clock_offset_s * NANOSECONDS
+        )  # added to all times when they are written
         self.transforms = Transforms(log, self.namespace)
         self._choose()
 
@@ -211,25 +215,27 @@ class RobotLog:
     # --- which messages
 
     def time_ns(self, entry: Entry) -> int:
-        """The time of a message by the clock that the options choose, corrected by the robot's offset."""
+        """The time of a message by the clock that the options choose."""
         source = self.settings.time_source
         if source == "header":
-            stamp = entry.header_ns()
-        elif source == "log":
-            stamp = entry.log_ns
-        elif entry.publish_ns is not None:
-            stamp = entry.publish_ns
-        else:
+            return entry.header_ns()
+        if source == "log":
+            return entry.log_ns
+        if entry.publish_ns is None:
             raise DuagError(
                 f"{self.name}: bags of ROS hold no times of publication, expected time_source=header or log"
             )
-        return stamp + round(self.settings.clock_offset_s * NANOSECONDS)
+        return entry.publish_ns
 
+    @cached_property
     def pairs(self) -> dict[int, int]:
         """Time of a colour image -> time of its depth image."""
         stamps: dict[str, list[int]] = {self.color: [], self.depth: []}
+        delays = []
         for entry in self.log.entries(self.color, self.depth):
             stamps[entry.topic].append(self.time_ns(entry))
+            delays.append(entry.log_ns - stamps[entry.topic][-1])
+        self._delays_ns = np.array(delays, dtype=np.int64)
         for topic, times in stamps.items():
             if times != sorted(times):
                 self.warnings.append(f"{topic}: times go backwards; images are taken in order of time")
@@ -255,8 +261,15 @@ class RobotLog:
             )
         return {c.stamp_ns: d.stamp_ns for c, d in found}
 
-    def frames(self, pairs: Mapping[int, int]) -> Iterator[tuple[int, Any, Any]]:
+    def clock(self, robot: str) -> RobotClock:
+        """What the times of the images say about the robot's clock."""
+        first, last = min(self.pairs), max(self.pairs)
+        header = self.settings.time_source == "header"
+        return RobotClock(robot, self.log, self.namespace, self._delays_ns, first, last, header)
+
+    def frames(self) -> Iterator[tuple[int, Any, Any]]:
         """Time, colour and depth message of every pair, in order of time; holds no more than it must."""
+        pairs = self.pairs
         used_by: dict[int, list[int]] = {}
         for color_ns, depth_ns in pairs.items():
             used_by.setdefault(depth_ns, []).append(color_ns)

@@ -44,7 +44,7 @@ class RosBag:
             header = partial(ros_header_ns, raw, self._encoding, f"{self.path}: {connection.topic}")
             if foxglove.plain_name(connection.msgtype) in foxglove.ROS_TYPES:
                 header = partial(_stamp_of, read)
-            yield Entry(connection.topic, log_ns, None, read, header)
+            yield Entry(connection.topic, log_ns, None, raw, read, header)
 
     def _read(self, connection: Any, raw: bytes) -> Any:
         where = f"{self.path}: {connection.topic}"

@@ -72,6 +72,12 @@ def convert(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Option of the converter; repeatable."),
     ] = None,
+    time_source: Annotated[
+        str | None,
+        typer.Option(
+            help="Of logs of other programs: header, log (recording) or publish.", show_default=False
+        ),
+    ] = None,
     force: Force = False,
     list_datasets: Annotated[
         bool, typer.Option("--list", help="List the datasets and their options.")
@@ -88,7 +94,8 @@ def convert(
         return
     if dataset is None or source is None or out is None:
         raise typer.BadParameter("expected DATASET SRC --out REC, or --list")
-    converters.convert(dataset, source, out, robots=robots, force=force, options=options or [])
+    said = [*(options or []), *([f"time_source={time_source}"] if time_source else [])]
+    converters.convert(dataset, source, out, robots=robots, force=force, options=said)
     print(out)
 
 
