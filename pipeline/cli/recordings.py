@@ -147,3 +147,19 @@ def check(
     print(json.dumps(report.plain(), indent=2) if as_json else checks.format_report(report))
     if not report.sound:
         raise typer.Exit(EXIT_FAILED)
+
+
+@app.command()
+def recover(
+    source: Annotated[Path, typer.Argument(help="A damaged log or recording; it stays as it is.")],
+    out: Out,
+    force: Force = False,
+) -> None:
+    """Save every message that is whole in a log that is cut or damaged, and say what is lost.
+
+    Examples: `duagc recover broken/alpha.mcap --out alpha.mcap`, `duagc recover broken --out recordings/saved`
+    """
+    from pipeline import recovery
+
+    for salvage in recovery.recover(source, out, force):
+        print(salvage.line())
