@@ -58,7 +58,10 @@ def simulate(
 
 @app.command()
 def convert(
-    dataset: Annotated[str | None, typer.Argument(help="Name of the dataset; see --list.")] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Argument(help="Name of the dataset (see --list), or a converter of your own in a .py."),
+    ] = None,
     source: Annotated[Path | None, typer.Argument(metavar="SRC", help="Where its files are.")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write; must not exist.")] = None,
     robots: Annotated[
