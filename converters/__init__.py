@@ -15,6 +15,7 @@ DATASETS = {
     "aria-multiagent": "converters.aria_multiagent",
     "bonn": "converters.bonn",
     "icl-nuim": "converters.icl_nuim",
+    "kimera-multi": "converters.kimera_multi",
     "replica": "converters.replica",
     "ros": "converters.ros",
     "replica-multiagent": "converters.replica_multiagent",

@@ -38,7 +38,27 @@ def is_depth(message: Any) -> bool:
     """Whether an Image or CompressedImage holds depth, by what it says of itself."""
     if hasattr(message, "encoding"):
         return message.encoding in DEPTH_ENCODINGS
-    return "compressedDepth" in message.format
+    return "compressedDepth" in message.format or _is_gray_png_of_16_bits(bytes(message.data[:26]))
+
+
+def _is_gray_png_of_16_bits(head: bytes) -> bool:
+    """By the first chunk of a PNG: 16 bits, and gray (colour type 0)."""
+    return head.startswith(b"\x89PNG") and head[24:26] == b"\x10\x00"
+
+
+def size_of(message: Any, where: str) -> tuple[int, int]:
+    """Width and height of an Image or CompressedImage."""
+    import cv2
+
+    if hasattr(message, "encoding"):
+        return int(message.width), int(message.height)
+    if is_depth(message):
+        height, width = depth_m(message, where, 1.0).shape
+        return width, height
+    image = cv2.imdecode(np.frombuffer(color_bytes(message, where)[0], np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise DuagError(f"{where}: no decoder reads it, expected a colour image")
+    return int(image.shape[1]), int(image.shape[0])
 
 
 def rows_of(message: Any, where: str, dtype: str, channels: int) -> NDArray[Any]:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import Force, Json, Out, Workers, app
+from pipeline.cli.common import EXIT_FAILED, Force, Json, Out, Workers, app
 
 
 @app.command()
@@ -72,6 +72,12 @@ def convert(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Option of the converter; repeatable."),
     ] = None,
+    time_source: Annotated[
+        str | None,
+        typer.Option(
+            help="Of logs of other programs: header, log (recording) or publish.", show_default=False
+        ),
+    ] = None,
     force: Force = False,
     list_datasets: Annotated[
         bool, typer.Option("--list", help="List the datasets and their options.")
@@ -88,7 +94,8 @@ def convert(
         return
     if dataset is None or source is None or out is None:
         raise typer.BadParameter("expected DATASET SRC --out REC, or --list")
-    converters.convert(dataset, source, out, robots=robots, force=force, options=options or [])
+    said = [*(options or []), *([f"time_source={time_source}"] if time_source else [])]
+    converters.convert(dataset, source, out, robots=robots, force=force, options=said)
     print(out)
 
 
@@ -105,3 +112,23 @@ def info(
 
     content = recording.info(path)
     print(json.dumps(content, indent=2) if as_json else recording.format_info(content))
+
+
+@app.command()
+def check(
+    path: Annotated[Path, typer.Argument(help="A recording, or the log of one robot.", show_default=False)],
+    as_json: Json = False,
+) -> None:
+    """Say whether a recording is sound: times, pairs, depth scale, calibration, what a run will take.
+
+    Exit code 1 if there is an error; warnings and notes leave it 0.
+
+    Example: `duagc check recordings/redkitchen`
+    """
+    from pipeline import checks, numeric
+
+    numeric.settle_opencv()
+    report = checks.check(path)
+    print(json.dumps(report.plain(), indent=2) if as_json else checks.format_report(report))
+    if not report.sound:
+        raise typer.Exit(EXIT_FAILED)
