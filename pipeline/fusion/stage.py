@@ -94,7 +94,8 @@ def _views(source: AgentInput, frames: Sequence[Odometry], result: AgentResult, 
         for f in [*(f for f in frames if f.frame_index in keyframes), *middles]:
             frame = log.frame(f.frame_index)
             T_world_camera = result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera
-            views.append(View(frame.color, frame.usable_depth, T_world_camera, frame.mask))
+            usable = frame.usable_depth
+            views.append(View(frame.color, usable, T_world_camera, frame.mask, frame.depth_sigma))
     return views
 
 

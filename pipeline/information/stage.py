@@ -35,19 +35,22 @@ _ROWS_AT_A_TIME = 1024  # 9x9 matrices of as many stay in the cache
 class View:
     """One keyframe: colour uint8 [H, W, 3] RGB, depth float32 [H, W] m, pose of the camera in the map.
 
-    mask: bool [H, W], pixels that may be used; None = all.
+    mask: bool [H, W], pixels that may be used; None = all. depth_sigma_m: [H, W] standard deviation of the depth as the
+    log tells it; None: that of the sensor model.
     """
 
     color: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
     T_map_camera: NDArray[np.float64]
     mask: NDArray[np.bool_] | None = None
+    depth_sigma_m: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
 class Noise:
     """Noise of the images: colour sigma (0..1) and depth sigma(z) = factor (base + quadratic (z - 0.4)^2), m.
 
+    from_log: depth sigma = factor times what the log tells of every pixel.
     color_pixels, depth_pixels: how many neighbouring pixels say together what one would say alone.
     """
 
@@ -55,16 +58,24 @@ class Noise:
     depth_factor: float
     depth_base_m: float
     depth_quadratic_per_m: float
+    from_log: bool = False
     color_pixels: float = 1.0
     depth_pixels: float = 1.0
 
-    def depth_sigma_m(self, depth_m: NDArray) -> NDArray[np.float64]:
-        """Standard deviation of measured depths, metres."""
+    def depth_sigma_m(
+        self, depth_m: NDArray, told_m: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float64]:
+        """Standard deviation of measured depths, metres; told_m: what the log tells, if it does."""
+        if told_m is not None:
+            # where there is no depth any number will do
+            return self.depth_factor * np.where(told_m > 0, told_m, 1.0).astype(np.float64)
         z = np.asarray(depth_m, dtype=np.float64)
         return self.depth_factor * (self.depth_base_m + self.depth_quadratic_per_m * (z - 0.4) ** 2)
 
     def depth_formula(self) -> str:
         """The depth noise in words, for the record."""
+        if self.from_log:
+            return f"{self.depth_factor:.6g} * sigma of the log"
         return f"{self.depth_factor:.6g} * ({self.depth_base_m:.6g} + {self.depth_quadratic_per_m:.6g} * (z - 0.4)^2)"
 
 
@@ -94,7 +105,7 @@ def run_information(
         views = []
         for keyframe in keyframes:
             frame = log.frame(keyframe.frame_index)
-            views.append(View(frame.color, frame.depth, keyframe.T_map_camera, frame.mask))
+            views.append(View(frame.color, frame.depth, keyframe.T_map_camera, frame.mask, frame.depth_sigma))
         camera = log.camera
     noise = estimate_noise(final.gaussians, camera, views, config, threads, depth=final.depth)
     noise, overlap = with_correlation(noise, final.gaussians, camera, views, config, threads, final.depth)
@@ -195,7 +206,8 @@ def estimate_noise(
         colors.append(np.abs(difference[covered]).ravel())
         both = covered & (z > 0)
         residual = render.depth[sample][both] / alpha[both] - z[both]
-        depths.append(np.abs(residual) / unit.depth_sigma_m(z[both]))
+        told = None if view.depth_sigma_m is None else view.depth_sigma_m[sample][both]
+        depths.append(np.abs(residual) / unit.depth_sigma_m(z[both], told))
     color, units = np.concatenate(colors), np.concatenate(depths)
     color_sigma = MAD_TO_SIGMA * float(np.median(color)) if len(color) else 0.0
     factor = 1.0
@@ -207,6 +219,7 @@ def estimate_noise(
         depth_factor=factor,
         depth_base_m=config.depth_sigma_base_m,
         depth_quadratic_per_m=config.depth_sigma_quadratic_per_m,
+        from_log=any(view.depth_sigma_m is not None for view in views),
     )
 
 
@@ -242,7 +255,7 @@ def with_correlation(
         color = (render.color.astype(np.float64) - view.color / 255.0).mean(axis=2)
         both = covered & (view.depth_m > 0)
         z = np.where(both, view.depth_m, 1.0).astype(np.float64)
-        off = (render.depth / np.maximum(render.alpha, 0.9) - z) / noise.depth_sigma_m(z)
+        off = (render.depth / np.maximum(render.alpha, 0.9) - z) / noise.depth_sigma_m(z, view.depth_sigma_m)
         sums["color"].add(color, covered)
         sums["depth"].add(off, both)
     found = {name: autocorrelation.pixels_per_sample() for name, autocorrelation in sums.items()}
@@ -361,7 +374,8 @@ def sum_information(
     inverse_color = np.full((camera.height, camera.width), color_precision, np.float32)
     # newest first, so that `per_gaussian` can stop at the latest that saw a Gaussian
     for view in reversed(chosen):
-        inverse_variance = 1.0 / (np.square(noise.depth_sigma_m(view.depth_m)) * noise.depth_pixels)
+        variance = np.square(noise.depth_sigma_m(view.depth_m, view.depth_sigma_m)) * noise.depth_pixels
+        inverse_variance = 1.0 / variance
         inverse_depth = np.where(view.depth_m > 0, inverse_variance, 0.0).astype(np.float32)
         rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera), mask=view.mask, depth=depth)
         if config.window == "per_gaussian":

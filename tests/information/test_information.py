@@ -66,6 +66,30 @@ def views_of(gaussians: Gaussians, color_noise: float = 0.0, depth_factor: float
     return out
 
 
+def test_noise_that_the_log_tells_takes_the_place_of_the_model() -> None:
+    """Twice the sigma, a quarter of what depth says; a factor of the residuals on top; colour is as before."""
+    gaussians, config = wall(), InformationConfig()
+    plain = views_of(gaussians)
+    tight, loose = (
+        [replace(v, depth_sigma_m=np.full(v.depth_m.shape, sigma, np.float32)) for v in plain]
+        for sigma in (0.01, 0.02)
+    )
+    told = Noise(1e6, 1.0, 0.0012, 0.0019, from_log=True)  # colour says nothing
+    sums = [sum_information(gaussians, CAMERA, views, told, config) for views in (tight, loose)]
+    assert sums[0].geometry.any()
+    np.testing.assert_allclose(sums[0].geometry, 4 * sums[1].geometry, rtol=1e-4, atol=1e-3)
+    r = np.random.default_rng(2)
+    noisy = [
+        replace(
+            v, depth_m=np.where(v.depth_m > 0, v.depth_m + r.normal(0, 0.03, v.depth_m.shape), 0).astype("f4")
+        )
+        for v in tight
+    ]
+    found = estimate_noise(gaussians, CAMERA, noisy, config, every=1)
+    assert found.depth_factor == pytest.approx(3.0, rel=0.05)
+    assert found.depth_formula() == f"{found.depth_factor:.6g} * sigma of the log"
+
+
 def test_noise_is_found_in_the_residuals() -> None:
     gaussians = wall()
     views = views_of(gaussians, 0.05, 2.0)
