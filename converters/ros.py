@@ -29,6 +29,7 @@ from pipeline.progress import track
 from pipeline.recording.register_depth import register_depth
 
 Options = LogOptions
+FARTHEST = np.iinfo(np.uint16).max  # in units of depth
 
 
 def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **options: Any) -> None:
@@ -102,7 +103,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
     readings = _Readings(robot, source)
     camera, maps = source.color_camera.camera, source.color_maps
     check = ReprojectionCheck(camera, len(pairs), gap)
-    without = empty = 0
+    without = empty = far = 0
     progress = track(source.frames(), f"convert {robot.name}", len(pairs))
     for index, (stamp_ns, color, depth) in enumerate(progress):
         where = f"{log}: {source.color} at {stamp_ns} ns"
@@ -120,18 +121,24 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
                 f"{log}: {source.depth} at {stamp_ns} ns is {metres.shape[1]}x{metres.shape[0]}, expected "
                 f"{size[0]}x{size[1]} as in its CameraInfo"
             )
+        if source.depth_maps is not None:
+            metres = np.asarray(cv2.remap(metres, *source.depth_maps, cv2.INTER_NEAREST), dtype=np.float32)
         if source.T_color_depth is not None:
             metres = register_depth(metres, source.depth_camera.camera, source.T_color_depth, camera)
-        elif maps is not None:
-            metres = np.asarray(cv2.remap(metres, *maps, cv2.INTER_NEAREST), dtype=np.float32)
         units = np.rint(metres / source.depth_scale)
-        raw = np.where(units <= np.iinfo(np.uint16).max, units, 0).astype(np.uint16)
+        raw = np.where(units <= FARTHEST, units, 0).astype(np.uint16)
+        far += int((units > FARTHEST).sum())
         T = source.truth.at(stamp_ns, settings.max_pose_gap_s) if source.truth else None
         without += T is None
         readings.write_until(stamp_ns)
         robot.add_frame(stamp_ns + shift_ns, data, color_format, raw, T)
         check.add(index, raw.astype(np.float64) * source.depth_scale, T)
         empty += int((raw == 0).sum())
+    if far:
+        limit = FARTHEST * source.depth_scale
+        source.warnings.append(
+            f"{far} pixels are farther away than {limit:.1f} m, which depth can hold; left out"
+        )
     readings.write_until(np.iinfo(np.int64).max)
     if source.truth is not None and without:
         source.warnings.append(f"{without} of {len(pairs)} frames have no true pose")

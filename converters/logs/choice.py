@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -57,8 +57,16 @@ class Chooser:
         return self._one("color", found, ("color", "rgb"))
 
     def depth(self) -> Choice:
-        """Images that say that they are depth."""
-        return self._one("depth", [t for t, m in self.images.items() if is_depth(m)], REGISTERED)
+        """Images that say that they are depth; mono16 may be infrared and counts only where nothing else does."""
+        found = [t for t, m in self.images.items() if is_depth(m)]
+        sure = [t for t in found if getattr(self.images[t], "encoding", "") != "mono16"]
+        choice = self._one("depth", sure or found, REGISTERED)
+        lost = [t for t, m in self.images.items() if "depth" in t.lower() and not is_depth(m)]
+        if choice.topic or not lost:
+            return choice
+        return replace(
+            choice, why=f"{choice.why}; {', '.join(lost)} holds no depth, or as JPEG, which destroys it"
+        )
 
     def info(self, option: str, image_topic: str) -> Choice:
         """CameraInfo of an image topic: the one whose name shares most with it."""

@@ -15,7 +15,8 @@ import numpy as np
 from converters.logs.choice import Chooser
 from converters.logs.clocks import compare, overlap_warnings
 from converters.logs.files import NANOSECONDS, SUFFIXES, Log, open_log
-from converters.logs.robot_log import IMU_TYPE, POSE_TYPES, RobotLog
+from converters.logs.motion import IMU_TYPE, POSE_TYPES
+from converters.logs.robot_log import RobotLog
 from converters.logs.sources import Source, is_log, sources_of
 from pipeline.errors import DuagError
 from pipeline.recording.names import LIBRARY, MAGIC, RECORDING_FILE

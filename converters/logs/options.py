@@ -25,7 +25,8 @@ class LogOptions(AssociationOptions):
     odometry: str = ""
     """Topic of another odometry (wheels, legs: Odometry or PoseStamped) that helps tracking. None if empty."""
     truth: str = ""
-    """Topic of true poses (Odometry, PoseStamped, TransformStamped), for evaluation; none if empty."""
+    """Topic of true poses (Odometry, PoseStamped, TransformStamped), or a transform that changes as "/tf PARENT CHILD",
+    for evaluation; none if empty."""
     truth_frame: str = ""
     """Frame that the true poses are of; by default what the message says, which /tf_static must tie to the camera."""
     namespaces: str = ""
