@@ -84,8 +84,11 @@ class Chooser:
             some = [topic for topic in found if hint in topic.lower()]
             if len(some) == 1:
                 return Choice(some[0], f"the only {kind} images with {hint!r} in their name", tuple(found))
-        names = ", ".join(found) or f"none of {', '.join(self.images)}"
-        return Choice("", f"{kind} images on {names}", tuple(found))
+        if not found:
+            names = ", ".join(self.images)
+            why = f"none of {names} holds {kind} images" if names else "there are no images"
+            return Choice("", why)
+        return Choice("", f"{kind} images on {', '.join(found)}", tuple(found))
 
     def _told(self, option: str, known: Sequence[str]) -> Choice:
         wanted = self._wanted[option]

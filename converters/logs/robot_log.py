@@ -124,13 +124,28 @@ class RobotLog:
         if s.T_color_depth:
             return extrinsics_of("T_color_depth", s.T_color_depth)
         named_frames = bool(color.frame_id and depth.frame_id)
-        T = self.transforms.lookup(color.frame_id, depth.frame_id) if named_frames else None
+        T = (
+            self.transforms.lookup(color.frame_id, depth.frame_id)
+            if named_frames
+            else self._realsense_extrinsics()
+        )
         if T is None:
             raise DuagError(
                 f"{self.name}: {self.depth} is seen from {depth.frame_id!r}, colour from {color.frame_id!r}, and "
                 "/tf_static does not tie them; expected --set T_color_depth='x y z qw qx qy qz' or registered=yes"
             )
         return T
+
+    def _realsense_extrinsics(self) -> Array | None:
+        """T_color_depth [4, 4] of a recording by RealSense's own software: each stream tells T_stream_reference."""
+        found = []
+        for image in (self.color, self.depth):
+            topic = f"{image.removesuffix('/image/data')}/tf/0"
+            if not self.log.of_type("geometry_msgs/msg/Transform", below=topic.removesuffix("/0")):
+                return None
+            m = self.log.first(topic)
+            found.append(pose_matrix(m.translation, m.rotation, f"{self.name}: {topic}"))
+        return found[0] @ se3.inverse(found[1])
 
     def _body_camera(self, topic: str, body: str) -> Array:
         """T_body_color [4, 4] of the frame that a topic of poses is of."""
@@ -250,9 +265,12 @@ class RobotLog:
         listed = {topic: [Listed(t, Path()) for t in sorted(set(times))] for topic, times in stamps.items()}
         found = associate(listed[self.color], listed[self.depth], self.settings)
         if not found:
+            away = nearest_s(
+                [d.stamp_ns for d in listed[self.depth]], [c.stamp_ns for c in listed[self.color]]
+            )
             raise DuagError(
                 f"{self.name}: no image on {self.depth} within {self.settings.limit_ns / NANOSECONDS:g} s of one on "
-                f"{self.color}, expected pairs"
+                f"{self.color} (the nearest is {away:.3f} s away), expected pairs, or --set max_difference_s=SECONDS"
             )
         alone = len(listed[self.color]) - len(found)
         if alone:
@@ -295,6 +313,16 @@ class RobotLog:
         """What the log says about its source."""
         moved = "registered to colour by the converter" if self.T_color_depth is not None else "registered"
         return {"color_topic": self.color, "depth_topic": self.depth, "depth": moved}
+
+
+def nearest_s(times_ns: list[int], others_ns: list[int]) -> float:
+    """The least difference between sorted times and sorted others, seconds."""
+    times, others = np.array(times_ns, dtype=np.int64), np.array(others_ns, dtype=np.int64)
+    after = np.searchsorted(others, times)
+    near = np.stack(
+        [others[np.clip(after, 0, len(others) - 1)], others[np.clip(after - 1, 0, len(others) - 1)]]
+    )
+    return float(np.abs(near - times).min()) / NANOSECONDS
 
 
 def extrinsics_of(option: str, text: str) -> Array:

@@ -97,7 +97,8 @@ def _from_file(path: Path, options: Mapping[str, Any]) -> list[Source]:
         _check_names(row, where, "logs", "namespace")
         settings = options_of(LogOptions, {**content, **row, **options}, where)
         paths = tuple(inner for log in logs for inner in logs_in(path.parent / log))
-        sources.append(Source(name, paths, namespace, " ".join(logs), settings))
+        label = " ".join(Path(log).name for log in logs) if len(robots) > 1 else ""
+        sources.append(Source(name, paths, namespace, label, settings))
     return sources
 
 
@@ -120,11 +121,11 @@ def _groups(src: Path) -> dict[str, tuple[Path, ...]]:
         raise DuagError(f"{src}: no such file or folder, expected a log")
     if src.is_file() and src.suffix not in SUFFIXES:
         raise DuagError(f"{src}: is no log, expected one of {', '.join(SUFFIXES)}")
-    if _is_log(src):
+    if is_log(src):
         return {src.name: (src,)}
     groups = {}
     for path in sorted(src.iterdir(), key=_natural):
-        inner = (path,) if _is_log(path) else _inside(path)
+        inner = (path,) if is_log(path) else _inside(path)
         if inner:
             groups[path.name] = inner
     if not groups:
@@ -135,10 +136,11 @@ def _groups(src: Path) -> dict[str, tuple[Path, ...]]:
 def _inside(folder: Path) -> tuple[Path, ...]:
     if not folder.is_dir() or folder.name.startswith("."):
         return ()
-    return tuple(path for path in sorted(folder.iterdir(), key=_natural) if _is_log(path))
+    return tuple(path for path in sorted(folder.iterdir(), key=_natural) if is_log(path))
 
 
-def _is_log(path: Path) -> bool:
+def is_log(path: Path) -> bool:
+    """Whether a path is one log, by its name: a file, or a folder of `ros2 bag`."""
     if path.is_file():
         return path.suffix in SUFFIXES and not path.name.startswith(".")
     return (path / "metadata.yaml").is_file()
