@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from converters.base import NANOSECONDS, RecordingWriter, RobotWriter
 from converters.logs import open_log
@@ -21,7 +22,7 @@ from converters.logs.clocks import LEAST_OFFSET_S, angular_speed, compare, lag, 
 from converters.logs.options import LogOptions
 from converters.logs.robot_log import RobotLog
 from converters.logs.sources import sources_of
-from converters.ros_images import color_bytes, depth_m
+from converters.ros_images import color_bytes, depth_values, encoded_size, in_metres
 from converters.self_check import GAP, MAX_RATIO, ReprojectionCheck
 from pipeline import numeric
 from pipeline.errors import DuagError
@@ -103,37 +104,55 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
     readings = _Readings(robot, source)
     camera, maps = source.color_camera.camera, source.color_maps
     check = ReprojectionCheck(camera, len(pairs), gap)
-    without = empty = far = 0
+    expected = camera.width, camera.height
+    without = empty = far = cut = 0
     progress = track(source.frames(), f"convert {robot.name}", len(pairs))
     for index, (stamp_ns, color, depth) in enumerate(progress):
         where = f"{log}: {source.color} at {stamp_ns} ns"
         data, color_format = color_bytes(color, where)
+        found = encoded_size(data)
+        if found is None:
+            cut += 1
+            continue
+        if found != expected:
+            raise DuagError(
+                f"{where} is {found[0]}x{found[1]}, expected {expected[0]}x{expected[1]} as in its CameraInfo"
+            )
         if maps is not None:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
             if image is None:
                 raise DuagError(f"{where}: no decoder reads it, expected a colour image")
             data = cv2.imencode(".png", cv2.remap(image, *maps, cv2.INTER_LINEAR))[1].tobytes()
             color_format = "png"
-        metres = depth_m(depth, f"{log}: {source.depth} at {stamp_ns} ns", settings.depth_scale)
+        where = f"{log}: {source.depth} at {stamp_ns} ns"
+        values: NDArray[Any] = depth_values(depth, where)
         size = source.depth_camera.camera.width, source.depth_camera.camera.height
-        if metres.shape != (size[1], size[0]):
+        if values.shape != (size[1], size[0]):
             raise DuagError(
-                f"{log}: {source.depth} at {stamp_ns} ns is {metres.shape[1]}x{metres.shape[0]}, expected "
-                f"{size[0]}x{size[1]} as in its CameraInfo"
+                f"{where} is {values.shape[1]}x{values.shape[0]}, expected {size[0]}x{size[1]} as in its CameraInfo"
             )
         if source.depth_maps is not None:
-            metres = np.asarray(cv2.remap(metres, *source.depth_maps, cv2.INTER_NEAREST), dtype=np.float32)
-        if source.T_color_depth is not None:
-            metres = register_depth(metres, source.depth_camera.camera, source.T_color_depth, camera)
-        units = np.rint(metres / source.depth_scale)
-        raw = np.where(units <= FARTHEST, units, 0).astype(np.uint16)
-        far += int((units > FARTHEST).sum())
+            values = cv2.remap(values, *source.depth_maps, cv2.INTER_NEAREST)
+        if source.keeps_depth and values.dtype == np.uint16:
+            raw = np.asarray(values, dtype=np.uint16)
+        else:
+            metres = in_metres(values, settings.depth_scale)
+            if source.T_color_depth is not None:
+                metres = register_depth(metres, source.depth_camera.camera, source.T_color_depth, camera)
+            units = np.rint(metres / source.depth_scale)
+            raw = np.where(units <= FARTHEST, units, 0).astype(np.uint16)
+            far += int((units > FARTHEST).sum())
         T = source.truth.at(stamp_ns, settings.max_pose_gap_s) if source.truth else None
         without += T is None
         readings.write_until(stamp_ns)
         robot.add_frame(stamp_ns + shift_ns, data, color_format, raw, T)
-        check.add(index, raw.astype(np.float64) * source.depth_scale, T)
+        if T is not None:
+            check.add(index, raw.astype(np.float64) * source.depth_scale, T)
         empty += int((raw == 0).sum())
+    if cut:
+        source.warnings.append(
+            f"{cut} colour images are cut short; left out, as all frames without a whole one"
+        )
     if far:
         limit = FARTHEST * source.depth_scale
         source.warnings.append(
@@ -142,8 +161,8 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
     readings.write_until(np.iinfo(np.int64).max)
     if source.truth is not None and without:
         source.warnings.append(f"{without} of {len(pairs)} frames have no true pose")
-    pixels = len(pairs) * camera.width * camera.height
-    return {"without_depth": empty / pixels, **check.result(log, max_ratio), **_truth_lag(source)}
+    pixels = (len(pairs) - cut) * camera.width * camera.height
+    return {"without_depth": empty / max(pixels, 1), **check.result(log, max_ratio), **_truth_lag(source)}
 
 
 def _truth_lag(source: RobotLog) -> dict[str, float]:

@@ -54,8 +54,8 @@ class RobotLog:
         self.color_camera = self._camera(self.color, "color_info", chooser)
         self.depth_camera = self._camera(self.depth, "depth_info", chooser)
         self.T_color_depth = self._extrinsics()
-        kept = is_integer_depth(chooser.images[self.depth]) and self.T_color_depth is None
-        self.depth_scale = s.depth_scale if kept else OUT_SCALE
+        self.keeps_depth = is_integer_depth(chooser.images[self.depth]) and self.T_color_depth is None
+        self.depth_scale = s.depth_scale if self.keeps_depth else OUT_SCALE
         self._motion = MotionReader(self.log, s, self.transforms, self.color_camera.frame_id, self.time_ns)
         self.truth: CameraPoses | None = self._motion.poses(s.truth, "truth") if s.truth else None
 
