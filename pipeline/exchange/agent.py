@@ -45,6 +45,7 @@ from pipeline.exchange.evidence import (
 from pipeline.exchange.knowledge import Knowledge
 from pipeline.exchange.meeting import HigherEnd, LowerEnd, Meeting, OwnPlaces, Send
 from pipeline.exchange.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError, Packet, parse
+from pipeline.exchange.poses_wire import read_poses, write_poses_in_parts
 from pipeline.exchange.signatures import Identity
 from pipeline.exchange.transport import Arrival, Message, Outgoing, Transport
 from pipeline.exchange.verification import Verdict
@@ -261,7 +262,7 @@ class Agent:
             return
         if poses and self.poses is not None and neighbour.name in self.poses.links:
             shared = self.poses.links[neighbour.name].keyframes
-            self.poses.receive(neighbour.name, wire.read_poses(poses, shared))
+            self.poses.receive(neighbour.name, read_poses(poses, shared, neighbour.index < self.own))
 
     # --- outgoing
 
@@ -310,13 +311,9 @@ class Agent:
         )
         speaks = self.poses is not None and neighbour.name in self.poses.links and not missing
         if self.poses is not None and speaks and not self._all_agreed():
-            packet = self.poses.outgoing(neighbour.name)
-            double = packet.translations.dtype == np.float64
-            per = wire.poses_per_packet(MAX_PAYLOAD_BYTES - len(state), double)
-            payloads = [
-                state + wire.write_poses(packet.part(slice(first, first + per)))
-                for first in range(0, len(packet.keyframes), per)
-            ]
+            packet, decides = self.poses.outgoing(neighbour.name), self.own < neighbour.index
+            parts = write_poses_in_parts(packet, MAX_PAYLOAD_BYTES - len(state), decides)
+            payloads = [state + part for part in parts]
         return [Message(self._new_id(), Kind.STATE, payload) for payload in payloads]
 
     def _all_agreed(self) -> bool:

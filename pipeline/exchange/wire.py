@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.consensus.evidence import unpack_symmetric
-from pipeline.consensus.links import PosePacket, SharedKeyframes
+from pipeline.consensus.links import SharedKeyframes
 from pipeline.exchange.compact import COMPACT, decode, encode
 from pipeline.exchange.packets import (
     EVIDENCE_BYTES,
@@ -289,69 +289,6 @@ def read_verdicts(data: bytes, limit: int) -> Verdicts:
     if n and not (metric.min() > 0 and metric.max() < 1e15):
         raise MalformedError("closures: the metric must be positive")
     return Verdicts(candidates, verified, consistent, bool(joined), T, SharedKeyframes(keyframes, metric))
-
-
-# --- poses of a round
-
-
-_POSES = struct.Struct("<IIBH2f2f")
-_CONVERGED, _CURVATURE, _DOUBLE = 1, 2, 4
-
-
-def write_poses(packet: PosePacket) -> bytes:
-    """Bytes of the poses of a round, float32 or float64 as the packet has them."""
-    double = packet.translations.dtype == np.float64
-    flags = _CONVERGED * packet.converged + _CURVATURE * (packet.curvature is not None) + _DOUBLE * double
-    curvature = (0.0, 0.0) if packet.curvature is None else packet.curvature.tolist()
-    n = len(packet.keyframes)
-    dtype = "float64" if double else "float32"
-    return b"".join(
-        [
-            _POSES.pack(packet.sequence, packet.version, flags, n, *packet.penalties.tolist(), *curvature),
-            array_bytes(packet.keyframes, "int32"),
-            array_bytes(packet.quats_wxyz, dtype),
-            array_bytes(packet.translations, dtype),
-        ]
-    )
-
-
-def poses_per_packet(room_bytes: int, double: bool) -> int:
-    """Keyframes that fit into the rest of a packet."""
-    return (room_bytes - _POSES.size) // (4 + 7 * (8 if double else 4))
-
-
-def read_poses(data: bytes, shared: NDArray[np.int32]) -> PosePacket:
-    """Poses of a round about some of the keyframes `shared`, ascending."""
-    reader = Reader(data, "poses")
-    sequence, version, flags, n, *numbers = reader.fields(_POSES)
-    if flags > _CONVERGED + _CURVATURE + _DOUBLE or not np.isfinite(numbers).all() or min(numbers) < 0:
-        raise MalformedError("poses: unknown flags, or impossible penalties")
-    if not (min(numbers[:2]) > 0 and max(numbers) < 1e9):
-        raise MalformedError("poses: penalties must be positive")
-    dtype = "float64" if flags & _DOUBLE else "float32"
-    keyframes = reader.array("int32", (n,))
-    quats, translations = reader.array(dtype, (n, 4)), reader.array(dtype, (n, 3))
-    reader.done()
-    if np.diff(keyframes).min(initial=1) < 1 or not np.isin(keyframes, shared).all():
-        raise MalformedError("poses: of keyframes that the link does not share")
-    if n and (
-        np.abs((quats.astype(np.float64) ** 2).sum(axis=1) - 1).max() > 1e-3
-        or np.abs(translations).max() > MAX_COORDINATE
-    ):
-        raise MalformedError("poses: not rigid motions")
-    curvature = np.array(numbers[2:], dtype=np.float32) if flags & _CURVATURE else None
-    if curvature is not None and curvature.min() < 1e-12:
-        raise MalformedError("poses: the curvature must be positive")
-    return PosePacket(
-        sequence,
-        version,
-        keyframes,
-        quats,
-        translations,
-        np.array(numbers[:2], dtype=np.float32),
-        curvature,
-        bool(flags & _CONVERGED),
-    )
 
 
 # --- one keyframe

@@ -149,6 +149,7 @@ class Tracker:
         depth_m: Image,
         *,
         mask: NDArray[np.bool_] | None = None,
+        depth_sigma_m: Image | None = None,
     ) -> TrackedFrame:
         """Track one frame; the first that can be used becomes keyframe 0 and the origin of the map.
 
@@ -156,10 +157,12 @@ class Tracker:
             stamp_ns: time of the frame, increasing.
             image: colour [h, w, 3] or grey [h, w], 0..1. depth_m: [h, w], metres, 0 = unknown.
             mask: bool [h, w], False where a pixel must not be used; its depth counts as unknown. None = all may.
+            depth_sigma_m: [h, w], standard deviation of the depth, metres; None: that of the sensor model.
         """
         if mask is not None:
             depth_m = np.where(mask, depth_m, 0)
-        pyramid = RgbdPyramid.build(image, depth_m, self.camera, levels=len(self.config.tracking.strides))
+        levels = len(self.config.tracking.strides)
+        pyramid = RgbdPyramid.build(image, depth_m, self.camera, levels, depth_sigma_m)
         found = self._examine(frame_index, stamp_ns, pyramid)
         if found is None:
             return self._begin(frame_index, stamp_ns, pyramid)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import reprlib
+from dataclasses import asdict
 from numbers import Real
 from typing import Any
 
@@ -113,13 +114,23 @@ class Rasterizer:
         depth: DepthKind = "blended",
         pose: bool = False,
         parameters: bool = True,
+        depth_certainty: Image | None = None,
     ) -> tuple[ViewLoss, Gradients]:
         """Forward, loss and backward of one view in one pass: `splat.losses.rgbd_loss` and its derivatives.
 
         color: measured, float32 [H, W, 3], compared with exp(a) * rendered + b for exposure (a, b). depth_m: measured,
         float32 [H, W], 0 where there is none. The rest as in `forward` and `backward`; `fisher` and the others may
-        follow as after a `forward`.
+        follow as after a `forward`. depth_certainty: factor [H, W] of the depth residuals, then in three passes.
         """
+        if depth_certainty is not None:
+            from pipeline.splat.losses import LossConfig, rgbd_loss
+
+            render = self.forward(gaussians, camera, T_camera_map, background, mask=mask, depth=depth)
+            config = LossConfig(**asdict(loss))
+            found = rgbd_loss(render, color, depth_m, config, exposure, mask, depth_certainty)
+            by_images = found.d_color, found.d_depth, found.d_alpha
+            gradients = self.backward(*by_images, pose=pose, parameters=parameters)
+            return ViewLoss(found.value, found.color, found.depth, found.d_exposure), gradients
         height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth)
         measured = (
             _checked_image("color", color, (height, width, 3), "the camera"),

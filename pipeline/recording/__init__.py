@@ -9,6 +9,7 @@ from pipeline.recording.folder import Recording
 from pipeline.recording.motion import Motion, MotionPrior
 from pipeline.recording.names import (
     DEPTH_SCALE_KEY,
+    RANGE_SIGMA_KEY,
     RECORDING_FILE,
     RECORDING_FORMAT,
     RECORDING_SCHEMA,
@@ -20,6 +21,7 @@ from pipeline.recording.write import LogWriter
 
 __all__ = [
     "DEPTH_SCALE_KEY",
+    "RANGE_SIGMA_KEY",
     "RECORDING_FILE",
     "RECORDING_FORMAT",
     "RECORDING_SCHEMA",

@@ -442,6 +442,24 @@ def test_view_gradients_are_forward_loss_and_backward(rasterizer, scene, exposur
     assert_same_gradients(gradients, separate, 1e-5, drift)
 
 
+def test_view_gradients_with_certain_depth_are_those_without(plain):
+    color, depth_m = measured_images(plain)
+    arguments = plain.gaussians, plain.camera, plain.T_camera_map, color, depth_m, LOSS
+    rasterizer, sure = Rasterizer(), np.ones_like(depth_m)
+    loss, gradients = rasterizer.view_gradients(*arguments, exposure=(0.1, 0.02))
+    same, of_same = rasterizer.view_gradients(*arguments, exposure=(0.1, 0.02), depth_certainty=sure)
+    np.testing.assert_allclose([same.value, same.depth], [loss.value, loss.depth], rtol=1e-5)
+    np.testing.assert_allclose(same.d_exposure, loss.d_exposure, rtol=1e-4)
+    np.testing.assert_allclose(of_same.means, gradients.means, atol=1e-4 * np.abs(gradients.means).max())
+    less, of_less = rasterizer.view_gradients(*arguments, depth_certainty=0.0 * sure)
+    assert less.depth == 0
+    without, of_color = rasterizer.view_gradients(
+        *arguments[:-1], dataclasses.replace(LOSS, depth_weight=0.0)
+    )
+    assert less.value == pytest.approx(without.value, rel=1e-5)
+    np.testing.assert_allclose(of_less.means, of_color.means, atol=1e-4 * np.abs(of_color.means).max())
+
+
 def test_view_gradients_draw_a_view_that_can_be_asked_further(rasterizer, plain):
     color, depth_m = measured_images(plain)
     arguments = (plain.gaussians, plain.camera, plain.T_camera_map)

@@ -1,0 +1,233 @@
+"""One robot's RGB-D camera in a log: which topics, which cameras, and which messages belong together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from converters.logs.choice import REGISTERED, Chooser
+from converters.logs.clocks import RobotClock
+from converters.logs.files import NANOSECONDS, Entry, Log
+from converters.logs.frames import Transforms, pose_matrix
+from converters.logs.motion import CameraPoses, Imu, MotionReader, extrinsics_of
+from converters.logs.options import LogOptions
+from converters.ros_images import RosCamera, is_integer_depth, size_of
+from converters.tum_layout import Listed, associate
+from pipeline.errors import DuagError
+from pipeline.geometry import se3
+
+Array = NDArray[np.float64]
+RECTIFIED = ("image_rect", "image_rect_color", "rect")
+OUT_SCALE = 0.0005  # metres per unit of depth that was registered or came as floats
+
+
+class RobotLog:
+    """Colour, depth, cameras and true poses of one robot.
+
+    Raises (on construction):
+        DuagError: a topic is missing or more than one could be meant; a camera or an extrinsic is unknown.
+    """
+
+    def __init__(self, log: Log, namespace: str, settings: LogOptions) -> None:
+        self.log, self.namespace, self.settings = log, namespace.rstrip("/"), settings
+        self.name = log.name
+        self.warnings: list[str] = []
+        self.shift_ns = round(
+            settings.clock_offset_s * NANOSECONDS
+        )  # added to all times when they are written
+        self.transforms = Transforms(log, self.namespace)
+        self._choose()
+
+    def _choose(self) -> None:
+        s = self.settings
+        chooser = Chooser(self.log, self.namespace, s.model_dump())
+        if not chooser.images:
+            where = f" below {self.namespace}" if self.namespace else ""
+            raise DuagError(f"{self.name}: found no topic of images{where}, expected colour and depth")
+        self.depth = chooser.depth().required(self.log, "depth")
+        self.color = chooser.color().required(self.log, "color")
+        self.color_camera = self._camera(self.color, "color_info", chooser)
+        self.depth_camera = self._camera(self.depth, "depth_info", chooser)
+        self.T_color_depth = self._extrinsics()
+        kept = is_integer_depth(chooser.images[self.depth]) and self.T_color_depth is None
+        self.depth_scale = s.depth_scale if kept else OUT_SCALE
+        self._motion = MotionReader(self.log, s, self.transforms, self.color_camera.frame_id, self.time_ns)
+        self.truth: CameraPoses | None = self._motion.poses(s.truth, "truth") if s.truth else None
+
+    def _camera(self, topic: str, option: str, chooser: Chooser) -> RosCamera:
+        """Camera of an image topic."""
+        chosen = chooser.info(option, topic).required(self.log, option)
+        name = PurePosixPath(topic.removesuffix("/compressedDepth").removesuffix("/compressed")).name
+        camera = RosCamera.of(self.log.first(chosen), name.startswith(RECTIFIED), f"{self.name}: {chosen}")
+        found = size_of(chooser.images[topic], f"{self.name}: {topic}")
+        expected = camera.camera.width, camera.camera.height
+        if found != expected:
+            raise DuagError(
+                f"{self.name}: {topic} is {found[0]}x{found[1]}, expected {expected[0]}x{expected[1]} as in {chosen}"
+            )
+        return camera
+
+    @cached_property
+    def color_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Where in the colour images every pixel of the recording's camera lies."""
+        return self.color_camera.maps() if self.settings.undistort else None
+
+    @cached_property
+    def depth_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Where in the depth images every pixel of their pinhole lies; None if they need not be undistorted.
+
+        Depth that is registered has the distortion of colour; that of another camera its own.
+        """
+        return self.color_maps if self.T_color_depth is None else self.depth_camera.maps()
+
+    # --- where the cameras are
+
+    def _extrinsics(self) -> Array | None:
+        """T_color_depth [4, 4]; None if depth is registered already."""
+        s, color, depth = self.settings, self.color_camera, self.depth_camera
+        same = color.camera == depth.camera and color.frame_id == depth.frame_id != ""
+        named = any(hint in self.depth.lower() for hint in REGISTERED)
+        if s.registered == "yes" or (s.registered == "auto" and not s.T_color_depth and (same or named)):
+            if (color.camera.width, color.camera.height) != (depth.camera.width, depth.camera.height):
+                raise DuagError(
+                    f"{self.name}: {self.depth} is {depth.camera.width}x{depth.camera.height}, expected "
+                    f"{color.camera.width}x{color.camera.height} of colour that it is registered to"
+                )
+            return None
+        if s.T_color_depth:
+            return extrinsics_of("T_color_depth", s.T_color_depth)
+        named_frames = bool(color.frame_id and depth.frame_id)
+        T = (
+            self.transforms.lookup(color.frame_id, depth.frame_id)
+            if named_frames
+            else self._realsense_extrinsics()
+        )
+        if T is None:
+            raise DuagError(
+                f"{self.name}: {self.depth} is seen from {depth.frame_id!r}, colour from {color.frame_id!r}, and "
+                "/tf_static does not tie them; expected --set T_color_depth='x y z qw qx qy qz' or registered=yes"
+            )
+        return T
+
+    def _realsense_extrinsics(self) -> Array | None:
+        """T_color_depth [4, 4] of a recording by RealSense's own software: each stream tells T_stream_reference."""
+        found = []
+        for image in (self.color, self.depth):
+            topic = f"{image.removesuffix('/image/data')}/tf/0"
+            if not self.log.of_type("geometry_msgs/msg/Transform", below=topic.removesuffix("/0")):
+                return None
+            m = self.log.first(topic)
+            found.append(pose_matrix(m.translation, m.rotation, f"{self.name}: {topic}"))
+        return found[0] @ se3.inverse(found[1])
+
+    @cached_property
+    def imu(self) -> Imu | None:
+        """What the IMU measured, in order of time."""
+        return self._motion.imu(self.settings.imu) if self.settings.imu else None
+
+    @cached_property
+    def odometry(self) -> CameraPoses | None:
+        """Poses of the colour camera by another odometry."""
+        return self._motion.poses(self.settings.odometry, "odometry") if self.settings.odometry else None
+
+    # --- which messages
+
+    def time_ns(self, entry: Entry) -> int:
+        """The time of a message by the clock that the options choose."""
+        source = self.settings.time_source
+        if source == "header":
+            return entry.header_ns()
+        if source == "log":
+            return entry.log_ns
+        if entry.publish_ns is None:
+            raise DuagError(
+                f"{self.name}: bags of ROS hold no times of publication, expected time_source=header or log"
+            )
+        return entry.publish_ns
+
+    @cached_property
+    def pairs(self) -> dict[int, int]:
+        """Time of a colour image -> time of its depth image."""
+        stamps: dict[str, list[int]] = {self.color: [], self.depth: []}
+        delays = []
+        for entry in self.log.entries(self.color, self.depth):
+            stamps[entry.topic].append(self.time_ns(entry))
+            delays.append(entry.log_ns - stamps[entry.topic][-1])
+        self._delays_ns = np.array(delays, dtype=np.int64)
+        for topic, times in stamps.items():
+            if times != sorted(times):
+                self.warnings.append(f"{topic}: times go backwards; images are taken in order of time")
+            if len(set(times)) < len(times):
+                self.warnings.append(
+                    f"{topic}: {len(times) - len(set(times))} images repeat a time; left out"
+                )
+            if not any(times):
+                raise DuagError(
+                    f"{self.name}: {topic}: all times are zero, expected times, or --set time_source=log"
+                )
+        listed = {topic: [Listed(t, Path()) for t in sorted(set(times))] for topic, times in stamps.items()}
+        found = associate(listed[self.color], listed[self.depth], self.settings)
+        if not found:
+            away = nearest_s(
+                [d.stamp_ns for d in listed[self.depth]], [c.stamp_ns for c in listed[self.color]]
+            )
+            raise DuagError(
+                f"{self.name}: no image on {self.depth} within {self.settings.limit_ns / NANOSECONDS:g} s of one on "
+                f"{self.color} (the nearest is {away:.3f} s away), expected pairs, or --set max_difference_s=SECONDS"
+            )
+        alone = len(listed[self.color]) - len(found)
+        if alone:
+            self.warnings.append(
+                f"{alone} of {len(listed[self.color])} colour images have no depth near in time"
+            )
+        return {c.stamp_ns: d.stamp_ns for c, d in found}
+
+    def clock(self, robot: str) -> RobotClock:
+        """What the times of the images say about the robot's clock."""
+        first, last = min(self.pairs), max(self.pairs)
+        header = self.settings.time_source == "header"
+        return RobotClock(robot, self.log, self.namespace, self._delays_ns, first, last, header)
+
+    def frames(self) -> Iterator[tuple[int, Any, Any]]:
+        """Time, colour and depth message of every pair, in order of time; holds no more than it must."""
+        pairs = self.pairs
+        used_by: dict[int, list[int]] = {}
+        for color_ns, depth_ns in pairs.items():
+            used_by.setdefault(depth_ns, []).append(color_ns)
+        colors: dict[int, Any] = {}
+        depths: dict[int, Any] = {}
+        order = sorted(pairs)
+        at = 0
+        for entry in self.log.entries(self.color, self.depth):
+            stamp = self.time_ns(entry)
+            if entry.topic == self.color and stamp in pairs:
+                colors.setdefault(stamp, entry)
+            elif entry.topic == self.depth and stamp in used_by:
+                depths.setdefault(stamp, entry)
+            while at < len(order) and order[at] in colors and pairs[order[at]] in depths:
+                color_ns, depth_ns = order[at], pairs[order[at]]
+                yield color_ns, colors.pop(color_ns).read(), depths[depth_ns].read()
+                used_by[depth_ns].remove(color_ns)
+                if not used_by[depth_ns]:
+                    del depths[depth_ns]
+                at += 1
+
+    def sensors(self) -> dict[str, str]:
+        """What the log says about its source."""
+        moved = "registered to colour by the converter" if self.T_color_depth is not None else "registered"
+        return {"color_topic": self.color, "depth_topic": self.depth, "depth": moved}
+
+
+def nearest_s(times_ns: list[int], others_ns: list[int]) -> float:
+    """The least difference between sorted times and sorted others, seconds."""
+    times, others = np.array(times_ns, dtype=np.int64), np.array(others_ns, dtype=np.int64)
+    after = np.searchsorted(others, times)
+    near = np.stack(
+        [others[np.clip(after, 0, len(others) - 1)], others[np.clip(after - 1, 0, len(others) - 1)]]
+    )
+    return float(np.abs(near - times).min()) / NANOSECONDS

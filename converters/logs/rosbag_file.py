@@ -1,0 +1,96 @@
+"""Bags of ROS 1 (`.bag`) and ROS 2 (`.db3`, folders of `ros2 bag`)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from converters.logs import foxglove
+from converters.logs.files import NANOSECONDS, Entry, Topic, stamp_ns
+from pipeline.errors import DuagError
+
+
+class RosBag:
+    """A bag, read by rosbags. Bags of ROS 2 without types are read with those of Humble."""
+
+    def __init__(self, path: Path) -> None:
+        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.typesys import Stores, get_typestore
+
+        self.path = path
+        try:
+            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            self._reader.open()
+        except AnyReaderError as error:
+            hint = "; `rosbag reindex` mends one that was cut short" if path.suffix == ".bag" else ""
+            reason = " ".join(str(error).rstrip(".").split())
+            raise DuagError(f"{path}: {reason}, expected a bag of ROS 1 or ROS 2{hint}") from error
+        except Exception as error:  # whatever a broken bag provokes in the reader
+            raise DuagError(
+                f"{path}: {type(error).__name__} {error}, expected a bag of ROS 1 or ROS 2"
+            ) from error
+        self._encoding = "cdr" if self._reader.is2 else "ros1"
+        self.topics: dict[str, Topic] = {}
+        for c in self._reader.connections:
+            count = c.msgcount + (self.topics[c.topic].count if c.topic in self.topics else 0)
+            kind = foxglove.ROS_TYPES.get(foxglove.plain_name(c.msgtype), c.msgtype)
+            self.topics[c.topic] = Topic(c.topic, kind, c.msgtype, self._encoding, count)
+
+    def entries(self, topics: Sequence[str]) -> Iterator[Entry]:
+        connections = [c for c in self._reader.connections if c.topic in topics]
+        if not connections:
+            return
+        for connection, log_ns, raw in self._reader.messages(connections=connections):
+            read = partial(self._read, connection, raw)
+            header = partial(ros_header_ns, raw, self._encoding, f"{self.path}: {connection.topic}")
+            if foxglove.plain_name(connection.msgtype) in foxglove.ROS_TYPES:
+                header = partial(_stamp_of, read)
+            yield Entry(connection.topic, log_ns, None, raw, read, header)
+
+    def _read(self, connection: Any, raw: bytes) -> Any:
+        where = f"{self.path}: {connection.topic}"
+        message = deserialised(self._reader.deserialize, raw, connection.msgtype, where)
+        return foxglove.as_ros(foxglove.plain_name(connection.msgtype), message, where)
+
+    def close(self) -> None:
+        self._reader.close()
+
+
+def deserialised(read: Any, raw: bytes, kind: str, where: str) -> Any:
+    """A message of ROS from its bytes, or an error that names its topic."""
+    from rosbags.highlevel import AnyReaderError
+
+    try:
+        return read(raw, kind)
+    except (
+        AnyReaderError,
+        AssertionError,
+        ValueError,
+        IndexError,
+        KeyError,
+        struct.error,
+        UnicodeDecodeError,
+    ) as error:
+        raise DuagError(
+            f"{where} holds {len(raw)} bytes that are no {kind} ({type(error).__name__})"
+        ) from error
+
+
+def ros_header_ns(raw: bytes, encoding: str, where: str) -> int:
+    """Stamp of a message that begins with a header, without reading the rest."""
+    try:
+        if encoding == "cdr":
+            order = "<" if raw[1] & 1 else ">"
+            seconds, nanoseconds = struct.unpack_from(f"{order}iI", raw, 4)
+        else:
+            seconds, nanoseconds = struct.unpack_from("<II", raw, 4)
+    except (struct.error, IndexError) as error:
+        raise DuagError(f"{where} holds {len(raw)} bytes, expected a message with a header") from error
+    return int(seconds) * NANOSECONDS + int(nanoseconds)
+
+
+def _stamp_of(read: Any) -> int:
+    return stamp_ns(read())
