@@ -331,6 +331,9 @@ class RecordingWriter:
         self.warnings: list[str] = []
         self.parameters = dict(parameters or {})
         self.checks: dict[str, Any] = {}
+        self.clocks: dict[
+            str, Any
+        ] = {}  # by robot: how its clock differs from the first robot's, where that was asked
         self._source, self._converter, self._force = dict(source or {}), converter, force
         self._robots: dict[str, dict[str, Any]] = {}
         self._open: list[RobotWriter] = []
@@ -406,6 +409,7 @@ class RecordingWriter:
             "geometry": self._geometry,
             "robots": {robot: self._robots[robot] for robot in sorted(self._robots)},
             "checks": self.checks,
+            "clocks": self.clocks,
             "warnings": self.warnings,
         }
         text = json.dumps(description, indent=2, allow_nan=False) + "\n"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from pipeline.config import Config
-from pipeline.errors import DuagError
+from pipeline.errors import DuagError, closest
 from pipeline.geometry import se3, so3
 
 MAX_ROTATION_DEFECT = 0.01  # largest entry of |R - nearest rotation|
@@ -25,10 +25,10 @@ def options_of(model: type[Options], values: Mapping[str, Any], dataset: str) ->
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
-        known = ", ".join(model.model_fields)
-        raise DuagError(
-            f"{dataset}: {name} = {first['input']!r}: {first['msg']}; options are {known}"
-        ) from error
+        if first["type"] == "extra_forbidden":
+            hint = closest(name, list(model.model_fields), "options")
+            raise DuagError(f"{dataset}: {name} is no option; {hint}") from error
+        raise DuagError(f"{dataset}: {name} = {first['input']!r}: {first['msg']}") from error
 
 
 def read_bytes(path: Path, expected: str) -> bytes:

@@ -24,13 +24,14 @@ from pydantic import Field
 from converters.base import RecordingWriter
 from converters.image_files import options_of, read_text
 from converters.logs import Log, open_log
-from converters.logs.choice import closest
+from converters.logs.motion import CameraPoses
 from converters.logs.options import LogOptions
-from converters.logs.robot_log import CameraPoses, RobotLog
-from converters.ros import logs_in, write_robot
+from converters.logs.robot_log import RobotLog
+from converters.logs.sources import logs_in
+from converters.ros import settle_clocks, write_robot
 from converters.tum_layout import AssociationOptions, Poses
 from pipeline import numeric
-from pipeline.errors import DuagError
+from pipeline.errors import DuagError, closest
 from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
@@ -92,15 +93,10 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
         }
         parameters = {"robots": len(found), **settings.model_dump()}
         with RecordingWriter(out, "", source, "kimera-multi", parameters, force) as recording:
+            logs = {robot.name: _robot_log(robot, settings, src) for robot in found}
+            settle_clocks(recording, logs)
             for robot in found:
-                write_robot(
-                    recording,
-                    robot.name,
-                    _robot_log(robot, settings, src),
-                    robot.files,
-                    TRUTH_RATIO,
-                    TRUTH_GAP,
-                )
+                write_robot(recording, robot.name, logs[robot.name], robot.files, TRUTH_RATIO, TRUTH_GAP)
 
 
 @dataclass

@@ -1,25 +1,26 @@
 """Logs of ROS 1, ROS 2 and Foxglove: colour and depth of RGB-D cameras, chosen by type and name of their topics.
 
-SRC is a `.bag`, a `.db3`, an `.mcap` or a folder of `ros2 bag`; or a folder with one of these per robot, or with a
-folder of them per robot. Images are paired by the stamps of their headers. Colour is undistorted, and depth that
-another camera saw is registered to it, with extrinsics from the log's constant transforms or given ones.
+SRC is a `.bag`, a `.db3`, an `.mcap` or a folder of `ros2 bag`; a folder with one of these per robot, or with a folder
+of them per robot; or a TOML file that says which logs and topics each robot has (`duagc info LOG --toml`). Images are
+paired by the stamps of their headers. Colour is undistorted, and depth that another camera saw is registered to it,
+with extrinsics from the log's constant transforms or given ones.
 """
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from converters.base import RecordingWriter, RobotWriter, robot_names
-from converters.image_files import options_of
+from converters.base import NANOSECONDS, RecordingWriter, RobotWriter
 from converters.logs import open_log
-from converters.logs.files import SUFFIXES
+from converters.logs.clocks import LEAST_OFFSET_S, angular_speed, compare, lag, overlap_warnings
 from converters.logs.options import LogOptions
 from converters.logs.robot_log import RobotLog
+from converters.logs.sources import sources_of
 from converters.ros_images import color_bytes, depth_m
 from converters.self_check import GAP, MAX_RATIO, ReprojectionCheck
 from pipeline import numeric
@@ -28,6 +29,7 @@ from pipeline.progress import track
 from pipeline.recording.register_depth import register_depth
 
 Options = LogOptions
+FARTHEST = np.iinfo(np.uint16).max  # in units of depth
 
 
 def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **options: Any) -> None:
@@ -39,85 +41,39 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
         DuagError: names log and topic, what was found and what was expected.
     """
     numeric.settle_opencv()
-    settings = options_of(Options, options, "ros")
-    sources = sources_of(src, settings)
+    sources = sources_of(src, options)
     if robots and robots != len(sources):
         raise DuagError(f"{src}: found {len(sources)} robots, expected --robots {len(sources)}")
-    parameters = {"robots": len(sources), **settings.model_dump()}
+    parameters = {"robots": {s.robot: s.settings.model_dump() for s in sources}}
     source = {"dataset": "ros", "folder": src.resolve().name, "parts": [s.label for s in sources]}
-    with RecordingWriter(out, "", source, "ros", parameters, force) as recording:
-        for name, part in zip(robot_names(len(sources)), sources, strict=True):
-            with open_log(part.paths, part.name) as log:
-                robot_log = RobotLog(log, part.namespace, settings)
-                write_robot(recording, name, robot_log, part.label)
+    with RecordingWriter(out, "", source, "ros", parameters, force) as recording, ExitStack() as opened:
+        robot_logs = {}
+        for part in sources:
+            log = opened.enter_context(open_log(part.paths, part.name))
+            robot_logs[part.robot] = RobotLog(log, part.namespace, part.settings)
+        settle_clocks(recording, robot_logs)
+        for part in sources:
+            write_robot(recording, part.robot, robot_logs[part.robot], part.label)
 
 
-@dataclass(frozen=True)
-class Source:
-    """The logs of one robot. name: how messages call them. label: how the recording calls them."""
-
-    paths: tuple[Path, ...]
-    namespace: str
-    label: str
-
-    @property
-    def name(self) -> str:
-        """One log, or the folder of several."""
-        return str(self.paths[0] if len(self.paths) == 1 else self.paths[0].parent)
-
-
-def sources_of(src: Path, settings: LogOptions) -> list[Source]:
-    """Logs and namespace of every robot.
-
-    Raises:
-        DuagError: there is no log.
-    """
-    spaces = [text.strip() for text in settings.namespaces.split(",") if text.strip()]
-    if spaces or settings.pieces:
-        paths = tuple(logs_in(src))
-        return [Source(paths, space, space) for space in spaces or [""]]
-    groups = _groups(src)
-    return [Source(paths, "", label if len(groups) > 1 else "") for label, paths in groups.items()]
-
-
-def logs_in(src: Path) -> list[Path]:
-    """All logs of a folder, or the log itself, in the order of the numbers in their names."""
-    return [path for group in _groups(src).values() for path in group]
-
-
-def _groups(src: Path) -> dict[str, tuple[Path, ...]]:
-    """The logs of every robot, by the name of its log or folder."""
-    if not src.exists():
-        raise DuagError(f"{src}: no such file or folder, expected a log")
-    if src.is_file() and src.suffix not in SUFFIXES:
-        raise DuagError(f"{src}: is no log, expected one of {', '.join(SUFFIXES)}")
-    if _is_log(src):
-        return {src.name: (src,)}
-    groups = {}
-    for path in sorted(src.iterdir(), key=_natural):
-        inner = (path,) if _is_log(path) else _inside(path)
-        if inner:
-            groups[path.name] = inner
-    if not groups:
-        raise DuagError(f"{src}: found no log, expected one for each robot")
-    return groups
-
-
-def _inside(folder: Path) -> tuple[Path, ...]:
-    if not folder.is_dir() or folder.name.startswith("."):
-        return ()
-    return tuple(path for path in sorted(folder.iterdir(), key=_natural) if _is_log(path))
-
-
-def _is_log(path: Path) -> bool:
-    if path.is_file():
-        return path.suffix in SUFFIXES and not path.name.startswith(".")
-    return (path / "metadata.yaml").is_file()
-
-
-def _natural(path: Path) -> list[Any]:
-    """Order in which 9.bag comes before 10.bag."""
-    return [(int(word), "") if word.isdigit() else (0, word) for word in re.split(r"(\d+)", path.name)]
+def settle_clocks(recording: RecordingWriter, robot_logs: Mapping[str, RobotLog]) -> None:
+    """Say how the robots' clocks differ, and shift their times as the options ask."""
+    clocks = [robot_log.clock(robot) for robot, robot_log in robot_logs.items()]
+    offsets = compare(clocks)
+    for robot, robot_log in robot_logs.items():
+        kind, offset = robot_log.settings.clocks, offsets[robot]
+        if kind == "from_zero":
+            robot_log.shift_ns -= min(robot_log.pairs)
+        elif kind == "estimated" and offset.seconds is not None and offset.matters:
+            robot_log.shift_ns += round(offset.seconds * NANOSECONDS)
+        elif kind == "estimated" and offset.seconds is None:
+            robot_log.warnings.append(f"its clock is kept: {offset.how}")
+    if len(robot_logs) > 1:
+        recording.clocks = {
+            robot: {**offsets[robot].row(), "added_s": robot_log.shift_ns / NANOSECONDS}
+            for robot, robot_log in robot_logs.items()
+        }
+        recording.warnings += overlap_warnings(clocks)
 
 
 def write_robot(
@@ -143,12 +99,12 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
     import cv2
 
     settings, log = source.settings, source.name
-    pairs = source.pairs()
+    pairs, shift_ns = source.pairs, source.shift_ns
     readings = _Readings(robot, source)
     camera, maps = source.color_camera.camera, source.color_maps
     check = ReprojectionCheck(camera, len(pairs), gap)
-    without = empty = 0
-    progress = track(source.frames(pairs), f"convert {robot.name}", len(pairs))
+    without = empty = far = 0
+    progress = track(source.frames(), f"convert {robot.name}", len(pairs))
     for index, (stamp_ns, color, depth) in enumerate(progress):
         where = f"{log}: {source.color} at {stamp_ns} ns"
         data, color_format = color_bytes(color, where)
@@ -165,23 +121,48 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
                 f"{log}: {source.depth} at {stamp_ns} ns is {metres.shape[1]}x{metres.shape[0]}, expected "
                 f"{size[0]}x{size[1]} as in its CameraInfo"
             )
+        if source.depth_maps is not None:
+            metres = np.asarray(cv2.remap(metres, *source.depth_maps, cv2.INTER_NEAREST), dtype=np.float32)
         if source.T_color_depth is not None:
             metres = register_depth(metres, source.depth_camera.camera, source.T_color_depth, camera)
-        elif maps is not None:
-            metres = np.asarray(cv2.remap(metres, *maps, cv2.INTER_NEAREST), dtype=np.float32)
         units = np.rint(metres / source.depth_scale)
-        raw = np.where(units <= np.iinfo(np.uint16).max, units, 0).astype(np.uint16)
+        raw = np.where(units <= FARTHEST, units, 0).astype(np.uint16)
+        far += int((units > FARTHEST).sum())
         T = source.truth.at(stamp_ns, settings.max_pose_gap_s) if source.truth else None
         without += T is None
         readings.write_until(stamp_ns)
-        robot.add_frame(stamp_ns, data, color_format, raw, T)
+        robot.add_frame(stamp_ns + shift_ns, data, color_format, raw, T)
         check.add(index, raw.astype(np.float64) * source.depth_scale, T)
         empty += int((raw == 0).sum())
+    if far:
+        limit = FARTHEST * source.depth_scale
+        source.warnings.append(
+            f"{far} pixels are farther away than {limit:.1f} m, which depth can hold; left out"
+        )
     readings.write_until(np.iinfo(np.int64).max)
     if source.truth is not None and without:
         source.warnings.append(f"{without} of {len(pairs)} frames have no true pose")
     pixels = len(pairs) * camera.width * camera.height
-    return {"without_depth": empty / pixels, **check.result(log, max_ratio)}
+    return {"without_depth": empty / pixels, **check.result(log, max_ratio), **_truth_lag(source)}
+
+
+def _truth_lag(source: RobotLog) -> dict[str, float]:
+    """How much later the true poses turn than what the robot itself measured; nothing where that cannot be told."""
+    if source.truth is None or (source.imu is None and source.odometry is None):
+        return {}
+    true = angular_speed(source.truth.body.stamps_ns, source.truth.body.T_world_body)
+    if source.imu is not None:
+        own = source.imu.stamps_ns, np.linalg.norm(source.imu.values[:, :3], axis=1)
+    elif source.odometry is not None:
+        own = angular_speed(source.odometry.body.stamps_ns, source.odometry.body.T_world_body)
+    found = lag(*own, *true)
+    if found is None:
+        return {}
+    if abs(found[0]) > LEAST_OFFSET_S:
+        source.warnings.append(
+            f"true poses are {found[0]:.3f} s late by the robot's own clock (they turn so much later)"
+        )
+    return {"truth_lag_s": found[0], "truth_lag_correlation": found[1]}
 
 
 class _Readings:
@@ -193,14 +174,14 @@ class _Readings:
         odometry = self._odometry.body.stamps_ns if self._odometry else np.zeros(0, np.int64)
         self._stamps = np.concatenate([imu, odometry])
         self._order = np.argsort(self._stamps, kind="stable")
-        self._imu_count, self._next = len(imu), 0
+        self._imu_count, self._next, self._shift_ns = len(imu), 0, source.shift_ns
         if self._imu:
             robot.set_imu(self._imu.T_color_imu)
 
     def write_until(self, stamp_ns: int) -> None:
         """Write what was measured before a time."""
         while self._next < len(self._order) and self._stamps[k := self._order[self._next]] < stamp_ns:
-            stamp = int(self._stamps[k])
+            stamp = int(self._stamps[k]) + self._shift_ns
             if k < self._imu_count and self._imu:
                 values = self._imu.values[k]
                 self._robot.add_imu(stamp, values[:3], values[3:])

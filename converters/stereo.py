@@ -5,7 +5,7 @@ Bouguet's rectification turns both cameras until corresponding points lie in one
 sigma_z = z^2 sigma_d / (f b). Everything here is OpenCV, arrays in and arrays out, for any converter:
 
     rig = StereoRig.of(left, right, T_right_left)
-    RowCheck(rig).add(*pair) ... .result(where)        # refuses a calibration that is not that of the images
+    RowCheck().add(*pair) ... .result(where)        # refuses a calibration that is not that of the images
     color, depth_m, sigma_m = rig.rectify_left(image), *rig.depth(gray_left, gray_right)
 """
 
@@ -232,8 +232,7 @@ def disparity_sigma_m(
 class RowCheck:
     """Measures a rectification on the images themselves: matched features must lie in one row, and to the left."""
 
-    def __init__(self, rig: StereoRig) -> None:
-        self._rig = rig
+    def __init__(self) -> None:
         self._differences: list[Array] = [np.zeros((0, 2))]
 
     def add(self, left: Image, right: Image) -> None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import Any
 
 from converters.logs.files import Log
 from converters.ros_images import is_depth
-from pipeline.errors import DuagError
+from pipeline.errors import DuagError, closest
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
@@ -58,8 +57,16 @@ class Chooser:
         return self._one("color", found, ("color", "rgb"))
 
     def depth(self) -> Choice:
-        """Images that say that they are depth."""
-        return self._one("depth", [t for t, m in self.images.items() if is_depth(m)], REGISTERED)
+        """Images that say that they are depth; mono16 may be infrared and counts only where nothing else does."""
+        found = [t for t, m in self.images.items() if is_depth(m)]
+        sure = [t for t in found if getattr(self.images[t], "encoding", "") != "mono16"]
+        choice = self._one("depth", sure or found, REGISTERED)
+        lost = [t for t, m in self.images.items() if "depth" in t.lower() and not is_depth(m)]
+        if choice.topic or not lost:
+            return choice
+        return replace(
+            choice, why=f"{choice.why}; {', '.join(lost)} holds no depth, or as JPEG, which destroys it"
+        )
 
     def info(self, option: str, image_topic: str) -> Choice:
         """CameraInfo of an image topic: the one whose name shares most with it."""
@@ -85,8 +92,11 @@ class Chooser:
             some = [topic for topic in found if hint in topic.lower()]
             if len(some) == 1:
                 return Choice(some[0], f"the only {kind} images with {hint!r} in their name", tuple(found))
-        names = ", ".join(found) or f"none of {', '.join(self.images)}"
-        return Choice("", f"{kind} images on {names}", tuple(found))
+        if not found:
+            names = ", ".join(self.images)
+            why = f"none of {names} holds {kind} images" if names else "there are no images"
+            return Choice("", why)
+        return Choice("", f"{kind} images on {', '.join(found)}", tuple(found))
 
     def _told(self, option: str, known: Sequence[str]) -> Choice:
         wanted = self._wanted[option]
@@ -95,14 +105,6 @@ class Chooser:
                 f"{self.log.name}: {option} topic {wanted} not found, {closest(wanted, known, 'a topic')}"
             )
         return Choice(wanted, "told", tuple(known))
-
-
-def closest(word: str, known: Sequence[str], kind: str) -> str:
-    """The end of a message about a wrong name: what was meant perhaps, else what there is."""
-    near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
-    if near:
-        return f"expected perhaps {near[0]}"
-    return f"expected one of {', '.join(known)}" if known else f"expected {kind}, and there is none"
 
 
 def shared_parts(a: str, b: str) -> int:

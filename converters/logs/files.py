@@ -42,12 +42,14 @@ class Topic:
 class Entry:
     """One message. log_ns: when it was recorded; publish_ns: when it was sent, where the container tells.
 
-    read: the message, with ROS's fields. header_ns: the time in its header, 0 where it has none.
+    data: as it stands in the container. read: the message, with ROS's fields. header_ns: the time in its header, 0
+    where it has none.
     """
 
     topic: str
     log_ns: int
     publish_ns: int | None
+    data: bytes
     read: Callable[[], Any]
     header_ns: Callable[[], int]
 

@@ -84,6 +84,7 @@ class McapFile:
             self._decoders[channel.id] = _Foxglove(schema, encoding)
         else:  # nothing that is read here; still shown to people
             kind = f"{name or 'no schema'} as {encoding or 'nothing known'}"
+            self._decoders[channel.id] = _Unknown(kind)
         known = self.topics.get(channel.topic)
         if known and known.count and count and known.type != kind:
             raise DuagError(
@@ -147,13 +148,12 @@ class McapFile:
         with parsing(self.path):
             for channel, m in self._messages(topics):
                 where = f"{self.path}: {channel.topic}"
-                if channel.id not in self._decoders:
-                    raise DuagError(f"{where} is {self.topics[channel.topic].type}, expected ROS or Foxglove")
                 decoder = self._decoders[channel.id]
                 yield Entry(
                     channel.topic,
                     m.log_time,
                     m.publish_time,
+                    m.data,
                     partial(decoder.read, m.data, where),
                     partial(decoder.header_ns, m.data, where),
                 )
@@ -228,3 +228,16 @@ class _Foxglove:
 
     def header_ns(self, data: bytes, where: str) -> int:
         return stamp_ns(self.read(data, where))
+
+
+class _Unknown:
+    """Messages that are not read here."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+
+    def read(self, data: bytes, where: str) -> Any:
+        raise DuagError(f"{where} is {self.kind}, expected ROS or Foxglove")
+
+    def header_ns(self, data: bytes, where: str) -> int:
+        return 0

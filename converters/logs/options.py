@@ -25,7 +25,8 @@ class LogOptions(AssociationOptions):
     odometry: str = ""
     """Topic of another odometry (wheels, legs: Odometry or PoseStamped) that helps tracking. None if empty."""
     truth: str = ""
-    """Topic of true poses (Odometry, PoseStamped, TransformStamped), for evaluation; none if empty."""
+    """Topic of true poses (Odometry, PoseStamped, TransformStamped), or a transform that changes as "/tf PARENT CHILD",
+    for evaluation; none if empty."""
     truth_frame: str = ""
     """Frame that the true poses are of; by default what the message says, which /tf_static must tie to the camera."""
     namespaces: str = ""
@@ -44,6 +45,9 @@ class LogOptions(AssociationOptions):
     """Times of the headers, those of recording, or those of publication (which only MCAP knows)."""
     clock_offset_s: float = Field(default=0.0, allow_inf_nan=False)
     """Seconds to add to all times of the robot, for clocks that differ between robots."""
+    clocks: Literal["as_recorded", "estimated", "from_zero"] = "as_recorded"
+    """What becomes of the robots' clocks: kept (their difference is estimated and told), corrected by the estimated
+    difference where it matters, or every robot starts at time 0."""
     pieces: bool = False
     """All logs of the folder belong to one robot, or to several in different namespaces."""
     undistort: bool = True

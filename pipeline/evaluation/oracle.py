@@ -30,10 +30,11 @@ from pipeline.fusion.config import FusionConfig
 from pipeline.fusion.fuse import fuse
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.messages import unpack_pose
+from pipeline.messages import GaussianInformation, unpack_pose
 from pipeline.recording import read_log
 from pipeline.robot import Step, factors_of, registrations_of
 from pipeline.run_folder import RobotRun, RunFolder
+from pipeline.splat.gaussians import Gaussians
 from schemas import topics
 
 Array = NDArray[np.float64]
@@ -139,19 +140,14 @@ def _gaussian_gaps(
     pairs: Mapping[tuple[str, str], NDArray[np.int64]],
 ) -> Array:
     """Largest |x - x*| sqrt(diagonal of the information at x*) of each of a robot's matched Gaussians [m]."""
-    evidence = {
-        name: Evidence.from_map(
-            name, r.own_map.gaussians, r.information, np.array([k.T_map_camera for k in r.keyframes])
-        )
-        for name in members
-        if (r := run.robots[name])
-    }
-    own = run.robots[robot].own_map.gaussians
+    told = {name: Evidence.from_map(*_map_of(run.robots[name])) for name in members}
+    _, own, _, T_map_keyframe = mine = _map_of(run.robots[robot])
     best = fuse(
         robot,
         own,
-        np.array([k.T_map_camera for k in run.robots[robot].keyframes]),
-        evidence,
+        T_map_keyframe,
+        told,
+        Evidence.of_splats(*mine),
         central,
         pairs,
         (),
@@ -165,6 +161,12 @@ def _gaussian_gaps(
     roots = np.sqrt(Weights.of(information).diagonal())
     gaps = np.abs(theta - theta_of(best.gaussians)[: len(own)]) * roots
     return np.asarray(gaps[matched].max(axis=1, initial=0.0))
+
+
+def _map_of(robot: RobotRun) -> tuple[str, Gaussians, GaussianInformation, Array]:
+    """Name, own map, its information, and keyframes in it [k, 4, 4]."""
+    T_map_keyframe = np.array([k.T_map_camera for k in robot.keyframes])
+    return robot.robot, robot.own_map.gaussians, robot.information, T_map_keyframe
 
 
 def solve_component(

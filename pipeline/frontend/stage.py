@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline import progress as progress_bar
 from pipeline.errors import DuagError
-from pipeline.frontend import bundle
+from pipeline.frontend import bundle, loops
 from pipeline.frontend.config import FrontendConfig, is_held_out
 from pipeline.frontend.failure import Reason
 from pipeline.frontend.keyframes import KeyframePair, Refined, refine
@@ -91,7 +91,15 @@ def _track(log: RgbdLog, config: FrontendConfig, progress: bool) -> tuple[Tracke
     tracked = []
     for frame in source:
         image = frame.color.astype(np.float32) * np.float32(1 / 255)
-        tracked.append(tracker.track(frame.index, frame.stamp_ns, image, frame.depth, mask=frame.mask))
+        found = tracker.track(
+            frame.index,
+            frame.stamp_ns,
+            image,
+            frame.depth,
+            mask=frame.mask,
+            depth_sigma_m=frame.depth_sigma,
+        )
+        tracked.append(found)
     return tracker, tracked
 
 
@@ -106,14 +114,14 @@ def _refine(
 
     def images(index: int, levels: int) -> RgbdPyramid:
         frame = log.frame(keyframes[index].frame_index)
-        depth = frame.depth if frame.mask is None else np.where(frame.mask, frame.depth, np.float32(0))
-        return RgbdPyramid.build(frame.color * np.float32(1 / 255), depth, log.camera, levels)
+        color = frame.color * np.float32(1 / 255)
+        return RgbdPyramid.build(color, frame.usable_depth, log.camera, levels, frame.depth_sigma)
 
     registration = config.tracking.registration
     pairs = list(tracker.pairs)
     if settings.loops.enabled:
         tracked = refine(start, pairs, settings.huber_sigmas).T_map_keyframe
-        pairs += bundle.find_loops(tracked, keyframes, images, settings.loops, registration, seed, log.robot)
+        pairs += loops.find_loops(tracked, keyframes, images, settings.loops, registration, seed, log.robot)
     if not settings.local_optimisation:
         return refine(start, pairs, settings.huber_sigmas), pairs
     return bundle.optimise(start, keyframes, images, pairs, settings, registration)
@@ -201,7 +209,12 @@ def _map(
     for keyframe in steps:
         frame = log.frame(keyframe.frame_index)
         stats = mapper.add_keyframe(
-            keyframe.keyframe_index, frame.color, frame.depth, keyframe.T_map_camera, mask=frame.mask
+            keyframe.keyframe_index,
+            frame.color,
+            frame.depth,
+            keyframe.T_map_camera,
+            mask=frame.mask,
+            depth_sigma_m=frame.depth_sigma,
         )
         updates.append(update(keyframe, stats))
     for supporting in _support(frames, keyframes, config):
@@ -212,6 +225,7 @@ def _map(
             frame.depth,
             supporting.T_keyframe_camera,
             mask=frame.mask,
+            depth_sigma_m=frame.depth_sigma,
         )
     unrefined = mapper.gaussians
     clock.lap("mapping_s")

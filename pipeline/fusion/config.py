@@ -38,24 +38,17 @@ class FusionConfig(Config):
     spacing_per_sigma: float = Field(default=1.8, ge=0.0)
     """Local spacing of splats, in units of their standard deviation along the surface: the mapper seeds discs with a
     standard deviation of 0.55 cells."""
-    position_floor_m: float = Field(default=0.003, ge=0.0)
-    """Standard deviation added to every position, in all directions. Fisher information knows the noise of pixels but
-    not the bias of a map: two discs a few millimetres apart, slightly tilted and each sure to a tenth of a millimetre,
-    would meet centimetres away, where their planes cross. 0 is the method as printed."""
-    slope: float = Field(default=0.2, ge=0.0)
-    """Two splats some distance apart lie on one plane only up to this slope: (slope * distance)^2 is added to the
-    position's covariance in all directions. 0 is the method as printed."""
-    shape_floor: float = Field(default=0.1, ge=0.0)
-    """The same for every coordinate of vec log Sigma; 0.1 is 5 % of a scale."""
-    sampling_log_covariance: float = Field(default=0.5, ge=0.0)
-    """Standard deviation by which two robots' splats of one place differ in a coordinate of vec log Sigma because they
-    are cut differently (association = neighbours)."""
-    sampling_color: float = Field(default=0.1, ge=0.0)
+    scatter_position_m: float = Field(default=0.01, gt=0.0)
+    """Standard deviation by which two robots' splats of one place are expected to differ across the surface. What is
+    expected counts as much as `scatter_support` matched Gaussians; the rest is measured."""
+    scatter_log_covariance: float = Field(default=1.0, gt=0.0)
+    """The same for a coordinate of vec log Sigma."""
+    scatter_color: float = Field(default=0.07, gt=0.0)
     """The same for colour channels, 0..1."""
-    sampling_opacity: float = Field(default=1.0, ge=0.0)
+    scatter_opacity: float = Field(default=0.5, gt=0.0)
     """The same for opacity logits."""
-    unobserved_below: float = Field(default=1e-6, gt=0.0)
-    """Directions with less than this share of a block's largest information count as unobserved: float32 noise."""
+    scatter_support: int = Field(default=50, ge=1)
+    """Matched Gaussians that the expectation is worth."""
     explained_m: float = Field(default=0.10, ge=0.0)
     """A neighbour's Gaussian this far behind a surface that an own keyframe measured still counts as explained..."""
     explained_relative: float = Field(default=0.03, ge=0.0)

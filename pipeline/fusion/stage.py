@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.consensus.config import MatchingConfig
-from pipeline.consensus.evidence import unpack_symmetric
+from pipeline.consensus.evidence import Evidence, unpack_symmetric
 from pipeline.errors import DuagError
 from pipeline.fusion.config import FusionConfig
 from pipeline.fusion.fuse import FusedMap, fuse
@@ -52,6 +52,7 @@ def run_fusion(
         own.gaussians,
         own.T_map_keyframe,
         {own.robot: result.own_evidence, **result.evidence},
+        Evidence.of_splats(own.robot, own.gaussians, own.information, own.T_map_keyframe),
         result.T_world_keyframe_of,
         result.pairs,
         _depth_images(own),
@@ -93,7 +94,8 @@ def _views(source: AgentInput, frames: Sequence[Odometry], result: AgentResult, 
         for f in [*(f for f in frames if f.frame_index in keyframes), *middles]:
             frame = log.frame(f.frame_index)
             T_world_camera = result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera
-            views.append(View(frame.color, frame.usable_depth, T_world_camera, frame.mask))
+            usable = frame.usable_depth
+            views.append(View(frame.color, usable, T_world_camera, frame.mask, frame.depth_sigma))
     return views
 
 
@@ -158,5 +160,9 @@ def _information(robot: str, fused: FusedMap, stamp_ns: int) -> GaussianInformat
         observations=fused.members.astype(np.uint32),
         color_sigma=0.0,
         depth_sigma="as each member said",
+        deviation_m=np.zeros(n, np.float32),  # in what the members said
+        color_pixels_per_sample=1.0,
+        depth_pixels_per_sample=1.0,
+        overlap=1.0,
         frame_id=WORLD_FRAME,
     )

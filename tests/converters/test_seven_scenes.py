@@ -55,10 +55,9 @@ def depth_pose(index: int) -> np.ndarray:
     return se3.from_rotation_translation(np.stack([x, np.cross(z, x), z], axis=1), position)
 
 
-@pytest.fixture(scope="module")
-def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("scene") / "seq-01"
-    folder.mkdir()
+def make_sequence(folder: Path) -> Path:
+    """A sequence in the files of the dataset."""
+    folder.mkdir(parents=True)
     options = Options()
     for index in range(FRAMES):
         pose = depth_pose(index)
@@ -72,6 +71,11 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pose[:3, :3] += np.random.default_rng(index).uniform(-4e-4, 4e-4, (3, 3))  # as the dataset has it
         np.savetxt(f"{stem}.pose.txt", pose, delimiter="\t")
     return folder
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_sequence(tmp_path_factory.mktemp("scene") / "seq-01")
 
 
 @pytest.fixture

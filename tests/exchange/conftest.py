@@ -114,6 +114,10 @@ def information_of(name: str, maps: Gaussians, rng: np.random.Generator) -> Gaus
         np.full(n, 3, np.uint32),
         0.02,
         "0.0012 + 0.0019 (z - 0.4)^2",
+        rng.uniform(0.001, 0.02, n).astype(np.float32),
+        9.0,
+        25.0,
+        12.0,
     )
 
 
