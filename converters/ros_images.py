@@ -67,6 +67,14 @@ def encoded_size(data: bytes) -> tuple[int, int] | None:
     return None
 
 
+def is_cut_short(message: Any) -> bool:
+    """Whether a CompressedImage is a JPEG or PNG that lacks its end."""
+    if not hasattr(message, "format"):
+        return False
+    data = bytes(message.data)
+    return data.startswith((b"\xff\xd8\xff", b"\x89PNG")) and encoded_size(data) is None
+
+
 def is_depth(message: Any) -> bool:
     """Whether an Image or CompressedImage holds depth, by what it says of itself."""
     if hasattr(message, "encoding"):

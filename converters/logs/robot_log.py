@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from converters.logs.choice import REGISTERED, Chooser
 from converters.logs.clocks import RobotClock
+from converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
 from converters.logs.files import NANOSECONDS, Entry, Log
 from converters.logs.frames import Transforms, pose_matrix
+from converters.logs.gather import gathered
 from converters.logs.motion import CameraPoses, Imu, MotionReader, extrinsics_of
 from converters.logs.options import LogOptions
 from converters.ros_images import RosCamera, is_integer_depth, size_of
@@ -22,6 +24,7 @@ from pipeline.errors import DuagError
 from pipeline.geometry import se3
 
 Array = NDArray[np.float64]
+HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
 RECTIFIED = ("image_rect", "image_rect_color", "rect")
 OUT_SCALE = 0.0005  # metres per unit of depth that was registered or came as floats
 
@@ -52,18 +55,67 @@ class RobotLog:
         self.depth = chooser.depth().required(self.log, "depth")
         self.color = chooser.color().required(self.log, "color")
         self.color_camera = self._camera(self.color, "color_info", chooser)
+        self._motion = MotionReader(self.log, s, self.transforms, self.color_camera.frame_id, self.time_ns)
+        self.truth: CameraPoses | None = self._motion.poses(s.truth, "truth") if s.truth else None
+        self.T_color_depth: Array | None = None
+        self.derived = self._derived(chooser) if s.depth_from != "image" else None
+        if self.derived:
+            self.camera, self.depth_scale = self.derived.camera, self.derived.scale
+            return
+        self.camera = self.color_camera.camera
         self.depth_camera = self._camera(self.depth, "depth_info", chooser)
         self.T_color_depth = self._extrinsics()
         self.keeps_depth = is_integer_depth(chooser.images[self.depth]) and self.T_color_depth is None
         self.depth_scale = s.depth_scale if self.keeps_depth else OUT_SCALE
-        self._motion = MotionReader(self.log, s, self.transforms, self.color_camera.frame_id, self.time_ns)
-        self.truth: CameraPoses | None = self._motion.poses(s.truth, "truth") if s.truth else None
+
+    def _derived(self, chooser: Chooser) -> Derived:
+        """Depth of a stereo pair or of a LiDAR."""
+        s, color = (
+            self.settings,
+            (self.color, self._info(self.color, "color_info", chooser), self.color_camera),
+        )
+        if s.depth_from == "stereo":
+            right = self._info(self.depth, "depth_info", chooser)
+            other = self.depth, right, self._camera(self.depth, "depth_info", chooser)
+            return stereo_of(self.log, color, other, _is_rectified(self.color), self.transforms, s)
+        if s.max_difference_s == 0:
+            self.settings = s.model_copy(update={"max_difference_s": HALF_TURN_S})
+        motion = self.odometry.prior() if self.odometry else self.imu.prior() if self.imu else None
+        if motion is None:
+            self.warnings.append(
+                "sweeps hold what the LiDAR moved meanwhile; expected --set imu=TOPIC or odometry=TOPIC to take it out"
+            )
+        camera = self.color, self.color_camera
+        return sweeps_of(self.log, camera, self.depth, self.transforms, motion, s)
+
+    @property
+    def T_color_camera(self) -> Array:  # noqa: N802 (a transform)
+        """Where the camera of the recording is in the colour camera: turned, if that is rectified."""
+        return self.derived.T_color_camera if self.derived else np.eye(4)
+
+    def depth_m(self, picture: Picture) -> Array:
+        """Depth [h, w] of a picture in metres, 0 = none."""
+        if self.derived:
+            return self.derived.depth_m(picture)
+        assert picture.depth is not None
+        return np.asarray(picture.depth, dtype=np.float64) * self.depth_scale
+
+    def check_rows(self) -> dict[str, Any]:
+        """The test of the rectification of a stereo pair; nothing for other sources of depth."""
+        if not isinstance(self.derived, Stereo):
+            return {}
+        groups = [{self.color: c, self.depth: d} for c, d in some_pairs(self.pairs)]
+        found = gathered(self.log, groups, self.time_ns)
+        return self.derived.check([(g[self.color].read(), g[self.depth].read()) for g in found])
+
+    def _info(self, topic: str, option: str, chooser: Chooser) -> str:
+        """The CameraInfo of an image topic."""
+        return chooser.info(option, topic).required(self.log, option)
 
     def _camera(self, topic: str, option: str, chooser: Chooser) -> RosCamera:
         """Camera of an image topic."""
-        chosen = chooser.info(option, topic).required(self.log, option)
-        name = PurePosixPath(topic.removesuffix("/compressedDepth").removesuffix("/compressed")).name
-        camera = RosCamera.of(self.log.first(chosen), name.startswith(RECTIFIED), f"{self.name}: {chosen}")
+        chosen = self._info(topic, option, chooser)
+        camera = RosCamera.of(self.log.first(chosen), _is_rectified(topic), f"{self.name}: {chosen}")
         found = size_of(chooser.images[topic], f"{self.name}: {topic}")
         expected = camera.camera.width, camera.camera.height
         if found != expected:
@@ -220,7 +272,14 @@ class RobotLog:
     def sensors(self) -> dict[str, str]:
         """What the log says about its source."""
         moved = "registered to colour by the converter" if self.T_color_depth is not None else "registered"
+        moved = self.derived.words if self.derived else moved
         return {"color_topic": self.color, "depth_topic": self.depth, "depth": moved}
+
+
+def _is_rectified(topic: str) -> bool:
+    """Whether images are undistorted, by the name of their topic."""
+    name = PurePosixPath(topic.removesuffix("/compressedDepth").removesuffix("/compressed")).name
+    return name.startswith(RECTIFIED)
 
 
 def nearest_s(times_ns: list[int], others_ns: list[int]) -> float:
