@@ -108,7 +108,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
     without = empty = far = cut = 0
     progress = track(source.frames(), f"convert {robot.name}", len(pairs))
     for index, (stamp_ns, color, depth) in enumerate(progress):
-        if is_cut_short(color):
+        if is_cut_short(color) or is_cut_short(depth):
             cut += 1
             continue
         if derived:
@@ -128,7 +128,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
             check.add(index, source.depth_m(picture), T)
         empty += 0 if picture.depth is None else int((picture.depth == 0).sum())
     if cut:
-        source.warnings.append(f"{cut} colour images are cut short; left out, with all that belongs to them")
+        source.warnings.append(f"{cut} frames have colour or depth that is cut short; left out")
     if far:
         limit = FARTHEST * source.depth_scale
         source.warnings.append(

@@ -54,24 +54,23 @@ def encoded_size(data: bytes) -> tuple[int, int] | None:
     if data.startswith(b"\x89PNG"):
         whole = len(data) > 24 and b"IEND" in data[-64:]
         return (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) if whole else None
-    if not data.startswith(b"\xff\xd8") or not data.rstrip(b"\0").endswith(
-        b"\xff\xd9"
-    ):  # some cameras append zeros
-        return None
-    at = 2
+    at = 2 if data.startswith(b"\xff\xd8") else len(data)
     while at + 9 < len(data) and data[at] == 0xFF:
         marker = data[at + 1]
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of a frame
+            if data.rfind(b"\xff\xd9", at) < 0:  # no end; some cameras write more behind it
+                return None
             return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
         at += 1 if marker == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return None
 
 
 def is_cut_short(message: Any) -> bool:
-    """Whether a CompressedImage is a JPEG or PNG that lacks its end."""
+    """Whether a CompressedImage is a JPEG or PNG that lacks its end; that of compressedDepth has 12 bytes before it."""
     if not hasattr(message, "format"):
         return False
     data = bytes(message.data)
+    data = data[12:] if data[12:].startswith(b"\x89PNG") else data
     return data.startswith((b"\xff\xd8\xff", b"\x89PNG")) and encoded_size(data) is None
 
 

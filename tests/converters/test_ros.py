@@ -256,10 +256,10 @@ def test_two_robots_in_one_bag_and_in_two(tmp_path: Path) -> None:
     r.write(tmp_path / "two" / "a", scene(r, prefix="/husky", poses=path(FRAMES, 0.2)), "sqlite3")
     r.write(tmp_path / "two" / "b", scene(r, prefix="/jackal"), "sqlite3")
     converters.convert("ros", tmp_path / "two", tmp_path / "rec2", robots=2)
-    for name in ("alpha", "bravo"):
+    for name, other in (("husky", "alpha"), ("jackal", "bravo")):
         with (
             open_rgbd(tmp_path / "rec" / f"{name}.mcap") as one,
-            open_rgbd(tmp_path / "rec2" / f"{name}.mcap") as two,
+            open_rgbd(tmp_path / "rec2" / f"{other}.mcap") as two,
         ):
             assert np.array_equal(one.frame(2).depth, two.frame(2).depth)
             assert np.array_equal(one.frame(2).color, two.frame(2).color)
@@ -480,7 +480,9 @@ def test_frames_whose_colour_is_cut_short_are_left_out(tmp_path: Path) -> None:
     converters.convert("ros", r.write(tmp_path / "bag", rows, "lz4"), tmp_path / "rec")
     description = json.loads((tmp_path / "rec" / "recording.json").read_text())
     assert description["robots"]["alpha"]["frames"] == FRAMES - 1
-    assert any("1 colour images are cut short" in warning for warning in description["warnings"])
+    assert any(
+        "1 frames have colour or depth that is cut short" in warning for warning in description["warnings"]
+    )
 
 
 def test_depth_that_needs_no_moving_keeps_its_numbers(tmp_path: Path) -> None:
