@@ -25,6 +25,7 @@ from converters.ros_images import color_bytes, depth_m
 from converters.self_check import GAP, MAX_RATIO, ReprojectionCheck
 from pipeline import numeric
 from pipeline.errors import DuagError
+from pipeline.files import decode_image
 from pipeline.progress import track
 from pipeline.recording.register_depth import register_depth
 
@@ -108,7 +109,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
         where = f"{log}: {source.color} at {stamp_ns} ns"
         data, color_format = color_bytes(color, where)
         if maps is not None:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+            image = decode_image(data, cv2.IMREAD_COLOR)
             if image is None:
                 raise DuagError(f"{where}: no decoder reads it, expected a colour image")
             data = cv2.imencode(".png", cv2.remap(image, *maps, cv2.INTER_LINEAR))[1].tobytes()
