@@ -20,6 +20,7 @@ DATASETS = {
     "replica": "converters.replica",
     "ros": "converters.ros",
     "replica-multiagent": "converters.replica_multiagent",
+    "s3e": "converters.s3e",
     "scannet": "converters.scannet",
     "scannetpp": "converters.scannetpp",
     "tum": "converters.tum",

@@ -24,8 +24,9 @@ from pydantic import Field
 from converters.base import RecordingWriter
 from converters.image_files import options_of
 from converters.logs import Log, open_log
+from converters.logs.motion import CameraPoses
 from converters.logs.options import LogOptions
-from converters.logs.robot_log import CameraPoses, RobotLog
+from converters.logs.robot_log import RobotLog
 from converters.logs.sources import logs_in
 from converters.ros import settle_clocks, write_robot
 from converters.tum_layout import AssociationOptions, Poses

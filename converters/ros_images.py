@@ -32,6 +32,21 @@ _COLOR_CODES = {  # encoding: channels, and the name of OpenCV's conversion to B
     "yuv422_yuy2": (2, "COLOR_YUV2BGR_YUY2"),
     "yuyv": (2, "COLOR_YUV2BGR_YUY2"),
 }
+FISHEYE = (
+    "equidistant",
+    "fisheye",
+    "kannala_brandt",
+)  # one model, by the names that ROS, RealSense, Foxglove give it
+# with no name, as older drivers; RealSense names the model whose numbers are zero or those of plumb_bob
+POLYNOMIAL = (
+    "",
+    "plumb_bob",
+    "rational_polynomial",
+    "radtan",
+    "brown_conrady",
+    "Brown Conrady",
+    "Modified Brown Conrady",
+)
 DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
 
 
@@ -40,6 +55,12 @@ def is_depth(message: Any) -> bool:
     if hasattr(message, "encoding"):
         return message.encoding in DEPTH_ENCODINGS
     return "compressedDepth" in message.format or _is_gray_png_of_16_bits(bytes(message.data[:26]))
+
+
+def is_integer_depth(message: Any) -> bool:
+    """Whether depth comes as integers, whose numbers can be kept; else as floats."""
+    encoding = message.encoding if hasattr(message, "encoding") else message.format.split(";")[0].strip()
+    return bool(encoding != "32FC1")
 
 
 def _is_gray_png_of_16_bits(head: bytes) -> bool:
@@ -221,11 +242,18 @@ class RosCamera:
             (cx - roi.x_offset + 0.5) / binning[0] - 0.5,
             (cy - roi.y_offset + 0.5) / binning[1] - 0.5,
         )
-        fisheye = model in ("equidistant", "fisheye")
-        known = ("", "plumb_bob", "rational_polynomial", "equidistant", "fisheye", "none", "None")
-        if np.any(D) and model not in known and "brown" not in model.lower():
-            raise DuagError(f"{where}: distortion model {model!r}, expected one of {', '.join(known[1:5])}")
-        return RosCamera(camera, tuple(D.tolist()) if np.any(D) else (), fisheye, message.header.frame_id)
+        if not np.any(D):
+            return RosCamera(camera, (), False, message.header.frame_id)
+        fisheye = model in FISHEYE
+        lengths = {True: (4,), False: (4, 5, 8, 12, 14)}[fisheye]
+        if not fisheye and model not in POLYNOMIAL:
+            known = ", ".join((*POLYNOMIAL[1:], *FISHEYE))
+            raise DuagError(f"{where}: distortion model {model!r}, expected one of {known}")
+        if len(D) not in lengths or not np.isfinite(D).all():
+            raise DuagError(
+                f"{where}: distortion {D.tolist()} of {model!r}, expected {' or '.join(map(str, lengths))} numbers"
+            )
+        return RosCamera(camera, tuple(D.tolist()), fisheye, message.header.frame_id)
 
     def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Where in its images every pixel of the pinhole lies; None without distortion."""

@@ -5,13 +5,14 @@ Bouguet's rectification turns both cameras until corresponding points lie in one
 sigma_z = z^2 sigma_d / (f b). Everything here is OpenCV, arrays in and arrays out, for any converter:
 
     rig = StereoRig.of(left, right, T_right_left)
-    RowCheck(rig).add(*pair) ... .result(where)        # refuses a calibration that is not that of the images
+    RowCheck().add(*pair) ... .result(where)        # refuses a calibration that is not that of the images
     color, depth_m, sigma_m = rig.rectify_left(image), *rig.depth(gray_left, gray_right)
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -134,6 +135,55 @@ class StereoRig:
         camera = PinholeCamera(*size, focal, focal, u0, v0)
         return StereoRig(camera, -P_right[0, 3] / P_right[0, 0], options, (maps[0], maps[1]), R_left)
 
+    @staticmethod
+    def rectified(
+        left: PinholeCamera,
+        right: PinholeCamera,
+        baseline_m: float,
+        where: str,
+        options: StereoOptions | None = None,
+    ) -> StereoRig:
+        """A pair whose images are rectified already.
+
+        Raises:
+            DuagError: the cameras differ, or the right one is not to the right.
+        """
+        if left != right or not baseline_m > 0:
+            raise DuagError(
+                f"{where}: rectified cameras {left} and {right}, base line {baseline_m:g} m, expected the same "
+                "camera twice and a positive base line"
+            )
+        return StereoRig(left, baseline_m, options)
+
+    @staticmethod
+    def projected(
+        left: RawCamera,
+        right: RawCamera,
+        R: Sequence[Array],
+        P: Sequence[Array],
+        where: str,
+        options: StereoOptions | None = None,
+    ) -> StereoRig:
+        """A pair with the rectification of a CameraInfo: R [3, 3] and P [3, 4] of left and right."""
+        import cv2
+
+        a, b = (
+            PinholeCamera(
+                left.width, left.height, *(float(p[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+            )
+            for p in P
+        )
+        rig = StereoRig.rectified(a, b, -float(P[1][0, 3]) / float(P[1][0, 0]), where, options)
+        model: Any = cv2.fisheye if left.fisheye else cv2
+        size, turns = (left.width, left.height), [np.asarray(r, dtype=np.float64).reshape(3, 3) for r in R]
+        maps = [
+            model.initUndistortRectifyMap(
+                c.K, np.array(c.distortion or (0.0,) * 4), turn, p[:3, :3], size, cv2.CV_32FC1
+            )
+            for c, turn, p in zip((left, right), turns, P, strict=True)
+        ]
+        return StereoRig(a, rig.baseline_m, options, (maps[0], maps[1]), turns[0])
+
     def rectify_left(self, image: Image) -> Image:
         """A left image, grey or colour, as the rectified camera sees it."""
         return self._rectify(image, 0)
@@ -232,8 +282,7 @@ def disparity_sigma_m(
 class RowCheck:
     """Measures a rectification on the images themselves: matched features must lie in one row, and to the left."""
 
-    def __init__(self, rig: StereoRig) -> None:
-        self._rig = rig
+    def __init__(self) -> None:
         self._differences: list[Array] = [np.zeros((0, 2))]
 
     def add(self, left: Image, right: Image) -> None:

@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from converters.logs.choice import Chooser
+from converters.logs.choice import POINTS_TYPE, Chooser
 from converters.logs.clocks import compare, overlap_warnings
 from converters.logs.files import NANOSECONDS, SUFFIXES, Log, open_log
-from converters.logs.robot_log import IMU_TYPE, POSE_TYPES, RobotLog
+from converters.logs.motion import IMU_TYPE, POSE_TYPES
+from converters.logs.robot_log import RobotLog
 from converters.logs.sources import Source, is_log, sources_of
 from pipeline.errors import DuagError
 from pipeline.recording.names import LIBRARY, MAGIC, RECORDING_FILE
 from pipeline.recording.read import parsing
 
-POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
 HEADERS_FIRST, HEADERS_EACH = (
     100,
     20,
@@ -184,7 +184,7 @@ def _robot(log: Log, source: Source) -> tuple[RobotLog | None, dict[str, Any]]:
         color, depth = chooser.color(), chooser.depth()
         choices = {"color": color, "depth": depth}
         for option, image in (("color_info", color), ("depth_info", depth)):
-            if image.topic:
+            if image.topic in chooser.images:
                 choices[option] = chooser.info(option, image.topic)
         out["choices"] = {
             k: {"topic": c.topic, "why": c.why, "candidates": c.candidates} for k, c in choices.items()
@@ -193,6 +193,8 @@ def _robot(log: Log, source: Source) -> tuple[RobotLog | None, dict[str, Any]]:
         out["frames"] = len(robot_log.pairs)
         moved = robot_log.T_color_depth is not None
         out["depth"] = "moved into the colour camera" if moved else "registered to colour already"
+        if robot_log.derived:
+            out["depth"] = robot_log.derived.words
         out["warnings"] = robot_log.warnings
     except DuagError as error:
         robot_log, problem = None, str(error)

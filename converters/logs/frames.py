@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.files import Log
+from converters.logs.files import Entry, Log, stamp_ns
 from pipeline.errors import DuagError
 from pipeline.geometry import se3
 
@@ -40,22 +41,23 @@ class Transforms:
     def _read(self, topics: list[str]) -> dict[tuple[str, str], Array]:
         found: dict[tuple[str, str], Array] = {}
         for topic in topics:
-            for parent, child, T in self._messages(topic):
+            for _, parent, child, T in self.of_topic(topic):
                 found[parent, child] = T
         return found
 
-    def _messages(self, topic: str) -> Any:
+    def of_topic(self, topic: str) -> Iterator[tuple[tuple[Entry, int], str, str, Array]]:
+        """Message and time of its header (ns), parent, child and T_parent_child of every transform of a topic."""
         for entry in self._log.entries(topic):
             for t in entry.read().transforms:
                 T = pose_matrix(t.transform.translation, t.transform.rotation, f"{self._log.name}: {topic}")
-                yield frame_name(t.header.frame_id), frame_name(t.child_frame_id), T
+                yield (entry, stamp_ns(t)), frame_name(t.header.frame_id), frame_name(t.child_frame_id), T
 
     def _read_others(self) -> None:
         """Constant transforms among those that are repeated."""
         self._complete = True
         found: dict[tuple[str, str], Array] = {}
         for topic in self._other_topics:
-            for parent, child, T in self._messages(topic):
+            for _, parent, child, T in self.of_topic(topic):
                 first = found.setdefault((parent, child), T)
                 if np.abs(first - T).max() > SAME:
                     self.moving.add((parent, child))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,46 +12,21 @@ from numpy.typing import NDArray
 
 from converters.logs.choice import REGISTERED, Chooser
 from converters.logs.clocks import RobotClock
+from converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
 from converters.logs.files import NANOSECONDS, Entry, Log
-from converters.logs.frames import Transforms, frame_name, pose_matrix
+from converters.logs.frames import Transforms, pose_matrix
+from converters.logs.gather import gathered
+from converters.logs.motion import CameraPoses, Imu, MotionReader, extrinsics_of
 from converters.logs.options import LogOptions
-from converters.ros_images import RosCamera, size_of
-from converters.tum_layout import Listed, Poses, associate
-from pipeline.errors import DuagError, closest
+from converters.ros_images import RosCamera, is_integer_depth, size_of
+from converters.tum_layout import Listed, associate
+from pipeline.errors import DuagError
 from pipeline.geometry import se3
 
 Array = NDArray[np.float64]
-POSE_TYPES = (
-    "nav_msgs/msg/Odometry",
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "geometry_msgs/msg/TransformStamped",
-)
-IMU_TYPE = "sensor_msgs/msg/Imu"
+HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
 RECTIFIED = ("image_rect", "image_rect_color", "rect")
 OUT_SCALE = 0.0005  # metres per unit of depth that was registered or came as floats
-
-
-@dataclass(frozen=True)
-class Imu:
-    """stamps_ns int64 [n], increasing; values [n, 6]: rad/s and m/s^2 in its own axes; T_color_imu [4, 4]."""
-
-    stamps_ns: NDArray[np.int64]
-    values: Array
-    T_color_imu: Array
-
-
-@dataclass(frozen=True)
-class CameraPoses:
-    """Poses of a body that holds the colour camera: it is the body that moves evenly between two of them."""
-
-    body: Poses
-    T_body_color: Array
-
-    def at(self, stamp_ns: int, max_gap_s: float) -> Array | None:
-        """Pose [4, 4] of the colour camera at a time; None where there is none near."""
-        T = self.body.at(stamp_ns, max_gap_s)
-        return None if T is None else T @ self.T_body_color
 
 
 class RobotLog:
@@ -80,20 +54,68 @@ class RobotLog:
             raise DuagError(f"{self.name}: found no topic of images{where}, expected colour and depth")
         self.depth = chooser.depth().required(self.log, "depth")
         self.color = chooser.color().required(self.log, "color")
-        images = chooser.images
         self.color_camera = self._camera(self.color, "color_info", chooser)
+        self._motion = MotionReader(self.log, s, self.transforms, self.color_camera.frame_id, self.time_ns)
+        self.truth: CameraPoses | None = self._motion.poses(s.truth, "truth") if s.truth else None
+        self.T_color_depth: Array | None = None
+        self.derived = self._derived(chooser) if s.depth_from != "image" else None
+        if self.derived:
+            self.camera, self.depth_scale = self.derived.camera, self.derived.scale
+            return
+        self.camera = self.color_camera.camera
         self.depth_camera = self._camera(self.depth, "depth_info", chooser)
         self.T_color_depth = self._extrinsics()
-        raw16 = not hasattr(images[self.depth], "encoding") or images[self.depth].encoding != "32FC1"
-        kept = raw16 and self.T_color_depth is None and self.color_maps is None
+        kept = is_integer_depth(chooser.images[self.depth]) and self.T_color_depth is None
         self.depth_scale = s.depth_scale if kept else OUT_SCALE
-        self.truth: CameraPoses | None = self._poses(s.truth, "truth") if s.truth else None
+
+    def _derived(self, chooser: Chooser) -> Derived:
+        """Depth of a stereo pair or of a LiDAR."""
+        s, color = (
+            self.settings,
+            (self.color, self._info(self.color, "color_info", chooser), self.color_camera),
+        )
+        if s.depth_from == "stereo":
+            right = self._info(self.depth, "depth_info", chooser)
+            other = self.depth, right, self._camera(self.depth, "depth_info", chooser)
+            return stereo_of(self.log, color, other, _is_rectified(self.color), self.transforms, s)
+        if s.max_difference_s == 0:
+            self.settings = s.model_copy(update={"max_difference_s": HALF_TURN_S})
+        motion = self.odometry.prior() if self.odometry else self.imu.prior() if self.imu else None
+        if motion is None:
+            self.warnings.append(
+                "sweeps hold what the LiDAR moved meanwhile; expected --set imu=TOPIC or odometry=TOPIC to take it out"
+            )
+        camera = self.color, self.color_camera
+        return sweeps_of(self.log, camera, self.depth, self.transforms, motion, s)
+
+    @property
+    def T_color_camera(self) -> Array:  # noqa: N802 (a transform)
+        """Where the camera of the recording is in the colour camera: turned, if that is rectified."""
+        return self.derived.T_color_camera if self.derived else np.eye(4)
+
+    def depth_m(self, picture: Picture) -> Array:
+        """Depth [h, w] of a picture in metres, 0 = none."""
+        if self.derived:
+            return self.derived.depth_m(picture)
+        assert picture.depth is not None
+        return np.asarray(picture.depth, dtype=np.float64) * self.depth_scale
+
+    def check_rows(self) -> dict[str, Any]:
+        """The test of the rectification of a stereo pair; nothing for other sources of depth."""
+        if not isinstance(self.derived, Stereo):
+            return {}
+        groups = [{self.color: c, self.depth: d} for c, d in some_pairs(self.pairs)]
+        found = gathered(self.log, groups, self.time_ns)
+        return self.derived.check([(g[self.color].read(), g[self.depth].read()) for g in found])
+
+    def _info(self, topic: str, option: str, chooser: Chooser) -> str:
+        """The CameraInfo of an image topic."""
+        return chooser.info(option, topic).required(self.log, option)
 
     def _camera(self, topic: str, option: str, chooser: Chooser) -> RosCamera:
         """Camera of an image topic."""
-        chosen = chooser.info(option, topic).required(self.log, option)
-        name = PurePosixPath(topic.removesuffix("/compressedDepth").removesuffix("/compressed")).name
-        camera = RosCamera.of(self.log.first(chosen), name.startswith(RECTIFIED), f"{self.name}: {chosen}")
+        chosen = self._info(topic, option, chooser)
+        camera = RosCamera.of(self.log.first(chosen), _is_rectified(topic), f"{self.name}: {chosen}")
         found = size_of(chooser.images[topic], f"{self.name}: {topic}")
         expected = camera.camera.width, camera.camera.height
         if found != expected:
@@ -106,6 +128,14 @@ class RobotLog:
     def color_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Where in the colour images every pixel of the recording's camera lies."""
         return self.color_camera.maps() if self.settings.undistort else None
+
+    @cached_property
+    def depth_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Where in the depth images every pixel of their pinhole lies; None if they need not be undistorted.
+
+        Depth that is registered has the distortion of colour; that of another camera its own.
+        """
+        return self.color_maps if self.T_color_depth is None else self.depth_camera.maps()
 
     # --- where the cameras are
 
@@ -147,85 +177,15 @@ class RobotLog:
             found.append(pose_matrix(m.translation, m.rotation, f"{self.name}: {topic}"))
         return found[0] @ se3.inverse(found[1])
 
-    def _body_camera(self, topic: str, body: str) -> Array:
-        """T_body_color [4, 4] of the frame that a topic of poses is of."""
-        frame = self.settings.truth_frame if topic == self.settings.truth else ""
-        frame = frame_name(frame or body or self.color_camera.frame_id)
-        if self.settings.T_body_color:
-            return extrinsics_of("T_body_color", self.settings.T_body_color)
-        if frame in ("camera", frame_name(self.color_camera.frame_id)):
-            return np.eye(4)
-        T = self.transforms.lookup(frame, self.color_camera.frame_id)
-        if T is None:
-            raise DuagError(
-                f"{self.name}: {topic} is of {frame!r}, and /tf_static does not tie it to "
-                f"{self.color_camera.frame_id!r}; expected --set T_body_color='x y z qw qx qy qz', or "
-                "truth_frame=camera if that is where it is"
-            )
-        return T
-
-    def _poses(self, topic: str, option: str) -> CameraPoses:
-        """Poses of the colour camera by a topic of poses of its body."""
-        known = self.log.of_type(*POSE_TYPES)
-        if topic not in known:
-            raise DuagError(
-                f"{self.name}: {option} topic {topic} not found, {closest(topic, known, 'poses')}"
-            )
-        poses: dict[int, Array] = {}
-        body = ""
-        for entry in self.log.entries(topic):
-            m, where = entry.read(), f"{self.name}: {topic} at {entry.log_ns} ns"
-            if hasattr(m, "transform"):
-                position, orientation = m.transform.translation, m.transform.rotation
-            else:
-                pose = m.pose.pose if hasattr(m.pose, "pose") else m.pose
-                position, orientation = pose.position, pose.orientation
-            body = getattr(m, "child_frame_id", "")
-            if np.isfinite([position.x, position.y, position.z]).all():
-                poses[self.time_ns(entry)] = pose_matrix(position, orientation, where)
-        stamps = sorted(poses)
-        T = np.array([poses[stamp] for stamp in stamps]).reshape(-1, 4, 4)
-        return CameraPoses(Poses(np.array(stamps, dtype=np.int64), T, 0), self._body_camera(topic, body))
-
     @cached_property
     def imu(self) -> Imu | None:
         """What the IMU measured, in order of time."""
-        topic = self.settings.imu
-        if not topic:
-            return None
-        known = self.log.of_type(IMU_TYPE)
-        if topic not in known:
-            raise DuagError(f"{self.name}: imu topic {topic} not found, {closest(topic, known, 'an IMU')}")
-        stamps: list[int] = []
-        rows: list[list[float]] = []
-        frame = ""
-        for entry in self.log.entries(topic):
-            m = entry.read()
-            frame, w, a = m.header.frame_id, m.angular_velocity, m.linear_acceleration
-            stamps.append(self.time_ns(entry))
-            rows.append([w.x, w.y, w.z, a.x, a.y, a.z])
-        times, first = np.unique(np.array(stamps, dtype=np.int64), return_index=True)
-        values = np.array(rows, dtype=np.float64)[first]
-        if not np.isfinite(values).all():
-            raise DuagError(
-                f"{self.name}: {topic} holds numbers that are not finite, expected rad/s and m/s^2"
-            )
-        if self.settings.T_color_imu:
-            T = extrinsics_of("T_color_imu", self.settings.T_color_imu)
-        else:
-            found = self.transforms.lookup(self.color_camera.frame_id, frame)
-            if found is None:
-                raise DuagError(
-                    f"{self.name}: {topic} is of {frame!r}, and /tf_static does not tie it to "
-                    f"{self.color_camera.frame_id!r}; expected --set T_color_imu='x y z qw qx qy qz'"
-                )
-            T = found
-        return Imu(times, values, T)
+        return self._motion.imu(self.settings.imu) if self.settings.imu else None
 
     @cached_property
     def odometry(self) -> CameraPoses | None:
         """Poses of the colour camera by another odometry."""
-        return self._poses(self.settings.odometry, "odometry") if self.settings.odometry else None
+        return self._motion.poses(self.settings.odometry, "odometry") if self.settings.odometry else None
 
     # --- which messages
 
@@ -312,7 +272,14 @@ class RobotLog:
     def sensors(self) -> dict[str, str]:
         """What the log says about its source."""
         moved = "registered to colour by the converter" if self.T_color_depth is not None else "registered"
+        moved = self.derived.words if self.derived else moved
         return {"color_topic": self.color, "depth_topic": self.depth, "depth": moved}
+
+
+def _is_rectified(topic: str) -> bool:
+    """Whether images are undistorted, by the name of their topic."""
+    name = PurePosixPath(topic.removesuffix("/compressedDepth").removesuffix("/compressed")).name
+    return name.startswith(RECTIFIED)
 
 
 def nearest_s(times_ns: list[int], others_ns: list[int]) -> float:
@@ -323,14 +290,3 @@ def nearest_s(times_ns: list[int], others_ns: list[int]) -> float:
         [others[np.clip(after, 0, len(others) - 1)], others[np.clip(after - 1, 0, len(others) - 1)]]
     )
     return float(np.abs(near - times).min()) / NANOSECONDS
-
-
-def extrinsics_of(option: str, text: str) -> Array:
-    """Matrix [4, 4] of "x y z qw qx qy qz" (m), the value of an option."""
-    try:
-        x, y, z, *q = np.array(text.split(), dtype=np.float64).tolist()
-        if len(q) != 4 or not np.isfinite([x, y, z]).all() or abs(np.linalg.norm(q) - 1) > 0.01:
-            raise ValueError("no rigid motion")
-    except ValueError as error:
-        raise DuagError(f"ros: {option} = {text!r}, expected 'x y z qw qx qy qz'") from error
-    return np.asarray(se3.from_quat_translation(np.array(q), np.array([x, y, z])))

@@ -24,7 +24,11 @@ class RosBag:
         try:
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
-        except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
+        except AnyReaderError as error:
+            hint = "; `rosbag reindex` mends one that was cut short" if path.suffix == ".bag" else ""
+            reason = " ".join(str(error).rstrip(".").split())
+            raise DuagError(f"{path}: {reason}, expected a bag of ROS 1 or ROS 2{hint}") from error
+        except Exception as error:  # whatever a broken bag provokes in the reader
             raise DuagError(
                 f"{path}: {type(error).__name__} {error}, expected a bag of ROS 1 or ROS 2"
             ) from error

@@ -160,6 +160,11 @@ class ExchangeConfig(Config):
     """Length of one round."""
     max_rounds: int = Field(default=3000, ge=1)
     """The session ends here, whatever has been agreed."""
+    solver: Literal["admm", "elimination"] = "admm"
+    """Of the poses. admm: relaxed edge-ADMM, a few poses per round and link; elimination: exact steps along a tree of
+    robots, matrices in few rounds."""
+    elimination_wire: Literal["float32", "float64"] = "float64"
+    """Precision of the matrices of elimination on the wire."""
     coverage: Literal["all", "overlap"] = "all"
     """Send every Gaussian to everybody, or only those in space that the receiver's keyframes saw."""
     evidence_wire: Literal["compact", "float32", "float64"] = "compact"

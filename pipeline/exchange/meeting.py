@@ -12,7 +12,7 @@ the verdict has arrived.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -20,16 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import streams
-from pipeline.consensus.closures import Closure, consistent, drift
-from pipeline.consensus.links import SharedKeyframes
-from pipeline.consensus.poses import PoseAgent
+from pipeline.consensus.closures import Closure, Group, consistent, drift, frame_variance
+from pipeline.consensus.cycles import Proposal
+from pipeline.consensus.links import SharedKeyframes, link_metric
 from pipeline.exchange import injection, places, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.packets import Kind, MalformedError
 from pipeline.exchange.places import Candidate
 from pipeline.exchange.verification import Verdict, Verified, verify
 from pipeline.exchange.wire import KeyframeSample, PlaceBook, Verdicts
-from pipeline.geometry import se3
 from pipeline.registration import Reference, RgbdPyramid
 from pipeline.registration.features import Features, extract
 from pipeline.robot import RobotData, factors_of
@@ -92,12 +91,15 @@ class Tried:
 
 @dataclass(frozen=True)
 class Joined:
-    """Two robots that share a frame: closures at the end that holds them, shared keyframes at both."""
+    """Two robots that share a frame: shared keyframes at both ends, the rest at the end that holds the closures.
 
-    T_own_peer: Array
-    closures: tuple[Closure, ...]
-    keep: NDArray[np.bool_]
+    groups: bool per closure, one array for each group that agrees on a frame. proposals: what they agree on.
+    """
+
     shared: SharedKeyframes
+    closures: tuple[Closure, ...] = ()
+    groups: tuple[NDArray[np.bool_], ...] = ()
+    proposals: tuple[Proposal, ...] = ()
 
 
 class Meeting:
@@ -135,8 +137,7 @@ class HigherEnd(Meeting):
             verdicts = wire.read_verdicts(payload, limit)
             self.verdicts = verdicts
             if verdicts.joined:
-                T_own_peer = se3.inverse(verdicts.T_lower_higher)
-                self.joined = Joined(T_own_peer, (), np.zeros(0, dtype=bool), verdicts.shared)
+                self.joined = Joined(verdicts.shared)
         else:
             raise MalformedError(f"{kind.name} is not for the higher-named end, or came twice")
 
@@ -243,20 +244,29 @@ class LowerEnd(Meeting):
                         reason = f"{reason}; {injection.DETAIL}"
                     result = replace(t.result, verdict=Verdict.INCONSISTENT, detail=reason)
                     self.tried[at] = Tried(t.candidate, result)
-        T = agreement.T_ownmap_peermap
         shared = SharedKeyframes(np.zeros(0, np.int32), np.zeros((0, 6), np.float32))
-        if T is not None:
-            trial = PoseAgent(
-                self.own, self.places.data.T_map_keyframe, self.places.registrations, self.config.consensus
-            )
-            shared = trial.add_link(self.peer, closures, keep=agreement.keep)
-            self.joined = Joined(T, tuple(closures), agreement.keep, shared)
+        if agreement.T_ownmap_peermap is not None:
+            keyframes = np.unique([c.peer_keyframe for c in closures])
+            metric = link_metric(closures, keyframes, self.config.consensus.closures)
+            shared = SharedKeyframes(keyframes.astype(np.int32), metric)
+            groups = (Group(agreement.keep, agreement.T_ownmap_peermap), *agreement.others)
+            proposals = tuple(self._proposal(closures, group) for group in groups)
+            self.joined = Joined(shared, tuple(closures), tuple(g.keep for g in groups), proposals)
         self.verdicts = Verdicts(
             candidates=sum(t.result.verdict is not Verdict.UNLIKE for t in self.tried),
             verified=len(closures),
             consistent=int(agreement.keep.sum()),
-            joined=T is not None,
-            T_lower_higher=np.eye(4) if T is None else T,
+            joined=self.joined is not None,
             shared=shared,
         )
         send(Kind.CLOSURES, wire.write_verdicts(self.verdicts))
+
+    def _proposal(self, closures: Sequence[Closure], group: Group) -> Proposal:
+        """What a group of closures says of the relative frame, anywhere in the two maps."""
+        assert self.book is not None
+        own, peer = self.places.data.T_map_keyframe, self.book.T_map_keyframe
+        agreeing = [c for c, keep in zip(closures, group.keep.tolist(), strict=True) if keep]
+        variance = frame_variance(
+            agreeing, own, peer, self.places.drift, self.book.drift, self.config.consensus.closures
+        )
+        return Proposal(len(agreeing), group.T_ownmap_peermap, variance)

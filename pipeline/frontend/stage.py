@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline import progress as progress_bar
 from pipeline.errors import DuagError
-from pipeline.frontend import bundle
+from pipeline.frontend import bundle, loops
 from pipeline.frontend.config import FrontendConfig, is_held_out
 from pipeline.frontend.failure import Reason
 from pipeline.frontend.keyframes import KeyframePair, Refined, refine
@@ -121,7 +121,7 @@ def _refine(
     pairs = list(tracker.pairs)
     if settings.loops.enabled:
         tracked = refine(start, pairs, settings.huber_sigmas).T_map_keyframe
-        pairs += bundle.find_loops(tracked, keyframes, images, settings.loops, registration, seed, log.robot)
+        pairs += loops.find_loops(tracked, keyframes, images, settings.loops, registration, seed, log.robot)
     if not settings.local_optimisation:
         return refine(start, pairs, settings.huber_sigmas), pairs
     return bundle.optimise(start, keyframes, images, pairs, settings, registration)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +86,13 @@ class TrackedKeyframe:
     features: Features = field(repr=False)
     coarsest: Level = field(repr=False)
     exposure: tuple[float, float] = (1.0, 0.0)
+
+    @cached_property
+    def centre_map(self) -> Array:
+        """The middle [3] of what it sees, in the map as tracked."""
+        points = self.reference.levels[-1].points.astype(np.float64)
+        middle = np.median(points, axis=0) if len(points) else np.zeros(3)
+        return se3.transform(self.T_map_keyframe, middle[None])[0]
 
 
 @dataclass(frozen=True)
@@ -462,8 +470,12 @@ class Tracker:
     ) -> None:
         """Register a new keyframe to the earlier ones that see most of it, the one it was tracked from excepted."""
         limits = self.config.keyframes
+        # where it was tracked from looks at nearly the same place
+        centres = np.array([keyframe.centre_map for keyframe in self.keyframes])
+        distance = np.linalg.norm(centres - centres[previous], axis=1)
+        nearest = np.sort(np.argsort(distance, kind="stable")[: limits.optimisation_candidates])
         candidates = []
-        for keyframe in self.keyframes:
+        for keyframe in (self.keyframes[k] for k in nearest):
             T_keyframe_new = se3.inverse(keyframe.T_map_keyframe) @ T_map_keyframe
             overlap = predicted_overlap(keyframe.reference, pyramid, T_keyframe_new)
             if keyframe.keyframe_index != previous and overlap >= limits.neighbour_overlap:

@@ -18,8 +18,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Image = NDArray[np.float32]
 NEAREST_M = 0.05
-MARGIN_PX = 64  # beside the image, for triangles that reach into it
-LONGEST_SIDE_PX = 28.0  # of a triangle, in the camera's pixels as seen from the LiDAR
+LONGEST_SIDE = 0.06  # of a triangle as the LiDAR sees it, in focal lengths: rings may be 3 degrees apart
 SAME_SURFACE = 0.05  # relative step of range between neighbouring beams that is always one surface
 LEAST_SLOPE_RAD = np.radians(
     10.0
@@ -41,7 +40,7 @@ def lidar_depth(
     """
     points, rays = _before(points_lidar, T_camera_lidar, camera)
     pixels, inverse = camera.project(points), 1 / points[:, 2]
-    triangles = _surfaces(rays, camera)
+    triangles = _surfaces(rays)
     between, change = _drawn(pixels[triangles], inverse[triangles], camera)
 
     u, v = np.rint(pixels).astype(np.int64).T
@@ -66,15 +65,16 @@ def _before(points_lidar: Array, T_camera_lidar: Array, camera: PinholeCamera) -
     front = (points[:, 2] > NEAREST_M) & (rays[:, 2] > NEAREST_M)
     points, rays = points[front], rays[front]
     pixels, size = camera.project(points), np.array([camera.width, camera.height])
-    near = ((pixels > -MARGIN_PX) & (pixels < size + MARGIN_PX)).all(axis=1)
+    margin = LONGEST_SIDE * camera.fx  # beside the image, for triangles that reach into it
+    near = ((pixels > -margin) & (pixels < size + margin)).all(axis=1)
     return points[near], rays[near]
 
 
-def _surfaces(rays: Array, camera: PinholeCamera) -> Indices:
+def _surfaces(rays: Array) -> Indices:
     """Triangles [t, 3] of neighbouring beams that meet one surface."""
     from scipy.spatial import Delaunay, QhullError
 
-    beams, ranges = camera.project(rays), np.linalg.norm(rays, axis=1)
+    beams, ranges = rays[:, :2] / rays[:, 2:], np.linalg.norm(rays, axis=1)
     try:
         triangles = (
             Delaunay(beams).simplices.astype(np.int64) if len(beams) >= 3 else np.zeros((0, 3), np.int64)
@@ -90,7 +90,7 @@ def _surfaces(rays: Array, camera: PinholeCamera) -> Indices:
         )  # of the nearer point from the other's beam
         along_m = far - (rays[a] * rays[b]).sum(axis=1) / far
         smooth = (far <= (1 + SAME_SURFACE) * near) | (np.arctan2(across_m, along_m) >= LEAST_SLOPE_RAD)
-        sound &= smooth & (np.linalg.norm(beams[a] - beams[b], axis=1) <= LONGEST_SIDE_PX)
+        sound &= smooth & (np.linalg.norm(beams[a] - beams[b], axis=1) <= LONGEST_SIDE)
     return triangles[sound]
 
 

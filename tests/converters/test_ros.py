@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import converters
-from converters import ros_images
+from converters.logs.frames import pose_matrix
 from pipeline import messages as m
 from pipeline.errors import DuagError
 from pipeline.geometry import se3, so3
@@ -310,132 +308,101 @@ def test_a_frame_tied_to_nothing_needs_extrinsics(tmp_path: Path) -> None:
         converters.convert("ros", bag, tmp_path / "rec3", options=["T_color_depth='1 2'"])
 
 
-# --- encodings
-
-
-def gray_card() -> np.ndarray:
-    rng = np.random.default_rng(0)
-    return cv2.GaussianBlur(rng.integers(0, 256, (12, 16, 3)).astype(np.uint8), (5, 5), 0)
-
-
-def decoded(message: Any) -> np.ndarray:
-    data, _ = ros_images.color_bytes(message, "here")
-    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-
-
-@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "rgba8", "bgra8", "mono8"])
-def test_colour_encodings(encoding: str) -> None:
-    card = gray_card()
-    alpha = np.full((12, 16, 1), 255, np.uint8)
-    pixels = {
-        "rgb8": card,
-        "bgr8": card[..., ::-1],
-        "rgba8": np.concatenate([card, alpha], axis=2),
-        "bgra8": np.concatenate([card[..., ::-1], alpha], axis=2),
-        "mono8": card[..., 0],
-    }[encoding]
-    expected = np.repeat(card[..., :1], 3, axis=2) if encoding == "mono8" else card
-    assert np.array_equal(
-        decoded(Ros(2).image(1, "c", np.ascontiguousarray(pixels), encoding, pad=5)), expected
-    )
-
-
-@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_bayer_patterns_have_the_right_red(pattern: str) -> None:
-    """A red card stays red whatever the pattern."""
-    tile = {"r": 200, "g": 30, "b": 10}
-    pixels = np.tile(np.array([tile[c] for c in pattern], np.uint8).reshape(2, 2), (6, 8))
-    rgb = decoded(Ros(1).image(1, "c", pixels, f"bayer_{pattern}8"))[3:-3, 3:-3]
-    assert np.allclose(rgb.reshape(-1, 3).mean(axis=0), [200, 30, 10], atol=2)
-
-
-def depth_image() -> np.ndarray:
-    raw = (1000 + 37 * np.arange(12)[:, None] + 11 * np.arange(16)).astype(np.uint16)
-    raw[2:4, 3:9] = 0
-    return raw
-
-
-@pytest.mark.parametrize("big", [False, True])
-def test_depth_of_sixteen_bits_and_of_floats(big: bool) -> None:
-    raw = depth_image()
-    sixteen = Ros(1).image(1, "d", raw, "16UC1", pad=4, big=big)
-    assert np.array_equal(
-        ros_images.depth_m(sixteen, "here", 0.001), raw.astype(np.float32) * np.float32(0.001)
-    )
-    metres = raw.astype(np.float32) / 1000
-    metres[0, :4] = [np.nan, np.inf, -1.0, 0.0]
-    floats = Ros(2).image(1, "d", metres, "32FC1", big=big)
-    got = ros_images.depth_m(floats, "here", 0.001)
-    assert (got[0, :4] == 0).all()
-    assert np.array_equal(got[1:], metres[1:])
-
-
-def rvl(raw: np.ndarray) -> bytes:
-    """RVL encoder, as the paper has it."""
-    nibbles: list[int] = []
-
-    def put(value: int) -> None:
-        while True:
-            nibble, value = value & 7, value >> 3
-            nibbles.append(nibble | (8 if value else 0))
-            if not value:
-                return
-
-    flat, at, previous = raw.ravel().astype(int).tolist(), 0, 0
-    while at < len(flat):
-        zeros = at
-        while at < len(flat) and flat[at] == 0:
-            at += 1
-        put(at - zeros)
-        end = at
-        while end < len(flat) and flat[end] != 0:
-            end += 1
-        put(end - at)
-        for value in flat[at:end]:
-            delta = value - previous
-            put((delta << 1) ^ (delta >> 63))
-            previous = value
-        at = end
-    nibbles += [0] * (-len(nibbles) % 8)
-    words = [
-        sum(n << (28 - 4 * k) for k, n in enumerate(nibbles[i : i + 8])) for i in range(0, len(nibbles), 8)
-    ]
-    return struct.pack("<II", raw.shape[1], raw.shape[0]) + struct.pack(f"<{len(words)}I", *words)
-
-
-def test_compressed_depth() -> None:
-    raw = depth_image()
+def test_true_poses_of_a_transform_that_changes(tmp_path: Path) -> None:
+    """ "/tf world base": the same poses as those of the odometry, by any of the clocks."""
     r = Ros(2)
-    head = struct.pack("<iff", 0, 0.0, 0.0)
-    png = cv2.imencode(".png", raw)[1].tobytes()
-    for text, data in (
-        ("16UC1; compressedDepth png", head + png),
-        ("16UC1; compressedDepth", head + png),
-        ("16UC1; compressedDepth rvl", head + rvl(raw)),
-        ("16UC1; compressedDepth png", png),
+    rows = []
+    for topic, log_ns, message in scene(r):
+        if topic != "/odom":
+            rows.append((topic, log_ns, message))
+            continue
+        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        pose = message.pose.pose
+        T = pose_matrix(pose.position, pose.orientation, "here")
+        rows.append(("/tf", log_ns, r.tf(r.transform(stamp, "world", "_base", T))))
+    bag = r.write(tmp_path / "bag", rows, "mcap")
+    for k, options in enumerate(
+        (["truth=/tf world _base"], ["truth=/tf /world /_base", "time_source=header"])
     ):
-        got = ros_images.depth_m(r.compressed(1, "d", data, text), "here", 0.001)
-        assert np.array_equal(got, raw.astype(np.float32) * np.float32(0.001)), text
-    metres = raw / 1000.0
-    a, b = 100.0 * 101.0, 1 - 100.0 * 101.0 / 10.0
-    inverse = np.where(raw > 0, np.rint(a / np.where(raw > 0, metres, 1.0) + b), 0).astype(np.uint16)
-    data = struct.pack("<iff", 0, a, b) + cv2.imencode(".png", inverse)[1].tobytes()
-    got = ros_images.depth_m(r.compressed(1, "d", data, "32FC1; compressedDepth png"), "here", 0.001)
-    assert np.abs(got - metres).max() < 3e-4
-    jpeg = cv2.imencode(".jpg", (raw >> 8).astype(np.uint8))[1].tobytes()
-    for data, message in ((jpeg, "depth as JPEG"), (head + b"\0" * 40, "broken RVL"), (b"123", "3 bytes")):
-        with pytest.raises(DuagError, match=message):
-            ros_images.depth_m(r.compressed(1, "d", data, "16UC1; compressedDepth png"), "here", 0.001)
+        converters.convert("ros", bag, tmp_path / f"rec{k}", options=options)
+        records = read_log(tmp_path / f"rec{k}" / "alpha.groundtruth.mcap")
+        assert np.allclose(
+            [m.unpack_pose_in_frame(record.proto()) for record in records], path(FRAMES), atol=1e-9
+        )
+    with pytest.raises(DuagError, match="/tf has no map _base, expected perhaps world _base"):
+        converters.convert("ros", bag, tmp_path / "rec", options=["truth=/tf map _base"])
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_broken_rvl_is_an_error_or_depth(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    data = bytearray(rvl(depth_image()))
-    for _ in range(5):
-        data[rng.integers(8, len(data))] = int(rng.integers(256))
-    with contextlib.suppress(DuagError):  # the only error it may raise
-        assert ros_images._rvl(bytes(data[: rng.integers(8, len(data) + 1)]), "here").shape == (12, 16)
+def test_depth_of_a_lens_is_undistorted_before_it_is_moved(tmp_path: Path) -> None:
+    """A depth camera with distortion of its own gives the depth that one without would give."""
+    r = Ros(1)
+    bags = {}
+    for name, distortion in (("straight", ()), ("bent", (0.2, -0.1, 0.002, 0.001, 0.0))):
+        rows = []
+        for topic, log_ns, message in scene(r):
+            if topic.endswith("depth/camera_info"):
+                message = r.info(START_NS, "_depth", DEPTH, distortion)
+            if topic.endswith("image_rect_raw"):
+                k = sum(t.endswith("image_rect_raw") for t, _, _ in rows)
+                z = render(DEPTH, path(FRAMES)[k] @ T_COLOR_DEPTH, distortion)[1]
+                stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+                message = r.image(stamp, "_depth", np.rint(z * 1000).astype(np.uint16), "16UC1")
+                topic = "/camera/depth/image_raw"
+            rows.append((topic, log_ns, message))
+        bags[name] = r.write(tmp_path / name, rows, "plain")
+        converters.convert("ros", bags[name], tmp_path / f"rec_{name}")
+    depths = []
+    for name in bags:
+        with open_rgbd(tmp_path / f"rec_{name}" / "alpha.mcap") as log:
+            depths.append(log.frame(1).depth)
+    both = (depths[0] > 0) & (depths[1] > 0)
+    assert both.mean() > 0.5
+    assert np.percentile(np.abs(depths[0] - depths[1])[both] / depths[0][both], 90) < 0.01
+
+
+def test_infrared_images_are_not_taken_for_depth(tmp_path: Path) -> None:
+    """Of 16UC1 and mono16 the former is depth; depth as JPEG is told as the reason why there is none."""
+    r = Ros(2)
+    rows = scene(r)
+    infrared = [
+        (
+            t.replace("depth/image_rect_raw", "infra/image_raw"),
+            ns,
+            r.image(ns, "_ir", np.ones((90, 120), np.uint16), "mono16"),
+        )
+        for t, ns, _ in rows
+        if t.endswith("image_rect_raw")
+    ]
+    converters.convert("ros", r.write(tmp_path / "ir", rows + infrared, "mcap"), tmp_path / "rec")
+    sensors = json.loads((tmp_path / "rec" / "recording.json").read_text())["robots"]["alpha"]["sensors"]
+    assert sensors["depth_topic"] == "/camera/depth/image_rect_raw"
+    jpeg = cv2.imencode(".jpg", np.full((90, 120), 30, np.uint8))[1].tobytes()
+    lost = [
+        (f"{t}/compressed", ns, r.compressed(ns, "_depth", jpeg, "16UC1; jpeg compressed "))
+        if t.endswith("image_rect_raw")
+        else (t, ns, message)
+        for t, ns, message in rows
+    ]
+    with pytest.raises(
+        DuagError, match="image_rect_raw/compressed holds no depth, or as JPEG, which destroys it"
+    ):
+        converters.convert("ros", r.write(tmp_path / "lost", lost, "mcap"), tmp_path / "rec2")
+
+
+def test_depth_that_is_too_far_is_told(tmp_path: Path) -> None:
+    """Registered depth is kept in half millimetres, up to 32.8 m; what lies beyond is left out, and counted."""
+    r = Ros(2)
+    rows = []
+    for topic, log_ns, message in scene(r):
+        if topic.endswith("image_rect_raw"):
+            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            pixels = np.full((90, 120), 3.0, np.float32)
+            pixels[:45] = 40.0
+            message = r.image(stamp, "_depth", pixels, "32FC1")
+        rows.append((topic, log_ns, message))
+    converters.convert("ros", r.write(tmp_path / "bag", rows, "sqlite3"), tmp_path / "rec")
+    warnings = json.loads((tmp_path / "rec" / "recording.json").read_text())["warnings"]
+    assert any("pixels are farther away than 32.8 m" in warning for warning in warnings)
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def test_sigma_grows_with_the_square_of_depth() -> None:
 
 def test_rows_are_tested_on_the_images() -> None:
     stereo = rig()
-    right_order = RowCheck(stereo)
+    right_order = RowCheck()
     for T in path(2, step=0.4):
         right_order.add(*rectified(stereo, T))
     found = right_order.result("here")
@@ -108,17 +108,17 @@ def test_rows_are_tested_on_the_images() -> None:
 
     turned_back = se3.from_rotation_translation(T_RIGHT_LEFT[:3, :3].T, T_RIGHT_LEFT[:3, 3])
     wrong = StereoRig.of(raw(LEFT, D_LEFT), raw(RIGHT, D_RIGHT), turned_back, "here", OPTIONS)
-    check = RowCheck(wrong)
+    check = RowCheck()
     check.add(*rectified(wrong, path(1)[0]))
     with pytest.raises(DuagError, match=r"here: matched features lie .* px apart in rows"):
         check.result("here")
 
-    check = RowCheck(stereo)
+    check = RowCheck()
     left, right = rectified(stereo, path(1)[0])
     check.add(right, left)
     with pytest.raises(DuagError, match="the cameras are swapped"):
         check.result("here")
-    check = RowCheck(stereo)
+    check = RowCheck()
     check.add(np.zeros_like(left), np.zeros_like(left))
     with pytest.raises(DuagError, match="here: 0 features"):
         check.result("here")

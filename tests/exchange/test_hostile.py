@@ -138,7 +138,9 @@ def test_twenty_thousand_damaged_packets_change_nothing(team: list[RobotData], q
     assert sum(sum(agent.refused.values()) for agent in agents.values()) > 0.7 * count
 
 
-def test_twenty_thousand_forged_packets_change_nothing_where_packets_are_signed(team: list[RobotData]) -> None:
+def test_twenty_thousand_forged_packets_change_nothing_where_packets_are_signed(
+    team: list[RobotData],
+) -> None:
     alone, _, _ = meet(team, SIGNED, [], 0)
     results, agents, count = meet(team, SIGNED, [forged, forged, flipped, cut, repeated], 360)
     assert count > 20_000

@@ -43,13 +43,15 @@ def meet(
     )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=["admm", "elimination"])
 def lossy_chain(
-    team: dict[str, tuple[RobotData, np.ndarray]], tmp_path_factory: pytest.TempPathFactory
+    team: dict[str, tuple[RobotData, np.ndarray]],
+    tmp_path_factory: pytest.TempPathFactory,
+    request: pytest.FixtureRequest,
 ) -> tuple[dict[str, AgentResult], Path, ExchangeConfig]:
     folder = tmp_path_factory.mktemp("chain")
-    link = LinkConfig(topology="chain", loss_probability=0.3)
-    return meet(team, 3, folder, link=link), folder, ExchangeConfig(link=link)
+    config = ExchangeConfig(link=LinkConfig(topology="chain", loss_probability=0.3), solver=request.param)
+    return meet(team, 3, folder, link=config.link, solver=config.solver), folder, config
 
 
 def error_m(result: AgentResult, team: dict[str, tuple[RobotData, np.ndarray]]) -> float:
@@ -246,6 +248,19 @@ def test_injected_false_closures_are_found_out(
         assert result.converged
         moved_m, _ = se3.distance(result.T_world_keyframe, undisturbed[name].T_world_keyframe)
         assert moved_m.max() < 2e-3
+
+
+def test_elimination_ends_where_the_other_solver_does(
+    team: Any, undisturbed: dict[str, AgentResult], tmp_path: Path
+) -> None:
+    results = meet(team, 2, tmp_path, solver="elimination")
+    for name, result in results.items():
+        assert result.converged
+        moved_m, moved_rad = se3.distance(result.T_world_keyframe, undisturbed[name].T_world_keyframe)
+        assert moved_m.max() < 2e-5  # the other one stops when it moves by less than 1e-5
+        assert moved_rad.max() < 2e-5
+    kinds = {p.kind_name for p in read_session(tmp_path / "exchange.mcap").packets}
+    assert "TREE" in kinds
 
 
 def test_missing_poses_cost_rounds_and_false_matches_are_as_many_as_asked_for(

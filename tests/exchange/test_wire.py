@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.consensus.cycles import Proposal
 from pipeline.consensus.evidence import pack_symmetric, unpack_symmetric
 from pipeline.consensus.links import PosePacket, SharedKeyframes
 from pipeline.exchange import wire
@@ -70,9 +71,7 @@ def records(n: int) -> np.ndarray:
 
 MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
     "state": (
-        wire.write_state(
-            wire.State(1, 0b1011, 3, 0, True, False, np.array([254, 255, 0, 1], np.uint8), 0b101)
-        ),
+        wire.write_state(wire.State(0b1101, 0b101, 3, 0, True, False, np.array([254, 255, 0, 1], np.uint8))),
         lambda d: wire.read_state(d, TEAM),
     ),
     "places": (
@@ -94,7 +93,6 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
                 5,
                 4,
                 True,
-                poses(1)[0],
                 SharedKeyframes(np.array([2, 6], np.int32), np.ones((2, 6), np.float32)),
             )
         ),
@@ -105,8 +103,10 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
         lambda d: read_poses(d, SHARED, False),
     ),
     "frame": (
-        wire.write_frame(wire.Frame(1, 7, 2, poses(1)[0], 0b1010), TEAM),
-        lambda d: wire.read_frame(d, TEAM),
+        wire.write_frames(
+            wire.PairFrames(1, 2, tuple(Proposal(n, poses(1)[0], (0.01 * n, 0.02)) for n in (7, 2)))
+        ),
+        lambda d: wire.read_frames(d, TEAM),
     ),
     "anchors": (
         wire.write_anchors(wire.Anchors(2, poses(4), poses(1)[0])),
