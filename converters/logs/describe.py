@@ -20,7 +20,6 @@ from converters.logs.robot_log import RobotLog
 from converters.logs.sources import Source, is_log, sources_of
 from pipeline.errors import DuagError
 from pipeline.recording.names import LIBRARY, MAGIC, RECORDING_FILE
-from pipeline.recording.read import parsing
 
 HEADERS_FIRST, HEADERS_EACH = (
     100,
@@ -54,8 +53,7 @@ def describe(src: Path) -> dict[str, Any]:
     """
     logs: dict[str, Any] = {}
     robots: dict[str, Any] = {}
-    with parsing(src):
-        sources = list(_robots(src))
+    sources = list(_robots(src))
     clocks = []
     opened = []
     try:
