@@ -27,6 +27,7 @@ from converters.ros_images import color_bytes, depth_values, encoded_size, in_me
 from converters.self_check import GAP, MAX_RATIO, ReprojectionCheck
 from pipeline import numeric
 from pipeline.errors import DuagError
+from pipeline.files import decode_image
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.progress import track
@@ -153,7 +154,7 @@ def _measured(source: RobotLog, stamp_ns: int, color: Any, depth: Any) -> tuple[
     data, color_format = color_bytes(color, where)
     _check_size(where, encoded_size(data) or (0, 0), source.camera)
     if maps is not None:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        image = decode_image(data, cv2.IMREAD_COLOR)
         if image is None:
             raise DuagError(f"{where}: no decoder reads it, expected a colour image")
         data = cv2.imencode(".png", cv2.remap(image, *maps, cv2.INTER_LINEAR))[1].tobytes()

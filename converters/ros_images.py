@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import DuagError
+from pipeline.files import decode_image
 from pipeline.geometry.camera import PinholeCamera
 
 Depth = NDArray[np.float32]
@@ -101,7 +102,7 @@ def size_of(message: Any, where: str) -> tuple[int, int]:
     if is_depth(message):
         height, width = depth_m(message, where, 1.0).shape
         return width, height
-    image = cv2.imdecode(np.frombuffer(color_bytes(message, where)[0], np.uint8), cv2.IMREAD_COLOR)
+    image = decode_image(color_bytes(message, where)[0], cv2.IMREAD_COLOR)
     if image is None:
         raise DuagError(f"{where}: no decoder reads it, expected a colour image")
     return int(image.shape[1]), int(image.shape[0])
@@ -191,7 +192,7 @@ def _compressed_depth(text: str, data: bytes, where: str) -> NDArray[np.uint16] 
     if not body.startswith(b"\x89PNG"):
         values = _rvl(body, where)
     else:
-        image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = decode_image(body, cv2.IMREAD_UNCHANGED)
         if image is None or image.dtype != np.uint16 or image.ndim != 2:
             raise DuagError(f"{where}: no decoder finds 16-bit depth in it, expected a PNG of 16 bits")
         values = image.astype(np.uint16)

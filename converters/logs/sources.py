@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from converters.base import robot_names
-from converters.image_files import options_of, read_text
+from converters.image_files import options_of
 from converters.logs.files import SUFFIXES
 from converters.logs.options import LogOptions
 from pipeline.errors import DuagError, closest
+from pipeline.files import read_text
 from schemas import topics
 
 GROUPING = ("namespaces", "pieces")  # options that say which logs are whose, which a TOML file does itself
