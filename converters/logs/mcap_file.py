@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -181,12 +182,25 @@ class _Ros:
         """Understood when the first message is read: definitions that nobody needs may be beyond the parser."""
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-        store = get_typestore(Stores.EMPTY)
         text = self.schema.data.decode()
-        if self.schema.encoding == "ros2idl":
-            store.register(get_types_from_idl(text))
-        else:
+        if not text.strip():  # a recorder that had no definitions at hand
+            return get_typestore(Stores.ROS2_HUMBLE if self.encoding == "cdr" else Stores.ROS1_NOETIC)
+        store = get_typestore(Stores.EMPTY)
+        if self.schema.encoding != "ros2idl":
             store.register(get_types_from_msg(text, self.type))
+            return store
+        line = "=" * 80 + "\n"
+        parts = (
+            [part.split("\n", 1)[1] for part in text.split(line)[1:]]
+            if text.startswith(f"{line}IDL: ")
+            else [text]
+        )
+        types: dict[str, Any] = {}
+        for part in parts:
+            types.update(
+                get_types_from_idl(re.sub(r"(?m)^\s*#.*$", "", part))
+            )  # its parser knows no #include
+        store.register(types)
         return store
 
     def read(self, data: bytes, where: str) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -26,7 +26,32 @@ from pipeline.geometry import se3
 Array = NDArray[np.float64]
 HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
 RECTIFIED = ("image_rect", "image_rect_color", "rect")
+SAME_CAMERA_PX = 1.0  # up to which a camera has not changed
 OUT_SCALE = 0.0005  # metres per unit of depth that was registered or came as floats
+
+
+class _Cameras:
+    """Watches that what a CameraInfo says does not change: a camera of the recording is one camera."""
+
+    def __init__(self, first: Mapping[str, tuple[RosCamera, bool]], name: str) -> None:
+        self._first, self._name = first, name
+        self._seen: dict[str, bytes] = {}
+
+    def see(self, entry: Entry) -> None:
+        """Compare a message with the first one. Raises DuagError where the difference can be seen in images."""
+        rest = entry.data[16:]  # in ROS what follows the times of the header, most often the same bytes
+        if self._seen.get(entry.topic) == rest:
+            return
+        self._seen[entry.topic] = rest
+        first, rectified = self._first[entry.topic]
+        where = f"{self._name}: {entry.topic}"
+        now = RosCamera.of(entry.read(), rectified, where)
+        a, b = (np.array([c.camera.fx, c.camera.fy, c.camera.cx, c.camera.cy]) for c in (first, now))
+        if np.abs(a - b).max() > SAME_CAMERA_PX or first.distortion != now.distortion:
+            raise DuagError(
+                f"{where} changes at {entry.log_ns} ns from fx fy cx cy = {a.round(2).tolist()} px to "
+                f"{b.round(2).tolist()}, expected one camera (a zoom or autofocus has to be fixed while recording)"
+            )
 
 
 class RobotLog:
@@ -43,6 +68,9 @@ class RobotLog:
         self.shift_ns = round(
             settings.clock_offset_s * NANOSECONDS
         )  # added to all times when they are written
+        self._cameras: dict[
+            str, tuple[RosCamera, bool]
+        ] = {}  # by topic: as first told, whether of rectified images
         self.transforms = Transforms(log, self.namespace)
         self._choose()
 
@@ -116,6 +144,7 @@ class RobotLog:
         """Camera of an image topic."""
         chosen = self._info(topic, option, chooser)
         camera = RosCamera.of(self.log.first(chosen), _is_rectified(topic), f"{self.name}: {chosen}")
+        self._cameras[chosen] = (camera, _is_rectified(topic))
         found = size_of(chooser.images[topic], f"{self.name}: {topic}")
         expected = camera.camera.width, camera.camera.height
         if found != expected:
@@ -207,7 +236,11 @@ class RobotLog:
         """Time of a colour image -> time of its depth image."""
         stamps: dict[str, list[int]] = {self.color: [], self.depth: []}
         delays = []
-        for entry in self.log.entries(self.color, self.depth):
+        cameras = _Cameras(self._cameras, self.name)
+        for entry in self.log.entries(self.color, self.depth, *self._cameras):
+            if entry.topic in self._cameras:
+                cameras.see(entry)
+                continue
             stamps[entry.topic].append(self.time_ns(entry))
             delays.append(entry.log_ns - stamps[entry.topic][-1])
         self._delays_ns = np.array(delays, dtype=np.int64)

@@ -12,7 +12,7 @@ import pytest
 import converters
 from converters.logs import clocks
 from pipeline.geometry import so3
-from pipeline.recording import open_rgbd
+from pipeline.recording import format_info, info, open_rgbd
 from tests.converters.box_room import path
 from tests.converters.test_ros import FRAMES, START_NS, STEP_NS, Ros, scene
 
@@ -64,6 +64,8 @@ def test_one_recorder_tells_how_headers_differ(tmp_path: Path) -> None:
     assert abs(start(tmp_path / "moved", "husky") - START_NS - STEP_NS) < 1000
     assert start(tmp_path / "moved", "jackal") == START_NS + STEP_NS
     assert clocks_of(tmp_path / "moved")["husky"]["added_s"] == pytest.approx(HUSKY_LATE_NS / 1e9, abs=1e-6)
+    shown = format_info(info(tmp_path / "moved"))
+    assert "clock 3.250000 s behind the first robot's (one recorder), 3.250000 s were added" in shown
     converters.convert("ros", bag, tmp_path / "zero", options=[*options, "clocks=from_zero"])
     assert [start(tmp_path / "zero", robot) for robot in ("jackal", "husky")] == [0, 0]
 
