@@ -426,7 +426,8 @@ def _surfaces(
     config: FusionConfig,
     depth: DepthKind,
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """What own keyframes know of surfaces: measured depth, rendered where it is missing, the farthest close by."""
+    """What own keyframes know of surfaces, where the own map draws them: measured depth, rendered where it is missing,
+    the farthest close by."""
     from scipy.ndimage import maximum_filter
 
     from pipeline.kernels import Rasterizer
@@ -435,9 +436,10 @@ def _surfaces(
     for keyframe, measured in depth_images:
         T_camera_world = se3.inverse(T_world_keyframe[keyframe])
         render = rasterizer.forward(own_world, camera, T_camera_world, depth=depth)
-        stands_in = (measured <= 0) & (render.alpha > config.explained_opacity)
-        filled = np.where(stands_in, render.depth / np.maximum(render.alpha, np.float32(1e-3)), measured)
-        yield keyframe, maximum_filter(filled, 2 * config.explained_px + 1)
+        drawn = render.depth / np.maximum(render.alpha, np.float32(1e-3))
+        surface = np.where(measured > 0, measured, drawn)
+        known = np.where(render.alpha >= config.explained_opacity, surface, np.float32(0))
+        yield keyframe, maximum_filter(known, 2 * config.explained_px + 1)
 
 
 def explained(

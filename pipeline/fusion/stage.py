@@ -13,6 +13,7 @@ from pipeline.consensus.evidence import Evidence, unpack_symmetric
 from pipeline.errors import DuagError
 from pipeline.fusion.config import FusionConfig
 from pipeline.fusion.fuse import FusedMap, fuse
+from pipeline.fusion.own_pixels import weigh_by_own_pixels
 from pipeline.fusion.refine import View, refine
 from pipeline.geometry.trajectory import Trajectory, write_tum
 from pipeline.messages import WORLD_FRAME, CorrectedKeyframes, GaussianInformation, GaussianMap, Odometry
@@ -64,13 +65,26 @@ def run_fusion(
     frames = _frames(source)
     stamp_ns = frames[-1].stamp_ns
     refined = None
-    if len(result.component) > 1 and config.refine.steps_per_view:
+    if len(result.component) > 1:
         views = _views(source, frames, result, config.refine.support_views)
-        owned = fused.source == fused.robots.index(own.robot)
-        floor_m = matching.thickness_floor_m
-        refined = refine(
-            fused.gaussians, owned, views, own.camera, config.refine, floor_m, own.depth, seed, threads
+        info = own.information
+        fused = weigh_by_own_pixels(
+            fused,
+            len(own.gaussians),
+            views[: own.keyframes],
+            own.camera,
+            info.color_sigma,
+            info.color_pixels_per_sample,
+            config,
+            own.depth,
+            threads,
         )
+        if config.refine.steps_per_view:
+            owned = fused.source == fused.robots.index(own.robot)
+            floor_m = matching.thickness_floor_m
+            refined = refine(
+                fused.gaussians, owned, views, own.camera, config.refine, floor_m, own.depth, seed, threads
+            )
     write_ply(folder / "fused.ply", fused.gaussians)
     write_ply(folder / "refined.ply", fused.gaussians if refined is None else refined)
     _write_log(folder / "fused.mcap", result, fused, refined, stamp_ns, own.depth)
