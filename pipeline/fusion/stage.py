@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.config import MatchingConfig
-from pipeline.consensus.evidence import Evidence, unpack_symmetric
+from pipeline.consensus.config import MatchingConfig, WeightKind
+from pipeline.consensus.evidence import unpack_symmetric
+from pipeline.consensus.weighting import own_stiffness
 from pipeline.errors import DuagError
 from pipeline.fusion.config import FusionConfig
 from pipeline.fusion.fuse import FusedMap, fuse
@@ -32,6 +33,7 @@ def run_fusion(
     folder: Path,
     config: FusionConfig,
     matching: MatchingConfig,
+    weights: WeightKind = "block",
     *,
     seed: int = 0,
     threads: int = 1,
@@ -42,7 +44,7 @@ def run_fusion(
         source: the robot's own files.
         result: what it took home from the session.
         folder: where the results go.
-        matching: as the pairs of the session were found.
+        matching: as the pairs of the session were found. weights: kind of the session.
         seed: of the run. threads: of the rasterizer; changes no bit.
     Returns:
         The fused map, in the world frame.
@@ -53,7 +55,7 @@ def run_fusion(
         own.gaussians,
         own.T_map_keyframe,
         {own.robot: result.own_evidence, **result.evidence},
-        Evidence.of_splats(own.robot, own.gaussians, own.information, own.T_map_keyframe),
+        own_stiffness(own.robot, own.gaussians, own.information, own.T_map_keyframe, weights),
         result.T_world_keyframe_of,
         result.pairs,
         _depth_images(own),
@@ -61,6 +63,7 @@ def run_fusion(
         config,
         matching,
         own.depth,
+        weights,
     )
     frames = _frames(source)
     stamp_ns = frames[-1].stamp_ns
