@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from converters.base import NANOSECONDS, RecordingWriter, RobotWriter
 from converters.logs import open_log
@@ -22,11 +23,13 @@ from converters.logs.derived import Picture, Sweeps
 from converters.logs.options import LogOptions
 from converters.logs.robot_log import RobotLog
 from converters.logs.sources import sources_of
-from converters.ros_images import color_bytes, depth_m
+from converters.ros_images import color_bytes, depth_values, encoded_size, in_metres, is_cut_short
 from converters.self_check import GAP, MAX_RATIO, ReprojectionCheck
 from pipeline import numeric
 from pipeline.errors import DuagError
+from pipeline.files import decode_image
 from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
 from pipeline.progress import track
 from pipeline.recording.register_depth import register_depth
 
@@ -103,9 +106,12 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
     if isinstance(derived, Sweeps):
         robot.set_lidar(derived.lidar.T_camera_lidar, derived.lidar.range_sigma_m)
     check = ReprojectionCheck(source.camera, len(pairs), gap)
-    without = empty = far = 0
+    without = empty = far = cut = 0
     progress = track(source.frames(), f"convert {robot.name}", len(pairs))
     for index, (stamp_ns, color, depth) in enumerate(progress):
+        if is_cut_short(color) or is_cut_short(depth):
+            cut += 1
+            continue
         if derived:
             picture = derived.picture(color, depth, stamp_ns, pairs[stamp_ns])
         else:
@@ -122,6 +128,8 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
         if check.needs(index, T):
             check.add(index, source.depth_m(picture), T)
         empty += 0 if picture.depth is None else int((picture.depth == 0).sum())
+    if cut:
+        source.warnings.append(f"{cut} frames have colour or depth that is cut short; left out")
     if far:
         limit = FARTHEST * source.depth_scale
         source.warnings.append(
@@ -131,7 +139,9 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
     if source.truth is not None and without:
         source.warnings.append(f"{without} of {len(pairs)} frames have no true pose")
     if not isinstance(derived, Sweeps):
-        rows["without_depth"] = empty / (len(pairs) * source.camera.width * source.camera.height)
+        rows["without_depth"] = empty / max(
+            1, (len(pairs) - cut) * source.camera.width * source.camera.height
+        )
     return {**rows, **check.result(log, max_ratio), **_truth_lag(source)}
 
 
@@ -142,26 +152,33 @@ def _measured(source: RobotLog, stamp_ns: int, color: Any, depth: Any) -> tuple[
     log, maps = source.name, source.color_maps
     where = f"{log}: {source.color} at {stamp_ns} ns"
     data, color_format = color_bytes(color, where)
+    _check_size(where, encoded_size(data) or (0, 0), source.camera)
     if maps is not None:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        image = decode_image(data, cv2.IMREAD_COLOR)
         if image is None:
             raise DuagError(f"{where}: no decoder reads it, expected a colour image")
         data = cv2.imencode(".png", cv2.remap(image, *maps, cv2.INTER_LINEAR))[1].tobytes()
         color_format = "png"
-    metres = depth_m(depth, f"{log}: {source.depth} at {stamp_ns} ns", source.settings.depth_scale)
-    size = source.depth_camera.camera.width, source.depth_camera.camera.height
-    if metres.shape != (size[1], size[0]):
-        raise DuagError(
-            f"{log}: {source.depth} at {stamp_ns} ns is {metres.shape[1]}x{metres.shape[0]}, expected "
-            f"{size[0]}x{size[1]} as in its CameraInfo"
-        )
+    where = f"{log}: {source.depth} at {stamp_ns} ns"
+    values: NDArray[Any] = depth_values(depth, where)
+    _check_size(where, (values.shape[1], values.shape[0]), source.depth_camera.camera)
     if source.depth_maps is not None:
-        metres = np.asarray(cv2.remap(metres, *source.depth_maps, cv2.INTER_NEAREST), dtype=np.float32)
+        values = cv2.remap(values, *source.depth_maps, cv2.INTER_NEAREST)
+    if source.keeps_depth and values.dtype == np.uint16:
+        return Picture(data, color_format, np.asarray(values, dtype=np.uint16)), 0
+    metres = in_metres(values, source.settings.depth_scale)
     if source.T_color_depth is not None:
         metres = register_depth(metres, source.depth_camera.camera, source.T_color_depth, source.camera)
     units = np.rint(metres / source.depth_scale)
     raw = np.where(units <= FARTHEST, units, 0).astype(np.uint16)
     return Picture(data, color_format, raw), int((units > FARTHEST).sum())
+
+
+def _check_size(where: str, found: tuple[int, int], camera: PinholeCamera) -> None:
+    if found != (camera.width, camera.height):
+        raise DuagError(
+            f"{where} is {found[0]}x{found[1]}, expected {camera.width}x{camera.height} as in its CameraInfo"
+        )
 
 
 def _truth_lag(source: RobotLog) -> dict[str, float]:

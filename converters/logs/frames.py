@@ -97,6 +97,6 @@ def pose_matrix(position: Any, orientation: Any, where: str) -> Array:
         DuagError: the quaternion is no rotation.
     """
     q = np.array([orientation.w, orientation.x, orientation.y, orientation.z], dtype=np.float64)
-    if not np.isfinite(q).all() or abs(np.linalg.norm(q) - 1) > 0.01:
+    if not np.isfinite(q).all() or np.abs(q).max() > 2 or abs(np.linalg.norm(q) - 1) > 0.01:
         raise DuagError(f"{where}: quaternion wxyz {q.tolist()}, expected one of length 1")
     return np.asarray(se3.from_quat_translation(q, np.array([position.x, position.y, position.z])))

@@ -15,12 +15,12 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from converters.logs import foxglove
 from converters.logs.files import Entry, Topic, ros_type, stamp_ns
-from converters.logs.rosbag_file import deserialised, ros_header_ns
+from converters.logs.rosbag_file import deserialised, reading, reason, ros_header_ns
 from pipeline.errors import DuagError
 from pipeline.recording.names import MAGIC
-from pipeline.recording.read import parsing
 
 LARGEST_CHUNK = 1 << 30  # bytes, unpacked
+WANTED = "a sound MCAP log"
 
 
 class McapFile:
@@ -30,7 +30,7 @@ class McapFile:
         self.path = path
         self.topics: dict[str, Topic] = {}
         self._decoders: dict[int, _Decoder] = {}
-        with parsing(path):
+        with reading(path, WANTED):
             self._stream = path.open("rb")
             try:
                 self._open()
@@ -145,7 +145,7 @@ class McapFile:
                 yield self._channels[record.channel_id], record
 
     def entries(self, topics: Sequence[str]) -> Iterator[Entry]:
-        with parsing(self.path):
+        with reading(self.path, WANTED):
             for channel, m in self._messages(topics):
                 where = f"{self.path}: {channel.topic}"
                 decoder = self._decoders[channel.id]
@@ -194,7 +194,9 @@ class _Ros:
             try:
                 store = self._store()
             except Exception as error:  # whatever a broken definition provokes in the parser
-                raise DuagError(f"{where}: the definition of {self.type} cannot be read ({error})") from error
+                raise DuagError(
+                    f"{where}: the definition of {self.type} cannot be read ({reason(error)})"
+                ) from error
             self._deserialise = store.deserialize_cdr if self.encoding == "cdr" else store.deserialize_ros1
         message = deserialised(self._deserialise, data, self.type, where)
         return foxglove.as_ros(foxglove.plain_name(self.schema.name), message, where)
@@ -222,7 +224,7 @@ class _Foxglove:
                 message = schemas.message_class(self.name).FromString(data)
         except Exception as error:  # protobuf's DecodeError, broken JSON, broken text
             raise DuagError(
-                f"{where} holds {len(data)} bytes that are no {self.name} in {self.encoding} ({error})"
+                f"{where} holds {len(data)} bytes that are no {self.name} in {self.encoding} ({reason(error)})"
             ) from error
         return foxglove.as_ros(self.name, message, where)
 

@@ -65,8 +65,8 @@ class RobotLog:
         self.camera = self.color_camera.camera
         self.depth_camera = self._camera(self.depth, "depth_info", chooser)
         self.T_color_depth = self._extrinsics()
-        kept = is_integer_depth(chooser.images[self.depth]) and self.T_color_depth is None
-        self.depth_scale = s.depth_scale if kept else OUT_SCALE
+        self.keeps_depth = is_integer_depth(chooser.images[self.depth]) and self.T_color_depth is None
+        self.depth_scale = s.depth_scale if self.keeps_depth else OUT_SCALE
 
     def _derived(self, chooser: Chooser) -> Derived:
         """Depth of a stereo pair or of a LiDAR."""
