@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.config import MatchingConfig
-from pipeline.consensus.evidence import Evidence, unpack_symmetric
+from pipeline.consensus.config import MatchingConfig, WeightKind
+from pipeline.consensus.evidence import unpack_symmetric
+from pipeline.consensus.weighting import own_stiffness
 from pipeline.errors import DuagError
 from pipeline.fusion.config import FusionConfig
 from pipeline.fusion.fuse import FusedMap, fuse
+from pipeline.fusion.own_pixels import weigh_by_own_pixels
 from pipeline.fusion.refine import View, refine
 from pipeline.geometry.trajectory import Trajectory, write_tum
 from pipeline.messages import WORLD_FRAME, CorrectedKeyframes, GaussianInformation, GaussianMap, Odometry
@@ -31,6 +33,7 @@ def run_fusion(
     folder: Path,
     config: FusionConfig,
     matching: MatchingConfig,
+    weights: WeightKind = "block",
     *,
     seed: int = 0,
     threads: int = 1,
@@ -41,7 +44,7 @@ def run_fusion(
         source: the robot's own files.
         result: what it took home from the session.
         folder: where the results go.
-        matching: as the pairs of the session were found.
+        matching: as the pairs of the session were found. weights: kind of the session.
         seed: of the run. threads: of the rasterizer; changes no bit.
     Returns:
         The fused map, in the world frame.
@@ -52,7 +55,7 @@ def run_fusion(
         own.gaussians,
         own.T_map_keyframe,
         {own.robot: result.own_evidence, **result.evidence},
-        Evidence.of_splats(own.robot, own.gaussians, own.information, own.T_map_keyframe),
+        own_stiffness(own.robot, own.gaussians, own.information, own.T_map_keyframe, weights),
         result.T_world_keyframe_of,
         result.pairs,
         _depth_images(own),
@@ -60,17 +63,31 @@ def run_fusion(
         config,
         matching,
         own.depth,
+        weights,
     )
     frames = _frames(source)
     stamp_ns = frames[-1].stamp_ns
     refined = None
-    if len(result.component) > 1 and config.refine.steps_per_view:
+    if len(result.component) > 1:
         views = _views(source, frames, result, config.refine.support_views)
-        owned = fused.source == fused.robots.index(own.robot)
-        floor_m = matching.thickness_floor_m
-        refined = refine(
-            fused.gaussians, owned, views, own.camera, config.refine, floor_m, own.depth, seed, threads
+        info = own.information
+        fused = weigh_by_own_pixels(
+            fused,
+            len(own.gaussians),
+            views[: own.keyframes],
+            own.camera,
+            info.color_sigma,
+            info.color_pixels_per_sample,
+            config,
+            own.depth,
+            threads,
         )
+        if config.refine.steps_per_view:
+            owned = fused.source == fused.robots.index(own.robot)
+            floor_m = matching.thickness_floor_m
+            refined = refine(
+                fused.gaussians, owned, views, own.camera, config.refine, floor_m, own.depth, seed, threads
+            )
     write_ply(folder / "fused.ply", fused.gaussians)
     write_ply(folder / "refined.ply", fused.gaussians if refined is None else refined)
     _write_log(folder / "fused.mcap", result, fused, refined, stamp_ns, own.depth)
