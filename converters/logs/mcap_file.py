@@ -18,6 +18,7 @@ from converters.logs import foxglove
 from converters.logs.files import Entry, Topic, ros_type, stamp_ns
 from converters.logs.rosbag_file import LARGEST_CHUNK, deserialised, reading, reason, ros_header_ns
 from pipeline.errors import DuagError
+from pipeline.files import check_file
 from pipeline.recording.names import MAGIC
 
 WANTED = "a sound MCAP log"
@@ -30,6 +31,7 @@ class McapFile:
         self.path = path
         self.topics: dict[str, Topic] = {}
         self._decoders: dict[int, _Decoder] = {}
+        check_file(path, WANTED)
         with reading(path, WANTED):
             self._stream = path.open("rb")
             try:

@@ -24,6 +24,7 @@ from pipeline.errors import DuagError
 from pipeline.geometry import se3
 
 Array = NDArray[np.float64]
+LATEST_NS = 1 << 62  # 146 years
 HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
 RECTIFIED = ("image_rect", "image_rect_color", "rect")
 SAME_CAMERA_PX = 1.0  # up to which a camera has not changed
@@ -218,15 +219,17 @@ class RobotLog:
     def time_ns(self, entry: Entry) -> int:
         """The time of a message by the clock that the options choose."""
         source = self.settings.time_source
+        at = entry.log_ns if source == "log" else entry.publish_ns
         if source == "header":
-            return entry.header_ns()
-        if source == "log":
-            return entry.log_ns
-        if entry.publish_ns is None:
+            at = entry.header_ns()
+        if at is None:
             raise DuagError(
                 f"{self.name}: bags of ROS hold no times of publication, expected time_source=header or log"
             )
-        return entry.publish_ns
+        if not 0 <= at < LATEST_NS or not 0 <= entry.log_ns < LATEST_NS:
+            found = f"{self.name}: {entry.topic} has the times {at} and {entry.log_ns} ns"
+            raise DuagError(f"{found}, expected 0 to {LATEST_NS}")
+        return at
 
     @cached_property
     def pairs(self) -> dict[int, int]:
