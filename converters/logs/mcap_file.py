@@ -16,11 +16,10 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from converters.logs import foxglove
 from converters.logs.files import Entry, Topic, ros_type, stamp_ns
-from converters.logs.rosbag_file import deserialised, reading, reason, ros_header_ns
+from converters.logs.rosbag_file import LARGEST_CHUNK, deserialised, reading, reason, ros_header_ns
 from pipeline.errors import DuagError
 from pipeline.recording.names import MAGIC
 
-LARGEST_CHUNK = 1 << 30  # bytes, unpacked
 WANTED = "a sound MCAP log"
 
 

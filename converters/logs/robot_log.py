@@ -65,12 +65,10 @@ class RobotLog:
         self.log, self.namespace, self.settings = log, namespace.rstrip("/"), settings
         self.name = log.name
         self.warnings: list[str] = []
-        self.shift_ns = round(
-            settings.clock_offset_s * NANOSECONDS
-        )  # added to all times when they are written
-        self._cameras: dict[
-            str, tuple[RosCamera, bool]
-        ] = {}  # by topic: as first told, whether of rectified images
+        # added to all times when they are written
+        self.shift_ns = round(settings.clock_offset_s * NANOSECONDS)
+        # by topic of a CameraInfo: the camera as first told, and whether its images are rectified
+        self._cameras: dict[str, tuple[RosCamera, bool]] = {}
         self.transforms = Transforms(log, self.namespace)
         self._choose()
 
@@ -98,10 +96,8 @@ class RobotLog:
 
     def _derived(self, chooser: Chooser) -> Derived:
         """Depth of a stereo pair or of a LiDAR."""
-        s, color = (
-            self.settings,
-            (self.color, self._info(self.color, "color_info", chooser), self.color_camera),
-        )
+        s = self.settings
+        color = self.color, self._info(self.color, "color_info", chooser), self.color_camera
         if s.depth_from == "stereo":
             right = self._info(self.depth, "depth_info", chooser)
             other = self.depth, right, self._camera(self.depth, "depth_info", chooser)
@@ -191,7 +187,8 @@ class RobotLog:
         if T is None:
             raise DuagError(
                 f"{self.name}: {self.depth} is seen from {depth.frame_id!r}, colour from {color.frame_id!r}, and "
-                "/tf_static does not tie them; expected --set T_color_depth='x y z qw qx qy qz' or registered=yes"
+                f"/tf_static does not tie them{self.transforms.moving_words()}; expected --set T_color_depth="
+                "'x y z qw qx qy qz' or registered=yes"
             )
         return T
 
@@ -280,27 +277,10 @@ class RobotLog:
 
     def frames(self) -> Iterator[tuple[int, Any, Any]]:
         """Time, colour and depth message of every pair, in order of time; holds no more than it must."""
-        pairs = self.pairs
-        used_by: dict[int, list[int]] = {}
-        for color_ns, depth_ns in pairs.items():
-            used_by.setdefault(depth_ns, []).append(color_ns)
-        colors: dict[int, Any] = {}
-        depths: dict[int, Any] = {}
-        order = sorted(pairs)
-        at = 0
-        for entry in self.log.entries(self.color, self.depth):
-            stamp = self.time_ns(entry)
-            if entry.topic == self.color and stamp in pairs:
-                colors.setdefault(stamp, entry)
-            elif entry.topic == self.depth and stamp in used_by:
-                depths.setdefault(stamp, entry)
-            while at < len(order) and order[at] in colors and pairs[order[at]] in depths:
-                color_ns, depth_ns = order[at], pairs[order[at]]
-                yield color_ns, colors.pop(color_ns).read(), depths[depth_ns].read()
-                used_by[depth_ns].remove(color_ns)
-                if not used_by[depth_ns]:
-                    del depths[depth_ns]
-                at += 1
+        order = sorted(self.pairs)
+        groups = [{self.color: time, self.depth: self.pairs[time]} for time in order]
+        for time, found in zip(order, gathered(self.log, groups, self.time_ns), strict=False):
+            yield time, found[self.color].read(), found[self.depth].read()
 
     def sensors(self) -> dict[str, str]:
         """What the log says about its source."""

@@ -13,12 +13,15 @@ from converters.logs import foxglove
 from converters.logs.files import NANOSECONDS, Entry, Topic, stamp_ns
 from pipeline.errors import DuagError
 
+LARGEST_CHUNK = 256 << 20  # bytes, unpacked; recorders write some megabytes
+
 
 class RosBag:
     """A bag, read by rosbags. Bags of ROS 2 without types are read with those of Humble."""
 
     def __init__(self, path: Path) -> None:
         from rosbags.highlevel import AnyReader
+        from rosbags.rosbag1 import Reader as Reader1
         from rosbags.typesys import Stores, get_typestore
 
         self.path = path
@@ -26,6 +29,9 @@ class RosBag:
         with reading(path, f"a bag of ROS 1 or ROS 2{hint}"):
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
+            for reader in self._reader.readers:
+                if isinstance(reader, Reader1):
+                    _bound_chunks(reader)
         self._encoding = "cdr" if self._reader.is2 else "ros1"
         self.topics: dict[str, Topic] = {}
         for c in self._reader.connections:
@@ -52,6 +58,34 @@ class RosBag:
 
     def close(self) -> None:
         self._reader.close()
+
+
+def _bound_chunks(reader: Any) -> None:
+    """Let no chunk of a bag of ROS 1 unpack into more than memory."""
+    import bz2
+
+    import lz4.frame
+
+    def bounded(unpack: Any) -> Any:
+        opener = {
+            bz2.decompress: bz2.BZ2Decompressor,
+            lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
+        }.get(unpack)
+        if opener is None:
+            return unpack
+
+        def decompress(data: bytes) -> bytes:
+            stream = opener()
+            out = bytes(stream.decompress(data, LARGEST_CHUNK))
+            if not stream.eof:
+                raise ValueError(f"a chunk that is broken, or unpacks to more than {LARGEST_CHUNK} bytes")
+            return out
+
+        return decompress
+
+    reader.chunks = {
+        at: chunk._replace(decompressor=bounded(chunk.decompressor)) for at, chunk in reader.chunks.items()
+    }
 
 
 @contextmanager

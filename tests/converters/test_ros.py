@@ -506,3 +506,28 @@ def test_depth_that_needs_no_moving_keeps_its_numbers(tmp_path: Path) -> None:
     assert all(
         np.array_equal(m.unpack_depth(record.proto(), "here"), pixels[i]) for i, record in enumerate(records)
     )
+
+
+def test_times_in_another_order_than_the_recording_do_not_fill_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A clock that jumps back would make the first half wait for the second."""
+    r = Ros(2)
+    rows = scene(r)
+    moved = [(t, ns + 10**9 * (k < 9), message) for k, (t, ns, message) in enumerate(rows)]
+    bag = r.write(tmp_path / "bag", sorted(moved, key=lambda x: x[1]), "mcap")
+    converters.convert("ros", bag, tmp_path / "rec")
+    monkeypatch.setattr("converters.logs.gather.MOST_KEPT_BYTES", 100_000)
+    with pytest.raises(DuagError, match="wait for messages of earlier times, expected times in the order"):
+        converters.convert("ros", bag, tmp_path / "rec2")
+
+
+@pytest.mark.parametrize("container", ["bz2", "lz4"])
+def test_chunks_that_unpack_into_too_much_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, container: str
+) -> None:
+    r = Ros(1)
+    bag = r.write(tmp_path / "bag", scene(r), container)
+    monkeypatch.setattr("converters.logs.rosbag_file.LARGEST_CHUNK", 50_000)
+    with pytest.raises(DuagError, match="unpacks to more than 50000 bytes"):
+        converters.convert("ros", bag, tmp_path / "rec")
