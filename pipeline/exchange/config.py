@@ -65,7 +65,7 @@ class LinkConfig(Config):
     """A packet occupies its directed link for its size over this; 0: for no time."""
     queue_ns: int = Field(default=1_000_000_000, ge=0)
     """A packet that would wait longer than this for the link is dropped by its sender's radio."""
-    budget_bytes: int = Field(default=250_000, ge=2_400)
+    budget_bytes: int = Field(default=150_000, ge=2_400)
     """Most that one robot sends to one neighbour in one round, headers included."""
 
     @model_validator(mode="after")
