@@ -76,6 +76,7 @@ ROBOT_NAMES = (
     *("xray", "yankee", "zulu"),
 )
 NANOSECONDS = 1_000_000_000
+MAX_SIDE_PX, MAX_FOCAL_PX = 16_384, 1e6
 SIGMA_SCALE_M = 1e-4  # of the images of standard deviations
 UNITS = {"time": "ns", "length": "m", "depth": "depth_scale_m per unit, along z, 0 = none", "angle": "rad"}
 
@@ -85,6 +86,18 @@ def robot_names(count: int) -> list[str]:
     if not 1 <= count <= len(ROBOT_NAMES):
         raise DuagError(f"{count} robots, expected 1 to {len(ROBOT_NAMES)}")
     return list(ROBOT_NAMES[:count])
+
+
+def check_camera(camera: PinholeCamera, where: str) -> None:
+    """Refuse intrinsics that no camera has: they came from a file."""
+    sides, focals = (camera.width, camera.height), (camera.fx, camera.fy)
+    sound = all(1 <= side <= MAX_SIDE_PX for side in sides)
+    sound = sound and all(0 < focal < MAX_FOCAL_PX for focal in focals)
+    sound = sound and all(abs(centre) < MAX_FOCAL_PX for centre in (camera.cx, camera.cy))
+    if not sound:
+        raise DuagError(
+            f"{where}: camera {camera}, expected sides up to {MAX_SIDE_PX} px and sound intrinsics"
+        )
 
 
 class RobotWriter:
@@ -111,6 +124,7 @@ class RobotWriter:
         """
         if not re.fullmatch(topics.ROBOT_NAME, name):
             raise DuagError(f"robot {name!r}: expected lower-case letters, digits and underscores")
+        check_camera(camera, f"robot {name}")
         self.folder, self.name, self.camera, self.depth_scale = Path(folder), name, camera, float(depth_scale)
         self.sensors = dict(sensors or {})
         self.summary: dict[str, Any] = {}

@@ -15,6 +15,7 @@ from converters.ros_images import color_bytes
 from converters.ros_points import as_of, points_of
 from converters.stereo import RowCheck, StereoRig
 from pipeline.errors import DuagError
+from pipeline.files import decode_image
 from pipeline.recording.lidar import lidar_depth
 from pipeline.recording.motion import GyroPrior, MotionPrior
 
@@ -46,7 +47,7 @@ def decoded(message: Any, where: str) -> Image:
     import cv2
 
     data, _ = color_bytes(message, where)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise DuagError(f"{where}: {len(data)} bytes that no decoder reads, expected an image")
     return np.asarray(image, dtype=np.uint8)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from converters.base import RecordingWriter
-from converters.image_files import options_of, read_text
+from converters.image_files import options_of
 from converters.logs import Log, open_log
 from converters.logs.motion import CameraPoses
 from converters.logs.options import LogOptions
@@ -32,6 +32,7 @@ from converters.ros import settle_clocks, write_robot
 from converters.tum_layout import AssociationOptions, Poses
 from pipeline import numeric
 from pipeline.errors import DuagError, closest
+from pipeline.files import read_text
 from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]

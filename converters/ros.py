@@ -14,17 +14,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from converters.base import NANOSECONDS, RecordingWriter, RobotWriter
 from converters.logs import open_log
 from converters.logs.clocks import LEAST_OFFSET_S, angular_speed, compare, lag, overlap_warnings
+from converters.logs.derived import Picture, Sweeps
 from converters.logs.options import LogOptions
 from converters.logs.robot_log import RobotLog
 from converters.logs.sources import sources_of
-from converters.ros_images import color_bytes, depth_m
+from converters.ros_images import color_bytes, depth_values, encoded_size, in_metres, is_cut_short
 from converters.self_check import GAP, MAX_RATIO, ReprojectionCheck
 from pipeline import numeric
 from pipeline.errors import DuagError
+from pipeline.files import decode_image
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
 from pipeline.progress import track
 from pipeline.recording.register_depth import register_depth
 
@@ -90,50 +95,41 @@ def write_robot(
         label: which part of the source it was. max_ratio, gap: see `ReprojectionCheck`.
     """
     sensors = {"part": label, **source.sensors()}
-    with recording.robot(name, source.color_camera.camera, source.depth_scale, sensors) as robot:
+    with recording.robot(name, source.camera, source.depth_scale, sensors) as robot:
         recording.checks[name] = _write_frames(robot, source, max_ratio, gap)
     recording.warnings += [f"{name}: {text}" for text in source.warnings]
 
 
 def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: int) -> dict[str, Any]:
-    import cv2
-
-    settings, log = source.settings, source.name
-    pairs, shift_ns = source.pairs, source.shift_ns
-    readings = _Readings(robot, source)
-    camera, maps = source.color_camera.camera, source.color_maps
-    check = ReprojectionCheck(camera, len(pairs), gap)
-    without = empty = far = 0
+    settings, log, pairs, derived = source.settings, source.name, source.pairs, source.derived
+    readings, rows = _Readings(robot, source), source.check_rows()
+    if isinstance(derived, Sweeps):
+        robot.set_lidar(derived.lidar.T_camera_lidar, derived.lidar.range_sigma_m)
+    check = ReprojectionCheck(source.camera, len(pairs), gap)
+    without = empty = far = cut = 0
     progress = track(source.frames(), f"convert {robot.name}", len(pairs))
     for index, (stamp_ns, color, depth) in enumerate(progress):
-        where = f"{log}: {source.color} at {stamp_ns} ns"
-        data, color_format = color_bytes(color, where)
-        if maps is not None:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-            if image is None:
-                raise DuagError(f"{where}: no decoder reads it, expected a colour image")
-            data = cv2.imencode(".png", cv2.remap(image, *maps, cv2.INTER_LINEAR))[1].tobytes()
-            color_format = "png"
-        metres = depth_m(depth, f"{log}: {source.depth} at {stamp_ns} ns", settings.depth_scale)
-        size = source.depth_camera.camera.width, source.depth_camera.camera.height
-        if metres.shape != (size[1], size[0]):
-            raise DuagError(
-                f"{log}: {source.depth} at {stamp_ns} ns is {metres.shape[1]}x{metres.shape[0]}, expected "
-                f"{size[0]}x{size[1]} as in its CameraInfo"
-            )
-        if source.depth_maps is not None:
-            metres = np.asarray(cv2.remap(metres, *source.depth_maps, cv2.INTER_NEAREST), dtype=np.float32)
-        if source.T_color_depth is not None:
-            metres = register_depth(metres, source.depth_camera.camera, source.T_color_depth, camera)
-        units = np.rint(metres / source.depth_scale)
-        raw = np.where(units <= FARTHEST, units, 0).astype(np.uint16)
-        far += int((units > FARTHEST).sum())
+        if is_cut_short(color) or is_cut_short(depth):
+            cut += 1
+            continue
+        if derived:
+            picture = derived.picture(color, depth, stamp_ns, pairs[stamp_ns])
+        else:
+            picture, beyond = _measured(source, stamp_ns, color, depth)
+            far += beyond
         T = source.truth.at(stamp_ns, settings.max_pose_gap_s) if source.truth else None
+        T = None if T is None else T @ source.T_color_camera
         without += T is None
         readings.write_until(stamp_ns)
-        robot.add_frame(stamp_ns + shift_ns, data, color_format, raw, T)
-        check.add(index, raw.astype(np.float64) * source.depth_scale, T)
-        empty += int((raw == 0).sum())
+        at_ns, encoded = stamp_ns + source.shift_ns, (picture.color, picture.color_format)
+        if picture.points_lidar is not None:
+            robot.add_points(at_ns, picture.points_lidar)
+        robot.add_frame(at_ns, *encoded, picture.depth, T, depth_sigma_m=picture.depth_sigma_m)
+        if check.needs(index, T):
+            check.add(index, source.depth_m(picture), T)
+        empty += 0 if picture.depth is None else int((picture.depth == 0).sum())
+    if cut:
+        source.warnings.append(f"{cut} frames have colour or depth that is cut short; left out")
     if far:
         limit = FARTHEST * source.depth_scale
         source.warnings.append(
@@ -142,8 +138,47 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
     readings.write_until(np.iinfo(np.int64).max)
     if source.truth is not None and without:
         source.warnings.append(f"{without} of {len(pairs)} frames have no true pose")
-    pixels = len(pairs) * camera.width * camera.height
-    return {"without_depth": empty / pixels, **check.result(log, max_ratio), **_truth_lag(source)}
+    if not isinstance(derived, Sweeps):
+        rows["without_depth"] = empty / max(
+            1, (len(pairs) - cut) * source.camera.width * source.camera.height
+        )
+    return {**rows, **check.result(log, max_ratio), **_truth_lag(source)}
+
+
+def _measured(source: RobotLog, stamp_ns: int, color: Any, depth: Any) -> tuple[Picture, int]:
+    """The frame of a depth image, and how many pixels are too far away for the log."""
+    import cv2
+
+    log, maps = source.name, source.color_maps
+    where = f"{log}: {source.color} at {stamp_ns} ns"
+    data, color_format = color_bytes(color, where)
+    _check_size(where, encoded_size(data) or (0, 0), source.camera)
+    if maps is not None:
+        image = decode_image(data, cv2.IMREAD_COLOR)
+        if image is None:
+            raise DuagError(f"{where}: no decoder reads it, expected a colour image")
+        data = cv2.imencode(".png", cv2.remap(image, *maps, cv2.INTER_LINEAR))[1].tobytes()
+        color_format = "png"
+    where = f"{log}: {source.depth} at {stamp_ns} ns"
+    values: NDArray[Any] = depth_values(depth, where)
+    _check_size(where, (values.shape[1], values.shape[0]), source.depth_camera.camera)
+    if source.depth_maps is not None:
+        values = cv2.remap(values, *source.depth_maps, cv2.INTER_NEAREST)
+    if source.keeps_depth and values.dtype == np.uint16:
+        return Picture(data, color_format, np.asarray(values, dtype=np.uint16)), 0
+    metres = in_metres(values, source.settings.depth_scale)
+    if source.T_color_depth is not None:
+        metres = register_depth(metres, source.depth_camera.camera, source.T_color_depth, source.camera)
+    units = np.rint(metres / source.depth_scale)
+    raw = np.where(units <= FARTHEST, units, 0).astype(np.uint16)
+    return Picture(data, color_format, raw), int((units > FARTHEST).sum())
+
+
+def _check_size(where: str, found: tuple[int, int], camera: PinholeCamera) -> None:
+    if found != (camera.width, camera.height):
+        raise DuagError(
+            f"{where} is {found[0]}x{found[1]}, expected {camera.width}x{camera.height} as in its CameraInfo"
+        )
 
 
 def _truth_lag(source: RobotLog) -> dict[str, float]:
@@ -175,8 +210,9 @@ class _Readings:
         self._stamps = np.concatenate([imu, odometry])
         self._order = np.argsort(self._stamps, kind="stable")
         self._imu_count, self._next, self._shift_ns = len(imu), 0, source.shift_ns
+        self._T_color_camera = source.T_color_camera
         if self._imu:
-            robot.set_imu(self._imu.T_color_imu)
+            robot.set_imu(se3.inverse(self._T_color_camera) @ self._imu.T_color_imu)
 
     def write_until(self, stamp_ns: int) -> None:
         """Write what was measured before a time."""
@@ -187,5 +223,6 @@ class _Readings:
                 self._robot.add_imu(stamp, values[:3], values[3:])
             elif self._odometry:
                 T_odometry_body = self._odometry.body.T_world_body[k - self._imu_count]
-                self._robot.add_odometry(stamp, T_odometry_body @ self._odometry.T_body_color)
+                T_odometry_color = T_odometry_body @ self._odometry.T_body_color
+                self._robot.add_odometry(stamp, T_odometry_color @ self._T_color_camera)
             self._next += 1

@@ -34,13 +34,14 @@ from converters.derived_depth import (
     png,
     spread,
 )
-from converters.image_files import options_of, read_text
+from converters.image_files import options_of
 from converters.logs import open_log
 from converters.logs.files import Entry, Log
 from converters.logs.gather import gathered, nearest
 from converters.stereo import RawCamera, StereoOptions, StereoRig
 from pipeline import numeric
 from pipeline.errors import DuagError
+from pipeline.files import read_text
 from pipeline.geometry import se3, so3
 from pipeline.progress import track
 

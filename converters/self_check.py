@@ -33,6 +33,10 @@ class ReprojectionCheck:
         self._residuals: list[NDArray[np.float64]] = []
         self._depths: list[NDArray[np.float64]] = []
 
+    def needs(self, index: int, T_world_camera: NDArray[np.float64] | None) -> bool:
+        """Whether frame `index` is compared with another."""
+        return T_world_camera is not None and (index in self._second or index in self._second.values())
+
     def add(
         self, index: int, depth_m: NDArray[np.float64], T_world_camera: NDArray[np.float64] | None
     ) -> None:

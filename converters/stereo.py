@@ -12,6 +12,7 @@ sigma_z = z^2 sigma_d / (f b). Everything here is OpenCV, arrays in and arrays o
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -133,6 +134,55 @@ class StereoRig:
         focal, u0, v0 = float(P_left[0, 0]), float(P_left[0, 2]), float(P_left[1, 2])
         camera = PinholeCamera(*size, focal, focal, u0, v0)
         return StereoRig(camera, -P_right[0, 3] / P_right[0, 0], options, (maps[0], maps[1]), R_left)
+
+    @staticmethod
+    def rectified(
+        left: PinholeCamera,
+        right: PinholeCamera,
+        baseline_m: float,
+        where: str,
+        options: StereoOptions | None = None,
+    ) -> StereoRig:
+        """A pair whose images are rectified already.
+
+        Raises:
+            DuagError: the cameras differ, or the right one is not to the right.
+        """
+        if left != right or not baseline_m > 0:
+            raise DuagError(
+                f"{where}: rectified cameras {left} and {right}, base line {baseline_m:g} m, expected the same "
+                "camera twice and a positive base line"
+            )
+        return StereoRig(left, baseline_m, options)
+
+    @staticmethod
+    def projected(
+        left: RawCamera,
+        right: RawCamera,
+        R: Sequence[Array],
+        P: Sequence[Array],
+        where: str,
+        options: StereoOptions | None = None,
+    ) -> StereoRig:
+        """A pair with the rectification of a CameraInfo: R [3, 3] and P [3, 4] of left and right."""
+        import cv2
+
+        a, b = (
+            PinholeCamera(
+                left.width, left.height, *(float(p[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+            )
+            for p in P
+        )
+        rig = StereoRig.rectified(a, b, -float(P[1][0, 3]) / float(P[1][0, 0]), where, options)
+        model: Any = cv2.fisheye if left.fisheye else cv2
+        size, turns = (left.width, left.height), [np.asarray(r, dtype=np.float64).reshape(3, 3) for r in R]
+        maps = [
+            model.initUndistortRectifyMap(
+                c.K, np.array(c.distortion or (0.0,) * 4), turn, p[:3, :3], size, cv2.CV_32FC1
+            )
+            for c, turn, p in zip((left, right), turns, P, strict=True)
+        ]
+        return StereoRig(a, rig.baseline_m, options, (maps[0], maps[1]), turns[0])
 
     def rectify_left(self, image: Image) -> Image:
         """A left image, grey or colour, as the rectified camera sees it."""

@@ -13,6 +13,8 @@ from pipeline.errors import DuagError, closest
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
+LEFT, RIGHT = ("left", "infra1", "cam0"), ("right", "infra2", "cam1")
 REGISTERED = ("aligned_depth_to_color", "depth_registered", "registered", "aligned")
 
 
@@ -50,18 +52,39 @@ class Chooser:
             t: log.first(t) for t in log.of_type(*IMAGE_TYPES, below=self.namespace)
         }
         self.infos = log.of_type(INFO_TYPE, below=self.namespace)
+        self.clouds = log.of_type(POINTS_TYPE, below=self.namespace)
 
     def color(self) -> Choice:
         """Images that are not depth, and are not named so."""
         found = [t for t, m in self.images.items() if not is_depth(m) and "depth" not in t.lower()]
-        return self._one("color", found, ("color", "rgb"))
+        left = LEFT if self._wanted.get("depth_from") == "stereo" else ()
+        return self._one("color", found, (*left, "color", "rgb"))
 
     def depth(self) -> Choice:
-        """Images that say that they are depth; mono16 may be infrared and counts only where nothing else does."""
+        """Images that say that they are depth; mono16 may be infrared and counts only where nothing else does.
+
+        Where depth comes from elsewhere (`depth_from`): the right images, or the points of a LiDAR.
+        """
+        source = self._wanted.get("depth_from")
+        if source == "stereo":
+            left = self.color().topic
+            others = [t for t, m in self.images.items() if t != left and not is_depth(m)]
+            return self._one("depth", [t for t in others if "depth" not in t.lower()], RIGHT, "right")
+        if source == "lidar":
+            return self._one("depth", self.clouds, (), "point", self.clouds)
         found = [t for t, m in self.images.items() if is_depth(m)]
         sure = [t for t in found if getattr(self.images[t], "encoding", "") != "mono16"]
         choice = self._one("depth", sure or found, REGISTERED)
         lost = [t for t, m in self.images.items() if "depth" in t.lower() and not is_depth(m)]
+        if not choice.topic and not choice.candidates and self.clouds:
+            choice = replace(choice, why=f"{choice.why}, but there are points (depth_from=lidar)")
+        sides = [
+            [t for t in self.images if any(hint in t.lower() for hint in hints)] for hints in (LEFT, RIGHT)
+        ]
+        if not choice.topic and not choice.candidates and all(sides):
+            choice = replace(
+                choice, why=f"{choice.why}, but there are left and right ones (depth_from=stereo)"
+            )
         if choice.topic or not lost:
             return choice
         return replace(
@@ -79,10 +102,21 @@ class Chooser:
             return Choice("", f"{image_topic} has CameraInfo on {names}", tuple(self.infos))
         return Choice(best[0], "its name shares most with that of the images", tuple(self.infos))
 
-    def _one(self, kind: str, found: Sequence[str], hints: Sequence[str]) -> Choice:
-        """The topic that was told, the only one, or the only one with the first hint that decides."""
+    def _one(
+        self,
+        kind: str,
+        found: Sequence[str],
+        hints: Sequence[str],
+        called: str = "",
+        known: Sequence[str] = (),
+    ) -> Choice:
+        """The topic that was told, the only one, or the only one with the first hint that decides.
+
+        kind: the option. called: what kind of images these are, if not that. known: what may be told, if not images.
+        """
         if self._wanted.get(kind):
-            return self._told(kind, list(self.images))
+            return self._told(kind, known or list(self.images))
+        kind = called or kind
         found = [
             t for t in found if t.rpartition("/")[0] not in found
         ]  # "/image/compressed" repeats "/image"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from array import array
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -12,17 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from converters.logs.choice import Chooser
+from converters.logs.choice import POINTS_TYPE, Chooser
 from converters.logs.clocks import compare, overlap_warnings
 from converters.logs.files import NANOSECONDS, SUFFIXES, Log, open_log
 from converters.logs.motion import IMU_TYPE, POSE_TYPES
 from converters.logs.robot_log import RobotLog
-from converters.logs.sources import Source, is_log, sources_of
+from converters.logs.sources import Source, is_log, robot_of, sources_of
 from pipeline.errors import DuagError
+from pipeline.progress import track
 from pipeline.recording.names import LIBRARY, MAGIC, RECORDING_FILE
-from pipeline.recording.read import parsing
 
-POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
 HEADERS_FIRST, HEADERS_EACH = (
     100,
     20,
@@ -55,8 +53,7 @@ def describe(src: Path) -> dict[str, Any]:
     """
     logs: dict[str, Any] = {}
     robots: dict[str, Any] = {}
-    with parsing(src):
-        sources = list(_robots(src))
+    sources = list(_robots(src))
     clocks = []
     opened = []
     try:
@@ -88,8 +85,7 @@ def _robots(src: Path) -> Iterator[Source]:
         with open_log(source.paths, source.name) as log:
             spaces = [] if src.suffix == ".toml" else namespaces(log)
         for space in spaces:
-            name = re.sub(r"[^a-z0-9_]", "_", space.lower().strip("/"))
-            yield replace(source, robot=name if name[:1].isalpha() else f"robot_{name}", namespace=space)
+            yield replace(source, robot=robot_of(space), namespace=space)
         if not spaces:
             yield source
 
@@ -112,7 +108,8 @@ def _log(log: Log) -> dict[str, Any]:
     times: dict[str, array[int]] = {name: array("q") for name in log.topics}
     delays: dict[str, list[int]] = {name: [] for name in log.topics}
     publish = False
-    for entry in log.entries(*log.topics):
+    messages = sum(topic.count for topic in log.topics.values())
+    for entry in track(log.entries(*log.topics), f"read {Path(log.name).name}", messages):
         seen = times[entry.topic]
         publish |= entry.publish_ns is not None
         if len(seen) < HEADERS_FIRST or len(seen) % HEADERS_EACH == 0:
@@ -185,7 +182,7 @@ def _robot(log: Log, source: Source) -> tuple[RobotLog | None, dict[str, Any]]:
         color, depth = chooser.color(), chooser.depth()
         choices = {"color": color, "depth": depth}
         for option, image in (("color_info", color), ("depth_info", depth)):
-            if image.topic:
+            if image.topic in chooser.images:
                 choices[option] = chooser.info(option, image.topic)
         out["choices"] = {
             k: {"topic": c.topic, "why": c.why, "candidates": c.candidates} for k, c in choices.items()
@@ -194,6 +191,8 @@ def _robot(log: Log, source: Source) -> tuple[RobotLog | None, dict[str, Any]]:
         out["frames"] = len(robot_log.pairs)
         moved = robot_log.T_color_depth is not None
         out["depth"] = "moved into the colour camera" if moved else "registered to colour already"
+        if robot_log.derived:
+            out["depth"] = robot_log.derived.words
         out["warnings"] = robot_log.warnings
     except DuagError as error:
         robot_log, problem = None, str(error)

@@ -50,7 +50,9 @@ def as_ros(schema: str, message: Any, where: str) -> Any:
     try:
         return _MAKERS[schema](message)
     except (AttributeError, TypeError, ValueError, KeyError, binascii.Error) as error:
-        raise DuagError(f"{where} holds a {schema} that cannot be read ({error})") from error
+        raise DuagError(
+            f"{where} holds a {schema} that cannot be read ({' '.join(str(error).split())})"
+        ) from error
 
 
 class JsonFields:

@@ -29,9 +29,7 @@ class Transforms:
         self._log = log
         topics = log.of_type(*TF_TYPES)
         own = [t for t in topics if t.startswith(f"{namespace}/") or t.count("/") == 1]
-        own.sort(
-            key=lambda t: t.startswith(f"{namespace}/") and t.count("/") > 1
-        )  # the robot's own word counts last
+        own.sort(key=lambda t: t.count("/") > 1)  # the robot's own word counts last
         self._static_topics = [t for t in own if t.endswith("tf_static")]
         self._other_topics = [t for t in own if not t.endswith("tf_static")]
         self._known = self._read(self._static_topics)
@@ -72,6 +70,11 @@ class Transforms:
             T = self._search(frame_name(target), frame_name(source))
         return T
 
+    def moving_words(self) -> str:
+        """What to add to a complaint that frames are not tied: those that are tied by what moves."""
+        some = ", ".join(f"{parent} to {child}" for parent, child in sorted(self.moving)[:3])
+        return f" (what changes is no extrinsic: {some})" if some else ""
+
     def _search(self, target: str, source: str) -> Array | None:
         reached = {target: np.eye(4)}
         queue = [target]
@@ -97,6 +100,6 @@ def pose_matrix(position: Any, orientation: Any, where: str) -> Array:
         DuagError: the quaternion is no rotation.
     """
     q = np.array([orientation.w, orientation.x, orientation.y, orientation.z], dtype=np.float64)
-    if not np.isfinite(q).all() or abs(np.linalg.norm(q) - 1) > 0.01:
+    if not np.isfinite(q).all() or np.abs(q).max() > 2 or abs(np.linalg.norm(q) - 1) > 0.01:
         raise DuagError(f"{where}: quaternion wxyz {q.tolist()}, expected one of length 1")
     return np.asarray(se3.from_quat_translation(q, np.array([position.x, position.y, position.z])))

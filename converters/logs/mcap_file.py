@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -15,12 +16,12 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from converters.logs import foxglove
 from converters.logs.files import Entry, Topic, ros_type, stamp_ns
-from converters.logs.rosbag_file import deserialised, ros_header_ns
+from converters.logs.rosbag_file import LARGEST_CHUNK, deserialised, reading, reason, ros_header_ns
 from pipeline.errors import DuagError
+from pipeline.files import check_file
 from pipeline.recording.names import MAGIC
-from pipeline.recording.read import parsing
 
-LARGEST_CHUNK = 1 << 30  # bytes, unpacked
+WANTED = "a sound MCAP log"
 
 
 class McapFile:
@@ -30,7 +31,8 @@ class McapFile:
         self.path = path
         self.topics: dict[str, Topic] = {}
         self._decoders: dict[int, _Decoder] = {}
-        with parsing(path):
+        check_file(path, WANTED)
+        with reading(path, WANTED):
             self._stream = path.open("rb")
             try:
                 self._open()
@@ -145,7 +147,7 @@ class McapFile:
                 yield self._channels[record.channel_id], record
 
     def entries(self, topics: Sequence[str]) -> Iterator[Entry]:
-        with parsing(self.path):
+        with reading(self.path, WANTED):
             for channel, m in self._messages(topics):
                 where = f"{self.path}: {channel.topic}"
                 decoder = self._decoders[channel.id]
@@ -181,12 +183,25 @@ class _Ros:
         """Understood when the first message is read: definitions that nobody needs may be beyond the parser."""
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-        store = get_typestore(Stores.EMPTY)
         text = self.schema.data.decode()
-        if self.schema.encoding == "ros2idl":
-            store.register(get_types_from_idl(text))
-        else:
+        if not text.strip():  # a recorder that had no definitions at hand
+            return get_typestore(Stores.ROS2_HUMBLE if self.encoding == "cdr" else Stores.ROS1_NOETIC)
+        store = get_typestore(Stores.EMPTY)
+        if self.schema.encoding != "ros2idl":
             store.register(get_types_from_msg(text, self.type))
+            return store
+        line = "=" * 80 + "\n"
+        parts = (
+            [part.split("\n", 1)[1] for part in text.split(line)[1:]]
+            if text.startswith(f"{line}IDL: ")
+            else [text]
+        )
+        types: dict[str, Any] = {}
+        for part in parts:
+            types.update(
+                get_types_from_idl(re.sub(r"(?m)^\s*#.*$", "", part))
+            )  # its parser knows no #include
+        store.register(types)
         return store
 
     def read(self, data: bytes, where: str) -> Any:
@@ -194,7 +209,9 @@ class _Ros:
             try:
                 store = self._store()
             except Exception as error:  # whatever a broken definition provokes in the parser
-                raise DuagError(f"{where}: the definition of {self.type} cannot be read ({error})") from error
+                raise DuagError(
+                    f"{where}: the definition of {self.type} cannot be read ({reason(error)})"
+                ) from error
             self._deserialise = store.deserialize_cdr if self.encoding == "cdr" else store.deserialize_ros1
         message = deserialised(self._deserialise, data, self.type, where)
         return foxglove.as_ros(foxglove.plain_name(self.schema.name), message, where)
@@ -222,7 +239,7 @@ class _Foxglove:
                 message = schemas.message_class(self.name).FromString(data)
         except Exception as error:  # protobuf's DecodeError, broken JSON, broken text
             raise DuagError(
-                f"{where} holds {len(data)} bytes that are no {self.name} in {self.encoding} ({error})"
+                f"{where} holds {len(data)} bytes that are no {self.name} in {self.encoding} ({reason(error)})"
             ) from error
         return foxglove.as_ros(self.name, message, where)
 

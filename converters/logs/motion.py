@@ -14,6 +14,7 @@ from converters.logs.options import LogOptions
 from converters.tum_layout import Poses
 from pipeline.errors import DuagError, closest
 from pipeline.geometry import se3
+from pipeline.recording.motion import GyroPrior, MotionPrior, OdometryPrior
 
 Array = NDArray[np.float64]
 POSE_TYPES = (
@@ -33,6 +34,10 @@ class Imu:
     values: Array
     T_color_imu: Array
 
+    def prior(self) -> MotionPrior:
+        """How the colour camera turned."""
+        return GyroPrior(self.stamps_ns.tolist(), self.values[:, :3] @ self.T_color_imu[:3, :3].T)
+
 
 @dataclass(frozen=True)
 class CameraPoses:
@@ -45,6 +50,10 @@ class CameraPoses:
         """Pose [4, 4] of the colour camera at a time; None where there is none near."""
         T = self.body.at(stamp_ns, max_gap_s)
         return None if T is None else T @ self.T_body_color
+
+    def prior(self) -> MotionPrior:
+        """How the colour camera moved."""
+        return OdometryPrior(self.body.stamps_ns.tolist(), self.body.T_world_body @ self.T_body_color)
 
 
 class MotionReader:

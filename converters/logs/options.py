@@ -6,20 +6,23 @@ from typing import Literal
 
 from pydantic import Field
 
+from converters.stereo import StereoOptions
 from converters.tum_layout import AssociationOptions
 
 
-class LogOptions(AssociationOptions):
+class LogOptions(AssociationOptions, StereoOptions):
     """Topics, times and cameras; whatever is empty is found by type and name."""
 
     color: str = ""
     """Topic of the colour images."""
+    depth_from: Literal["image", "stereo", "lidar"] = "image"
+    """Where depth comes from: depth images, a stereo pair with colour as its left eye, or points of a LiDAR."""
     depth: str = ""
-    """Topic of the depth images."""
+    """Topic of the depth images; of the right images, or of the points, by `depth_from`."""
     color_info: str = ""
     """Topic of the colour camera's CameraInfo."""
     depth_info: str = ""
-    """Topic of the depth camera's CameraInfo."""
+    """Topic of the depth camera's CameraInfo, or the right camera's."""
     imu: str = ""
     """Topic of an IMU on the robot; its turning rates help tracking. None if empty."""
     odometry: str = ""
@@ -30,17 +33,21 @@ class LogOptions(AssociationOptions):
     truth_frame: str = ""
     """Frame that the true poses are of; by default what the message says, which /tf_static must tie to the camera."""
     namespaces: str = ""
-    """Namespaces of several robots in one bag, separated by commas, for example "/acl_jackal,/sparkal1"."""
+    """Namespaces of several robots in one log, separated by commas, for example "/acl_jackal,/sparkal1"; they name the
+    robots."""
     registered: Literal["auto", "yes", "no"] = "auto"
     """Whether depth is seen from the colour camera; auto: by name of the topic, frame and camera."""
     T_color_depth: str = ""
-    """Extrinsics "x y z qw qx qy qz" (m) of a depth camera that /tf_static does not know; x_color = T x_depth."""
+    """Extrinsics "x y z qw qx qy qz" (m) of a depth camera, right camera or LiDAR that /tf_static does not know;
+    x_color = T x_depth."""
     T_color_imu: str = ""
     """Extrinsics of the IMU, likewise, where /tf_static does not know them."""
     T_body_color: str = ""
     """Pose of the colour camera in the body that odometry and true poses are of, likewise."""
     depth_scale: float = Field(default=0.001, gt=0)
     """Metres per unit of 16-bit depth."""
+    range_sigma_m: float = Field(default=0.03, gt=0)
+    """Standard deviation of the LiDAR's ranges."""
     time_source: Literal["header", "log", "publish"] = "header"
     """Times of the headers, those of recording, or those of publication (which only MCAP knows)."""
     clock_offset_s: float = Field(default=0.0, allow_inf_nan=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from converters.logs.choice import REGISTERED, Chooser
 from converters.logs.clocks import RobotClock
+from converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
 from converters.logs.files import NANOSECONDS, Entry, Log
 from converters.logs.frames import Transforms, pose_matrix
+from converters.logs.gather import gathered
 from converters.logs.motion import CameraPoses, Imu, MotionReader, extrinsics_of
 from converters.logs.options import LogOptions
 from converters.ros_images import RosCamera, is_integer_depth, size_of
@@ -22,8 +24,35 @@ from pipeline.errors import DuagError
 from pipeline.geometry import se3
 
 Array = NDArray[np.float64]
+LATEST_NS = 1 << 62  # 146 years
+HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
 RECTIFIED = ("image_rect", "image_rect_color", "rect")
+SAME_CAMERA_PX = 1.0  # up to which a camera has not changed
 OUT_SCALE = 0.0005  # metres per unit of depth that was registered or came as floats
+
+
+class _Cameras:
+    """Watches that what a CameraInfo says does not change: a camera of the recording is one camera."""
+
+    def __init__(self, first: Mapping[str, tuple[RosCamera, bool]], name: str) -> None:
+        self._first, self._name = first, name
+        self._seen: dict[str, bytes] = {}
+
+    def see(self, entry: Entry) -> None:
+        """Compare a message with the first one. Raises DuagError where the difference can be seen in images."""
+        rest = entry.data[16:]  # in ROS what follows the times of the header, most often the same bytes
+        if self._seen.get(entry.topic) == rest:
+            return
+        self._seen[entry.topic] = rest
+        first, rectified = self._first[entry.topic]
+        where = f"{self._name}: {entry.topic}"
+        now = RosCamera.of(entry.read(), rectified, where)
+        a, b = (np.array([c.camera.fx, c.camera.fy, c.camera.cx, c.camera.cy]) for c in (first, now))
+        if np.abs(a - b).max() > SAME_CAMERA_PX or first.distortion != now.distortion:
+            raise DuagError(
+                f"{where} changes at {entry.log_ns} ns from fx fy cx cy = {a.round(2).tolist()} px to "
+                f"{b.round(2).tolist()}, expected one camera (a zoom or autofocus has to be fixed while recording)"
+            )
 
 
 class RobotLog:
@@ -37,9 +66,10 @@ class RobotLog:
         self.log, self.namespace, self.settings = log, namespace.rstrip("/"), settings
         self.name = log.name
         self.warnings: list[str] = []
-        self.shift_ns = round(
-            settings.clock_offset_s * NANOSECONDS
-        )  # added to all times when they are written
+        # added to all times when they are written
+        self.shift_ns = round(settings.clock_offset_s * NANOSECONDS)
+        # by topic of a CameraInfo: the camera as first told, and whether its images are rectified
+        self._cameras: dict[str, tuple[RosCamera, bool]] = {}
         self.transforms = Transforms(log, self.namespace)
         self._choose()
 
@@ -52,18 +82,66 @@ class RobotLog:
         self.depth = chooser.depth().required(self.log, "depth")
         self.color = chooser.color().required(self.log, "color")
         self.color_camera = self._camera(self.color, "color_info", chooser)
-        self.depth_camera = self._camera(self.depth, "depth_info", chooser)
-        self.T_color_depth = self._extrinsics()
-        kept = is_integer_depth(chooser.images[self.depth]) and self.T_color_depth is None
-        self.depth_scale = s.depth_scale if kept else OUT_SCALE
         self._motion = MotionReader(self.log, s, self.transforms, self.color_camera.frame_id, self.time_ns)
         self.truth: CameraPoses | None = self._motion.poses(s.truth, "truth") if s.truth else None
+        self.T_color_depth: Array | None = None
+        self.derived = self._derived(chooser) if s.depth_from != "image" else None
+        if self.derived:
+            self.camera, self.depth_scale = self.derived.camera, self.derived.scale
+            return
+        self.camera = self.color_camera.camera
+        self.depth_camera = self._camera(self.depth, "depth_info", chooser)
+        self.T_color_depth = self._extrinsics()
+        self.keeps_depth = is_integer_depth(chooser.images[self.depth]) and self.T_color_depth is None
+        self.depth_scale = s.depth_scale if self.keeps_depth else OUT_SCALE
+
+    def _derived(self, chooser: Chooser) -> Derived:
+        """Depth of a stereo pair or of a LiDAR."""
+        s = self.settings
+        color = self.color, self._info(self.color, "color_info", chooser), self.color_camera
+        if s.depth_from == "stereo":
+            right = self._info(self.depth, "depth_info", chooser)
+            other = self.depth, right, self._camera(self.depth, "depth_info", chooser)
+            return stereo_of(self.log, color, other, _is_rectified(self.color), self.transforms, s)
+        if s.max_difference_s == 0:
+            self.settings = s.model_copy(update={"max_difference_s": HALF_TURN_S})
+        motion = self.odometry.prior() if self.odometry else self.imu.prior() if self.imu else None
+        if motion is None:
+            self.warnings.append(
+                "sweeps hold what the LiDAR moved meanwhile; expected --set imu=TOPIC or odometry=TOPIC to take it out"
+            )
+        camera = self.color, self.color_camera
+        return sweeps_of(self.log, camera, self.depth, self.transforms, motion, s)
+
+    @property
+    def T_color_camera(self) -> Array:  # noqa: N802 (a transform)
+        """Where the camera of the recording is in the colour camera: turned, if that is rectified."""
+        return self.derived.T_color_camera if self.derived else np.eye(4)
+
+    def depth_m(self, picture: Picture) -> Array:
+        """Depth [h, w] of a picture in metres, 0 = none."""
+        if self.derived:
+            return self.derived.depth_m(picture)
+        assert picture.depth is not None
+        return np.asarray(picture.depth, dtype=np.float64) * self.depth_scale
+
+    def check_rows(self) -> dict[str, Any]:
+        """The test of the rectification of a stereo pair; nothing for other sources of depth."""
+        if not isinstance(self.derived, Stereo):
+            return {}
+        groups = [{self.color: c, self.depth: d} for c, d in some_pairs(self.pairs)]
+        found = gathered(self.log, groups, self.time_ns)
+        return self.derived.check([(g[self.color].read(), g[self.depth].read()) for g in found])
+
+    def _info(self, topic: str, option: str, chooser: Chooser) -> str:
+        """The CameraInfo of an image topic."""
+        return chooser.info(option, topic).required(self.log, option)
 
     def _camera(self, topic: str, option: str, chooser: Chooser) -> RosCamera:
         """Camera of an image topic."""
-        chosen = chooser.info(option, topic).required(self.log, option)
-        name = PurePosixPath(topic.removesuffix("/compressedDepth").removesuffix("/compressed")).name
-        camera = RosCamera.of(self.log.first(chosen), name.startswith(RECTIFIED), f"{self.name}: {chosen}")
+        chosen = self._info(topic, option, chooser)
+        camera = RosCamera.of(self.log.first(chosen), _is_rectified(topic), f"{self.name}: {chosen}")
+        self._cameras[chosen] = (camera, _is_rectified(topic))
         found = size_of(chooser.images[topic], f"{self.name}: {topic}")
         expected = camera.camera.width, camera.camera.height
         if found != expected:
@@ -110,7 +188,8 @@ class RobotLog:
         if T is None:
             raise DuagError(
                 f"{self.name}: {self.depth} is seen from {depth.frame_id!r}, colour from {color.frame_id!r}, and "
-                "/tf_static does not tie them; expected --set T_color_depth='x y z qw qx qy qz' or registered=yes"
+                f"/tf_static does not tie them{self.transforms.moving_words()}; expected --set T_color_depth="
+                "'x y z qw qx qy qz' or registered=yes"
             )
         return T
 
@@ -140,22 +219,28 @@ class RobotLog:
     def time_ns(self, entry: Entry) -> int:
         """The time of a message by the clock that the options choose."""
         source = self.settings.time_source
+        at = entry.log_ns if source == "log" else entry.publish_ns
         if source == "header":
-            return entry.header_ns()
-        if source == "log":
-            return entry.log_ns
-        if entry.publish_ns is None:
+            at = entry.header_ns()
+        if at is None:
             raise DuagError(
                 f"{self.name}: bags of ROS hold no times of publication, expected time_source=header or log"
             )
-        return entry.publish_ns
+        if not 0 <= at < LATEST_NS or not 0 <= entry.log_ns < LATEST_NS:
+            found = f"{self.name}: {entry.topic} has the times {at} and {entry.log_ns} ns"
+            raise DuagError(f"{found}, expected 0 to {LATEST_NS}")
+        return at
 
     @cached_property
     def pairs(self) -> dict[int, int]:
         """Time of a colour image -> time of its depth image."""
         stamps: dict[str, list[int]] = {self.color: [], self.depth: []}
         delays = []
-        for entry in self.log.entries(self.color, self.depth):
+        cameras = _Cameras(self._cameras, self.name)
+        for entry in self.log.entries(self.color, self.depth, *self._cameras):
+            if entry.topic in self._cameras:
+                cameras.see(entry)
+                continue
             stamps[entry.topic].append(self.time_ns(entry))
             delays.append(entry.log_ns - stamps[entry.topic][-1])
         self._delays_ns = np.array(delays, dtype=np.int64)
@@ -195,32 +280,22 @@ class RobotLog:
 
     def frames(self) -> Iterator[tuple[int, Any, Any]]:
         """Time, colour and depth message of every pair, in order of time; holds no more than it must."""
-        pairs = self.pairs
-        used_by: dict[int, list[int]] = {}
-        for color_ns, depth_ns in pairs.items():
-            used_by.setdefault(depth_ns, []).append(color_ns)
-        colors: dict[int, Any] = {}
-        depths: dict[int, Any] = {}
-        order = sorted(pairs)
-        at = 0
-        for entry in self.log.entries(self.color, self.depth):
-            stamp = self.time_ns(entry)
-            if entry.topic == self.color and stamp in pairs:
-                colors.setdefault(stamp, entry)
-            elif entry.topic == self.depth and stamp in used_by:
-                depths.setdefault(stamp, entry)
-            while at < len(order) and order[at] in colors and pairs[order[at]] in depths:
-                color_ns, depth_ns = order[at], pairs[order[at]]
-                yield color_ns, colors.pop(color_ns).read(), depths[depth_ns].read()
-                used_by[depth_ns].remove(color_ns)
-                if not used_by[depth_ns]:
-                    del depths[depth_ns]
-                at += 1
+        order = sorted(self.pairs)
+        groups = [{self.color: time, self.depth: self.pairs[time]} for time in order]
+        for time, found in zip(order, gathered(self.log, groups, self.time_ns), strict=False):
+            yield time, found[self.color].read(), found[self.depth].read()
 
     def sensors(self) -> dict[str, str]:
         """What the log says about its source."""
         moved = "registered to colour by the converter" if self.T_color_depth is not None else "registered"
+        moved = self.derived.words if self.derived else moved
         return {"color_topic": self.color, "depth_topic": self.depth, "depth": moved}
+
+
+def _is_rectified(topic: str) -> bool:
+    """Whether images are undistorted, by the name of their topic."""
+    name = PurePosixPath(topic.removesuffix("/compressedDepth").removesuffix("/compressed")).name
+    return name.startswith(RECTIFIED)
 
 
 def nearest_s(times_ns: list[int], others_ns: list[int]) -> float:

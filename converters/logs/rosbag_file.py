@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,27 +12,30 @@ from typing import Any
 from converters.logs import foxglove
 from converters.logs.files import NANOSECONDS, Entry, Topic, stamp_ns
 from pipeline.errors import DuagError
+from pipeline.files import check_file
+
+LARGEST_CHUNK = 256 << 20  # bytes, unpacked; recorders write some megabytes
 
 
 class RosBag:
     """A bag, read by rosbags. Bags of ROS 2 without types are read with those of Humble."""
 
     def __init__(self, path: Path) -> None:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
+        from rosbags.rosbag1 import Reader as Reader1
         from rosbags.typesys import Stores, get_typestore
 
         self.path = path
-        try:
+        hint = "; `rosbag reindex` mends one that was cut short" if path.suffix == ".bag" else ""
+        wanted = f"a bag of ROS 1 or ROS 2{hint}"
+        for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+            check_file(file, wanted)
+        with reading(path, wanted):
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
-        except AnyReaderError as error:
-            hint = "; `rosbag reindex` mends one that was cut short" if path.suffix == ".bag" else ""
-            reason = " ".join(str(error).rstrip(".").split())
-            raise DuagError(f"{path}: {reason}, expected a bag of ROS 1 or ROS 2{hint}") from error
-        except Exception as error:  # whatever a broken bag provokes in the reader
-            raise DuagError(
-                f"{path}: {type(error).__name__} {error}, expected a bag of ROS 1 or ROS 2"
-            ) from error
+            for reader in self._reader.readers:
+                if isinstance(reader, Reader1):
+                    _bound_chunks(reader)
         self._encoding = "cdr" if self._reader.is2 else "ros1"
         self.topics: dict[str, Topic] = {}
         for c in self._reader.connections:
@@ -43,12 +47,13 @@ class RosBag:
         connections = [c for c in self._reader.connections if c.topic in topics]
         if not connections:
             return
-        for connection, log_ns, raw in self._reader.messages(connections=connections):
-            read = partial(self._read, connection, raw)
-            header = partial(ros_header_ns, raw, self._encoding, f"{self.path}: {connection.topic}")
-            if foxglove.plain_name(connection.msgtype) in foxglove.ROS_TYPES:
-                header = partial(_stamp_of, read)
-            yield Entry(connection.topic, log_ns, None, raw, read, header)
+        with reading(self.path, "a sound bag of ROS 1 or ROS 2"):
+            for connection, log_ns, raw in self._reader.messages(connections=connections):
+                read = partial(self._read, connection, raw)
+                header = partial(ros_header_ns, raw, self._encoding, f"{self.path}: {connection.topic}")
+                if foxglove.plain_name(connection.msgtype) in foxglove.ROS_TYPES:
+                    header = partial(_stamp_of, read)
+                yield Entry(connection.topic, log_ns, None, raw, read, header)
 
     def _read(self, connection: Any, raw: bytes) -> Any:
         where = f"{self.path}: {connection.topic}"
@@ -59,24 +64,56 @@ class RosBag:
         self._reader.close()
 
 
+def _bound_chunks(reader: Any) -> None:
+    """Let no chunk of a bag of ROS 1 unpack into more than memory."""
+    import bz2
+
+    import lz4.frame
+
+    def bounded(unpack: Any) -> Any:
+        opener = {
+            bz2.decompress: bz2.BZ2Decompressor,
+            lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
+        }.get(unpack)
+        if opener is None:
+            return unpack
+
+        def decompress(data: bytes) -> bytes:
+            stream = opener()
+            out = bytes(stream.decompress(data, LARGEST_CHUNK))
+            if not stream.eof:
+                raise ValueError(f"a chunk that is broken, or unpacks to more than {LARGEST_CHUNK} bytes")
+            return out
+
+        return decompress
+
+    reader.chunks = {
+        at: chunk._replace(decompressor=bounded(chunk.decompressor)) for at, chunk in reader.chunks.items()
+    }
+
+
+@contextmanager
+def reading(path: Path, expected: str) -> Iterator[None]:
+    """Turn whatever a reader stumbles over in a broken file into one line."""
+    try:
+        yield
+    except (DuagError, GeneratorExit):
+        raise
+    except Exception as error:
+        raise DuagError(f"{path}: {reason(error)}, expected {expected}") from error
+
+
+def reason(error: Exception) -> str:
+    """What an error says, on one line; its kind if it says nothing."""
+    return " ".join(str(error).rstrip(".").split())[:200] or type(error).__name__
+
+
 def deserialised(read: Any, raw: bytes, kind: str, where: str) -> Any:
     """A message of ROS from its bytes, or an error that names its topic."""
-    from rosbags.highlevel import AnyReaderError
-
     try:
         return read(raw, kind)
-    except (
-        AnyReaderError,
-        AssertionError,
-        ValueError,
-        IndexError,
-        KeyError,
-        struct.error,
-        UnicodeDecodeError,
-    ) as error:
-        raise DuagError(
-            f"{where} holds {len(raw)} bytes that are no {kind} ({type(error).__name__})"
-        ) from error
+    except Exception as error:  # whatever broken bytes provoke
+        raise DuagError(f"{where} holds {len(raw)} bytes that are no {kind} ({reason(error)})") from error
 
 
 def ros_header_ns(raw: bytes, encoding: str, where: str) -> int:

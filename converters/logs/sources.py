@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from converters.base import robot_names
-from converters.image_files import options_of, read_text
+from converters.image_files import options_of
 from converters.logs.files import SUFFIXES
 from converters.logs.options import LogOptions
 from pipeline.errors import DuagError, closest
+from pipeline.files import check_file, read_text
 from schemas import topics
 
 GROUPING = ("namespaces", "pieces")  # options that say which logs are whose, which a TOML file does itself
@@ -61,8 +62,18 @@ def sources_of(src: Path, options: Mapping[str, Any]) -> list[Source]:
     else:
         groups = _groups(src)
         parts = [(paths, "", label if len(groups) > 1 else "") for label, paths in groups.items()]
-    names = robot_names(len(parts))
+    names = [robot_of(space) for space in spaces] or robot_names(len(parts))
+    if len(set(names)) < len(names):
+        raise DuagError(
+            f"{src}: namespaces {', '.join(spaces)} name a robot twice, expected different robots"
+        )
     return [Source(name, *part, settings) for name, part in zip(names, parts, strict=True)]
+
+
+def robot_of(namespace: str) -> str:
+    """The name of a robot by its namespace: "/Husky-1" is husky_1."""
+    name = re.sub(r"[^a-z0-9_]", "_", namespace.lower().strip("/"))
+    return name if name[:1].isalpha() else f"robot_{name}"
 
 
 def _from_file(path: Path, options: Mapping[str, Any]) -> list[Source]:
@@ -121,6 +132,8 @@ def _groups(src: Path) -> dict[str, tuple[Path, ...]]:
         raise DuagError(f"{src}: no such file or folder, expected a log")
     if src.is_file() and src.suffix not in SUFFIXES:
         raise DuagError(f"{src}: is no log, expected one of {', '.join(SUFFIXES)}")
+    if not src.is_dir():
+        check_file(src, "a log")
     if is_log(src):
         return {src.name: (src,)}
     groups = {}

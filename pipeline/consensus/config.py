@@ -6,6 +6,8 @@ from pydantic import Field
 
 from pipeline.config import Config
 
+WeightKind = Literal["uniform", "observation_count", "residual_magnitude", "scalar", "diagonal", "block"]
+
 
 class ClosureConfig(Config):
     """Trust in single closures and in their mutual agreement."""

@@ -47,6 +47,10 @@ class FisherSums(Protocol):
         """[n]."""
 
     @property
+    def observations(self) -> NDArray[Any]:
+        """[n], views that saw the Gaussian."""
+
+    @property
     def deviation_m(self) -> NDArray[Any]:
         """[n]."""
 
@@ -203,18 +207,26 @@ class Evidence:
 
 def _sums_of(gaussians: Gaussians, information: FisherSums | None) -> tuple[Array, NDArray[np.int64]]:
     """The block diagonal of the sums [n, 31] in the map frame, by Gaussian, and the row of each there, -1 without."""
-    packed, rows = np.zeros((len(gaussians), 31)), np.full(len(gaussians), -1, dtype=np.int64)
-    if information is not None and len(information.ids):
-        order = np.argsort(information.ids, kind="stable")
-        at = np.minimum(np.searchsorted(information.ids[order], gaussians.ids), len(order) - 1)
-        found = information.ids[order[at]] == gaussians.ids
-        row = rows[found] = order[at[found]]
-        geometry = unpack_symmetric(information.geometry[row], 9)
-        packed[found, _POSITION] = pack_symmetric(geometry[:, :3, :3])
-        packed[found, _SHAPE] = pack_symmetric(geometry[:, 3:, 3:])
-        packed[found, _COLOR] = information.color[row]
-        packed[found, _OPACITY] = information.opacity[row]
+    packed = np.zeros((len(gaussians), 31))
+    if information is None:
+        return packed, np.full(len(gaussians), -1, dtype=np.int64)
+    rows = rows_by_id(gaussians.ids, information.ids)
+    found, row = rows >= 0, rows[rows >= 0]
+    geometry = unpack_symmetric(information.geometry[row], 9)
+    packed[found, _POSITION] = pack_symmetric(geometry[:, :3, :3])
+    packed[found, _SHAPE] = pack_symmetric(geometry[:, 3:, 3:])
+    packed[found, _COLOR] = information.color[row]
+    packed[found, _OPACITY] = information.opacity[row]
     return packed, rows
+
+
+def rows_by_id(wanted: NDArray[np.int64], ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The row of each wanted id in `ids`, -1 where it is not there."""
+    if not len(ids):
+        return np.full(len(wanted), -1, dtype=np.int64)
+    order = np.argsort(ids, kind="stable")
+    at = order[np.minimum(np.searchsorted(ids[order], wanted), len(order) - 1)]
+    return np.where(ids[at] == wanted, at, -1).astype(np.int64)
 
 
 def pack_information(position: Array, shape: Array, color: Array, opacity: Array) -> Array:

@@ -24,8 +24,10 @@ from pipeline.consensus.evidence import Evidence, theta_of
 from pipeline.consensus.factors import Factors
 from pipeline.consensus.gaussians import Weights
 from pipeline.consensus.poses import with_floor
+from pipeline.consensus.weighting import own_stiffness, told
 from pipeline.errors import DuagError
 from pipeline.evaluation.results import Absent
+from pipeline.exchange.config import ExchangeConfig
 from pipeline.fusion.config import FusionConfig
 from pipeline.fusion.fuse import fuse
 from pipeline.geometry import se3
@@ -140,20 +142,22 @@ def _gaussian_gaps(
     pairs: Mapping[tuple[str, str], NDArray[np.int64]],
 ) -> Array:
     """Largest |x - x*| sqrt(diagonal of the information at x*) of each of a robot's matched Gaussians [m]."""
-    told = {name: Evidence.from_map(*_map_of(run.robots[name])) for name in members}
+    weights = _section(run, ExchangeConfig, "exchange").weights
+    evidence = {name: told(*_map_of(run.robots[name]), weights) for name in members}
     _, own, _, T_map_keyframe = mine = _map_of(run.robots[robot])
     best = fuse(
         robot,
         own,
         T_map_keyframe,
-        told,
-        Evidence.of_splats(*mine),
+        evidence,
+        own_stiffness(*mine, weights),
         central,
         pairs,
         (),
         PinholeCamera(2, 2, 1.0, 1.0, 0.5, 0.5),  # looks at nothing: what is taken over is not compared
         _section(run, FusionConfig, "fusion").model_copy(update={"coverage": "overlap"}),
         _section(run, MatchingConfig, "exchange", "matching"),
+        weights=weights,
     )
     matched = best.members[: len(own)] > 1
     theta = theta_of(run.robots[robot].fused_map.gaussians.select(slice(0, len(own))))

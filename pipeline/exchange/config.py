@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from pipeline.config import Config
-from pipeline.consensus.config import MatchingConfig, PoseConsensusConfig
+from pipeline.consensus.config import MatchingConfig, PoseConsensusConfig, WeightKind
 from pipeline.registration import RegistrationConfig
 
 
@@ -169,6 +169,9 @@ class ExchangeConfig(Config):
     """Send every Gaussian to everybody, or only those in space that the receiver's keyframes saw."""
     evidence_wire: Literal["compact", "float32", "float64"] = "compact"
     """100 bytes per Gaussian, rounded far below its uncertainty, or 188, or 364 bytes and not rounded at all."""
+    weights: WeightKind = "block"
+    """How sure a robot says it is of a Gaussian: its information, or one of the simpler kinds to compare with
+    (`docs/consensus.md`)."""
     overlap_voxel_m: float = Field(default=0.25, gt=0.0)
     """Edge of the voxels that say which space a robot saw (coverage = overlap)."""
     link: LinkConfig = LinkConfig()

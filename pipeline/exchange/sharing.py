@@ -49,7 +49,7 @@ class Sharing:
     def own_body(self) -> NDArray[Any]:
         """Own evidence as it is sent, best first."""
         if self._body is None:
-            records = own_records(self.data, self.kind)
+            records = own_records(self.data, self.kind, self.config.weights)
             self._body = wire.to_body(self.kind, records[best_first(records)])
         return self._body
 

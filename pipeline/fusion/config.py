@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from pipeline.config import Config
+from pipeline.registration.moving import MovingConfig
 from pipeline.splat.losses import LossConfig
 from pipeline.splat.optimiser import LearningRates
 
@@ -24,6 +25,8 @@ class RefineConfig(Config):
     """They fall exponentially to this share."""
     rates: LearningRates = LearningRates()
     loss: LossConfig = LossConfig()
+    moving: MovingConfig = MovingConfig()
+    """What moves, by depth, is not trained on; as in the front end."""
 
 
 class FusionConfig(Config):
@@ -55,8 +58,10 @@ class FusionConfig(Config):
     """... plus this share of its depth."""
     explained_px: int = Field(default=4, ge=0)
     """The farthest surface within so many pixels decides: at outlines the two robots' poses and depths never agree."""
-    explained_opacity: float = Field(default=0.5, ge=0.0, le=1.0)
-    """Where a keyframe has no depth but the own map renders more opaque than this, the rendered depth stands in."""
+    explained_opacity: float = Field(default=0.9, ge=0.0, le=1.0)
+    """A keyframe explains only where the own map draws at least this opaque; without depth, the drawn one stands in."""
+    own_pixel_steps: int = Field(default=3, ge=0)
+    """Gauss-Newton steps on the opacities of what was taken over, by the robot's own images; 0: as their owners say."""
     added_need_information: bool = True
     """Take over only Gaussians on whose position their owner's pixels said something."""
     refine: RefineConfig = RefineConfig()

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.consensus.config import MatchingConfig
+from pipeline.consensus.config import MatchingConfig, WeightKind
 from pipeline.consensus.evidence import (
     COLOR,
     LOG_COVARIANCE,
@@ -33,6 +33,7 @@ from pipeline.consensus.evidence import (
 )
 from pipeline.consensus.factors import inflated
 from pipeline.consensus.matching import Pairs, held_thickness, tracks
+from pipeline.consensus.weighting import in_world
 from pipeline.fusion.config import FusionConfig
 from pipeline.geometry import se3, spd
 from pipeline.geometry.camera import PinholeCamera
@@ -274,6 +275,7 @@ def fuse(
     config: FusionConfig,
     matching: MatchingConfig,
     depth: DepthKind = "blended",
+    weights: WeightKind = "block",
 ) -> FusedMap:
     """Fuse what a robot knows into one map in the world frame.
 
@@ -290,10 +292,11 @@ def fuse(
         camera: of these depth images.
         matching: as the pairs were found; for splitting tracks that hold two Gaussians of one robot.
         depth: of a Gaussian at a pixel, as the own map was made.
+        weights: kind of the information in `evidence` and `own_splats`.
     """
     own, own_splats = (_in_order_of(gaussians.ids, e) for e in (evidence[robot], own_splats))
     names = tuple(sorted(evidence))
-    world = {n: (own if n == robot else evidence[n]).in_world(T_world_keyframe[n]) for n in names}
+    world = {n: in_world(own if n == robot else evidence[n], T_world_keyframe[n], weights) for n in names}
     start = np.concatenate([[0], np.cumsum([len(world[n]) for n in names])]).astype(np.int64)
     rows = _Rows.of([world[n] for n in names])
     owner = np.repeat(np.arange(len(names)), np.diff(start))
@@ -313,7 +316,7 @@ def fuse(
     if len(first):
         taking_part, mine = rows.take(member), np.flatnonzero(found.robot == me)
         if config.association == "neighbours":
-            splats = own_splats.select(found.row[mine]).in_world(T_world_keyframe[robot])
+            splats = in_world(own_splats.select(found.row[mine]), T_world_keyframe[robot], weights)
             taking_part = taking_part.with_rows(mine, _Rows.of([splats]))
         move[representative] = _moves(taking_part, reference, first, config, matching.thickness_floor_m)
         members[representative] = np.diff(np.append(first, len(member)))
@@ -426,7 +429,8 @@ def _surfaces(
     config: FusionConfig,
     depth: DepthKind,
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """What own keyframes know of surfaces: measured depth, rendered where it is missing, the farthest close by."""
+    """What own keyframes know of surfaces, where the own map draws them: measured depth, rendered where it is missing,
+    the farthest close by."""
     from scipy.ndimage import maximum_filter
 
     from pipeline.kernels import Rasterizer
@@ -435,9 +439,10 @@ def _surfaces(
     for keyframe, measured in depth_images:
         T_camera_world = se3.inverse(T_world_keyframe[keyframe])
         render = rasterizer.forward(own_world, camera, T_camera_world, depth=depth)
-        stands_in = (measured <= 0) & (render.alpha > config.explained_opacity)
-        filled = np.where(stands_in, render.depth / np.maximum(render.alpha, np.float32(1e-3)), measured)
-        yield keyframe, maximum_filter(filled, 2 * config.explained_px + 1)
+        drawn = render.depth / np.maximum(render.alpha, np.float32(1e-3))
+        surface = np.where(measured > 0, measured, drawn)
+        known = np.where(render.alpha >= config.explained_opacity, surface, np.float32(0))
+        yield keyframe, maximum_filter(known, 2 * config.explained_px + 1)
 
 
 def explained(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import DuagError
+from pipeline.files import read_bytes
 from pipeline.recording.names import RECORDING_FILE, RECORDING_FORMAT, RECORDING_SCHEMA
 from schemas import topics
 
@@ -63,8 +64,8 @@ def _read_description(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise DuagError(f"{path}: no such file, expected a recording (a folder with {RECORDING_FILE})")
     try:
-        description = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
+        description = json.loads(read_bytes(path, "the JSON of a recording"))
+    except (ValueError, RecursionError) as error:
         raise DuagError(f"{path}: {error}, expected the JSON of a recording") from error
     if not isinstance(description, dict) or description.get("format") != RECORDING_FORMAT:
         found = description.get("format") if isinstance(description, dict) else type(description).__name__

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline import messages
 from pipeline.errors import DuagError
+from pipeline.files import decode_image
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.recording.depth_sources import check_size, constant, depth_source
 from pipeline.recording.motion import MotionPrior, motion_prior
@@ -147,8 +148,8 @@ class RgbdLog:
     def _decode_color(self, record: Record) -> NDArray[np.uint8]:
         import cv2
 
-        data = np.frombuffer(record.proto().data, np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+        data = record.proto().data
+        image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             where = f"{self.path}: {record.topic} at {record.publish_time_ns} ns"
             raise DuagError(f"{where} has {len(data)} bytes that no decoder reads, expected JPEG or PNG")

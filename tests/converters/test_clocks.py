@@ -12,7 +12,7 @@ import pytest
 import converters
 from converters.logs import clocks
 from pipeline.geometry import so3
-from pipeline.recording import open_rgbd
+from pipeline.recording import format_info, info, open_rgbd
 from tests.converters.box_room import path
 from tests.converters.test_ros import FRAMES, START_NS, STEP_NS, Ros, scene
 
@@ -46,26 +46,28 @@ def start(recording: Path, robot: str) -> int:
 
 
 def test_one_recorder_tells_how_headers_differ(tmp_path: Path) -> None:
-    """Told always, applied only if asked; alpha is jackal."""
+    """Told always, applied only if asked."""
     r = Ros(2)
     jackal, husky = both(r)
     bag = r.write(tmp_path / "bag", sorted(jackal + husky, key=lambda x: x[1]), "mcap")
     options = ["namespaces=/jackal,/husky"]
     converters.convert("ros", bag, tmp_path / "kept", options=options)
-    told = clocks_of(tmp_path / "kept")["bravo"]
+    told = clocks_of(tmp_path / "kept")["husky"]
     assert told["offset_s"] == pytest.approx(HUSKY_LATE_NS / 1e9, abs=1e-6)
     assert told["low_s"] <= HUSKY_LATE_NS / 1e9 <= told["high_s"]
     assert told["how"] == "one recorder"
     assert told["added_s"] == 0
-    assert start(tmp_path / "kept", "bravo") == START_NS + STEP_NS - HUSKY_LATE_NS
+    assert start(tmp_path / "kept", "husky") == START_NS + STEP_NS - HUSKY_LATE_NS
     warnings = json.loads((tmp_path / "kept" / "recording.json").read_text())["warnings"]
-    assert any("bravo: its times" in w and "none in common" in w for w in warnings)
+    assert any("husky: its times" in w and "none in common" in w for w in warnings)
     converters.convert("ros", bag, tmp_path / "moved", options=[*options, "clocks=estimated"])
-    assert abs(start(tmp_path / "moved", "bravo") - START_NS - STEP_NS) < 1000
-    assert start(tmp_path / "moved", "alpha") == START_NS + STEP_NS
-    assert clocks_of(tmp_path / "moved")["bravo"]["added_s"] == pytest.approx(HUSKY_LATE_NS / 1e9, abs=1e-6)
+    assert abs(start(tmp_path / "moved", "husky") - START_NS - STEP_NS) < 1000
+    assert start(tmp_path / "moved", "jackal") == START_NS + STEP_NS
+    assert clocks_of(tmp_path / "moved")["husky"]["added_s"] == pytest.approx(HUSKY_LATE_NS / 1e9, abs=1e-6)
+    shown = format_info(info(tmp_path / "moved"))
+    assert "clock 3.250000 s behind the first robot's (one recorder), 3.250000 s were added" in shown
     converters.convert("ros", bag, tmp_path / "zero", options=[*options, "clocks=from_zero"])
-    assert [start(tmp_path / "zero", robot) for robot in ("alpha", "bravo")] == [0, 0]
+    assert [start(tmp_path / "zero", robot) for robot in ("jackal", "husky")] == [0, 0]
 
 
 def test_clocks_that_agree_are_left_alone(tmp_path: Path) -> None:
@@ -75,8 +77,8 @@ def test_clocks_that_agree_are_left_alone(tmp_path: Path) -> None:
     converters.convert(
         "ros", bag, tmp_path / "rec", options=["namespaces=/jackal,/husky", "clocks=estimated"]
     )
-    assert clocks_of(tmp_path / "rec")["bravo"]["added_s"] == 0
-    assert start(tmp_path / "rec", "bravo") == START_NS + STEP_NS
+    assert clocks_of(tmp_path / "rec")["husky"]["added_s"] == 0
+    assert start(tmp_path / "rec", "husky") == START_NS + STEP_NS
 
 
 RECORDER_NS = 1_700_000_000  # husky's recorder is so much ahead of jackal's

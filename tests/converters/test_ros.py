@@ -22,6 +22,7 @@ from pipeline.errors import DuagError
 from pipeline.geometry import se3, so3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.recording import open_rgbd, read_log
+from pipeline.recording.read import LogFile
 from pipeline.recording.register_depth import register_depth
 from schemas import topics
 from tests.converters.box_room import path, render
@@ -255,10 +256,10 @@ def test_two_robots_in_one_bag_and_in_two(tmp_path: Path) -> None:
     r.write(tmp_path / "two" / "a", scene(r, prefix="/husky", poses=path(FRAMES, 0.2)), "sqlite3")
     r.write(tmp_path / "two" / "b", scene(r, prefix="/jackal"), "sqlite3")
     converters.convert("ros", tmp_path / "two", tmp_path / "rec2", robots=2)
-    for name in ("alpha", "bravo"):
+    for name, other in (("husky", "alpha"), ("jackal", "bravo")):
         with (
             open_rgbd(tmp_path / "rec" / f"{name}.mcap") as one,
-            open_rgbd(tmp_path / "rec2" / f"{name}.mcap") as two,
+            open_rgbd(tmp_path / "rec2" / f"{other}.mcap") as two,
         ):
             assert np.array_equal(one.frame(2).depth, two.frame(2).depth)
             assert np.array_equal(one.frame(2).color, two.frame(2).color)
@@ -463,3 +464,70 @@ def test_a_real_bag_converts_when_told_that_times_differ(tmp_path: Path) -> None
         assert (log.camera.width, log.camera.height) == (640, 480)
     assert 0.2 < (frame.depth > 0).mean() < 1
     assert 0.2 < np.median(frame.depth[frame.depth > 0]) < 5
+
+
+def test_frames_whose_colour_is_cut_short_are_left_out(tmp_path: Path) -> None:
+    """Told, not fatal: a camera that was unplugged for a moment must not cost the rest of the log."""
+    r = Ros(1)
+    rows = []
+    for topic, log_ns, message in scene(r):
+        if topic.endswith("color/image_raw"):
+            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            data = cv2.imencode(".jpg", render(COLOR, path(1)[0], DISTORTION)[0])[1].tobytes()
+            whole = stamp != START_NS + 2 * STEP_NS
+            message = r.compressed(stamp, "_color", data if whole else data[:999], "jpeg")
+        rows.append((topic, log_ns, message))
+    converters.convert("ros", r.write(tmp_path / "bag", rows, "lz4"), tmp_path / "rec")
+    description = json.loads((tmp_path / "rec" / "recording.json").read_text())
+    assert description["robots"]["alpha"]["frames"] == FRAMES - 1
+    assert any(
+        "1 frames have colour or depth that is cut short" in warning for warning in description["warnings"]
+    )
+
+
+def test_depth_that_needs_no_moving_keeps_its_numbers(tmp_path: Path) -> None:
+    """To the last bit, in any unit, and beyond 32 m."""
+    r = Ros(2)
+    rng = np.random.default_rng(5)
+    pixels = rng.integers(0, 65536, (FRAMES, 120, 160)).astype(np.uint16)
+    rows, k = [], 0
+    for topic, log_ns, message in scene(r):
+        if topic.endswith("camera_info"):
+            message = r.info(START_NS, "_color", COLOR)
+        elif topic.endswith("image_rect_raw"):
+            stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            message, k = r.image(stamp, "_color", pixels[k], "16UC1", pad=6, big=k == 2), k + 1
+        rows.append((topic, log_ns, message))
+    bag = r.write(tmp_path / "bag", rows, "sqlite3")
+    converters.convert("ros", bag, tmp_path / "rec", options=["depth_scale=0.00025"])
+    with LogFile(tmp_path / "rec" / "alpha.mcap") as log:
+        records = list(log.records(["/alpha/camera/depth"]))
+    assert log.channels["/alpha/camera/depth"].metadata["depth_scale"] == "0.00025"
+    assert all(
+        np.array_equal(m.unpack_depth(record.proto(), "here"), pixels[i]) for i, record in enumerate(records)
+    )
+
+
+def test_times_in_another_order_than_the_recording_do_not_fill_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A clock that jumps back would make the first half wait for the second."""
+    r = Ros(2)
+    rows = scene(r)
+    moved = [(t, ns + 10**9 * (k < 9), message) for k, (t, ns, message) in enumerate(rows)]
+    bag = r.write(tmp_path / "bag", sorted(moved, key=lambda x: x[1]), "mcap")
+    converters.convert("ros", bag, tmp_path / "rec")
+    monkeypatch.setattr("converters.logs.gather.MOST_KEPT_BYTES", 100_000)
+    with pytest.raises(DuagError, match="wait for messages of earlier times, expected times in the order"):
+        converters.convert("ros", bag, tmp_path / "rec2")
+
+
+@pytest.mark.parametrize("container", ["bz2", "lz4"])
+def test_chunks_that_unpack_into_too_much_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, container: str
+) -> None:
+    r = Ros(1)
+    bag = r.write(tmp_path / "bag", scene(r), container)
+    monkeypatch.setattr("converters.logs.rosbag_file.LARGEST_CHUNK", 50_000)
+    with pytest.raises(DuagError, match="unpacks to more than 50000 bytes"):
+        converters.convert("ros", bag, tmp_path / "rec")

@@ -172,3 +172,24 @@ def test_broken_rvl_is_an_error_or_depth(seed: int) -> None:
         data[rng.integers(8, len(data))] = int(rng.integers(256))
     with contextlib.suppress(DuagError):  # the only error it may raise
         assert ros_images._rvl(bytes(data[: rng.integers(8, len(data) + 1)]), "here").shape == (12, 16)
+
+
+@pytest.mark.parametrize("extension", [".jpg", ".png"])
+@pytest.mark.parametrize(
+    "quality", [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]]
+)
+def test_the_size_of_an_encoded_image_is_told_without_decoding(extension: str, quality: list[int]) -> None:
+    pixels = np.random.default_rng(1).integers(0, 255, (30, 50, 3)).astype(np.uint8)
+    data = cv2.imencode(extension, pixels, quality if extension == ".jpg" else [])[1].tobytes()
+    assert ros_images.encoded_size(data) == (50, 30)
+    assert ros_images.encoded_size(data[: len(data) // 2]) is None
+    assert ros_images.encoded_size(b"") is None
+    if extension == ".jpg":
+        assert ros_images.encoded_size(data + b"\0" * 100 + b"more") == (50, 30)
+        assert ros_images.encoded_size(data[:2] + b"\xff" + data[2:]) == (50, 30)  # a marker may be filled up
+
+
+def test_inverse_depth_needs_its_header() -> None:
+    png = cv2.imencode(".png", depth_image())[1].tobytes()
+    with pytest.raises(DuagError, match="inverse depth without its header"):
+        ros_images.depth_m(Ros(2).compressed(1, "d", png, "32FC1; compressedDepth png"), "here", 0.001)

@@ -12,7 +12,9 @@ from pipeline.geometry.camera import PinholeCamera
 from pipeline.splat.gaussians import Gaussians
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
-CONFIG = FusionConfig()
+CONFIG = FusionConfig(
+    explained_opacity=0.0
+)  # what was measured explains, though these maps draw hardly anything
 # every robot ends with the same Gaussian; nothing is measured
 ALIKE = FusionConfig(
     association="members", scatter_support=10**12, scatter_position_m=0.004, scatter_log_covariance=0.14
@@ -421,6 +423,33 @@ def test_the_own_map_explains_where_depth_is_missing():
         for opacity in (0.5, 1.0)
     }  # fmt: skip
     assert taken == {0.5: [2], 1.0: [0, 1, 2]}
+
+
+def test_a_surface_that_the_own_map_hardly_draws_is_not_explained():
+    """Where own splats are thin, a neighbour's on the measured wall fill it, and only there."""
+    grid = np.stack(np.meshgrid(np.linspace(-1.5, 1.5, 40), np.linspace(-1.2, 1.2, 40)), axis=-1).reshape(
+        -1, 2
+    )
+    n = len(grid)
+    own = Gaussians(
+        np.arange(n), np.zeros(n), np.concatenate([grid, np.full((n, 1), 2.0)], axis=1),
+        np.tile([1.0, 0, 0, 0], (n, 1)), np.log(np.tile([0.06, 0.06, 0.001], (n, 1))), np.full((n, 3), 0.5),
+        np.where(grid[:, 0] < 0, 4.0, -4.0),
+    )  # fmt: skip
+    theta = np.zeros((2, 13))
+    theta[:, MEAN] = [[-0.6, 0, 2.0], [0.6, 0, 2.0]]
+    theta[:, LOG_COVARIANCE] = -8 * np.array([1, 1, 1, 0, 0, 0])
+    origin = np.eye(4)[None]
+    evidence = {
+        "alpha": Evidence.from_map("alpha", own, None, origin),
+        "bravo": Evidence("bravo", np.arange(2), np.zeros(2), theta, np.ones((2, 31))),
+    }
+    wall = [(0, np.full((CAMERA.height, CAMERA.width), 2.0, np.float32))]
+    still = {"alpha": origin, "bravo": origin}
+    fused = fuse(
+        "alpha", own, origin, evidence, evidence["alpha"], still, {}, wall, CAMERA, FusionConfig(), MATCHING
+    )
+    assert fused.source_ids[n:].tolist() == [1]
 
 
 def test_what_two_neighbours_share_is_taken_over_once():
