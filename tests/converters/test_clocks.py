@@ -86,7 +86,7 @@ def test_readings_before_the_first_frame_have_no_place_from_zero(tmp_path: Path)
         out = tmp_path / clocks_option
         converters.convert("ros", bag, out, options=["imu=/imu", f"clocks={clocks_option}"])
         assert len(list(read_log(out / "alpha.mcap", ["/alpha/imu"]))) == count
-    with pytest.raises(DuagError, match="clock_offset_s = -10000000000.0 leads before 1970"):
+    with pytest.raises(DuagError, match="leads before 1970"):
         converters.convert("ros", bag, tmp_path / "rec", options=["clock_offset_s=-1e10"])
 
 
