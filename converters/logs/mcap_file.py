@@ -25,6 +25,7 @@ from converters.logs.rosbag_file import (
     ros_header_ns,
 )
 from pipeline.errors import DuagError
+from pipeline.files import check_file
 from pipeline.recording.names import MAGIC
 
 WANTED = "a sound MCAP log"
@@ -37,6 +38,7 @@ class McapFile:
         self.path = path
         self.topics: dict[str, Topic] = {}
         self._decoders: dict[int, _Decoder] = {}
+        check_file(path, WANTED)
         with reading(path, WANTED):
             self._stream = path.open("rb")
             try:

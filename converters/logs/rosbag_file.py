@@ -12,6 +12,7 @@ from typing import Any
 from converters.logs import foxglove
 from converters.logs.files import NANOSECONDS, Entry, Topic, sound_time, stamp_ns
 from pipeline.errors import DuagError
+from pipeline.files import check_file
 
 _READ = {
     "builtin_interfaces": "Time",
@@ -36,7 +37,10 @@ class RosBag:
 
         self.path = path
         hint = "; `rosbag reindex` mends one that was cut short" if path.suffix == ".bag" else ""
-        with reading(path, f"a bag of ROS 1 or ROS 2{hint}"):
+        wanted = f"a bag of ROS 1 or ROS 2{hint}"
+        for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+            check_file(file, wanted)
+        with reading(path, wanted):
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
             check_definitions(self._reader.typestore.fielddefs)

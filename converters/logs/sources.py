@@ -22,7 +22,7 @@ from converters.image_files import options_of
 from converters.logs.files import SUFFIXES
 from converters.logs.options import LogOptions
 from pipeline.errors import DuagError, closest
-from pipeline.files import read_text
+from pipeline.files import check_file, read_text
 from schemas import topics
 
 GROUPING = ("namespaces", "pieces")  # options that say which logs are whose, which a TOML file does itself
@@ -134,6 +134,8 @@ def _groups(src: Path) -> dict[str, tuple[Path, ...]]:
         raise DuagError(f"{src}: no such file or folder, expected a log")
     if src.is_file() and src.suffix not in SUFFIXES:
         raise DuagError(f"{src}: is no log, expected one of {', '.join(SUFFIXES)}")
+    if not src.is_dir():
+        check_file(src, "a log")
     if is_log(src):
         return {src.name: (src,)}
     groups = {}
