@@ -78,6 +78,13 @@ class Chooser:
         lost = [t for t, m in self.images.items() if "depth" in t.lower() and not is_depth(m)]
         if not choice.topic and not choice.candidates and self.clouds:
             choice = replace(choice, why=f"{choice.why}, but there are points (depth_from=lidar)")
+        sides = [
+            [t for t in self.images if any(hint in t.lower() for hint in hints)] for hints in (LEFT, RIGHT)
+        ]
+        if not choice.topic and not choice.candidates and all(sides):
+            choice = replace(
+                choice, why=f"{choice.why}, but there are left and right ones (depth_from=stereo)"
+            )
         if choice.topic or not lost:
             return choice
         return replace(

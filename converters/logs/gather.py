@@ -9,6 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from converters.logs.files import Entry, Log
+from pipeline.errors import DuagError
+
+MOST_KEPT_BYTES = 512 << 20
 
 
 def gathered(
@@ -18,20 +21,29 @@ def gathered(
 
     Groups should follow the order of recording: what arrives before its group is due is kept. Of several messages of
     one topic and time the first counts; a group whose messages do not all come ends the iteration.
+
+    Raises:
+        DuagError: more would have to be kept than memory should hold: times and recording are in different orders.
     """
     uses = Counter(part for group in groups for part in group.items())
     kept: dict[tuple[str, int], Entry] = {}
-    at = 0
+    at = kept_bytes = 0
     for entry in log.entries(*sorted({topic for topic, _ in uses})):
         part = entry.topic, time_ns(entry)
-        if uses.get(part, 0) > 0:
-            kept.setdefault(part, entry)
+        if uses.get(part, 0) > 0 and part not in kept:
+            kept[part] = entry
+            kept_bytes += len(entry.data)
+        if kept_bytes > MOST_KEPT_BYTES:
+            raise DuagError(
+                f"{log.name}: at {entry.log_ns} ns {kept_bytes >> 20} MB wait for messages of earlier times, expected "
+                "times in the order of recording, or time_source=log"
+            )
         while at < len(groups) and all(part in kept for part in groups[at].items()):
             yield {topic: kept[topic, stamp] for topic, stamp in groups[at].items()}
             for used in groups[at].items():
                 uses[used] -= 1
                 if not uses[used]:
-                    del kept[used]
+                    kept_bytes -= len(kept.pop(used).data)
             at += 1
 
 

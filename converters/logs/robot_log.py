@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from converters.logs.choice import REGISTERED, Chooser
 from converters.logs.clocks import RobotClock
 from converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
-from converters.logs.files import NANOSECONDS, Entry, Log
+from converters.logs.files import NANOSECONDS, Entry, Log, sound_time
 from converters.logs.frames import Transforms, pose_matrix
 from converters.logs.gather import gathered
 from converters.logs.motion import CameraPoses, Imu, MotionReader, extrinsics_of
@@ -26,7 +26,32 @@ from pipeline.geometry import se3
 Array = NDArray[np.float64]
 HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
 RECTIFIED = ("image_rect", "image_rect_color", "rect")
+SAME_CAMERA_PX = 1.0  # up to which a camera has not changed
 OUT_SCALE = 0.0005  # metres per unit of depth that was registered or came as floats
+
+
+class _Cameras:
+    """Watches that what a CameraInfo says does not change: a camera of the recording is one camera."""
+
+    def __init__(self, first: Mapping[str, tuple[RosCamera, bool]], name: str) -> None:
+        self._first, self._name = first, name
+        self._seen: dict[str, bytes] = {}
+
+    def see(self, entry: Entry) -> None:
+        """Compare a message with the first one. Raises DuagError where the difference can be seen in images."""
+        rest = entry.data[16:]  # in ROS what follows the times of the header, most often the same bytes
+        if self._seen.get(entry.topic) == rest:
+            return
+        self._seen[entry.topic] = rest
+        first, rectified = self._first[entry.topic]
+        where = f"{self._name}: {entry.topic}"
+        now = RosCamera.of(entry.read(), rectified, where)
+        a, b = (np.array([c.camera.fx, c.camera.fy, c.camera.cx, c.camera.cy]) for c in (first, now))
+        if np.abs(a - b).max() > SAME_CAMERA_PX or first.distortion != now.distortion:
+            raise DuagError(
+                f"{where} changes at {entry.log_ns} ns from fx fy cx cy = {a.round(2).tolist()} px to "
+                f"{b.round(2).tolist()}, expected one camera (a zoom or autofocus has to be fixed while recording)"
+            )
 
 
 class RobotLog:
@@ -40,9 +65,10 @@ class RobotLog:
         self.log, self.namespace, self.settings = log, namespace.rstrip("/"), settings
         self.name = log.name
         self.warnings: list[str] = []
-        self.shift_ns = round(
-            settings.clock_offset_s * NANOSECONDS
-        )  # added to all times when they are written
+        # added to all times when they are written
+        self.shift_ns = round(settings.clock_offset_s * NANOSECONDS)
+        # by topic of a CameraInfo: the camera as first told, and whether its images are rectified
+        self._cameras: dict[str, tuple[RosCamera, bool]] = {}
         self.transforms = Transforms(log, self.namespace)
         self._choose()
 
@@ -56,7 +82,7 @@ class RobotLog:
         self.color = chooser.color().required(self.log, "color")
         self.color_camera = self._camera(self.color, "color_info", chooser)
         self._motion = MotionReader(self.log, s, self.transforms, self.color_camera.frame_id, self.time_ns)
-        self.truth: CameraPoses | None = self._motion.poses(s.truth, "truth") if s.truth else None
+        self.truth: CameraPoses | None = self._motion.truth()
         self.T_color_depth: Array | None = None
         self.derived = self._derived(chooser) if s.depth_from != "image" else None
         if self.derived:
@@ -70,10 +96,8 @@ class RobotLog:
 
     def _derived(self, chooser: Chooser) -> Derived:
         """Depth of a stereo pair or of a LiDAR."""
-        s, color = (
-            self.settings,
-            (self.color, self._info(self.color, "color_info", chooser), self.color_camera),
-        )
+        s = self.settings
+        color = self.color, self._info(self.color, "color_info", chooser), self.color_camera
         if s.depth_from == "stereo":
             right = self._info(self.depth, "depth_info", chooser)
             other = self.depth, right, self._camera(self.depth, "depth_info", chooser)
@@ -116,6 +140,7 @@ class RobotLog:
         """Camera of an image topic."""
         chosen = self._info(topic, option, chooser)
         camera = RosCamera.of(self.log.first(chosen), _is_rectified(topic), f"{self.name}: {chosen}")
+        self._cameras[chosen] = (camera, _is_rectified(topic))
         found = size_of(chooser.images[topic], f"{self.name}: {topic}")
         expected = camera.camera.width, camera.camera.height
         if found != expected:
@@ -162,7 +187,8 @@ class RobotLog:
         if T is None:
             raise DuagError(
                 f"{self.name}: {self.depth} is seen from {depth.frame_id!r}, colour from {color.frame_id!r}, and "
-                "/tf_static does not tie them; expected --set T_color_depth='x y z qw qx qy qz' or registered=yes"
+                f"/tf_static does not tie them{self.transforms.moving_words()}; expected --set T_color_depth="
+                "'x y z qw qx qy qz' or registered=yes"
             )
         return T
 
@@ -193,7 +219,7 @@ class RobotLog:
         """The time of a message by the clock that the options choose."""
         source = self.settings.time_source
         if source == "header":
-            return entry.header_ns()
+            return sound_time(entry.header_ns(), f"{self.name}: {entry.topic}")
         if source == "log":
             return entry.log_ns
         if entry.publish_ns is None:
@@ -207,7 +233,11 @@ class RobotLog:
         """Time of a colour image -> time of its depth image."""
         stamps: dict[str, list[int]] = {self.color: [], self.depth: []}
         delays = []
-        for entry in self.log.entries(self.color, self.depth):
+        cameras = _Cameras(self._cameras, self.name)
+        for entry in self.log.entries(self.color, self.depth, *self._cameras):
+            if entry.topic in self._cameras:
+                cameras.see(entry)
+                continue
             stamps[entry.topic].append(self.time_ns(entry))
             delays.append(entry.log_ns - stamps[entry.topic][-1])
         self._delays_ns = np.array(delays, dtype=np.int64)
@@ -237,6 +267,8 @@ class RobotLog:
             self.warnings.append(
                 f"{alone} of {len(listed[self.color])} colour images have no depth near in time"
             )
+        if min(c.stamp_ns for c, _ in found) + self.shift_ns < 0:
+            raise DuagError(f"{self.name}: clock_offset_s = {self.settings.clock_offset_s} leads before 1970")
         return {c.stamp_ns: d.stamp_ns for c, d in found}
 
     def clock(self, robot: str) -> RobotClock:
@@ -247,27 +279,10 @@ class RobotLog:
 
     def frames(self) -> Iterator[tuple[int, Any, Any]]:
         """Time, colour and depth message of every pair, in order of time; holds no more than it must."""
-        pairs = self.pairs
-        used_by: dict[int, list[int]] = {}
-        for color_ns, depth_ns in pairs.items():
-            used_by.setdefault(depth_ns, []).append(color_ns)
-        colors: dict[int, Any] = {}
-        depths: dict[int, Any] = {}
-        order = sorted(pairs)
-        at = 0
-        for entry in self.log.entries(self.color, self.depth):
-            stamp = self.time_ns(entry)
-            if entry.topic == self.color and stamp in pairs:
-                colors.setdefault(stamp, entry)
-            elif entry.topic == self.depth and stamp in used_by:
-                depths.setdefault(stamp, entry)
-            while at < len(order) and order[at] in colors and pairs[order[at]] in depths:
-                color_ns, depth_ns = order[at], pairs[order[at]]
-                yield color_ns, colors.pop(color_ns).read(), depths[depth_ns].read()
-                used_by[depth_ns].remove(color_ns)
-                if not used_by[depth_ns]:
-                    del depths[depth_ns]
-                at += 1
+        order = sorted(self.pairs)
+        groups = [{self.color: time, self.depth: self.pairs[time]} for time in order]
+        for time, found in zip(order, gathered(self.log, groups, self.time_ns), strict=False):
+            yield time, found[self.color].read(), found[self.depth].read()
 
     def sensors(self) -> dict[str, str]:
         """What the log says about its source."""

@@ -3,6 +3,7 @@
 from pipeline.config import Config
 from pipeline.frontend.mapping_config import MappingConfig
 from pipeline.registration.align import RegistrationConfig
+from pipeline.registration.moving import MovingConfig
 
 # Not settings: the files of a run and their readers promise this rule.
 HELD_OUT_PERIOD = 8
@@ -198,3 +199,5 @@ class FrontendConfig(Config):
     mapping_enabled: bool = True
     """Grow a map; without, the log holds odometry and keyframes and an empty map."""
     mapping: MappingConfig = MappingConfig()
+    moving: MovingConfig = MovingConfig()
+    """What moves, by depth: not mapped. `information.moving` keeps the same out of the Fisher sums."""

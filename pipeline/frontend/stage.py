@@ -25,6 +25,7 @@ from pipeline.frontend.tracking import Status, TrackedFrame, TrackedKeyframe, Tr
 from pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
 from pipeline.recording import LogWriter, RgbdLog, open_rgbd
 from pipeline.registration import RgbdPyramid
+from pipeline.registration.moving import FreeSpace
 from pipeline.splat.gaussians import DepthKind, Gaussians
 from schemas import topics
 
@@ -204,6 +205,9 @@ def _map(
         )
 
     mapper = Mapper(log.camera, config.mapping, seed, threads=threads)
+    free = FreeSpace(log.camera, config.moving)
+    for keyframe in keyframes:
+        free.add(log.frame(keyframe.frame_index).usable_depth, keyframe.T_map_camera)
     steps = progress_bar.track(keyframes, f"mapping {log.robot}") if progress else keyframes
     updates = []
     for keyframe in steps:
@@ -213,18 +217,19 @@ def _map(
             frame.color,
             frame.depth,
             keyframe.T_map_camera,
-            mask=frame.mask,
+            mask=free.usable(frame.usable_depth, keyframe.T_map_camera, frame.mask),
             depth_sigma_m=frame.depth_sigma,
         )
         updates.append(update(keyframe, stats))
     for supporting in _support(frames, keyframes, config):
         frame = log.frame(supporting.frame_index)
+        T_map_camera = keyframes[supporting.keyframe_index].T_map_camera @ supporting.T_keyframe_camera
         mapper.add_view(
             supporting.keyframe_index,
             frame.color,
             frame.depth,
             supporting.T_keyframe_camera,
-            mask=frame.mask,
+            mask=free.usable(frame.usable_depth, T_map_camera, frame.mask),
             depth_sigma_m=frame.depth_sigma,
         )
     unrefined = mapper.gaussians

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,14 @@ from pipeline.consensus.config import MatchingConfig, WeightKind
 from pipeline.consensus.evidence import unpack_symmetric
 from pipeline.consensus.weighting import own_stiffness
 from pipeline.errors import DuagError
-from pipeline.fusion.config import FusionConfig
+from pipeline.fusion.config import FusionConfig, RefineConfig
 from pipeline.fusion.fuse import FusedMap, fuse
 from pipeline.fusion.own_pixels import weigh_by_own_pixels
 from pipeline.fusion.refine import View, refine
 from pipeline.geometry.trajectory import Trajectory, write_tum
 from pipeline.messages import WORLD_FRAME, CorrectedKeyframes, GaussianInformation, GaussianMap, Odometry
 from pipeline.recording import LogWriter, open_rgbd, read_log
+from pipeline.registration.moving import FreeSpace
 from pipeline.robot import AgentInput, AgentResult, RobotData, load
 from pipeline.splat.gaussians import DepthKind, Gaussians
 from pipeline.splat.ply import write_ply
@@ -69,7 +71,7 @@ def run_fusion(
     stamp_ns = frames[-1].stamp_ns
     refined = None
     if len(result.component) > 1:
-        views = _views(source, frames, result, config.refine.support_views)
+        views = _views(source, frames, result, config.refine)
         info = own.information
         fused = weigh_by_own_pixels(
             fused,
@@ -99,21 +101,26 @@ def run_fusion(
     return fused
 
 
-def _views(source: AgentInput, frames: Sequence[Odometry], result: AgentResult, support: int) -> list[View]:
+def _views(
+    source: AgentInput, frames: Sequence[Odometry], result: AgentResult, config: RefineConfig
+) -> list[View]:
     """The robot's keyframes and, evenly spread, frames between them, at their corrected poses; none held out."""
     topic = topics.KEYFRAME.of(source.robot)
     keyframes = {record.message().frame_index for record in read_log(source.frontend, (topic,))}
     others = [f for f in frames if f.frame_index not in keyframes and not f.held_out]
-    count = min(support, len(others))
+    count = min(config.support_views, len(others))
     middles = [others[(2 * k + 1) * len(others) // (2 * count)] for k in range(count)]
     views = []
     with open_rgbd(source.log) as log:
+        free = FreeSpace(log.camera, config.moving)
         for f in [*(f for f in frames if f.frame_index in keyframes), *middles]:
             frame = log.frame(f.frame_index)
             T_world_camera = result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera
             usable = frame.usable_depth
+            if f.frame_index in keyframes:
+                free.add(usable, T_world_camera)
             views.append(View(frame.color, usable, T_world_camera, frame.mask, frame.depth_sigma))
-    return views
+    return [replace(v, mask=free.usable(v.depth_m, v.T_world_camera, v.mask)) for v in views]
 
 
 def _depth_images(own: RobotData) -> Iterator[tuple[int, NDArray[np.float32]]]:

@@ -20,6 +20,7 @@ from pipeline.information.config import InformationConfig
 from pipeline.kernels import FisherSums, Rasterizer
 from pipeline.messages import GaussianInformation, GaussianMap, Keyframe, Odometry
 from pipeline.recording import LogWriter, open_rgbd, read_log
+from pipeline.registration.moving import FreeSpace
 from pipeline.splat.gaussians import DepthKind, Gaussians
 from schemas import topics
 
@@ -107,6 +108,7 @@ def run_information(
             frame = log.frame(keyframe.frame_index)
             views.append(View(frame.color, frame.depth, keyframe.T_map_camera, frame.mask, frame.depth_sigma))
         camera = log.camera
+    views = without_moving(views, camera, config)
     noise = estimate_noise(final.gaussians, camera, views, config, threads, depth=final.depth)
     noise, overlap = with_correlation(noise, final.gaussians, camera, views, config, threads, final.depth)
     sums = sum_information(final.gaussians, camera, views, noise, config, threads, depth=final.depth)
@@ -134,6 +136,18 @@ def run_information(
     with LogWriter(out_path, robot=final.robot) as writer:
         writer.write(topics.INFORMATION.of(final.robot), result, log_time_ns)
     return result
+
+
+def without_moving(views: Sequence[View], camera: PinholeCamera, config: InformationConfig) -> list[View]:
+    """The views with what moved masked, as the front end did before it mapped them."""
+    free = FreeSpace(camera, config.moving)
+    depths = [v.depth_m if v.mask is None else np.where(v.mask, v.depth_m, np.float32(0)) for v in views]
+    for view, depth_m in zip(views, depths, strict=True):
+        free.add(depth_m, view.T_map_camera)
+    return [
+        replace(view, mask=free.usable(depth_m, view.T_map_camera, view.mask))
+        for view, depth_m in zip(views, depths, strict=True)
+    ]
 
 
 def read_frontend(path: Path) -> tuple[GaussianMap, list[Keyframe], int]:

@@ -138,6 +138,7 @@ def format_info(content: Mapping[str, Any]) -> str:
         lines = [f"recording {content['name']}: {source}, {len(content['robots'])} robots"]
         for robot, row in content["robots"].items():
             lines += _robot_lines(robot, row)
+            lines += _clock_lines(content.get("clocks", {}).get(robot))
     return "\n".join([*lines, *(f"warning: {w}" for w in content.get("warnings", []))])
 
 
@@ -157,6 +158,15 @@ def _robot_lines(robot: str, row: Mapping[str, Any]) -> list[str]:
         )
         lines.append(f"    path {row['path']['length_m']:.2f} m within {span} m")
     return lines + _topic_lines(row["topics"], "    ")
+
+
+def _clock_lines(clock: Mapping[str, Any] | None) -> list[str]:
+    """How a robot's clock differs from the first one's, where the converter could tell."""
+    if not clock or clock["how"] == "the reference":
+        return []
+    seconds, added = clock["offset_s"], f", {clock['added_s']:.6f} s were added" if clock["added_s"] else ""
+    told = "not known" if seconds is None else f"{seconds:.6f} s behind the first robot's"
+    return [f"    clock {told} ({clock['how']}){added}"]
 
 
 def _log_lines(log: Mapping[str, Any], indent: str = "") -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,12 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 import converters
 import schemas
+from converters.logs import open_log
 from pipeline.errors import DuagError
 from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
 from pipeline.recording import read_log
-from tests.converters.test_ros import Ros, scene
+from tests.converters.test_ros import COLOR, DISTORTION, Ros, scene
 
 Row = tuple[str, int, Any]
 
@@ -284,3 +287,100 @@ def test_messages_that_do_not_fit_their_schema_are_errors(tmp_path: Path) -> Non
         with pytest.raises(DuagError, match=message):
             converters.convert("ros", path, tmp_path / "rec")
     assert base64.b64decode("!") == b""  # what a lenient decoder would have made of the first
+
+
+def test_a_camera_that_changes_is_refused(tmp_path: Path) -> None:
+    """As of a telephone that focuses: by a tenth of a pixel it may, by more not."""
+    r = Ros(2)
+    rows = scene(r)
+    info = next(m for t, _, m in rows if t == "/camera/color/camera_info")
+    for by, kind in ((0.1, "cdr"), (0.1, "protobuf"), (3.0, "cdr"), (3.0, "json")):
+        camera = PinholeCamera(COLOR.width, COLOR.height, COLOR.fx + by, COLOR.fy, COLOR.cx, COLOR.cy)
+        later = (
+            "/camera/color/camera_info",
+            rows[-1][1] + 1,
+            r.info(rows[-1][1], info.header.frame_id, camera, DISTORTION),
+        )
+        log = write(tmp_path / "log.mcap", [*rows, later], kind, r)
+        if by < 1:
+            converters.convert("ros", log, tmp_path / f"rec_{kind}")
+            continue
+        with pytest.raises(DuagError, match=r"camera_info changes at .* from .*\[140.0, .*\[143.0"):
+            converters.convert("ros", log, tmp_path / "rec")
+
+
+def raw_log(path: Path, topic: str, schema: tuple[str, str, bytes], data: bytes) -> Path:
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        channel = writer.register_channel(topic, "cdr", writer.register_schema(*schema))
+        writer.add_message(channel, 7, data, 7)
+        writer.finish()
+    return path
+
+
+def test_definitions_that_are_missing_are_those_of_ros(tmp_path: Path) -> None:
+    r = Ros(2)
+    message = r.header(5, "camera")
+    data = bytes(r.store.serialize_cdr(message, message.__msgtype__))
+    path = raw_log(tmp_path / "log.mcap", "/h", ("std_msgs/msg/Header", "", b""), data)
+    with open_log([path]) as log:
+        assert log.first("/h").frame_id == "camera"
+
+
+def test_definitions_in_idl(tmp_path: Path) -> None:
+    """Two types, the inner one in a part of its own, as recorders of ROS 2 write them."""
+    inner = "module demo { module msg { struct Inner { long value; }; }; };"
+    struct_outer = "struct Outer { demo::msg::Inner inner; string name; };"
+    outer = f'#include "demo/msg/Inner.idl"\nmodule demo {{ module msg {{ {struct_outer} }}; }};'
+    line = "=" * 80 + "\n"
+    for text in (
+        f"{line}IDL: demo/msg/Outer\n{outer}\n{line}IDL: demo/msg/Inner\n{inner}\n",
+        f"{inner}\n{outer}",
+    ):
+        data = b"\x00\x01\x00\x00" + struct.pack("<iI", 42, 6) + b"hello\x00"
+        path = raw_log(tmp_path / "log.mcap", "/o", ("demo/msg/Outer", "ros2idl", text.encode()), data)
+        with open_log([path]) as log:
+            assert (log.first("/o").inner.value, log.first("/o").name) == (42, "hello")
+
+
+@pytest.mark.parametrize(
+    ("log_ns", "stamp_ns", "message"),
+    [
+        (2**64 - 1, 5, "time 18446744073709551615 ns"),
+        (7, -(10**9), "time -1000000000 ns"),
+        (7, 2**62, "time 46"),
+    ],
+)
+def test_times_that_cannot_be_are_refused(tmp_path: Path, log_ns: int, stamp_ns: int, message: str) -> None:
+    r = Ros(2)
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic, _, ros in scene(r):
+            proto = foxglove(ros)
+            if topic == "/camera/color/image_raw":
+                proto.timestamp.seconds, proto.timestamp.nanos = divmod(stamp_ns, 10**9)
+            name = proto.DESCRIPTOR.full_name
+            schema = writer.register_schema(name, "protobuf", schemas.descriptor_set(name))
+            writer.add_message(
+                writer.register_channel(topic, "protobuf", schema), log_ns, proto.SerializeToString(), 7
+            )
+        writer.finish()
+    with pytest.raises(DuagError, match=message):
+        converters.convert("ros", path, tmp_path / "rec")
+
+
+def test_definitions_that_are_not_those_of_ros_are_refused(tmp_path: Path) -> None:
+    r = Ros(2)
+    info = next(m for t, _, m in scene(r) if t.endswith("camera_info"))
+    name, encoding, text, data = encoded(info, "cdr", r)
+    path = raw_log(
+        tmp_path / "log.mcap", "/i", (name, encoding, text.replace(b"binning_x", b"binnimg_x")), data
+    )
+    with (
+        open_log([path]) as log,
+        pytest.raises(DuagError, match="its sensor_msgs/msg/CameraInfo has no field binning_x"),
+    ):
+        log.first("/i")

@@ -20,10 +20,12 @@ from pipeline.information.stage import (
     sum_information,
     surface_deviation,
     with_correlation,
+    without_moving,
     without_thickness,
 )
 from pipeline.kernels import FisherSums, Rasterizer
 from pipeline.recording import LogWriter, read_log
+from pipeline.registration.moving import MovingConfig
 from pipeline.splat.gaussians import Gaussians
 from pipeline.splat.seeding import THICKNESS_FLOOR_M
 from schemas import topics
@@ -353,3 +355,30 @@ def test_a_front_end_without_a_map_is_one_line(tmp_path: Path) -> None:
         run_information(
             tmp_path / "alpha.mcap", tmp_path / "unfinished.mcap", tmp_path / "out.mcap", InformationConfig()
         )
+
+
+def test_what_moved_is_in_no_sum() -> None:
+    """A card at half the distance, elsewhere in every view: the wall behind it is not informed through it."""
+    gaussians = wall()
+    plain, crossed = [], []
+    for k, T in enumerate(POSES):
+        # all views of the wall at z = 2, from poses that turn little: its depth is that of a plane
+        normal, offset = T[:3, :3].T @ np.array([0.0, 0.0, 1.0]), 2.0 - T[2, 3]
+        depth = (offset / (CAMERA.rays() @ normal)).astype(np.float32)
+        color = np.full((CAMERA.height, CAMERA.width, 3), 128, np.uint8)
+        plain.append(View(color, depth, T))
+        card = depth.copy()
+        card[8:24, 2 + 11 * k : 12 + 11 * k] = 1.0
+        crossed.append(View(color, card, T))
+    config = InformationConfig(moving=MovingConfig(halvings=1, grow_px=4))
+    assert all(view.mask is None for view in without_moving(plain, CAMERA, config))
+    masked = without_moving(crossed, CAMERA, config)
+    for view in masked:
+        assert view.mask is not None
+        assert view.mask[view.depth_m < 1.5].mean() < 0.05
+        assert view.mask.mean() > 0.7
+    off = config.model_copy(update={"moving": MovingConfig(enabled=False)})
+    assert without_moving(crossed, CAMERA, off) == crossed
+    less = sum_information(gaussians, CAMERA, masked, NOISE, config)
+    more = sum_information(gaussians, CAMERA, crossed, NOISE, config)
+    assert less.weight.sum() < 0.95 * more.weight.sum()
