@@ -106,6 +106,8 @@ def _from_file(path: Path, options: Mapping[str, Any]) -> list[Source]:
         if not isinstance(namespace, str) or (namespace and not namespace.startswith("/")):
             raise DuagError(f"{where} namespace = {namespace!r}, expected text that begins with a slash")
         _check_names(row, where, "logs", "namespace")
+        if isinstance(row.get("truth_file"), str):
+            row["truth_file"] = str(path.parent / row["truth_file"])
         settings = options_of(LogOptions, {**content, **row, **options}, where)
         paths = tuple(inner for log in logs for inner in logs_in(path.parent / log))
         label = " ".join(Path(log).name for log in logs) if len(robots) > 1 else ""
