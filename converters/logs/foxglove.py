@@ -49,7 +49,7 @@ def as_ros(schema: str, message: Any, where: str) -> Any:
         return message
     try:
         return _MAKERS[schema](message)
-    except (AttributeError, TypeError, ValueError, KeyError, binascii.Error) as error:
+    except (AttributeError, TypeError, ValueError, KeyError, OverflowError, binascii.Error) as error:
         raise DuagError(
             f"{where} holds a {schema} that cannot be read ({' '.join(str(error).split())})"
         ) from error

@@ -22,7 +22,7 @@ from converters.image_files import options_of
 from converters.logs.files import SUFFIXES
 from converters.logs.options import LogOptions
 from pipeline.errors import DuagError, closest
-from pipeline.files import read_text
+from pipeline.files import check_file, read_text
 from schemas import topics
 
 GROUPING = ("namespaces", "pieces")  # options that say which logs are whose, which a TOML file does itself
@@ -106,6 +106,8 @@ def _from_file(path: Path, options: Mapping[str, Any]) -> list[Source]:
         if not isinstance(namespace, str) or (namespace and not namespace.startswith("/")):
             raise DuagError(f"{where} namespace = {namespace!r}, expected text that begins with a slash")
         _check_names(row, where, "logs", "namespace")
+        if isinstance(row.get("truth_file"), str):
+            row["truth_file"] = str(path.parent / row["truth_file"])
         settings = options_of(LogOptions, {**content, **row, **options}, where)
         paths = tuple(inner for log in logs for inner in logs_in(path.parent / log))
         label = " ".join(Path(log).name for log in logs) if len(robots) > 1 else ""
@@ -132,6 +134,8 @@ def _groups(src: Path) -> dict[str, tuple[Path, ...]]:
         raise DuagError(f"{src}: no such file or folder, expected a log")
     if src.is_file() and src.suffix not in SUFFIXES:
         raise DuagError(f"{src}: is no log, expected one of {', '.join(SUFFIXES)}")
+    if not src.is_dir():
+        check_file(src, "a log")
     if is_log(src):
         return {src.name: (src,)}
     groups = {}

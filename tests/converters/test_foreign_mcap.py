@@ -342,3 +342,45 @@ def test_definitions_in_idl(tmp_path: Path) -> None:
         path = raw_log(tmp_path / "log.mcap", "/o", ("demo/msg/Outer", "ros2idl", text.encode()), data)
         with open_log([path]) as log:
             assert (log.first("/o").inner.value, log.first("/o").name) == (42, "hello")
+
+
+@pytest.mark.parametrize(
+    ("log_ns", "stamp_ns", "message"),
+    [
+        (2**64 - 1, 5, "time 18446744073709551615 ns"),
+        (7, -(10**9), "time -1000000000 ns"),
+        (7, 2**62, "time 46"),
+    ],
+)
+def test_times_that_cannot_be_are_refused(tmp_path: Path, log_ns: int, stamp_ns: int, message: str) -> None:
+    r = Ros(2)
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic, _, ros in scene(r):
+            proto = foxglove(ros)
+            if topic == "/camera/color/image_raw":
+                proto.timestamp.seconds, proto.timestamp.nanos = divmod(stamp_ns, 10**9)
+            name = proto.DESCRIPTOR.full_name
+            schema = writer.register_schema(name, "protobuf", schemas.descriptor_set(name))
+            writer.add_message(
+                writer.register_channel(topic, "protobuf", schema), log_ns, proto.SerializeToString(), 7
+            )
+        writer.finish()
+    with pytest.raises(DuagError, match=message):
+        converters.convert("ros", path, tmp_path / "rec")
+
+
+def test_definitions_that_are_not_those_of_ros_are_refused(tmp_path: Path) -> None:
+    r = Ros(2)
+    info = next(m for t, _, m in scene(r) if t.endswith("camera_info"))
+    name, encoding, text, data = encoded(info, "cdr", r)
+    path = raw_log(
+        tmp_path / "log.mcap", "/i", (name, encoding, text.replace(b"binning_x", b"binnimg_x")), data
+    )
+    with (
+        open_log([path]) as log,
+        pytest.raises(DuagError, match="its sensor_msgs/msg/CameraInfo has no field binning_x"),
+    ):
+        log.first("/i")
