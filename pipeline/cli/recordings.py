@@ -113,10 +113,15 @@ def info(
         bool,
         typer.Option("--toml", help="Of a log of another program: a file to convert it by, to be edited."),
     ] = False,
+    preview: Annotated[
+        Path | None,
+        typer.Option(help="Write a PNG of some colour and depth images of every robot.", show_default=False),
+    ] = None,
 ) -> None:
     """Say what is in a recording, a run or a log; of a log of another program also what would be converted and why.
 
-    Examples: `duagc info recordings/redkitchen`, `duagc info campus.bag --toml > campus.toml`
+    Examples: `duagc info recordings/redkitchen --preview redkitchen.png`,
+    `duagc info campus.bag --toml > campus.toml`
     """
     from converters.logs import describe
     from pipeline import recording
@@ -129,6 +134,8 @@ def info(
     if as_toml:
         raise DuagError(f"{path}: is none of another program's logs, expected one with --toml")
     content = recording.info(path)
+    if preview is not None:
+        recording.write_preview_of(path, preview)
     print(json.dumps(content, indent=2) if as_json else recording.format_info(content))
 
 

@@ -1,17 +1,20 @@
 """How two robots find out whether they have been in the same place, and where one's map lies in the other's.
 
-    higher-named end                                    lower-named end
+    higher end                                          lower end
+    HELLO        digest of what was seen              <->
     DESCRIPTORS  compact descriptors of all keyframes ->
                                                       <- REQUEST   keyframes worth a closer look
     SAMPLE       one per requested keyframe           ->
-                                                      <- CLOSURES  verdict, shared keyframes, relative frame
+                                                      <- CLOSURES  verdict, shared keyframes
 
-The lower-named end keeps the closures. It has decided when its verdict has been acknowledged, the other end when
-the verdict has arrived.
+The lower end is the one with the lower digest (and name, should they be equal): who verifies decides which of two
+measurements counts, and that must not depend on names. It keeps the closures. It has decided when its verdict has been
+acknowledged, the other end when the verdict has arrived.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -29,6 +32,7 @@ from pipeline.exchange.packets import Kind, MalformedError
 from pipeline.exchange.places import Candidate
 from pipeline.exchange.verification import Verdict, Verified, verify
 from pipeline.exchange.wire import KeyframeSample, PlaceBook, Verdicts
+from pipeline.geometry import se3
 from pipeline.registration import Reference, RgbdPyramid
 from pipeline.registration.features import Features, extract
 from pipeline.robot import RobotData, factors_of
@@ -65,6 +69,18 @@ class OwnPlaces:
         return RgbdPyramid.build(color.astype(np.float32) / np.float32(255), depth, self.data.camera)
 
     @property
+    def digest(self) -> bytes:
+        """Eight bytes that depend on what the robot saw, and on nothing else."""
+        whole = hashlib.sha256(b"".join(f.descriptors.tobytes() for f in self.features))
+        return whole.digest()[: wire.DIGEST_BYTES]
+
+    @property
+    def T_first_keyframe(self) -> Array:  # noqa: N802 (transforms)
+        """Keyframes [n, 4, 4] as seen from the first: no result depends on where a robot's map has its origin."""
+        T = self.data.T_map_keyframe
+        return se3.inverse(T[0]) @ T if len(T) else T
+
+    @property
     def drift(self) -> Array:
         """Accumulated variance of the own odometry, [n, 2]."""
         return drift(factors_of(self.data.odometry), self.data.keyframes, self.config.consensus.closures)
@@ -73,7 +89,7 @@ class OwnPlaces:
         """What a neighbour gets to recognise places."""
         most = self.config.places.features_per_place
         compact = [f.descriptors[:most] for f in self.features]
-        return PlaceBook(compact, self.data.T_map_keyframe, self.drift)
+        return PlaceBook(compact, self.T_first_keyframe, self.drift)
 
     def sample(self, keyframe: int) -> KeyframeSample:
         """What a neighbour gets to verify closures with one keyframe."""
@@ -103,18 +119,16 @@ class Joined:
 
 
 class Meeting:
-    """The lower-named end of a pair, or the higher-named one: two subclasses."""
+    """The lower end of a pair, or the higher one: two subclasses."""
 
     def __init__(self, own: str, peer: str, places_: OwnPlaces, config: ExchangeConfig, seed: int) -> None:
         self.own, self.peer, self.places, self.config, self.seed = own, peer, places_, config, seed
         self.verdicts: Verdicts | None = None
         self.joined: Joined | None = None
         self.tried: list[Tried] = []
-        self.begun = False
 
     def begin(self, send: Send) -> None:
-        """Called once, when the neighbour has been heard for the first time."""
-        self.begun = True
+        """Called once, when the ends know which is which."""
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
         """Take one complete message of this meeting."""
@@ -125,7 +139,6 @@ class HigherEnd(Meeting):
     """Sends descriptors and the samples it is asked for; gets the verdict."""
 
     def begin(self, send: Send) -> None:
-        super().begin(send)
         send(Kind.DESCRIPTORS, wire.write_places(self.places.book()))
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
@@ -139,7 +152,7 @@ class HigherEnd(Meeting):
             if verdicts.joined:
                 self.joined = Joined(verdicts.shared)
         else:
-            raise MalformedError(f"{kind.name} is not for the higher-named end, or came twice")
+            raise MalformedError(f"{kind.name} is not for the higher end, or came twice")
 
 
 class LowerEnd(Meeting):
@@ -161,7 +174,7 @@ class LowerEnd(Meeting):
             if not self.waiting:
                 self._decide(send)
         else:
-            raise MalformedError(f"{kind.name} is not for the lower-named end, or came twice")
+            raise MalformedError(f"{kind.name} is not for the lower end, or came twice")
 
     def _choose(self, book: PlaceBook, send: Send) -> None:
         """Score all pairs of keyframes and ask for the samples of the best."""
@@ -189,14 +202,9 @@ class LowerEnd(Meeting):
 
     def _verify(self, sample: KeyframeSample) -> None:
         for candidate in self.waiting.pop(sample.keyframe):
-            rng = streams.generator(
-                self.seed,
-                "ransac",
-                robot=self.own,
-                peer=self.peer,
-                own_keyframe=candidate.own_keyframe,
-                peer_keyframe=candidate.peer_keyframe,
-            )
+            ends = (self.places.features[candidate.own_keyframe], sample.features)
+            own, peer = (hashlib.sha256(f.descriptors.tobytes()).hexdigest() for f in ends)
+            rng = streams.generator(self.seed, "ransac", own=own, peer=peer)
             result = verify(
                 candidate.own_keyframe,
                 candidate.peer_keyframe,
@@ -229,8 +237,8 @@ class LowerEnd(Meeting):
         closures = [t.result.closure for t in self.tried if t.result.closure is not None]
         agreement = consistent(
             closures,
-            self.places.data.T_map_keyframe,
-            self.book.T_map_keyframe,
+            self.places.T_first_keyframe,
+            self.book.T_first_keyframe,
             self.places.drift,
             self.book.drift,
             self.config.consensus.closures,
@@ -262,9 +270,9 @@ class LowerEnd(Meeting):
         send(Kind.CLOSURES, wire.write_verdicts(self.verdicts))
 
     def _proposal(self, closures: Sequence[Closure], group: Group) -> Proposal:
-        """What a group of closures says of the relative frame, anywhere in the two maps."""
+        """What a group of closures says of the first keyframe of either robot in that of the other, own frame first."""
         assert self.book is not None
-        own, peer = self.places.data.T_map_keyframe, self.book.T_map_keyframe
+        own, peer = self.places.T_first_keyframe, self.book.T_first_keyframe
         agreeing = [c for c, keep in zip(closures, group.keep.tolist(), strict=True) if keep]
         variance = frame_variance(
             agreeing, own, peer, self.places.drift, self.book.drift, self.config.consensus.closures
