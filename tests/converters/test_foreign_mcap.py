@@ -18,6 +18,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 import converters
 import schemas
 from converters.logs import open_log
+from pipeline.checks import check
 from pipeline.errors import DuagError
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
@@ -171,6 +172,8 @@ def test_every_encoding_gives_the_same_recording(
     log = write(tmp_path / "log.mcap", scene(r), kind, r, **settings)
     converters.convert("ros", log, tmp_path / "rec", options=["truth=/odom"])
     assert digests(tmp_path / "rec") == expected
+    report = check(tmp_path / "rec")
+    assert report.sound, report.findings
 
 
 def test_pieces_of_a_log_are_one_log(tmp_path: Path, expected: dict[str, str]) -> None:
