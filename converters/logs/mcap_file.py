@@ -51,7 +51,7 @@ class McapFile:
         self._stream.seek(-min(len(MAGIC), self.path.stat().st_size), 2)
         if self._stream.read() != MAGIC:
             raise DuagError(
-                f"{self.path}: is cut short or no MCAP; what it holds can be saved with `mcap recover`"
+                f"{self.path}: is cut short or no MCAP; what it holds can be saved with `duagc recover`"
             )
         self._stream.seek(0)
         self._reader = SeekingReader(self._stream, validate_crcs=True, record_size_limit=LARGEST_CHUNK)
