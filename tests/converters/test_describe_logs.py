@@ -6,6 +6,7 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -183,6 +184,44 @@ def test_our_own_files_are_not_foreign(tmp_path: Path) -> None:
         assert not describe.is_foreign(own)
     out = run.invoke(app, ["info", str(tmp_path / "rec"), "--toml"])
     assert isinstance(out.exception, DuagError)
+
+
+def test_what_a_cut_log_holds_can_be_saved_and_converted(tmp_path: Path) -> None:
+    r = Ros(2)
+    log = write(tmp_path / "a.mcap", scene(r), "protobuf", r)
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(log.read_bytes()[:-3000])
+    assert "duagc recover" in str(run.invoke(app, ["info", str(cut)]).exception)
+    saved = run.invoke(app, ["recover", str(cut), "--out", str(tmp_path / "saved.mcap")])
+    assert saved.exit_code == 0, saved.exception
+    assert "robot alpha: " in run.invoke(app, ["info", str(tmp_path / "saved.mcap")]).stdout
+    converters.convert("ros", tmp_path / "saved.mcap", tmp_path / "rec")
+    frames = json.loads((tmp_path / "rec" / "recording.json").read_text())["robots"]["alpha"]["frames"]
+    assert 0 < frames <= FRAMES
+
+
+def test_depth_that_is_aligned_goes_before_raw_depth(tmp_path: Path) -> None:
+    """As a RealSense publishes: both, and infrared; aligned depth is taken and not moved."""
+    r = Ros(2)
+    rows = []
+    for topic, ns, message in scene(r):
+        rows.append((topic, ns, message))
+        if topic.endswith("color/camera_info"):
+            rows.append(("/camera/aligned_depth_to_color/camera_info", ns, message))
+        if topic.endswith("image_rect_raw"):
+            time = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            aligned = np.full((120, 160), 1500, np.uint16)
+            rows.append(
+                ("/camera/aligned_depth_to_color/image_raw", ns, r.image(time, "_color", aligned, "16UC1"))
+            )
+            gray = r.image(time, "_infra", np.zeros((90, 120), np.uint8), "mono8")
+            rows += [(f"/camera/infra{k}/image_rect_raw", ns, gray) for k in (1, 2)]
+    robot = describe.describe(r.write(tmp_path / "bag", rows, "mcap"))["robots"]["alpha"]
+    assert robot["choices"]["depth"]["topic"] == "/camera/aligned_depth_to_color/image_raw"
+    assert robot["choices"]["depth_info"]["topic"] == "/camera/aligned_depth_to_color/camera_info"
+    assert robot["choices"]["color"]["topic"] == "/camera/color/image_raw"
+    assert robot["depth"] == "registered to colour already"
+    assert robot["problem"] is None
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real bags are not there")
