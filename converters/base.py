@@ -37,6 +37,7 @@ from pipeline.errors import DuagError
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.recording import (
     DEPTH_SCALE_KEY,
+    RANGE_SIGMA_KEY,
     RECORDING_FILE,
     RECORDING_FORMAT,
     RECORDING_SCHEMA,
@@ -75,6 +76,8 @@ ROBOT_NAMES = (
     *("xray", "yankee", "zulu"),
 )
 NANOSECONDS = 1_000_000_000
+MAX_SIDE_PX, MAX_FOCAL_PX = 16_384, 1e6
+SIGMA_SCALE_M = 1e-4  # of the images of standard deviations
 UNITS = {"time": "ns", "length": "m", "depth": "depth_scale_m per unit, along z, 0 = none", "angle": "rad"}
 
 
@@ -85,10 +88,23 @@ def robot_names(count: int) -> list[str]:
     return list(ROBOT_NAMES[:count])
 
 
+def check_camera(camera: PinholeCamera, where: str) -> None:
+    """Refuse intrinsics that no camera has: they came from a file."""
+    sides, focals = (camera.width, camera.height), (camera.fx, camera.fy)
+    sound = all(1 <= side <= MAX_SIDE_PX for side in sides)
+    sound = sound and all(0 < focal < MAX_FOCAL_PX for focal in focals)
+    sound = sound and all(abs(centre) < MAX_FOCAL_PX for centre in (camera.cx, camera.cy))
+    if not sound:
+        raise DuagError(
+            f"{where}: camera {camera}, expected sides up to {MAX_SIDE_PX} px and sound intrinsics"
+        )
+
+
 class RobotWriter:
     """Writes the logs of one robot into the folder of a recording; a context manager.
 
-    `summary` is, after a clean exit, what `recording.json` says about the robot: plain numbers and text.
+    Frames and messages of other sensors are appended in the order of their times, all together. `summary` is, after a
+    clean exit, what `recording.json` says about the robot: plain numbers and text.
     """
 
     def __init__(
@@ -108,21 +124,22 @@ class RobotWriter:
         """
         if not re.fullmatch(topics.ROBOT_NAME, name):
             raise DuagError(f"robot {name!r}: expected lower-case letters, digits and underscores")
+        check_camera(camera, f"robot {name}")
         self.folder, self.name, self.camera, self.depth_scale = Path(folder), name, camera, float(depth_scale)
         self.sensors = dict(sensors or {})
         self.summary: dict[str, Any] = {}
         self._files = ExitStack()
         self._log = LogWriter(self.folder / f"{name}.mcap", name, self.sensors)
         self._truth: LogWriter | None = None
-        self._has_exact_depth = False
+        self._has_depth = self._has_exact_depth = self._has_sigma = False
+        self._sensors: dict[
+            str, NDArray[np.float64]
+        ] = {}  # topic of a pose in the camera that is still to be written
         self._stamps: list[int] = []
         self._positions: list[NDArray[np.float64]] = []
 
     def __enter__(self) -> RobotWriter:
         self._files.enter_context(self._log)
-        self._log.channel(
-            topics.DEPTH.of(self.name), topics.DEPTH.schema, {DEPTH_SCALE_KEY: repr(self.depth_scale)}
-        )
         return self
 
     def add_frame(
@@ -130,24 +147,28 @@ class RobotWriter:
         stamp_ns: int,
         color: bytes,
         color_format: str,
-        depth: NDArray[np.uint16],
+        depth: NDArray[np.uint16] | None,
         T_world_camera: NDArray[np.float64] | None = None,
         exact_depth: NDArray[np.uint16] | None = None,
         mask: NDArray[np.bool_] | None = None,
+        depth_sigma_m: NDArray[np.floating] | None = None,
     ) -> None:
         """Append one frame.
 
         Args:
             stamp_ns: time of the recording, increasing.
             color: the encoded colour image as it is; color_format: "jpeg" or "png".
-            depth: uint16 [H, W] in units of depth_scale along z, registered to colour, 0 = none.
+            depth: uint16 [H, W] in units of depth_scale along z, registered to colour, 0 = none. None: the depth is
+                that of another camera or a LiDAR.
             T_world_camera: true pose [4, 4] of the colour camera in the world that all robots share, where known.
             exact_depth: like depth, without noise, where that differs and is known.
             mask: bool [H, W], False where a pixel must not be used (a moving object); None = all may.
+            depth_sigma_m: [H, W], standard deviation of the depth in metres, where it is known pixel by pixel: then
+                with every frame. Counts to 6.5 m in steps of 0.1 mm.
         """
-        self._check_size(depth)
-        if mask is not None:
-            self._check_size(mask)
+        for image in (depth, mask, depth_sigma_m):
+            if image is not None:
+                self._check_size(image)
         if color_format not in ("jpeg", "png"):
             raise ValueError(f"colour format {color_format!r}, expected 'jpeg' or 'png'")
         if self._stamps and stamp_ns <= self._stamps[-1]:
@@ -160,7 +181,14 @@ class RobotWriter:
         self._log.write(
             topics.COLOR.of(name), messages.pack_color(stamp_ns, name, color, color_format), stamp_ns
         )
-        self._log.write(topics.DEPTH.of(name), messages.pack_depth(stamp_ns, name, depth), stamp_ns)
+        if depth is not None:
+            if not self._has_depth:
+                text = {DEPTH_SCALE_KEY: repr(self.depth_scale)}
+                self._log.channel(topics.DEPTH.of(name), topics.DEPTH.schema, text)
+                self._has_depth = True
+            self._log.write(topics.DEPTH.of(name), messages.pack_depth(stamp_ns, name, depth), stamp_ns)
+            if depth_sigma_m is not None:
+                self._add_sigma(stamp_ns, depth, depth_sigma_m)
         if mask is not None:
             self._log.write(topics.MASK.of(name), messages.pack_mask(stamp_ns, name, mask), stamp_ns)
         if T_world_camera is not None:
@@ -177,7 +205,76 @@ class RobotWriter:
                 self._has_exact_depth = True
             truth.write(topic, messages.pack_depth(stamp_ns, name, exact_depth), stamp_ns)
 
-    def _check_size(self, image: NDArray[np.uint16] | NDArray[np.bool_]) -> None:
+    def _add_sigma(self, stamp_ns: int, depth: NDArray[np.uint16], sigma_m: NDArray[np.floating]) -> None:
+        topic = topics.DEPTH_SIGMA.of(self.name)
+        if not self._has_sigma:
+            self._log.channel(topic, topics.DEPTH_SIGMA.schema, {DEPTH_SCALE_KEY: repr(SIGMA_SCALE_M)})
+            self._has_sigma = True
+        told = (depth > 0) & (np.asarray(sigma_m) > 0)
+        units = np.clip(np.rint(sigma_m / SIGMA_SCALE_M), 1, np.iinfo(np.uint16).max)
+        raw = np.where(told, units, 0).astype(np.uint16)
+        self._log.write(topic, messages.pack_depth(stamp_ns, self.name, raw), stamp_ns)
+
+    def set_depth_camera(
+        self, camera: PinholeCamera, T_camera_depth: NDArray[np.float64], depth_scale: float
+    ) -> None:
+        """Announce a depth camera of its own: intrinsics, T_camera_depth [4, 4], metres per unit of its images."""
+        self._depth_camera = camera
+        self._sensors[topics.RAW_DEPTH_TRANSFORM.of(self.name)] = T_camera_depth
+        text = {DEPTH_SCALE_KEY: repr(float(depth_scale))}
+        self._log.channel(topics.RAW_DEPTH.of(self.name), topics.RAW_DEPTH.schema, text)
+
+    def add_depth(self, stamp_ns: int, depth: NDArray[np.uint16]) -> None:
+        """Append an image of the depth camera, uint16 [h, w] along its z, 0 = none; not registered to colour."""
+        if depth.shape != (self._depth_camera.height, self._depth_camera.width):
+            raise ValueError(f"an image is {depth.shape}, expected that of {self._depth_camera}")
+        if self._announce(topics.RAW_DEPTH_TRANSFORM, stamp_ns, "depth_camera"):
+            calibration = messages.pack_calibration(stamp_ns, self.name, self._depth_camera)
+            self._log.write(topics.RAW_DEPTH_CALIBRATION.of(self.name), calibration, stamp_ns)
+        self._log.write(
+            topics.RAW_DEPTH.of(self.name), messages.pack_depth(stamp_ns, self.name, depth), stamp_ns
+        )
+
+    def set_lidar(self, T_camera_lidar: NDArray[np.float64], range_sigma_m: float | None) -> None:
+        """Announce a LiDAR: T_camera_lidar [4, 4] and the standard deviation of its ranges, None if not known."""
+        self._sensors[topics.LIDAR_TRANSFORM.of(self.name)] = T_camera_lidar
+        text = {} if range_sigma_m is None else {RANGE_SIGMA_KEY: repr(float(range_sigma_m))}
+        self._log.channel(topics.LIDAR.of(self.name), topics.LIDAR.schema, text)
+
+    def add_points(self, stamp_ns: int, points_lidar: NDArray[np.floating]) -> None:
+        """Append a sweep of the LiDAR: points [n, 3], metres, all as of the one time."""
+        self._announce(topics.LIDAR_TRANSFORM, stamp_ns, "lidar")
+        points = messages.pack_points(stamp_ns, f"{self.name}/lidar", points_lidar)
+        self._log.write(topics.LIDAR.of(self.name), points, stamp_ns)
+
+    def set_imu(self, T_camera_imu: NDArray[np.float64]) -> None:
+        """Announce an IMU: T_camera_imu [4, 4]."""
+        self._sensors[topics.IMU_TRANSFORM.of(self.name)] = T_camera_imu
+
+    def add_imu(
+        self, stamp_ns: int, rates_rad_s: NDArray[np.float64], accelerations_m_s2: NDArray[np.float64]
+    ) -> None:
+        """Append a reading of the IMU: angular velocity [3] and acceleration with gravity [3], about its own axes."""
+        self._announce(topics.IMU_TRANSFORM, stamp_ns, "imu")
+        reading = messages.pack_imu(stamp_ns, self.name, rates_rad_s, accelerations_m_s2)
+        self._log.write(topics.IMU.of(self.name), reading, stamp_ns)
+
+    def add_odometry(self, stamp_ns: int, T_odometry_camera: NDArray[np.float64]) -> None:
+        """Append a pose [4, 4] of the camera by another odometry, in a frame of its own."""
+        pose = messages.pack_pose_in_frame(stamp_ns, f"{self.name}/odometry_prior", T_odometry_camera)
+        self._log.write(topics.ODOMETRY_PRIOR.of(self.name), pose, stamp_ns)
+
+    def _announce(self, transform: topics.Topic, stamp_ns: int, sensor: str) -> bool:
+        """Write the pose of a sensor in the camera before its first message; whether this was that."""
+        T_camera_sensor = self._sensors.pop(transform.of(self.name), None)
+        if T_camera_sensor is None:
+            return False
+        frames = messages.camera_frame(self.name), f"{self.name}/{sensor}"
+        message = messages.pack_transform(stamp_ns, *frames, T_camera_sensor)
+        self._log.write(transform.of(self.name), message, stamp_ns)
+        return True
+
+    def _check_size(self, image: NDArray[Any]) -> None:
         if image.shape != (self.camera.height, self.camera.width):
             raise ValueError(f"an image is {image.shape}, expected {(self.camera.height, self.camera.width)}")
 
@@ -249,6 +346,9 @@ class RecordingWriter:
         self.warnings: list[str] = []
         self.parameters = dict(parameters or {})
         self.checks: dict[str, Any] = {}
+        self.clocks: dict[
+            str, Any
+        ] = {}  # by robot: how its clock differs from the first robot's, where that was asked
         self._source, self._converter, self._force = dict(source or {}), converter, force
         self._robots: dict[str, dict[str, Any]] = {}
         self._open: list[RobotWriter] = []
@@ -324,6 +424,7 @@ class RecordingWriter:
             "geometry": self._geometry,
             "robots": {robot: self._robots[robot] for robot in sorted(self._robots)},
             "checks": self.checks,
+            "clocks": self.clocks,
             "warnings": self.warnings,
         }
         text = json.dumps(description, indent=2, allow_nan=False) + "\n"

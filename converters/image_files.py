@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from pipeline.config import Config
-from pipeline.errors import DuagError
+from pipeline.errors import DuagError, closest
+from pipeline.files import decode_image, read_bytes
 from pipeline.geometry import se3, so3
 
 MAX_ROTATION_DEFECT = 0.01  # largest entry of |R - nearest rotation|
@@ -25,26 +26,10 @@ def options_of(model: type[Options], values: Mapping[str, Any], dataset: str) ->
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
-        known = ", ".join(model.model_fields)
-        raise DuagError(
-            f"{dataset}: {name} = {first['input']!r}: {first['msg']}; options are {known}"
-        ) from error
-
-
-def read_bytes(path: Path, expected: str) -> bytes:
-    """The bytes of a file."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DuagError(f"{path}: {error.strerror or error}, expected {expected}") from error
-
-
-def read_text(path: Path, expected: str) -> str:
-    """The text of a file."""
-    try:
-        return read_bytes(path, expected).decode()
-    except UnicodeDecodeError as error:
-        raise DuagError(f"{path}: is not text, expected {expected}") from error
+        if first["type"] == "extra_forbidden":
+            hint = closest(name, list(model.model_fields), "options")
+            raise DuagError(f"{dataset}: {name} is no option; {hint}") from error
+        raise DuagError(f"{dataset}: {name} = {first['input']!r}: {first['msg']}") from error
 
 
 def read_color(path: Path, size: tuple[int, int]) -> tuple[bytes, str]:
@@ -52,7 +37,7 @@ def read_color(path: Path, size: tuple[int, int]) -> tuple[bytes, str]:
     import cv2
 
     data = read_bytes(path, "a colour image")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    image = decode_image(data, cv2.IMREAD_COLOR)
     if image is None:
         raise DuagError(f"{path}: {len(data)} bytes that no decoder reads, expected a colour image")
     check_size(path, image.shape, size)
@@ -68,7 +53,7 @@ def read_depth(path: Path, size: tuple[int, int], unit: str = "depth") -> NDArra
     import cv2
 
     data = read_bytes(path, "a depth image")
-    raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    raw = decode_image(data, cv2.IMREAD_UNCHANGED)
     if raw is None:
         raise DuagError(f"{path}: {len(data)} bytes that no decoder reads, expected a depth image")
     if raw.dtype != np.uint16 or raw.ndim != 2:

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from converters import image_folder, replica_layout
-from converters.image_files import options_of, read_text
+from converters.image_files import options_of
 from pipeline.errors import DuagError
+from pipeline.files import read_text
 from pipeline.geometry.camera import PinholeCamera
 
 

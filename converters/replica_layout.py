@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from converters.image_files import options_of, read_text, rigid
+from converters.image_files import options_of, rigid
 from converters.image_folder import Clip, FrameFiles, stamps_of, write
 from pipeline.config import Config
 from pipeline.errors import DuagError
+from pipeline.files import read_text
 from pipeline.geometry.camera import PinholeCamera
 
 FILE = re.compile(r"(frame|depth)(\d+)\.(jpg|jpeg|png)")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import DuagError
+from pipeline.files import decode_image
 from pipeline.geometry.camera import PinholeCamera
 
 Depth = NDArray[np.float32]
@@ -31,14 +32,80 @@ _COLOR_CODES = {  # encoding: channels, and the name of OpenCV's conversion to B
     "yuv422_yuy2": (2, "COLOR_YUV2BGR_YUY2"),
     "yuyv": (2, "COLOR_YUV2BGR_YUY2"),
 }
+FISHEYE = (
+    "equidistant",
+    "fisheye",
+    "kannala_brandt",
+)  # one model, by the names that ROS, RealSense, Foxglove give it
+# with no name, as older drivers; RealSense names the model whose numbers are zero or those of plumb_bob
+POLYNOMIAL = (
+    "",
+    "plumb_bob",
+    "rational_polynomial",
+    "radtan",
+    "brown_conrady",
+    "Brown Conrady",
+    "Modified Brown Conrady",
+)
 DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
+
+
+def encoded_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height that a JPEG or PNG tells, without decoding; None if it is cut short or neither."""
+    if data.startswith(b"\x89PNG"):
+        whole = len(data) > 24 and b"IEND" in data[-64:]
+        return (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) if whole else None
+    at = 2 if data.startswith(b"\xff\xd8") else len(data)
+    while at + 9 < len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of a frame
+            if data.rfind(b"\xff\xd9", at) < 0:  # no end; some cameras write more behind it
+                return None
+            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+        at += 1 if marker == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return None
+
+
+def is_cut_short(message: Any) -> bool:
+    """Whether a CompressedImage is a JPEG or PNG that lacks its end; that of compressedDepth has 12 bytes before it."""
+    if not hasattr(message, "format"):
+        return False
+    data = bytes(message.data)
+    data = data[12:] if data[12:].startswith(b"\x89PNG") else data
+    return data.startswith((b"\xff\xd8\xff", b"\x89PNG")) and encoded_size(data) is None
 
 
 def is_depth(message: Any) -> bool:
     """Whether an Image or CompressedImage holds depth, by what it says of itself."""
     if hasattr(message, "encoding"):
         return message.encoding in DEPTH_ENCODINGS
-    return "compressedDepth" in message.format
+    return "compressedDepth" in message.format or _is_gray_png_of_16_bits(bytes(message.data[:26]))
+
+
+def is_integer_depth(message: Any) -> bool:
+    """Whether depth comes as integers, whose numbers can be kept; else as floats."""
+    encoding = message.encoding if hasattr(message, "encoding") else message.format.split(";")[0].strip()
+    return bool(encoding != "32FC1")
+
+
+def _is_gray_png_of_16_bits(head: bytes) -> bool:
+    """By the first chunk of a PNG: 16 bits, and gray (colour type 0)."""
+    return head.startswith(b"\x89PNG") and head[24:26] == b"\x10\x00"
+
+
+def size_of(message: Any, where: str) -> tuple[int, int]:
+    """Width and height of an Image or CompressedImage."""
+    import cv2
+
+    if hasattr(message, "encoding"):
+        return int(message.width), int(message.height)
+    if is_depth(message):
+        height, width = depth_m(message, where, 1.0).shape
+        return width, height
+    image = decode_image(color_bytes(message, where)[0], cv2.IMREAD_COLOR)
+    if image is None:
+        raise DuagError(f"{where}: no decoder reads it, expected a colour image")
+    return int(image.shape[1]), int(image.shape[0])
 
 
 def rows_of(message: Any, where: str, dtype: str, channels: int) -> NDArray[Any]:
@@ -80,11 +147,23 @@ def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
 
 
 def depth_m(message: Any, where: str, scale: float) -> Depth:
-    """Depth [h, w] in metres, 0 where there is none. scale: metres per unit of 16-bit depth."""
+    """Depth [h, w] in metres, 0 where there is none. scale: metres per unit of integer depth."""
+    return in_metres(depth_values(message, where), scale)
+
+
+def in_metres(values: NDArray[np.uint16] | Depth, scale: float) -> Depth:
+    """What `depth_values` gives, in metres."""
+    if values.dtype == np.uint16:
+        return values.astype(np.float32) * np.float32(scale)
+    return values.astype(np.float32, copy=False)
+
+
+def depth_values(message: Any, where: str) -> NDArray[np.uint16] | Depth:
+    """Depth [h, w], 0 where there is none: integers as they stand, uint16, or metres, float32."""
     if hasattr(message, "format"):
-        return _compressed_depth(message.format, bytes(message.data), where, scale)
+        return _compressed_depth(message.format, bytes(message.data), where)
     if message.encoding in ("16UC1", "mono16"):
-        return rows_of(message, where, "uint16", 1)[..., 0].astype(np.float32) * np.float32(scale)
+        return rows_of(message, where, "uint16", 1)[..., 0]
     if message.encoding == "32FC1":
         return _sound(rows_of(message, where, "float32", 1)[..., 0])
     raise DuagError(f"{where}: encoding {message.encoding!r}, expected one of {', '.join(DEPTH_ENCODINGS)}")
@@ -96,7 +175,7 @@ def _sound(depth: NDArray[Any]) -> Depth:
         return np.where(np.isfinite(depth) & (depth > 0), depth, 0.0).astype(np.float32)
 
 
-def _compressed_depth(text: str, data: bytes, where: str, scale: float) -> Depth:
+def _compressed_depth(text: str, data: bytes, where: str) -> NDArray[np.uint16] | Depth:
     """compressedDepth of image_transport: a header of 12 bytes, then PNG or RVL; plain PNG too.
 
     A PNG of 32FC1 holds inverse depth, z = A / (v - B); the encoding in `format` decides, not the header.
@@ -113,12 +192,14 @@ def _compressed_depth(text: str, data: bytes, where: str, scale: float) -> Depth
     if not body.startswith(b"\x89PNG"):
         values = _rvl(body, where)
     else:
-        image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = decode_image(body, cv2.IMREAD_UNCHANGED)
         if image is None or image.dtype != np.uint16 or image.ndim != 2:
             raise DuagError(f"{where}: no decoder finds 16-bit depth in it, expected a PNG of 16 bits")
         values = image.astype(np.uint16)
     if encoding != "32FC1":
-        return values.astype(np.float32) * np.float32(scale)
+        return values
+    if plain:
+        raise DuagError(f"{where}: inverse depth without its header of 12 bytes, expected compressedDepth")
     _, a, b = struct.unpack("<iff", data[:12])
     with np.errstate(divide="ignore", invalid="ignore"):
         return _sound(np.where(values > 0, a / (values.astype(np.float32) - np.float32(b)), 0.0))
@@ -200,11 +281,18 @@ class RosCamera:
             (cx - roi.x_offset + 0.5) / binning[0] - 0.5,
             (cy - roi.y_offset + 0.5) / binning[1] - 0.5,
         )
-        fisheye = model in ("equidistant", "fisheye")
-        known = ("", "plumb_bob", "rational_polynomial", "equidistant", "fisheye", "none", "None")
-        if np.any(D) and model not in known and "brown" not in model.lower():
-            raise DuagError(f"{where}: distortion model {model!r}, expected one of {', '.join(known[1:5])}")
-        return RosCamera(camera, tuple(D.tolist()) if np.any(D) else (), fisheye, message.header.frame_id)
+        if not np.any(D):
+            return RosCamera(camera, (), False, message.header.frame_id)
+        fisheye = model in FISHEYE
+        lengths = {True: (4,), False: (4, 5, 8, 12, 14)}[fisheye]
+        if not fisheye and model not in POLYNOMIAL:
+            known = ", ".join((*POLYNOMIAL[1:], *FISHEYE))
+            raise DuagError(f"{where}: distortion model {model!r}, expected one of {known}")
+        if len(D) not in lengths or not np.isfinite(D).all():
+            raise DuagError(
+                f"{where}: distortion {D.tolist()} of {model!r}, expected {' or '.join(map(str, lengths))} numbers"
+            )
+        return RosCamera(camera, tuple(D.tolist()), fisheye, message.header.frame_id)
 
     def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Where in its images every pixel of the pinhole lies; None without distortion."""

@@ -14,10 +14,11 @@ import numpy as np
 from pydantic import Field
 
 from converters import image_folder
-from converters.image_files import options_of, read_bytes, read_text, rigid
+from converters.image_files import options_of, rigid
 from converters.image_folder import Clip, FrameFiles, stamps_of
 from pipeline.config import Config
 from pipeline.errors import DuagError
+from pipeline.files import decode_image, read_bytes, read_text
 from pipeline.geometry.camera import PinholeCamera
 
 DEPTH_SCALE = 0.001
@@ -73,7 +74,7 @@ def _camera(path: Path, image: Path) -> PinholeCamera:
         K = np.array(read_text(path, "4x4 intrinsics").split(), dtype=np.float64).reshape(4, 4)
     except ValueError as error:
         raise DuagError(f"{path}: {error}, expected 4x4 numbers") from error
-    pixels = cv2.imdecode(np.frombuffer(read_bytes(image, "an image"), np.uint8), cv2.IMREAD_UNCHANGED)
+    pixels = decode_image(read_bytes(image, "an image"), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise DuagError(f"{image}: no decoder reads it, expected an image")
     return PinholeCamera(pixels.shape[1], pixels.shape[0], K[0, 0], K[1, 1], K[0, 2], K[1, 2])

@@ -15,10 +15,11 @@ import numpy as np
 from pydantic import Field
 
 from converters import image_folder
-from converters.image_files import options_of, read_text, rigid
+from converters.image_files import options_of, rigid
 from converters.image_folder import Clip, FrameFiles, stamps_of
 from pipeline.config import Config
 from pipeline.errors import DuagError
+from pipeline.files import read_text
 from pipeline.geometry.camera import PinholeCamera
 
 DEPTH_SCALE = 0.001

@@ -21,9 +21,10 @@ MAX_RATIO = 0.02  # of the median depth
 class ReprojectionCheck:
     """Moves the depth of a frame into a later one by the poses and compares."""
 
-    def __init__(self, camera: PinholeCamera, frames: int) -> None:
+    def __init__(self, camera: PinholeCamera, frames: int, gap: int = GAP) -> None:
+        """gap: frames between the two of a pair; more where the true poses are known to be rough."""
         self._camera = camera
-        gap = min(GAP, frames - 1)
+        gap = min(gap, frames - 1)
         starts: list[int] = []
         if gap > 0:
             starts = np.linspace(0, frames - 1 - gap, PAIRS).astype(int).tolist()
@@ -31,6 +32,10 @@ class ReprojectionCheck:
         self._kept: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
         self._residuals: list[NDArray[np.float64]] = []
         self._depths: list[NDArray[np.float64]] = []
+
+    def needs(self, index: int, T_world_camera: NDArray[np.float64] | None) -> bool:
+        """Whether frame `index` is compared with another."""
+        return T_world_camera is not None and (index in self._second or index in self._second.values())
 
     def add(
         self, index: int, depth_m: NDArray[np.float64], T_world_camera: NDArray[np.float64] | None
@@ -61,9 +66,12 @@ class ReprojectionCheck:
         self._residuals.append(np.abs(found - expected)[found > 0])
         self._depths.append(found[found > 0])
 
-    def result(self, label: str) -> dict[str, Any]:
+    def result(self, label: str, max_ratio: float = MAX_RATIO) -> dict[str, Any]:
         """Median residual and median depth in metres, None where too little overlaps.
 
+        Args:
+            label: of the source, for the message. max_ratio: largest residual as a share of the depth; more where the
+                true poses are known to be rough.
         Raises:
             DuagError: the residual is too large: poses, depth and intrinsics do not belong together.
         """
@@ -71,9 +79,9 @@ class ReprojectionCheck:
         if len(residuals) < MIN_PIXELS:
             return {"reprojection_median_m": None, "median_depth_m": None}
         residual, depth = float(np.median(residuals)), float(np.median(np.concatenate(self._depths)))
-        if residual > MAX_RATIO * depth:
+        if residual > max_ratio * depth:
             raise DuagError(
                 f"{label}: depth moved by the poses differs by {residual:.3f} m at {depth:.2f} m (medians), expected "
-                f"less than {MAX_RATIO:.0%}: poses, intrinsics and depth do not belong together"
+                f"less than {max_ratio:.0%}: poses, intrinsics and depth do not belong together"
             )
         return {"reprojection_median_m": residual, "median_depth_m": depth}

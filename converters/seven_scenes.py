@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from converters.base import NANOSECONDS, RecordingWriter, RobotWriter, robot_names
-from converters.image_files import options_of, read_color, read_depth, read_text, rigid
+from converters.image_files import options_of, read_color, read_depth, rigid
 from converters.self_check import ReprojectionCheck
 from pipeline import numeric
 from pipeline.config import Config
 from pipeline.errors import DuagError
+from pipeline.files import read_text
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.progress import track

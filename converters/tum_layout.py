@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from converters.base import NANOSECONDS
-from converters.image_files import read_text
 from converters.image_folder import FrameFiles
 from pipeline.config import Config
 from pipeline.errors import DuagError
+from pipeline.files import read_text
 from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pipeline.errors import DuagError
+from pipeline.files import read_text
 
 
 class Config(BaseModel):
@@ -36,10 +37,8 @@ def load(model: type[Model], path: Path | None = None, overrides: Sequence[str] 
     if path is not None:
         source = str(path)
         try:
-            values = tomllib.loads(path.read_text())
-        except OSError as error:
-            raise DuagError(f"{path}: {error.strerror or error}, expected a TOML configuration") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            values = tomllib.loads(read_text(path, "a TOML configuration"))
+        except (tomllib.TOMLDecodeError, RecursionError) as error:
             raise DuagError(f"{path}: not valid TOML: {error}") from error
     for override in overrides:
         _apply(values, override)

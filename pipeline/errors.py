@@ -1,8 +1,20 @@
 """Errors that a user can fix."""
 
+from collections.abc import Sequence
+
 
 class DuagError(Exception):
     """One line that names the file, the topic, what was found and what was expected.
 
     The command line prints the line and exits with 1; anything else that is raised is a bug.
     """
+
+
+def closest(word: str, known: Sequence[str], kind: str) -> str:
+    """The end of a line about a wrong name: what was perhaps meant, else what there is, else that there is no `kind`."""
+    import difflib
+
+    near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)
+    if near:
+        return f"expected perhaps {near[0]}"
+    return f"expected one of {', '.join(known)}" if known else f"expected {kind}, and there is none"

@@ -157,9 +157,14 @@ class Inspector:
             if kind is Kind.STATE:
                 state, poses = wire.read_state(payload, team)
                 names = self._session.team
+                pairs = {
+                    f"{a} and {b}": wire.pair_bit(i, j)
+                    for j, b in enumerate(names)
+                    for i, a in enumerate(names[:j])
+                }
                 return {
-                    "root": names[state.root],
-                    "members": [n for k, n in enumerate(names) if state.members >> k & 1],
+                    "links": [pair for pair, bit in pairs.items() if state.links & bit],
+                    "parted": [pair for pair, bit in pairs.items() if state.parted & bit],
                     "frames_hops": state.frames_hops,
                     "still_hops": state.still_hops,
                     "agreed": state.agreed,

@@ -352,6 +352,10 @@ class GaussianInformation:
     geometry: float32 [n, 45], upper triangle, row-major, of the 9x9 over (mean 3, vec log covariance 6).
     color: float32 [n, 3], diagonal over RGB. opacity: float32 [n], over the logit. observations: uint32 [n], views.
     color_sigma: noise of a colour channel, image units. depth_sigma: noise of depth, as a formula of z in metres.
+    deviation_m: float32 [n], how far the mean is from the surface that the robot's depth images measured; the sums
+    hold everything but one Gaussian fixed and do not know of it. color_pixels_per_sample, depth_pixels_per_sample:
+    pixels that say together what one would say alone, because their residuals are alike; the sums are divided by them.
+    overlap: Gaussians drawn in a pixel, mean over the views.
     """
 
     schema: ClassVar[str] = "duagc.v1.GaussianInformation"
@@ -367,11 +371,17 @@ class GaussianInformation:
     observations: NDArray[np.uint32]
     color_sigma: float
     depth_sigma: str
+    deviation_m: NDArray[np.float32]
+    color_pixels_per_sample: float
+    depth_pixels_per_sample: float
+    overlap: float
     frame_id: str = ""  # empty: the robot's map
 
     def __post_init__(self) -> None:
         n = len(self.ids)
-        shapes = {"geometry": (n, 45), "color": (n, 3), "opacity": (n,), "observations": (n,)}
+        shapes = {
+            "geometry": (n, 45), "color": (n, 3), "opacity": (n,), "observations": (n,), "deviation_m": (n,)
+        }  # fmt: skip
         for name, shape in shapes.items():
             if np.shape(getattr(self, name)) != shape:
                 raise ValueError(
@@ -394,6 +404,10 @@ class GaussianInformation:
             observations_uint32=pack_array(self.observations, "uint32"),
             color_sigma=float(self.color_sigma),
             depth_sigma=self.depth_sigma,
+            deviation_m_float32=pack_array(self.deviation_m, "float32"),
+            color_pixels_per_sample=float(self.color_pixels_per_sample),
+            depth_pixels_per_sample=float(self.depth_pixels_per_sample),
+            overlap=float(self.overlap),
         )
         pack_stamp(message, self.stamp_ns)
         return message
@@ -417,6 +431,10 @@ class GaussianInformation:
             observations=array("observations_uint32", "uint32"),
             color_sigma=m.color_sigma,
             depth_sigma=m.depth_sigma,
+            deviation_m=array("deviation_m_float32", "float32"),
+            color_pixels_per_sample=m.color_pixels_per_sample,
+            depth_pixels_per_sample=m.depth_pixels_per_sample,
+            overlap=m.overlap,
             frame_id=m.frame_id,
         )
 

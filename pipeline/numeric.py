@@ -1,4 +1,4 @@
-"""Settings of the numeric libraries that make results independent of threads and of the processor.
+"""Settings of the numeric libraries that make results independent of threads and of the processor, and bounded.
 
 Call `settle()` before numpy, scipy or OpenCV is imported for the first time; child processes inherit the
 environment. One BLAS thread, because a product split over threads sums in another order; the AVX2 code paths of
@@ -15,6 +15,7 @@ _ENVIRONMENT = {
     "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
     "OPENCV_CPU_DISABLE": "AVX512-SKX",
     "PYTHONHASHSEED": "0",
+    "OPENCV_IO_MAX_IMAGE_PIXELS": str(1 << 26),  # a small file can hold a large image
 }
 
 

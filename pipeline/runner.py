@@ -207,6 +207,7 @@ def fuse_robot(robot: str, log: Path, folder: Path, result: AgentResult, config:
         folder,
         config.fusion,
         config.exchange.matching,
+        config.exchange.weights,
         seed=config.seed,
         threads=threads_per_worker(1),
     )

@@ -43,6 +43,13 @@ DEPTH = Topic(
     Scope.SENSOR,
     "16UC1 depth along z, registered to colour, 0 = none; channel metadata depth_scale = metres per unit",
 )
+DEPTH_SIGMA = Topic(
+    "/<robot>/camera/depth_sigma",
+    "foxglove.RawImage",
+    "converters",
+    Scope.SENSOR,
+    "16UC1 standard deviation of the registered depth of the same publish time, 0 = unknown; depth_scale as above",
+)
 MASK = Topic(
     "/<robot>/camera/mask",
     "foxglove.RawImage",
@@ -83,7 +90,7 @@ LIDAR = Topic(
     "foxglove.PointCloud",
     "converters",
     Scope.SENSOR,
-    "points of one sweep, x y z in metres, read where there is no depth image",
+    "points of one sweep, x y z in metres, read where there is no depth image; channel metadata range_sigma = metres",
 )
 LIDAR_TRANSFORM = Topic(
     "/<robot>/lidar/transform",
@@ -205,6 +212,7 @@ CLOSURE_DECISION = Topic(
 TOPICS: tuple[Topic, ...] = (
     COLOR,
     DEPTH,
+    DEPTH_SIGMA,
     MASK,
     CALIBRATION,
     RAW_DEPTH,

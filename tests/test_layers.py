@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 # what each part of pipeline/ may import from pipeline/, besides itself
-FOUNDATION = {"__init__", "errors", "config", "numeric", "streams", "progress", "geometry"}
+FOUNDATION = {"__init__", "errors", "files", "config", "numeric", "streams", "progress", "geometry"}
 MATHEMATICS = FOUNDATION | {"kernels", "splat", "registration"}
 LOGS = {"messages", "recording"}
 ALLOWED = {

@@ -48,6 +48,10 @@ def gaussian_information(rng: np.random.Generator, n: int) -> m.GaussianInformat
         observations=rng.integers(0, 2**32 - 1, n).astype(np.uint32),
         color_sigma=0.03,
         depth_sigma="0.0012 + 0.0019 (z - 0.4)^2",
+        deviation_m=rng.random(n).astype(np.float32),
+        color_pixels_per_sample=9.5,
+        depth_pixels_per_sample=25.0,
+        overlap=12.25,
         frame_id="alpha/map",
     )
 

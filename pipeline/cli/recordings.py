@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import Force, Json, Out, Workers, app
+from pipeline.cli.common import EXIT_FAILED, Force, Json, Out, Workers, app
+from pipeline.errors import DuagError
 
 
 @app.command()
@@ -71,7 +72,10 @@ def simulate(
 
 @app.command()
 def convert(
-    dataset: Annotated[str | None, typer.Argument(help="Name of the dataset; see --list.")] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Argument(help="Name of the dataset (see --list), or a converter of your own in a .py."),
+    ] = None,
     source: Annotated[Path | None, typer.Argument(metavar="SRC", help="Where its files are.")] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write; must not exist.")] = None,
     robots: Annotated[
@@ -85,6 +89,12 @@ def convert(
     options: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Option of the converter; repeatable."),
+    ] = None,
+    time_source: Annotated[
+        str | None,
+        typer.Option(
+            help="Of logs of other programs: header, log (recording) or publish.", show_default=False
+        ),
     ] = None,
     force: Force = False,
     list_datasets: Annotated[
@@ -102,20 +112,78 @@ def convert(
         return
     if dataset is None or source is None or out is None:
         raise typer.BadParameter("expected DATASET SRC --out REC, or --list")
-    converters.convert(dataset, source, out, robots=robots, force=force, options=options or [])
+    said = [*(options or []), *([f"time_source={time_source}"] if time_source else [])]
+    converters.convert(dataset, source, out, robots=robots, force=force, options=said)
     print(out)
 
 
 @app.command()
 def info(
-    path: Annotated[Path, typer.Argument(help="A recording, a run or a log.", show_default=False)],
+    path: Annotated[
+        Path, typer.Argument(help="A recording, a run or a log, also of another program.", show_default=False)
+    ],
     as_json: Json = False,
+    as_toml: Annotated[
+        bool,
+        typer.Option("--toml", help="Of a log of another program: a file to convert it by, to be edited."),
+    ] = False,
+    preview: Annotated[
+        Path | None,
+        typer.Option(help="Write a PNG of some colour and depth images of every robot.", show_default=False),
+    ] = None,
 ) -> None:
-    """Say what is in a recording, a run or a log.
+    """Say what is in a recording, a run or a log; of a log of another program also what would be converted and why.
 
-    Example: `duagc info recordings/redkitchen`
+    Examples: `duagc info recordings/redkitchen --preview redkitchen.png`,
+    `duagc info campus.bag --toml > campus.toml`
     """
+    from converters.logs import describe
     from pipeline import recording
 
+    if describe.is_foreign(path):
+        described = describe.describe(path)
+        text = describe.toml_text(described) if as_toml else describe.format_description(described)
+        print(json.dumps(described, indent=2) if as_json else text)
+        return
+    if as_toml:
+        raise DuagError(f"{path}: is none of another program's logs, expected one with --toml")
     content = recording.info(path)
+    if preview is not None:
+        recording.write_preview_of(path, preview)
     print(json.dumps(content, indent=2) if as_json else recording.format_info(content))
+
+
+@app.command()
+def check(
+    path: Annotated[Path, typer.Argument(help="A recording, or the log of one robot.", show_default=False)],
+    as_json: Json = False,
+) -> None:
+    """Say whether a recording is sound: times, pairs, depth scale, calibration, what a run will take.
+
+    Exit code 1 if there is an error; warnings and notes leave it 0.
+
+    Example: `duagc check recordings/redkitchen`
+    """
+    from pipeline import checks, numeric
+
+    numeric.settle_opencv()
+    report = checks.check(path)
+    print(json.dumps(report.plain(), indent=2) if as_json else checks.format_report(report))
+    if not report.sound:
+        raise typer.Exit(EXIT_FAILED)
+
+
+@app.command()
+def recover(
+    source: Annotated[Path, typer.Argument(help="A damaged log or recording; it stays as it is.")],
+    out: Out,
+    force: Force = False,
+) -> None:
+    """Save every message that is whole in a log that is cut or damaged, and say what is lost.
+
+    Examples: `duagc recover broken/alpha.mcap --out alpha.mcap`, `duagc recover broken --out recordings/saved`
+    """
+    from pipeline import recovery
+
+    for salvage in recovery.recover(source, out, force):
+        print(salvage.line())

@@ -18,6 +18,7 @@ from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
 CHI2_3_999 = 16.27  # 99.9 % quantile of chi^2 with 3 degrees of freedom
+_OTHER_GROUPS = 2  # beside the largest, that a cycle of three robots may find to be the right ones
 _CANDIDATES = 150  # relative frames tried as the start of the mean
 
 
@@ -48,14 +49,23 @@ class Closure:
 class Consistency:
     """What the closures of one pair of robots say together.
 
-    keep: bool [m], the mutually consistent group. T_ownmap_peermap: [4, 4], or None if too few agree. reasons: one
-    per closure, in words. support: size of the group.
+    keep: bool [m], the largest mutually consistent group. T_ownmap_peermap: [4, 4], or None if too few agree.
+    reasons: one per closure, in words. support: size of the group. others: smaller groups, disjoint, largest first.
     """
 
     keep: NDArray[np.bool_]
     T_ownmap_peermap: Array | None
     reasons: tuple[str, ...]
     support: int
+    others: tuple[Group, ...] = ()
+
+
+@dataclass(frozen=True)
+class Group:
+    """Closures that agree with each other, bool [m], and the relative frame [4, 4] that they agree on."""
+
+    keep: NDArray[np.bool_]
+    T_ownmap_peermap: Array
 
 
 def closure_factors(
@@ -153,7 +163,16 @@ def consistent(
         return Consistency(np.zeros(m, dtype=bool), None, (reason,) * m, support)
     rejected = f"disagrees with the consistent group of {support} among {m} closures"
     reasons = tuple("consistent" if k else rejected for k in keep.tolist())
-    return Consistency(keep, robust_frame(frames[keep], config), reasons, support)
+    others: list[Group] = []
+    left = ~keep
+    while len(others) < _OTHER_GROUPS and np.count_nonzero(left) >= config.min_support:
+        group = np.zeros(m, dtype=bool)
+        group[np.flatnonzero(left)[_clique((agree | agree.T)[np.ix_(left, left)])]] = True
+        if group.sum() < config.min_support:
+            break
+        others.append(Group(group, robust_frame(frames[group], config)))
+        left &= ~group
+    return Consistency(keep, robust_frame(frames[keep], config), reasons, support, tuple(others))
 
 
 def plausible(
@@ -182,13 +201,43 @@ def plausible(
     measured = own[i] @ np.array([c.T_own_peer for c in closures], dtype=np.float64).reshape(-1, 4, 4)
     translation_m = np.linalg.norm(measured[:, :3, 3] - peer[j, :3, 3], axis=1)
     rotation_rad = np.linalg.norm(so3.log(np.swapaxes(measured[:, :3, :3], 1, 2) @ peer[j, :3, :3]), axis=1)
-    covariance = np.linalg.inv(closure_factors(closures, i, j, config).information + np.eye(6))
+    variance = _whole_variance(closures, own, peer, drift_own, drift_peer, config)
+    limit = CHI2_3_999 * config.margin * variance
+    return (rotation_rad**2 < limit[:, 1]) & (translation_m**2 < limit[:, 0])
+
+
+def frame_variance(
+    closures: Sequence[Closure],
+    T_map_keyframe_own: Array,
+    T_map_keyframe_peer: Array,
+    drift_own: Array,
+    drift_peer: Array,
+    config: ClosureConfig,
+) -> tuple[float, float]:
+    """Variance (m^2, rad^2) of the relative frame that closures agree on, anywhere in the two maps.
+
+    No closure is surer than the drift of both robots lets it be, so many are no better here than their mean.
+    """
+    poses = np.asarray(T_map_keyframe_own), np.asarray(T_map_keyframe_peer)
+    mean = _whole_variance(closures, *poses, drift_own, drift_peer, config).mean(axis=0)
+    return float(mean[0]), float(mean[1])
+
+
+def _whole_variance(
+    closures: Sequence[Closure],
+    own: Array,
+    peer: Array,
+    drift_own: Array,
+    drift_peer: Array,
+    config: ClosureConfig,
+) -> Array:
+    """Variance [m, 2] (m^2, rad^2) of closures with the whole odometry of both robots, over the reach of their maps."""
+    index = np.zeros(len(closures), dtype=np.int64)
+    covariance = np.linalg.inv(closure_factors(closures, index, index, config).information + np.eye(6))
     variance = np.diagonal(covariance, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)
-    variance = config.margin * (variance + drift_own[-1] + drift_peer[-1])
+    variance = variance + drift_own[-1] + drift_peer[-1]
     reach_m = max(float(np.linalg.norm(np.ptp(poses[:, :3, 3], axis=0))) for poses in (own, peer))
-    return (rotation_rad**2 < CHI2_3_999 * variance[:, 1]) & (
-        translation_m**2 < CHI2_3_999 * (variance[:, 0] + variance[:, 1] * reach_m**2 / 3)
-    )
+    return variance + np.array([reach_m**2 / 3, 0.0]) * variance[:, 1:]
 
 
 def robust_frame(frames: Array, config: ClosureConfig) -> Array:

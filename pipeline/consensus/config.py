@@ -6,6 +6,8 @@ from pydantic import Field
 
 from pipeline.config import Config
 
+WeightKind = Literal["uniform", "observation_count", "residual_magnitude", "scalar", "diagonal", "block"]
+
 
 class ClosureConfig(Config):
     """Trust in single closures and in their mutual agreement."""
@@ -33,7 +35,7 @@ class PoseConsensusConfig(Config):
 
     relaxation: float = Field(default=0.9, gt=0.0, lt=1.0)
     """Share of the way that an edge variable goes to what arrived (0.5 is the textbook's, slower)."""
-    penalty_start: float = Field(default=0.1, gt=0.0)
+    penalty_start: float = Field(default=0.3, gt=0.0)
     """First penalty, as a multiple of the metric (the information of the pair's closures)."""
     penalty_min: float = Field(default=0.015, gt=0.0)
     """Least penalty; below it one Gauss-Newton step per round can diverge."""
@@ -63,11 +65,13 @@ class PoseConsensusConfig(Config):
     """A link on which nothing is in doubt after the warm-up skips the graduated weights. That saves rounds; in a larger
     team a false closure may fit until others' weights have changed."""
     robust_packets: int = Field(default=5, ge=1)
-    """Packets received per step of the graduated weights."""
+    """Most packets received per step of the graduated weights; a link that is steady takes two."""
     robust_growth: float = Field(default=1.4, gt=1.0)
     """Factor on the control parameter mu per step; 1.6 freezes robots on wrong weights."""
-    robust_passes: tuple[tuple[float, int], ...] = ((0.01, 25), (0.1, 15))
-    """Passes of the graduated weights: (first mu, steps)."""
+    robust_mu: tuple[float, float] = (1e-5, 300.0)
+    """Least first and greatest last mu. The schedule ends when all weights of a link are zero or one."""
+    robust_convexity: float = Field(default=0.1, ge=0.0)
+    """It begins at this share of the mu at which the worst closure is just convex; 0: always at the least."""
     odometry_floor_m: float = Field(default=0.002, ge=0.0)
     """Added to the covariance of every odometry factor: registration does not report its bias (m)."""
     odometry_floor_rad: float = Field(default=0.001, ge=0.0)

@@ -43,6 +43,23 @@ class Block:
     unsure: bool
 
 
+@dataclass(frozen=True)
+class Step:
+    """The root's answer to the blocks of one exchange.
+
+    accepted: the last step lowered the cost; else everybody goes back to where it was before. finished: this is the
+    last message. fresh: everybody linearises anew. damping: for the next blocks. delta: [s, 6], steps of the variables
+    shared with the parent.
+    """
+
+    exchange: int
+    accepted: bool
+    finished: bool
+    fresh: bool
+    damping: float
+    delta: Array
+
+
 class Front:
     """The variables of one robot's subtree, and one linear step over them.
 

@@ -16,12 +16,15 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.consensus.factors import inflated
 from pipeline.geometry import se3, spd
 from pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]
 MEAN, LOG_COVARIANCE, COLOR, OPACITY = slice(0, 3), slice(3, 9), slice(9, 12), 12
 """Places in theta."""
+SHAPE_FLOOR = 0.1
+"""Least standard deviation of a coordinate of vec log Sigma: 5 % of a scale."""
 _POSITION, _SHAPE, _COLOR, _OPACITY = slice(0, 6), slice(6, 27), slice(27, 30), 30
 
 
@@ -42,6 +45,18 @@ class FisherSums(Protocol):
     @property
     def opacity(self) -> NDArray[Any]:
         """[n]."""
+
+    @property
+    def observations(self) -> NDArray[Any]:
+        """[n], views that saw the Gaussian."""
+
+    @property
+    def deviation_m(self) -> NDArray[Any]:
+        """[n]."""
+
+    @property
+    def overlap(self) -> float:
+        """Gaussians drawn in a pixel."""
 
 
 def unpack_symmetric(upper: ArrayLike, size: int) -> Array:
@@ -105,7 +120,11 @@ class Evidence:
     def from_map(
         owner: str, gaussians: Gaussians, information: FisherSums | None, T_map_keyframe: ArrayLike
     ) -> Evidence:
-        """Evidence of a robot's own map, each Gaussian in the frame of its anchor.
+        """What a robot can tell others of its own map, each Gaussian in the frame of its anchor.
+
+        The sums of the images hold everything but one Gaussian fixed; what others want to know is where the surface is.
+        So the mean's deviation from the measured surface is added to its covariance, and nobody knows a shape better
+        than `SHAPE_FLOOR`. No information stays none.
 
         Args:
             owner: the robot.
@@ -114,19 +133,32 @@ class Evidence:
                 if None.
             T_map_keyframe: [k, 4, 4], by anchor.
         """
-        n, theta = len(gaussians), theta_of(gaussians)
-        packed = np.zeros((n, 31))
-        if information is not None and len(information.ids):
-            order = np.argsort(information.ids, kind="stable")
-            at = np.minimum(np.searchsorted(information.ids[order], gaussians.ids), len(order) - 1)
-            found = information.ids[order[at]] == gaussians.ids
-            row = order[at[found]]
-            geometry = unpack_symmetric(information.geometry[row], 9)
-            packed[found, _POSITION] = pack_symmetric(geometry[:, :3, :3])
-            packed[found, _SHAPE] = pack_symmetric(geometry[:, 3:, 3:])
-            packed[found, _COLOR] = information.color[row]
-            packed[found, _OPACITY] = information.opacity[row]
-        in_map = Evidence(owner, gaussians.ids, gaussians.anchors, theta, packed)
+        packed, rows = _sums_of(gaussians, information)
+        if information is not None and len(rows):
+            deviation_m = np.zeros(len(gaussians))
+            deviation_m[rows >= 0] = information.deviation_m[rows[rows >= 0]]
+            position = inflated(
+                unpack_symmetric(packed[:, _POSITION], 3), deviation_m[:, None, None] ** 2 * np.eye(3)
+            )
+            shape = inflated(unpack_symmetric(packed[:, _SHAPE], 6), SHAPE_FLOOR**2 * np.eye(6))
+            packed[:, _POSITION], packed[:, _SHAPE] = pack_symmetric(position), pack_symmetric(shape)
+        in_map = Evidence(owner, gaussians.ids, gaussians.anchors, theta_of(gaussians), packed)
+        return in_map._turned(se3.inverse(T_map_keyframe))
+
+    @staticmethod
+    def of_splats(
+        owner: str, gaussians: Gaussians, information: FisherSums | None, T_map_keyframe: ArrayLike
+    ) -> Evidence:
+        """How stiff a robot's own splats are among each other: what its own images lose if all of them move a little.
+
+        Splats of a pixel make up for each other, so the loss is no sum over splats; `overlap` times the Fisher sums is
+        a sum over splats that is never less (|sum of n numbers|^2 <= n times the sum of their squares).
+        Arguments as of `from_map`.
+        """
+        packed, _ = _sums_of(gaussians, information)
+        if information is not None:
+            packed *= information.overlap
+        in_map = Evidence(owner, gaussians.ids, gaussians.anchors, theta_of(gaussians), packed)
         return in_map._turned(se3.inverse(T_map_keyframe))
 
     def __len__(self) -> int:
@@ -171,6 +203,30 @@ class Evidence:
     def opacity_information(self) -> Array:
         """[n], over the logit."""
         return self.information[:, _OPACITY]
+
+
+def _sums_of(gaussians: Gaussians, information: FisherSums | None) -> tuple[Array, NDArray[np.int64]]:
+    """The block diagonal of the sums [n, 31] in the map frame, by Gaussian, and the row of each there, -1 without."""
+    packed = np.zeros((len(gaussians), 31))
+    if information is None:
+        return packed, np.full(len(gaussians), -1, dtype=np.int64)
+    rows = rows_by_id(gaussians.ids, information.ids)
+    found, row = rows >= 0, rows[rows >= 0]
+    geometry = unpack_symmetric(information.geometry[row], 9)
+    packed[found, _POSITION] = pack_symmetric(geometry[:, :3, :3])
+    packed[found, _SHAPE] = pack_symmetric(geometry[:, 3:, 3:])
+    packed[found, _COLOR] = information.color[row]
+    packed[found, _OPACITY] = information.opacity[row]
+    return packed, rows
+
+
+def rows_by_id(wanted: NDArray[np.int64], ids: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The row of each wanted id in `ids`, -1 where it is not there."""
+    if not len(ids):
+        return np.full(len(wanted), -1, dtype=np.int64)
+    order = np.argsort(ids, kind="stable")
+    at = order[np.minimum(np.searchsorted(ids[order], wanted), len(order) - 1)]
+    return np.where(ids[at] == wanted, at, -1).astype(np.int64)
 
 
 def pack_information(position: Array, shape: Array, color: Array, opacity: Array) -> Array:

@@ -27,7 +27,6 @@ from pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Ev
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-WeightKind = Literal["uniform", "observation_count", "residual_magnitude", "scalar", "diagonal", "block"]
 COORDINATES = 13
 
 
@@ -54,33 +53,14 @@ class Weights:
     opacity: Array
 
     @staticmethod
-    def of(evidence: Evidence, kind: WeightKind = "block", measure: Array | None = None) -> Weights:
-        """Weights of evidence, which must stand in the common frame.
-
-        Args:
-            kind: `block`, its diagonal, one number per block (`scalar`: the mean of the diagonal), 1 (`uniform`), or
-                one number per Gaussian that `measure` [n] gives (`observation_count`, `residual_magnitude`: the
-                weight itself, for example the inverse of a mean residual).
-        """
-        blocks = Weights(
+    def of(evidence: Evidence) -> Weights:
+        """Weights of evidence, which must stand in the common frame."""
+        return Weights(
             evidence.position_information(),
             evidence.shape_information(),
             evidence.color_information(),
             evidence.opacity_information(),
         )
-        if kind == "block":
-            return blocks
-        diagonal = blocks.diagonal()
-        if kind == "uniform":
-            diagonal = np.ones_like(diagonal)
-        elif kind in ("observation_count", "residual_magnitude"):
-            if measure is None:
-                raise ValueError(f"weights by {kind} need a measure of every Gaussian")
-            diagonal = np.repeat(np.asarray(measure, np.float64)[:, None], COORDINATES, axis=1)
-        elif kind == "scalar":
-            for part in (MEAN, LOG_COVARIANCE, COLOR):
-                diagonal[:, part] = diagonal[:, part].mean(axis=1, keepdims=True)
-        return Weights.of_diagonal(diagonal)
 
     @staticmethod
     def of_diagonal(diagonal: Array) -> Weights:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pipeline.consensus.closures import Closure
 from pipeline.consensus.factors import Factors, isotropic_information
 from pipeline.errors import DuagError
+from pipeline.files import read_text
 from pipeline.geometry import se3
 
 Array = NDArray[np.float64]
@@ -169,7 +170,7 @@ def read_g2o(path: Path) -> Edges:
     i: list[Key] = []
     j: list[Key] = []
     rows: list[list[float]] = []
-    for number, line in enumerate(_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_text(path, "a pose graph").splitlines(), start=1):
         words = line.split()
         if not words or words[0].startswith("#") or words[0] in _IGNORED_TAGS:
             continue
@@ -231,7 +232,7 @@ def read_kimera(path: Path) -> Edges:
         "kappa",
         "tau",
     ]
-    reader = csv.DictReader(_text(path).splitlines())
+    reader = csv.DictReader(read_text(path, "a pose graph").splitlines())
     missing = [name for name in needed if name not in (reader.fieldnames or [])]
     if missing:
         raise DuagError(f"{path}: no column {missing[0]}, expected {', '.join(needed)}")
@@ -253,13 +254,6 @@ def read_kimera(path: Path) -> Edges:
         raise DuagError(f"{path}: no measurements in this file")
     v = np.array(rows)
     return Edges(i, j, se3.from_quat_translation(v[:, [3, 0, 1, 2]], v[:, 4:7]), v[:, 7], v[:, 8])
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DuagError(f"{path}: {error}, expected a text file") from error
 
 
 def _merge(graphs: Sequence[Edges]) -> Edges:
@@ -303,7 +297,7 @@ def _with_reference(edges: Edges, path: Path) -> tuple[Edges, str | None]:
     inlier = np.zeros(len(edges.i), dtype=bool)
     if file.suffix == ".csv":
         true = set()
-        for line in _text(file).splitlines()[1:]:
+        for line in read_text(file, "a pose graph").splitlines()[1:]:
             words = line.split(",")
             if len(words) != 5 or not all(word.strip().isdigit() for word in words):
                 raise DuagError(
@@ -314,7 +308,9 @@ def _with_reference(edges: Edges, path: Path) -> tuple[Edges, str | None]:
                 true.add(((f"robot{a}", i), (f"robot{b}", j)))
         inlier[:] = [(a, b) in true for a, b in zip(edges.i, edges.j, strict=True)]
     else:  # numbers of edges of the only graph, counted from 1 in the order of the file; the rest is odometry
-        false = [int(n) for n in re.findall(r"<outlier_lc_indices>\s*(\d+)\s*<", _text(file))]
+        false = [
+            int(n) for n in re.findall(r"<outlier_lc_indices>\s*(\d+)\s*<", read_text(file, "a pose graph"))
+        ]
         if not false or max(false) > len(inlier) or min(false) < 1:
             raise DuagError(
                 f"{file}: expected <outlier_lc_indices> from 1 to the {len(inlier)} edges of the graph"

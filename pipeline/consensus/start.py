@@ -11,7 +11,7 @@ from pipeline.consensus import factors as pose_factors
 from pipeline.consensus.central import solve_central
 from pipeline.consensus.config import PoseConsensusConfig
 from pipeline.consensus.factors import Factors
-from pipeline.consensus.robust import graduated_weights
+from pipeline.consensus.robust import controls, graduated_weights
 from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
@@ -66,10 +66,9 @@ def own_start(
         return solve_central(both, chordal(both, n)).poses, kept
     T = solve_central(odometry, chordal(odometry, n)).poses
     c2, trusted = config.truncation**2, np.ones(len(odometry))
-    for first, steps in config.robust_passes:
-        for k in range(steps):
-            squared = pose_factors.squared_residuals(loops, T)
-            weights = graduated_weights(squared, c2, first * config.robust_growth**k)
-            T = solve_central(both, T, np.concatenate([trusted, weights]), iterations=_STEPS).poses
+    for mu in controls(config):
+        squared = pose_factors.squared_residuals(loops, T)
+        weights = graduated_weights(squared, c2, mu)
+        T = solve_central(both, T, np.concatenate([trusted, weights]), iterations=_STEPS).poses
     kept = pose_factors.squared_residuals(loops, T) <= c2
     return solve_central(both, T, np.concatenate([trusted, kept])).poses, kept

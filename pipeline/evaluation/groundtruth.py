@@ -55,6 +55,12 @@ def recorded_depth_is_exact(recording: Recording, robot: str) -> bool:
     return sensors.get("depth_noise") == "none"
 
 
+def knows_rotations(recording: Recording, robot: str) -> bool:
+    """Whether the rotations of the true poses mean anything; satellite positions, for example, have none."""
+    sensors = recording.description["robots"][robot].get("sensors") or {}
+    return sensors.get("truth") != "position"
+
+
 def _depth_scale(path: Path, topic: str) -> float:
     """Metres per unit of a depth topic, from the metadata of its channel."""
     from mcap.reader import make_reader

@@ -24,8 +24,12 @@ from schemas import topics
 
 Series = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
 
-SOLVER = "relaxed edge-ADMM (poses), evidence sent once (Gaussians)"
+SOLVERS = {
+    "admm": "relaxed edge-ADMM (poses), evidence sent once (Gaussians)",
+    "elimination": "elimination along a tree of robots (poses), evidence sent once (Gaussians)",
+}
 PURPOSE = {  # of a message, by its kind
+    "HELLO": "set-up",
     "DESCRIPTORS": "set-up",
     "REQUEST": "set-up",
     "SAMPLE": "set-up",
@@ -38,6 +42,7 @@ PURPOSE = {  # of a message, by its kind
     "EVIDENCE_EXACT": "Gaussians",
     "EVIDENCE_DOUBLE": "Gaussians",
     "STATE": "poses",
+    "TREE": "poses",
     "ACK": "acknowledgements",
 }
 PURPOSES = ("Gaussians", "poses", "set-up", "acknowledgements")
@@ -242,7 +247,8 @@ class Session:
         elif together - set(agreed):
             late = ", ".join(sorted(together - set(agreed)))
             ticks = Absent(f"{late} did not get there in {self.summary.rounds} rounds")
-        return {"solver": SOLVER, "converged": self.summary.converged, "rounds_to_tolerance": ticks, **gaps}
+        solver = SOLVERS[self.run.config.get("exchange", {}).get("solver", "admm")]
+        return {"solver": solver, "converged": self.summary.converged, "rounds_to_tolerance": ticks, **gaps}
 
     @property
     def period_ns(self) -> int:

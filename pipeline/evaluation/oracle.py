@@ -24,16 +24,19 @@ from pipeline.consensus.evidence import Evidence, theta_of
 from pipeline.consensus.factors import Factors
 from pipeline.consensus.gaussians import Weights
 from pipeline.consensus.poses import with_floor
+from pipeline.consensus.weighting import own_stiffness, told
 from pipeline.errors import DuagError
 from pipeline.evaluation.results import Absent
+from pipeline.exchange.config import ExchangeConfig
 from pipeline.fusion.config import FusionConfig
 from pipeline.fusion.fuse import fuse
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.messages import unpack_pose
+from pipeline.messages import GaussianInformation, unpack_pose
 from pipeline.recording import read_log
 from pipeline.robot import Step, factors_of, registrations_of
 from pipeline.run_folder import RobotRun, RunFolder
+from pipeline.splat.gaussians import Gaussians
 from schemas import topics
 
 Array = NDArray[np.float64]
@@ -77,7 +80,7 @@ def gap_to_oracle(
     Raises:
         DuagError: the settings of the run are not what they should be.
     """
-    config = _section(run, PoseConsensusConfig, "exchange", "consensus")
+    config = section_of(run, PoseConsensusConfig, "exchange", "consensus")
     claims = {robot.component for robot in run.robots.values() if len(robot.component) > 1}
     gaps = []
     for members in sorted(claims):
@@ -139,25 +142,22 @@ def _gaussian_gaps(
     pairs: Mapping[tuple[str, str], NDArray[np.int64]],
 ) -> Array:
     """Largest |x - x*| sqrt(diagonal of the information at x*) of each of a robot's matched Gaussians [m]."""
-    evidence = {
-        name: Evidence.from_map(
-            name, r.own_map.gaussians, r.information, np.array([k.T_map_camera for k in r.keyframes])
-        )
-        for name in members
-        if (r := run.robots[name])
-    }
-    own = run.robots[robot].own_map.gaussians
+    weights = section_of(run, ExchangeConfig, "exchange").weights
+    evidence = {name: told(*_map_of(run.robots[name]), weights) for name in members}
+    _, own, _, T_map_keyframe = mine = _map_of(run.robots[robot])
     best = fuse(
         robot,
         own,
-        np.array([k.T_map_camera for k in run.robots[robot].keyframes]),
+        T_map_keyframe,
         evidence,
+        own_stiffness(*mine, weights),
         central,
         pairs,
         (),
         PinholeCamera(2, 2, 1.0, 1.0, 0.5, 0.5),  # looks at nothing: what is taken over is not compared
-        _section(run, FusionConfig, "fusion").model_copy(update={"coverage": "overlap"}),
-        _section(run, MatchingConfig, "exchange", "matching"),
+        section_of(run, FusionConfig, "fusion").model_copy(update={"coverage": "overlap"}),
+        section_of(run, MatchingConfig, "exchange", "matching"),
+        weights=weights,
     )
     matched = best.members[: len(own)] > 1
     theta = theta_of(run.robots[robot].fused_map.gaussians.select(slice(0, len(own))))
@@ -165,6 +165,12 @@ def _gaussian_gaps(
     roots = np.sqrt(Weights.of(information).diagonal())
     gaps = np.abs(theta - theta_of(best.gaussians)[: len(own)]) * roots
     return np.asarray(gaps[matched].max(axis=1, initial=0.0))
+
+
+def _map_of(robot: RobotRun) -> tuple[str, Gaussians, GaussianInformation, Array]:
+    """Name, own map, its information, and keyframes in it [k, 4, 4]."""
+    T_map_keyframe = np.array([k.T_map_camera for k in robot.keyframes])
+    return robot.robot, robot.own_map.gaussians, robot.information, T_map_keyframe
 
 
 def solve_component(
@@ -220,7 +226,7 @@ def _closures(members: Sequence[str], decisions: Sequence[Any]) -> list[Weighted
     return out
 
 
-def _section(run: RunFolder, model: type[Model], *names: str) -> Model:
+def section_of(run: RunFolder, model: type[Model], *names: str) -> Model:
     """One section of the run's settings."""
     section = run.config
     for name in names:

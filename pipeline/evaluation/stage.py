@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -122,8 +122,9 @@ class TruePaths:
         after, before = {}, {}
         for name, robot in run.robots.items():
             true = groundtruth.trajectory(source, name)
-            after[name] = _paired(true, robot.trajectory)
-            before[name] = _paired(true, robot.odometry)
+            rotations = groundtruth.knows_rotations(source, name)
+            after[name] = _paired(true, robot.trajectory, rotations)
+            before[name] = _paired(true, robot.odometry, rotations)
         known = {r: p for r in run.largest_component if not isinstance(p := after[r], Absent)}
         missing = [p for r in run.largest_component if isinstance(p := after[r], Absent)]
         alone = len(run.largest_component) < 2
@@ -138,10 +139,10 @@ class TruePaths:
         return pairs if isinstance(pairs, Absent) else trajectory_errors.alignment([pairs])
 
 
-def _paired(true: Trajectory | Absent, estimated: Trajectory) -> Paired | Absent:
+def _paired(true: Trajectory | Absent, estimated: Trajectory, rotations: bool) -> Paired | Absent:
     if isinstance(true, Absent):
         return true
-    pairs = trajectory_errors.pair(true, estimated)
+    pairs = replace(trajectory_errors.pair(true, estimated), positions_only=not rotations)
     return pairs if len(pairs) else Absent("no frame has a ground-truth pose within 20 ms")
 
 
@@ -185,6 +186,8 @@ def _agreement_section(robot: RobotRun, source: Recording, truth: TruePaths) -> 
     paired = truth.after[robot.robot]
     if isinstance(paired, Absent):
         section["depth_agreement_m_of_truth"] = paired
+    elif paired.positions_only:
+        section["depth_agreement_m_of_truth"] = trajectory_errors.NO_ROTATIONS
     else:
         paths["depth_agreement_m_of_truth"] = dict(zip(paired.stamps_ns.tolist(), paired.true, strict=True))
     known = [i for i, stamp in stamp_of.items() if all(stamp in path for path in paths.values())]

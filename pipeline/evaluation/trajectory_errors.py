@@ -15,16 +15,21 @@ Array = NDArray[np.float64]
 ASSOCIATION_TOLERANCE_NS = 20_000_000  # that of the TUM tools
 
 
+NO_ROTATIONS = Absent("the ground truth has positions only")
+
+
 @dataclass(frozen=True)
 class Paired:
     """Poses of one camera that have a ground-truth pose of the same time.
 
     stamps_ns: int64 [n], of the estimate. true: T_gt_camera [n, 4, 4]. estimated: T_frame_camera [n, 4, 4].
+    positions_only: the rotations of `true` mean nothing.
     """
 
     stamps_ns: NDArray[np.int64]
     true: Array
     estimated: Array
+    positions_only: bool = False
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -64,6 +69,8 @@ def rpe(pairs: Paired) -> tuple[float, float] | Absent:
     """Relative pose error from frame to frame: RMSE of translation (m) and of rotation (rad)."""
     if len(pairs) < 2:
         return Absent(f"relative errors need at least 2 paired poses, found {len(pairs)}")
+    if pairs.positions_only:
+        return NO_ROTATIONS
     return rpe_rmse(pairs.true, pairs.estimated, step=1)
 
 

@@ -1,18 +1,18 @@
 """One robot's agent: a tick per round, from delivered packets to packets sent.
 
     meet        places, candidates, closures with every neighbour          meeting.py
-    frames      root (lowest name) of the component and own map frame in the root's, flooded
-    poses       rounds of the pose consensus until everybody holds still    pipeline.consensus.poses
-    tell        evidence of every robot to every robot, agreed poses         knowledge.py
+    frames      relative frames of all pairs, flooded; who knows the same pairs places the team alike    frames.py
+    poses       rounds of a solver until everybody holds still              solvers.py
+    tell        evidence of every robot to every robot, agreed poses         sharing.py, knowledge.py
     match       the lower-named robot of a pair matches Gaussians and tells
 
 The steps overlap: evidence hangs on keyframes and travels while the poses still move. Two conditions must hold in the
-whole component before an agent goes on: that everybody has decided on all its links (before poses), and that
-everybody holds still (after). Each is found by counting hops: an agent for which it holds itself says one more than
-the least of its neighbours, and whoever reaches the size of the team knows that it holds everywhere.
+whole component before an agent goes on: that everybody has decided on all its links and knows all frames (before
+poses), and that everybody holds still (after). Each is found by counting hops: an agent for which it holds itself says
+one more than the least of its neighbours, and whoever reaches the size of the team knows that it holds everywhere.
 
 A link may turn out to be false during the pose rounds: the graduated weights leave too few of its closures. The end
-that holds them parts it for good, and whoever hears of that begins again with frames, without the link. The set of
+that holds them parts it for good, and whoever hears of that places the team again, without the link. The set of
 parted links only grows; it stands in every state and labels everything that depends on it. Nobody can be agreed
 before the whole component knows the same set, because a holder does not hold still before its weights are final.
 
@@ -22,77 +22,32 @@ An agent knows its own data, its configuration and the packets it was given. It 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.closures import Closure, plausible
-from pipeline.consensus.poses import PoseAgent
-from pipeline.consensus.robust import COUNTS
+from pipeline.consensus.closures import plausible
 from pipeline.exchange import injection, wire
 from pipeline.exchange.config import ExchangeConfig
-from pipeline.exchange.evidence import (
-    best_first,
-    match_pairs,
-    own_records,
-    seen_voxels,
-    to_evidence,
-    within,
-)
-from pipeline.exchange.knowledge import Knowledge
+from pipeline.exchange.frames import Frames
 from pipeline.exchange.meeting import HigherEnd, LowerEnd, Meeting, OwnPlaces, Send
+from pipeline.exchange.neighbour import Neighbour
+from pipeline.exchange.outcome import result_of
 from pipeline.exchange.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError, Packet, parse
+from pipeline.exchange.sharing import Sharing
 from pipeline.exchange.signatures import Identity
+from pipeline.exchange.solvers import AdmmSolver, EliminationSolver, LinkStart, PoseSolver, SolverStart
 from pipeline.exchange.transport import Arrival, Message, Outgoing, Transport
-from pipeline.exchange.verification import Verdict
-from pipeline.exchange.wire import Anchors, Frame, PairList, State, pair_bit
+from pipeline.exchange.wire import Anchors, PairFrames, State, pair_bit
 from pipeline.geometry import se3
-from pipeline.robot import AgentResult, ClosureRecord, RobotData
+from pipeline.robot import AgentResult, RobotData
 
 Array = NDArray[np.float64]
 EVERYWHERE = 255  # a hop count that has reached the whole component, for good
-EVIDENCE_WIRES = {
-    "compact": Kind.EVIDENCE,
-    "float32": Kind.EVIDENCE_EXACT,
-    "float64": Kind.EVIDENCE_DOUBLE,
-}
-MEETING_KINDS = frozenset({Kind.DESCRIPTORS, Kind.REQUEST, Kind.SAMPLE, Kind.CLOSURES})
-
-
-@dataclass
-class Neighbour:
-    """All that an agent keeps about one neighbour."""
-
-    index: int
-    name: str
-    transport: Transport
-    meeting: Meeting
-    state: State | None = None
-    frame: Frame | None = (
-        None  # the one that counts: without most parted links, then nearest to the lowest root
-    )
-    voxels: NDArray[np.int64] | None = None
-    verdict_message: int | None = None
-    gone: bool = False  # silent for too long
-    parted: bool = False  # its closures were refuted: as if never met
-    last_weights: list[float] = field(default_factory=list)  # of the closures held, when the link was parted
-    evidence_sent: dict[int, int] = field(default_factory=dict)  # owner: message
-
-    @property
-    def decided(self) -> bool:
-        """Whether it is settled if the two robots share a frame."""
-        if self.gone:
-            return True
-        told = self.verdict_message is None or not self.transport.is_open(self.verdict_message)
-        return self.meeting.verdicts is not None and told
-
-    @property
-    def joined(self) -> bool:
-        """Whether the two robots share a frame, and the neighbour knows it."""
-        return not self.gone and not self.parted and self.decided and self.meeting.joined is not None
+MAX_EARLY_MESSAGES = 64
+LOWER_END_KINDS = frozenset({Kind.DESCRIPTORS, Kind.SAMPLE})  # what the lower end gets
+MEETING_KINDS = LOWER_END_KINDS | {Kind.REQUEST, Kind.CLOSURES}
 
 
 class Agent:
@@ -123,30 +78,21 @@ class Agent:
         self.neighbours = {self.team.index(name): self._neighbour(name) for name in sorted(neighbours)}
         self.round = -1
         self.refused: Counter[str] = Counter()
-        self.evidence_kind = EVIDENCE_WIRES[config.evidence_wire]
-        self.knowledge = Knowledge(self.own, len(self.team), self.evidence_kind)
-        self.frame = Frame(self.own, wire.WHOLE, 0, np.eye(4))
-        self.members = 1 << self.own
-        self.parted = 0  # links known to have been parted, a mask of pair_bit
+        self.sharing = Sharing(data, self.team, config, seed, self._send)
+        self.knowledge = self.sharing.knowledge
+        self.frames = Frames(self.own, self.team, config.consensus.closures.margin)
         self.frames_hops = self.still_hops = 0
-        self.poses: PoseAgent | None = None
+        self.poses: PoseSolver | None = None
+        self.links: dict[int, LinkStart] = {}  # joined neighbours as the solver has them
         self.agreed = self.done = self.converged = False
         self.rounds_to_agreement: int | None = None
-        self._body: NDArray[Any] | None = None
-        self._records: NDArray[Any] | None = None
-        self._frame_told: dict[int, tuple[Frame, int]] = {}  # what, in which message
-        self._voxels_told: set[int] = set()
-        self._anchors_told: set[tuple[int, int]] = set()
-        self._pairs_told: dict[tuple[int, tuple[int, int]], int] = {}  # message; 0 = they told this robot
 
     def _neighbour(self, name: str) -> Neighbour:
         index = self.team.index(name)
-        end = LowerEnd if self.data.robot < name else HigherEnd
-        meeting = end(self.data.robot, name, self.places, self.config, self.seed)
         transport = Transport(
             self.own, index, name, self.config.transport, self._new_id, identity=self.identity
         )
-        return Neighbour(index, name, transport, meeting)
+        return Neighbour(index, name, transport)
 
     # --- one round
 
@@ -161,13 +107,15 @@ class Agent:
             self._take(data)
         self._watch()
         for neighbour in self._living():
-            if neighbour.transport.last_heard is not None and not neighbour.meeting.begun:
-                neighbour.meeting.begin(self._sender(neighbour))
+            if neighbour.transport.last_heard is not None and not neighbour.greeted:
+                neighbour.greeted = True
+                self._send(neighbour, Kind.HELLO, self.places.digest)
         self._hear_of_partings()
         self._settle_frames()
         self._settle_poses()
-        self._tell()
-        self._match()
+        self.sharing.tell(self._joined(), self.frames.members, self._T_world_map() if self.agreed else None)
+        if self.agreed:
+            self.sharing.match(self.others)
         self._finish()
         return [packet for neighbour in self._living() for packet in self._burst(neighbour)]
 
@@ -175,14 +123,13 @@ class Agent:
         return [n for n in self.neighbours.values() if not n.gone]
 
     @property
-    def root(self) -> int:
-        """Lowest-named robot known to be in the component."""
-        return self.frame.root
+    def others(self) -> list[int]:
+        """Members of the component besides this robot."""
+        return [robot for robot in self.frames.members if robot != self.own]
 
-    @property
-    def T_world_map(self) -> Array:  # noqa: N802 (a transform)
-        """Own map frame in the root's, as it was placed before the pose rounds."""
-        return self.frame.T_world_map
+    def _T_world_map(self) -> Array:  # noqa: N802 (a transform)
+        """Own map frame where it was placed before the pose rounds."""
+        return self.frames.T_world_first(self.own) @ se3.inverse(self.data.T_map_keyframe[0])
 
     def _joined(self) -> list[Neighbour]:
         return [n for n in self.neighbours.values() if n.joined]
@@ -204,7 +151,7 @@ class Agent:
         others = self._joined()
         settled = self.agreed or any(n.state is not None and n.state.agreed for n in others)
         if died and others and not settled:
-            self._part(self.parted | died)
+            self._part(self.frames.parted | died)
 
     # --- incoming
 
@@ -216,7 +163,7 @@ class Agent:
             arrival = neighbour.transport.receive(packet, self.round)
             if arrival is not None:
                 self._handle(neighbour, arrival)
-        except MalformedError as error:
+        except ValueError as error:
             self.refused[str(error)] += 1
 
     def _addressed(self, packet: Packet) -> Neighbour:
@@ -228,40 +175,67 @@ class Agent:
             raise MalformedError("from a neighbour that was given up")
         return self.neighbours[packet.sender]
 
-    def _handle(self, neighbour: Neighbour, arrival: Arrival) -> None:
-        team = len(self.team)
+    def _handle(self, n: Neighbour, arrival: Arrival) -> None:
+        payload, team = arrival.payload, len(self.team)
         if arrival.kind is Kind.STATE:
-            self._take_state(neighbour, arrival.payload)
+            self._take_state(n, payload)
+        elif arrival.kind is Kind.HELLO:
+            digest = wire.read_digest(payload)
+            self._meet(n, lower=(self.places.digest, self.data.robot) < (digest, n.name))
         elif arrival.kind in MEETING_KINDS:
-            if not neighbour.meeting.begun:
-                neighbour.meeting.begin(self._sender(neighbour))
-            neighbour.meeting.take(arrival.kind, arrival.payload, self._sender(neighbour))
+            self._meet(n, lower=arrival.kind in LOWER_END_KINDS).take(arrival.kind, payload, self._sender(n))
         elif arrival.kind is Kind.FRAME:
-            frame = wire.read_frame(arrival.payload, team)
-            if neighbour.frame is None or _rank(frame) < _rank(neighbour.frame):
-                neighbour.frame = frame
+            if self.poses is not None:
+                raise MalformedError("frame: all of them were known before the poses began")
+            n.frames_told.setdefault(self.frames.learn(payload, self._held_pairs()), 0)
+        elif arrival.kind is Kind.TREE:
+            self._take_tree(n, payload)
         elif arrival.kind is Kind.VOXELS:
-            _, neighbour.voxels = wire.read_voxels(arrival.payload, team)
+            _, n.voxels = wire.read_voxels(payload, team)
         elif arrival.kind is Kind.ANCHORS:
-            self._anchors_told.add((neighbour.index, self.knowledge.take_anchors(arrival.payload)))
+            n.anchors_told.add(self.knowledge.take_anchors(payload))
         elif arrival.kind is Kind.PAIRS:
-            self._pairs_told.setdefault((neighbour.index, self.knowledge.take_pairs(arrival.payload)), 0)
-        elif arrival.kind is self.evidence_kind:
-            owner = self.knowledge.take_evidence(
-                neighbour.index, arrival.message, arrival.payload, arrival.complete
-            )
+            n.pairs_told.setdefault(self.knowledge.take_pairs(payload), 0)
+        elif arrival.kind is self.sharing.kind:
+            owner = self.knowledge.take_evidence(n.index, arrival.message, payload, arrival.complete)
             if owner is not None:
                 for provider, message in self.knowledge.forget_incoming(owner):
                     self.neighbours[provider].transport.accept_rest(message, self.round)
-                neighbour.transport.accept_rest(arrival.message, self.round)
+                n.transport.accept_rest(arrival.message, self.round)
 
-    def _take_state(self, neighbour: Neighbour, payload: bytes) -> None:
-        neighbour.state, poses = wire.read_state(payload, len(self.team))
-        if neighbour.state.parted != self.parted:
-            return
-        if poses and self.poses is not None and neighbour.name in self.poses.links:
-            shared = self.poses.links[neighbour.name].keyframes
-            self.poses.receive(neighbour.name, wire.read_poses(poses, shared))
+    def _meet(self, n: Neighbour, lower: bool) -> Meeting:
+        """The meeting with a neighbour; it begins when it is known which end this robot is."""
+        if n.meeting is None:
+            end = LowerEnd if lower else HigherEnd
+            n.meeting = end(self.data.robot, n.name, self.places, self.config, self.seed)
+            n.meeting.begin(self._sender(n))
+        return n.meeting
+
+    def _held_pairs(self) -> set[tuple[int, int]]:
+        """Pairs of this robot that nobody else may speak for."""
+        return {
+            _pair(self.own, n.index) for n in self.neighbours.values() if not isinstance(n.meeting, HigherEnd)
+        }
+
+    def _take_state(self, n: Neighbour, payload: bytes) -> None:
+        n.state, poses = wire.read_state(payload, len(self.team))
+        if (
+            poses
+            and n.state.parted == self.frames.parted
+            and self.poses is not None
+            and n.index in self.links
+        ):
+            self.poses.take_state(self.links[n.index], poses)
+
+    def _take_tree(self, n: Neighbour, payload: bytes) -> None:
+        """A message of the solver. One of a start that is still to come here waits for it."""
+        parted, rest = wire.read_labelled(payload, len(self.team))
+        if self.poses is not None and parted == self.frames.parted:
+            self.poses.take_message(n.index, rest)
+        elif parted & self.frames.parted == self.frames.parted:
+            if len(n.early) >= MAX_EARLY_MESSAGES:
+                raise MalformedError("elimination: too many messages before its start")
+            n.early.append((parted, rest))
 
     # --- outgoing
 
@@ -271,17 +245,16 @@ class Agent:
 
     def _sender(self, neighbour: Neighbour) -> Send:
         def send(kind: Kind, payload: bytes) -> None:
-            message = self._send([neighbour], kind, payload)
+            message = self._send(neighbour, kind, payload)
             if kind is Kind.CLOSURES:
                 neighbour.verdict_message = message
 
         return send
 
-    def _send(self, neighbours: Sequence[Neighbour], kind: Kind, payload: bytes) -> int:
-        """Queue one reliable message for some neighbours; returns its id."""
+    def _send(self, neighbour: Neighbour, kind: Kind, payload: bytes) -> int:
+        """Queue one reliable message; returns its id."""
         message = Message(self._new_id(), kind, payload)
-        for neighbour in neighbours:
-            neighbour.transport.send(message)
+        neighbour.transport.send(message)
         return message.id
 
     def _burst(self, neighbour: Neighbour) -> list[Outgoing]:
@@ -294,29 +267,24 @@ class Agent:
         direct = {n.index for n in self._joined()}
         state = wire.write_state(
             State(
-                self.root,
-                self.members,
+                self.frames.links,
+                self.frames.parted,
                 self.frames_hops,
                 self.still_hops,
                 self.agreed,
                 self.done,
                 self.knowledge.sources(direct, {n.index for n in self._living() if not n.parted}),
-                self.parted,
             )
         )
         payloads = [state]
         missing = injection.poses_are_missing(
             self.config.injection, self.seed, self.data.robot, neighbour.name, self.round
         )
-        speaks = self.poses is not None and neighbour.name in self.poses.links and not missing
-        if self.poses is not None and speaks and not self._all_agreed():
-            packet = self.poses.outgoing(neighbour.name)
-            double = packet.translations.dtype == np.float64
-            per = wire.poses_per_packet(MAX_PAYLOAD_BYTES - len(state), double)
-            payloads = [
-                state + wire.write_poses(packet.part(slice(first, first + per)))
-                for first in range(0, len(packet.keyframes), per)
-            ]
+        speaks = neighbour.index in self.links and not missing and not self._all_agreed()
+        if self.poses is not None and speaks:
+            room_bytes = MAX_PAYLOAD_BYTES - len(state)
+            parts = self.poses.states(self.links[neighbour.index], room_bytes)
+            payloads = [state + part for part in parts] or payloads
         return [Message(self._new_id(), Kind.STATE, payload) for payload in payloads]
 
     def _all_agreed(self) -> bool:
@@ -326,80 +294,64 @@ class Agent:
 
     def _hear_of_partings(self) -> None:
         """Take over what joined neighbours know of parted links. Once poses are agreed there is nothing to hear."""
-        known = self.parted
+        known = self.frames.parted
         for n in self._joined():
             if n.state is not None:
                 known |= n.state.parted
-        if known != self.parted and not self.agreed:
+        if known != self.frames.parted and not self.agreed:
             self._part(known)
 
     def _part(self, known: int) -> None:
         """Begin again with frames, without the links of this mask; forget what depended on them."""
-        self.parted = known
+        self.frames.part(known)
         for n in self.neighbours.values():
             if not n.parted and known & pair_bit(self.own, n.index):
                 n.parted = True
-                if self.poses is not None and n.name in self.poses.links:
+                if self.poses is not None and n.index in self.links:
                     n.last_weights = self.poses.weights(n.name).tolist()
                 n.transport.cancel_all()
                 n.evidence_sent.clear()
-        self.frame = Frame(self.own, wire.WHOLE, 0, np.eye(4), known)
-        self.members = 1 << self.own
         self.frames_hops = self.still_hops = 0
-        self.poses = None
-        self._frame_told.clear()
+        self.poses, self.links = None, {}
 
     def _same_links(self, n: Neighbour) -> bool:
-        """Whether a neighbour's last state is about the team without the same parted links."""
-        return n.state is not None and n.state.parted == self.parted
+        """Whether a neighbour's last state is about the team with the same links."""
+        state = n.state
+        return state is not None and (state.links, state.parted) == (self.frames.links, self.frames.parted)
 
     # --- frames
 
     def _settle_frames(self) -> None:
-        """Adopt the lowest root and its frame, tell it on, and count how far around everybody has decided.
+        """Tell frames on, and count how far around everybody has decided and knows the same ones.
 
-        To have decided is also that the neighbours have the own frame: when everybody has, no frame changes any more.
+        To have decided is also that the neighbours have what this robot knows: when everybody has, nothing new comes.
         """
         joined = self._joined()
         for n in joined:
-            frame = n.frame
-            if frame is None or frame.parted != self.parted or self.poses is not None:
-                continue
-            assert n.meeting.joined is not None
-            assert n.meeting.verdicts is not None
-            support = min(frame.support, n.meeting.verdicts.consistent)
-            T_world_map = frame.T_world_map @ se3.inverse(n.meeting.joined.T_own_peer)
-            way = Frame(frame.root, support, frame.hops + 1, T_world_map, self.parted)
-            if way.rank < self.frame.rank:
-                self.frame = way
+            pair = _pair(self.own, n.index)
+            if isinstance(n.meeting, LowerEnd) and n.meeting.joined and pair not in self.frames.pairs:
+                proposals = n.meeting.joined.proposals
+                if pair[0] != self.own:
+                    proposals = tuple(p.turned() for p in proposals)
+                self.frames.tell(PairFrames(*pair, proposals))
         for n in joined:
-            if n.index not in self._frame_told or self._frame_told[n.index][0] is not self.frame:
-                message = self._send([n], Kind.FRAME, wire.write_frame(self.frame, len(self.team)))
-                self._frame_told[n.index] = (self.frame, message)
-            if n.state is not None and self._same_links(n) and n.state.root == self.root:
-                self.members |= n.state.members
+            for pair in sorted(self.frames.payloads):
+                if pair not in n.frames_told:
+                    n.frames_told[pair] = self._send(n, Kind.FRAME, self.frames.payloads[pair])
         if self.frames_hops == EVERYWHERE:
             return
         self.frames_hops = 0
-        told = not any(n.transport.is_open(self._frame_told[n.index][1]) for n in joined)
+        told = not any(n.transport.is_open(m) for n in joined for m in n.frames_told.values())
         if told and all(n.decided for n in self.neighbours.values()):
-            least = min((self._frames_hops_of(n) for n in joined), default=EVERYWHERE - 1)
-            self.frames_hops = min(least + 1, EVERYWHERE)
+            hops = [n.state.frames_hops if n.state and self._same_links(n) else 0 for n in joined]
+            self.frames_hops = min([EVERYWHERE - 1, *hops]) + 1
         if self.frames_hops >= len(self.team):
             self.frames_hops = EVERYWHERE
-
-    def _frames_hops_of(self, neighbour: Neighbour) -> int:
-        state = neighbour.state
-        if state is None or not self._same_links(neighbour):
-            return 0
-        if state.root != self.root or state.members != self.members:
-            return 0
-        return min(state.frames_hops, EVERYWHERE - 1)
 
     # --- poses
 
     def _settle_poses(self) -> None:
-        """One round of the pose consensus; final when everybody in the component holds still."""
+        """One round of the solver; final when everybody in the component holds still."""
         joined = self._joined()
         if self.frames_hops < EVERYWHERE or not joined:
             return
@@ -407,17 +359,22 @@ class Agent:
             self._start_poses()
         assert self.poses is not None
         if not self._all_agreed():
-            self.poses.step()
+            self.poses.advance()
+            self.refused.update(self.poses.refused)
+            self.poses.refused.clear()
+            for receiver, payload in self.poses.messages():
+                labelled = wire.write_labelled(self.frames.parted, len(self.team), payload)
+                self._send(self.neighbours[receiver], Kind.TREE, labelled)
         if self.agreed:
             return
         refuted = sum(pair_bit(self.own, n.index) for n in joined if self.poses.refuted(n.name))
         if refuted:
-            self._part(self.parted | refuted)
+            self._part(self.frames.parted | refuted)
             return
         self.still_hops = 0
         if self.poses.settled:
-            least = min((n.state.still_hops if n.state and self._same_links(n) else 0) for n in joined)
-            self.still_hops = min(least + 1, EVERYWHERE)
+            hops = [n.state.still_hops if n.state and self._same_links(n) else 0 for n in joined]
+            self.still_hops = min([EVERYWHERE - 1, *hops]) + 1
         if self.still_hops > len(self.team):
             self.agreed, self.still_hops = True, EVERYWHERE
             self.rounds_to_agreement = self.round
@@ -426,142 +383,50 @@ class Agent:
             self.knowledge.anchors_bytes[self.own] = wire.write_anchors(anchors)
 
     def _start_poses(self) -> None:
-        self.poses = PoseAgent(
-            self.data.robot, self.data.T_map_keyframe, self.places.registrations, self.config.consensus
+        """Give the solver the own map where it was placed, and the joined neighbours."""
+        self.links = {n.index: self._link_start(n) for n in self._joined()}
+        start = SolverStart(
+            self.data.robot,
+            self.own,
+            self.places.T_first_keyframe,
+            self.places.registrations,
+            self.frames.T_world_first(self.own),
+            self.frames.tree(),
+            list(self.links.values()),
         )
-        self.poses.set_frame(self.T_world_map)
-        for n in self._joined():
-            meeting = n.meeting.joined
-            assert meeting is not None
-            if isinstance(n.meeting, LowerEnd):
-                assert n.meeting.book is not None
-                assert n.frame is not None
-                T_world_peer = n.frame.T_world_map @ n.meeting.book.T_map_keyframe
-                placed = plausible(
-                    meeting.closures,
-                    self.T_world_map @ self.data.T_map_keyframe,
-                    T_world_peer,
-                    self.places.drift,
-                    n.meeting.book.drift,
-                    self.config.consensus.closures,
-                )
-                self.poses.add_link(
-                    n.name,
-                    meeting.closures,
-                    keep=meeting.keep & placed,
-                    T_world_keyframe_peer=dict(enumerate(T_world_peer)),
-                )
-            else:
-                self.poses.add_link(n.name, shared=meeting.shared)
-
-    # --- telling others
-
-    def _tell(self) -> None:
-        """Evidence to whoever lacks it; space seen, agreed poses and pair lists to everybody."""
-        for n in self._joined():
-            if self.config.coverage == "overlap" and self.agreed and n.index not in self._voxels_told:
-                self._voxels_told.add(n.index)
-                keys = seen_voxels(self.data.gaussians, self.T_world_map, self.config.overlap_voxel_m)
-                self._send([n], Kind.VOXELS, wire.write_voxels(self.own, keys))
-            self._tell_evidence(n)
-            for owner in sorted(self.knowledge.anchors_bytes):
-                if owner != n.index and (n.index, owner) not in self._anchors_told:
-                    self._anchors_told.add((n.index, owner))
-                    self._send([n], Kind.ANCHORS, self.knowledge.anchors_bytes[owner])
-            for pair in sorted(self.knowledge.pairs_bytes):
-                if pair[0] != n.index and (n.index, pair) not in self._pairs_told:
-                    message = self._send([n], Kind.PAIRS, self.knowledge.pairs_bytes[pair])
-                    self._pairs_told[n.index, pair] = message
-
-    def _tell_evidence(self, n: Neighbour) -> None:
-        if n.state is None:
-            return
-        for owner in [self.own, *sorted(self.knowledge.evidence)]:
-            if not self.members >> owner & 1:
-                continue
-            wanted = owner != n.index and n.state.sources[owner] in (wire.NOBODY, self.own)
-            if not wanted and owner in n.evidence_sent:  # it is there, or somebody else brings it
-                n.transport.cancel(n.evidence_sent.pop(owner))
-            if not wanted or owner in n.evidence_sent:
-                continue
-            if self.config.coverage == "overlap":
-                payload = self._overlapping(n, owner)
-            elif owner == self.own:
-                payload = self._own_evidence()
-            else:
-                payload = self.knowledge.evidence_bytes[owner]
-            if payload is not None:
-                n.evidence_sent[owner] = self._send([n], self.evidence_kind, payload)
-
-    def _own_body(self) -> NDArray[Any]:
-        """Own evidence as it is sent, best first."""
-        if self._body is None:
-            records = own_records(self.data, self.evidence_kind)
-            self._body = wire.to_body(self.evidence_kind, records[best_first(records)])
-        return self._body
-
-    def _own_records(self) -> NDArray[Any]:
-        """Own evidence as the others read it, best first."""
-        if self._records is None:
-            self._records = wire.from_body(self.evidence_kind, self._own_body())
-        return self._records
-
-    def _own_evidence(self) -> bytes:
-        k = self.knowledge
-        if self.own not in k.evidence_bytes:
-            k.evidence_bytes[self.own] = wire.write_evidence(
-                self.evidence_kind, self.own, 1, self._own_body()
-            )
-        return k.evidence_bytes[self.own]
-
-    def _overlapping(self, n: Neighbour, owner: int) -> bytes | None:
-        """Evidence of an owner in the space that a neighbour saw; None until that can be told."""
-        k = self.knowledge
-        if n.voxels is None or self.poses is None:
-            return None
-        if owner == self.own:
-            records, body, T_common = (
-                self._own_records(),
-                self._own_body(),
-                self.T_world_map @ self.data.T_map_keyframe,
-            )
-        elif owner in k.anchors:
-            records, body, T_common = k.evidence[owner], k.bodies[owner], k.anchors[owner].T_common_keyframe
+        if self.config.solver == "admm":
+            self.poses = AdmmSolver(start, self.config.consensus)
         else:
-            return None
-        known = records["anchor"] < len(T_common)
-        keep = within(records[known], T_common, n.voxels, self.config.overlap_voxel_m)
-        return wire.write_evidence(self.evidence_kind, owner, 1, body[known][keep])
+            precision = self.config.elimination_wire
+            self.poses = EliminationSolver(start, self.config.consensus, len(self.team), precision)
+        for n in self._joined():
+            for parted, payload in n.early:
+                if parted == self.frames.parted:
+                    self.poses.take_message(n.index, payload)
+            n.early.clear()
 
-    # --- matching
-
-    def _others(self) -> list[int]:
-        """Members of the component besides this robot."""
-        return [i for i in range(len(self.team)) if self.members >> i & 1 and i != self.own]
-
-    def _match(self) -> None:
-        """Match own Gaussians with those of every higher-named member, once everything needed is here."""
-        if not self.agreed:
-            return
-        k = self.knowledge
-        for other in self._others():
-            ready = other in k.anchors and other in k.evidence and (self.own, other) not in k.pairs
-            if self.own < other and ready:
-                ids = match_pairs(
-                    self.data.robot,
-                    self._own_records(),
-                    k.anchors[self.own].T_common_keyframe,
-                    self.team[other],
-                    k.sound_records(other),
-                    k.anchors[other].T_common_keyframe,
-                    self.config.matching,
-                )
-                ids = injection.false_matches(
-                    ids, self.config.injection, self.seed, self.data.robot, self.team[other]
-                )
-                pairs = PairList(self.own, other, 1, ids)
-                k.pairs[self.own, other] = pairs
-                k.pairs_bytes[self.own, other] = wire.write_pairs(pairs)
+    def _link_start(self, n: Neighbour) -> LinkStart:
+        """A joined neighbour; closures start with weight if they fit to where both robots were placed."""
+        assert n.meeting is not None
+        meeting = n.meeting.joined
+        assert meeting is not None
+        if not isinstance(n.meeting, LowerEnd):
+            return LinkStart(n.index, n.name, meeting.shared, (), np.zeros(0, bool), np.zeros((0, 4, 4)))
+        assert n.meeting.book is not None
+        T_world_peer = self.frames.T_world_first(n.index) @ n.meeting.book.T_first_keyframe
+        pair = (min(self.data.robot, n.name), max(self.data.robot, n.name))
+        chosen = self.frames.placement.chosen[pair]
+        n.contradiction = self.frames.placement.contradictions.get(pair, "")
+        keep = np.zeros(len(meeting.closures), bool) if chosen is None else meeting.groups[chosen]
+        placed = plausible(
+            meeting.closures,
+            self.frames.T_world_first(self.own) @ self.places.T_first_keyframe,
+            T_world_peer,
+            self.places.drift,
+            n.meeting.book.drift,
+            self.config.consensus.closures,
+        )
+        return LinkStart(n.index, n.name, meeting.shared, meeting.closures, keep & placed, T_world_peer)
 
     # --- end
 
@@ -573,7 +438,7 @@ class Agent:
             self.done = True  # alone from the start, or whoever it met has gone
             self.converged = self.poses is None
             return
-        k, everyone = self.knowledge, sorted([self.own, *self._others()])
+        k, everyone = self.knowledge, self.frames.members
         complete = (
             self.agreed
             and all(m in k.anchors for m in everyone)
@@ -589,97 +454,9 @@ class Agent:
         return n.state is not None and all(n.state.sources[m] == wire.COMPLETE for m in everyone)
 
     def result(self) -> AgentResult:
-        """What the robot takes home. Alone, its poses are those of its own map, bit for bit."""
-        robot = self.data.robot
-        T_common = {robot: self.data.T_map_keyframe}
-        gauge = np.eye(4)
-        others: list[int] = []
-        if self.poses is not None:
-            others = self._others()
-            T_common = {self.team[i]: a.T_common_keyframe for i, a in sorted(self.knowledge.anchors.items())}
-            T_common.setdefault(robot, self.poses.T_world_keyframe)
-            gauge = self._gauge()
-        T_world = {name: gauge @ T for name, T in T_common.items()} if self.poses is not None else T_common
-        names = [robot, *(self.team[i] for i in others)]
-        pairs = {
-            (self.team[p.lower], self.team[p.higher]): p.ids
-            for p in self.knowledge.pairs.values()
-            if self.team[p.lower] in names and self.team[p.higher] in names and self._active(p)
-        }
-        own = self._own_records()
-        evidence = {
-            self.team[i]: self.knowledge.sound_records(i) for i in others if i in self.knowledge.anchors
-        }
-        return AgentResult(
-            robot=robot,
-            component=tuple(sorted(names)),
-            T_world_keyframe=T_world[robot],
-            T_world_keyframe_of=T_world,
-            own_evidence=to_evidence(robot, own[np.argsort(own["id"])]),
-            evidence={name: to_evidence(name, records) for name, records in evidence.items()},
-            pairs=pairs,
-            closures=tuple(self._closures()),
-            agreed=self.agreed or not others,
-            converged=self.converged,
-            rounds=self.round + 1,
-            rounds_to_agreement=self.rounds_to_agreement,
-            refused=dict(sorted(self.refused.items())),
-        )
-
-    def _active(self, pairs: PairList) -> bool:
-        """Whether a pair list counts: at the end that made it, only when the other end is known to have it."""
-        if pairs.lower != self.own or self.done:
-            return True
-        message = self._pairs_told.get((pairs.higher, (pairs.lower, pairs.higher)))
-        return message is not None and not self.neighbours[pairs.higher].transport.is_open(message)
-
-    def _gauge(self) -> Array:
-        """T_world_common: the root's first keyframe is where its own map has it. Identity before the root said so."""
-        root = self.knowledge.anchors.get(self.root)
-        if root is None:
-            return np.eye(4)
-        return root.T_map_first @ se3.inverse(root.T_common_keyframe[0])
-
-    def _closures(self) -> Iterator[ClosureRecord]:
-        for n in self.neighbours.values():
-            for t in n.meeting.tried:
-                r = t.result
-                weight = None if r.closure is None else self._weight(n, r.closure)
-                verdict, detail = r.verdict, r.detail
-                if weight is not None and n.parted:
-                    verdict = Verdict.ALONE if weight >= COUNTS else Verdict.OUTWEIGHED
-                    detail, weight = f"weight {weight:.2f} when the link was parted; {detail}", 0.0
-                elif weight is not None:  # the graduated weights have the last word
-                    verdict = Verdict.KEPT if weight >= COUNTS else Verdict.OUTWEIGHED
-                yield ClosureRecord(
-                    self.data.robot,
-                    n.name,
-                    t.candidate.own_keyframe,
-                    t.candidate.peer_keyframe,
-                    t.candidate.score,
-                    verdict.value,
-                    r.matches,
-                    r.inliers,
-                    detail,
-                    weight,
-                    None if r.closure is None else r.closure.T_own_peer,
-                    None if r.closure is None else r.closure.information,
-                )
-
-    def _weight(self, n: Neighbour, closure: Closure) -> float | None:
-        """Robust weight of a closure at the end, or when its link was parted; None if it took no part."""
-        if n.meeting.joined is None:
-            return None
-        if n.parted:
-            weights = n.last_weights
-        elif self.poses is not None and n.name in self.poses.links:
-            weights = self.poses.weights(n.name).tolist()
-        else:
-            return None
-        held = n.meeting.joined.closures
-        return next((w for w, other in zip(weights, held, strict=True) if other is closure), None)
+        """What the robot takes home."""
+        return result_of(self)
 
 
-def _rank(frame: Frame) -> tuple[int, tuple[int, int, int]]:
-    """Order in which a neighbour's frames count: its parted links only become more."""
-    return -frame.parted.bit_count(), frame.rank
+def _pair(a: int, b: int) -> tuple[int, int]:
+    return min(a, b), max(a, b)

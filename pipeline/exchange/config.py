@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from pipeline.config import Config
-from pipeline.consensus.config import MatchingConfig, PoseConsensusConfig
+from pipeline.consensus.config import MatchingConfig, PoseConsensusConfig, WeightKind
 from pipeline.registration import RegistrationConfig
 
 
@@ -65,7 +65,7 @@ class LinkConfig(Config):
     """A packet occupies its directed link for its size over this; 0: for no time."""
     queue_ns: int = Field(default=1_000_000_000, ge=0)
     """A packet that would wait longer than this for the link is dropped by its sender's radio."""
-    budget_bytes: int = Field(default=250_000, ge=2_400)
+    budget_bytes: int = Field(default=150_000, ge=2_400)
     """Most that one robot sends to one neighbour in one round, headers included."""
 
     @model_validator(mode="after")
@@ -160,10 +160,18 @@ class ExchangeConfig(Config):
     """Length of one round."""
     max_rounds: int = Field(default=3000, ge=1)
     """The session ends here, whatever has been agreed."""
+    solver: Literal["admm", "elimination"] = "admm"
+    """Of the poses. admm: relaxed edge-ADMM, a few poses per round and link; elimination: exact steps along a tree of
+    robots, matrices in few rounds."""
+    elimination_wire: Literal["float32", "float64"] = "float64"
+    """Precision of the matrices of elimination on the wire."""
     coverage: Literal["all", "overlap"] = "all"
     """Send every Gaussian to everybody, or only those in space that the receiver's keyframes saw."""
     evidence_wire: Literal["compact", "float32", "float64"] = "compact"
     """100 bytes per Gaussian, rounded far below its uncertainty, or 188, or 364 bytes and not rounded at all."""
+    weights: WeightKind = "block"
+    """How sure a robot says it is of a Gaussian: its information, or one of the simpler kinds to compare with
+    (`docs/consensus.md`)."""
     overlap_voxel_m: float = Field(default=0.25, gt=0.0)
     """Edge of the voxels that say which space a robot saw (coverage = overlap)."""
     link: LinkConfig = LinkConfig()

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.config import MatchingConfig
+from pipeline.consensus.config import MatchingConfig, WeightKind
 from pipeline.consensus.evidence import Evidence
 from pipeline.consensus.matching import match
+from pipeline.consensus.weighting import told
 from pipeline.exchange.packets import Kind
 from pipeline.exchange.wire import record_dtype
 from pipeline.geometry import se3
@@ -26,9 +27,9 @@ DIAGONAL = np.array([0, 3, 5, 6, 12, 17, 21, 24, 26, 27, 28, 29, 30])
 VOXEL_BITS = 20  # per axis; voxels beyond +-2^19 share those at the border
 
 
-def own_records(data: RobotData, kind: Kind) -> Records:
+def own_records(data: RobotData, kind: Kind, weights: WeightKind) -> Records:
     """A robot's own evidence in the frames of its anchors, in the precision of this kind of evidence."""
-    evidence = Evidence.from_map(data.robot, data.gaussians, data.information, data.T_map_keyframe)
+    evidence = told(data.robot, data.gaussians, data.information, data.T_map_keyframe, weights)
     return to_records(evidence, kind)
 
 

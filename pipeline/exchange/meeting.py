@@ -1,18 +1,21 @@
 """How two robots find out whether they have been in the same place, and where one's map lies in the other's.
 
-    higher-named end                                    lower-named end
+    higher end                                          lower end
+    HELLO        digest of what was seen              <->
     DESCRIPTORS  compact descriptors of all keyframes ->
                                                       <- REQUEST   keyframes worth a closer look
     SAMPLE       one per requested keyframe           ->
-                                                      <- CLOSURES  verdict, shared keyframes, relative frame
+                                                      <- CLOSURES  verdict, shared keyframes
 
-The lower-named end keeps the closures. It has decided when its verdict has been acknowledged, the other end when
-the verdict has arrived.
+The lower end is the one with the lower digest (and name, should they be equal): who verifies decides which of two
+measurements counts, and that must not depend on names. It keeps the closures. It has decided when its verdict has been
+acknowledged, the other end when the verdict has arrived.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import hashlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -20,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import streams
-from pipeline.consensus.closures import Closure, consistent, drift
-from pipeline.consensus.links import SharedKeyframes
-from pipeline.consensus.poses import PoseAgent
+from pipeline.consensus.closures import Closure, Group, consistent, drift, frame_variance
+from pipeline.consensus.cycles import Proposal
+from pipeline.consensus.links import SharedKeyframes, link_metric
 from pipeline.exchange import injection, places, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.packets import Kind, MalformedError
@@ -54,7 +57,9 @@ class OwnPlaces:
         if self._features is None:
             most = self.config.places.features_per_keyframe
             camera = self.data.camera
-            self._features = [extract(*self.data.images(k), camera, most) for k in range(self.data.keyframes)]
+            self._features = [
+                extract(*self.data.images(k)[:2], camera, most) for k in range(self.data.keyframes)
+            ]
         return self._features
 
     def pyramid(self, keyframe: int) -> RgbdPyramid:
@@ -62,8 +67,22 @@ class OwnPlaces:
         return self._pyramid(keyframe)
 
     def _build_pyramid(self, keyframe: int) -> RgbdPyramid:
-        color, depth = self.data.images(keyframe)
-        return RgbdPyramid.build(color.astype(np.float32) / np.float32(255), depth, self.data.camera)
+        images = self.data.images(keyframe)
+        color = images.color.astype(np.float32) / np.float32(255)
+        camera, sigma_m = self.data.camera, images.depth_sigma_m
+        return RgbdPyramid.build(color, images.depth_m, camera, depth_sigma_m=sigma_m)
+
+    @property
+    def digest(self) -> bytes:
+        """Eight bytes that depend on what the robot saw, and on nothing else."""
+        whole = hashlib.sha256(b"".join(f.descriptors.tobytes() for f in self.features))
+        return whole.digest()[: wire.DIGEST_BYTES]
+
+    @property
+    def T_first_keyframe(self) -> Array:  # noqa: N802 (transforms)
+        """Keyframes [n, 4, 4] as seen from the first: no result depends on where a robot's map has its origin."""
+        T = self.data.T_map_keyframe
+        return se3.inverse(T[0]) @ T if len(T) else T
 
     @property
     def drift(self) -> Array:
@@ -74,7 +93,7 @@ class OwnPlaces:
         """What a neighbour gets to recognise places."""
         most = self.config.places.features_per_place
         compact = [f.descriptors[:most] for f in self.features]
-        return PlaceBook(compact, self.data.T_map_keyframe, self.drift)
+        return PlaceBook(compact, self.T_first_keyframe, self.drift)
 
     def sample(self, keyframe: int) -> KeyframeSample:
         """What a neighbour gets to verify closures with one keyframe."""
@@ -92,27 +111,28 @@ class Tried:
 
 @dataclass(frozen=True)
 class Joined:
-    """Two robots that share a frame: closures at the end that holds them, shared keyframes at both."""
+    """Two robots that share a frame: shared keyframes at both ends, the rest at the end that holds the closures.
 
-    T_own_peer: Array
-    closures: tuple[Closure, ...]
-    keep: NDArray[np.bool_]
+    groups: bool per closure, one array for each group that agrees on a frame. proposals: what they agree on.
+    """
+
     shared: SharedKeyframes
+    closures: tuple[Closure, ...] = ()
+    groups: tuple[NDArray[np.bool_], ...] = ()
+    proposals: tuple[Proposal, ...] = ()
 
 
 class Meeting:
-    """The lower-named end of a pair, or the higher-named one: two subclasses."""
+    """The lower end of a pair, or the higher one: two subclasses."""
 
     def __init__(self, own: str, peer: str, places_: OwnPlaces, config: ExchangeConfig, seed: int) -> None:
         self.own, self.peer, self.places, self.config, self.seed = own, peer, places_, config, seed
         self.verdicts: Verdicts | None = None
         self.joined: Joined | None = None
         self.tried: list[Tried] = []
-        self.begun = False
 
     def begin(self, send: Send) -> None:
-        """Called once, when the neighbour has been heard for the first time."""
-        self.begun = True
+        """Called once, when the ends know which is which."""
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
         """Take one complete message of this meeting."""
@@ -123,7 +143,6 @@ class HigherEnd(Meeting):
     """Sends descriptors and the samples it is asked for; gets the verdict."""
 
     def begin(self, send: Send) -> None:
-        super().begin(send)
         send(Kind.DESCRIPTORS, wire.write_places(self.places.book()))
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
@@ -135,10 +154,9 @@ class HigherEnd(Meeting):
             verdicts = wire.read_verdicts(payload, limit)
             self.verdicts = verdicts
             if verdicts.joined:
-                T_own_peer = se3.inverse(verdicts.T_lower_higher)
-                self.joined = Joined(T_own_peer, (), np.zeros(0, dtype=bool), verdicts.shared)
+                self.joined = Joined(verdicts.shared)
         else:
-            raise MalformedError(f"{kind.name} is not for the higher-named end, or came twice")
+            raise MalformedError(f"{kind.name} is not for the higher end, or came twice")
 
 
 class LowerEnd(Meeting):
@@ -160,7 +178,7 @@ class LowerEnd(Meeting):
             if not self.waiting:
                 self._decide(send)
         else:
-            raise MalformedError(f"{kind.name} is not for the lower-named end, or came twice")
+            raise MalformedError(f"{kind.name} is not for the lower end, or came twice")
 
     def _choose(self, book: PlaceBook, send: Send) -> None:
         """Score all pairs of keyframes and ask for the samples of the best."""
@@ -188,14 +206,9 @@ class LowerEnd(Meeting):
 
     def _verify(self, sample: KeyframeSample) -> None:
         for candidate in self.waiting.pop(sample.keyframe):
-            rng = streams.generator(
-                self.seed,
-                "ransac",
-                robot=self.own,
-                peer=self.peer,
-                own_keyframe=candidate.own_keyframe,
-                peer_keyframe=candidate.peer_keyframe,
-            )
+            ends = (self.places.features[candidate.own_keyframe], sample.features)
+            own, peer = (hashlib.sha256(f.descriptors.tobytes()).hexdigest() for f in ends)
+            rng = streams.generator(self.seed, "ransac", own=own, peer=peer)
             result = verify(
                 candidate.own_keyframe,
                 candidate.peer_keyframe,
@@ -228,8 +241,8 @@ class LowerEnd(Meeting):
         closures = [t.result.closure for t in self.tried if t.result.closure is not None]
         agreement = consistent(
             closures,
-            self.places.data.T_map_keyframe,
-            self.book.T_map_keyframe,
+            self.places.T_first_keyframe,
+            self.book.T_first_keyframe,
             self.places.drift,
             self.book.drift,
             self.config.consensus.closures,
@@ -243,20 +256,29 @@ class LowerEnd(Meeting):
                         reason = f"{reason}; {injection.DETAIL}"
                     result = replace(t.result, verdict=Verdict.INCONSISTENT, detail=reason)
                     self.tried[at] = Tried(t.candidate, result)
-        T = agreement.T_ownmap_peermap
         shared = SharedKeyframes(np.zeros(0, np.int32), np.zeros((0, 6), np.float32))
-        if T is not None:
-            trial = PoseAgent(
-                self.own, self.places.data.T_map_keyframe, self.places.registrations, self.config.consensus
-            )
-            shared = trial.add_link(self.peer, closures, keep=agreement.keep)
-            self.joined = Joined(T, tuple(closures), agreement.keep, shared)
+        if agreement.T_ownmap_peermap is not None:
+            keyframes = np.unique([c.peer_keyframe for c in closures])
+            metric = link_metric(closures, keyframes, self.config.consensus.closures)
+            shared = SharedKeyframes(keyframes.astype(np.int32), metric)
+            groups = (Group(agreement.keep, agreement.T_ownmap_peermap), *agreement.others)
+            proposals = tuple(self._proposal(closures, group) for group in groups)
+            self.joined = Joined(shared, tuple(closures), tuple(g.keep for g in groups), proposals)
         self.verdicts = Verdicts(
             candidates=sum(t.result.verdict is not Verdict.UNLIKE for t in self.tried),
             verified=len(closures),
             consistent=int(agreement.keep.sum()),
-            joined=T is not None,
-            T_lower_higher=np.eye(4) if T is None else T,
+            joined=self.joined is not None,
             shared=shared,
         )
         send(Kind.CLOSURES, wire.write_verdicts(self.verdicts))
+
+    def _proposal(self, closures: Sequence[Closure], group: Group) -> Proposal:
+        """What a group of closures says of the first keyframe of either robot in that of the other, own frame first."""
+        assert self.book is not None
+        own, peer = self.places.T_first_keyframe, self.book.T_first_keyframe
+        agreeing = [c for c, keep in zip(closures, group.keep.tolist(), strict=True) if keep]
+        variance = frame_variance(
+            agreeing, own, peer, self.places.drift, self.book.drift, self.config.consensus.closures
+        )
+        return Proposal(len(agreeing), group.T_ownmap_peermap, variance)

@@ -36,11 +36,11 @@ EVIDENCE_BYTES, EVIDENCE_EXACT_BYTES, EVIDENCE_DOUBLE_BYTES = 100, 188, 364  # o
 
 
 class Kind(IntEnum):
-    """What a message holds. The order is the order of sending within a round."""
+    """What a message holds. The order is the order of sending within a round; evidence comes last."""
 
     ACK = 1  # chunks received, per message
     STATE = 2  # where the sender stands, and its poses of this round if it has any
-    FRAME = 3  # root of the component and the sender's map frame in the common frame
+    FRAME = 3  # what the closures of two robots say of their relative frame; flooded
     DESCRIPTORS = 4  # compact descriptors of every keyframe, to recognise places
     REQUEST = 5  # keyframes whose sample is wanted
     SAMPLE = 6  # one keyframe: features with 3-D points, and points for registration
@@ -52,10 +52,15 @@ class Kind(IntEnum):
     EVIDENCE_EXACT = 12  # the same in float32
     EVIDENCE_DOUBLE = 13  # the same in float64
     POSE_GRAPH = 14  # `duagc posegraph` only: frames and eliminated graphs; its first byte says which
+    HELLO = 16  # digest of what the sender saw; the two ends' roles follow from it
+    TREE = 15  # elimination: fronts and blocks up the tree of robots, steps down
 
 
 FIRE_AND_FORGET = frozenset({Kind.ACK, Kind.STATE})
 """Kinds that are sent once, in one packet, and never acknowledged."""
+
+URGENT_KINDS = frozenset({Kind.TREE, Kind.POSE_GRAPH})
+"""Kinds that hold up the whole team until they arrive."""
 
 
 class MalformedError(ValueError):

@@ -248,10 +248,10 @@ class ConsensusRecorder:
         neighbours = agent.neighbours.values()
         return schemas.new(
             "AgentRound",
-            frame_id=map_frame(agent.team[agent.root]),
+            frame_id=map_frame(agent.team[agent.frames.root]),
             robot=agent.data.robot,
-            root=agent.team[agent.root],
-            members=[name for i, name in enumerate(agent.team) if agent.members >> i & 1],
+            root=agent.team[agent.frames.root],
+            members=[agent.team[i] for i in agent.frames.members],
             joined_links=sum(n.joined for n in neighbours),
             undecided_links=sum(not n.decided for n in neighbours),
             evidence_owners=len(agent.knowledge.evidence),
@@ -270,7 +270,7 @@ class ConsensusRecorder:
         largest = agent.poses.largest_change
         message = schemas.new(
             "ConsensusRound",
-            frame_id=map_frame(agent.team[agent.root]),
+            frame_id=map_frame(agent.team[agent.frames.root]),
             robot=agent.data.robot,
             primal=values["primal"],
             dual=values["dual"],

@@ -19,6 +19,7 @@ from pipeline.exchange.packets import (
     EVIDENCE_KINDS,
     HEADER_BYTES,
     MAX_PAYLOAD_BYTES,
+    URGENT_KINDS,
     Kind,
     MalformedError,
     Packet,
@@ -87,6 +88,11 @@ class _News:
     first: int
     last: int
     until_round: int
+
+
+def _priority(entry: _Open) -> tuple[bool, int, int]:
+    """Evidence last, else by kind, then in the order of sending."""
+    return entry.message.kind in EVIDENCE_KINDS, entry.message.kind, entry.message.id
 
 
 class Transport:
@@ -176,16 +182,21 @@ class Transport:
                 if size > budget_bytes:
                     break
                 budget_bytes -= size
-                entry.due_round[chunk] = round_index + self._retransmit_after()
+                entry.due_round[chunk] = round_index + self._retransmit_after(entry.message.kind)
                 out.append(self._packet(entry.message, chunk, round_index))
         return out
 
-    def _retransmit_after(self) -> int:
-        """Rounds until a packet counts as lost: never less than there and back take."""
-        return max(self.config.retransmit_after_rounds, 2 * (self._delay_rounds or 0) + 2)
+    def _retransmit_after(self, kind: Kind) -> int:
+        """Rounds until a packet counts as lost: never less than there and back take.
+
+        What others wait for goes out again the sooner the more is lost: an answer that will not come is no use.
+        """
+        rounds = max(self.config.retransmit_after_rounds, 2 * (self._delay_rounds or 0) + 2)
+        heard = self._packets_heard / (self._highest_sequence + 1)
+        return max(1, round(rounds * heard)) if kind in URGENT_KINDS else rounds
 
     def _due(self, round_index: int) -> Iterator[tuple[_Open, int]]:
-        for entry in sorted(self._open.values(), key=lambda e: (e.message.kind, e.message.id)):
+        for entry in sorted(self._open.values(), key=_priority):
             for chunk in np.flatnonzero(~entry.acknowledged & (entry.due_round <= round_index)).tolist():
                 yield entry, chunk
 

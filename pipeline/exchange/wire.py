@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.consensus.cycles import Proposal
 from pipeline.consensus.evidence import unpack_symmetric
-from pipeline.consensus.links import PosePacket, SharedKeyframes
+from pipeline.consensus.links import SharedKeyframes
 from pipeline.exchange.compact import COMPACT, decode, encode
 from pipeline.exchange.packets import (
     EVIDENCE_BYTES,
@@ -103,27 +104,25 @@ def pose_bytes(T: Array) -> bytes:
 class State:
     """Where an agent stands, as it tells its neighbours in every round.
 
-    root: index of the lowest-named robot that it knows to be in its component. members: bit mask over the team.
-    parted: links that it knows to have been parted, bit mask over the pairs of the team (`pair_bit`); what else is
-    told holds for the team without them.
+    links: pairs of robots whose relative frame it knows. parted: those of them that it knows to have been parted; what
+    else is told holds for the team without them. Both are bit masks over the pairs of the team (`pair_bit`).
     frames_hops, still_hops: how many hops around it everybody has decided on all links, and holds still; 0 = not
     itself. agreed: its poses are final. done: it needs nothing more. sources: uint8 [team], for each owner of
     evidence where it comes from: a neighbour's index, COMPLETE or NOBODY.
     """
 
-    root: int
-    members: int
+    links: int
+    parted: int
     frames_hops: int
     still_hops: int
     agreed: bool
     done: bool
     sources: NDArray[np.uint8]
-    parted: int = 0
 
 
 COMPLETE, NOBODY = 254, 255
 MAX_TEAM = 64
-_STATE = struct.Struct("<HQBBBB")
+_STATE = struct.Struct("<BBBB")
 
 
 def pair_bit(a: int, b: int) -> int:
@@ -150,40 +149,60 @@ def _read_pairs(reader: Reader, team: int) -> int:
 
 def write_state(state: State) -> bytes:
     """Bytes of a state; the poses of the round may follow."""
-    flags = int(state.agreed) | 2 * int(state.done)
-    head = _STATE.pack(
-        state.root, state.members, state.frames_hops, state.still_hops, flags, len(state.sources)
-    )
-    return head + array_bytes(state.sources, "uint8") + _pairs_bytes(state.parted, len(state.sources))
+    flags, team = int(state.agreed) | 2 * int(state.done), len(state.sources)
+    head = _STATE.pack(state.frames_hops, state.still_hops, flags, team)
+    masks = _pairs_bytes(state.links, team) + _pairs_bytes(state.parted, team)
+    return head + array_bytes(state.sources, "uint8") + masks
 
 
 def read_state(data: bytes, team: int) -> tuple[State, bytes]:
     """A state and the bytes that follow it."""
     reader = Reader(data, "state")
-    root, members, frames_hops, still_hops, flags, n = reader.fields(_STATE)
+    frames_hops, still_hops, flags, n = reader.fields(_STATE)
     if n != team:
         raise MalformedError(f"state: about a team of {n}, expected {team}")
-    if flags > 3 or root >= team or members >> team:
-        raise MalformedError("state: names a robot outside the team, or has unknown flags")
+    if flags > 3:
+        raise MalformedError("state: unknown flags")
     sources = reader.array("uint8", (n,))
-    parted = _read_pairs(reader, team)
-    state = State(root, members, frames_hops, still_hops, bool(flags & 1), bool(flags & 2), sources, parted)
+    links, parted = _read_pairs(reader, team), _read_pairs(reader, team)
+    state = State(links, parted, frames_hops, still_hops, bool(flags & 1), bool(flags & 2), sources)
     return state, data[reader.position :]
 
 
+def write_labelled(parted: int, team: int, payload: bytes) -> bytes:
+    """Bytes of TREE: a message of the solver, for the team without these links."""
+    return _pairs_bytes(parted, team) + payload
+
+
+def read_labelled(data: bytes, team: int) -> tuple[int, bytes]:
+    """From TREE: the parted links, and the message."""
+    reader = Reader(data, "elimination")
+    return _read_pairs(reader, team), data[reader.position :]
+
+
 # --- places
+
+DIGEST_BYTES = 8
+
+
+def read_digest(data: bytes) -> bytes:
+    """From HELLO."""
+    if len(data) != DIGEST_BYTES:
+        raise MalformedError(f"hello: {len(data)} bytes, expected {DIGEST_BYTES}")
+    return data
 
 
 @dataclass(frozen=True)
 class PlaceBook:
     """What a robot tells its neighbour to let it recognise places.
 
-    descriptors: one array per keyframe. T_map_keyframe: [n, 4, 4]. drift: [n, 2], accumulated variance of its
+    descriptors: one array per keyframe. T_first_keyframe: [n, 4, 4], as seen from its
+    first keyframe. drift: [n, 2], accumulated variance of its
     odometry from keyframe 0 (m^2, rad^2).
     """
 
     descriptors: list[Descriptors]
-    T_map_keyframe: Array
+    T_first_keyframe: Array
     drift: Array
 
 
@@ -195,7 +214,7 @@ def write_places(book: PlaceBook) -> bytes:
     return b"".join(
         [
             _COUNT.pack(len(book.descriptors)),
-            pose_bytes(book.T_map_keyframe),
+            pose_bytes(book.T_first_keyframe),
             array_bytes(book.drift, "float64"),
             array_bytes([len(d) for d in book.descriptors], "uint16"),
             *(array_bytes(d, "uint8") for d in book.descriptors),
@@ -246,15 +265,14 @@ class Verdicts:
     """What the lower-named end found out about a pair.
 
     candidates, verified, consistent: pairs of keyframes that were tried, that became closures, that agree.
-    joined: the two robots share a frame; only then the rest holds. T_lower_higher: [4, 4], map frame of the higher
-    end in that of the lower. shared: keyframes of the higher end that the lower one copies, and their metric.
+    joined: the two robots share a frame. shared: then, the keyframes of the higher end that the lower one copies, and
+    their metric.
     """
 
     candidates: int
     verified: int
     consistent: int
     joined: bool
-    T_lower_higher: Array
     shared: SharedKeyframes
 
 
@@ -268,7 +286,6 @@ def write_verdicts(verdicts: Verdicts) -> bytes:
     return b"".join(
         [
             _VERDICTS.pack(*head),
-            pose_bytes(verdicts.T_lower_higher),
             array_bytes(verdicts.shared.keyframes, "int32"),
             array_bytes(verdicts.shared.metric, "float32"),
         ]
@@ -279,7 +296,6 @@ def read_verdicts(data: bytes, limit: int) -> Verdicts:
     """From CLOSURES about keyframes below `limit`."""
     reader = Reader(data, "closures")
     candidates, verified, consistent, joined, n = reader.fields(_VERDICTS)
-    T = reader.poses(1)[0]
     if joined > 1 or bool(joined) != bool(n) or n > MAX_KEYFRAMES:
         raise MalformedError("closures: joined robots share keyframes, others do not")
     keyframes, metric = reader.array("int32", (n,)), reader.array("float32", (n, 6))
@@ -288,70 +304,7 @@ def read_verdicts(data: bytes, limit: int) -> Verdicts:
         raise MalformedError(f"closures: shared keyframes must ascend and stay below {limit}")
     if n and not (metric.min() > 0 and metric.max() < 1e15):
         raise MalformedError("closures: the metric must be positive")
-    return Verdicts(candidates, verified, consistent, bool(joined), T, SharedKeyframes(keyframes, metric))
-
-
-# --- poses of a round
-
-
-_POSES = struct.Struct("<IIBH2f2f")
-_CONVERGED, _CURVATURE, _DOUBLE = 1, 2, 4
-
-
-def write_poses(packet: PosePacket) -> bytes:
-    """Bytes of the poses of a round, float32 or float64 as the packet has them."""
-    double = packet.translations.dtype == np.float64
-    flags = _CONVERGED * packet.converged + _CURVATURE * (packet.curvature is not None) + _DOUBLE * double
-    curvature = (0.0, 0.0) if packet.curvature is None else packet.curvature.tolist()
-    n = len(packet.keyframes)
-    dtype = "float64" if double else "float32"
-    return b"".join(
-        [
-            _POSES.pack(packet.sequence, packet.version, flags, n, *packet.penalties.tolist(), *curvature),
-            array_bytes(packet.keyframes, "int32"),
-            array_bytes(packet.quats_wxyz, dtype),
-            array_bytes(packet.translations, dtype),
-        ]
-    )
-
-
-def poses_per_packet(room_bytes: int, double: bool) -> int:
-    """Keyframes that fit into the rest of a packet."""
-    return (room_bytes - _POSES.size) // (4 + 7 * (8 if double else 4))
-
-
-def read_poses(data: bytes, shared: NDArray[np.int32]) -> PosePacket:
-    """Poses of a round about some of the keyframes `shared`, ascending."""
-    reader = Reader(data, "poses")
-    sequence, version, flags, n, *numbers = reader.fields(_POSES)
-    if flags > _CONVERGED + _CURVATURE + _DOUBLE or not np.isfinite(numbers).all() or min(numbers) < 0:
-        raise MalformedError("poses: unknown flags, or impossible penalties")
-    if not (min(numbers[:2]) > 0 and max(numbers) < 1e9):
-        raise MalformedError("poses: penalties must be positive")
-    dtype = "float64" if flags & _DOUBLE else "float32"
-    keyframes = reader.array("int32", (n,))
-    quats, translations = reader.array(dtype, (n, 4)), reader.array(dtype, (n, 3))
-    reader.done()
-    if np.diff(keyframes).min(initial=1) < 1 or not np.isin(keyframes, shared).all():
-        raise MalformedError("poses: of keyframes that the link does not share")
-    if n and (
-        np.abs((quats.astype(np.float64) ** 2).sum(axis=1) - 1).max() > 1e-3
-        or np.abs(translations).max() > MAX_COORDINATE
-    ):
-        raise MalformedError("poses: not rigid motions")
-    curvature = np.array(numbers[2:], dtype=np.float32) if flags & _CURVATURE else None
-    if curvature is not None and curvature.min() < 1e-12:
-        raise MalformedError("poses: the curvature must be positive")
-    return PosePacket(
-        sequence,
-        version,
-        keyframes,
-        quats,
-        translations,
-        np.array(numbers[:2], dtype=np.float32),
-        curvature,
-        bool(flags & _CONVERGED),
-    )
+    return Verdicts(candidates, verified, consistent, bool(joined), SharedKeyframes(keyframes, metric))
 
 
 # --- one keyframe
@@ -426,48 +379,42 @@ def _shorts(points: NDArray[np.float32]) -> tuple[float, bytes]:
 # --- frames and final poses
 
 
-_FRAME = struct.Struct("<HIH")
-WHOLE = 0xFFFFFFFF
-"""Support of a robot's frame in itself."""
+_FRAME = struct.Struct("<HHB")
+_PROPOSAL = struct.Struct("<Idd")
+MAX_PROPOSALS = 8
 
 
 @dataclass(frozen=True)
-class Frame:
-    """Where the sender's map lies in the component.
+class PairFrames:
+    """What the closures of two robots say of their relative frame, best supported first; lower index first."""
 
-    root: lowest robot of the component. support: closures that agree on the weakest link of the way to it (WHOLE at
-    the root itself). hops: length of that way. T_world_map: [4, 4], own map frame in the root's. parted: links known
-    to have been parted, as in `State`; the frame holds for the team without them.
-    """
-
-    root: int
-    support: int
-    hops: int
-    T_world_map: Array
-    parted: int = 0
-
-    @property
-    def rank(self) -> tuple[int, int, int]:
-        """The lowest rank counts: lowest root, then the way with the strongest weakest link, then the shortest."""
-        return self.root, -self.support, self.hops
+    lower: int
+    higher: int
+    proposals: tuple[Proposal, ...]
 
 
-def write_frame(frame: Frame, team: int) -> bytes:
-    """Bytes of FRAME in a team of so many."""
-    head = _FRAME.pack(frame.root, frame.support, frame.hops)
-    return head + _pairs_bytes(frame.parted, team) + pose_bytes(frame.T_world_map)
+def write_frames(frames: PairFrames) -> bytes:
+    """Bytes of FRAME."""
+    parts = [_FRAME.pack(frames.lower, frames.higher, len(frames.proposals))]
+    for p in frames.proposals:
+        parts += [_PROPOSAL.pack(p.support, *p.variance), pose_bytes(p.T_a_b)]
+    return b"".join(parts)
 
 
-def read_frame(data: bytes, team: int) -> Frame:
+def read_frames(data: bytes, team: int) -> PairFrames:
     """From FRAME."""
     reader = Reader(data, "frame")
-    root, support, hops = reader.fields(_FRAME)
-    parted = _read_pairs(reader, team)
-    T = reader.poses(1)[0]
+    lower, higher, n = reader.fields(_FRAME)
+    if not lower < higher < team or not 1 <= n <= MAX_PROPOSALS:
+        raise MalformedError("frame: the two robots must be in the team, lower first, and have a frame")
+    proposals = []
+    for _ in range(n):
+        support, *variance = reader.fields(_PROPOSAL)
+        if not all(0 < v < MAX_COORDINATE**2 for v in variance):
+            raise MalformedError("frame: impossible variance")
+        proposals.append(Proposal(support, reader.poses(1)[0], (variance[0], variance[1])))
     reader.done()
-    if root >= team or hops >= team:
-        raise MalformedError("frame: names a robot outside the team")
-    return Frame(root, support, hops, T, parted)
+    return PairFrames(lower, higher, tuple(proposals))
 
 
 @dataclass(frozen=True)

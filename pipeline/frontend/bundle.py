@@ -1,23 +1,24 @@
-"""Joint optimisation of keyframe poses by the images themselves, and loops inside one robot's path.
+"""Joint optimisation of keyframe poses by the images themselves.
 
 `optimise` minimises the sum of the photometric and point-to-plane costs of all pairs of keyframes that see the same
-surfaces. Every round linearises every pair at the present poses (`registration.linearise`) and solves all quadratics
-together; a registration of each pair by itself would settle into its own minimum first, and pairs with little overlap
-find wrong ones. The quadratics of the last round are the factors of the robot's pose graph.
+surfaces. The cost of a pair is expanded to a quadratic at the present poses (`registration.linearise`), and quadratics
+are solved together; a registration of each pair by itself would settle into its own minimum first, and pairs with
+little overlap find wrong ones. A pair is expanded again only when the motion between its keyframes has changed. The
+quadratics at the answer are the factors of the robot's pose graph.
 
-`find_loops` recognises places by features, and believes a pair only if registrations both ways agree.
+The work per keyframe is bounded however long the path is: overlaps are computed with a bounded number of earlier
+keyframes, the best few become pairs, and the number of rounds is bounded. Only the sparse solution is over all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import streams
-from pipeline.frontend.config import KeyframeConfig, LoopConfig
+from pipeline.frontend.config import KeyframeConfig
 from pipeline.frontend.keyframes import KeyframePair, Refined, overlap, refine
 from pipeline.geometry import se3
 from pipeline.registration import (
@@ -29,15 +30,13 @@ from pipeline.registration import (
     RegistrationConfig,
     RgbdPyramid,
     linearise,
-    register,
 )
-from pipeline.registration.features import Features, matches, ransac
+from pipeline.registration.features import Features
 
 Array = NDArray[np.float64]
+Ends = tuple[int, int]  # of a pair: the earlier keyframe, the later one
 SETTLED = 1e-4  # m, rad: Gauss-Newton steps shrink fast, what is left after such a one is far smaller
-COARSE_ROUNDS = (
-    2  # first rounds, on levels 2 and 1, after a loop: far from the minimum small images lead there faster
-)
+COARSE_ROUNDS = 2  # on levels 2 and 1, after a loop: far from the minimum small images lead there faster
 FAR = 0.02  # m, rad: a registration that contradicts the start by more says that it is far
 UNUSABLE = (Outcome.LOW_OVERLAP, Outcome.RESIDUAL)  # weak directions carry no information and do no harm
 
@@ -54,8 +53,8 @@ class View(Protocol):
 
 
 Images = Callable[[int, int], RgbdPyramid]
-"""The images of a keyframe, by its index and the number of levels; read again from the log in every round, so that
-memory stays bounded."""
+"""The images of a keyframe, by its index and the number of levels; read again from the log when needed, so that memory
+stays bounded."""
 
 
 def optimise(
@@ -74,26 +73,27 @@ def optimise(
     Returns:
         The poses, and one factor per pair of keyframes: sum of factors = the joint cost at the answer, to second order.
     """
+    neighbourhood = _Neighbourhood(views, config)
+    costs = _Costs(views, images, tracked, config, registration)
     refined = refine(T_map_keyframes, tracked, config.huber_sigmas)
-    factors = list(tracked)
-    exposures: dict[tuple[int, int], tuple[float, float]] = {}
-    connected = {(pair.first, pair.second): pair for pair in tracked}
-    ends: list[tuple[int, int]] = []
     coarse_rounds = COARSE_ROUNDS if _far(T_map_keyframes, tracked) else 0
+    factors = list(tracked)
+    ends: list[Ends] = []
     for index in range(config.optimisation_rounds):
         T = refined.T_map_keyframe
         if index in (0, coarse_rounds, config.optimisation_rounds // 2):
-            ends = sorted(
-                {(pair.first, pair.second) for pair in tracked} | set(overlapping(T, views, config)),
-                key=lambda pair: (pair[1], pair[0]),
-            )
-        level = max(0, coarse_rounds - index)
-        factors = _linearised(T, views, images, ends, connected, exposures, config, registration, level)
-        before, refined = T, refine(T, factors, config.huber_sigmas)
-        moved_m, turned_rad = se3.distance(before, refined.T_map_keyframe)
+            ends = _in_order({(pair.first, pair.second) for pair in tracked} | set(neighbourhood.pairs(T)))
+        costs.expand(ends, T, level=max(0, coarse_rounds - index))
+        factors = costs.factors(ends)
+        refined = refine(T, factors, config.huber_sigmas)
+        moved_m, turned_rad = se3.distance(T, refined.T_map_keyframe)
         if index > coarse_rounds and max(moved_m.max(), turned_rad.max()) < SETTLED:
             break
     return refined, factors
+
+
+def _in_order(pairs: Iterable[Ends]) -> list[Ends]:
+    return sorted(pairs, key=lambda pair: (pair[1], pair[0]))
 
 
 def _far(T: Array, pairs: Sequence[KeyframePair]) -> bool:
@@ -102,47 +102,69 @@ def _far(T: Array, pairs: Sequence[KeyframePair]) -> bool:
     return any(max(moved_m, turned_rad) > FAR for moved_m, turned_rad in found)
 
 
-def _linearised(
-    T: Array,
-    views: Sequence[View],
-    images: Images,
-    ends: Sequence[tuple[int, int]],
-    connected: dict[tuple[int, int], KeyframePair],
-    exposures: dict[tuple[int, int], tuple[float, float]],
-    config: KeyframeConfig,
-    registration: RegistrationConfig,
-    level: int,
-) -> list[KeyframePair]:
-    """The quadratics of all pairs at the poses T; of a pair that cannot be compared there, what tracking said."""
-    results: dict[tuple[int, int], Registration] = {}
-    both_ways = sorted({*ends, *((b, a) for a, b in ends)}, key=lambda pair: (pair[1], pair[0]))
-    loaded, pyramid = -1, None
-    for reference_index, target in both_ways:
-        if target != loaded:
-            loaded, pyramid = target, images(target, level + 1)
-        assert pyramid is not None
-        reference = views[reference_index].reference
-        T_reference_target = se3.inverse(T[reference_index]) @ T[target]
-        known = exposures.get((reference_index, target))
+class _Costs:
+    """The costs of pairs of keyframes as quadratics, each where it was last expanded."""
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        images: Images,
+        tracked: Sequence[KeyframePair],
+        config: KeyframeConfig,
+        registration: RegistrationConfig,
+    ) -> None:
+        self._views, self._registration = views, registration
+        self._images = images
+        self._min_overlap = 0.8 * config.optimisation_overlap
+        self._tracked = {(pair.first, pair.second): pair for pair in tracked}
+        self._found: dict[Ends, KeyframePair | None] = {}  # None: the images cannot be compared
+        self._where: dict[Ends, tuple[Array, int]] = {}  # motion and level of the last expansion
+        self._exposures: dict[Ends, tuple[float, float]] = {}  # of (reference, target)
+
+    def factors(self, ends: Sequence[Ends]) -> list[KeyframePair]:
+        """The quadratics of pairs; of one that cannot be compared, what tracking said, if anything."""
+        found = (self._found.get(pair) or self._tracked.get(pair) for pair in ends)
+        return [factor for factor in found if factor is not None]
+
+    def expand(self, ends: Sequence[Ends], T: Array, level: int = 0) -> None:
+        """Expand the costs of pairs at the poses T, on an image level, unless that was done there before."""
+        ends = [pair for pair in ends if self._moved(pair, T, level)]
+        results: dict[Ends, Registration] = {}
+        loaded, pyramid = -1, None
+        for reference, target in _in_order({*ends, *((b, a) for a, b in ends)}):
+            if target != loaded:
+                loaded, pyramid = target, self._images(target, level + 1)
+            assert pyramid is not None
+            result = self._linearised(reference, target, pyramid, T, level)
+            if self._comparable(result):
+                self._exposures[reference, target] = result.exposure
+                results[reference, target] = result
+        for first, second in ends:
+            T_first_second = se3.inverse(T[first]) @ T[second]
+            ways = results.get((first, second)), results.get((second, first))
+            self._found[first, second] = _factor(first, second, T_first_second, *ways)
+            self._where[first, second] = T_first_second, level
+
+    def _moved(self, pair: Ends, T: Array, level: int) -> bool:
+        if pair not in self._where or self._where[pair][1] != level:
+            return True
+        motion = se3.inverse(T[pair[0]]) @ T[pair[1]]
+        return float(np.max(se3.distance(self._where[pair][0], motion))) >= SETTLED
+
+    def _linearised(
+        self, reference: int, target: int, pyramid: RgbdPyramid, T: Array, level: int
+    ) -> Registration:
+        samples, config = self._views[reference].reference, self._registration
+        T_reference_target = se3.inverse(T[reference]) @ T[target]
+        known = self._exposures.get((reference, target))
         if known is None:
             # gain and offset first: with wrong ones the weights of the grey values are wrong
-            known = linearise(
-                reference, pyramid, T_reference_target, config=registration, level=level
-            ).exposure
-        result = linearise(reference, pyramid, T_reference_target, known, registration, level)
-        if _comparable(result, config.optimisation_overlap):
-            exposures[reference_index, target] = result.exposure
-            results[reference_index, target] = result
-    factors = []
-    for first, second in ends:
-        T_first_second = se3.inverse(T[first]) @ T[second]
-        factor = _factor(
-            first, second, T_first_second, results.get((first, second)), results.get((second, first))
-        )
-        factor = factor or connected.get((first, second))
-        if factor is not None:
-            factors.append(factor)
-    return factors
+            known = linearise(samples, pyramid, T_reference_target, config=config, level=level).exposure
+        return linearise(samples, pyramid, T_reference_target, known, config, level)
+
+    def _comparable(self, result: Registration) -> bool:
+        """Whether two views show enough of the same surfaces at a pose, and agree there."""
+        return result.outcome not in UNUSABLE and min(result.overlap, result.view) >= self._min_overlap
 
 
 def _factor(
@@ -166,123 +188,48 @@ def _factor(
     return KeyframePair(first, second, T_first_second @ se3.exp(step), information)
 
 
-def _comparable(result: Registration, min_overlap: float) -> bool:
-    """Whether two views show enough of the same surfaces at a pose, and agree there."""
-    return result.outcome not in UNUSABLE and min(result.overlap, result.view) >= 0.8 * min_overlap
+class _Neighbourhood:
+    """Which keyframes see each other.
 
-
-# --- which keyframes see each other -------------------------------------------------------------------------------
-
-
-def overlapping(T: Array, views: Sequence[View], config: KeyframeConfig) -> list[tuple[int, int]]:
-    """Pairs (earlier, later) of keyframes whose overlap, either way, reaches the limit; the best few of each later one.
-
-    The overlap is computed only where the balls around the two views' surfaces meet.
+    Overlaps are computed only where the balls around what two views see meet, and with no more than so many of them,
+    those whose balls are nearest: a robot that stays in one room makes more keyframes there than it can compare.
     """
-    centres, radii = _balls(T, views)
-    pairs = []
-    for second in range(1, len(views)):
+
+    def __init__(self, views: Sequence[View], config: KeyframeConfig) -> None:
+        self._views, self._config = views, config
+        self._centres, self._radii = np.zeros((len(views), 3)), np.zeros(len(views))  # camera frames
+        for k, view in enumerate(views):
+            coarsest: ReferenceLevel = view.reference.levels[-1]
+            if len(coarsest):
+                points = coarsest.points.astype(np.float64)
+                self._centres[k] = np.median(points, axis=0)
+                self._radii[k] = np.quantile(np.linalg.norm(points - self._centres[k], axis=1), 0.9)
+
+    def pairs(self, T: Array) -> list[Ends]:
+        """Pairs of keyframes whose overlap, either way, reaches the limit; the best few of each later one."""
+        return [(first, second) for second in range(1, len(T)) for first in self.before(second, T)]
+
+    def before(self, second: int, T: Array) -> list[int]:
+        """Earlier keyframes that overlap with one at the poses T [k, 4, 4], most overlap first; the best few."""
+        config, views = self._config, self._views
+        centres = np.einsum("nij,nj->ni", T[: second + 1, :3, :3], self._centres[: second + 1])
+        centres += T[: second + 1, :3, 3]
         distance = np.linalg.norm(centres[:second] - centres[second], axis=1)
+        meeting = np.flatnonzero(distance < self._radii[:second] + self._radii[second])
+        nearest = meeting[np.argsort(distance[meeting], kind="stable")[: config.optimisation_candidates]]
         found = []
-        for first in np.flatnonzero(distance < radii[:second] + radii[second]).tolist():
+        for first in sorted(nearest.tolist()):
             T_first_second = se3.inverse(T[first]) @ T[second]
+            T_second_first = se3.inverse(T_first_second)
             share = min(
                 overlap(views[first].reference.levels[-1], views[second].coarsest, T_first_second),
-                overlap(
-                    views[second].reference.levels[-1], views[first].coarsest, se3.inverse(T_first_second)
-                ),
+                overlap(views[second].reference.levels[-1], views[first].coarsest, T_second_first),
             )
             if share >= config.optimisation_overlap:
                 found.append((-share, -first))
-        pairs += [(-first, second) for _, first in sorted(found)[: config.optimisation_neighbours]]
-    return pairs
+        return [-first for _, first in sorted(found)[: config.optimisation_neighbours]]
 
 
-def _balls(T: Array, views: Sequence[View]) -> tuple[Array, Array]:
-    """Centres [k, 3] and radii [k] of balls that hold nine tenths of what each view sees, map frame."""
-    centres, radii = np.zeros((len(views), 3)), np.zeros(len(views))
-    for k, view in enumerate(views):
-        coarsest: ReferenceLevel = view.reference.levels[-1]
-        if len(coarsest):
-            points = coarsest.points.astype(np.float64)
-            centre = np.median(points, axis=0)
-            centres[k] = se3.transform(T[k], centre[None])[0]
-            radii[k] = np.quantile(np.linalg.norm(points - centre, axis=1), 0.9)
-    return centres, radii
-
-
-# --- loops --------------------------------------------------------------------------------------------------------
-
-
-def find_loops(
-    T_map_keyframes: Array,
-    views: Sequence[View],
-    images: Images,
-    config: LoopConfig,
-    registration: RegistrationConfig,
-    seed: int,
-    robot: str,
-) -> list[KeyframePair]:
-    """Pairs of keyframes that show the same place although their poses say that they do not, or not by enough.
-
-    Candidates have many matching features; three-point samples give a motion; registrations from there, one way and
-    the other, must be good and agree. What passes still has only a robust weight in the graph.
-
-    Args:
-        T_map_keyframes: [k, 4, 4], as tracked. seed, robot: of the random stream.
-    """
-    found = []
-    for second in range(config.min_gap, len(views)):
-        candidates = _resembling(views, second, config)
-        for first in candidates:
-            T_first_second = se3.inverse(T_map_keyframes[first]) @ T_map_keyframes[second]
-            seen = overlap(views[first].reference.levels[-1], views[second].coarsest, T_first_second)
-            if seen >= config.known_overlap:
-                continue  # the joint optimisation compares them anyway
-            pair = _verified(views, images, first, second, config, registration, seed, robot)
-            if pair is not None:
-                found.append(pair)
-    return found
-
-
-def _resembling(views: Sequence[View], second: int, config: LoopConfig) -> list[int]:
-    """Earlier keyframes with most matches among the strongest features, ascending."""
-    most = config.features_compared
-    theirs = views[second].features.descriptors[:most]
-    scored = []
-    for first in range(second - config.min_gap + 1):
-        score = len(matches(views[first].features.descriptors[:most], theirs, config.ratio))
-        if score >= config.min_matches:
-            scored.append((-score, first))
-    return sorted(first for _, first in sorted(scored)[: config.candidates])
-
-
-def _verified(
-    views: Sequence[View],
-    images: Images,
-    first: int,
-    second: int,
-    config: LoopConfig,
-    registration: RegistrationConfig,
-    seed: int,
-    robot: str,
-) -> KeyframePair | None:
-    """The registration of a candidate, if it withstands all tests."""
-    ours, theirs = views[first].features, views[second].features
-    pairs = matches(ours.descriptors, theirs.descriptors, config.ratio)
-    if len(pairs) < config.min_inliers:
-        return None
-    rng = streams.generator(seed, "frontend.loop", robot=robot, first=first, second=second)
-    points = ours.points[pairs[:, 0]].astype(np.float64), theirs.points[pairs[:, 1]].astype(np.float64)
-    guess, agree = ransac(*points, config.inlier_m, config.hypotheses, rng)
-    if agree.sum() < max(config.min_inliers, config.min_inlier_share * len(pairs)):
-        return None
-    levels = len(registration.iterations)
-    forth = register(views[first].reference, images(second, levels), guess, registration)
-    back = register(views[second].reference, images(first, levels), se3.inverse(guess), registration)
-    if not (forth.ok and back.ok) or min(forth.overlap, back.overlap) < config.min_overlap:
-        return None
-    apart_m, apart_rad = se3.distance(forth.T_reference_target, se3.inverse(back.T_reference_target))
-    if apart_m > config.max_disagreement_m or apart_rad > config.max_disagreement_rad:
-        return None
-    return KeyframePair(first, second, forth.T_reference_target, forth.information)
+def overlapping(T: Array, views: Sequence[View], config: KeyframeConfig) -> list[Ends]:
+    """Pairs (earlier, later) of keyframes that overlap, as `optimise` would choose them at the poses T [k, 4, 4]."""
+    return _Neighbourhood(views, config).pairs(T)

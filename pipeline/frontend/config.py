@@ -3,6 +3,7 @@
 from pipeline.config import Config
 from pipeline.frontend.mapping_config import MappingConfig
 from pipeline.registration.align import RegistrationConfig
+from pipeline.registration.moving import MovingConfig
 
 # Not settings: the files of a run and their readers promise this rule.
 HELD_OUT_PERIOD = 8
@@ -64,9 +65,12 @@ class KeyframeConfig(Config):
     local_optimisation: bool = True
     """Optimise all keyframe poses jointly on the images; without, only the registrations made in tracking count."""
     optimisation_rounds: int = 10
-    """Linearisations of all pairs at most; it ends when no pose moves by more than 0.1 mm and 0.1 mrad."""
+    """Rounds over all keyframes at most; they end when no pose moves by more than 0.1 mm and 0.1 mrad, and look again
+    only at pairs that moved by as much."""
     optimisation_overlap: float = 0.3
     """Least overlap, at the present poses, of two keyframes that are compared."""
+    optimisation_candidates: int = 24
+    """Earlier keyframes, those that look at the nearest places, whose overlap with one is computed."""
     optimisation_neighbours: int = 8
     """Earlier keyframes that a keyframe is compared with at most, those with most overlap."""
     loops: LoopConfig = LoopConfig()
@@ -195,3 +199,5 @@ class FrontendConfig(Config):
     mapping_enabled: bool = True
     """Grow a map; without, the log holds odometry and keyframes and an empty map."""
     mapping: MappingConfig = MappingConfig()
+    moving: MovingConfig = MovingConfig()
+    """What moves, by depth: not mapped. `information.moving` keeps the same out of the Fisher sums."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pipeline.frontend.config import FailureConfig
 from pipeline.geometry import se3
 from pipeline.registration import Level, RegistrationConfig, RgbdPyramid
+from pipeline.registration.moving import largest_of_3x3
 
 Array = NDArray[np.float64]
 Image = NDArray[np.floating]
@@ -119,14 +120,8 @@ def intruders(
     points = points[points[:, 2] > 0.05]
     uv = np.rint(camera.project(points)).astype(np.int64)
     inside = (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
-    nearest = _largest_of_3x3(keyframe.inverse_depth)[uv[inside, 1], uv[inside, 0]]
+    nearest = largest_of_3x3(keyframe.inverse_depth)[uv[inside, 1], uv[inside, 0]]
     told = nearest > 0
     z_keyframe, z_seen = 1 / nearest[told].astype(np.float64), points[inside, 2][told]
     gate_m = np.maximum(config.intruder_gate_m, config.intruder_gate_relative * z_keyframe)
     return int(np.count_nonzero(z_seen < z_keyframe - gate_m)), len(z_seen)
-
-
-def _largest_of_3x3(image: Image) -> Image:
-    padded = np.pad(image, 1)
-    rows = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
-    return np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])

@@ -20,7 +20,7 @@ from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels import CompiledAdam, FisherSums, Gradients, LossWeights, Rasterizer, Render, ViewLoss
 from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.losses import halve
+from pipeline.splat.losses import depth_certainty, halve
 from pipeline.splat.optimiser import BETA_1, BETA_2, LearningRates
 from pipeline.splat.seeding import seed_discs, unexplained, worst_drawn
 
@@ -43,7 +43,8 @@ class MappingStats:
 class _View:
     """A keyframe as the mapper keeps it: colours as bytes, depth in metres, 0 also where a mask forbids the pixel.
 
-    mask, half_mask: pixels that may be used; None = all.
+    mask, half_mask: pixels that may be used; None = all. certainty, half_certainty: factors of the depth residuals
+    (`splat.losses.depth_certainty`); None = all 1. depth_sigma_m: standard deviation of the depth; None = not told.
     """
 
     index: int
@@ -55,6 +56,9 @@ class _View:
     median_depth_m: float
     mask: NDArray[np.bool_] | None = None
     half_mask: NDArray[np.bool_] | None = None
+    depth_sigma_m: Image | None = None
+    certainty: Image | None = None
+    half_certainty: Image | None = None
     exposure: tuple[float, float] = (0.0, 0.0)
     exposure_moments: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 2)))
     exposure_steps: int = 0
@@ -122,6 +126,7 @@ class Mapper:
         T_map_camera: NDArray[np.float64],
         *,
         mask: NDArray[np.bool_] | None = None,
+        depth_sigma_m: Image | None = None,
     ) -> MappingStats:
         """Seed what the map does not explain of a new keyframe and optimise the window around it.
 
@@ -130,10 +135,11 @@ class Mapper:
             color: RGB [H, W, 3]. depth_m: metres [H, W], 0 where there is none. Both are kept, not copied.
             T_map_camera: pose of the camera in the map frame.
             mask: bool [H, W], False where a pixel neither seeds nor counts in a loss; None = all count.
+            depth_sigma_m: [H, W], standard deviation of the depth, metres; None: not known pixel by pixel.
         """
         if keyframe_index != len(self._views):
             raise ValueError(f"keyframe {keyframe_index} added after {len(self._views)} keyframes")
-        view = _view(keyframe_index, color, depth_m, T_map_camera, mask)
+        view = self._view(keyframe_index, color, depth_m, T_map_camera, mask, depth_sigma_m)
         self._views.append(view)
         self._adam.freeze_after(self.config.stable_steps or None)
         inserted, pruned = self._seed(
@@ -175,13 +181,15 @@ class Mapper:
         T_keyframe_camera: NDArray[np.float64],
         *,
         mask: NDArray[np.bool_] | None = None,
+        depth_sigma_m: Image | None = None,
     ) -> None:
         """Let a tracked frame that is no keyframe take part in `finish`; it moves with its keyframe.
 
         It seeds no Gaussians. Never give a frame that is held out for evaluation.
         """
         T_map_camera = self._views[keyframe_index].T_map_camera @ T_keyframe_camera
-        self._support.append((_view(keyframe_index, color, depth_m, T_map_camera, mask), T_keyframe_camera))
+        view = self._view(keyframe_index, color, depth_m, T_map_camera, mask, depth_sigma_m)
+        self._support.append((view, T_keyframe_camera))
 
     def finish(self) -> MappingStats:
         """Refine geometry and colour over all views: `final_iterations` steps for each keyframe, at full size.
@@ -218,6 +226,22 @@ class Mapper:
 
     # --- one view -----------------------------------------------------------------------------------------------
 
+    def _view(
+        self,
+        index: int,
+        color: Bytes,
+        depth_m: Image,
+        T_map_camera: NDArray[np.float64],
+        mask: NDArray[np.bool_] | None,
+        depth_sigma_m: Image | None,
+    ) -> _View:
+        view = _view(index, color, depth_m, T_map_camera, mask)
+        if depth_sigma_m is not None:
+            view.depth_sigma_m = depth_sigma_m
+            view.certainty = depth_certainty(depth_sigma_m, self.config.loss.depth_huber_m)
+            view.half_certainty = halve(view.certainty)
+        return view
+
     def _draw(self, view: _View, level: int, mask: NDArray[np.bool_] | None = None) -> Render:
         return self.rasterizer.forward(
             self._gaussians,
@@ -242,6 +266,7 @@ class Mapper:
             exposure=view.exposure,
             mask=view.usable(level),
             depth=self.config.depth,
+            depth_certainty=view.certainty if level == 0 else view.half_certainty,
         )
 
     def _mean_loss(self) -> float:
@@ -286,7 +311,7 @@ class Mapper:
             if config.exposure:
                 view.exposure = _first_exposure(render, color, view.mask)
             color = self._as_drawn(view, color, render)
-            wanted = unexplained(render, color, depth_m, config.seeding)
+            wanted = unexplained(render, color, depth_m, config.seeding, view.depth_sigma_m)
         new = self._discs(view, color, depth_m, wanted, budget)
         excess = len(self._gaussians) + len(new) - config.max_gaussians
         self._measure(self._covisible(view, config.sweep_keyframes))
@@ -357,6 +382,8 @@ class Mapper:
         for view in views:
             self._draw(view, 1, view.half_mask)
             inverse_depth = (view.half_depth_m > 0) * np.float32(self.config.contribution_depth_sigma_m**-2)
+            if view.half_certainty is not None:
+                inverse_depth = inverse_depth * view.half_certainty**2
             self.rasterizer.fisher(inverse_color, inverse_depth, sums)
         transparency = 1.0 / (1.0 + np.exp(self._gaussians.opacity_logits.astype(np.float64)))
         return sums.opacity / transparency**2, sums.observations > 0

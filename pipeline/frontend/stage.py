@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline import progress as progress_bar
 from pipeline.errors import DuagError
-from pipeline.frontend import bundle
+from pipeline.frontend import bundle, loops
 from pipeline.frontend.config import FrontendConfig, is_held_out
 from pipeline.frontend.failure import Reason
 from pipeline.frontend.keyframes import KeyframePair, Refined, refine
@@ -25,6 +25,7 @@ from pipeline.frontend.tracking import Status, TrackedFrame, TrackedKeyframe, Tr
 from pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
 from pipeline.recording import LogWriter, RgbdLog, open_rgbd
 from pipeline.registration import RgbdPyramid
+from pipeline.registration.moving import FreeSpace
 from pipeline.splat.gaussians import DepthKind, Gaussians
 from schemas import topics
 
@@ -91,7 +92,15 @@ def _track(log: RgbdLog, config: FrontendConfig, progress: bool) -> tuple[Tracke
     tracked = []
     for frame in source:
         image = frame.color.astype(np.float32) * np.float32(1 / 255)
-        tracked.append(tracker.track(frame.index, frame.stamp_ns, image, frame.depth, mask=frame.mask))
+        found = tracker.track(
+            frame.index,
+            frame.stamp_ns,
+            image,
+            frame.depth,
+            mask=frame.mask,
+            depth_sigma_m=frame.depth_sigma,
+        )
+        tracked.append(found)
     return tracker, tracked
 
 
@@ -106,14 +115,14 @@ def _refine(
 
     def images(index: int, levels: int) -> RgbdPyramid:
         frame = log.frame(keyframes[index].frame_index)
-        depth = frame.depth if frame.mask is None else np.where(frame.mask, frame.depth, np.float32(0))
-        return RgbdPyramid.build(frame.color * np.float32(1 / 255), depth, log.camera, levels)
+        color = frame.color * np.float32(1 / 255)
+        return RgbdPyramid.build(color, frame.usable_depth, log.camera, levels, frame.depth_sigma)
 
     registration = config.tracking.registration
     pairs = list(tracker.pairs)
     if settings.loops.enabled:
         tracked = refine(start, pairs, settings.huber_sigmas).T_map_keyframe
-        pairs += bundle.find_loops(tracked, keyframes, images, settings.loops, registration, seed, log.robot)
+        pairs += loops.find_loops(tracked, keyframes, images, settings.loops, registration, seed, log.robot)
     if not settings.local_optimisation:
         return refine(start, pairs, settings.huber_sigmas), pairs
     return bundle.optimise(start, keyframes, images, pairs, settings, registration)
@@ -196,22 +205,32 @@ def _map(
         )
 
     mapper = Mapper(log.camera, config.mapping, seed, threads=threads)
+    free = FreeSpace(log.camera, config.moving)
+    for keyframe in keyframes:
+        free.add(log.frame(keyframe.frame_index).usable_depth, keyframe.T_map_camera)
     steps = progress_bar.track(keyframes, f"mapping {log.robot}") if progress else keyframes
     updates = []
     for keyframe in steps:
         frame = log.frame(keyframe.frame_index)
         stats = mapper.add_keyframe(
-            keyframe.keyframe_index, frame.color, frame.depth, keyframe.T_map_camera, mask=frame.mask
+            keyframe.keyframe_index,
+            frame.color,
+            frame.depth,
+            keyframe.T_map_camera,
+            mask=free.usable(frame.usable_depth, keyframe.T_map_camera, frame.mask),
+            depth_sigma_m=frame.depth_sigma,
         )
         updates.append(update(keyframe, stats))
     for supporting in _support(frames, keyframes, config):
         frame = log.frame(supporting.frame_index)
+        T_map_camera = keyframes[supporting.keyframe_index].T_map_camera @ supporting.T_keyframe_camera
         mapper.add_view(
             supporting.keyframe_index,
             frame.color,
             frame.depth,
             supporting.T_keyframe_camera,
-            mask=frame.mask,
+            mask=free.usable(frame.usable_depth, T_map_camera, frame.mask),
+            depth_sigma_m=frame.depth_sigma,
         )
     unrefined = mapper.gaussians
     clock.lap("mapping_s")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +87,13 @@ class TrackedKeyframe:
     coarsest: Level = field(repr=False)
     exposure: tuple[float, float] = (1.0, 0.0)
 
+    @cached_property
+    def centre_map(self) -> Array:
+        """The middle [3] of what it sees, in the map as tracked."""
+        points = self.reference.levels[-1].points.astype(np.float64)
+        middle = np.median(points, axis=0) if len(points) else np.zeros(3)
+        return se3.transform(self.T_map_keyframe, middle[None])[0]
+
 
 @dataclass(frozen=True)
 class _Found:
@@ -141,6 +149,7 @@ class Tracker:
         depth_m: Image,
         *,
         mask: NDArray[np.bool_] | None = None,
+        depth_sigma_m: Image | None = None,
     ) -> TrackedFrame:
         """Track one frame; the first that can be used becomes keyframe 0 and the origin of the map.
 
@@ -148,10 +157,12 @@ class Tracker:
             stamp_ns: time of the frame, increasing.
             image: colour [h, w, 3] or grey [h, w], 0..1. depth_m: [h, w], metres, 0 = unknown.
             mask: bool [h, w], False where a pixel must not be used; its depth counts as unknown. None = all may.
+            depth_sigma_m: [h, w], standard deviation of the depth, metres; None: that of the sensor model.
         """
         if mask is not None:
             depth_m = np.where(mask, depth_m, 0)
-        pyramid = RgbdPyramid.build(image, depth_m, self.camera, levels=len(self.config.tracking.strides))
+        levels = len(self.config.tracking.strides)
+        pyramid = RgbdPyramid.build(image, depth_m, self.camera, levels, depth_sigma_m)
         found = self._examine(frame_index, stamp_ns, pyramid)
         if found is None:
             return self._begin(frame_index, stamp_ns, pyramid)
@@ -459,8 +470,12 @@ class Tracker:
     ) -> None:
         """Register a new keyframe to the earlier ones that see most of it, the one it was tracked from excepted."""
         limits = self.config.keyframes
+        # where it was tracked from looks at nearly the same place
+        centres = np.array([keyframe.centre_map for keyframe in self.keyframes])
+        distance = np.linalg.norm(centres - centres[previous], axis=1)
+        nearest = np.sort(np.argsort(distance, kind="stable")[: limits.optimisation_candidates])
         candidates = []
-        for keyframe in self.keyframes:
+        for keyframe in (self.keyframes[k] for k in nearest):
             T_keyframe_new = se3.inverse(keyframe.T_map_keyframe) @ T_map_keyframe
             overlap = predicted_overlap(keyframe.reference, pyramid, T_keyframe_new)
             if keyframe.keyframe_index != previous and overlap >= limits.neighbour_overlap:

@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from pipeline.config import Config
+from pipeline.registration.moving import MovingConfig
 from pipeline.splat.losses import LossConfig
 from pipeline.splat.optimiser import LearningRates
 
@@ -24,6 +25,8 @@ class RefineConfig(Config):
     """They fall exponentially to this share."""
     rates: LearningRates = LearningRates()
     loss: LossConfig = LossConfig()
+    moving: MovingConfig = MovingConfig()
+    """What moves, by depth, is not trained on; as in the front end."""
 
 
 class FusionConfig(Config):
@@ -38,32 +41,27 @@ class FusionConfig(Config):
     spacing_per_sigma: float = Field(default=1.8, ge=0.0)
     """Local spacing of splats, in units of their standard deviation along the surface: the mapper seeds discs with a
     standard deviation of 0.55 cells."""
-    position_floor_m: float = Field(default=0.003, ge=0.0)
-    """Standard deviation added to every position, in all directions. Fisher information knows the noise of pixels but
-    not the bias of a map: two discs a few millimetres apart, slightly tilted and each sure to a tenth of a millimetre,
-    would meet centimetres away, where their planes cross. 0 is the method as printed."""
-    slope: float = Field(default=0.2, ge=0.0)
-    """Two splats some distance apart lie on one plane only up to this slope: (slope * distance)^2 is added to the
-    position's covariance in all directions. 0 is the method as printed."""
-    shape_floor: float = Field(default=0.1, ge=0.0)
-    """The same for every coordinate of vec log Sigma; 0.1 is 5 % of a scale."""
-    sampling_log_covariance: float = Field(default=0.5, ge=0.0)
-    """Standard deviation by which two robots' splats of one place differ in a coordinate of vec log Sigma because they
-    are cut differently (association = neighbours)."""
-    sampling_color: float = Field(default=0.1, ge=0.0)
+    scatter_position_m: float = Field(default=0.01, gt=0.0)
+    """Standard deviation by which two robots' splats of one place are expected to differ across the surface. What is
+    expected counts as much as `scatter_support` matched Gaussians; the rest is measured."""
+    scatter_log_covariance: float = Field(default=1.0, gt=0.0)
+    """The same for a coordinate of vec log Sigma."""
+    scatter_color: float = Field(default=0.07, gt=0.0)
     """The same for colour channels, 0..1."""
-    sampling_opacity: float = Field(default=1.0, ge=0.0)
+    scatter_opacity: float = Field(default=0.5, gt=0.0)
     """The same for opacity logits."""
-    unobserved_below: float = Field(default=1e-6, gt=0.0)
-    """Directions with less than this share of a block's largest information count as unobserved: float32 noise."""
+    scatter_support: int = Field(default=50, ge=1)
+    """Matched Gaussians that the expectation is worth."""
     explained_m: float = Field(default=0.10, ge=0.0)
     """A neighbour's Gaussian this far behind a surface that an own keyframe measured still counts as explained..."""
     explained_relative: float = Field(default=0.03, ge=0.0)
     """... plus this share of its depth."""
     explained_px: int = Field(default=4, ge=0)
     """The farthest surface within so many pixels decides: at outlines the two robots' poses and depths never agree."""
-    explained_opacity: float = Field(default=0.5, ge=0.0, le=1.0)
-    """Where a keyframe has no depth but the own map renders more opaque than this, the rendered depth stands in."""
+    explained_opacity: float = Field(default=0.9, ge=0.0, le=1.0)
+    """A keyframe explains only where the own map draws at least this opaque; without depth, the drawn one stands in."""
+    own_pixel_steps: int = Field(default=3, ge=0)
+    """Gauss-Newton steps on the opacities of what was taken over, by the robot's own images; 0: as their owners say."""
     added_need_information: bool = True
     """Take over only Gaussians on whose position their owner's pixels said something."""
     refine: RefineConfig = RefineConfig()

@@ -5,11 +5,12 @@ In the flat chart theta = (mean, vec log Sigma, colour, opacity logit) the fused
     theta* = (sum W_eff)^-1 sum W_eff theta,        W_eff = (W^-1 + Sigma_assoc)^-1 = (I + W Sigma_assoc)^-1 W,
 
 which is the paper's (12) and, as the chart is flat, its log-Euclidean mean (13). Sigma_assoc is the variance of where
-on the surface a robot happened to put its splat, spacing^2 / 12 along the surface and zero across it, plus a small
-isotropic part for what Fisher information does not know (bias, slope); it belongs to the mean, the covariance has a
-floor of its own. `association` says whose values carry it. A thickness that the mapper holds at its floor is held here
-too. Every robot's evidence counts once, however often it arrived and through whom. Where no member of a track knows
-anything, the own value stays.
+on the surface a robot happened to put its splat: spacing^2 / 12 along the surface, and what the matched splats of two
+robots were measured to differ by across it, in shape, colour and opacity. `association` says whose values carry it: by
+default the neighbours', and the own splat counts with its stiffness among its own (`Evidence.of_splats`), because what
+makes a picture is not where one splat is but what they are together. A thickness that the mapper holds at its floor is
+held here too. Every robot's evidence counts once, however often it arrived and through whom. Where no member of a track
+knows anything, the own value stays. The result is a continuous function of the evidence.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.consensus.config import MatchingConfig
+from pipeline.consensus.config import MatchingConfig, WeightKind
 from pipeline.consensus.evidence import (
     COLOR,
     LOG_COVARIANCE,
@@ -32,6 +33,7 @@ from pipeline.consensus.evidence import (
 )
 from pipeline.consensus.factors import inflated
 from pipeline.consensus.matching import Pairs, held_thickness, tracks
+from pipeline.consensus.weighting import in_world
 from pipeline.fusion.config import FusionConfig
 from pipeline.geometry import se3, spd
 from pipeline.geometry.camera import PinholeCamera
@@ -39,6 +41,10 @@ from pipeline.splat.gaussians import DepthKind, Gaussians
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+MAD_TO_SIGMA = 1.4826
+# Information of the own mean (1/m^2) and shape, which decides where nobody knows more. Matches are within centimetres,
+# so that of `neighbours` is no claim; where all robots shall end with the same Gaussian it is next to nothing.
+PRIOR = {"neighbours": (100.0, 0.1), "members": (1e-2, 1e-4)}
 _NEAR_M = 0.05  # points closer to a camera than this are not judged by it
 
 
@@ -84,6 +90,13 @@ class _Rows:
             np.concatenate([e.opacity_information() for e in evidence]),
         )
 
+    def with_rows(self, at: Index, other: _Rows) -> _Rows:
+        """Those of `other`, in order, in the places `at`."""
+        changed = {name: array.copy() for name, array in vars(self).items()}
+        for name, array in changed.items():
+            array[at] = getattr(other, name)
+        return _Rows(**changed)
+
     def take(self, rows: Index) -> _Rows:
         return _Rows(
             self.theta[rows], self.position[rows], self.shape[rows], self.color[rows], self.opacity[rows]
@@ -91,66 +104,113 @@ class _Rows:
 
 
 def association_covariance(vec_log_covariance: Array, spacing_per_sigma: float) -> Array:
-    """Sigma_assoc [n, 3, 3], m^2: spacing^2 / 12 along the two longer axes of each Gaussian, zero along the shortest.
+    """Sigma_assoc [n, 3, 3], m^2: spacing^2 / 12 along the surface, zero along the shortest axis of each Gaussian.
 
-    The spacing is taken from the Gaussian's own extent, so that everybody computes the same from the evidence alone.
+    spacing^2 (Sigma - shortest^2) / 12, from the Gaussian's own extent, so that everybody computes the same from the
+    evidence alone. No axis is chosen, so that it does not jump where two axes are as short as each other.
 
     Args:
         vec_log_covariance: [n, 6], in the frame in which the result is wanted.
     """
     values, vectors = np.linalg.eigh(spd.vec_to_sym(vec_log_covariance))
-    variance = spacing_per_sigma**2 * np.exp(values) / 12
-    variance[:, 0] = 0.0
+    variance = spacing_per_sigma**2 * (np.exp(values) - np.exp(values[:, :1])) / 12
     return (vectors * variance[:, None, :]) @ vectors.swapaxes(-1, -2)
 
 
 def weighted_move(
-    weights: Array, values: Array, first: Index, unobserved_below: float, free: Array | None = None
+    weights: Array,
+    values: Array,
+    first: Index,
+    prior: float,
+    free: Array | None = None,
 ) -> Array:
-    """(sum W)^+ sum W (value - reference) per group: how far the fused value lies from each group's reference.
+    """How far the fused value of each group lies from its reference: (prior + sum W)^-1 sum W (value - reference).
 
     A matrix-weighted mean may lie far outside its members if they are sure of different directions and contradict
-    each other there: two planes that are nearly parallel cross far away. Where it lies farther from the members'
-    centre than every member, the mean with the traces of the weights, which cannot, takes its place.
+    each other there: two planes that are nearly parallel cross far away. Farther from the mean weighted by traces than
+    its members it does not get: it stops on the way. Everything is a continuous function of weights and values, so
+    that rounding tips no decision.
 
     Args:
         weights: [r, d, d], positive semidefinite; rows of a group follow each other.
         values: [r, d], differences from the group's reference.
         first: [g], first row of every group.
-        unobserved_below: share of a group's largest eigenvalue below which a direction is not moved.
-        free: projection [g, d, d] onto the directions in which a group may move at all.
+        prior: information of the reference's own value in every direction, so little that it only decides where
+            nobody knows anything.
+        free: [g, d, d], shares of each direction in which a group may move, symmetric, eigenvalues 0 to 1.
     Returns:
-        [g, d]; zero in directions that nobody knows.
+        [g, d]; exactly zero in directions that nobody knows.
     """
     total = np.add.reduceat(weights, first, axis=0)
     pull = np.add.reduceat((weights @ values[..., None])[..., 0], first, axis=0)
+    trace = np.maximum(np.trace(weights, axis1=-2, axis2=-1), 0.0)
+    centre = _weighted_move_diagonal(trace[:, None], values, first)
+    size = np.diff(np.append(first, len(values)))
+    apart = values - np.repeat(centre, size, axis=0)
     if free is not None:
         total, pull = free @ total @ free, (free @ pull[..., None])[..., 0]
-        size = np.diff(np.append(first, len(values)))
-        values = (np.repeat(free, size, axis=0) @ values[..., None])[..., 0]
-    eigenvalues, vectors = np.linalg.eigh(total)
-    known = eigenvalues > unobserved_below * np.maximum(eigenvalues[:, -1:], 1e-300)
-    inverse = np.where(known, 1.0 / np.where(known, eigenvalues, 1.0), 0.0)
-    along = (vectors.swapaxes(-1, -2) @ pull[..., None])[..., 0]
-    move = (vectors @ (along * inverse)[..., None])[..., 0]
-
-    trace = np.maximum(np.trace(weights, axis1=-2, axis2=-1), 0.0)
-    informed = trace > 0  # a member without information does not stake out where the others may go
-    count = np.maximum(np.add.reduceat(informed.astype(np.float64), first), 1.0)
-    size = np.diff(np.append(first, len(values)))
-    centre = np.add.reduceat(values * informed[:, None], first, axis=0) / count[:, None]
-    reach = np.linalg.norm(values - np.repeat(centre, size, axis=0), axis=1) * informed
-    far = np.linalg.norm(move - centre, axis=1) > np.maximum.reduceat(reach, first) * (1 + 1e-9)
-    by_trace = _weighted_move_diagonal(trace[:, None], values, first)
-    within = (vectors @ ((vectors.swapaxes(-1, -2) @ by_trace[..., None])[..., 0] * known)[..., None])[..., 0]
-    return np.asarray(np.where(far[:, None], within, move), dtype=np.float64)
+        apart = (np.repeat(free, size, axis=0) @ apart[..., None])[..., 0]
+    right = np.stack([pull, (total @ centre[..., None])[..., 0]], axis=-1)
+    solved = np.linalg.solve(total + prior * np.eye(total.shape[-1]), right)
+    move, centre = solved[..., 0], solved[..., 1]  # the centre as far as anybody knows its directions
+    known = trace / (trace + prior)  # who knows nothing does not stake out where the others may go
+    reach = np.maximum.reduceat(known * np.linalg.norm(apart, axis=1), first)
+    beyond = np.linalg.norm(move - centre, axis=1)
+    share = np.minimum(1.0, reach / np.where(beyond > 0, beyond, 1.0))
+    return np.asarray(centre + share[:, None] * (move - centre), dtype=np.float64)
 
 
 def _weighted_move_diagonal(weights: Array, values: Array, first: Index) -> Array:
-    """The same for a diagonal block: weights and values [r, d]."""
+    """sum w (value - reference) / sum w per group, for weights [r, 1 or d] and values [r, d]; zero without weight."""
     total = np.add.reduceat(weights, first, axis=0)
     pull = np.add.reduceat(weights * values, first, axis=0)
     return np.where(total > 0, pull / np.where(total > 0, total, 1.0), 0.0)
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """How far two robots' splats of one place lie apart, standard deviations: of the mean across the surface (m), of
+    coordinates of vec log Sigma, of colours (0..1), of opacity logits. Measured by the receiver on its own tracks.
+
+    It is no estimation error: each robot cut the surface into splats of its own, which make up for each other.
+    """
+
+    position_m: float
+    shape: float
+    color: float
+    opacity: float
+
+    @staticmethod
+    def of(rows: _Rows, delta: Array, reference: Index, first: Index, config: FusionConfig) -> Scatter:
+        """Robust spread (1.48 times the median) of members with information about their references, [r, 13] `delta`.
+
+        What the settings expect counts as much as `scatter_support` members.
+        """
+        size = np.diff(np.append(first, len(delta)))
+        informed = np.trace(rows.position, axis1=-2, axis2=-1) > 0
+        informed[reference] = False
+        seen = delta[informed]
+        across = _across(rows.theta[np.repeat(reference, size)[informed], LOG_COVARIANCE])
+        parts = (
+            (np.sqrt(np.sum((across @ seen[:, MEAN, None])[..., 0] ** 2, axis=1)), config.scatter_position_m),
+            (np.abs(seen[:, LOG_COVARIANCE]), config.scatter_log_covariance),
+            (np.abs(seen[:, COLOR]), config.scatter_color),
+            (np.abs(seen[:, OPACITY]), config.scatter_opacity),
+        )
+        n, support = len(seen), config.scatter_support
+        variances = [
+            (n * (MAD_TO_SIGMA * np.median(x)) ** 2 + support * expected**2) / (n + support)
+            if n
+            else expected**2
+            for x, expected in parts
+        ]
+        return Scatter(*(float(np.sqrt(v)) for v in variances))
+
+
+def _across(vec_log_covariance: Array) -> Array:
+    """shortest^2 Sigma^-1 [n, 3, 3]: one across a disc, almost zero along it, one in all directions of a ball."""
+    values, vectors = np.linalg.eigh(spd.vec_to_sym(vec_log_covariance))
+    return np.asarray((vectors * np.exp(values[:, :1] - values)[:, None, :]) @ vectors.swapaxes(-1, -2))
 
 
 @dataclass(frozen=True)
@@ -163,31 +223,20 @@ class _Spread:
     opacity: Array
 
     @staticmethod
-    def of(rows: _Rows, reference: Index, first: Index, config: FusionConfig) -> _Spread:
+    def of(rows: _Rows, delta: Array, reference: Index, first: Index, config: FusionConfig) -> _Spread:
         """By `config.association`. References are the receiver's own rows, or a track's lowest name."""
-        n = len(rows.theta)
-        size = np.diff(np.append(first, n))
+        scatter = Scatter.of(rows, delta, reference, first, config)
+        share = np.full(len(delta), 0.5)  # of the variance of a difference: both members' alike
         assigned = association_covariance(rows.theta[:, LOG_COVARIANCE], config.spacing_per_sigma)
         if config.association == "neighbours":
-            apart = rows.theta[:, MEAN] - np.repeat(rows.theta[reference, MEAN], size, axis=0)
-        else:
-            informed = (np.trace(rows.position, axis1=-2, axis2=-1) > 0).astype(np.float64)[:, None]
-            centre = _weighted_move_diagonal(informed, rows.theta[:, MEAN], first)
-            apart = rows.theta[:, MEAN] - np.repeat(centre, size, axis=0)
-        bias = config.position_floor_m**2 + config.slope**2 * np.sum(apart**2, axis=1)
-        position = assigned + bias[:, None, None] * np.eye(3)
-        other = np.zeros(n)
-        if config.association == "neighbours":
-            normal = np.linalg.eigh(spd.vec_to_sym(rows.theta[reference, LOG_COVARIANCE]))[1][:, :, 0]
-            # where on the surface its own splat stands is no estimate: the floor is across only
-            position[reference] = config.position_floor_m**2 * normal[:, :, None] * normal[:, None, :]
-            other[:] = 1.0
-            other[reference] = 0.0
+            share[:] = 1.0
+            share[reference] = 0.0  # where a robot put its own splat is no estimate
+            assigned[reference] = 0.0
         return _Spread(
-            position,
-            config.shape_floor**2 + other * config.sampling_log_covariance**2,
-            other * config.sampling_color**2,
-            other * config.sampling_opacity**2,
+            assigned + (share * scatter.position_m**2)[:, None, None] * np.eye(3),
+            share * scatter.shape**2,
+            share * scatter.color**2,
+            share * scatter.opacity**2,
         )
 
 
@@ -197,18 +246,17 @@ def _moves(
     """Fused minus reference theta [g, 13] of every track."""
     size = np.diff(np.append(first, len(rows.theta)))
     delta = rows.theta - np.repeat(rows.theta[reference], size, axis=0)
-    spread = _Spread.of(rows, reference, first, config)
+    spread = _Spread.of(rows, delta, reference, first, config)
     held = held_thickness(rows.theta[reference, LOG_COVARIANCE], thickness_floor_m)
     free = np.eye(6) - held.swapaxes(-1, -2) @ held
     position = inflated(rows.position, spread.position)
     shape = inflated(rows.shape, spread.shape[:, None, None] * np.eye(6))
     color = rows.color / (1 + rows.color * spread.color[:, None])
     opacity = rows.opacity / (1 + rows.opacity * spread.opacity)
+    prior_position, prior_shape = PRIOR[config.association]
     move = np.zeros((len(first), 13))
-    move[:, MEAN] = weighted_move(position, delta[:, MEAN], first, config.unobserved_below)
-    move[:, LOG_COVARIANCE] = weighted_move(
-        shape, delta[:, LOG_COVARIANCE], first, config.unobserved_below, free
-    )
+    move[:, MEAN] = weighted_move(position, delta[:, MEAN], first, prior_position)
+    move[:, LOG_COVARIANCE] = weighted_move(shape, delta[:, LOG_COVARIANCE], first, prior_shape, free)
     move[:, COLOR] = _weighted_move_diagonal(color, delta[:, COLOR], first)
     move[:, OPACITY] = _weighted_move_diagonal(opacity[:, None], delta[:, OPACITY, None], first)[:, 0]
     return move
@@ -219,6 +267,7 @@ def fuse(
     gaussians: Gaussians,
     T_map_keyframe: ArrayLike,
     evidence: Mapping[str, Evidence],
+    own_splats: Evidence,
     T_world_keyframe: Mapping[str, Array],
     pairs: Pairs,
     depth_images: Iterable[tuple[int, NDArray[np.float32]]],
@@ -226,6 +275,7 @@ def fuse(
     config: FusionConfig,
     matching: MatchingConfig,
     depth: DepthKind = "blended",
+    weights: WeightKind = "block",
 ) -> FusedMap:
     """Fuse what a robot knows into one map in the world frame.
 
@@ -234,19 +284,19 @@ def fuse(
         gaussians: its own map, in its map frame.
         T_map_keyframe: [k, 4, 4], its keyframes in its own map, by anchor.
         evidence: by robot, in anchor frames, the receiver's own included (of all its Gaussians, by id).
+        own_splats: how stiff the receiver's splats are (`Evidence.of_splats`), in anchor frames, of all its Gaussians;
+            for `association = neighbours`.
         T_world_keyframe: by robot, [k, 4, 4] by anchor, for every robot in `evidence`.
         pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians.
         depth_images: (own keyframe index, depth [H, W] in metres, 0 invalid), read once; for `coverage = all`.
         camera: of these depth images.
         matching: as the pairs were found; for splitting tracks that hold two Gaussians of one robot.
         depth: of a Gaussian at a pixel, as the own map was made.
+        weights: kind of the information in `evidence` and `own_splats`.
     """
-    own = evidence[robot]
-    if not np.array_equal(np.sort(own.ids), np.sort(gaussians.ids)):
-        raise ValueError(f"{robot}: the own evidence must be on the Gaussians of the own map")
-    own = own.select(np.argsort(own.ids, kind="stable")[_rank(gaussians.ids)])  # in the order of the map
+    own, own_splats = (_in_order_of(gaussians.ids, e) for e in (evidence[robot], own_splats))
     names = tuple(sorted(evidence))
-    world = {n: (own if n == robot else evidence[n]).in_world(T_world_keyframe[n]) for n in names}
+    world = {n: in_world(own if n == robot else evidence[n], T_world_keyframe[n], weights) for n in names}
     start = np.concatenate([[0], np.cumsum([len(world[n]) for n in names])]).astype(np.int64)
     rows = _Rows.of([world[n] for n in names])
     owner = np.repeat(np.arange(len(names)), np.diff(start))
@@ -264,7 +314,11 @@ def fuse(
     members = np.ones(len(rows.theta), dtype=np.int32)
     sums = pack_information(rows.position, rows.shape, rows.color, rows.opacity)
     if len(first):
-        move[representative] = _moves(rows.take(member), reference, first, config, matching.thickness_floor_m)
+        taking_part, mine = rows.take(member), np.flatnonzero(found.robot == me)
+        if config.association == "neighbours":
+            splats = in_world(own_splats.select(found.row[mine]), T_world_keyframe[robot], weights)
+            taking_part = taking_part.with_rows(mine, _Rows.of([splats]))
+        move[representative] = _moves(taking_part, reference, first, config, matching.thickness_floor_m)
         members[representative] = np.diff(np.append(first, len(member)))
         sums[representative] = np.add.reduceat(sums[member], first, axis=0)
 
@@ -297,6 +351,13 @@ def fuse(
         matched=int(np.sum(members[own_rows] > 1)),
         added=len(added),
     )
+
+
+def _in_order_of(ids: Index, own: Evidence) -> Evidence:
+    """Own evidence in the order of the map's ids."""
+    if not np.array_equal(np.sort(own.ids), np.sort(ids)):
+        raise ValueError(f"{own.owner}: the own evidence must be on the Gaussians of the own map")
+    return own.select(np.argsort(own.ids, kind="stable")[_rank(ids)])
 
 
 def _rank(ids: Index) -> Index:
@@ -368,7 +429,8 @@ def _surfaces(
     config: FusionConfig,
     depth: DepthKind,
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """What own keyframes know of surfaces: measured depth, rendered where it is missing, the farthest close by."""
+    """What own keyframes know of surfaces, where the own map draws them: measured depth, rendered where it is missing,
+    the farthest close by."""
     from scipy.ndimage import maximum_filter
 
     from pipeline.kernels import Rasterizer
@@ -377,9 +439,10 @@ def _surfaces(
     for keyframe, measured in depth_images:
         T_camera_world = se3.inverse(T_world_keyframe[keyframe])
         render = rasterizer.forward(own_world, camera, T_camera_world, depth=depth)
-        stands_in = (measured <= 0) & (render.alpha > config.explained_opacity)
-        filled = np.where(stands_in, render.depth / np.maximum(render.alpha, np.float32(1e-3)), measured)
-        yield keyframe, maximum_filter(filled, 2 * config.explained_px + 1)
+        drawn = render.depth / np.maximum(render.alpha, np.float32(1e-3))
+        surface = np.where(measured > 0, measured, drawn)
+        known = np.where(render.alpha >= config.explained_opacity, surface, np.float32(0))
+        yield keyframe, maximum_filter(known, 2 * config.explained_px + 1)
 
 
 def explained(

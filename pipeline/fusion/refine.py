@@ -22,16 +22,21 @@ from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
 from pipeline.splat.gaussians import DepthKind, Gaussians
+from pipeline.splat.losses import depth_certainty
 
 
 @dataclass(frozen=True)
 class View:
-    """An own image: colour uint8 [H, W, 3], depth (m, 0 = none) [H, W], T_world_camera [4, 4], pixels that count."""
+    """An own image: colour uint8 [H, W, 3], depth (m, 0 = none) [H, W], T_world_camera [4, 4], pixels that count.
+
+    depth_sigma_m: [H, W], standard deviation of the depth; None: not known pixel by pixel.
+    """
 
     color: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
     T_world_camera: NDArray[np.float64]
     mask: NDArray[np.bool_] | None = None
+    depth_sigma_m: NDArray[np.float32] | None = None
 
 
 _TRAINED = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
@@ -71,6 +76,9 @@ def refine(
         if position == 0:
             order = streams.generator(seed, "fusion.refine", start=step).permutation(len(views))
         view = views[order[position]]
+        certainty = None
+        if view.depth_sigma_m is not None:
+            certainty = depth_certainty(view.depth_sigma_m, config.loss.depth_huber_m)
         _, gradients = rasterizer.view_gradients(
             gaussians,
             camera,
@@ -80,6 +88,7 @@ def refine(
             weights,
             mask=view.mask,
             depth=depth,
+            depth_certainty=certainty,
         )
         share = config.rate * config.rate_decay ** (step / max(steps - 1, 1))
         stepped = adam.step(gaussians, gradients, config.rates.times(share))

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.config import MatchingConfig
+from pipeline.consensus.config import MatchingConfig, WeightKind
 from pipeline.consensus.evidence import unpack_symmetric
+from pipeline.consensus.weighting import own_stiffness
 from pipeline.errors import DuagError
-from pipeline.fusion.config import FusionConfig
+from pipeline.fusion.config import FusionConfig, RefineConfig
 from pipeline.fusion.fuse import FusedMap, fuse
+from pipeline.fusion.own_pixels import weigh_by_own_pixels
 from pipeline.fusion.refine import View, refine
 from pipeline.geometry.trajectory import Trajectory, write_tum
 from pipeline.messages import WORLD_FRAME, CorrectedKeyframes, GaussianInformation, GaussianMap, Odometry
 from pipeline.recording import LogWriter, open_rgbd, read_log
+from pipeline.registration.moving import FreeSpace
 from pipeline.robot import AgentInput, AgentResult, RobotData, load
 from pipeline.splat.gaussians import DepthKind, Gaussians
 from pipeline.splat.ply import write_ply
@@ -31,6 +35,7 @@ def run_fusion(
     folder: Path,
     config: FusionConfig,
     matching: MatchingConfig,
+    weights: WeightKind = "block",
     *,
     seed: int = 0,
     threads: int = 1,
@@ -41,7 +46,7 @@ def run_fusion(
         source: the robot's own files.
         result: what it took home from the session.
         folder: where the results go.
-        matching: as the pairs of the session were found.
+        matching: as the pairs of the session were found. weights: kind of the session.
         seed: of the run. threads: of the rasterizer; changes no bit.
     Returns:
         The fused map, in the world frame.
@@ -52,6 +57,7 @@ def run_fusion(
         own.gaussians,
         own.T_map_keyframe,
         {own.robot: result.own_evidence, **result.evidence},
+        own_stiffness(own.robot, own.gaussians, own.information, own.T_map_keyframe, weights),
         result.T_world_keyframe_of,
         result.pairs,
         _depth_images(own),
@@ -59,17 +65,31 @@ def run_fusion(
         config,
         matching,
         own.depth,
+        weights,
     )
     frames = _frames(source)
     stamp_ns = frames[-1].stamp_ns
     refined = None
-    if len(result.component) > 1 and config.refine.steps_per_view:
-        views = _views(source, frames, result, config.refine.support_views)
-        owned = fused.source == fused.robots.index(own.robot)
-        floor_m = matching.thickness_floor_m
-        refined = refine(
-            fused.gaussians, owned, views, own.camera, config.refine, floor_m, own.depth, seed, threads
+    if len(result.component) > 1:
+        views = _views(source, frames, result, config.refine)
+        info = own.information
+        fused = weigh_by_own_pixels(
+            fused,
+            len(own.gaussians),
+            views[: own.keyframes],
+            own.camera,
+            info.color_sigma,
+            info.color_pixels_per_sample,
+            config,
+            own.depth,
+            threads,
         )
+        if config.refine.steps_per_view:
+            owned = fused.source == fused.robots.index(own.robot)
+            floor_m = matching.thickness_floor_m
+            refined = refine(
+                fused.gaussians, owned, views, own.camera, config.refine, floor_m, own.depth, seed, threads
+            )
     write_ply(folder / "fused.ply", fused.gaussians)
     write_ply(folder / "refined.ply", fused.gaussians if refined is None else refined)
     _write_log(folder / "fused.mcap", result, fused, refined, stamp_ns, own.depth)
@@ -81,25 +101,31 @@ def run_fusion(
     return fused
 
 
-def _views(source: AgentInput, frames: Sequence[Odometry], result: AgentResult, support: int) -> list[View]:
+def _views(
+    source: AgentInput, frames: Sequence[Odometry], result: AgentResult, config: RefineConfig
+) -> list[View]:
     """The robot's keyframes and, evenly spread, frames between them, at their corrected poses; none held out."""
     topic = topics.KEYFRAME.of(source.robot)
     keyframes = {record.message().frame_index for record in read_log(source.frontend, (topic,))}
     others = [f for f in frames if f.frame_index not in keyframes and not f.held_out]
-    count = min(support, len(others))
+    count = min(config.support_views, len(others))
     middles = [others[(2 * k + 1) * len(others) // (2 * count)] for k in range(count)]
     views = []
     with open_rgbd(source.log) as log:
+        free = FreeSpace(log.camera, config.moving)
         for f in [*(f for f in frames if f.frame_index in keyframes), *middles]:
             frame = log.frame(f.frame_index)
             T_world_camera = result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera
-            views.append(View(frame.color, frame.usable_depth, T_world_camera, frame.mask))
-    return views
+            usable = frame.usable_depth
+            if f.frame_index in keyframes:
+                free.add(usable, T_world_camera)
+            views.append(View(frame.color, usable, T_world_camera, frame.mask, frame.depth_sigma))
+    return [replace(v, mask=free.usable(v.depth_m, v.T_world_camera, v.mask)) for v in views]
 
 
 def _depth_images(own: RobotData) -> Iterator[tuple[int, NDArray[np.float32]]]:
     for keyframe in range(own.keyframes):
-        yield keyframe, own.images(keyframe)[1]
+        yield keyframe, own.images(keyframe).depth_m
 
 
 def _frames(source: AgentInput) -> list[Odometry]:
@@ -158,5 +184,9 @@ def _information(robot: str, fused: FusedMap, stamp_ns: int) -> GaussianInformat
         observations=fused.members.astype(np.uint32),
         color_sigma=0.0,
         depth_sigma="as each member said",
+        deviation_m=np.zeros(n, np.float32),  # in what the members said
+        color_pixels_per_sample=1.0,
+        depth_pixels_per_sample=1.0,
+        overlap=1.0,
         frame_id=WORLD_FRAME,
     )

@@ -2,7 +2,10 @@
 
 from typing import Literal
 
+from pydantic import Field
+
 from pipeline.config import Config
+from pipeline.registration.moving import MovingConfig
 from pipeline.splat.seeding import THICKNESS_FLOOR_M
 
 
@@ -21,5 +24,12 @@ class InformationConfig(Config):
     """Scale sigma(z) by the robust spread of the map's own depth residuals; recorded with the result."""
     depth_factor_min: float = 0.25
     depth_factor_max: float = 10.0
+    correlation_px: int = Field(default=4, ge=0)
+    """Residuals of pixels this far apart in u and v are correlated with each other: about the reach of a Gaussian. What
+    they share counts once; 0 takes every pixel for independent."""
+    deviation_gate_m: float = Field(default=0.1, gt=0.0)
+    """A surface measured farther than this from a Gaussian is another one's."""
+    moving: MovingConfig = MovingConfig()
+    """What moves, by depth, is in no sum; as in the front end."""
     thickness_floor_m: float = THICKNESS_FLOOR_M
     """Log-scales at this floor carry no information; must be the floor that the map was made with."""

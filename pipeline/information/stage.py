@@ -7,7 +7,7 @@ information.mcap. Source: method section 1 and 2, paper eq. (2)-(4) with J^T R^-
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +20,13 @@ from pipeline.information.config import InformationConfig
 from pipeline.kernels import FisherSums, Rasterizer
 from pipeline.messages import GaussianInformation, GaussianMap, Keyframe, Odometry
 from pipeline.recording import LogWriter, open_rgbd, read_log
+from pipeline.registration.moving import FreeSpace
 from pipeline.splat.gaussians import DepthKind, Gaussians
 from schemas import topics
 
 MAD_TO_SIGMA = 1.4826
+CORRELATION_VIEWS = 8
+NEAR_M = 0.05  # points closer to a camera than this are not judged by it
 FLOOR_TOLERANCE = 1e-3  # of a log-scale; float32 logs of metres are good to 1e-6
 _UPPER = np.triu_indices(9)
 _ROWS_AT_A_TIME = 1024  # 9x9 matrices of as many stay in the cache
@@ -33,31 +36,47 @@ _ROWS_AT_A_TIME = 1024  # 9x9 matrices of as many stay in the cache
 class View:
     """One keyframe: colour uint8 [H, W, 3] RGB, depth float32 [H, W] m, pose of the camera in the map.
 
-    mask: bool [H, W], pixels that may be used; None = all.
+    mask: bool [H, W], pixels that may be used; None = all. depth_sigma_m: [H, W] standard deviation of the depth as the
+    log tells it; None: that of the sensor model.
     """
 
     color: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
     T_map_camera: NDArray[np.float64]
     mask: NDArray[np.bool_] | None = None
+    depth_sigma_m: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of the images: colour sigma (0..1) and depth sigma(z) = factor (base + quadratic (z - 0.4)^2), m."""
+    """Noise of the images: colour sigma (0..1) and depth sigma(z) = factor (base + quadratic (z - 0.4)^2), m.
+
+    from_log: depth sigma = factor times what the log tells of every pixel.
+    color_pixels, depth_pixels: how many neighbouring pixels say together what one would say alone.
+    """
 
     color_sigma: float
     depth_factor: float
     depth_base_m: float
     depth_quadratic_per_m: float
+    from_log: bool = False
+    color_pixels: float = 1.0
+    depth_pixels: float = 1.0
 
-    def depth_sigma_m(self, depth_m: NDArray) -> NDArray[np.float64]:
-        """Standard deviation of measured depths, metres."""
+    def depth_sigma_m(
+        self, depth_m: NDArray, told_m: NDArray[np.float32] | None = None
+    ) -> NDArray[np.float64]:
+        """Standard deviation of measured depths, metres; told_m: what the log tells, if it does."""
+        if told_m is not None:
+            # where there is no depth any number will do
+            return self.depth_factor * np.where(told_m > 0, told_m, 1.0).astype(np.float64)
         z = np.asarray(depth_m, dtype=np.float64)
         return self.depth_factor * (self.depth_base_m + self.depth_quadratic_per_m * (z - 0.4) ** 2)
 
     def depth_formula(self) -> str:
         """The depth noise in words, for the record."""
+        if self.from_log:
+            return f"{self.depth_factor:.6g} * sigma of the log"
         return f"{self.depth_factor:.6g} * ({self.depth_base_m:.6g} + {self.depth_quadratic_per_m:.6g} * (z - 0.4)^2)"
 
 
@@ -87,9 +106,11 @@ def run_information(
         views = []
         for keyframe in keyframes:
             frame = log.frame(keyframe.frame_index)
-            views.append(View(frame.color, frame.depth, keyframe.T_map_camera, frame.mask))
+            views.append(View(frame.color, frame.depth, keyframe.T_map_camera, frame.mask, frame.depth_sigma))
         camera = log.camera
+    views = without_moving(views, camera, config)
     noise = estimate_noise(final.gaussians, camera, views, config, threads, depth=final.depth)
+    noise, overlap = with_correlation(noise, final.gaussians, camera, views, config, threads, final.depth)
     sums = sum_information(final.gaussians, camera, views, noise, config, threads, depth=final.depth)
     result = GaussianInformation(
         stamp_ns=final.stamp_ns,
@@ -105,10 +126,28 @@ def run_information(
         observations=sums.observations,
         color_sigma=noise.color_sigma,
         depth_sigma=noise.depth_formula(),
+        deviation_m=surface_deviation(final.gaussians, camera, views, config.deviation_gate_m).astype(
+            np.float32
+        ),
+        color_pixels_per_sample=noise.color_pixels,
+        depth_pixels_per_sample=noise.depth_pixels,
+        overlap=overlap,
     )
     with LogWriter(out_path, robot=final.robot) as writer:
         writer.write(topics.INFORMATION.of(final.robot), result, log_time_ns)
     return result
+
+
+def without_moving(views: Sequence[View], camera: PinholeCamera, config: InformationConfig) -> list[View]:
+    """The views with what moved masked, as the front end did before it mapped them."""
+    free = FreeSpace(camera, config.moving)
+    depths = [v.depth_m if v.mask is None else np.where(v.mask, v.depth_m, np.float32(0)) for v in views]
+    for view, depth_m in zip(views, depths, strict=True):
+        free.add(depth_m, view.T_map_camera)
+    return [
+        replace(view, mask=free.usable(depth_m, view.T_map_camera, view.mask))
+        for view, depth_m in zip(views, depths, strict=True)
+    ]
 
 
 def read_frontend(path: Path) -> tuple[GaussianMap, list[Keyframe], int]:
@@ -181,7 +220,8 @@ def estimate_noise(
         colors.append(np.abs(difference[covered]).ravel())
         both = covered & (z > 0)
         residual = render.depth[sample][both] / alpha[both] - z[both]
-        depths.append(np.abs(residual) / unit.depth_sigma_m(z[both]))
+        told = None if view.depth_sigma_m is None else view.depth_sigma_m[sample][both]
+        depths.append(np.abs(residual) / unit.depth_sigma_m(z[both], told))
     color, units = np.concatenate(colors), np.concatenate(depths)
     color_sigma = MAD_TO_SIGMA * float(np.median(color)) if len(color) else 0.0
     factor = 1.0
@@ -193,7 +233,132 @@ def estimate_noise(
         depth_factor=factor,
         depth_base_m=config.depth_sigma_base_m,
         depth_quadratic_per_m=config.depth_sigma_quadratic_per_m,
+        from_log=any(view.depth_sigma_m is not None for view in views),
     )
+
+
+def with_correlation(
+    noise: Noise,
+    gaussians: Gaussians,
+    camera: PinholeCamera,
+    views: Sequence[View],
+    config: InformationConfig,
+    threads: int = 1,
+    depth: DepthKind = "blended",
+) -> tuple[Noise, float]:
+    """The noise with its pixels per sample, and how many Gaussians a pixel draws; from some of the views.
+
+    Residuals of neighbouring pixels are alike, because a map's errors are: n pixels then say as much as n / m that are
+    independent, with m the sum of the residuals' autocorrelation over the window (the effective sample size of a mean).
+    Residuals beyond four times their robust spread count as that much.
+    """
+    rasterizer = Rasterizer(threads=threads)
+    chosen = views[:: max(1, -(-len(views) // CORRELATION_VIEWS))]
+    sums = {
+        "color": _Autocorrelation(config.correlation_px),
+        "depth": _Autocorrelation(config.correlation_px),
+    }
+    drawn = pixels = 0
+    for view in chosen:
+        render = rasterizer.forward(
+            gaussians, camera, se3.inverse(view.T_map_camera), mask=view.mask, depth=depth
+        )
+        drawn += rasterizer.statistics().blended_pairs
+        pixels += camera.height * camera.width if view.mask is None else int(np.count_nonzero(view.mask))
+        covered = render.alpha > 0.9
+        color = (render.color.astype(np.float64) - view.color / 255.0).mean(axis=2)
+        both = covered & (view.depth_m > 0)
+        z = np.where(both, view.depth_m, 1.0).astype(np.float64)
+        off = (render.depth / np.maximum(render.alpha, 0.9) - z) / noise.depth_sigma_m(z, view.depth_sigma_m)
+        sums["color"].add(color, covered)
+        sums["depth"].add(off, both)
+    found = {name: autocorrelation.pixels_per_sample() for name, autocorrelation in sums.items()}
+    changed = replace(noise, color_pixels=found["color"], depth_pixels=found["depth"])
+    return changed, max(1.0, drawn / max(pixels, 1))
+
+
+class _Autocorrelation:
+    """Sums of products of residuals some pixels apart, over images."""
+
+    def __init__(self, reach_px: int) -> None:
+        self.reach_px = reach_px
+        side = 2 * reach_px + 1
+        self.products, self.counts = np.zeros((side, side)), np.zeros((side, side))
+
+    def add(self, residual: NDArray[np.float64], usable: NDArray[np.bool_]) -> None:
+        """Take the usable pixels of an image [H, W]."""
+        if not usable.any():
+            return
+        limit = 4 * MAD_TO_SIGMA * float(np.median(np.abs(residual[usable])))
+        x = np.where(usable, np.clip(residual, -limit, limit), 0.0)
+        r, (h, w) = self.reach_px, x.shape
+        for i in range(min(r, h - 1) + 1):
+            for j in range(-min(r, w - 1), min(r, w - 1) + 1):
+                if i == 0 and j < 0:
+                    continue  # the other half is the same, turned
+                a = np.s_[: h - i, max(0, -j) : w - max(0, j)]
+                b = np.s_[i:, max(0, j) : w + min(0, j)]
+                product, count = float(np.sum(x[a] * x[b])), int(np.count_nonzero(usable[a] & usable[b]))
+                for v, u in {(r + i, r + j), (r - i, r - j)}:
+                    self.products[v, u] += product
+                    self.counts[v, u] += count
+
+    def pixels_per_sample(self) -> float:
+        """Sum of the correlations over the window; 1 for independent residuals, and where there are none."""
+        r = self.reach_px
+        if not self.products[r, r] > 0:
+            return 1.0
+        covariance = self.products / np.maximum(self.counts, 1.0)
+        return max(1.0, float(np.sum(covariance) / covariance[r, r]))
+
+
+def surface_deviation(
+    gaussians: Gaussians, camera: PinholeCamera, views: Sequence[View], gate_m: float
+) -> NDArray[np.float64]:
+    """How far every Gaussian's mean is from the surface that the depth images show, metres [n].
+
+    Splats that overlap make up for each other's places: where a sum of them is drawn to a millimetre, each may be a
+    centimetre off, and no pixel tells. What tells is the depth image itself: root mean square, over the views that
+    measured a surface within the gate, of the mean's distance from the tangent plane at its pixel. The median over all
+    Gaussians counts as half a view more, and stands alone where a Gaussian was never measured; without any, the gate.
+    """
+    means, n = gaussians.means.astype(np.float64), len(gaussians)
+    squares, count = np.zeros(n), np.zeros(n)
+    for view in views:
+        usable = view.depth_m if view.mask is None else np.where(view.mask, view.depth_m, np.float32(0))
+        rows, distance_m = _from_tangent_planes(
+            se3.transform(se3.inverse(view.T_map_camera), means), usable, camera
+        )
+        near = np.abs(distance_m) < gate_m
+        squares[rows[near]] += distance_m[near] ** 2
+        count[rows[near]] += 1
+    measured = count > 0
+    typical = float(np.median(squares[measured] / count[measured])) if measured.any() else gate_m**2
+    return np.sqrt((squares + 0.5 * typical) / (count + 0.5))
+
+
+def _from_tangent_planes(
+    points_camera: NDArray[np.float64], depth_m: NDArray[np.float32], camera: PinholeCamera
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Rows of the points whose pixel and its neighbours two pixels off were measured, and their distances, metres."""
+    rows = np.flatnonzero(points_camera[:, 2] > NEAR_M)
+    u, v = np.rint(camera.project(points_camera[rows])).astype(np.int64).T
+    inside = (u >= 2) & (u < camera.width - 2) & (v >= 2) & (v < camera.height - 2)
+    rows, u, v = rows[inside], u[inside], v[inside]
+
+    def surface(du: int, dv: int) -> NDArray[np.float64]:
+        z = depth_m[v + dv, u + du].astype(np.float64)
+        ray = np.stack(
+            [(u + du - camera.cx) / camera.fx, (v + dv - camera.cy) / camera.fy, np.ones(len(u))], axis=1
+        )
+        return ray * z[:, None]
+
+    at, right, left, below, above = (surface(*d) for d in ((0, 0), (2, 0), (-2, 0), (0, 2), (0, -2)))
+    normal = np.cross(right - left, below - above)
+    length = np.linalg.norm(normal, axis=1)
+    measured = (length > 0) & np.all([p[:, 2] > 0 for p in (at, right, left, below, above)], axis=0)
+    off = np.sum(normal * (points_camera[rows] - at), axis=1) / np.where(length > 0, length, 1.0)
+    return rows[measured], off[measured]
 
 
 def _in_blocks(side_px: int, every: int) -> NDArray[np.int64]:
@@ -219,10 +384,12 @@ def sum_information(
     rasterizer = Rasterizer(threads=threads)
     total = FisherSums(len(gaussians))
     chosen = views[-config.window_length :] if config.window == "rolling" else views
-    inverse_color = np.full((camera.height, camera.width), noise.color_sigma**-2, np.float32)
+    color_precision = 1 / (noise.color_sigma**2 * noise.color_pixels)
+    inverse_color = np.full((camera.height, camera.width), color_precision, np.float32)
     # newest first, so that `per_gaussian` can stop at the latest that saw a Gaussian
     for view in reversed(chosen):
-        inverse_variance = 1.0 / np.square(noise.depth_sigma_m(view.depth_m))
+        variance = np.square(noise.depth_sigma_m(view.depth_m, view.depth_sigma_m)) * noise.depth_pixels
+        inverse_variance = 1.0 / variance
         inverse_depth = np.where(view.depth_m > 0, inverse_variance, 0.0).astype(np.float32)
         rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera), mask=view.mask, depth=depth)
         if config.window == "per_gaussian":

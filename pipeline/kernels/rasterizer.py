@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import reprlib
+from dataclasses import asdict
 from numbers import Real
 from typing import Any
 
@@ -30,6 +31,7 @@ MAX_SIDE_PX = 16384
 MAX_THREADS = 1024
 MAX_GAUSSIANS = 2**30
 LARGEST_LOG_SCALE = 40.0  # of metres; as in visibility.h
+SAME_LAYER = 0.05  # relative difference of depth
 ROTATION_TOLERANCE = 1e-4  # of R^T R - I; a pose read from six decimals passes
 
 Image = NDArray[np.float32]
@@ -52,9 +54,9 @@ def available_isas() -> list[str]:
 class Rasterizer:
     """Draws Gaussians into a camera, and takes derivatives back to them.
 
-    `backward`, `fisher` and `contributions` refer to the last `forward`; the arrays of its Gaussians must not have
-    changed since. Scratch memory stays between calls. One Rasterizer serves one thread at a time; the GIL is released.
-    All results are the same bits for any number of threads and on every instruction set.
+    `backward`, `fisher`, `contributions` and `layer_depth` refer to the last `forward`; the arrays of its Gaussians
+    must not have changed since. Scratch memory stays between calls. One Rasterizer serves one thread at a time; the GIL
+    is released. All results are the same bits for any number of threads and on every instruction set.
     """
 
     def __init__(self, isa: str = "auto", threads: int = 1) -> None:
@@ -112,13 +114,23 @@ class Rasterizer:
         depth: DepthKind = "blended",
         pose: bool = False,
         parameters: bool = True,
+        depth_certainty: Image | None = None,
     ) -> tuple[ViewLoss, Gradients]:
         """Forward, loss and backward of one view in one pass: `splat.losses.rgbd_loss` and its derivatives.
 
         color: measured, float32 [H, W, 3], compared with exp(a) * rendered + b for exposure (a, b). depth_m: measured,
         float32 [H, W], 0 where there is none. The rest as in `forward` and `backward`; `fisher` and the others may
-        follow as after a `forward`.
+        follow as after a `forward`. depth_certainty: factor [H, W] of the depth residuals, then in three passes.
         """
+        if depth_certainty is not None:
+            from pipeline.splat.losses import LossConfig, rgbd_loss
+
+            render = self.forward(gaussians, camera, T_camera_map, background, mask=mask, depth=depth)
+            config = LossConfig(**asdict(loss))
+            found = rgbd_loss(render, color, depth_m, config, exposure, mask, depth_certainty)
+            by_images = found.d_color, found.d_depth, found.d_alpha
+            gradients = self.backward(*by_images, pose=pose, parameters=parameters)
+            return ViewLoss(found.value, found.color, found.depth, found.d_exposure), gradients
         height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth)
         measured = (
             _checked_image("color", color, (height, width, 3), "the camera"),
@@ -270,6 +282,21 @@ class Rasterizer:
         pixels = np.zeros(len(gaussians), dtype=np.uint32)
         self._raster.contributions(weights, pixels)
         return weights, pixels
+
+    def layer_depth(self, tolerance: float = SAME_LAYER) -> Image:
+        """Depth [H, W] of the surface that stops the light of each pixel of the last view, metres.
+
+        The median Gaussian is the one at which half of the light is stopped; the result is the mean depth, by
+        blending weight, of the Gaussians within `tolerance` (relative) of its depth. At an edge, where the blended
+        depth mixes two surfaces, it is that of one of them. 0 where more than half of the light passes. No derivative
+        is taken of it.
+        """
+        _, size = self._last_forward()
+        if not (isinstance(tolerance, Real) and 0 <= float(tolerance) <= 1):
+            raise ValueError(f"tolerance is {tolerance!r}, expected a number from 0 to 1")
+        depth = empty(*size)
+        self._raster.layer_depth(float(tolerance), depth)
+        return depth
 
     def statistics(self) -> Statistics:
         """The work of the last view."""

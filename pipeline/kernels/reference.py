@@ -170,6 +170,18 @@ class ReferenceRasterizer:
         weights = self._weights()
         return weights.sum(axis=0), (weights > 0).sum(axis=0).astype(np.uint32)
 
+    def layer_depth(self, tolerance: float = 0.05) -> NDArray[np.float64]:
+        """Depth [H, W] of the layer that the median Gaussian of a pixel lies on; see `Rasterizer.layer_depth`."""
+        weights, depths = (part.detach().numpy() for part in (self._painting.weights, self._painting.depths))
+        left = 1 - np.cumsum(weights, axis=1)
+        before = np.concatenate([np.ones((len(left), 1)), left[:, :-1]], axis=1)
+        median = np.where((before >= 0.5) & (left < 0.5), depths, 0.0).sum(axis=1)
+        own = np.where(np.abs(depths - median[:, None]) <= tolerance * median[:, None], weights, 0.0)
+        mean = (own * depths).sum(axis=1) / np.maximum(own.sum(axis=1), 1e-8)
+        image = np.zeros(self._drawn.shape)
+        image[self._drawn] = np.where(median > 0, mean, 0.0)
+        return image
+
     def gate_margin(self) -> float:
         """Smallest relative distance of any pair of pixel and Gaussian from the thresholds of alpha and transmittance.
 
@@ -355,13 +367,15 @@ _SCREEN_NUMBERS = 2 + 4 + 1 + 2 + 1 + 3  # of one Gaussian
 
 
 class Painting(NamedTuple):
-    """m pixels. color: [m, 3]. depth: [m]. alpha: [m]. weights: [m, k]. gates: see `blend`."""
+    """m pixels. color: [m, 3]. depth: [m]. alpha: [m]. weights: [m, k]. gates: see `blend`. depths: [m, k], of every
+    Gaussian at every pixel."""
 
     color: Any
     depth: Any
     alpha: Any
     weights: Any
     gates: tuple[Any, Any]
+    depths: Any
 
 
 _Channels = Callable[[Painting], Any]  # to values [c, m]
@@ -413,7 +427,7 @@ def paint(pixels: Any, screen: Screen, background: Any) -> Painting:
     total = weights.sum(-1)
     color = (weights[..., None] * screen.colors).sum(-2) + (1 - total)[:, None] * background
     along_ray = screen.depths + (screen.slopes * (pixels[:, None] - screen.centres)).sum(-1)
-    return Painting(color, (weights * along_ray).sum(-1), total, weights, gates)
+    return Painting(color, (weights * along_ray).sum(-1), total, weights, gates, along_ray)
 
 
 def blend(pixels: Any, centres: Any, conics: Any, opacities: Any) -> tuple[Any, tuple[Any, Any]]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +9,7 @@ from pipeline.consensus.closures import holder
 from pipeline.consensus.links import SharedKeyframes, link_metric
 from pipeline.consensus.poses import PoseAgent
 from pipeline.exchange.packets import MAX_PAYLOAD_BYTES
-from pipeline.posegraph import wire
+from pipeline.exchange.poses_wire import read_poses, write_poses_in_parts
 from pipeline.posegraph.agent import GraphAgent, Neighbour
 
 Array = NDArray[np.float64]
@@ -56,16 +54,13 @@ class AdmmAgent(GraphAgent):
         if not self._everybody_started():
             return [_STARTED]
         packet = self.poses.outgoing(neighbour.name)
-        n = len(packet.keyframes)
-        parts = -(-n // wire.poses_per_packet(MAX_PAYLOAD_BYTES, packet.translations.dtype == np.float64))
-        cuts = [n * k // parts for k in range(parts + 1)]
-        return [wire.write_poses(packet, a, b - a, self.own < neighbour.index) for a, b in pairwise(cuts)]
+        return write_poses_in_parts(packet, MAX_PAYLOAD_BYTES, self.own < neighbour.index)
 
     def take_state(self, neighbour: Neighbour, payload: bytes) -> None:
         self._started.add(neighbour.index)
         if payload != _STARTED:
             shared = self.poses.links[neighbour.name].keyframes
-            poses = wire.read_poses(payload, shared, neighbour.index < self.own)
+            poses = read_poses(payload, shared, neighbour.index < self.own)
             self.poses.receive(neighbour.name, poses)
 
     def _everybody_started(self) -> bool:

@@ -38,14 +38,6 @@ _TRANSPORT = TransportConfig(contact_lost_after_rounds=_NEVER, silent_after_roun
 _UNLIMITED = 1 << 40  # bytes per round and link: what a solver sends is counted, not held back
 
 
-class EagerTransport(Transport):
-    """Sends again the sooner, the more is lost: waiting for an acknowledgement that will not come is no use."""
-
-    def _retransmit_after(self) -> int:
-        heard = self._packets_heard / (self._highest_sequence + 1)
-        return max(1, round(super()._retransmit_after() * heard))
-
-
 @dataclass
 class Neighbour:
     """What a robot knows about one neighbour. closures: of the pair, from this robot's side."""
@@ -87,7 +79,7 @@ class GraphAgent:
             self.team.index(peer): Neighbour(
                 peer,
                 self.team.index(peer),
-                EagerTransport(self.own, self.team.index(peer), peer, _TRANSPORT, self._new_id),
+                Transport(self.own, self.team.index(peer), peer, _TRANSPORT, self._new_id),
                 closures,
             )
             for peer, closures in sorted(graph.closures.items())

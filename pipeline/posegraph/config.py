@@ -33,9 +33,8 @@ class PoseGraphConfig(Config):
         odometry_floor_rad=0,
         closures=_AS_GIVEN,
         robust=False,
-        penalty_start=0.3,
-        robust_passes=((1e-5, 52),),
         robust_skip=False,
+        robust_convexity=0.0,
     )
     """Shared by all solvers: robust weights, tolerance, and what only edge-ADMM uses."""
     elimination_tolerance: float = Field(default=1e-7, gt=0.0)

@@ -9,8 +9,6 @@ if they were exact, so that noisy cycles have no fixed point and the limit, if a
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,8 +17,8 @@ from pipeline.consensus.closures import closure_factors
 from pipeline.consensus.factors import Factors, retract
 from pipeline.consensus.links import PosePacket
 from pipeline.exchange.packets import MAX_PAYLOAD_BYTES
+from pipeline.exchange.poses_wire import read_poses, write_poses_in_parts
 from pipeline.geometry import se3, so3
-from pipeline.posegraph import wire
 from pipeline.posegraph.agent import GraphAgent, Neighbour
 
 Array = NDArray[np.float64]
@@ -94,12 +92,10 @@ class PaperAgent(GraphAgent):
         nothing = np.zeros(2, dtype=np.float32)
         quats, t = so3.to_quat_wxyz(T[:, :3, :3]).astype(np.float32), T[:, :3, 3].astype(np.float32)
         packet = PosePacket(self._sent, 0, named, quats, t, nothing, None, self.settled)
-        parts = -(-len(named) // wire.poses_per_packet(MAX_PAYLOAD_BYTES, double=False))
-        cuts = [len(named) * k // parts for k in range(parts + 1)]
-        return [wire.write_poses(packet, a, b - a, decides=False) for a, b in pairwise(cuts)]
+        return write_poses_in_parts(packet, MAX_PAYLOAD_BYTES, decides=False)
 
     def take_state(self, neighbour: Neighbour, payload: bytes) -> None:
-        packet = wire.read_poses(payload, neighbour.peer_keyframes, from_decider=False)
+        packet = read_poses(payload, neighbour.peer_keyframes, from_decider=False)
         if packet.sequence >= self._newest[neighbour.index]:
             self._newest[neighbour.index] = packet.sequence
             at = np.searchsorted(neighbour.peer_keyframes, packet.keyframes)

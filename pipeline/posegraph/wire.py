@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.elimination import Block, Variable
-from pipeline.consensus.links import PosePacket
 from pipeline.exchange.packets import MalformedError
-from pipeline.exchange.wire import MAX_COORDINATE, MAX_TEAM, Reader, array_bytes
+from pipeline.exchange.wire import Reader, array_bytes
 from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
@@ -26,9 +23,6 @@ class Code(IntEnum):
     KEYFRAMES = 2  # to a neighbour: own keyframes that the pair's closures name, in the own map
     VERDICT = 3  # lower to higher name: which closures the iteration starts with
     FRAME = 4  # flooded: relative frame of two robots and how many closures agree on it
-    FRONT = 5  # elimination, up the tree: variables that the subtree shares with others
-    BLOCK = 6  # elimination, up the tree: what is left of the subtree's cost after elimination
-    STEP = 7  # elimination, down the tree: how the shared variables move
 
 
 @dataclass(frozen=True)
@@ -149,207 +143,3 @@ def _read_motions(reader: Reader, n: int, precision: str) -> Array:
     if n and np.abs((quats**2).sum(axis=1) - 1).max() > 1e-3:
         raise MalformedError(f"{reader.what}: not rigid motions")
     return se3.from_quat_translation(quats, t.astype(np.float64))
-
-
-# --- poses of a round
-
-
-_POSES = struct.Struct("<IIBHH2f")
-_CONVERGED, _CURVATURE, _PENALTIES, _POSE_DOUBLE = 1, 2, 4, 8
-_OTHERS = np.array(
-    [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]
-)  # components that are sent beside the largest
-
-
-def write_poses(packet: PosePacket, first: int, count: int, decides: bool) -> bytes:
-    """Bytes of some of the poses of a round: shared keyframes `first` to `first + count` of the link.
-
-    24 1/4 per pose in float32: the largest component of the quaternion is left out, which one takes two bits; both
-    ends know the keyframes. The end that decides sends its penalties, the other end its curvature.
-    """
-    part = packet.part(slice(first, first + count))
-    double = part.translations.dtype == np.float64
-    flags = _CONVERGED * part.converged + _POSE_DOUBLE * double
-    numbers = (0.0, 0.0)
-    if decides:
-        flags, numbers = flags + _PENALTIES, part.penalties.tolist()
-    elif part.curvature is not None:
-        flags, numbers = flags + _CURVATURE, part.curvature.tolist()
-    q = part.quats_wxyz
-    largest = np.argmax(np.abs(q), axis=1)
-    rows = np.arange(count)
-    q = np.where(q[rows, largest] < 0, -1, 1)[:, None] * q
-    bits = np.unpackbits(largest.astype(np.uint8)[:, None], axis=1, count=2, bitorder="little")
-    precision = "float64" if double else "float32"
-    return b"".join(
-        [
-            _POSES.pack(part.sequence, part.version, flags, first, count, *numbers),
-            np.packbits(bits, bitorder="little").tobytes(),
-            array_bytes(q[rows[:, None], _OTHERS[largest]], precision),
-            array_bytes(part.translations, precision),
-        ]
-    )
-
-
-def poses_per_packet(room_bytes: int, double: bool) -> int:
-    """Poses that fit into a packet."""
-    return 4 * (room_bytes - _POSES.size) // (1 + 4 * 6 * (8 if double else 4))
-
-
-def read_poses(data: bytes, shared: NDArray[np.int32], from_decider: bool) -> PosePacket:
-    """Poses of a round about some of the keyframes `shared`."""
-    reader = Reader(data, "poses")
-    sequence, version, flags, first, n, *numbers = reader.fields(_POSES)
-    if flags >= 2 * _POSE_DOUBLE or bool(flags & _PENALTIES) != from_decider or first + n > len(shared):
-        raise MalformedError("poses: unknown flags, not from this end, or of keyframes that are not shared")
-    brings = flags & (_PENALTIES | _CURVATURE)
-    if brings and not (np.isfinite(numbers).all() and min(numbers) > 1e-12 and max(numbers) < 1e9):
-        raise MalformedError("poses: penalties and curvature must be positive")
-    precision = "float64" if flags & _POSE_DOUBLE else "float32"
-    bits = np.unpackbits(reader.array("uint8", (-(-n // 4),)), count=2 * n, bitorder="little").reshape(n, 2)
-    others = reader.array(precision, (n, 3)).astype(np.float64)
-    translations = reader.array(precision, (n, 3))
-    reader.done()
-    rest = 1.0 - (others**2).sum(axis=1)
-    if rest.min(initial=1.0) < 0.2 or np.abs(translations).max(initial=0.0) > MAX_COORDINATE:
-        raise MalformedError("poses: not rigid motions")
-    largest, rows = bits[:, 0] + 2 * bits[:, 1], np.arange(n)
-    quats = np.zeros((n, 4))
-    quats[rows, largest] = np.sqrt(rest)
-    quats[rows[:, None], _OTHERS[largest]] = others
-    pair = np.array(numbers, dtype=np.float32)
-    penalties = pair if from_decider else np.zeros(2, dtype=np.float32)
-    curvature, converged = pair if flags & _CURVATURE else None, bool(flags & _CONVERGED)
-    keyframes = shared[first : first + n]
-    return PosePacket(sequence, version, keyframes, quats, translations, penalties, curvature, converged)
-
-
-# --- elimination
-
-
-_FRONT = struct.Struct("<BI")
-_BLOCK = struct.Struct("<BIIddB")
-_STEP = struct.Struct("<BIBdI")
-_REWEIGHTED, _UNSURE, _DOUBLE, _NEW = 1, 2, 4, 8
-_ACCEPTED, _FINISHED, _FRESH = 1, 2, 4
-_UPPER = np.triu_indices(6)
-
-
-@dataclass(frozen=True)
-class Step:
-    """The root's answer to the blocks of one exchange.
-
-    accepted: the last step lowered the cost; else everybody goes back to where it was before. finished: this is the
-    last message. fresh: everybody linearises anew. damping: for the next blocks. delta: [s, 6], steps of the variables
-    shared with the parent.
-    """
-
-    exchange: int
-    accepted: bool
-    finished: bool
-    fresh: bool
-    damping: float
-    delta: Array
-
-
-def write_front(everybody: Mapping[Variable, int]) -> bytes:
-    """Bytes of FRONT, 14 per variable: owner, keyframe, mask of all robots that have it (0: owner not below)."""
-    names = sorted(everybody)
-    return b"".join(
-        [
-            _FRONT.pack(Code.FRONT, len(names)),
-            array_bytes([owner for owner, _ in names], "uint16"),
-            array_bytes([keyframe for _, keyframe in names], "uint32"),
-            array_bytes(np.array([everybody[v] for v in names], dtype=np.uint64), "uint64"),
-        ]
-    )
-
-
-def read_front(data: bytes, team: int) -> dict[Variable, int]:
-    """From FRONT."""
-    reader = Reader(data, "front")
-    _, n = reader.fields(_FRONT)
-    owners = reader.array("uint16", (n,)).tolist()
-    keyframes = reader.array("uint32", (n,)).tolist()
-    masks = reader.array("uint64", (n,)).tolist()
-    reader.done()
-    names = list(zip(owners, keyframes, strict=True))
-    if max(owners, default=0) >= team or any(mask >> team for mask in masks):
-        raise MalformedError("front: names a robot outside the team")
-    if names != sorted(set(names)):
-        raise MalformedError("front: variables must ascend")
-    return dict(zip(names, masks, strict=True))
-
-
-def write_block(exchange: int, block: Block, precision: str) -> bytes:
-    """Bytes of BLOCK. Of H the upper triangle, and of its 6x6 parts beside the diagonal those that are not zero.
-
-    precision: float32 or float64, of H; the gradient, which decides where the iteration ends, is always float64.
-    """
-    n = len(block.g) // 6
-    flags = _REWEIGHTED * block.reweighted + _UNSURE * block.unsure + _DOUBLE * (precision == "float64")
-    flags += _NEW * (block.H is not None)
-    head = _BLOCK.pack(Code.BLOCK, exchange, n, block.cost, block.largest_step, flags)
-    if block.H is None:
-        return head + array_bytes(block.g, "float64")
-    parts = block.H.reshape(n, 6, n, 6).transpose(0, 2, 1, 3)
-    beside = parts[np.triu_indices(n, 1)].reshape(-1, 36)
-    filled = beside.any(axis=1)
-    diagonal = parts[np.arange(n), np.arange(n)][:, _UPPER[0], _UPPER[1]]
-    return b"".join(
-        [
-            head,
-            array_bytes(block.g, "float64"),
-            array_bytes(diagonal, precision),
-            np.packbits(filled, bitorder="little").tobytes(),
-            array_bytes(beside[filled], precision),
-        ]
-    )
-
-
-def read_block(data: bytes, variables: int) -> tuple[int, Block]:
-    """Number of the exchange and the block, over so many variables."""
-    reader = Reader(data, "block")
-    _, exchange, n, cost, largest_step, flags = reader.fields(_BLOCK)
-    if n != variables or not (cost >= 0 and largest_step >= 0) or flags >= 2 * _NEW:
-        raise MalformedError(f"block: over {n} variables, expected {variables}; or impossible numbers")
-    g = reader.array("float64", (6 * n,))
-    H = _read_matrix(reader, n, "float64" if flags & _DOUBLE else "float32") if flags & _NEW else None
-    reader.done()
-    return exchange, Block(H, g, cost, largest_step, bool(flags & _REWEIGHTED), bool(flags & _UNSURE))
-
-
-def _read_matrix(reader: Reader, n: int, precision: str) -> Array:
-    """A symmetric matrix [6 n, 6 n] of 6x6 parts."""
-    diagonal = reader.array(precision, (n, 21))
-    off = n * (n - 1) // 2
-    filled = np.unpackbits(reader.array("uint8", (-(-off // 8),)), count=off, bitorder="little").astype(bool)
-    beside = reader.array(precision, (int(filled.sum()), 6, 6))
-    parts = np.zeros((n, n, 6, 6))
-    rows, columns = (index[filled] for index in np.triu_indices(n, 1))
-    parts[rows, columns], parts[columns, rows] = beside, beside.transpose(0, 2, 1)
-    own = np.arange(n)[:, None]
-    parts[own, own, _UPPER[0], _UPPER[1]] = parts[own, own, _UPPER[1], _UPPER[0]] = diagonal
-    return np.ascontiguousarray(parts.transpose(0, 2, 1, 3)).reshape(6 * n, 6 * n)
-
-
-def write_step(step: Step) -> bytes:
-    """Bytes of STEP: 48 per shared variable."""
-    flags = _ACCEPTED * step.accepted + _FINISHED * step.finished + _FRESH * step.fresh
-    head = _STEP.pack(Code.STEP, step.exchange, flags, step.damping, len(step.delta))
-    return head + array_bytes(step.delta, "float64")
-
-
-def read_step(data: bytes, variables: int) -> Step:
-    """From STEP over so many variables; without steps if it was not accepted."""
-    reader = Reader(data, "step")
-    _, exchange, flags, damping, n = reader.fields(_STEP)
-    delta = reader.array("float64", (n, 6))
-    reader.done()
-    accepted = bool(flags & _ACCEPTED)
-    if flags >= 2 * _FRESH or n != accepted * variables or not damping >= 0:
-        raise MalformedError(f"step: over {n} variables, expected {variables}; or impossible numbers")
-    return Step(exchange, accepted, bool(flags & _FINISHED), bool(flags & _FRESH), damping, delta)
-
-
-assert MAX_TEAM <= 64  # masks of robots are 64 bits

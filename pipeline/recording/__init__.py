@@ -9,17 +9,19 @@ from pipeline.recording.folder import Recording
 from pipeline.recording.motion import Motion, MotionPrior
 from pipeline.recording.names import (
     DEPTH_SCALE_KEY,
+    RANGE_SIGMA_KEY,
     RECORDING_FILE,
     RECORDING_FORMAT,
     RECORDING_SCHEMA,
 )
 from pipeline.recording.read import Record, content_digest, log_metadata, merge, read_log, verify
 from pipeline.recording.rgbd import RgbdFrame, RgbdLog, open_rgbd
-from pipeline.recording.summary import format_info, info
+from pipeline.recording.summary import format_info, info, write_preview_of
 from pipeline.recording.write import LogWriter
 
 __all__ = [
     "DEPTH_SCALE_KEY",
+    "RANGE_SIGMA_KEY",
     "RECORDING_FILE",
     "RECORDING_FORMAT",
     "RECORDING_SCHEMA",
@@ -38,4 +40,5 @@ __all__ = [
     "open_rgbd",
     "read_log",
     "verify",
+    "write_preview_of",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -12,12 +13,24 @@ from numpy.typing import NDArray
 from pipeline import messages
 from pipeline.errors import DuagError
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording.names import DEPTH_SCALE_KEY
+from pipeline.recording.lidar import lidar_depth
+from pipeline.recording.names import DEPTH_SCALE_KEY, RANGE_SIGMA_KEY
 from pipeline.recording.read import LogFile, Record
-from pipeline.recording.register_depth import fill_between, register_depth
+from pipeline.recording.register_depth import register_depth
 from schemas import topics as topic_table
 
 Value = TypeVar("Value")
+
+
+@dataclass(frozen=True)
+class DepthImage:
+    """Depth [h, w], metres along z of the colour camera, 0 = unknown, and its standard deviation where the log has it.
+
+    sigma_m: [h, w], metres, 0 where the depth is unknown; None: the sensor's noise is not told.
+    """
+
+    depth_m: NDArray[np.float32]
+    sigma_m: NDArray[np.float32] | None = None
 
 
 class DepthSource(Protocol):
@@ -26,8 +39,8 @@ class DepthSource(Protocol):
     topic: str
     scale: float
 
-    def read(self, record: Record) -> NDArray[np.float32]:
-        """Depth [h, w] of a message, metres along z of the colour camera, 0 = unknown."""
+    def read(self, record: Record) -> DepthImage:
+        """The depth image of a message."""
         ...
 
 
@@ -46,14 +59,28 @@ def depth_source(log: LogFile, robot: str, camera: PinholeCamera) -> DepthSource
 
 
 class Registered:
-    """Depth images that are registered to colour."""
+    """Depth images that are registered to colour, and those of their standard deviation if there are any."""
 
     def __init__(self, log: LogFile, robot: str, camera: PinholeCamera) -> None:
         self.topic, self.camera = topic_table.DEPTH.of(robot), camera
-        self.scale = _scale(log, self.topic)
+        self.scale = _metres(log, self.topic, DEPTH_SCALE_KEY)
+        self._log, self._sigma_topic = log, topic_table.DEPTH_SIGMA.of(robot)
+        self._sigma_at = log.entries_by_time(self._sigma_topic)
+        if self._sigma_at:
+            self._sigma_scale = _metres(log, self._sigma_topic, DEPTH_SCALE_KEY)
 
-    def read(self, record: Record) -> NDArray[np.float32]:
-        return _depth_image(record, self.scale, self.camera)
+    def read(self, record: Record) -> DepthImage:
+        depth_m = _depth_image(record, self.scale, self.camera)
+        if not self._sigma_at:
+            return DepthImage(depth_m)
+        entry = self._sigma_at.get(record.publish_time_ns)
+        if entry is None:
+            raise DuagError(
+                f"{_where(record)} has no image on {self._sigma_topic}, expected one for each depth image"
+            )
+        sigma_m = _depth_image(self._log.record_at(self._sigma_topic, entry), self._sigma_scale, self.camera)
+        known = (depth_m > 0) & (sigma_m > 0)  # a depth that nobody vouches for is none
+        return DepthImage(np.where(known, depth_m, np.float32(0)), np.where(known, sigma_m, np.float32(0)))
 
 
 class OtherCamera:
@@ -61,19 +88,19 @@ class OtherCamera:
 
     def __init__(self, log: LogFile, robot: str, camera: PinholeCamera) -> None:
         self.topic, self.camera = topic_table.RAW_DEPTH.of(robot), camera
-        self.scale = _scale(log, self.topic)
+        self.scale = _metres(log, self.topic, DEPTH_SCALE_KEY)
         calibration = topic_table.RAW_DEPTH_CALIBRATION.of(robot)
         self.depth_camera = constant(log, calibration, messages.unpack_calibration)
         transform = topic_table.RAW_DEPTH_TRANSFORM.of(robot)
         self.T_camera_depth = np.array(constant(log, transform, transform_rows))
 
-    def read(self, record: Record) -> NDArray[np.float32]:
+    def read(self, record: Record) -> DepthImage:
         depth_m = _depth_image(record, self.scale, self.depth_camera)
-        return register_depth(depth_m, self.depth_camera, self.T_camera_depth, self.camera)
+        return DepthImage(register_depth(depth_m, self.depth_camera, self.T_camera_depth, self.camera))
 
 
 class Lidar:
-    """Sweeps of a LiDAR, filled between their points."""
+    """Sweeps of a LiDAR, filled between their points; with sigma if the log tells the noise of its ranges."""
 
     scale = 1.0
 
@@ -81,11 +108,14 @@ class Lidar:
         self.topic, self.camera = topic_table.LIDAR.of(robot), camera
         transform = topic_table.LIDAR_TRANSFORM.of(robot)
         self.T_camera_lidar = np.array(constant(log, transform, transform_rows))
+        told = RANGE_SIGMA_KEY in log.channels[self.topic].metadata
+        self._range_sigma_m = _metres(log, self.topic, RANGE_SIGMA_KEY) if told else None
 
-    def read(self, record: Record) -> NDArray[np.float32]:
+    def read(self, record: Record) -> DepthImage:
         points = messages.unpack_points(record.proto(), _where(record))
-        R, t = self.T_camera_lidar[:3, :3], self.T_camera_lidar[:3, 3]
-        return fill_between(points @ R.T + t, self.camera)
+        range_sigma_m = self._range_sigma_m or 0.0
+        depth_m, sigma_m = lidar_depth(points, self.T_camera_lidar, self.camera, range_sigma_m)
+        return DepthImage(depth_m, sigma_m if range_sigma_m else None)
 
 
 def constant(log: LogFile, topic: str, unpack: Callable[[Any], Value]) -> Value:
@@ -114,15 +144,16 @@ def transform_rows(message: Any) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in messages.unpack_transform(message).tolist())
 
 
-def _scale(log: LogFile, topic: str) -> float:
-    text = log.channels[topic].metadata.get(DEPTH_SCALE_KEY)
+def _metres(log: LogFile, topic: str, key: str) -> float:
+    """A length in the metadata of a channel."""
+    text = log.channels[topic].metadata.get(key)
     try:
         scale = float(text or "missing")
     except ValueError:
         scale = math.nan
     if not (math.isfinite(scale) and scale > 0):
-        where = f"{log.path}: {topic}: channel metadata {DEPTH_SCALE_KEY}"
-        raise DuagError(f"{where} is {text!r}, expected metres per unit, for example '0.001'")
+        where = f"{log.path}: {topic}: channel metadata {key}"
+        raise DuagError(f"{where} is {text!r}, expected metres, for example '0.001'")
     return scale
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import DuagError
+from pipeline.files import read_bytes
 from pipeline.recording.names import RECORDING_FILE, RECORDING_FORMAT, RECORDING_SCHEMA
 from schemas import topics
 
@@ -63,8 +64,8 @@ def _read_description(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise DuagError(f"{path}: no such file, expected a recording (a folder with {RECORDING_FILE})")
     try:
-        description = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
+        description = json.loads(read_bytes(path, "the JSON of a recording"))
+    except (ValueError, RecursionError) as error:
         raise DuagError(f"{path}: {error}, expected the JSON of a recording") from error
     if not isinstance(description, dict) or description.get("format") != RECORDING_FORMAT:
         found = description.get("format") if isinstance(description, dict) else type(description).__name__
@@ -74,6 +75,10 @@ def _read_description(path: Path) -> dict[str, Any]:
     robots = description.get("robots")
     if not isinstance(robots, dict) or not robots or not isinstance(description.get("name"), str):
         raise DuagError(f"{path}: found no name or no robots, expected both")
+    for field, kind in (("source", dict), ("warnings", list), ("checks", dict), ("clocks", dict)):
+        if not isinstance(description.setdefault(field, kind()), kind):
+            found = type(description[field]).__name__
+            raise DuagError(f"{path}: {field} is a {found}, expected a {kind.__name__}")
     _check_file_name(path, "geometry", description.get("geometry"))
     for robot, row in robots.items():
         if not re.fullmatch(

@@ -11,3 +11,4 @@ DEPTH_SCALE_KEY = "depth_scale"
 RECORDING_FILE = "recording.json"
 RECORDING_FORMAT = "duagc.recording"
 RECORDING_SCHEMA = 1
+RANGE_SIGMA_KEY = "range_sigma"  # channel metadata of a LiDAR: standard deviation of its ranges, m

@@ -74,39 +74,3 @@ def draw_points(points_camera: Array, camera: PinholeCamera) -> Image:
     total = np.bincount(pixel[front], 1 / z[front], size)
     depth = np.where(count > 0, count / np.where(count > 0, total, 1), 0)
     return depth.reshape(camera.height, camera.width).astype(np.float32)
-
-
-def fill_between(
-    points_camera: Array, camera: PinholeCamera, longest_px: float = 24.0, step: float = 0.05
-) -> Image:
-    """A depth image from sparse points, as of a LiDAR: measured points and the surface between them.
-
-    The points' pixels are triangulated; over a triangle whose corners are near each other in the image and in depth,
-    inverse depth is linear (exact on planes). The rest stays 0.
-
-    Args:
-        points_camera: [n, 3]. longest_px: longest side of a triangle. step: relative step of depth in a triangle.
-    """
-    from scipy.interpolate import LinearNDInterpolator
-    from scipy.spatial import Delaunay, QhullError
-
-    sparse = draw_points(points_camera, camera)
-    v, u = np.nonzero(sparse)
-    if len(v) < 3:
-        return sparse
-    pixels, inverse = np.stack([u, v], axis=-1).astype(np.float64), 1 / sparse[v, u].astype(np.float64)
-    try:
-        mesh = Delaunay(pixels)
-    except QhullError:  # all on one line
-        return sparse
-    corners, depths = pixels[mesh.simplices], inverse[mesh.simplices]
-    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
-    sound = (sides.max(axis=1) <= longest_px) & (depths.max(axis=1) <= (1 + step) * depths.min(axis=1))
-    rows, columns = np.mgrid[: camera.height, : camera.width]
-    wanted = np.stack([columns.ravel(), rows.ravel()], axis=-1).astype(np.float64)
-    triangle = mesh.find_simplex(wanted)
-    inside = np.flatnonzero((triangle >= 0) & sound[np.maximum(triangle, 0)])
-    filled = np.zeros(camera.height * camera.width, dtype=np.float64)
-    filled[inside] = 1 / LinearNDInterpolator(mesh, inverse)(wanted[inside])
-    image = filled.reshape(camera.height, camera.width).astype(np.float32)
-    return np.where(sparse > 0, sparse, image)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline import messages
 from pipeline.errors import DuagError
+from pipeline.files import decode_image
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.recording.depth_sources import check_size, constant, depth_source
 from pipeline.recording.motion import MotionPrior, motion_prior
@@ -26,6 +27,7 @@ class RgbdFrame:
     index: position in the log. stamp_ns: when the colour was taken. color: uint8 [H, W, 3], RGB.
     depth: float32 [H, W], metres along z, 0 where nothing was measured. mask: bool [H, W], True = usable, False = a
     moving object or otherwise to be ignored; None = all usable. depth_offset_ns: how much later the depth was taken.
+    depth_sigma: float32 [H, W], standard deviation of the depth in metres, 0 where there is no depth; None = not told.
     """
 
     index: int
@@ -34,6 +36,7 @@ class RgbdFrame:
     depth: NDArray[np.float32]
     mask: NDArray[np.bool_] | None = None
     depth_offset_ns: int = 0
+    depth_sigma: NDArray[np.float32] | None = None
 
     @property
     def usable_depth(self) -> NDArray[np.float32]:
@@ -139,14 +142,14 @@ class RgbdLog:
         color = self._log.record_at(self._color_topic, self._color_at[stamp])
         depth = self._log.record_at(self._source.topic, self._depth_at[depth_stamp])
         image = self._decode_color(color)
-        offset = depth_stamp - stamp
-        return RgbdFrame(index, stamp, image, self._source.read(depth), self._mask_of(stamp), offset)
+        offset, found = depth_stamp - stamp, self._source.read(depth)
+        return RgbdFrame(index, stamp, image, found.depth_m, self._mask_of(stamp), offset, found.sigma_m)
 
     def _decode_color(self, record: Record) -> NDArray[np.uint8]:
         import cv2
 
-        data = np.frombuffer(record.proto().data, np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+        data = record.proto().data
+        image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             where = f"{self.path}: {record.topic} at {record.publish_time_ns} ns"
             raise DuagError(f"{where} has {len(data)} bytes that no decoder reads, expected JPEG or PNG")

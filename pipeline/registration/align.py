@@ -36,6 +36,7 @@ MAD_TO_SIGMA = 1.4826  # of a normal distribution
 MAD_STRIDE = 4  # residuals between those that estimate a scale, where there are thousands
 SETTLED = 4e-6  # m, rad: steps shrink by a third or more each, so less than half of the last one is left
 SETTLED_COARSE = 4e-5  # the next level begins with an error of its own size anyway
+GATE_SIGMAS = 3  # of depth whose noise is told: the gate is no narrower
 TILES = (10, 8)  # columns and rows of the tiles over which correlated residuals are summed
 
 
@@ -56,7 +57,8 @@ class RegistrationConfig(Config):
     huber_sigmas: float = 1.5
     """Residuals beyond this many sigmas count linearly."""
     depth_sigma_base_m: float = 0.0012
-    """Depth noise sigma(z) = base + slope * (z - 0.4)^2; only its shape counts, its scale is estimated."""
+    """Depth noise sigma(z) = base + slope * (z - 0.4)^2, where the log does not tell it pixel by pixel; only its shape
+    counts, its scale is estimated."""
     depth_sigma_slope_per_m: float = 0.0019
     """See depth_sigma_base_m (Nguyen, Izadi and Lovell 2012)."""
     depth_sigma_floor: float = 0.05
@@ -329,11 +331,13 @@ def _linearise(
     seen = np.flatnonzero(inside)
     q, u, v = q[:, seen], u[seen], v[seen]
 
-    gray, gu, gv, inverse_depth = _interpolate(level, u, v)
+    gray, gu, gv, inverse_depth, *told = _interpolate(level, u, v)
     with np.errstate(invalid="ignore"):
         # without a depth image every sample may be what is seen there
         z = 1 / inverse_depth if level.has_depth else q[2]
         gate = np.maximum(np.float32(config.depth_gate_m), np.float32(config.depth_gate_relative) * q[2])
+        if told:
+            gate = np.maximum(gate, np.float32(GATE_SIGMAS) * told[0])
         off = z - q[2]
         agree = np.abs(off) < gate
         # beyond the gate in front of the surface: that space was seen to be free; behind it: hidden
@@ -342,15 +346,19 @@ def _linearise(
     if config.normal_gate_rad > 0:
         agree &= _normals_agree(level, u, v, m, config.normal_gate_rad)
     agreeing = np.flatnonzero(agree)
-    conflicts, told = int(free.sum()), int(np.isfinite(z).sum())
-    total = len(samples) - (len(seen) - told)
+    conflicts, judged = int(free.sum()), int(np.isfinite(z).sum())
+    total = len(samples) - (len(seen) - judged)
 
     q, m, u, v, z = q[:, agreeing], m[:, agreeing], u[agreeing], v[agreeing], z[agreeing]
     gray, gu, gv = gray[agreeing], gu[agreeing], gv[agreeing]
     intensities = samples.intensities[seen[agreeing]]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy]).astype(np.float32)
     surface = np.stack([rays[0] * z, rays[1] * z, z])
-    sigma = _depth_sigma(z, config)
+    sigma = _depth_sigma(z, config) if not told else told[0][agreeing]
+    if (
+        told and samples.depth_sigmas is not None
+    ):  # of two views alike it stays the same, as that of the model
+        sigma = np.sqrt(np.float32(0.5) * (sigma**2 + samples.depth_sigmas[seen[agreeing]] ** 2))
     floor = config.depth_sigma_floor * 4.0**index
     depth = _depth_residuals(surface, q, m, sigma, floor, (u, v), config)
     if not level.has_depth:
@@ -363,15 +371,15 @@ def _linearise(
         photometric.nothing() if config.residuals == "depth" else photometric,
         overlap=len(agreeing) / max(total, 1),
         view=len(seen) / max(len(samples), 1),
-        conflict=conflicts / max(told, 1),
+        conflict=conflicts / max(judged, 1),
         agreeing=len(agreeing),
         median_depth_m=float(np.median(z)) if len(z) else 0.0,
         sigma_mean_m=float(sigma.mean(dtype=np.float64)) if len(z) else 0.0,
     )
 
 
-def _interpolate(level: Level, u: Floats, v: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Grey value, its two derivatives and the inverse depth (NaN where unknown) at pixels inside the image."""
+def _interpolate(level: Level, u: Floats, v: Floats) -> tuple[Floats, ...]:
+    """Grey value, its two derivatives, inverse depth (NaN where unknown) and sigma if known, at pixels inside."""
     width = level.camera.width
     u0, v0 = u.astype(np.int32), v.astype(np.int32)
     a, b = (u - u0)[:, None], (v - v0)[:, None]
@@ -381,8 +389,7 @@ def _interpolate(level: Level, u: Floats, v: Floats) -> tuple[Floats, Floats, Fl
     bottom = channels.take(corner + width, axis=0)
     bottom += a * (channels.take(corner + width + 1, axis=0) - bottom)
     top += b * (bottom - top)
-    gray, gu, gv, inverse_depth = np.ascontiguousarray(top.T)
-    return gray, gu, gv, inverse_depth
+    return tuple(np.ascontiguousarray(top.T))
 
 
 def _normals_agree(

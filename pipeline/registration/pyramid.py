@@ -28,12 +28,14 @@ class Level:
 
     camera: intrinsics of this resolution. gray: float32 [h, w], 0..1. inverse_depth: float32 [h, w], 1/m, 0 where
     the depth is unknown. has_depth: False if there is no depth image, which is not the same as one that is empty.
+    depth_sigma_m: float32 [h, w], standard deviation of the depth; None: not known pixel by pixel.
     """
 
     camera: PinholeCamera
     gray: Image
     inverse_depth: Image
     has_depth: bool = True
+    depth_sigma_m: Image | None = None
 
     @cached_property
     def gradients(self) -> tuple[Image, Image]:
@@ -45,13 +47,14 @@ class Level:
 
     @cached_property
     def channels(self) -> Image:
-        """(grey, d/du, d/dv, inverse depth or NaN) for interpolation, [h * w, 4].
+        """(grey, d/du, d/dv, inverse depth or NaN, and sigma where known) for interpolation, [h * w, 4 or 5].
 
         NaN makes every value that touches an unknown depth unknown, and fails every gate.
         """
         gu, gv = self.gradients
         inverse_depth = np.where(self.inverse_depth > 0, self.inverse_depth, np.float32(np.nan))
-        return np.stack([self.gray, gu, gv, inverse_depth], axis=-1).reshape(-1, 4)
+        sigma = [] if self.depth_sigma_m is None else [self.depth_sigma_m]
+        return np.stack([self.gray, gu, gv, inverse_depth, *sigma], axis=-1).reshape(-1, 4 + len(sigma))
 
     @cached_property
     def normals(self) -> Image:
@@ -78,15 +81,22 @@ class Level:
         """The next coarser level: blocks of 2x2 pixels become one.
 
         The grey value is the mean. The inverse depth is the mean over the nearest surface in the block (members
-        within 5 % of the nearest pixel), unknown if fewer than two pixels show it.
+        within 5 % of the nearest pixel), unknown if fewer than two pixels show it; sigma is their mean too, as errors
+        of neighbours are much the same.
         """
         camera = self.camera.halved()
         blocks = _blocks(self.inverse_depth, camera)
         members = blocks > blocks.max(axis=0) * (1 - SAME_SURFACE)
         count = members.sum(axis=0, dtype=np.float32)
         total = np.where(members, blocks, np.float32(0)).sum(axis=0)
-        inverse_depth = np.where((total > 0) & (count >= 2), total / np.maximum(count, 1), np.float32(0))
-        return Level(camera, _blocks(self.gray, camera).sum(axis=0) * np.float32(0.25), inverse_depth)
+        known = (total > 0) & (count >= 2)
+        inverse_depth = np.where(known, total / np.maximum(count, 1), np.float32(0))
+        sigma = None
+        if self.depth_sigma_m is not None:
+            of_members = np.where(members, _blocks(self.depth_sigma_m, camera), np.float32(0)).sum(axis=0)
+            sigma = np.where(known, of_members / np.maximum(count, 1), np.float32(0))
+        gray = _blocks(self.gray, camera).sum(axis=0) * np.float32(0.25)
+        return Level(camera, gray, inverse_depth, depth_sigma_m=sigma)
 
 
 @dataclass(frozen=True)
@@ -110,7 +120,13 @@ class RgbdPyramid:
         return RgbdPyramid(tuple(change(level) for level in self.levels))
 
     @staticmethod
-    def build(image: Image, depth_m: Image, camera: PinholeCamera, levels: int = 3) -> RgbdPyramid:
+    def build(
+        image: Image,
+        depth_m: Image,
+        camera: PinholeCamera,
+        levels: int = 3,
+        depth_sigma_m: Image | None = None,
+    ) -> RgbdPyramid:
         """Build the pyramid of a frame.
 
         Args:
@@ -118,6 +134,7 @@ class RgbdPyramid:
             depth_m: float32 [h, w], metres along z; 0, negative or not finite means unknown.
             camera: intrinsics of both images.
             levels: number of resolutions.
+            depth_sigma_m: [h, w], metres; None: not known pixel by pixel.
         """
         gray = image @ GREY_OF_RGB if image.ndim == 3 else np.asarray(image, dtype=np.float32)
         shape = (camera.height, camera.width)
@@ -125,7 +142,9 @@ class RgbdPyramid:
             raise ValueError(f"images of {gray.shape} and {depth_m.shape}, camera of {shape}")
         known = np.isfinite(depth_m) & (depth_m > 0)
         inverse_depth = np.where(known, 1 / np.where(known, depth_m, 1), 0).astype(np.float32)
-        built = [Level(camera, np.ascontiguousarray(gray), inverse_depth)]
+        if depth_sigma_m is not None:
+            depth_sigma_m = np.where(known, depth_sigma_m, 0).astype(np.float32)
+        built = [Level(camera, np.ascontiguousarray(gray), inverse_depth, depth_sigma_m=depth_sigma_m)]
         while len(built) < levels:
             built.append(built[-1].halved())
         return RgbdPyramid(tuple(built))

@@ -21,12 +21,14 @@ class ReferenceLevel:
     """Samples for one pyramid level.
 
     points: float32 [n, 3], metres, reference camera frame. normals: float32 [n, 3], unit length, same frame.
-    intensities: float32 [n], grey value 0..1 of that level's image at the sample.
+    intensities: float32 [n], grey value 0..1 of that level's image at the sample. depth_sigmas: float32 [n], metres;
+    None: not known sample by sample.
     """
 
     points: Samples
     normals: Samples
     intensities: Samples
+    depth_sigmas: Samples | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -71,7 +73,7 @@ class Reference:
         for index, level in enumerate(pyramid.levels[1:], start=1):
             scale = 2.0**index
             gray = _bilinear(level.gray, (u + 0.5) / scale - 0.5, (v + 0.5) / scale - 0.5)
-            levels.append(ReferenceLevel(samples.points, samples.normals, gray))
+            levels.append(ReferenceLevel(samples.points, samples.normals, gray, samples.depth_sigmas))
         return Reference(tuple(levels))
 
 
@@ -87,7 +89,8 @@ def _samples(level: Level, v: NDArray[np.int64], u: NDArray[np.int64]) -> Refere
     """The samples at pixels (u, v), each [n], of known depth and normal."""
     camera, z = level.camera, 1 / level.inverse_depth[v, u].astype(np.float64)
     points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
-    return ReferenceLevel(points.astype(np.float32), level.normals[v, u], level.gray[v, u])
+    sigmas = None if level.depth_sigma_m is None else level.depth_sigma_m[v, u]
+    return ReferenceLevel(points.astype(np.float32), level.normals[v, u], level.gray[v, u], sigmas)
 
 
 def _tiles(image: Samples, count: int) -> tuple[Samples, int, NDArray[np.int64]]:

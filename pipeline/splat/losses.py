@@ -75,6 +75,7 @@ def rgbd_loss(
     config: LossConfig,
     exposure: tuple[float, float] = (0.0, 0.0),
     mask: NDArray[np.bool_] | None = None,
+    certainty: Image | None = None,
 ) -> Loss:
     """Robust colour and depth loss of one view.
 
@@ -85,6 +86,7 @@ def rgbd_loss(
         config: weights and Huber widths.
         exposure: (a, b) of this image: log gain and offset.
         mask: pixels that count, all if absent.
+        certainty: factor [H, W] of the depth residuals, 0..1; all 1 if absent. See `depth_certainty`.
     Returns:
         Means over the counted pixels and the cotangents of exactly that mean.
     """
@@ -101,8 +103,12 @@ def rgbd_loss(
     per_depth = 1.0 / max(int(np.count_nonzero(measured)), 1)
 
     residual = np.where(measured, render.depth - render.alpha * depth_m, depth_m.dtype.type(0))
+    if certainty is not None:
+        residual = residual * certainty
     depth_value, depth_slope = huber(residual, config.depth_huber_m)
     depth_slope = depth_slope * (config.depth_weight * per_depth)
+    if certainty is not None:
+        depth_slope = depth_slope * certainty
     missing_slope = measured.astype(depth_m.dtype) * (config.alpha_weight * per_depth)
     d_alpha = -depth_slope * depth_m - missing_slope
 
@@ -120,6 +126,16 @@ def rgbd_loss(
         d_alpha=d_alpha,
         d_exposure=(by_gain, by_offset),
     )
+
+
+def depth_certainty(depth_sigma_m: Image, huber_m: float) -> Image:
+    """Factor [H, W] of depth residuals with a standard deviation [H, W] each: min(1, huber_m / sigma), 1 where unknown.
+
+    Up to the Huber width a residual counts in metres, as without a sigma; a less certain one in units of its sigma,
+    so that it turns linear where that many sigmas are.
+    """
+    least = np.maximum(depth_sigma_m, np.float32(huber_m))
+    return np.asarray(np.float32(huber_m) / least, dtype=np.float32)
 
 
 def psnr(rendered: NDArray, reference: NDArray, mask: NDArray[np.bool_] | None = None) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import DuagError
+from pipeline.files import read_bytes
 from pipeline.splat.gaussians import Gaussians
 
 SH_DEGREE_0 = 0.28209479177387814
@@ -92,7 +93,7 @@ def read_ply(path: str | Path) -> Gaussians:
 
 def _read_table(path: Path) -> NDArray[np.float32]:
     """The vertices as float32 [n, 17] after a strict check of the header and of the file's length."""
-    data = path.read_bytes()
+    data = read_bytes(path, "a map")
     end = data.find(b"end_header\n", 0, _HEADER_LIMIT_BYTES)
     if not data.startswith(b"ply\n") or end < 0:
         raise DuagError(f"{path.name}: not a .ply file")

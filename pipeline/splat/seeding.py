@@ -50,13 +50,24 @@ class SeedingConfig(Config):
     max_depth_m: float = 10.0
 
 
-def unexplained(render: Rendered, color: Image, depth_m: Image, config: SeedingConfig) -> NDArray[np.bool_]:
-    """Measured pixels [H, W] whose opacity, depth or colour the rendered map does not explain."""
+def unexplained(
+    render: Rendered,
+    color: Image,
+    depth_m: Image,
+    config: SeedingConfig,
+    depth_sigma_m: Image | None = None,
+) -> NDArray[np.bool_]:
+    """Measured pixels [H, W] whose opacity, depth or colour the rendered map does not explain.
+
+    depth_sigma_m: where known, depth within three of these is explained.
+    """
     from scipy.ndimage import uniform_filter
 
     alpha = np.maximum(render.alpha, np.float32(1e-3))
     thin = render.alpha < config.min_alpha
     allowed = config.depth_error_m + config.depth_error_relative * depth_m
+    if depth_sigma_m is not None:
+        allowed = np.maximum(allowed, 3 * depth_sigma_m)
     displaced = np.abs(render.depth / alpha - depth_m) > allowed
     error = uniform_filter(_mean_of_channels(np.abs(render.color - color)), config.cell_sizes_px[0] // 2 + 1)
     return (depth_m > 0) & (thin | displaced | (error > config.color_error))

@@ -11,6 +11,7 @@ from pipeline.consensus.evidence import (
     LOG_COVARIANCE,
     MEAN,
     OPACITY,
+    SHAPE_FLOOR,
     Evidence,
     pack_information,
     pack_symmetric,
@@ -29,6 +30,8 @@ class Sums:
     geometry: NDArray
     color: NDArray
     opacity: NDArray
+    deviation_m: NDArray
+    overlap: float = 12.0
 
 
 def random_map(seed, n=20, keyframes=4):
@@ -44,7 +47,9 @@ def random_map(seed, n=20, keyframes=4):
     )
     A = rng.normal(size=(n, 9, 9))
     geometry = pack_symmetric(A @ A.swapaxes(-1, -2))
-    sums = Sums(gaussians.ids, geometry, rng.uniform(1, 2, (n, 3)), rng.uniform(1, 2, n))
+    sums = Sums(
+        gaussians.ids, geometry, rng.uniform(1, 2, (n, 3)), rng.uniform(1, 2, n), rng.uniform(0.001, 0.1, n)
+    )
     return gaussians, sums, random_poses(rng, keyframes)
 
 
@@ -70,10 +75,32 @@ def test_anchored_and_back_in_the_map_is_what_the_map_said():
     np.testing.assert_array_equal(back.theta[:, COLOR], gaussians.colors)
     np.testing.assert_array_equal(back.theta[:, OPACITY], gaussians.opacity_logits)
     geometry = unpack_symmetric(sums.geometry, 9)
-    np.testing.assert_allclose(back.position_information(), geometry[:, :3, :3], atol=1e-11)
-    np.testing.assert_allclose(back.shape_information(), geometry[:, 3:, 3:], atol=1e-11)
+    off = sums.deviation_m[:, None, None] ** 2 * np.eye(3)
+    told = np.linalg.inv(np.linalg.inv(geometry[:, :3, :3]) + off)
+    np.testing.assert_allclose(back.position_information(), told, atol=1e-9)
+    told = np.linalg.inv(np.linalg.inv(geometry[:, 3:, 3:]) + SHAPE_FLOOR**2 * np.eye(6))
+    np.testing.assert_allclose(back.shape_information(), told, atol=1e-9)
     np.testing.assert_array_equal(back.color_information(), sums.color)
     np.testing.assert_array_equal(back.opacity_information(), sums.opacity)
+
+
+def test_own_splats_are_as_stiff_as_all_that_share_a_pixel():
+    gaussians, sums, T_map_keyframe = random_map(7)
+    back = Evidence.of_splats("alpha", gaussians, sums, T_map_keyframe).in_world(T_map_keyframe)
+    geometry = unpack_symmetric(sums.geometry, 9)
+    np.testing.assert_allclose(back.position_information(), 12 * geometry[:, :3, :3], atol=1e-10)
+    np.testing.assert_allclose(back.opacity_information(), 12 * sums.opacity)
+
+
+def test_what_is_told_is_never_surer_than_the_deviation_and_nothing_stays_nothing():
+    gaussians, sums, T_map_keyframe = random_map(8)
+    sums.geometry[::2] *= 1e12
+    sums.geometry[1::4] = 0.0
+    told = Evidence.from_map("alpha", gaussians, sums, T_map_keyframe)
+    sigma_m = 1 / np.sqrt(np.maximum(np.linalg.eigvalsh(told.position_information())[:, -1], 1e-300))
+    assert np.all(sigma_m >= sums.deviation_m * (1 - 1e-9))
+    np.testing.assert_allclose(sigma_m[::2], sums.deviation_m[::2], rtol=1e-3)
+    assert not told.information[1::4, :27].any()
 
 
 def test_a_motion_of_the_world_leaves_every_mahalanobis_distance():
@@ -101,7 +128,7 @@ def test_sums_are_found_by_id_and_absence_is_zero():
     gaussians, sums, T_map_keyframe = random_map(4)
     complete = Evidence.from_map("alpha", gaussians, sums, T_map_keyframe)
     order = np.random.default_rng(5).permutation(len(gaussians))[: len(gaussians) // 2]
-    half = Sums(sums.ids[order], sums.geometry[order], sums.color[order], sums.opacity[order])
+    half = Sums(*(array[order] for array in list(vars(sums).values())[:5]))
     partial = Evidence.from_map("alpha", gaussians, half, T_map_keyframe)
     there = np.isin(gaussians.ids, half.ids)
     np.testing.assert_array_equal(partial.information[there], complete.information[there])

@@ -109,6 +109,10 @@ def information(robot: str, gaussians: Gaussians, known: bool = True) -> Gaussia
         observations=np.full(n, 3, dtype=np.uint32),
         color_sigma=0.02,
         depth_sigma="0.002 z^2",
+        deviation_m=np.zeros(n, dtype=np.float32),
+        color_pixels_per_sample=1.0,
+        depth_pixels_per_sample=1.0,
+        overlap=1.0,
     )
 
 

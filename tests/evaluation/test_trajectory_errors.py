@@ -78,3 +78,10 @@ def test_a_team_of_one_has_no_joint_error():
     answer = trajectory_errors.team_error({"alpha": Paired(STAMPS, path, path)})
     assert isinstance(answer, Absent)
     assert "only alpha" in answer.reason
+
+
+def test_true_positions_without_rotations_say_nothing_about_steps() -> None:
+    path = se3.exp(np.random.default_rng(3).normal(0, 0.3, (len(STAMPS), 6)))
+    pairs = Paired(STAMPS, path, path, positions_only=True)
+    assert isinstance(trajectory_errors.rpe(pairs), Absent)
+    assert trajectory_errors.ate_rmse_m(pairs) == pytest.approx(0.0, abs=1e-9)

@@ -72,6 +72,7 @@ def fused_theta(
         own.gaussians,
         own.T_map_keyframe,
         evidence,
+        Evidence.of_splats(own.robot, own.gaussians, own.information, own.T_map_keyframe),
         poses,
         pairs,
         (),

@@ -130,18 +130,20 @@ def quiet(team: list[RobotData]) -> dict[str, AgentResult]:
     return results
 
 
-def test_ten_thousand_damaged_packets_change_nothing(team: list[RobotData], quiet: Any) -> None:
+def test_twenty_thousand_damaged_packets_change_nothing(team: list[RobotData], quiet: Any) -> None:
     """Whatever the CRC or the sequence number tells."""
-    results, agents, count = meet(team, ExchangeConfig(), [flipped, cut, spliced, repeated, invented], 110)
-    assert count > 10_000
+    results, agents, count = meet(team, ExchangeConfig(), [flipped, cut, spliced, repeated, invented], 360)
+    assert count > 20_000
     assert not moved(results, quiet)
     assert sum(sum(agent.refused.values()) for agent in agents.values()) > 0.7 * count
 
 
-def test_ten_thousand_forged_packets_change_nothing_where_packets_are_signed(team: list[RobotData]) -> None:
+def test_twenty_thousand_forged_packets_change_nothing_where_packets_are_signed(
+    team: list[RobotData],
+) -> None:
     alone, _, _ = meet(team, SIGNED, [], 0)
-    results, agents, count = meet(team, SIGNED, [forged, forged, flipped, cut, repeated], 110)
-    assert count > 10_000
+    results, agents, count = meet(team, SIGNED, [forged, forged, flipped, cut, repeated], 360)
+    assert count > 20_000
     assert not moved(results, alone)
     reasons = agents["alpha"].refused
     assert reasons["not signed by its sender"] > 1000

@@ -1,13 +1,17 @@
 """Joint optimisation of keyframes by their images, and loops: truth found, contradictions refused, bits repeated."""
 
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 
-from pipeline.frontend.bundle import find_loops, optimise, overlapping
+from pipeline.frontend import bundle
+from pipeline.frontend.bundle import optimise, overlapping
 from pipeline.frontend.config import KeyframeConfig, LoopConfig, RelocalisationConfig
 from pipeline.frontend.keyframes import KeyframePair, refine
+from pipeline.frontend.loops import find_loops
 from pipeline.frontend.relocalisation import features_of
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
@@ -182,3 +186,55 @@ def test_overlapping_pairs_are_those_that_see_each_other(circle: Walk) -> None:
     assert (0, 8) not in pairs
     assert all(first < second for first, second in pairs)
     assert max(sum(second == k for _, second in pairs) for k in range(17)) <= 3
+
+
+def test_work_per_keyframe_does_not_grow_with_the_path(noisy: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Up and down the same room: what is counted is images read, overlaps computed and costs expanded."""
+    counts = {"images": 0, "overlaps": 0, "costs": 0}
+
+    def counted(name: str, function: Any) -> Any:
+        def call(*arguments: Any, **keywords: Any) -> Any:
+            counts[name] += 1
+            return function(*arguments, **keywords)
+
+        return call
+
+    def work(length: int) -> dict[str, float]:
+        there_and_back = [k if k < 8 else 14 - k for k in range(14)]
+        order = [there_and_back[k % 14] for k in range(length)]
+        steps = [se3.inverse(noisy.truth[a]) @ noisy.truth[b] for a, b in pairwise(order)]
+        tracked = [KeyframePair(k, k + 1, step, 1e4 * np.eye(6)) for k, step in enumerate(steps)]
+        counts.update(images=0, overlaps=0, costs=0)
+        optimise(
+            noisy.truth[order],
+            [noisy.views[k] for k in order],
+            counted("images", lambda k, levels: noisy.pyramids[order[k]]),
+            tracked,
+            KeyframeConfig(optimisation_candidates=8, optimisation_neighbours=3, optimisation_rounds=3),
+            REGISTRATION,
+        )
+        return {name: count / length for name, count in counts.items()}
+
+    monkeypatch.setattr(bundle, "linearise", counted("costs", bundle.linearise))
+    monkeypatch.setattr(bundle, "overlap", counted("overlaps", bundle.overlap))
+    short, long = work(20), work(40)
+    assert long["overlaps"] > 8  # the limit is reached: many more keyframes see the place
+    for name in counts:
+        assert long[name] < 1.25 * short[name] + 1, name
+
+
+def test_a_pair_that_did_not_move_is_not_looked_at_again(noisy: Walk) -> None:
+    read: list[int] = []
+
+    def images(index: int, levels: int) -> RgbdPyramid:
+        read.append(index)
+        return noisy.pyramids[index]
+
+    rounds = []
+    for limit in (3, 30):
+        read.clear()
+        config = KeyframeConfig(optimisation_rounds=limit)
+        optimise(noisy.truth, noisy.views, images, noisy.pairs, config, REGISTRATION)
+        rounds.append(len(read) / len(noisy.views))
+    assert rounds[0] <= 3
+    assert rounds[1] < 30

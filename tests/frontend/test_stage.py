@@ -16,8 +16,10 @@ from pipeline.frontend.tracking import Status, TrackedFrame
 from pipeline.geometry import se3
 from pipeline.geometry.trajectory import ate_rmse_m
 from pipeline.recording import content_digest, read_log
+from pipeline.registration.moving import MovingConfig
 from schemas import topics
 from tests.registration.room import CAMERA, pose, render
+from tests.registration.test_moving import RADIUS_M, with_ball
 
 FRAMES = 13
 FRAME_NS = 33_333_333
@@ -158,3 +160,33 @@ def test_a_missing_log_is_named(tmp_path: Path) -> None:
     with pytest.raises(DuagError, match=r"none\.mcap"):
         run_frontend(tmp_path / "none.mcap", tmp_path / "frontend.mcap", TRACKING)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_moves_is_not_mapped(tmp_path: Path) -> None:
+    """A ball crosses the room: by depth alone it is kept out of the map, and without that it leaves a trail."""
+    centres = [np.array([0.4 + 0.5 * np.sin(1.3 * k), -0.3, 0.5]) for k in range(FRAMES)]
+    with RecordingWriter(tmp_path / "room") as recording, recording.robot("alpha", CAMERA, 0.0005) as robot:
+        for k in range(FRAMES):
+            gray, room = render(walk(k))
+            depth, shows = with_ball(room, walk(k), centres[k])
+            image = np.repeat(np.where(shows, 0.9, gray)[..., None], 3, axis=2)
+            png = cv2.imencode(".png", np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8))[1].tobytes()
+            robot.add_frame(k * FRAME_NS, png, "png", np.rint(depth / 0.0005).astype(np.uint16))
+    left = {}
+    for enabled in (True, False):
+        config = TRACKING.model_copy(
+            update={
+                "mapping_enabled": True,
+                "mapping": MappingConfig(max_gaussians=3000, iterations=4, final_iterations=2),
+                "keyframes": KeyframeConfig(max_translation_of_depth=0.04),
+                "moving": MovingConfig(enabled=enabled, halvings=1, grow_px=2),
+            }
+        )
+        out = tmp_path / f"{enabled}.mcap"
+        run_frontend(tmp_path / "room" / "alpha.mcap", out, config)
+        gaussians = messages(out, topics.MAP)[0].gaussians
+        points = se3.transform(walk(0), gaussians.means.astype(np.float64))
+        away = np.linalg.norm(points[:, None] - np.array(centres), axis=2).min(axis=1)
+        left[enabled] = int(np.count_nonzero(away < 1.1 * RADIUS_M))
+    assert left[False] > 100
+    assert left[True] < 0.05 * left[False]

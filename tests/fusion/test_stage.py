@@ -104,7 +104,7 @@ def robot(tmp_path_factory):
     ones = np.ones((N, 3), np.float32)
     sums = GaussianInformation(
         5 * 10**8, "bravo", "gauss_newton", "all", gaussians.ids, geometry, ones, ones[:, 0],
-        np.full(N, 7, np.uint32), 0.02, "0.001",
+        np.full(N, 7, np.uint32), 0.02, "0.001", np.full(N, 0.01, np.float32), 9.0, 25.0, 12.0,
     )  # fmt: skip
     with LogWriter(folder / "frontend.mcap", "bravo") as log:
         for k in range(FRAMES):
@@ -135,7 +135,7 @@ def robot(tmp_path_factory):
 
 def fuse_files(robot, result, folder):
     source = AgentInput("bravo", robot.log, robot.frontend, robot.information)
-    run_fusion(source, result, folder, FusionConfig(), MatchingConfig())
+    run_fusion(source, result, folder, FusionConfig(explained_opacity=0.0), MatchingConfig())
     fused = [topics.FUSED_MAP.of("bravo"), topics.CORRECTED_KEYFRAMES.of("bravo")]
     return {type(r.message()): r.message() for r in read_log(folder / "fused.mcap", topics=fused)}
 
@@ -146,10 +146,10 @@ def test_alone_everything_stays(robot, tmp_path):
     assert (tmp_path / "fused.ply").read_bytes() == (tmp_path / "own.ply").read_bytes()
     for name in ("odometry.tum", "trajectory.tum"):  # messages hold unit quaternions: a turn of rounding
         np.testing.assert_allclose(read_tum(tmp_path / name).poses, robot.T_map_camera, atol=1e-14)
-    blocks = [0, 9, 17, 24, 44]  # some of the diagonal, in the upper triangle of 9x9
-    np.testing.assert_allclose(
-        said[GaussianMap].information.geometry[:, blocks], robot.sums.geometry[:, blocks], rtol=1e-5
-    )
+    told = robot.evidence().in_world(robot.T_map_keyframe).information
+    geometry = said[GaussianMap].information.geometry
+    np.testing.assert_allclose(geometry[:, [0, 9, 17]], told[:, [0, 3, 5]], rtol=1e-5)  # diagonals
+    np.testing.assert_allclose(geometry[:, [24, 44]], told[:, [6, 26]], rtol=1e-5)
     assert said[CorrectedKeyframes].component == ["bravo"]
 
 
@@ -173,9 +173,8 @@ def test_frames_and_gaussians_move_with_their_keyframes(robot, tmp_path):
     ]
     np.testing.assert_allclose(fused.gaussians.means, by_anchor, atol=1e-6)
     trace = [0, 9, 17]  # of the position block in the upper triangle of 9x9: what a turn leaves
-    np.testing.assert_allclose(
-        fused.information.geometry[:, trace].sum(axis=1), robot.sums.geometry[:, trace].sum(axis=1), rtol=1e-5
-    )
+    told = np.trace(robot.evidence().position_information(), axis1=1, axis2=2)
+    np.testing.assert_allclose(fused.information.geometry[:, trace].sum(axis=1), told, rtol=1e-5)
 
 
 def test_what_only_a_neighbour_saw_is_taken_over(robot, tmp_path):
@@ -196,5 +195,5 @@ def test_information_of_another_map_is_refused(robot, tmp_path):
         log.write(topics.INFORMATION.of("bravo"), replace(robot.sums, ids=other), 5 * 10**8)
     source = AgentInput("bravo", robot.log, robot.frontend, tmp_path / "information.mcap")
     with pytest.raises(DuagError, match="other Gaussians"):
-        run_fusion(source, robot.alone(), tmp_path, FusionConfig(), MatchingConfig())
+        run_fusion(source, robot.alone(), tmp_path, FusionConfig(explained_opacity=0.0), MatchingConfig())
     assert [p.name for p in tmp_path.iterdir()] == ["information.mcap"]

@@ -1,5 +1,6 @@
 """The information stage: what is summed, in which units, and what never enters."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,10 +18,14 @@ from pipeline.information.stage import (
     estimate_noise,
     run_information,
     sum_information,
+    surface_deviation,
+    with_correlation,
+    without_moving,
     without_thickness,
 )
 from pipeline.kernels import FisherSums, Rasterizer
 from pipeline.recording import LogWriter, read_log
+from pipeline.registration.moving import MovingConfig
 from pipeline.splat.gaussians import Gaussians
 from pipeline.splat.seeding import THICKNESS_FLOOR_M
 from schemas import topics
@@ -63,6 +68,30 @@ def views_of(gaussians: Gaussians, color_noise: float = 0.0, depth_factor: float
     return out
 
 
+def test_noise_that_the_log_tells_takes_the_place_of_the_model() -> None:
+    """Twice the sigma, a quarter of what depth says; a factor of the residuals on top; colour is as before."""
+    gaussians, config = wall(), InformationConfig()
+    plain = views_of(gaussians)
+    tight, loose = (
+        [replace(v, depth_sigma_m=np.full(v.depth_m.shape, sigma, np.float32)) for v in plain]
+        for sigma in (0.01, 0.02)
+    )
+    told = Noise(1e6, 1.0, 0.0012, 0.0019, from_log=True)  # colour says nothing
+    sums = [sum_information(gaussians, CAMERA, views, told, config) for views in (tight, loose)]
+    assert sums[0].geometry.any()
+    np.testing.assert_allclose(sums[0].geometry, 4 * sums[1].geometry, rtol=1e-4, atol=1e-3)
+    r = np.random.default_rng(2)
+    noisy = [
+        replace(
+            v, depth_m=np.where(v.depth_m > 0, v.depth_m + r.normal(0, 0.03, v.depth_m.shape), 0).astype("f4")
+        )
+        for v in tight
+    ]
+    found = estimate_noise(gaussians, CAMERA, noisy, config, every=1)
+    assert found.depth_factor == pytest.approx(3.0, rel=0.05)
+    assert found.depth_formula() == f"{found.depth_factor:.6g} * sigma of the log"
+
+
 def test_noise_is_found_in_the_residuals() -> None:
     gaussians = wall()
     views = views_of(gaussians, 0.05, 2.0)
@@ -91,6 +120,58 @@ def test_a_few_wrong_pixels_do_not_change_the_noise() -> None:
     a, b = (estimate_noise(gaussians, CAMERA, v, config, every=1) for v in (views, spoiled))
     assert b.color_sigma == pytest.approx(a.color_sigma, rel=0.35)
     assert b.depth_factor == pytest.approx(a.depth_factor, rel=0.35)
+
+
+@pytest.mark.parametrize(("width", "pixels"), [(1, 1.0), (3, 9.0), (5, 25.0)])
+def test_residuals_that_are_alike_count_once(width: int, pixels: float) -> None:
+    """White noise averaged over width x width pixels: the sum of its autocorrelation is width^2."""
+    gaussians = wall()
+    r = np.random.default_rng(3)
+    views = []
+    for view in views_of(gaussians):
+        noise = cv2.blur(
+            r.normal(size=(*view.depth_m.shape, 2)), (width, width), borderType=cv2.BORDER_REFLECT
+        )
+        color = np.rint(255 * np.clip(view.color / 255.0 + 0.03 * noise[..., :1] * width, 0, 1)).astype(
+            np.uint8
+        )
+        depth = np.where(view.depth_m > 0, view.depth_m + 0.01 * noise[..., 1], 0).astype(np.float32)
+        views.append(View(color, depth, view.T_map_camera))
+    noise, overlap = with_correlation(NOISE, gaussians, CAMERA, views, InformationConfig())
+    assert noise.color_pixels == pytest.approx(pixels, rel=0.35, abs=0.5)  # 4 images of 48 x 36 px
+    assert noise.depth_pixels == pytest.approx(pixels, rel=0.35, abs=0.5)
+    assert 2 < overlap < 100
+    once, shared = (
+        sum_information(gaussians, CAMERA, views, n, InformationConfig())
+        for n in (NOISE, replace(NOISE, color_pixels=pixels, depth_pixels=pixels))
+    )
+    np.testing.assert_allclose(pixels * shared.geometry, once.geometry, rtol=1e-4, atol=1e-3)
+    independent = InformationConfig(correlation_px=0)
+    assert with_correlation(NOISE, gaussians, CAMERA, views, independent)[0].depth_pixels == 1.0
+
+
+def test_the_deviation_is_the_distance_from_the_measured_surface() -> None:
+    """Gaussians before and behind a wall that is seen at a slant; one far behind it, one that no camera sees."""
+    tilt = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.6, 0.0]))
+    normal, at = tilt[:3, 2], np.array([0.0, 0.0, 2.0])
+    rays = CAMERA.rays()
+    depth = (normal @ at / (rays @ normal)).astype(np.float32)  # the plane through `at`
+    along = np.array([[0.1, 0.2, 0.0], [-0.2, 0.1, 0.0], [0.3, -0.2, 0.0], [0.0, 0.0, 0.0]]) @ tilt[:3, :3].T
+    off_m = np.array([0.0, 0.02, -0.05, 0.5])
+    means = np.concatenate([at + along + off_m[:, None] * normal, [[0.0, 0.0, -3.0]]])
+    n = len(means)
+    gaussians = Gaussians(
+        np.arange(n), np.zeros(n), means, np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 3), -4.0), np.zeros((n, 3)),
+        np.zeros(n),
+    )  # fmt: skip
+    view = View(np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8), depth, np.eye(4))
+    found = surface_deviation(gaussians, CAMERA, [view] * 1000, 0.1)
+    np.testing.assert_allclose(found[:3], np.abs(off_m[:3]), atol=1e-3)
+    np.testing.assert_allclose(found[3:], 0.02, atol=1e-3)  # not measured: the median of the others
+    half = surface_deviation(gaussians, CAMERA, [view], 0.1)  # and it counts as half a view
+    np.testing.assert_allclose(half[1:3] ** 2, (off_m[1:3] ** 2 + 0.5 * 0.02**2) / 1.5, rtol=0.05)
+    blind = View(view.color, view.depth_m, view.T_map_camera, np.zeros(depth.shape, bool))
+    np.testing.assert_array_equal(surface_deviation(gaussians, CAMERA, [blind], 0.1), 0.1)
 
 
 def test_windows() -> None:
@@ -274,3 +355,30 @@ def test_a_front_end_without_a_map_is_one_line(tmp_path: Path) -> None:
         run_information(
             tmp_path / "alpha.mcap", tmp_path / "unfinished.mcap", tmp_path / "out.mcap", InformationConfig()
         )
+
+
+def test_what_moved_is_in_no_sum() -> None:
+    """A card at half the distance, elsewhere in every view: the wall behind it is not informed through it."""
+    gaussians = wall()
+    plain, crossed = [], []
+    for k, T in enumerate(POSES):
+        # all views of the wall at z = 2, from poses that turn little: its depth is that of a plane
+        normal, offset = T[:3, :3].T @ np.array([0.0, 0.0, 1.0]), 2.0 - T[2, 3]
+        depth = (offset / (CAMERA.rays() @ normal)).astype(np.float32)
+        color = np.full((CAMERA.height, CAMERA.width, 3), 128, np.uint8)
+        plain.append(View(color, depth, T))
+        card = depth.copy()
+        card[8:24, 2 + 11 * k : 12 + 11 * k] = 1.0
+        crossed.append(View(color, card, T))
+    config = InformationConfig(moving=MovingConfig(halvings=1, grow_px=4))
+    assert all(view.mask is None for view in without_moving(plain, CAMERA, config))
+    masked = without_moving(crossed, CAMERA, config)
+    for view in masked:
+        assert view.mask is not None
+        assert view.mask[view.depth_m < 1.5].mean() < 0.05
+        assert view.mask.mean() > 0.7
+    off = config.model_copy(update={"moving": MovingConfig(enabled=False)})
+    assert without_moving(crossed, CAMERA, off) == crossed
+    less = sum_information(gaussians, CAMERA, masked, NOISE, config)
+    more = sum_information(gaussians, CAMERA, crossed, NOISE, config)
+    assert less.weight.sum() < 0.95 * more.weight.sum()

@@ -8,6 +8,7 @@ import pytest
 
 from pipeline.kernels import FisherSums, Rasterizer, available_isas
 from pipeline.kernels.reference import ReferenceRasterizer
+from pipeline.kernels.types import DEPTH_KINDS
 from tests.kernels.scenes import KINDS, make_scene
 
 ISAS = available_isas()
@@ -30,7 +31,13 @@ def evaluate(rasterizer, kind):
         by_color=by_color,
         sums=sums,
         contributions=rasterizer.contributions(),
+        layers=[layers_of(rasterizer, scene, depth) for depth in DEPTH_KINDS],
     )
+
+
+def layers_of(rasterizer, scene, depth):
+    rasterizer.forward(scene.gaussians, scene.camera, scene.T_camera_map, scene.background, depth=depth)
+    return rasterizer.layer_depth()
 
 
 @cache
@@ -104,3 +111,13 @@ def test_contributions(kind, isa):
     exact_weights, exact_pixels = expected(kind).contributions
     assert_close(weights, exact_weights, 2e-6)
     np.testing.assert_array_equal(pixels, exact_pixels)
+
+
+@both
+def test_depth_of_one_layer(kind, isa):
+    for found, wanted in zip(computed(kind, isa).layers, expected(kind).layers, strict=True):
+        solid = expected(kind).render.alpha >= 0.5
+        assert np.count_nonzero((wanted > 0) != solid) <= 0.002 * wanted.size
+        # where half of the light, or a depth within the tolerance, is a matter of rounding, they may choose differently
+        differs = np.abs(found - wanted) > 1e-5 * wanted
+        assert np.count_nonzero(differs) <= 0.002 * wanted.size

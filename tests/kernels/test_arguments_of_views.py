@@ -204,11 +204,17 @@ def test_a_refused_view_leaves_nothing_to_differentiate():
         rasterizer.contributions()
 
 
-@pytest.mark.parametrize("call", ["full_fisher", "fisher", "contributions", "statistics"])
+@pytest.mark.parametrize("call", ["full_fisher", "fisher", "contributions", "statistics", "layer_depth"])
 def test_nothing_to_ask_before_the_first_view(call):
     arguments = {"full_fisher": (ones(), ones()), "fisher": (ones(), ones(), FisherSums(0))}.get(call, ())
     with pytest.raises(RuntimeError, match="forward"):
         getattr(Rasterizer(), call)(*arguments)
+
+
+@pytest.mark.parametrize("tolerance", [-0.1, 1.5, float("nan"), "0.05", None])
+def test_tolerances_that_cannot_be(tolerance):
+    with pytest.raises(ValueError, match="tolerance is"):
+        drawn().layer_depth(tolerance)
 
 
 @pytest.mark.parametrize("name", ["inv_var_color", "inv_var_depth"])

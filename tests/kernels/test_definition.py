@@ -10,6 +10,7 @@ from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels import Rasterizer
 from pipeline.kernels.reference import ReferenceRasterizer
 from pipeline.kernels.types import DEPTH_KINDS, FisherSums, Gradients, LossWeights
+from pipeline.splat.gaussians import Gaussians
 from pipeline.splat.losses import rgbd_loss
 from tests.kernels.scenes import BACKGROUND, Scene, make_scene, random_gaussians
 
@@ -183,6 +184,58 @@ def test_masked_pixels_bring_no_information(rasterizer, plain):
     assert pixels.max() <= mask.sum()
 
 
+def wall(z_m: float, opacity: float, right_of_px: float = -np.inf) -> Gaussians:
+    """Wide discs, one for every pixel right of a column, that face the camera of `tiny`."""
+    camera = tiny().camera
+    uv = np.argwhere(np.ones((camera.height, camera.width), bool))[:, ::-1]
+    rays = np.column_stack(
+        [(uv[:, 0] - camera.cx) / camera.fx, (uv[:, 1] - camera.cy) / camera.fy, np.ones(len(uv))]
+    )
+    means = (z_m * rays[uv[:, 0] > right_of_px]).astype(np.float32)
+    n = len(means)
+    return Gaussians(
+        ids=np.arange(n),
+        anchors=np.zeros(n, np.int32),
+        means=means,
+        quats_wxyz=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        log_scales=np.tile(np.log(np.float32([0.1 * z_m, 0.1 * z_m, 1e-3])), (n, 1)),
+        colors=np.zeros((n, 3), np.float32),
+        opacity_logits=np.full(n, np.log(opacity / (1 - opacity)), np.float32),
+    )
+
+
+@pytest.mark.parametrize("depth", DEPTH_KINDS)
+def test_one_layer_is_never_between_two(rasterizer, depth):
+    """A near wall covers the right half: blended depth slides from the far one to it, the layer's depth jumps."""
+    camera = tiny().camera
+    near, far = wall(1.0, 0.9, right_of_px=3), wall(2.0, 0.9)
+    render = rasterizer.forward(Gaussians.concatenate([near, far]), camera, np.eye(4), depth=depth)
+    layer, blended = rasterizer.layer_depth(), render.depth / render.alpha
+    is_near, is_far = np.abs(layer - 1) < 1e-3, np.abs(layer - 2) < 2e-3
+    assert (is_near | is_far).all()
+    assert is_near[:, 5:].all()
+    assert is_far[:, :2].all()
+    assert ((blended > 1.1) & (blended < 1.9)).any()
+
+
+def test_one_layer_of_one_wall_is_its_depth(rasterizer):
+    camera = tiny().camera
+    render = rasterizer.forward(wall(1.5, 0.9), camera, np.eye(4))
+    np.testing.assert_allclose(rasterizer.layer_depth(), render.depth / render.alpha, rtol=1e-5)
+    rasterizer.forward(wall(1.5, 0.05), camera, np.eye(4))
+    light = rasterizer.forward(wall(1.5, 0.05), camera, np.eye(4)).alpha < 0.499
+    assert light.any()
+    assert not rasterizer.layer_depth()[light].any()
+
+
+def test_a_layer_without_tolerance_is_the_median_gaussian(rasterizer):
+    camera, stack = tiny().camera, [wall(z, 0.3) for z in (1.0, 1.02, 1.04, 1.06, 1.08)]
+    rasterizer.forward(Gaussians.concatenate(stack), camera, np.eye(4))
+    exact, loose = rasterizer.layer_depth(0.0), rasterizer.layer_depth(0.2)
+    assert np.isin(np.round(exact, 4), np.round([1.0, 1.02, 1.04, 1.06, 1.08], 4).astype(np.float32)).all()
+    assert np.ptp(loose) < np.ptp([1.0, 1.08])
+
+
 def test_nothing_is_drawn_behind_a_closed_mask(rasterizer, plain):
     mask = np.zeros((plain.camera.height, plain.camera.width), dtype=bool)
     render = draw(rasterizer, plain, mask=mask)
@@ -191,6 +244,7 @@ def test_nothing_is_drawn_behind_a_closed_mask(rasterizer, plain):
     assert not flat(gradients).any()
     assert not gradients.pose.any()
     assert not any(array.any() for array in rasterizer.contributions())
+    assert not rasterizer.layer_depth().any()
 
 
 def test_pose_alone_is_the_same_pose(rasterizer, scene):
@@ -386,6 +440,24 @@ def test_view_gradients_are_forward_loss_and_backward(rasterizer, scene, exposur
                 change = np.linalg.norm(getattr(other, name) - getattr(separate, name))
                 drift[name] = max(drift[name], 2 * change)
     assert_same_gradients(gradients, separate, 1e-5, drift)
+
+
+def test_view_gradients_with_certain_depth_are_those_without(plain):
+    color, depth_m = measured_images(plain)
+    arguments = plain.gaussians, plain.camera, plain.T_camera_map, color, depth_m, LOSS
+    rasterizer, sure = Rasterizer(), np.ones_like(depth_m)
+    loss, gradients = rasterizer.view_gradients(*arguments, exposure=(0.1, 0.02))
+    same, of_same = rasterizer.view_gradients(*arguments, exposure=(0.1, 0.02), depth_certainty=sure)
+    np.testing.assert_allclose([same.value, same.depth], [loss.value, loss.depth], rtol=1e-5)
+    np.testing.assert_allclose(same.d_exposure, loss.d_exposure, rtol=1e-4)
+    np.testing.assert_allclose(of_same.means, gradients.means, atol=1e-4 * np.abs(gradients.means).max())
+    less, of_less = rasterizer.view_gradients(*arguments, depth_certainty=0.0 * sure)
+    assert less.depth == 0
+    without, of_color = rasterizer.view_gradients(
+        *arguments[:-1], dataclasses.replace(LOSS, depth_weight=0.0)
+    )
+    assert less.value == pytest.approx(without.value, rel=1e-5)
+    np.testing.assert_allclose(of_less.means, of_color.means, atol=1e-4 * np.abs(of_color.means).max())
 
 
 def test_view_gradients_draw_a_view_that_can_be_asked_further(rasterizer, plain):

@@ -34,6 +34,7 @@ def digest(rasterizer: Rasterizer) -> str:
         rasterizer.fisher(of_color, of_depth, sums, residual=of_depth)
         arrays += [*vars(render).values(), *vars(gradients).values(), *sums.arrays().values(), by_pose.pose]
         arrays += [rasterizer.full_fisher(of_color, of_depth), *rasterizer.contributions()]
+        arrays += [rasterizer.layer_depth()]
         loss, gradients = rasterizer.view_gradients(
             *view, color, depth_m, LOSS, exposure=(0.1, -0.05), mask=mask, depth=depth, pose=True
         )
@@ -42,7 +43,7 @@ def digest(rasterizer: Rasterizer) -> str:
         arrays += [np.array([loss.value, loss.color, loss.depth, *loss.d_exposure])]
         arrays += [np.array([statistics.visible, statistics.intersections])]
         arrays += [np.array([statistics.evaluated_pairs, statistics.blended_pairs])]
-    assert len(arrays) == 2 * 30
+    assert len(arrays) == 2 * 31
     return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
 
 

@@ -1,69 +1,18 @@
-"""Messages of the set-up, of rounds and of elimination: what is written is read, what is broken is refused."""
+"""Messages of the set-up and of elimination: what is written is read, what is broken is refused."""
 
 import numpy as np
 import pytest
 
-from pipeline.consensus.elimination import Block
-from pipeline.consensus.links import PosePacket
+from pipeline.consensus.elimination import Block, Step
+from pipeline.exchange import tree_wire
 from pipeline.exchange.packets import MalformedError
-from pipeline.geometry import se3, so3
+from pipeline.geometry import se3
 from pipeline.posegraph import wire
-from pipeline.posegraph.wire import NamedKeyframes, PairFrame, Roster, Step
+from pipeline.posegraph.wire import NamedKeyframes, PairFrame, Roster
 
 
 def poses(rng, n):
     return se3.from_quat_translation(rng.normal(size=(n, 4)), 10 * rng.normal(size=(n, 3)))
-
-
-def pose_packet(rng, n, dtype="float32", curvature=None):
-    T = poses(rng, n)
-    return PosePacket(
-        sequence=7,
-        version=3,
-        keyframes=(2 * np.arange(n)).astype(np.int32),
-        quats_wxyz=so3.to_quat_wxyz(T[:, :3, :3]).astype(dtype),
-        translations=T[:, :3, 3].astype(dtype),
-        penalties=np.array([0.5, 0.25], np.float32),
-        curvature=curvature,
-        converged=True,
-    )
-
-
-@pytest.mark.parametrize(("dtype", "atol"), [("float32", 3e-7), ("float64", 1e-15)])
-def test_poses_come_back_whichever_component_was_left_out(dtype, atol):
-    rng = np.random.default_rng(0)
-    packet = pose_packet(rng, 41, dtype)
-    assert len(set(np.argmax(np.abs(packet.quats_wxyz), axis=1).tolist())) == 4
-    data = wire.write_poses(packet, 3, 30, decides=True)
-    read = wire.read_poses(data, packet.keyframes, from_decider=True)
-    np.testing.assert_array_equal(read.keyframes, packet.keyframes[3:33])
-    np.testing.assert_array_equal(read.translations, packet.translations[3:33])
-    np.testing.assert_array_equal(read.penalties, packet.penalties)
-    assert (read.sequence, read.version, read.converged, read.curvature) == (7, 3, True, None)
-    dots = np.abs(np.sum(read.quats_wxyz * packet.quats_wxyz[3:33].astype(np.float64), axis=1))
-    np.testing.assert_allclose(dots, 1.0, atol=atol)
-    angle = so3.log(
-        so3.from_quat_wxyz(read.quats_wxyz).swapaxes(1, 2) @ so3.from_quat_wxyz(packet.quats_wxyz[3:33])
-    )
-    assert np.abs(angle).max() < 10 * atol
-
-
-def test_a_full_packet_of_poses_fits():
-    for dtype in ("float32", "float64"):
-        n = wire.poses_per_packet(1166, dtype == "float64")
-        packet = pose_packet(np.random.default_rng(1), n, dtype)
-        assert 1166 - 60 < len(wire.write_poses(packet, 0, n, decides=False)) <= 1166
-
-
-def test_the_other_end_sends_its_curvature_instead():
-    rng, curvature = np.random.default_rng(2), np.array([2.0, 3.0], np.float32)
-    packet = pose_packet(rng, 5, curvature=curvature)
-    data = wire.write_poses(packet, 0, 5, decides=False)
-    np.testing.assert_array_equal(
-        wire.read_poses(data, packet.keyframes, from_decider=False).curvature, curvature
-    )
-    with pytest.raises(MalformedError, match="not from this end"):
-        wire.read_poses(data, packet.keyframes, from_decider=True)
 
 
 def test_set_up_messages_come_back():
@@ -83,7 +32,7 @@ def test_set_up_messages_come_back():
     assert (back.lower, back.higher, back.support) == (1, 3, 12)
     np.testing.assert_allclose(back.T_lower_higher, frame.T_lower_higher, atol=1e-5)
     front = {(0, 4): 0b11, (2, 1): 0, (0, 9): 0b101}
-    assert wire.read_front(wire.write_front(front), 3) == front
+    assert tree_wire.read_front(tree_wire.write_front(front), 3) == front
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
@@ -95,20 +44,22 @@ def test_blocks_and_steps_come_back_and_zeros_cost_nothing(precision):
     H[:6, 12:18] = H[12:18, :6] = 0.0
     H = H.astype(precision).astype(np.float64)
     block = Block(H, rng.normal(size=6 * n), 3.5, 0.25, reweighted=True, unsure=False)
-    data = wire.write_block(9, block, precision)
-    exchange, read = wire.read_block(data, n)
+    data = tree_wire.write_block(9, block, precision)
+    exchange, read = tree_wire.read_block(data, n)
     assert exchange == 9
     np.testing.assert_array_equal(read.H, H)
     np.testing.assert_array_equal(read.g, block.g)
     assert (read.cost, read.largest_step, read.reweighted, read.unsure) == (3.5, 0.25, True, False)
     dense = Block(np.where(H == 0, 1.0, H), block.g, 3.5, 0.25, reweighted=True, unsure=False)
-    assert len(wire.write_block(9, dense, precision)) - len(data) == 36 * (4 if precision == "float32" else 8)
+    assert len(tree_wire.write_block(9, dense, precision)) - len(data) == 36 * (
+        4 if precision == "float32" else 8
+    )
     same = Block(None, block.g, 3.5, 0.25, reweighted=False, unsure=True)
-    short = wire.write_block(10, same, precision)
+    short = tree_wire.write_block(10, same, precision)
     assert len(short) < 400
-    assert wire.read_block(short, n)[1].H is None
+    assert tree_wire.read_block(short, n)[1].H is None
     step = Step(4, accepted=True, finished=False, fresh=True, damping=1e-3, delta=rng.normal(size=(3, 6)))
-    back = wire.read_step(wire.write_step(step), 3)
+    back = tree_wire.read_step(tree_wire.write_step(step), 3)
     np.testing.assert_array_equal(back.delta, step.delta)
     assert (back.exchange, back.accepted, back.finished, back.fresh, back.damping) == (
         4,
@@ -121,12 +72,10 @@ def test_blocks_and_steps_come_back_and_zeros_cost_nothing(precision):
 
 def test_what_is_cut_short_or_does_not_fit_is_refused():
     rng = np.random.default_rng(5)
-    packet = pose_packet(rng, 6)
     named = NamedKeyframes(np.array([1, 5], np.int32), poses(rng, 2), np.zeros((2, 2)))
     block = Block(np.eye(12), np.zeros(12), 1.0, 0.0, reweighted=False, unsure=False)
     step = Step(0, accepted=True, finished=False, fresh=False, damping=0.0, delta=np.zeros((2, 6)))
     messages = [
-        (wire.write_poses(packet, 0, 6, True), lambda d: wire.read_poses(d, packet.keyframes, True)),
         (wire.write_roster(Roster(0, 2)), lambda d: wire.read_roster(d, 2)),
         (
             wire.write_keyframes(named, "float32"),
@@ -134,18 +83,16 @@ def test_what_is_cut_short_or_does_not_fit_is_refused():
         ),
         (wire.write_verdict(np.ones(9, bool)), lambda d: wire.read_verdict(d, 9)),
         (wire.write_frame(PairFrame(0, 1, 2, np.eye(4))), lambda d: wire.read_frame(d, 2)),
-        (wire.write_front({(0, 1): 3}), lambda d: wire.read_front(d, 2)),
-        (wire.write_block(0, block, "float64"), lambda d: wire.read_block(d, 2)),
-        (wire.write_step(step), lambda d: wire.read_step(d, 2)),
+        (tree_wire.write_front({(0, 1): 3}), lambda d: tree_wire.read_front(d, 2)),
+        (tree_wire.write_block(0, block, "float64"), lambda d: tree_wire.read_block(d, 2)),
+        (tree_wire.write_step(step), lambda d: tree_wire.read_step(d, 2)),
     ]
     for data, read in messages:
         read(data)
         for broken in (data[:-1], data + b"\0"):
             with pytest.raises(MalformedError):
                 read(broken)
-    with pytest.raises(MalformedError, match="shared"):
-        wire.read_poses(wire.write_poses(packet, 0, 6, True), packet.keyframes[:5], True)
     with pytest.raises(MalformedError, match="team"):
         wire.read_roster(wire.write_roster(Roster(0, 0b1000)), 3)
     with pytest.raises(MalformedError, match="expected 3"):
-        wire.read_block(wire.write_block(0, block, "float64"), 3)
+        tree_wire.read_block(tree_wire.write_block(0, block, "float64"), 3)

@@ -220,3 +220,38 @@ def test_equal_input_gives_equal_bits(start, end):
     b = register(Reference.from_pyramid(pyramid(START), STRIDES), pyramid(END), np.eye(4))
     np.testing.assert_array_equal(a.T_reference_target, b.T_reference_target)
     np.testing.assert_array_equal(a.information, b.information)
+
+
+def told(T_world_camera, seed: int, tell: bool) -> RgbdPyramid:
+    """A view whose left half has depth of 2 mm, the right half of 8 cm, and says so or not."""
+    gray, depth = render(T_world_camera)
+    sigma = np.where(np.arange(CAMERA.width) < CAMERA.width // 2, 0.002, 0.08) * np.ones_like(depth)
+    noisy = depth + sigma * np.random.default_rng(seed).standard_normal(depth.shape)
+    return RgbdPyramid.build(gray, noisy.astype(np.float32), CAMERA, depth_sigma_m=sigma if tell else None)
+
+
+def test_noise_that_is_told_pixel_by_pixel_counts_as_told(reference):
+    errors = {}
+    for tell in (True, False):
+        errors[tell] = []
+        for seed in range(4):
+            target = told(END, seed + 10, tell)
+            found = register(reference, target, T_START_END).T_reference_target
+            errors[tell].append(np.hypot(*se3.distance(T_START_END, found)))
+    assert np.mean(errors[True]) < 0.3 * np.mean(errors[False])
+
+
+def test_told_noise_follows_the_pixels_down_the_pyramid():
+    view = told(START, 0, True)
+    for level in view.levels:
+        known = level.inverse_depth > 0
+        assert np.array_equal(level.depth_sigma_m > 0, known)
+        middle = level.camera.width // 2
+        np.testing.assert_allclose(
+            level.depth_sigma_m[:, : middle - 1][known[:, : middle - 1]], 0.002, rtol=1e-5
+        )
+        np.testing.assert_allclose(
+            level.depth_sigma_m[:, middle + 1 :][known[:, middle + 1 :]], 0.08, rtol=1e-5
+        )
+    samples = Reference.from_pyramid(view, STRIDES).levels[0]
+    assert set(np.round(samples.depth_sigmas, 4)) <= {np.float32(0.002), np.float32(0.08)}

@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.splat.losses import (
     LossConfig,
+    depth_certainty,
     depth_error,
     halve,
     huber,
@@ -24,6 +25,11 @@ class Drawn:
     alpha: np.ndarray
 
 
+def test_certainty_is_one_up_to_the_huber_width() -> None:
+    sigma = np.array([[0.0, 0.01, 0.02, 0.04, 0.2]], np.float32)
+    np.testing.assert_allclose(depth_certainty(sigma, 0.02), [[1, 1, 1, 0.5, 0.1]], rtol=1e-6)
+
+
 def views(seed: int = 0, h: int = 5, w: int = 7) -> tuple[Drawn, np.ndarray, np.ndarray]:
     """A render and a measured colour and depth; every third depth is missing."""
     r = np.random.default_rng(seed)
@@ -38,16 +44,19 @@ def views(seed: int = 0, h: int = 5, w: int = 7) -> tuple[Drawn, np.ndarray, np.
 
 @pytest.mark.parametrize("exposure", [(0.0, 0.0), (0.2, -0.05)])
 @pytest.mark.parametrize("masked", [False, True])
-def test_cotangents_are_derivatives(exposure: tuple[float, float], masked: bool) -> None:
+@pytest.mark.parametrize("told", [False, True])
+def test_cotangents_are_derivatives(exposure: tuple[float, float], masked: bool, told: bool) -> None:
     drawn, color, depth = views()
+    sure = np.random.default_rng(2).uniform(0.05, 1.0, depth.shape) if told else None
     mask = np.random.default_rng(1).random(depth.shape) > 0.3 if masked else None
     config = LossConfig(color_huber=0.3, depth_huber_m=0.08)
 
     def value(d: Drawn, e: tuple[float, float] = exposure) -> float:
         wide = Drawn(*(x.astype(np.float64) for x in (d.color, d.depth, d.alpha)))
-        return rgbd_loss(wide, color.astype(np.float64), depth.astype(np.float64), config, e, mask).value
+        measured = color.astype(np.float64), depth.astype(np.float64)
+        return rgbd_loss(wide, *measured, config, e, mask, sure).value
 
-    loss = rgbd_loss(drawn, color, depth, config, exposure, mask)
+    loss = rgbd_loss(drawn, color, depth, config, exposure, mask, sure)
     assert loss.value == pytest.approx(value(drawn), rel=1e-5)
     step = 1e-5  # float64 inside `value`: truncation of the quadratic part is exact, of the kinks rare
     for name, cotangent in (("color", loss.d_color), ("depth", loss.d_depth), ("alpha", loss.d_alpha)):

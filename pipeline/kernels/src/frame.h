@@ -239,6 +239,7 @@ struct Kernels {
     Status (*fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth, const float* residual,
                      const FisherArrays&);
     void (*contributions)(Frame&, float* weights, uint32_t* pixels);
+    void (*layer_depth)(Frame&, float tolerance, float* depth);
     // information: [n, 14, 14]
     Status (*full_fisher)(Frame&, const GaussianArrays&, const float* inv_var_color, const float* inv_var_depth, double* information);
     Status (*fit)(Frame&, const GaussianArrays&, const Loss&, LossValues&, const GradientArrays&);

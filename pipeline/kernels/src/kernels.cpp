@@ -2,6 +2,7 @@
 #include "adam.h"
 #include "fitting.h"
 #include "full_information.h"
+#include "layer.h"
 #include "machine_peak.h"
 
 namespace KERNEL_ISA {
@@ -116,6 +117,16 @@ static void contributions(Frame& frame, float* weights, uint32_t* pixels) {
     }
 }
 
+static void layer_depth(Frame& frame, float tolerance, float* depth) {
+    by_depth_kind(frame, [&](auto kind) {
+        constexpr DepthKind KIND = kind;
+        return over_tiles(frame, [&](int tile) {
+            layer_tile<KIND>(frame, tile, tolerance, depth);
+            return Status::ok;
+        });
+    });
+}
+
 template <Derivatives D>
 static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& loss, LossValues& values, const GradientArrays& out) {
     Status status = prepare(frame, gaussians);
@@ -151,6 +162,6 @@ static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& los
 namespace raster {
 extern const Kernels KERNEL_TABLE;
 const Kernels KERNEL_TABLE = {AS_TEXT(KERNEL_ISA), KERNEL_ISA::forward, KERNEL_ISA::backward, KERNEL_ISA::fisher,
-                              KERNEL_ISA::contributions, KERNEL_ISA::full_fisher, KERNEL_ISA::fit, KERNEL_ISA::adam,
+                              KERNEL_ISA::contributions, KERNEL_ISA::layer_depth, KERNEL_ISA::full_fisher, KERNEL_ISA::fit, KERNEL_ISA::adam,
                               KERNEL_ISA::fma_rate, KERNEL_ISA::bandwidth};
 }  // namespace raster

@@ -245,6 +245,12 @@ public:
         kernels_->contributions(frame_, weights.data(), pixels.data());
     }
 
+    void layer_depth(float tolerance, const Floats& depth) {
+        const Use use(busy_);
+        const nb::gil_scoped_release unlocked;
+        kernels_->layer_depth(frame_, tolerance, depth.data());
+    }
+
     // Pairs of a pixel and a Gaussian in the last view: whose alpha was computed, that were blended.
     std::pair<uint64_t, uint64_t> pairs() const {
         uint64_t evaluated = 0, blended = 0;
@@ -308,7 +314,8 @@ NB_MODULE(_raster, m) {
         .def("backward", &Raster::backward)
         .def("fisher", &Raster::fisher)
         .def("full_fisher", &Raster::full_fisher)
-        .def("contributions", &Raster::contributions);
+        .def("contributions", &Raster::contributions)
+        .def("layer_depth", &Raster::layer_depth);
     m.def("adam", &raster::adam);
     m.def("empty", &raster::OutputPool::array);
     m.def("fma_rate", &raster::fma_rate);

@@ -1,0 +1,151 @@
+"""Which topics of a log are a robot's colour, depth and cameras, by type and name, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+from typing import Any
+
+from converters.logs.files import Log
+from converters.ros_images import is_depth
+from pipeline.errors import DuagError, closest
+
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO_TYPE = "sensor_msgs/msg/CameraInfo"
+POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
+LEFT, RIGHT = ("left", "infra1", "cam0"), ("right", "infra2", "cam1")
+REGISTERED = ("aligned_depth_to_color", "depth_registered", "registered", "aligned")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A topic and why it is the one; or no topic, and what keeps from choosing.
+
+    candidates: topics that could have been meant.
+    """
+
+    topic: str
+    why: str
+    candidates: tuple[str, ...] = ()
+
+    def required(self, log: Log, option: str) -> str:
+        """The topic.
+
+        Raises:
+            DuagError: there is none; names the option that decides.
+        """
+        if not self.topic:
+            raise DuagError(f"{log.name}: {self.why}; expected --set {option}=TOPIC")
+        return self.topic
+
+
+class Chooser:
+    """Chooses among the topics of one robot; reads the first message of every topic of images."""
+
+    def __init__(self, log: Log, namespace: str = "", wanted: Mapping[str, str] | None = None) -> None:
+        """Args:
+        namespace: only topics below it. wanted: topics by name of the option ("color", ...), "" = not told.
+        """
+        self.log, self.namespace, self._wanted = log, namespace.rstrip("/"), dict(wanted or {})
+        self.images: dict[str, Any] = {
+            t: log.first(t) for t in log.of_type(*IMAGE_TYPES, below=self.namespace)
+        }
+        self.infos = log.of_type(INFO_TYPE, below=self.namespace)
+        self.clouds = log.of_type(POINTS_TYPE, below=self.namespace)
+
+    def color(self) -> Choice:
+        """Images that are not depth, and are not named so."""
+        found = [t for t, m in self.images.items() if not is_depth(m) and "depth" not in t.lower()]
+        left = LEFT if self._wanted.get("depth_from") == "stereo" else ()
+        return self._one("color", found, (*left, "color", "rgb"))
+
+    def depth(self) -> Choice:
+        """Images that say that they are depth; mono16 may be infrared and counts only where nothing else does.
+
+        Where depth comes from elsewhere (`depth_from`): the right images, or the points of a LiDAR.
+        """
+        source = self._wanted.get("depth_from")
+        if source == "stereo":
+            left = self.color().topic
+            others = [t for t, m in self.images.items() if t != left and not is_depth(m)]
+            return self._one("depth", [t for t in others if "depth" not in t.lower()], RIGHT, "right")
+        if source == "lidar":
+            return self._one("depth", self.clouds, (), "point", self.clouds)
+        found = [t for t, m in self.images.items() if is_depth(m)]
+        sure = [t for t in found if getattr(self.images[t], "encoding", "") != "mono16"]
+        choice = self._one("depth", sure or found, REGISTERED)
+        lost = [t for t, m in self.images.items() if "depth" in t.lower() and not is_depth(m)]
+        if not choice.topic and not choice.candidates and self.clouds:
+            choice = replace(choice, why=f"{choice.why}, but there are points (depth_from=lidar)")
+        sides = [
+            [t for t in self.images if any(hint in t.lower() for hint in hints)] for hints in (LEFT, RIGHT)
+        ]
+        if not choice.topic and not choice.candidates and all(sides):
+            choice = replace(
+                choice, why=f"{choice.why}, but there are left and right ones (depth_from=stereo)"
+            )
+        if choice.topic or not lost:
+            return choice
+        return replace(
+            choice, why=f"{choice.why}; {', '.join(lost)} holds no depth, or as JPEG, which destroys it"
+        )
+
+    def info(self, option: str, image_topic: str) -> Choice:
+        """CameraInfo of an image topic: the one whose name shares most with it."""
+        if self._wanted.get(option):
+            return self._told(option, self.infos)
+        shared = {info: shared_parts(image_topic, info) for info in self.infos}
+        best = [info for info in self.infos if shared[info] == max(shared.values())]
+        if len(best) != 1 or shared[best[0]] == 0:
+            names = ", ".join(self.infos) or "no topic"
+            return Choice("", f"{image_topic} has CameraInfo on {names}", tuple(self.infos))
+        return Choice(best[0], "its name shares most with that of the images", tuple(self.infos))
+
+    def _one(
+        self,
+        kind: str,
+        found: Sequence[str],
+        hints: Sequence[str],
+        called: str = "",
+        known: Sequence[str] = (),
+    ) -> Choice:
+        """The topic that was told, the only one, or the only one with the first hint that decides.
+
+        kind: the option. called: what kind of images these are, if not that. known: what may be told, if not images.
+        """
+        if self._wanted.get(kind):
+            return self._told(kind, known or list(self.images))
+        kind = called or kind
+        found = [
+            t for t in found if t.rpartition("/")[0] not in found
+        ]  # "/image/compressed" repeats "/image"
+        if len(found) == 1:
+            return Choice(found[0], f"the only images that are {kind}", tuple(found))
+        for hint in hints:
+            some = [topic for topic in found if hint in topic.lower()]
+            if len(some) == 1:
+                return Choice(some[0], f"the only {kind} images with {hint!r} in their name", tuple(found))
+        if not found:
+            names = ", ".join(self.images)
+            why = f"none of {names} holds {kind} images" if names else "there are no images"
+            return Choice("", why)
+        return Choice("", f"{kind} images on {', '.join(found)}", tuple(found))
+
+    def _told(self, option: str, known: Sequence[str]) -> Choice:
+        wanted = self._wanted[option]
+        if wanted not in known:
+            raise DuagError(
+                f"{self.log.name}: {option} topic {wanted} not found, {closest(wanted, known, 'a topic')}"
+            )
+        return Choice(wanted, "told", tuple(known))
+
+
+def shared_parts(a: str, b: str) -> int:
+    """How many parts two topics have in common from the left."""
+    count = 0
+    for x, y in zip(PurePosixPath(a).parts[1:], PurePosixPath(b).parts[1:], strict=False):
+        if x != y:
+            break
+        count += 1
+    return count

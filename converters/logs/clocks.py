@@ -1,0 +1,207 @@
+"""How the clocks of a team's robots differ, as far as their logs can tell.
+
+- One recorder wrote the messages of several robots: its times are common to all. Headers of a robot lie before them by
+  the time that messages take, at least; the least of it is taken to be the same for every robot.
+- Each robot has its own recorder, and some messages stand in both logs: their times of recording differ by the clocks'
+  difference and by the way from one robot to the other. Messages in both directions bound the difference from
+  both sides; from one direction the way cannot be told apart.
+- Otherwise nothing can be said: robots that do not see each other move independently.
+- Within one log, true poses and a gyroscope or odometry turn together: `lag` finds how far apart in time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from converters.logs.files import NANOSECONDS, Log
+from pipeline.geometry import so3
+
+Array = NDArray[np.float64]
+MOST_SHARED = 5000  # messages of a log that are compared
+LEAST_SHARED = 5
+LEAST_OFFSET_S = 0.02  # what pairing of images bears, and what transport takes
+RATE_HZ = 100.0  # of angular speeds that are compared
+LEAST_CORRELATION = 0.8
+
+
+@dataclass(frozen=True)
+class RobotClock:
+    """What the times of one robot's images say. delays_ns: time of recording less that of the header, [n].
+
+    header: times of the recording are those of headers (not of the recorder).
+    """
+
+    robot: str
+    log: Log
+    namespace: str
+    delays_ns: NDArray[np.int64]
+    start_ns: int
+    end_ns: int
+    header: bool
+
+
+@dataclass(frozen=True)
+class Offset:
+    """What to add to a robot's times to have them on the reference's clock; None where nothing tells.
+
+    low_s, high_s: bounds, None if that side is open. how: in words.
+    """
+
+    seconds: float | None
+    low_s: float | None
+    high_s: float | None
+    how: str
+
+    @property
+    def matters(self) -> bool:
+        """Whether it is known, and larger than what cannot be told from zero."""
+        if self.seconds is None or abs(self.seconds) < LEAST_OFFSET_S:
+            return False
+        return not (self.low_s is not None and self.high_s is not None and self.low_s <= 0 <= self.high_s)
+
+    def row(self) -> dict[str, Any]:
+        """Plain numbers and text."""
+        return {"offset_s": self.seconds, "low_s": self.low_s, "high_s": self.high_s, "how": self.how}
+
+
+def compare(clocks: Sequence[RobotClock]) -> dict[str, Offset]:
+    """Offset of every robot's times to those of the first."""
+    reference = clocks[0]
+    out = {reference.robot: Offset(0.0, 0.0, 0.0, "the reference")}
+    for clock in clocks[1:]:
+        out[clock.robot] = _offset(reference, clock)
+    return out
+
+
+def overlap_warnings(clocks: Sequence[RobotClock]) -> list[str]:
+    """Robots whose times have nothing in common with those of the first."""
+    first = clocks[0]
+    return [
+        f"{c.robot}: its times ({c.start_ns / NANOSECONDS:.3f} to {c.end_ns / NANOSECONDS:.3f} s) have none in common "
+        f"with those of {first.robot}"
+        for c in clocks[1:]
+        if c.start_ns > first.end_ns or c.end_ns < first.start_ns
+    ]
+
+
+def _offset(a: RobotClock, b: RobotClock) -> Offset:
+    recorded = _recorder_offset(a, b)
+    if recorded.seconds is None or not (a.header and b.header):
+        return recorded
+    # header + delay is the recorder's time; the least delays are taken to be equal, up to their usual size
+    least_a, least_b = int(a.delays_ns.min()), int(b.delays_ns.min())
+    usual = max(float(np.median(c.delays_ns)) - int(c.delays_ns.min()) for c in (a, b)) / NANOSECONDS
+    between = (least_b - least_a) / NANOSECONDS
+    low, high = recorded.low_s, recorded.high_s
+    return Offset(
+        recorded.seconds + between,
+        None if low is None else low + between - usual,
+        None if high is None else high + between + usual,
+        recorded.how,
+    )
+
+
+def _recorder_offset(a: RobotClock, b: RobotClock) -> Offset:
+    """What to add to times of b's recorder to have those of a's."""
+    if {part.path for part in a.log.parts} & {part.path for part in b.log.parts}:
+        return Offset(0.0, 0.0, 0.0, "one recorder")
+    shared = sorted(set(a.log.topics) & set(b.log.topics))
+    shared = [t for t in shared if a.log.topics[t].count and b.log.topics[t].count]
+    times_a, times_b = _times(a.log, shared), _times(b.log, shared)
+    rows = [(key[0], times_a[key] - times_b[key]) for key in times_a if key in times_b]
+    if len(rows) < LEAST_SHARED:
+        return Offset(None, None, None, "recorders of their own, and no messages that both recorded")
+    differences = np.array([d for _, d in rows], dtype=np.float64) / NANOSECONDS
+    sender = np.array([_sender(topic, a, b) for topic, _ in rows])
+    # from a: recorded by b a little later, so a - b is at most the offset; from b: at least
+    from_a, from_b = differences[sender == 1], differences[sender == 2]
+    low = float(from_a.max()) if len(from_a) else None
+    high = float(from_b.min()) if len(from_b) else None
+    if low is not None and high is not None:
+        low, high = min(low, high), max(low, high)  # a drift may turn them round
+        return Offset((low + high) / 2, low, high, f"{len(rows)} messages that both recorded, sent by both")
+    if low is not None or high is not None:
+        one = low if low is not None else high
+        return Offset(
+            one, low, high, f"{len(rows)} messages that both recorded, sent by one: less the way between them"
+        )
+    middle = float(np.median(differences))
+    ends = float(differences.min()), float(differences.max())
+    return Offset(middle, *ends, f"{len(rows)} messages that both recorded, sent by it is not known whom")
+
+
+def _sender(topic: str, a: RobotClock, b: RobotClock) -> int:
+    """1 or 2: the robot whose namespace a topic is in; 0: neither."""
+    for number, clock in ((1, a), (2, b)):
+        if clock.namespace and topic.startswith(f"{clock.namespace}/"):
+            return number
+    return 0
+
+
+def _times(log: Log, topics: Sequence[str]) -> dict[tuple[str, bytes], int]:
+    """When the messages of some topics were recorded, by topic and content; what comes twice is left out."""
+    found: dict[tuple[str, bytes], int] = {}
+    twice: set[tuple[str, bytes]] = set()
+    for number, entry in enumerate(log.entries(*topics) if topics else ()):
+        if number >= MOST_SHARED:
+            break
+        key = entry.topic, hashlib.blake2b(entry.data, digest_size=16).digest()
+        if key in found:
+            twice.add(key)
+        found[key] = entry.log_ns
+    return {key: time for key, time in found.items() if key not in twice}
+
+
+def lag(
+    stamps_a_ns: NDArray[np.int64],
+    speed_a: Array,
+    stamps_b_ns: NDArray[np.int64],
+    speed_b: Array,
+    most_s: float = 2.0,
+) -> tuple[float, float] | None:
+    """How much later b turns than a, by angular speeds (rad/s) that one body shows to two sensors.
+
+    Returns:
+        Lag in seconds and the correlation there; None if they do not correlate, or hardly turn.
+    """
+    if min(len(stamps_a_ns), len(stamps_b_ns)) < 2:
+        return None
+    start, stop = max(stamps_a_ns[0], stamps_b_ns[0]), min(stamps_a_ns[-1], stamps_b_ns[-1])
+    seconds = (int(stop) - int(start)) / NANOSECONDS
+    if seconds < 4 * most_s:
+        return None
+    grid = np.arange(int(seconds * RATE_HZ)) / RATE_HZ
+    a, b = (
+        np.interp(grid, (stamps - start) / NANOSECONDS, speed)
+        for stamps, speed in ((stamps_a_ns, speed_a), (stamps_b_ns, speed_b))
+    )
+    most = int(most_s * RATE_HZ)
+    inner = slice(most, len(a) - most)
+    scores = np.array(
+        [_correlation(a[inner], b[most + k : len(b) - most + k]) for k in range(-most, most + 1)]
+    )
+    best = int(np.argmax(scores))
+    if not 0 < best < len(scores) - 1 or scores[best] < LEAST_CORRELATION:
+        return None
+    before, at, after = scores[best - 1 : best + 2]
+    return (best - most + 0.5 * (before - after) / (before - 2 * at + after)) / RATE_HZ, float(at)
+
+
+def angular_speed(stamps_ns: NDArray[np.int64], T_world_body: Array) -> tuple[NDArray[np.int64], Array]:
+    """Times between the poses [n, 4, 4] of a body, and how fast it turned there (rad/s), [n - 1] each."""
+    R = T_world_body[:, :3, :3]
+    turned = np.linalg.norm(so3.log(np.swapaxes(R[:-1], -1, -2) @ R[1:]), axis=-1)
+    steps = np.diff(stamps_ns)
+    return stamps_ns[:-1] + steps // 2, turned * NANOSECONDS / steps
+
+
+def _correlation(a: Array, b: Array) -> float:
+    a, b = a - a.mean(), b - b.mean()
+    size = float(np.sqrt((a @ a) * (b @ b)))
+    return float(a @ b) / size if size > 1e-9 else 0.0

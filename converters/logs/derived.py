@@ -1,0 +1,191 @@
+"""Depth that a log does not hold as images: of a stereo pair whose left eye is the colour camera, or of a LiDAR."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from converters.derived_depth import ROW_PAIRS, STEREO_SCALE_M, Lidar, StereoFrames, decoded, png, spread
+from converters.logs.files import Log
+from converters.logs.frames import Transforms
+from converters.logs.motion import extrinsics_of
+from converters.logs.options import LogOptions
+from converters.ros_images import RosCamera, color_bytes
+from converters.stereo import RawCamera, StereoRig
+from pipeline.errors import DuagError
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.recording.lidar import lidar_depth
+from pipeline.recording.motion import MotionPrior
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What is written of a frame: encoded colour; depth in units of the log with sigma [h, w] in metres; or a sweep."""
+
+    color: bytes
+    color_format: str
+    depth: NDArray[np.uint16] | None = None
+    depth_sigma_m: NDArray[np.float32] | None = None
+    points_lidar: Array | None = None
+
+
+class Derived(Protocol):
+    """A source of depth. camera: of the recording; T_color_camera [4, 4]: where it is in the log's colour camera."""
+
+    camera: PinholeCamera
+    T_color_camera: Array
+    scale: float
+    words: str
+
+    def picture(self, color: Any, partner: Any, color_ns: int, partner_ns: int) -> Picture:
+        """Of a colour message and that which goes with it."""
+        ...
+
+    def depth_m(self, picture: Picture) -> Array:
+        """Depth [h, w] in metres of a picture, 0 = none."""
+        ...
+
+
+class Stereo:
+    """Colour is the left image, and is rectified."""
+
+    scale = STEREO_SCALE_M
+    words = "stereo"
+
+    def __init__(self, rig: StereoRig, size: tuple[int, int], where: str) -> None:
+        """size: of the images as they come. where: begins the line of an error."""
+        self._frames, self._where = StereoFrames(rig, size), where
+        self.camera = rig.camera
+        self.T_color_camera = se3.from_rotation_translation(rig.R_rectified_left.T, np.zeros(3))
+
+    def check(self, pairs: Sequence[tuple[Any, Any]]) -> dict[str, Any]:
+        """The test of the rectification on some pairs of messages."""
+        return self._frames.check_rows(pairs, self._where)
+
+    def picture(self, color: Any, partner: Any, color_ns: int, partner_ns: int) -> Picture:
+        data, depth, sigma_m = self._frames.frame(color, partner, f"{self._where} at {color_ns} ns")
+        return Picture(data, "png", depth, sigma_m)
+
+    def depth_m(self, picture: Picture) -> Array:
+        assert picture.depth is not None
+        return np.asarray(picture.depth, dtype=np.float64) * self.scale
+
+
+class Sweeps:
+    """Points of a LiDAR as of the time of the colour image; they are drawn when the recording is read."""
+
+    scale = 0.001  # no depth image is written
+    words = "lidar, drawn on reading"
+    T_color_camera = np.eye(4)
+
+    def __init__(self, lidar: Lidar, camera: RosCamera, undistort: bool, where: tuple[str, str]) -> None:
+        """where: of colour and points, for the line of an error."""
+        self.lidar, self.camera, self._where = lidar, camera.camera, where
+        self._maps = camera.maps() if undistort else None
+
+    def picture(self, color: Any, partner: Any, color_ns: int, partner_ns: int) -> Picture:
+        import cv2
+
+        where = f"{self._where[0]} at {color_ns} ns"
+        data, color_format = color_bytes(color, where)
+        if self._maps is not None:
+            image = cv2.remap(decoded(color, where), *self._maps, cv2.INTER_LINEAR)
+            data, color_format = png(np.asarray(image, dtype=np.uint8)), "png"
+        points = self.lidar.points(partner, partner_ns, color_ns, f"{self._where[1]} at {partner_ns} ns")
+        return Picture(data, color_format, points_lidar=points)
+
+    def depth_m(self, picture: Picture) -> Array:
+        assert picture.points_lidar is not None
+        T, sigma_m = self.lidar.T_camera_lidar, self.lidar.range_sigma_m
+        return lidar_depth(picture.points_lidar, T, self.camera, sigma_m)[0].astype(np.float64)
+
+
+def stereo_of(
+    log: Log,
+    color: tuple[str, str, RosCamera],
+    right: tuple[str, str, RosCamera],
+    rectified: bool,
+    transforms: Transforms,
+    settings: LogOptions,
+) -> Stereo:
+    """The pair of two image topics.
+
+    Where the right camera is comes from `T_color_depth`, else from the P of its CameraInfo, else from constant
+    transforms.
+
+    Args:
+        color, right: topic, topic of the CameraInfo, camera. rectified: whether the images are so already.
+    Raises:
+        DuagError: nothing says where the right camera is.
+    """
+    where = f"{log.name}: {color[0]} and {right[0]}"
+    cameras = [c.camera for c in (color[2], right[2])]
+    size = cameras[0].width, cameras[0].height
+    raw = [
+        RawCamera(c.camera.matrix(), c.distortion, c.camera.width, c.camera.height, c.fisheye)
+        for c in (color[2], right[2])
+    ]
+    if settings.T_color_depth:
+        T_right_left = se3.inverse(extrinsics_of("T_color_depth", settings.T_color_depth))
+        return Stereo(StereoRig.of(raw[0], raw[1], T_right_left, where, settings), size, where)
+    infos = [log.first(topic) for topic in (color[1], right[1])]
+    R, P = (
+        [np.array(getattr(m, name if hasattr(m, name) else name.lower()), dtype=np.float64) for m in infos]
+        for name in ("R", "P")
+    )
+    if P[1][3] != 0:
+        if rectified:
+            return Stereo(
+                StereoRig.rectified(cameras[0], cameras[1], -P[1][3] / P[1][0], where, settings), size, where
+            )
+        rig = StereoRig.projected(raw[0], raw[1], R, [p.reshape(3, 4) for p in P], where, settings)
+        return Stereo(rig, size, where)
+    T_left_right = transforms.lookup(color[2].frame_id, right[2].frame_id)
+    if T_left_right is None:
+        raise DuagError(
+            f"{where}: P of {right[1]} has no base line, and /tf_static does not tie {right[2].frame_id!r} to "
+            f"{color[2].frame_id!r}; expected --set T_color_depth='x y z qw qx qy qz' of the right camera"
+        )
+    rig = StereoRig.of(raw[0], raw[1], se3.inverse(T_left_right), where, settings)
+    return Stereo(rig, size, where)
+
+
+def sweeps_of(
+    log: Log,
+    color: tuple[str, RosCamera],
+    topic: str,
+    transforms: Transforms,
+    motion: MotionPrior | None,
+    settings: LogOptions,
+) -> Sweeps:
+    """The LiDAR of a topic of points; where it is comes from `T_color_depth`, else from constant transforms.
+
+    Raises:
+        DuagError: nothing says where it is.
+    """
+    frame = log.first(topic).header.frame_id
+    if settings.T_color_depth:
+        T: Array | None = extrinsics_of("T_color_depth", settings.T_color_depth)
+    else:
+        T = transforms.lookup(color[1].frame_id, frame)
+    if T is None:
+        raise DuagError(
+            f"{log.name}: {topic} is of {frame!r}, and /tf_static does not tie it to {color[1].frame_id!r}; "
+            "expected --set T_color_depth='x y z qw qx qy qz' of the LiDAR"
+        )
+    lidar = Lidar(T, settings.range_sigma_m, motion)
+    where = f"{log.name}: {color[0]}", f"{log.name}: {topic}"
+    return Sweeps(lidar, color[1], settings.undistort, where)
+
+
+def some_pairs(pairs: dict[int, int]) -> list[tuple[int, int]]:
+    """Up to `ROW_PAIRS` pairs of times, evenly spread."""
+    stamps = sorted(pairs)
+    return [(stamps[k], pairs[stamps[k]]) for k in sorted(spread(len(stamps), ROW_PAIRS))]

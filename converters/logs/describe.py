@@ -1,0 +1,279 @@
+"""What is in logs of other programs, what a conversion would choose, and a TOML file to start from."""
+
+from __future__ import annotations
+
+import json
+from array import array
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from converters.logs.choice import POINTS_TYPE, Chooser
+from converters.logs.clocks import compare, overlap_warnings
+from converters.logs.files import NANOSECONDS, SUFFIXES, Log, open_log
+from converters.logs.motion import IMU_TYPE, POSE_TYPES
+from converters.logs.robot_log import RobotLog
+from converters.logs.sources import Source, is_log, robot_of, sources_of
+from pipeline.errors import DuagError
+from pipeline.progress import track
+from pipeline.recording.names import LOG_RECORD, MAGIC, RECORDING_FILE
+
+HEAD_BYTES = 1024
+HEADERS_FIRST, HEADERS_EACH = (
+    100,
+    20,
+)  # of a topic's messages, all of the first and one of each later so many are asked
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether a path is a log, or a folder of logs, that other programs wrote, or a TOML file about such."""
+    if path.suffix == ".toml":
+        return path.is_file()
+    if path.suffix == ".mcap" and path.is_file():
+        with path.open("rb") as stream:  # our writer's first record says what the log is
+            head = stream.read(HEAD_BYTES)
+        return head.startswith(MAGIC) and LOG_RECORD.encode() not in head
+    if path.is_file():
+        return path.suffix in SUFFIXES
+    if not path.is_dir() or (path / RECORDING_FILE).is_file():
+        return False
+    if is_log(path):
+        return True
+    inner = [p for p in sorted(path.iterdir()) if not p.name.startswith(".")]
+    inner += [p for folder in inner if folder.is_dir() for p in sorted(folder.iterdir())]
+    return any(is_log(p) and (p.is_dir() or is_foreign(p)) for p in inner)
+
+
+def describe(src: Path) -> dict[str, Any]:
+    """Topics, rates and times of logs; per robot what would be chosen and why, or why not; how clocks differ.
+
+    Returns:
+        Plain numbers and text, ready for JSON.
+    """
+    logs: dict[str, Any] = {}
+    robots: dict[str, Any] = {}
+    sources = list(_robots(src))
+    clocks = []
+    opened = []
+    try:
+        for source in sources:
+            log = open_log(source.paths, source.name)
+            opened.append(log)
+            if log.name not in logs:
+                logs[log.name] = _log(log)
+            robot_log, robots[source.robot] = _robot(log, source)
+            if robot_log:
+                clocks.append(robot_log.clock(source.robot))
+        if len(clocks) > 1:
+            for robot, offset in compare(clocks).items():
+                robots[robot]["clock"] = offset.row()
+    finally:
+        for log in opened:
+            log.__exit__()
+    return {
+        "kind": "foreign",
+        "logs": logs,
+        "robots": robots,
+        "warnings": overlap_warnings(clocks) if clocks else [],
+    }
+
+
+def _robots(src: Path) -> Iterator[Source]:
+    """The robots that a conversion would find, and those that namespaces would tell apart."""
+    for source in sources_of(src, {}):
+        with open_log(source.paths, source.name) as log:
+            spaces = [] if src.suffix == ".toml" else namespaces(log)
+        for space in spaces:
+            yield replace(source, robot=robot_of(space), namespace=space)
+        if not spaces:
+            yield source
+
+
+def namespaces(log: Log) -> list[str]:
+    """Namespaces of a log that each have colour and depth, if that is what keeps from choosing; else none."""
+    chooser = Chooser(log)
+    if chooser.color().topic and chooser.depth().topic:
+        return []
+    spaces = []
+    for name in sorted({f"/{topic.split('/')[1]}" for topic in chooser.images}):
+        inner = Chooser(log, name)
+        if inner.color().topic and inner.depth().topic:
+            spaces.append(name)
+    return spaces if len(spaces) > 1 else []
+
+
+def _log(log: Log) -> dict[str, Any]:
+    """Size, span and topics of a log."""
+    times: dict[str, array[int]] = {name: array("q") for name in log.topics}
+    delays: dict[str, list[int]] = {name: [] for name in log.topics}
+    publish = False
+    messages = sum(topic.count for topic in log.topics.values())
+    for entry in track(log.entries(*log.topics), f"read {Path(log.name).name}", messages):
+        seen = times[entry.topic]
+        publish |= entry.publish_ns is not None
+        if len(seen) < HEADERS_FIRST or len(seen) % HEADERS_EACH == 0:
+            delay = _delay(entry, delays[entry.topic], first=not seen)
+            if delay is not None:
+                delays[entry.topic].append(delay)
+        seen.append(entry.log_ns)
+    spans = [(t[0], t[-1]) for t in times.values() if t]
+    return {
+        "bytes": sum(_size(part.path) for part in log.parts),
+        "pieces": [part.path.name for part in log.parts],
+        "start_ns": min((a for a, _ in spans), default=None),
+        "end_ns": max((b for _, b in spans), default=None),
+        "time_sources": ["header", "log", *(["publish"] if publish else [])],
+        "topics": {
+            name: {
+                "type": topic.type,
+                "schema": topic.schema,
+                "encoding": topic.encoding,
+                "messages": topic.count,
+                "rate_hz": _rate(times[name]),
+                "recorded_after_header_s": _median_s(delays[name]),
+            }
+            for name, topic in sorted(log.topics.items())
+        },
+    }
+
+
+def _delay(entry: Any, known: list[int], first: bool) -> int | None:
+    """Time of recording less that of the header; None where there is no header or it says nothing."""
+    if not first and not known:  # the first message had none
+        return None
+    try:
+        if first and not hasattr(entry.read(), "header"):
+            return None
+        stamp = int(entry.header_ns())
+    except DuagError:
+        return None
+    return int(entry.log_ns) - stamp if stamp else None
+
+
+def _rate(times: array[int]) -> float | None:
+    return (
+        (len(times) - 1) * NANOSECONDS / (times[-1] - times[0])
+        if len(times) > 1 and times[-1] > times[0]
+        else None
+    )
+
+
+def _median_s(delays: list[int]) -> float | None:
+    return float(np.median(delays)) / NANOSECONDS if delays else None
+
+
+def _size(path: Path) -> int:
+    files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
+    return sum(p.stat().st_size for p in files)
+
+
+def _robot(log: Log, source: Source) -> tuple[RobotLog | None, dict[str, Any]]:
+    """What would be chosen for a robot and why, what else there is, and what keeps from converting."""
+    space, settings = source.namespace, source.settings
+    out: dict[str, Any] = {
+        "log": log.name,
+        "logs": [str(p.resolve()) for p in source.paths],
+        "namespace": space,
+    }
+    robot_log, problem = None, None
+    try:
+        chooser = Chooser(log, space, settings.model_dump())
+        color, depth = chooser.color(), chooser.depth()
+        choices = {"color": color, "depth": depth}
+        for option, image in (("color_info", color), ("depth_info", depth)):
+            if image.topic in chooser.images:
+                choices[option] = chooser.info(option, image.topic)
+        out["choices"] = {
+            k: {"topic": c.topic, "why": c.why, "candidates": c.candidates} for k, c in choices.items()
+        }
+        robot_log = RobotLog(log, space, settings)
+        out["frames"] = len(robot_log.pairs)
+        moved = robot_log.T_color_depth is not None
+        out["depth"] = "moved into the colour camera" if moved else "registered to colour already"
+        if robot_log.derived:
+            out["depth"] = robot_log.derived.words
+        out["warnings"] = robot_log.warnings
+    except DuagError as error:
+        robot_log, problem = None, str(error)
+    out["problem"] = problem
+    kinds = {"imu": (IMU_TYPE,), "odometry": POSE_TYPES, "truth": POSE_TYPES, "points": (POINTS_TYPE,)}
+    out["others"] = {kind: log.of_type(*types, below=space) for kind, types in kinds.items()}
+    return robot_log, out
+
+
+# --- for people
+
+
+def format_description(content: Mapping[str, Any]) -> str:
+    """The result of `describe` as text."""
+    lines = []
+    for name, log in content["logs"].items():
+        lines += _log_lines(name, log)
+    for robot, row in content["robots"].items():
+        lines += _robot_lines(robot, row)
+    return "\n".join([*lines, *(f"warning: {text}" for text in content["warnings"])])
+
+
+def _log_lines(name: str, log: Mapping[str, Any]) -> list[str]:
+    span = "no messages"
+    if log["start_ns"] is not None:
+        seconds = (log["end_ns"] - log["start_ns"]) / NANOSECONDS
+        span = f"{seconds:.2f} s from {log['start_ns'] / NANOSECONDS:.3f} s"
+    pieces = f" in {len(log['pieces'])} pieces" if len(log["pieces"]) > 1 else ""
+    lines = [
+        f"log {name}{pieces}: {log['bytes'] / 1e6:.1f} MB, {span}, times: {', '.join(log['time_sources'])}"
+    ]
+    width = max((len(topic) for topic in log["topics"]), default=0)
+    for topic, t in log["topics"].items():
+        rate = f"{t['rate_hz']:8.2f} Hz" if t["rate_hz"] else " " * 11
+        delay = t["recorded_after_header_s"]
+        told = "" if delay is None else f"  recorded {delay:.3f} s after its header"
+        lines.append(f"  {topic:<{width}}  {t['messages']:>7}  {rate}  {t['type']}{told}")
+    return lines
+
+
+def _robot_lines(robot: str, row: Mapping[str, Any]) -> list[str]:
+    space = f" below {row['namespace']}" if row["namespace"] else ""
+    lines = [f"robot {robot}: {row['log']}{space}"]
+    for option, choice in row.get("choices", {}).items():
+        lines.append(f"  {option:<10}  {choice['topic'] or 'not decided'}: {choice['why']}")
+    if row["problem"]:
+        lines.append(f"  cannot be converted yet: {row['problem']}")
+    else:
+        lines.append(f"  {row['frames']} frames, depth is {row['depth']}")
+        lines += [f"  warning: {text}" for text in row["warnings"]]
+    for kind, found in row["others"].items():
+        if found:
+            lines.append(f"  {kind + '?':<10}  {', '.join(found)}")
+    clock = row.get("clock")
+    if clock and clock["how"] != "the reference":
+        told = "not known" if clock["offset_s"] is None else f"add {clock['offset_s']:.6f} s"
+        lines.append(f"  clock       {told} ({clock['how']})")
+    return lines
+
+
+def toml_text(content: Mapping[str, Any]) -> str:
+    """A TOML file that says what a conversion would choose, for `duagc convert ros FILE`; what is open is a comment."""
+    sources = sorted({s for log in content["logs"].values() for s in log["time_sources"]})
+    lines = [
+        "# duagc convert ros THIS_FILE --out RECORDING",
+        "# `duagc convert --list` has all options; above [robots] they hold for all. Paths: full, or beside this.",
+        f'time_source = "header"  # {", ".join(sources)}',
+    ]
+    for robot, row in content["robots"].items():
+        lines += ["", f"[robots.{robot}]", f"logs = {json.dumps(row['logs'])}"]
+        if row["namespace"]:
+            lines.append(f"namespace = {json.dumps(row['namespace'])}")
+        if row["problem"]:
+            lines.append(f"# {' '.join(row['problem'].split())}")
+        for option, choice in row.get("choices", {}).items():
+            if choice["topic"]:
+                lines.append(f"{option} = {json.dumps(choice['topic'])}  # {choice['why']}")
+            else:
+                lines += [f"# {option} = {json.dumps(topic)}" for topic in choice["candidates"] or [""]]
+        for kind in ("imu", "odometry", "truth"):
+            lines += [f"# {kind} = {json.dumps(topic)}" for topic in row["others"][kind]]
+    return "\n".join(lines)

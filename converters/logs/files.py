@@ -1,0 +1,163 @@
+"""One way to read every container: what topics there are, and their messages in order of recording.
+
+    with open_log([Path("a_0.bag"), Path("a_1.bag")]) as log:
+        for topic in log.topics.values():
+            print(topic.name, topic.type, topic.count)
+        for entry in log.entries("/camera/color/image_raw"):
+            image = entry.read()          # attributes as ROS names them, whatever the encoding
+
+Types and fields are those of ROS: Foxglove's messages are brought into that form (`converters.logs.foxglove`).
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+from pipeline.errors import DuagError
+
+NANOSECONDS = 1_000_000_000
+LAST_NS = 1 << 62
+SUFFIXES = (".bag", ".db3", ".mcap")
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a log. type: ROS's name of it ("sensor_msgs/msg/Image"), or the schema's own if it has none.
+
+    schema, encoding: as the file names them. count: messages.
+    """
+
+    name: str
+    type: str
+    schema: str
+    encoding: str
+    count: int
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One message. log_ns: when it was recorded; publish_ns: when it was sent, where the container tells.
+
+    data: as it stands in the container. read: the message, with ROS's fields. header_ns: the time in its header, 0
+    where it has none.
+    """
+
+    topic: str
+    log_ns: int
+    publish_ns: int | None
+    data: bytes
+    read: Callable[[], Any]
+    header_ns: Callable[[], int]
+
+
+class LogPart(Protocol):
+    """One container file, or a folder of `ros2 bag`."""
+
+    path: Path
+    topics: dict[str, Topic]
+
+    def entries(self, topics: Sequence[str]) -> Iterator[Entry]:
+        """Messages of these topics in order of recording."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class Log:
+    """One or several containers read as one; a context manager."""
+
+    def __init__(self, parts: Sequence[LogPart], name: str) -> None:
+        """name: how messages for people call it."""
+        self.parts, self.name = list(parts), name
+        self.topics: dict[str, Topic] = {}
+        for part in self.parts:
+            for topic in part.topics.values():
+                known = self.topics.get(topic.name)
+                if known and known.type != topic.type:
+                    raise DuagError(
+                        f"{part.path}: {topic.name} holds {topic.type}, expected {known.type} as in {parts[0].path}"
+                    )
+                self.topics[topic.name] = replace(topic, count=topic.count + (known.count if known else 0))
+
+    def __enter__(self) -> Log:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for part in self.parts:
+            part.close()
+
+    def of_type(self, *types: str, below: str = "") -> list[str]:
+        """Names of topics of these types that have messages, in a namespace."""
+        return sorted(
+            t.name
+            for t in self.topics.values()
+            if t.type in types and t.count and t.name.startswith(f"{below.rstrip('/')}/")
+        )
+
+    def entries(self, *topics: str) -> Iterator[Entry]:
+        """Messages of these topics, in order of recording over all parts."""
+        streams = [
+            part.entries(wanted) for part in self.parts if (wanted := [t for t in topics if t in part.topics])
+        ]
+        return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda entry: entry.log_ns)
+
+    def first(self, topic: str) -> Any:
+        """The first message of a topic."""
+        entry = next(iter(self.entries(topic)), None)
+        if entry is None:
+            raise DuagError(f"{self.name}: {topic} has no message, expected one")
+        return entry.read()
+
+
+def open_log(paths: Sequence[Path], name: str = "") -> Log:
+    """Open containers, to be read as one log.
+
+    Raises:
+        DuagError: a file is missing, of another kind, or broken.
+    """
+    parts: list[LogPart] = []
+    with ExitStack() as opened:
+        for path in paths:
+            parts.append(_open_part(path))
+            opened.callback(parts[-1].close)
+        log = Log(parts, name or str(paths[0]))
+        opened.pop_all()
+    return log
+
+
+def _open_part(path: Path) -> LogPart:
+    if not path.exists():
+        raise DuagError(f"{path}: no such file or folder, expected a log ({', '.join(SUFFIXES)})")
+    if path.suffix == ".mcap" and path.is_file():
+        from converters.logs.mcap_file import McapFile
+
+        return McapFile(path)
+    if path.suffix in SUFFIXES or (path / "metadata.yaml").is_file():
+        from converters.logs.rosbag_file import RosBag
+
+        return RosBag(path)
+    raise DuagError(f"{path}: is no log, expected {', '.join(SUFFIXES)} or a folder of `ros2 bag`")
+
+
+def sound_time(time_ns: int, where: str) -> int:
+    """A time that can be computed with. Raises DuagError for one before 1970 or after 2115."""
+    if not 0 <= time_ns < LAST_NS:
+        raise DuagError(f"{where}: time {time_ns} ns, expected one between the years 1970 and 2116")
+    return time_ns
+
+
+def ros_type(schema: str) -> str:
+    """A type of ROS by the name that ROS 2 has for it: "sensor_msgs/Image" is "sensor_msgs/msg/Image"."""
+    parts = schema.split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else schema
+
+
+def stamp_ns(message: Any) -> int:
+    """The time in the header of a message, 0 where it has none."""
+    header = getattr(message, "header", None)
+    return int(header.stamp.sec) * NANOSECONDS + int(header.stamp.nanosec) if header else 0

@@ -1,0 +1,61 @@
+"""Messages of several topics that belong together, in order of time, without holding more of a log than needed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from converters.logs.files import Entry, Log
+from pipeline.errors import DuagError
+
+MOST_KEPT_BYTES = 512 << 20
+
+
+def gathered(
+    log: Log, groups: Sequence[Mapping[str, int]], time_ns: Callable[[Entry], int]
+) -> Iterator[dict[str, Entry]]:
+    """For every group of (topic -> time) its messages, in the order of the groups.
+
+    Groups should follow the order of recording: what arrives before its group is due is kept. Of several messages of
+    one topic and time the first counts; a group whose messages do not all come ends the iteration.
+
+    Raises:
+        DuagError: more would have to be kept than memory should hold: times and recording are in different orders.
+    """
+    uses = Counter(part for group in groups for part in group.items())
+    kept: dict[tuple[str, int], Entry] = {}
+    at = kept_bytes = 0
+    for entry in log.entries(*sorted({topic for topic, _ in uses})):
+        part = entry.topic, time_ns(entry)
+        if uses.get(part, 0) > 0 and part not in kept:
+            kept[part] = entry
+            kept_bytes += len(entry.data)
+        if kept_bytes > MOST_KEPT_BYTES:
+            raise DuagError(
+                f"{log.name}: at {entry.log_ns} ns {kept_bytes >> 20} MB wait for messages of earlier times, expected "
+                "times in the order of recording, or time_source=log"
+            )
+        while at < len(groups) and all(part in kept for part in groups[at].items()):
+            yield {topic: kept[topic, stamp] for topic, stamp in groups[at].items()}
+            for used in groups[at].items():
+                uses[used] -= 1
+                if not uses[used]:
+                    kept_bytes -= len(kept.pop(used).data)
+            at += 1
+
+
+def nearest(times_ns: Sequence[int], others_ns: Sequence[int], most_ns: int) -> dict[int, int]:
+    """For each time the nearest of the others (of two the earlier), where that is near enough. Both increasing."""
+    if not len(times_ns) or not len(others_ns):
+        return {}
+    ours, theirs = np.asarray(times_ns, np.int64), np.asarray(others_ns, np.int64)
+    after = np.clip(np.searchsorted(theirs, ours), 0, len(theirs) - 1)
+    before = np.maximum(after - 1, 0)
+    best: NDArray[np.int64] = np.where(
+        np.abs(theirs[before] - ours) <= np.abs(theirs[after] - ours), theirs[before], theirs[after]
+    )
+    near = np.abs(best - ours) <= most_ns
+    return dict(zip(ours[near].tolist(), best[near].tolist(), strict=True))

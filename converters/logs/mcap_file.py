@@ -1,0 +1,274 @@
+"""MCAP files of any program: messages of ROS 1 and ROS 2, and Foxglove's in protobuf or JSON."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Chunk, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+from converters.logs import foxglove
+from converters.logs.files import Entry, Topic, ros_type, sound_time, stamp_ns
+from converters.logs.rosbag_file import (
+    LARGEST_CHUNK,
+    check_definitions,
+    deserialised,
+    reading,
+    reason,
+    ros_header_ns,
+)
+from pipeline.errors import DuagError
+from pipeline.files import check_file
+from pipeline.recording.names import MAGIC
+
+WANTED = "a sound MCAP log"
+
+
+class McapFile:
+    """An MCAP file. Without an index it is read from its beginning, in the order of the file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.topics: dict[str, Topic] = {}
+        self._decoders: dict[int, _Decoder] = {}
+        check_file(path, WANTED)
+        with reading(path, WANTED):
+            self._stream = path.open("rb")
+            try:
+                self._open()
+            except BaseException:
+                self._stream.close()
+                raise
+
+    def _open(self) -> None:
+        self._stream.seek(-min(len(MAGIC), self.path.stat().st_size), 2)
+        if self._stream.read() != MAGIC:
+            raise DuagError(
+                f"{self.path}: is cut short or no MCAP; what it holds can be saved with `duagc recover`"
+            )
+        self._stream.seek(0)
+        self._reader = SeekingReader(self._stream, validate_crcs=True, record_size_limit=LARGEST_CHUNK)
+        summary = self._reader.get_summary()
+        statistics = summary.statistics if summary else None
+        self._indexed = bool(
+            summary
+            and statistics
+            and summary.chunk_indexes
+            and all(chunk.message_index_offsets for chunk in summary.chunk_indexes)
+        )
+        if summary and statistics and self._indexed:
+            for index in summary.chunk_indexes:
+                self._check_size(self._beginning(index.chunk_start_offset))
+            counts = Counter(statistics.channel_message_counts)
+            channels, schemas = summary.channels, summary.schemas
+        else:
+            channels, schemas, counts = {}, {}, Counter()
+            for record in self._records():
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+                elif isinstance(record, Message):
+                    counts[record.channel_id] += 1
+        self._channels = channels
+        for number, channel in sorted(channels.items()):
+            self._add(channel, schemas.get(channel.schema_id), counts[number])
+
+    def _add(self, channel: Channel, schema: Schema | None, count: int) -> None:
+        """Make a channel known: the type of its messages by ROS's name, and how they are read."""
+        encoding, name = channel.message_encoding, schema.name if schema else ""
+        plain = foxglove.plain_name(name)
+        kind = foxglove.ROS_TYPES.get(plain)
+        if schema and encoding in ("cdr", "ros1"):
+            kind = kind or ros_type(name)
+            self._decoders[channel.id] = _Ros(schema, encoding)
+        elif schema and kind and encoding in ("protobuf", "json"):
+            self._decoders[channel.id] = _Foxglove(schema, encoding)
+        else:  # nothing that is read here; still shown to people
+            kind = f"{name or 'no schema'} as {encoding or 'nothing known'}"
+            self._decoders[channel.id] = _Unknown(kind)
+        known = self.topics.get(channel.topic)
+        if known and known.count and count and known.type != kind:
+            raise DuagError(
+                f"{self.path}: {channel.topic} holds {known.type} and {kind}, expected one of them"
+            )
+        if count or not known:
+            total = count + (known.count if known else 0)
+            self.topics[channel.topic] = Topic(channel.topic, kind, name, encoding, total)
+
+    def _records(self) -> Iterator[Any]:
+        """Schemas, channels and messages in the order of the file."""
+        self._stream.seek(0)
+        for record in StreamReader(self._stream, emit_chunks=True, record_size_limit=LARGEST_CHUNK).records:
+            if isinstance(record, Chunk):
+                self._check_size(record)
+                yield from breakup_chunk(record, validate_crc=True)
+            else:
+                yield record
+
+    def _beginning(self, offset: int) -> Chunk:
+        """A chunk with no more of its records than tell their unpacked size."""
+        self._stream.seek(offset)
+        head = self._stream.read(256)
+        length = int.from_bytes(head[37:41], "little")  # of the name of the compression
+        start = 41 + length + 8
+        compression = head[41 : 41 + length].decode(errors="replace")
+        return Chunk(
+            compression=compression,
+            data=head[start:],
+            message_end_time=0,
+            message_start_time=0,
+            uncompressed_crc=0,
+            uncompressed_size=int.from_bytes(head[25:33], "little"),
+        )
+
+    def _check_size(self, chunk: Chunk) -> None:
+        """Refuse a chunk that would unpack into more than memory, whatever the file says."""
+        size = chunk.uncompressed_size
+        if chunk.compression == "zstd":
+            import zstandard
+
+            told = zstandard.get_frame_parameters(chunk.data).content_size
+            size = max(size, told if told < zstandard.CONTENTSIZE_UNKNOWN else 0)
+        elif chunk.compression == "lz4":
+            import lz4.frame
+
+            size = max(size, lz4.frame.get_frame_info(chunk.data)["content_size"])
+        if size > LARGEST_CHUNK:
+            raise DuagError(f"{self.path}: a chunk unpacks to {size} bytes, expected at most {LARGEST_CHUNK}")
+
+    def _messages(self, topics: Sequence[str]) -> Iterator[tuple[Channel, Message]]:
+        if self._indexed:
+            for _, channel, message in self._reader.iter_messages(topics, log_time_order=True):
+                yield channel, message
+            return
+        for record in self._records():
+            if isinstance(record, Message) and self._channels[record.channel_id].topic in topics:
+                yield self._channels[record.channel_id], record
+
+    def entries(self, topics: Sequence[str]) -> Iterator[Entry]:
+        with reading(self.path, WANTED):
+            for channel, m in self._messages(topics):
+                where = f"{self.path}: {channel.topic}"
+                decoder = self._decoders[channel.id]
+                yield Entry(
+                    channel.topic,
+                    sound_time(m.log_time, where),
+                    sound_time(m.publish_time, where),
+                    m.data,
+                    partial(decoder.read, m.data, where),
+                    partial(decoder.header_ns, m.data, where),
+                )
+
+    def close(self) -> None:
+        self._stream.close()
+
+
+class _Decoder(Protocol):
+    """Reads the messages of one channel."""
+
+    def read(self, data: bytes, where: str) -> Any: ...
+
+    def header_ns(self, data: bytes, where: str) -> int: ...
+
+
+class _Ros:
+    """Messages of ROS by the definitions that the file carries."""
+
+    def __init__(self, schema: Schema, encoding: str) -> None:
+        self.schema, self.encoding, self.type = schema, encoding, ros_type(schema.name)
+        self._deserialise: Any = None
+
+    def _store(self) -> Any:
+        """Understood when the first message is read: definitions that nobody needs may be beyond the parser."""
+        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+        text = self.schema.data.decode()
+        if not text.strip():  # a recorder that had no definitions at hand
+            return get_typestore(Stores.ROS2_HUMBLE if self.encoding == "cdr" else Stores.ROS1_NOETIC)
+        store = get_typestore(Stores.EMPTY)
+        if self.schema.encoding != "ros2idl":
+            store.register(get_types_from_msg(text, self.type))
+            check_definitions(store.fielddefs)
+            return store
+        line = "=" * 80 + "\n"
+        parts = (
+            [part.split("\n", 1)[1] for part in text.split(line)[1:]]
+            if text.startswith(f"{line}IDL: ")
+            else [text]
+        )
+        types: dict[str, Any] = {}
+        for part in parts:
+            types.update(
+                get_types_from_idl(re.sub(r"(?m)^\s*#.*$", "", part))
+            )  # its parser knows no #include
+        store.register(types)
+        check_definitions(store.fielddefs)
+        return store
+
+    def read(self, data: bytes, where: str) -> Any:
+        if self._deserialise is None:
+            try:
+                store = self._store()
+            except Exception as error:  # whatever a broken definition provokes in the parser
+                raise DuagError(
+                    f"{where}: the definition of {self.type} cannot be read ({reason(error)})"
+                ) from error
+            self._deserialise = store.deserialize_cdr if self.encoding == "cdr" else store.deserialize_ros1
+        message = deserialised(self._deserialise, data, self.type, where)
+        return foxglove.as_ros(foxglove.plain_name(self.schema.name), message, where)
+
+    def header_ns(self, data: bytes, where: str) -> int:
+        if foxglove.plain_name(self.schema.name) in foxglove.ROS_TYPES:
+            return stamp_ns(self.read(data, where))
+        return ros_header_ns(data, self.encoding, where)
+
+
+class _Foxglove:
+    """Foxglove's messages in protobuf, by our classes, or JSON."""
+
+    def __init__(self, schema: Schema, encoding: str) -> None:
+        self.name, self.encoding = foxglove.plain_name(schema.name), encoding
+
+    def read(self, data: bytes, where: str) -> Any:
+        return foxglove.as_ros(self.name, self._message(data, where), where)
+
+    def header_ns(self, data: bytes, where: str) -> int:
+        """Without unpacking the image: of transforms in a list the first one's."""
+        message = self._message(data, where)
+        if self.name == "foxglove.FrameTransforms":
+            return stamp_ns(foxglove.as_ros(self.name, message, where))
+        return foxglove.stamp_ns(message, where)
+
+    def _message(self, data: bytes, where: str) -> Any:
+        import schemas
+
+        try:
+            if self.encoding == "json":
+                members = json.loads(data)
+                return foxglove.JsonFields(members if isinstance(members, dict) else {})
+            return schemas.message_class(self.name).FromString(data)
+        except Exception as error:  # protobuf's DecodeError, broken JSON, broken text
+            raise DuagError(
+                f"{where} holds {len(data)} bytes that are no {self.name} in {self.encoding} ({reason(error)})"
+            ) from error
+
+
+class _Unknown:
+    """Messages that are not read here."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+
+    def read(self, data: bytes, where: str) -> Any:
+        raise DuagError(f"{where} is {self.kind}, expected ROS or Foxglove")
+
+    def header_ns(self, data: bytes, where: str) -> int:
+        return 0

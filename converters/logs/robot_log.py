@@ -1,0 +1,307 @@
+"""One robot's RGB-D camera in a log: which topics, which cameras, and which messages belong together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from converters.logs.choice import REGISTERED, Chooser
+from converters.logs.clocks import RobotClock
+from converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
+from converters.logs.files import NANOSECONDS, Entry, Log, sound_time
+from converters.logs.frames import Transforms, pose_matrix
+from converters.logs.gather import gathered
+from converters.logs.motion import CameraPoses, Imu, MotionReader, extrinsics_of
+from converters.logs.options import LogOptions
+from converters.ros_images import RosCamera, is_integer_depth, size_of
+from converters.tum_layout import Listed, associate
+from pipeline.errors import DuagError
+from pipeline.geometry import se3
+
+Array = NDArray[np.float64]
+HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
+RECTIFIED = ("image_rect", "image_rect_color", "rect")
+SAME_CAMERA_PX = 1.0  # up to which a camera has not changed
+OUT_SCALE = 0.0005  # metres per unit of depth that was registered or came as floats
+
+
+class _Cameras:
+    """Watches that what a CameraInfo says does not change: a camera of the recording is one camera."""
+
+    def __init__(self, first: Mapping[str, tuple[RosCamera, bool]], name: str) -> None:
+        self._first, self._name = first, name
+        self._seen: dict[str, bytes] = {}
+
+    def see(self, entry: Entry) -> None:
+        """Compare a message with the first one. Raises DuagError where the difference can be seen in images."""
+        rest = entry.data[16:]  # in ROS what follows the times of the header, most often the same bytes
+        if self._seen.get(entry.topic) == rest:
+            return
+        self._seen[entry.topic] = rest
+        first, rectified = self._first[entry.topic]
+        where = f"{self._name}: {entry.topic}"
+        now = RosCamera.of(entry.read(), rectified, where)
+        a, b = (np.array([c.camera.fx, c.camera.fy, c.camera.cx, c.camera.cy]) for c in (first, now))
+        if np.abs(a - b).max() > SAME_CAMERA_PX or first.distortion != now.distortion:
+            raise DuagError(
+                f"{where} changes at {entry.log_ns} ns from fx fy cx cy = {a.round(2).tolist()} px to "
+                f"{b.round(2).tolist()}, expected one camera (a zoom or autofocus has to be fixed while recording)"
+            )
+
+
+class RobotLog:
+    """Colour, depth, cameras and true poses of one robot.
+
+    Raises (on construction):
+        DuagError: a topic is missing or more than one could be meant; a camera or an extrinsic is unknown.
+    """
+
+    def __init__(self, log: Log, namespace: str, settings: LogOptions) -> None:
+        self.log, self.namespace, self.settings = log, namespace.rstrip("/"), settings
+        self.name = log.name
+        self.warnings: list[str] = []
+        # added to all times when they are written
+        self.shift_ns = round(settings.clock_offset_s * NANOSECONDS)
+        # by topic of a CameraInfo: the camera as first told, and whether its images are rectified
+        self._cameras: dict[str, tuple[RosCamera, bool]] = {}
+        self.transforms = Transforms(log, self.namespace)
+        self._choose()
+
+    def _choose(self) -> None:
+        s = self.settings
+        chooser = Chooser(self.log, self.namespace, s.model_dump())
+        if not chooser.images:
+            where = f" below {self.namespace}" if self.namespace else ""
+            raise DuagError(f"{self.name}: found no topic of images{where}, expected colour and depth")
+        self.depth = chooser.depth().required(self.log, "depth")
+        self.color = chooser.color().required(self.log, "color")
+        self.color_camera = self._camera(self.color, "color_info", chooser)
+        self._motion = MotionReader(self.log, s, self.transforms, self.color_camera.frame_id, self.time_ns)
+        self.truth: CameraPoses | None = self._motion.truth()
+        self.T_color_depth: Array | None = None
+        self.derived = self._derived(chooser) if s.depth_from != "image" else None
+        if self.derived:
+            self.camera, self.depth_scale = self.derived.camera, self.derived.scale
+            return
+        self.camera = self.color_camera.camera
+        self.depth_camera = self._camera(self.depth, "depth_info", chooser)
+        self.T_color_depth = self._extrinsics()
+        self.keeps_depth = is_integer_depth(chooser.images[self.depth]) and self.T_color_depth is None
+        self.depth_scale = s.depth_scale if self.keeps_depth else OUT_SCALE
+
+    def _derived(self, chooser: Chooser) -> Derived:
+        """Depth of a stereo pair or of a LiDAR."""
+        s = self.settings
+        color = self.color, self._info(self.color, "color_info", chooser), self.color_camera
+        if s.depth_from == "stereo":
+            right = self._info(self.depth, "depth_info", chooser)
+            other = self.depth, right, self._camera(self.depth, "depth_info", chooser)
+            return stereo_of(self.log, color, other, _is_rectified(self.color), self.transforms, s)
+        if s.max_difference_s == 0:
+            self.settings = s.model_copy(update={"max_difference_s": HALF_TURN_S})
+        motion = self.odometry.prior() if self.odometry else self.imu.prior() if self.imu else None
+        if motion is None:
+            self.warnings.append(
+                "sweeps hold what the LiDAR moved meanwhile; expected --set imu=TOPIC or odometry=TOPIC to take it out"
+            )
+        camera = self.color, self.color_camera
+        return sweeps_of(self.log, camera, self.depth, self.transforms, motion, s)
+
+    @property
+    def T_color_camera(self) -> Array:  # noqa: N802 (a transform)
+        """Where the camera of the recording is in the colour camera: turned, if that is rectified."""
+        return self.derived.T_color_camera if self.derived else np.eye(4)
+
+    def depth_m(self, picture: Picture) -> Array:
+        """Depth [h, w] of a picture in metres, 0 = none."""
+        if self.derived:
+            return self.derived.depth_m(picture)
+        assert picture.depth is not None
+        return np.asarray(picture.depth, dtype=np.float64) * self.depth_scale
+
+    def check_rows(self) -> dict[str, Any]:
+        """The test of the rectification of a stereo pair; nothing for other sources of depth."""
+        if not isinstance(self.derived, Stereo):
+            return {}
+        groups = [{self.color: c, self.depth: d} for c, d in some_pairs(self.pairs)]
+        found = gathered(self.log, groups, self.time_ns)
+        return self.derived.check([(g[self.color].read(), g[self.depth].read()) for g in found])
+
+    def _info(self, topic: str, option: str, chooser: Chooser) -> str:
+        """The CameraInfo of an image topic."""
+        return chooser.info(option, topic).required(self.log, option)
+
+    def _camera(self, topic: str, option: str, chooser: Chooser) -> RosCamera:
+        """Camera of an image topic."""
+        chosen = self._info(topic, option, chooser)
+        camera = RosCamera.of(self.log.first(chosen), _is_rectified(topic), f"{self.name}: {chosen}")
+        self._cameras[chosen] = (camera, _is_rectified(topic))
+        found = size_of(chooser.images[topic], f"{self.name}: {topic}")
+        expected = camera.camera.width, camera.camera.height
+        if found != expected:
+            raise DuagError(
+                f"{self.name}: {topic} is {found[0]}x{found[1]}, expected {expected[0]}x{expected[1]} as in {chosen}"
+            )
+        return camera
+
+    @cached_property
+    def color_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Where in the colour images every pixel of the recording's camera lies."""
+        return self.color_camera.maps() if self.settings.undistort else None
+
+    @cached_property
+    def depth_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Where in the depth images every pixel of their pinhole lies; None if they need not be undistorted.
+
+        Depth that is registered has the distortion of colour; that of another camera its own.
+        """
+        return self.color_maps if self.T_color_depth is None else self.depth_camera.maps()
+
+    # --- where the cameras are
+
+    def _extrinsics(self) -> Array | None:
+        """T_color_depth [4, 4]; None if depth is registered already."""
+        s, color, depth = self.settings, self.color_camera, self.depth_camera
+        same = color.camera == depth.camera and color.frame_id == depth.frame_id != ""
+        named = any(hint in self.depth.lower() for hint in REGISTERED)
+        if s.registered == "yes" or (s.registered == "auto" and not s.T_color_depth and (same or named)):
+            if (color.camera.width, color.camera.height) != (depth.camera.width, depth.camera.height):
+                raise DuagError(
+                    f"{self.name}: {self.depth} is {depth.camera.width}x{depth.camera.height}, expected "
+                    f"{color.camera.width}x{color.camera.height} of colour that it is registered to"
+                )
+            return None
+        if s.T_color_depth:
+            return extrinsics_of("T_color_depth", s.T_color_depth)
+        named_frames = bool(color.frame_id and depth.frame_id)
+        T = (
+            self.transforms.lookup(color.frame_id, depth.frame_id)
+            if named_frames
+            else self._realsense_extrinsics()
+        )
+        if T is None:
+            raise DuagError(
+                f"{self.name}: {self.depth} is seen from {depth.frame_id!r}, colour from {color.frame_id!r}, and "
+                f"/tf_static does not tie them{self.transforms.moving_words()}; expected --set T_color_depth="
+                "'x y z qw qx qy qz' or registered=yes"
+            )
+        return T
+
+    def _realsense_extrinsics(self) -> Array | None:
+        """T_color_depth [4, 4] of a recording by RealSense's own software: each stream tells T_stream_reference."""
+        found = []
+        for image in (self.color, self.depth):
+            topic = f"{image.removesuffix('/image/data')}/tf/0"
+            if not self.log.of_type("geometry_msgs/msg/Transform", below=topic.removesuffix("/0")):
+                return None
+            m = self.log.first(topic)
+            found.append(pose_matrix(m.translation, m.rotation, f"{self.name}: {topic}"))
+        return found[0] @ se3.inverse(found[1])
+
+    @cached_property
+    def imu(self) -> Imu | None:
+        """What the IMU measured, in order of time."""
+        return self._motion.imu(self.settings.imu) if self.settings.imu else None
+
+    @cached_property
+    def odometry(self) -> CameraPoses | None:
+        """Poses of the colour camera by another odometry."""
+        return self._motion.poses(self.settings.odometry, "odometry") if self.settings.odometry else None
+
+    # --- which messages
+
+    def time_ns(self, entry: Entry) -> int:
+        """The time of a message by the clock that the options choose."""
+        source = self.settings.time_source
+        if source == "header":
+            return sound_time(entry.header_ns(), f"{self.name}: {entry.topic}")
+        if source == "log":
+            return entry.log_ns
+        if entry.publish_ns is None:
+            raise DuagError(
+                f"{self.name}: bags of ROS hold no times of publication, expected time_source=header or log"
+            )
+        return entry.publish_ns
+
+    @cached_property
+    def pairs(self) -> dict[int, int]:
+        """Time of a colour image -> time of its depth image."""
+        stamps: dict[str, list[int]] = {self.color: [], self.depth: []}
+        delays = []
+        cameras = _Cameras(self._cameras, self.name)
+        for entry in self.log.entries(self.color, self.depth, *self._cameras):
+            if entry.topic in self._cameras:
+                cameras.see(entry)
+                continue
+            stamps[entry.topic].append(self.time_ns(entry))
+            delays.append(entry.log_ns - stamps[entry.topic][-1])
+        self._delays_ns = np.array(delays, dtype=np.int64)
+        for topic, times in stamps.items():
+            if times != sorted(times):
+                self.warnings.append(f"{topic}: times go backwards; images are taken in order of time")
+            if len(set(times)) < len(times):
+                self.warnings.append(
+                    f"{topic}: {len(times) - len(set(times))} images repeat a time; left out"
+                )
+            if not any(times):
+                raise DuagError(
+                    f"{self.name}: {topic}: all times are zero, expected times, or --set time_source=log"
+                )
+        listed = {topic: [Listed(t, Path()) for t in sorted(set(times))] for topic, times in stamps.items()}
+        found = associate(listed[self.color], listed[self.depth], self.settings)
+        if not found:
+            away = nearest_s(
+                [d.stamp_ns for d in listed[self.depth]], [c.stamp_ns for c in listed[self.color]]
+            )
+            raise DuagError(
+                f"{self.name}: no image on {self.depth} within {self.settings.limit_ns / NANOSECONDS:g} s of one on "
+                f"{self.color} (the nearest is {away:.3f} s away), expected pairs, or --set max_difference_s=SECONDS"
+            )
+        alone = len(listed[self.color]) - len(found)
+        if alone:
+            self.warnings.append(
+                f"{alone} of {len(listed[self.color])} colour images have no depth near in time"
+            )
+        if min(c.stamp_ns for c, _ in found) + self.shift_ns < 0:
+            raise DuagError(f"{self.name}: clock_offset_s = {self.settings.clock_offset_s} leads before 1970")
+        return {c.stamp_ns: d.stamp_ns for c, d in found}
+
+    def clock(self, robot: str) -> RobotClock:
+        """What the times of the images say about the robot's clock."""
+        first, last = min(self.pairs), max(self.pairs)
+        header = self.settings.time_source == "header"
+        return RobotClock(robot, self.log, self.namespace, self._delays_ns, first, last, header)
+
+    def frames(self) -> Iterator[tuple[int, Any, Any]]:
+        """Time, colour and depth message of every pair, in order of time; holds no more than it must."""
+        order = sorted(self.pairs)
+        groups = [{self.color: time, self.depth: self.pairs[time]} for time in order]
+        for time, found in zip(order, gathered(self.log, groups, self.time_ns), strict=False):
+            yield time, found[self.color].read(), found[self.depth].read()
+
+    def sensors(self) -> dict[str, str]:
+        """What the log says about its source."""
+        moved = "registered to colour by the converter" if self.T_color_depth is not None else "registered"
+        moved = self.derived.words if self.derived else moved
+        return {"color_topic": self.color, "depth_topic": self.depth, "depth": moved}
+
+
+def _is_rectified(topic: str) -> bool:
+    """Whether images are undistorted, by the name of their topic."""
+    name = PurePosixPath(topic.removesuffix("/compressedDepth").removesuffix("/compressed")).name
+    return name.startswith(RECTIFIED)
+
+
+def nearest_s(times_ns: list[int], others_ns: list[int]) -> float:
+    """The least difference between sorted times and sorted others, seconds."""
+    times, others = np.array(times_ns, dtype=np.int64), np.array(others_ns, dtype=np.int64)
+    after = np.searchsorted(others, times)
+    near = np.stack(
+        [others[np.clip(after, 0, len(others) - 1)], others[np.clip(after - 1, 0, len(others) - 1)]]
+    )
+    return float(np.abs(near - times).min()) / NANOSECONDS

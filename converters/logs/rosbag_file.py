@@ -1,0 +1,157 @@
+"""Bags of ROS 1 (`.bag`) and ROS 2 (`.db3`, folders of `ros2 bag`)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from converters.logs import foxglove
+from converters.logs.files import NANOSECONDS, Entry, Topic, sound_time, stamp_ns
+from pipeline.errors import DuagError
+from pipeline.files import check_file
+
+_READ = {
+    "builtin_interfaces": "Time",
+    "std_msgs": "Header",
+    "geometry_msgs": "Point Pose PoseStamped PoseWithCovariance PoseWithCovarianceStamped Quaternion Transform "
+    "TransformStamped Vector3",
+    "nav_msgs": "Odometry",
+    "sensor_msgs": "CameraInfo CompressedImage Image Imu PointCloud2 PointField RegionOfInterest",
+    "tf2_msgs": "TFMessage",
+}
+READ_TYPES = {f"{package}/msg/{name}" for package, names in _READ.items() for name in names.split()}
+LARGEST_CHUNK = 256 << 20  # bytes, unpacked; recorders write some megabytes
+
+
+class RosBag:
+    """A bag, read by rosbags. Bags of ROS 2 without types are read with those of Humble."""
+
+    def __init__(self, path: Path) -> None:
+        from rosbags.highlevel import AnyReader
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.typesys import Stores, get_typestore
+
+        self.path = path
+        hint = "; `rosbag reindex` mends one that was cut short" if path.suffix == ".bag" else ""
+        wanted = f"a bag of ROS 1 or ROS 2{hint}"
+        for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+            check_file(file, wanted)
+        with reading(path, wanted):
+            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            self._reader.open()
+            check_definitions(self._reader.typestore.fielddefs)
+            for reader in self._reader.readers:
+                if isinstance(reader, Reader1):
+                    _bound_chunks(reader)
+        self._encoding = "cdr" if self._reader.is2 else "ros1"
+        self.topics: dict[str, Topic] = {}
+        for c in self._reader.connections:
+            count = c.msgcount + (self.topics[c.topic].count if c.topic in self.topics else 0)
+            kind = foxglove.ROS_TYPES.get(foxglove.plain_name(c.msgtype), c.msgtype)
+            self.topics[c.topic] = Topic(c.topic, kind, c.msgtype, self._encoding, count)
+
+    def entries(self, topics: Sequence[str]) -> Iterator[Entry]:
+        connections = [c for c in self._reader.connections if c.topic in topics]
+        if not connections:
+            return
+        with reading(self.path, "a sound bag of ROS 1 or ROS 2"):
+            for connection, log_ns, raw in self._reader.messages(connections=connections):
+                read = partial(self._read, connection, raw)
+                header = partial(ros_header_ns, raw, self._encoding, f"{self.path}: {connection.topic}")
+                if foxglove.plain_name(connection.msgtype) in foxglove.ROS_TYPES:
+                    header = partial(_stamp_of, read)
+                time_ns = sound_time(log_ns, f"{self.path}: {connection.topic}")
+                yield Entry(connection.topic, time_ns, None, raw, read, header)
+
+    def _read(self, connection: Any, raw: bytes) -> Any:
+        where = f"{self.path}: {connection.topic}"
+        message = deserialised(self._reader.deserialize, raw, connection.msgtype, where)
+        return foxglove.as_ros(foxglove.plain_name(connection.msgtype), message, where)
+
+    def close(self) -> None:
+        self._reader.close()
+
+
+def _bound_chunks(reader: Any) -> None:
+    """Let no chunk of a bag of ROS 1 unpack into more than memory."""
+    import bz2
+
+    import lz4.frame
+
+    def bounded(unpack: Any) -> Any:
+        opener = {
+            bz2.decompress: bz2.BZ2Decompressor,
+            lz4.frame.decompress: lz4.frame.LZ4FrameDecompressor,
+        }.get(unpack)
+        if opener is None:
+            return unpack
+
+        def decompress(data: bytes) -> bytes:
+            stream = opener()
+            out = bytes(stream.decompress(data, LARGEST_CHUNK))
+            if not stream.eof:
+                raise ValueError(f"a chunk that is broken, or unpacks to more than {LARGEST_CHUNK} bytes")
+            return out
+
+        return decompress
+
+    reader.chunks = {
+        at: chunk._replace(decompressor=bounded(chunk.decompressor)) for at, chunk in reader.chunks.items()
+    }
+
+
+@contextmanager
+def reading(path: Path, expected: str) -> Iterator[None]:
+    """Turn whatever a reader stumbles over in a broken file into one line."""
+    try:
+        yield
+    except (DuagError, GeneratorExit):
+        raise
+    except Exception as error:
+        raise DuagError(f"{path}: {reason(error)}, expected {expected}") from error
+
+
+def reason(error: Exception) -> str:
+    """What an error says, on one line; its kind if it says nothing."""
+    return " ".join(str(error).rstrip(".").split())[:200] or type(error).__name__
+
+
+def check_definitions(found: Mapping[str, Any]) -> None:
+    """Refuse a log that defines types that are read here otherwise than ROS does. found: fields by type."""
+    from rosbags.typesys import Stores, get_typestore
+
+    standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
+    for name in sorted(set(found) & READ_TYPES):
+        has, wanted = ({field.lower(): kind for field, kind in types[name][1]} for types in (found, standard))
+        for field in wanted:
+            if has.get(field) != wanted[field]:
+                raise ValueError(f"its {name} has no field {field} as ROS has it")
+
+
+def deserialised(read: Any, raw: bytes, kind: str, where: str) -> Any:
+    """A message of ROS from its bytes, or an error that names its topic."""
+    try:
+        return read(raw, kind)
+    except Exception as error:  # whatever broken bytes provoke
+        raise DuagError(f"{where} holds {len(raw)} bytes that are no {kind} ({reason(error)})") from error
+
+
+def ros_header_ns(raw: bytes, encoding: str, where: str) -> int:
+    """Stamp of a message that begins with a header, without reading the rest."""
+    try:
+        if encoding == "cdr":
+            order = "<" if raw[1] & 1 else ">"
+            seconds, nanoseconds = struct.unpack_from(f"{order}iI", raw, 4)
+        else:
+            seconds, nanoseconds = struct.unpack_from("<II", raw, 4)
+    except (struct.error, IndexError) as error:
+        raise DuagError(f"{where} holds {len(raw)} bytes, expected a message with a header") from error
+    return int(seconds) * NANOSECONDS + int(nanoseconds)
+
+
+def _stamp_of(read: Any) -> int:
+    return stamp_ns(read())

@@ -1,0 +1,166 @@
+"""Which logs belong to which robot: by files and folders, by namespaces, or by a TOML file.
+
+time_source = "header"            # options for all robots
+
+[robots.jackal]
+logs = ["jackal_0.bag", "jackal_1.bag"]      # beside this file; one log in several pieces
+namespace = "/jackal"                        # only topics below it
+color = "/jackal/camera/color/image_raw"     # options for this robot
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from converters.base import robot_names
+from converters.image_files import options_of
+from converters.logs.files import SUFFIXES
+from converters.logs.options import LogOptions
+from pipeline.errors import DuagError, closest
+from pipeline.files import check_file, read_text
+from schemas import topics
+
+GROUPING = ("namespaces", "pieces")  # options that say which logs are whose, which a TOML file does itself
+
+
+@dataclass(frozen=True)
+class Source:
+    """The logs of one robot, one log in pieces; what the user said about them. label: how the recording calls them."""
+
+    robot: str
+    paths: tuple[Path, ...]
+    namespace: str
+    label: str
+    settings: LogOptions
+
+    @property
+    def name(self) -> str:
+        """How messages call it: the log, or the folder of several."""
+        return str(self.paths[0] if len(self.paths) == 1 else self.paths[0].parent)
+
+
+def sources_of(src: Path, options: Mapping[str, Any]) -> list[Source]:
+    """Logs, namespace and settings of every robot, in order of its name.
+
+    Args:
+        src: a log, a folder or a TOML file. options: what was said on the command line; it has the last word.
+    Raises:
+        DuagError: there is no log, or something is said that is not known.
+    """
+    if src.suffix == ".toml":
+        return _from_file(src, options)
+    settings = options_of(LogOptions, options, "ros")
+    spaces = [text.strip() for text in settings.namespaces.split(",") if text.strip()]
+    if spaces or settings.pieces:
+        paths = tuple(logs_in(src))
+        parts = [(paths, space, space) for space in spaces or [""]]
+    else:
+        groups = _groups(src)
+        parts = [(paths, "", label if len(groups) > 1 else "") for label, paths in groups.items()]
+    names = [robot_of(space) for space in spaces] or robot_names(len(parts))
+    if len(set(names)) < len(names):
+        raise DuagError(
+            f"{src}: namespaces {', '.join(spaces)} name a robot twice, expected different robots"
+        )
+    return [Source(name, *part, settings) for name, part in zip(names, parts, strict=True)]
+
+
+def robot_of(namespace: str) -> str:
+    """The name of a robot by its namespace: "/Husky-1" is husky_1."""
+    name = re.sub(r"[^a-z0-9_]", "_", namespace.lower().strip("/"))
+    return name if name[:1].isalpha() else f"robot_{name}"
+
+
+def _from_file(path: Path, options: Mapping[str, Any]) -> list[Source]:
+    """The robots that a TOML file lists."""
+    try:
+        content = tomllib.loads(read_text(path, "a TOML file that lists robots"))
+    except tomllib.TOMLDecodeError as error:
+        raise DuagError(f"{path}: not valid TOML: {error}") from error
+    robots = content.pop("robots", None)
+    if not isinstance(robots, dict) or not robots:
+        raise DuagError(f"{path}: found no [robots.NAME], expected one for each robot")
+    for option in GROUPING:
+        if option in content or option in options:
+            raise DuagError(
+                f"{path}: {option} is said, expected `logs` and `namespace` of each robot instead"
+            )
+    _check_names(content, f"{path}")
+    sources = []
+    for name in sorted(robots):
+        where = f"{path}: [robots.{name}]"
+        row = robots[name]
+        if not isinstance(row, dict) or not re.fullmatch(topics.ROBOT_NAME, name):
+            raise DuagError(
+                f"{where} expected a table, named with lower-case letters, digits and underscores"
+            )
+        row = dict(row)
+        logs, namespace = row.pop("logs", None), row.pop("namespace", "")
+        if not isinstance(logs, list) or not logs or not all(isinstance(log, str) for log in logs):
+            raise DuagError(f"{where} logs = {logs!r}, expected a list of files or folders")
+        if not isinstance(namespace, str) or (namespace and not namespace.startswith("/")):
+            raise DuagError(f"{where} namespace = {namespace!r}, expected text that begins with a slash")
+        _check_names(row, where, "logs", "namespace")
+        if isinstance(row.get("truth_file"), str):
+            row["truth_file"] = str(path.parent / row["truth_file"])
+        settings = options_of(LogOptions, {**content, **row, **options}, where)
+        paths = tuple(inner for log in logs for inner in logs_in(path.parent / log))
+        label = " ".join(Path(log).name for log in logs) if len(robots) > 1 else ""
+        sources.append(Source(name, paths, namespace, label, settings))
+    return sources
+
+
+def _check_names(table: Mapping[str, Any], where: str, *more: str) -> None:
+    """Refuse a key that is no option."""
+    known = [*more, *(name for name in LogOptions.model_fields if name not in GROUPING)]
+    for key in table:
+        if key not in known:
+            raise DuagError(f"{where} {key} is no option; {closest(key, known, 'options')}")
+
+
+def logs_in(src: Path) -> list[Path]:
+    """All logs of a folder, or the log itself, in the order of the numbers in their names."""
+    return [path for group in _groups(src).values() for path in group]
+
+
+def _groups(src: Path) -> dict[str, tuple[Path, ...]]:
+    """The logs of every robot, by the name of its log or folder."""
+    if not src.exists():
+        raise DuagError(f"{src}: no such file or folder, expected a log")
+    if src.is_file() and src.suffix not in SUFFIXES:
+        raise DuagError(f"{src}: is no log, expected one of {', '.join(SUFFIXES)}")
+    if not src.is_dir():
+        check_file(src, "a log")
+    if is_log(src):
+        return {src.name: (src,)}
+    groups = {}
+    for path in sorted(src.iterdir(), key=_natural):
+        inner = (path,) if is_log(path) else _inside(path)
+        if inner:
+            groups[path.name] = inner
+    if not groups:
+        raise DuagError(f"{src}: found no log, expected one for each robot")
+    return groups
+
+
+def _inside(folder: Path) -> tuple[Path, ...]:
+    if not folder.is_dir() or folder.name.startswith("."):
+        return ()
+    return tuple(path for path in sorted(folder.iterdir(), key=_natural) if is_log(path))
+
+
+def is_log(path: Path) -> bool:
+    """Whether a path is one log, by its name: a file, or a folder of `ros2 bag`."""
+    if path.is_file():
+        return path.suffix in SUFFIXES and not path.name.startswith(".")
+    return (path / "metadata.yaml").is_file()
+
+
+def _natural(path: Path) -> list[Any]:
+    """Order in which 9.bag comes before 10.bag."""
+    return [(int(word), "") if word.isdigit() else (0, word) for word in re.split(r"(\d+)", path.name)]

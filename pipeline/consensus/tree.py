@@ -1,0 +1,246 @@
+"""One robot's node in the elimination along a tree of robots: what it makes of the messages of its neighbours there.
+
+One exchange is a block up and a step down every link of the tree: a Gauss-Newton step of the whole team, damped after
+Levenberg and Marquardt where it would not lower the cost. A matrix is sent again only where rotations below moved (or
+weights or damping changed); gradients always. The root only adds and decides on the damping; it sees a quadratic form
+over shared keyframes, nobody's graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.consensus import factors as pose_factors
+from pipeline.consensus.config import PoseConsensusConfig
+from pipeline.consensus.elimination import Block, Front, Step, Variable, damped, shared_variables
+from pipeline.consensus.factors import Factors, retract
+from pipeline.consensus.robust import RobustWeights
+
+Array = NDArray[np.float64]
+Message = dict[Variable, int] | tuple[int, Block] | Step
+"""Up: which robots have which variables, or a block and its exchange. Down: a step."""
+_SLOW = 0.5  # share of the step before from which the matrices are too old
+_ROUNDING = 1e-10  # relative rise of the cost that is no rise
+
+
+@dataclass(frozen=True)
+class TreePlace:
+    """A robot's place: own index, parent (None: it is the root), children, and bit mask of all robots below."""
+
+    own: int
+    parent: int | None
+    children: tuple[int, ...]
+    subtree: int
+
+    @staticmethod
+    def of(own: int, parent: Mapping[int, int | None]) -> TreePlace:
+        """From the parent of every robot of the component."""
+        subtree = 0
+        for robot in parent:
+            at: int | None = robot
+            while at is not None and at != own:
+                at = parent[at]
+            subtree |= (at == own) << robot
+        return TreePlace(own, parent[own], tuple(sorted(r for r, p in parent.items() if p == own)), subtree)
+
+
+@dataclass(frozen=True)
+class TreeGraph:
+    """What one robot knows of the team's graph.
+
+    variables: own keyframes, then copies of neighbours' keyframes. poses: [v, 4, 4], where they start; a copy must
+    start where its owner starts, to the last bit but a few, because every step moves both alike. shared: variables
+    that others have too, with the mask of all robots that have them as far as their owner knows; 0 for copies.
+    trusted: factors of weight one. doubted: groups of factors with robust weights.
+    """
+
+    variables: Sequence[Variable]
+    poses: Array
+    shared: Mapping[Variable, int]
+    trusted: Factors
+    doubted: Sequence[tuple[Factors, RobustWeights]]
+
+
+class TreeNode:
+    """One node. Messages come in by `take_...`; `advance` computes; what is to be sent lies in `outbox`."""
+
+    def __init__(
+        self, place: TreePlace, graph: TreeGraph, config: PoseConsensusConfig, tolerance: float
+    ) -> None:
+        """tolerance: the steps end when nothing moves more than this (m, rad)."""
+        self.place, self.graph, self.config, self.tolerance = place, graph, config, tolerance
+        self.poses = self._before = np.array(graph.poses)
+        self.exchange, self.finished = 0, False
+        self.outbox: list[tuple[int, Message]] = []
+        self.largest_step = 0.0
+        self.factorisations = 0
+        self._factors = Factors.concatenate([graph.trusted, *(factors for factors, _ in graph.doubted)])
+        self._front: Front | None = None
+        self._fronts: dict[int, dict[Variable, int]] = {}
+        self._blocks: dict[int, Block] = {}
+        self._matrices: dict[int, Array] = {}  # by child: the last one that came
+        self._damping = self._damped = 0.0
+        self._moved_rad = self._step_before = np.inf  # since the last linearisation; of the exchange before
+        self._cost: float | None = None  # at the root: of the last accepted poses
+        self._sent = -1  # exchange whose block went up
+
+    # --- messages
+
+    def take_front(self, child: int, everybody: dict[Variable, int]) -> None:
+        """A child's subtree shares these variables with others."""
+        if child not in self.place.children or child in self._fronts:
+            raise ValueError("front: not from a child, or told before")
+        self._fronts[child] = everybody
+
+    def take_block(self, child: int, exchange: int, block: Block) -> None:
+        """What is left of a child's subtree in this exchange."""
+        if exchange != self.exchange:
+            raise ValueError(f"block of exchange {exchange} in exchange {self.exchange}")
+        if block.H is not None:
+            self._matrices[child] = block.H
+        elif child not in self._matrices:
+            raise ValueError("block without its first matrix")
+        self._blocks[child] = block
+
+    def take_step(self, sender: int, step: Step) -> None:
+        """The parent's answer."""
+        if sender != self.place.parent:
+            raise ValueError("step: not from the parent")
+        self._descend(step)
+
+    def waits_for_front(self, child: int) -> bool:
+        """Whether a child has not yet told what it shares."""
+        return child in self.place.children and child not in self._fronts
+
+    def variables_of(self, child: int) -> int:
+        """How many variables a child's blocks are about."""
+        if child not in self._fronts:
+            raise ValueError("block: not from a child, or before its front")
+        return len(self._fronts[child])
+
+    def variables_above(self) -> int:
+        """How many variables a step of the parent is about."""
+        if self._front is None:
+            raise ValueError("step: before all children have told what they share")
+        return len(self._front.shared)
+
+    # --- one exchange
+
+    def advance(self) -> None:
+        """Lay out once all children have said what they share; send a block up once theirs are here."""
+        if self._front is None and set(self._fronts) == set(self.place.children):
+            self._lay_out()
+        here = set(self._blocks) == set(self.place.children)
+        if self._front is not None and here and not self.finished and self._sent != self.exchange:
+            self._reduce(self._front)
+
+    def _lay_out(self) -> None:
+        """All children have said what they share: say the same to the parent."""
+        known = dict(self.graph.shared)
+        for child in self.place.children:
+            for v, mask in self._fronts[child].items():
+                known[v] = known.get(v, 0) | mask
+        shared = shared_variables(known, self.place.subtree)
+        children = {c: list(self._fronts[c]) for c in self.place.children}
+        self._front = Front(self.graph.variables, children, shared)
+        if self.place.parent is not None:
+            self.outbox.append((self.place.parent, {v: known[v] for v in shared}))
+
+    def _reduce(self, front: Front) -> None:
+        """All blocks of this exchange are here: eliminate; send up, or decide at the root."""
+        self._sent = self.exchange
+        reweighted = self._weigh()
+        weights, blocks = self._weights(), self._blocks.values()
+        g, jacobians = pose_factors.gradient(self._factors, weights, self.poses)
+        H = self._relinearised(front, jacobians, reweighted)
+        block = Block(
+            H,
+            front.eliminate(g, {child: b.g for child, b in self._blocks.items()}),
+            pose_factors.cost(self._factors, self.poses, weights) + sum(b.cost for b in blocks),
+            max([self.largest_step, *(b.largest_step for b in blocks)]),
+            reweighted or any(b.reweighted for b in blocks),
+            not self.robust_done or any(b.unsure for b in blocks),
+        )
+        if self.place.parent is None:
+            self._decide_step(block)
+        else:
+            self.outbox.append((self.place.parent, (self.exchange, block)))
+
+    def _relinearised(self, front: Front, jacobians: tuple[Array, Array], reweighted: bool) -> Array | None:
+        """The eliminated matrix, or None if the last one still holds: here, and everywhere below."""
+        moved = self._moved_rad > self.config.relinearise_rad
+        stale = moved or reweighted or self._damping != self._damped
+        if stale:
+            anchor = 0 if self.place.parent is None else None
+            self._H_own = damped(self._factors, jacobians, len(self.poses), self._damping, anchor)
+            self._moved_rad, self._damped = 0.0, self._damping
+        if not stale and all(block.H is None for block in self._blocks.values()):
+            return None
+        self.factorisations += 1
+        return front.factorise(self._H_own, self._matrices)
+
+    def _decide_step(self, block: Block) -> None:
+        """At the root: was the last step good, and what comes next."""
+        small = block.largest_step < self.tolerance and self.exchange > 0
+        accepted = block.reweighted or self._cost is None or block.cost <= self._cost * (1 + _ROUNDING)
+        damping = max(1e-6, 10 * self._damping) if not accepted else self._damping / 10
+        if accepted:
+            self._cost = block.cost
+            damping = damping if damping > 1e-8 else 0.0
+        fresh = not accepted or block.largest_step > _SLOW * self._step_before
+        self._step_before = block.largest_step if self.exchange else np.inf
+        finished = small and not block.unsure
+        self._descend(Step(self.exchange, accepted, finished, fresh, damping, np.zeros((0, 6))))
+
+    def _descend(self, step: Step) -> None:
+        """Move, and hand the children their part of the step."""
+        if step.exchange != self.exchange or self._sent != self.exchange or self._front is None:
+            raise ValueError(f"step of exchange {step.exchange} in exchange {self.exchange}")
+        if step.accepted:
+            delta = self._front.resolve(step.delta)
+            own = delta[self._front.own_slots]
+            self._before, self.poses = self.poses, retract(self.poses, own)
+            self.largest_step = float(np.abs(own).max())
+            self._moved_rad += float(np.abs(own[:, 3:]).max())
+        else:
+            delta, self.poses = np.zeros((0, 6)), self._before
+        for child in self.place.children:
+            part = delta[self._front.child_slots[child]] if step.accepted else delta
+            answer = Step(step.exchange, step.accepted, step.finished, step.fresh, step.damping, part)
+            self.outbox.append((child, answer))
+        if step.fresh:
+            self._moved_rad = np.inf
+        self._damping, self.finished = step.damping, step.finished
+        self._blocks = {}
+        self.exchange += 1
+
+    # --- robust weights: one step of the schedule per exchange
+
+    def _weigh(self) -> bool:
+        """Take the next robust weights; True if some changed."""
+        received, changed = float(self.exchange * self.config.robust_packets), False
+        for factors, robust in self.graph.doubted:
+
+            def squared(factors: Factors = factors) -> Array:
+                return pose_factors.squared_residuals(factors, self.poses)
+
+            changed |= robust.advance(received, False, squared)
+        return changed
+
+    def _weights(self) -> Array:
+        doubted = [robust.weights for _, robust in self.graph.doubted]
+        return np.concatenate([np.ones(len(self.graph.trusted)), *doubted])
+
+    @property
+    def robust_done(self) -> bool:
+        """Whether the weights of all own factors are final."""
+        return all(robust.done for _, robust in self.graph.doubted)
+
+    @property
+    def cost(self) -> float:
+        """Of the own factors, weighted."""
+        return pose_factors.cost(self._factors, self.poses, self._weights())

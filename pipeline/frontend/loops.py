@@ -1,0 +1,92 @@
+"""Loops inside one robot's path: places recognised by features, believed only if registrations both ways agree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import streams
+from pipeline.frontend.bundle import Images, View
+from pipeline.frontend.config import LoopConfig
+from pipeline.frontend.keyframes import KeyframePair, overlap
+from pipeline.geometry import se3
+from pipeline.registration import RegistrationConfig, register
+from pipeline.registration.features import matches, ransac
+
+Array = NDArray[np.float64]
+
+
+def find_loops(
+    T_map_keyframes: Array,
+    views: Sequence[View],
+    images: Images,
+    config: LoopConfig,
+    registration: RegistrationConfig,
+    seed: int,
+    robot: str,
+) -> list[KeyframePair]:
+    """Pairs of keyframes that show the same place although their poses say that they do not, or not by enough.
+
+    Candidates have many matching features; three-point samples give a motion; registrations from there, one way and
+    the other, must be good and agree. What passes still has only a robust weight in the graph.
+
+    Args:
+        T_map_keyframes: [k, 4, 4], as tracked. seed, robot: of the random stream.
+    """
+    found = []
+    for second in range(config.min_gap, len(views)):
+        candidates = _resembling(views, second, config)
+        for first in candidates:
+            T_first_second = se3.inverse(T_map_keyframes[first]) @ T_map_keyframes[second]
+            seen = overlap(views[first].reference.levels[-1], views[second].coarsest, T_first_second)
+            if seen >= config.known_overlap:
+                continue  # the joint optimisation compares them anyway
+            pair = _verified(views, images, first, second, config, registration, seed, robot)
+            if pair is not None:
+                found.append(pair)
+    return found
+
+
+def _resembling(views: Sequence[View], second: int, config: LoopConfig) -> list[int]:
+    """Earlier keyframes with most matches among the strongest features, ascending."""
+    most = config.features_compared
+    theirs = views[second].features.descriptors[:most]
+    scored = []
+    for first in range(second - config.min_gap + 1):
+        score = len(matches(views[first].features.descriptors[:most], theirs, config.ratio))
+        if score >= config.min_matches:
+            scored.append((-score, first))
+    return sorted(first for _, first in sorted(scored)[: config.candidates])
+
+
+def _verified(
+    views: Sequence[View],
+    images: Images,
+    first: int,
+    second: int,
+    config: LoopConfig,
+    registration: RegistrationConfig,
+    seed: int,
+    robot: str,
+) -> KeyframePair | None:
+    """The registration of a candidate, if it withstands all tests."""
+    ours, theirs = views[first].features, views[second].features
+    pairs = matches(ours.descriptors, theirs.descriptors, config.ratio)
+    if len(pairs) < config.min_inliers:
+        return None
+    rng = streams.generator(seed, "frontend.loop", robot=robot, first=first, second=second)
+    points = ours.points[pairs[:, 0]].astype(np.float64), theirs.points[pairs[:, 1]].astype(np.float64)
+    guess, agree = ransac(*points, config.inlier_m, config.hypotheses, rng)
+    if agree.sum() < max(config.min_inliers, config.min_inlier_share * len(pairs)):
+        return None
+    levels = len(registration.iterations)
+    forth = register(views[first].reference, images(second, levels), guess, registration)
+    back = register(views[second].reference, images(first, levels), se3.inverse(guess), registration)
+    if not (forth.ok and back.ok) or min(forth.overlap, back.overlap) < config.min_overlap:
+        return None
+    apart_m, apart_rad = se3.distance(forth.T_reference_target, se3.inverse(back.T_reference_target))
+    if apart_m > config.max_disagreement_m or apart_rad > config.max_disagreement_rad:
+        return None
+    return KeyframePair(first, second, forth.T_reference_target, forth.information)

@@ -1,0 +1,146 @@
+"""Sweeps of a LiDAR as depth images of a camera beside it, with the standard deviation of every pixel.
+
+Neighbouring beams that meet one surface are joined to triangles, as the LiDAR sees them. Drawn from the camera with a
+z-buffer they say two things: which points the camera cannot see, because a nearer surface hides them, and how deep the
+surface is between the points. Pixels that a visible point falls on have exactly its depth; between the points the
+depth is interpolated, and less certain the more it changes there.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Image = NDArray[np.float32]
+NEAREST_M = 0.05
+LONGEST_SIDE = 0.06  # of a triangle as the LiDAR sees it, in focal lengths: rings may be 3 degrees apart
+SAME_SURFACE = 0.05  # relative step of range between neighbouring beams that is always one surface
+LEAST_SLOPE_RAD = np.radians(
+    10.0
+)  # else: the angle between the beam and the surface; at less there is an edge
+HIDDEN = 0.03  # relative depth behind the nearest surface from which a point is hidden
+SIGMA_OF_CHANGE = 0.25  # of an interpolated depth, as a share of the change of depth over its triangle
+
+
+def lidar_depth(
+    points_lidar: Array, T_camera_lidar: Array, camera: PinholeCamera, range_sigma_m: float
+) -> tuple[Image, Image]:
+    """Depth of a sweep as the camera would see it, and its standard deviation.
+
+    Args:
+        points_lidar: [n, 3], metres, of one sweep, all as of one time. T_camera_lidar: [4, 4].
+        range_sigma_m: standard deviation of a range.
+    Returns:
+        Depth along z and sigma, float32 [camera.height, camera.width], metres; both 0 where nothing is known.
+    """
+    points, rays = _before(points_lidar, T_camera_lidar, camera)
+    pixels, inverse = camera.project(points), 1 / points[:, 2]
+    triangles = _surfaces(rays)
+    between, change = _drawn(pixels[triangles], inverse[triangles], camera)
+
+    u, v = np.rint(pixels).astype(np.int64).T
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    pixel = np.where(inside, v * camera.width + u, 0)
+    behind_m = np.where(between[pixel] > 0, points[:, 2] - 1 / np.maximum(between[pixel], 1e-9), 0)
+    visible = np.flatnonzero(inside & (behind_m <= HIDDEN * points[:, 2] + 3 * range_sigma_m))
+    hit = visible[_largest(pixel[visible], inverse[visible])]
+
+    known = between > 0
+    depth = np.where(known, 1 / np.where(known, between, 1), 0)
+    sigma = np.where(known, np.hypot(range_sigma_m, SIGMA_OF_CHANGE * change), 0)
+    depth[pixel[hit]], sigma[pixel[hit]] = points[hit, 2], range_sigma_m
+    shape = camera.height, camera.width
+    return depth.reshape(shape).astype(np.float32), sigma.reshape(shape).astype(np.float32)
+
+
+def _before(points_lidar: Array, T_camera_lidar: Array, camera: PinholeCamera) -> tuple[Array, Array]:
+    """Points [m, 3] in and near the view, camera frame, and the same from the LiDAR's place, in the camera's axes."""
+    points = se3.transform(T_camera_lidar, points_lidar)
+    rays = points - T_camera_lidar[:3, 3]
+    front = (points[:, 2] > NEAREST_M) & (rays[:, 2] > NEAREST_M)
+    points, rays = points[front], rays[front]
+    pixels, size = camera.project(points), np.array([camera.width, camera.height])
+    margin = LONGEST_SIDE * camera.fx  # beside the image, for triangles that reach into it
+    near = ((pixels > -margin) & (pixels < size + margin)).all(axis=1)
+    return points[near], rays[near]
+
+
+def _surfaces(rays: Array) -> Indices:
+    """Triangles [t, 3] of neighbouring beams that meet one surface."""
+    from scipy.spatial import Delaunay, QhullError
+
+    beams, ranges = rays[:, :2] / rays[:, 2:], np.linalg.norm(rays, axis=1)
+    try:
+        triangles = (
+            Delaunay(beams).simplices.astype(np.int64) if len(beams) >= 3 else np.zeros((0, 3), np.int64)
+        )
+    except QhullError:  # all on one line
+        triangles = np.zeros((0, 3), np.int64)
+    sound = np.ones(len(triangles), bool)
+    for side in ((0, 1), (1, 2), (2, 0)):
+        a, b = triangles[:, side].T
+        near, far = np.minimum(ranges[a], ranges[b]), np.maximum(ranges[a], ranges[b])
+        across_m = (
+            np.linalg.norm(np.cross(rays[a], rays[b]), axis=1) / far
+        )  # of the nearer point from the other's beam
+        along_m = far - (rays[a] * rays[b]).sum(axis=1) / far
+        smooth = (far <= (1 + SAME_SURFACE) * near) | (np.arctan2(across_m, along_m) >= LEAST_SLOPE_RAD)
+        sound &= smooth & (np.linalg.norm(beams[a] - beams[b], axis=1) <= LONGEST_SIDE)
+    return triangles[sound]
+
+
+def _drawn(corners: Array, inverse: Array, camera: PinholeCamera) -> tuple[Array, Array]:
+    """Inverse depth of the nearest triangle at every pixel, flat, 0 where there is none; and its change of depth, m.
+
+    corners: [t, 3, 2], px. inverse: [t, 3], 1/m; linear over a triangle, which is exact.
+    """
+    nearest, change = np.zeros(camera.height * camera.width), np.zeros(camera.height * camera.width)
+    # sides as a u + b v + c >= 0 inside, row by row the span of columns where all three hold
+    p, q = corners[:, [1, 2, 0]], corners[:, [2, 0, 1]]
+    a, b = p[..., 1] - q[..., 1], q[..., 0] - p[..., 0]
+    c = -(a * p[..., 0] + b * p[..., 1])
+    area = a[:, 0] * corners[:, 0, 0] + b[:, 0] * corners[:, 0, 1] + c[:, 0]
+    usable = np.abs(area) > 1e-9
+    sides = (
+        np.stack([a, b, c], axis=-1)[usable] / area[usable, None, None]
+    )  # barycentric coordinates of (u, v, 1)
+    corners, inverse = corners[usable], inverse[usable]
+    first = np.clip(np.ceil(corners[..., 1].min(axis=1)), 0, camera.height).astype(np.int64)
+    last = np.clip(np.floor(corners[..., 1].max(axis=1)), -1, camera.height - 1).astype(np.int64)
+    triangle, row = _expanded(first, last)
+    slope, rest = sides[triangle, :, 0], sides[triangle, :, 1] * row[:, None] + sides[triangle, :, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        border = -rest / slope
+    low = np.where(slope > 0, border, np.where((slope == 0) & (rest < 0), np.inf, -np.inf)).max(axis=1)
+    high = np.where(slope < 0, border, np.inf).min(axis=1)
+    start = np.ceil(np.clip(low - 1e-9, 0, camera.width)).astype(np.int64)
+    stop = np.floor(np.clip(high + 1e-9, -1, camera.width - 1)).astype(np.int64)
+    span, column = _expanded(start, stop)
+    triangle, row = triangle[span], row[span]
+    at = np.stack([column, row, np.ones(len(row))], axis=-1)
+    found = np.einsum("nij,nj,ni->n", sides[triangle], at, inverse[triangle])
+    pixel = row * camera.width + column
+    chosen = _largest(pixel, found)
+    nearest[pixel[chosen]] = found[chosen]
+    depths = 1 / inverse[triangle[chosen]]
+    change[pixel[chosen]] = depths.max(axis=1) - depths.min(axis=1)
+    return nearest, change
+
+
+def _expanded(first: Indices, last: Indices) -> tuple[Indices, Indices]:
+    """Index k and value of all whole numbers from first[k] to last[k], in order."""
+    count = np.maximum(last - first + 1, 0)
+    index = np.repeat(np.arange(len(first)), count)
+    return index, np.arange(len(index)) - np.repeat(np.cumsum(count) - count, count) + first[index]
+
+
+def _largest(group: Indices, value: Array) -> Indices:
+    """Position of the largest value of every group, the first of equals."""
+    order = np.lexsort((-np.arange(len(group)), value, group))
+    last = np.append(group[order][1:] != group[order][:-1], True)[: len(order)]
+    return np.asarray(order[last], dtype=np.int64)

@@ -1,0 +1,159 @@
+"""What has moved: surfaces that stand where other views saw free space.
+
+In a rigid world a surface is in front of no other surface in any view that could see it: a point that a second view
+looks through was not there at that time, or is not there any more. One view may err, so several are asked, and a region
+must be of some size. What moves by less than the gate, or stands still in most views that see its place, is not found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config import Config
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.registration.pyramid import Level
+
+Array = NDArray[np.float64]
+Image = NDArray[np.floating]
+Mask = NDArray[np.bool_]
+
+
+class MovingConfig(Config):
+    """Finding what moves by depth alone."""
+
+    enabled: bool = True
+    gate_m: float = 0.15
+    """A point nearer by this than all that another view measured around its place stands in free space."""
+    gate_relative: float = 0.1
+    """The same as a fraction of the depth; the larger limit holds."""
+    views: int = 16
+    """Other views asked at most, those that look at the nearest places."""
+    min_views: int = 2
+    """Views that must have looked through a point; and they must be more than those that saw it there."""
+    min_region: float = 0.002
+    """Smallest connected region, as a share of the image: smaller ones are noise at edges."""
+    grow_px: int = 8
+    """Pixels, of the whole image, by which a region is enlarged: edges of what moves are mixed with what is behind."""
+    halvings: int = 2
+    """Times the images are halved before they are compared."""
+
+
+@dataclass(frozen=True)
+class _View:
+    T_map_camera: Array
+    inverse_depth: Image
+    nearest: Image  # largest inverse depth of 3x3 pixels
+    centre_map: Array
+
+
+class FreeSpace:
+    """What a set of views of one camera saw to be free."""
+
+    def __init__(self, camera: PinholeCamera, config: MovingConfig) -> None:
+        self.config, self._camera = config, camera
+        self._small = camera
+        for _ in range(config.halvings):
+            self._small = self._small.halved()
+        self._views: list[_View] = []
+
+    def add(self, depth_m: Image, T_map_camera: Array) -> None:
+        """Take a view. depth_m: [h, w], metres, 0 = unknown or masked."""
+        if self.config.enabled:
+            self._views.append(self._view(depth_m, T_map_camera))
+
+    def moving(self, depth_m: Image, T_map_camera: Array) -> Mask:
+        """Pixels [h, w] of a view that show what was not there when others of the set looked; it may be one of them."""
+        view = self._view(depth_m, T_map_camera)
+        v, u = np.nonzero(view.inverse_depth)
+        through, there = np.zeros(len(v), np.int32), np.zeros(len(v), np.int32)
+        z = 1 / view.inverse_depth[v, u].astype(np.float64)
+        points_map = se3.transform(view.T_map_camera, _points(self._small, u, v, z))
+        for other in self._nearest(view):
+            points = se3.transform(se3.inverse(other.T_map_camera), points_map)
+            seen, closer = in_front(points, other.nearest, self._small, self.config)
+            through[seen] += closer > 0
+            there[seen] += closer == 0
+        found = np.zeros(view.inverse_depth.shape, bool)
+        found[v, u] = (through >= self.config.min_views) & (through > there)
+        return self._regions(found)
+
+    def usable(self, depth_m: Image, T_map_camera: Array, mask: Mask | None) -> Mask | None:
+        """The pixels of a mask (None = all) that show nothing that moved; None = all."""
+        moving = self.moving(depth_m, T_map_camera) if self.config.enabled else np.zeros(1, bool)
+        if not moving.any():
+            return mask
+        return ~moving if mask is None else mask & ~moving
+
+    def _view(self, depth_m: Image, T_map_camera: Array) -> _View:
+        known = depth_m > 0
+        inverse = np.where(known, 1 / np.where(known, depth_m, 1), 0).astype(np.float32)
+        level = Level(self._camera, inverse, inverse)
+        for _ in range(self.config.halvings):
+            level = level.halved()
+        small = level.inverse_depth
+        centre = np.zeros(3)
+        v, u = np.nonzero(small)
+        if len(v):
+            centre = np.median(_points(self._small, u, v, 1 / small[v, u].astype(np.float64)), axis=0)
+        T = np.array(T_map_camera, dtype=np.float64)
+        return _View(T, small, largest_of_3x3(small), se3.transform(T, centre[None])[0])
+
+    def _nearest(self, view: _View) -> list[_View]:
+        """The views that look at the nearest places, itself excepted."""
+        others = [o for o in self._views if not np.array_equal(o.T_map_camera, view.T_map_camera)]
+        if len(others) <= self.config.views:
+            return others
+        distance = np.linalg.norm(np.array([o.centre_map for o in others]) - view.centre_map, axis=1)
+        return [others[k] for k in np.argsort(distance, kind="stable")[: self.config.views]]
+
+    def _regions(self, found: Mask) -> Mask:
+        """Connected regions that are large enough, enlarged, at full size."""
+        from scipy import ndimage
+
+        labels, count = ndimage.label(found, np.ones((3, 3)))
+        sizes = np.bincount(labels.ravel(), minlength=count + 1)
+        large = sizes >= self.config.min_region * found.size
+        large[0] = False
+        scale = 2**self.config.halvings
+        grown = large[labels]
+        if grown.any() and self.config.grow_px >= scale:
+            grown = ndimage.binary_dilation(grown, np.ones((3, 3)), self.config.grow_px // scale)
+        full = np.zeros((self._camera.height, self._camera.width), bool)
+        whole = grown.repeat(scale, axis=0).repeat(scale, axis=1)
+        full[: whole.shape[0], : whole.shape[1]] = whole
+        return full
+
+
+def in_front(
+    points: Array, nearest: Image, camera: PinholeCamera, config: MovingConfig
+) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
+    """Which of the points [n, 3], in the frame of a view, that view can tell about, and what it says.
+
+    nearest: `largest_of_3x3` of the view's inverse depth. Returns indices of the points whose place it looked at, and
+    for each 1 if it looked through, 0 if it saw a surface there. Points hidden behind what it saw are left out.
+    """
+    index = np.flatnonzero(points[:, 2] > 0.05)
+    uv = np.rint(camera.project(points[index])).astype(np.int64)
+    inside = (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
+    index, uv = index[inside], uv[inside]
+    inverse = nearest[uv[:, 1], uv[:, 0]]
+    index, inverse = index[inverse > 0], inverse[inverse > 0]
+    z_view, z_point = 1 / inverse.astype(np.float64), points[index, 2]
+    gate_m = np.maximum(config.gate_m, config.gate_relative * z_view)
+    said = np.where(z_point < z_view - gate_m, 1, np.where(z_point > z_view + gate_m, -1, 0)).astype(np.int8)
+    return index[said >= 0], said[said >= 0]
+
+
+def _points(camera: PinholeCamera, u: NDArray[np.int64], v: NDArray[np.int64], z: Array) -> Array:
+    return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
+
+
+def largest_of_3x3(image: Image) -> Image:
+    """Maximum over every pixel's 3x3 neighbourhood."""
+    padded = np.pad(image, 1)
+    rows = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
+    return np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])

@@ -1,0 +1,43 @@
+"""Every converter's fixture becomes a recording that passes the check."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import converters
+from pipeline import checks
+from tests.converters.test_image_folders import CASES
+from tests.converters.test_ros import Ros, scene
+from tests.converters.test_seven_scenes import make_sequence
+
+
+def ros_bag(version: int, container: str) -> Callable[[Path], Path]:
+    def make(root: Path) -> Path:
+        root.mkdir()
+        r = Ros(version)
+        return r.write(root / "bag", scene(r), container)
+
+    return make
+
+
+# name: dataset, how its fixture is made, options
+FIXTURES: dict[str, tuple[str, Callable[[Path], Path], list[str]]] = {
+    **{name: (name, make, options) for name, (make, options, _, _) in CASES.items()},
+    "7scenes": ("7scenes", lambda root: make_sequence(root / "seq-01"), []),
+    "ros1": ("ros", ros_bag(1, "plain"), ["truth=/odom"]),
+    "ros2": ("ros", ros_bag(2, "sqlite3"), ["truth=/odom"]),
+}
+
+
+@pytest.mark.parametrize("name", FIXTURES)
+def test_fixtures_pass(tmp_path: Path, name: str) -> None:
+    dataset, make, options = FIXTURES[name]
+    converters.convert(dataset, make(tmp_path / "data"), tmp_path / "recording", options=options)
+    report = checks.check(tmp_path / "recording")
+    alarms = report.of(checks.Severity.ERROR) + report.of(checks.Severity.WARNING)
+    fast = [finding for finding in alarms if "m/s" in finding.found]  # some fixtures fly round their room
+    assert alarms == fast, checks.format_report(report)
+    assert report.sound

@@ -1,0 +1,244 @@
+"""Planted faults are noticed, each by its own finding, and sound recordings raise no alarm."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from converters.simulate import simulate
+from pipeline import checks
+from pipeline import messages as m
+from pipeline.cli import app
+from pipeline.geometry import se3
+from pipeline.recording import LogWriter, Record, read_log
+from schemas import topics
+
+FRAMES = 20
+COLOR, DEPTH = topics.COLOR.of("bravo"), topics.DEPTH.of("bravo")
+CALIBRATION = topics.CALIBRATION.of("bravo")
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+Change = Callable[[list[Record]], Iterator[tuple[Record, Any, int]]]
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("sound") / "room"
+    simulate(out, robots=2, frames=FRAMES, size=(320, 240), noise="kinect", seed=1)
+    return out
+
+
+def planted(
+    sound: Path,
+    out: Path,
+    change: Change,
+    scale: float | None = None,
+    truth: bool = True,
+    alone: bool = True,
+) -> Path:
+    """A copy whose log of bravo is written again as `change` says: record, message, publish time."""
+    shutil.copytree(sound, out)
+    records = list(read_log(sound / "bravo.mcap"))
+    description = json.loads((sound / "recording.json").read_text())
+    told = description["robots"]["bravo"]["depth_scale_m"]
+    if alone:
+        del description["robots"]["alpha"]
+        (out / "recording.json").write_text(json.dumps(description))
+    with LogWriter(out / "bravo.mcap", "bravo") as log:
+        log.channel(DEPTH, topics.DEPTH.schema, {"depth_scale": repr(told * (scale or 1))})
+        for record, message, publish_ns in change(records):
+            log.write(record.topic, message, record.log_time_ns, publish_ns)
+    if not truth:
+        (out / "bravo.groundtruth.mcap").unlink()
+    return out
+
+
+def nothing(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+    for record in records:
+        yield record, record.proto(), record.publish_time_ns
+
+
+def late_depth(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+    """Every depth image has the time of the one three frames later."""
+    depths = [record for record in records if record.topic == DEPTH]
+    source = {r.log_time_ns: depths[max(0, i - 3)] for i, r in enumerate(depths)}
+    for record, message, publish_ns in nothing(records):
+        if record.topic == DEPTH:
+            message = source[record.log_time_ns].proto()
+            message.timestamp.FromNanoseconds(publish_ns)
+        yield record, message, publish_ns
+
+
+def unregistered(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+    """Depth as a camera some pixels to the side sees it."""
+    for record, message, publish_ns in nothing(records):
+        if record.topic == DEPTH:
+            depth = m.unpack_depth(message, "")
+            message = m.pack_depth(publish_ns, "bravo", np.roll(depth, 8, axis=1))
+        yield record, message, publish_ns
+
+
+def blue(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+    """Red and blue exchanged."""
+    for record, message, publish_ns in nothing(records):
+        if record.topic == COLOR:
+            image = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)
+            message.data = cv2.imencode(".png", image[:, :, ::-1])[1].tobytes()
+            message.format = "png"
+        yield record, message, publish_ns
+
+
+def swapped(**names: str) -> Change:
+    """Other intrinsics: each named one has the value of another."""
+
+    def change(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+        for record, message, publish_ns in nothing(records):
+            if record.topic == CALIBRATION:
+                camera = m.unpack_calibration(message)
+                camera = replace(camera, **{name: getattr(camera, other) for name, other in names.items()})
+                message = m.pack_calibration(publish_ns, "bravo", camera)
+            yield record, message, publish_ns
+
+    return change
+
+
+def stuck(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+    """Ten colour images in a row are the same."""
+    colors = [record for record in records if record.topic == COLOR]
+    for record, message, publish_ns in nothing(records):
+        if record.topic == COLOR and colors[5].log_time_ns < record.log_time_ns < colors[15].log_time_ns:
+            message.data = colors[5].proto().data
+        yield record, message, publish_ns
+
+
+def twice(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+    """An image has the time of the one before, and another time in the message."""
+    stamps = sorted({record.log_time_ns for record in records})
+    for record, message, publish_ns in nothing(records):
+        again = record.log_time_ns == stamps[8] and record.topic != CALIBRATION
+        yield record, message, stamps[7] if again else publish_ns
+
+
+def gap(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+    """A second without images, in the times alone."""
+    middle = records[len(records) // 2].log_time_ns
+    for record, message, publish_ns in nothing(records):
+        late = 10**9 if publish_ns > middle else 0
+        message.timestamp.FromNanoseconds(publish_ns + late)
+        yield record, message, publish_ns + late
+
+
+def no_depth(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+    for record, message, publish_ns in nothing(records):
+        if record.topic == DEPTH:
+            message.data = bytes(len(message.data))
+        yield record, message, publish_ns
+
+
+def half_depth(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+    """Every second depth image is missing."""
+    depths = [record.log_time_ns for record in records if record.topic == DEPTH]
+    for record, message, publish_ns in nothing(records):
+        if record.topic != DEPTH or depths.index(record.log_time_ns) % 2:
+            yield record, message, publish_ns
+
+
+FAULTS: dict[str, tuple[Change, dict[str, Any], str, str]] = {
+    "scale x5": (nothing, {"scale": 5}, "error", "depth scale"),
+    "scale x0.2": (nothing, {"scale": 0.2}, "error", "depth scale"),
+    "scale x0.001, no truth": (nothing, {"scale": 0.001, "truth": False}, "error", "depth scale"),
+    "scale x5, no truth": (nothing, {"scale": 5, "truth": False}, "warning", "depth scale"),
+    "late depth": (late_depth, {}, "warning", "depth in time"),
+    "unregistered depth": (unregistered, {}, "warning", "depth in place"),
+    "red and blue": (blue, {"alone": False}, "warning", "colour order"),
+    "centre swapped": (swapped(cx="cy", cy="cx"), {}, "warning", "intrinsics"),
+    "size for focal length": (swapped(fx="height"), {}, "warning", "intrinsics"),
+    "stuck": (stuck, {}, "warning", "repeats"),
+    "times twice": (twice, {}, "warning", "times"),
+    "gap": (gap, {}, "warning", "gaps"),
+    "no depth": (no_depth, {}, "error", "depth"),
+    "half the depth": (half_depth, {}, "warning", "pairs"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_planted_fault_is_noticed(sound: Path, tmp_path: Path, name: str) -> None:
+    change, how, severity, check = FAULTS[name]
+    report = checks.check(planted(sound, tmp_path / "rec", change, **how))
+    found = {(f.severity.value, f.check) for f in report.findings if f.robot == "bravo"}
+    assert (severity, check) in found, checks.format_report(report)
+    assert report.sound == (severity != "error")
+
+
+def test_a_sound_recording_raises_no_alarm(sound: Path, tmp_path: Path) -> None:
+    report = checks.check(sound)
+    assert not report.findings, checks.format_report(report)
+    assert set(report.robots) == {"alpha", "bravo"}
+    assert report.robots["alpha"]["frames"] == FRAMES
+    assert "nothing found" in checks.format_report(report)
+    assert checks.check(sound).plain() == report.plain()
+    again = checks.check(planted(sound, tmp_path / "rec", nothing))  # the metadata of the log are lost
+    assert [f.check for f in again.findings] == ["digest"]
+
+
+def test_logs_that_cannot_be_read_are_findings(sound: Path, tmp_path: Path) -> None:
+    out = shutil.copytree(sound, tmp_path / "rec")
+    log = out / "alpha.mcap"
+    log.write_bytes(log.read_bytes()[:-1000])
+    result = CliRunner().invoke(app, ["check", str(out), "--json"])
+    assert result.exit_code == 1
+    content = json.loads(result.stdout)
+    assert not content["sound"]
+    assert [f["robot"] for f in content["findings"] if f["severity"] == "error"] == ["alpha"]
+    assert set(content["robots"]) == {"bravo"}
+    result = CliRunner().invoke(app, ["check", str(out / "bravo.mcap")])
+    assert result.exit_code == 0
+    assert "nothing found" in result.stdout
+
+
+def test_an_odometry_tells_the_scale(sound: Path, tmp_path: Path) -> None:
+    """Without ground truth, poses of another sensor contradict a wrong depth scale."""
+    poses = list(read_log(sound / "bravo.groundtruth.mcap", [topics.GROUNDTRUTH_POSE.of("bravo")]))
+
+    def change(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+        for record, pose in zip([r for r in records if r.topic == COLOR], poses, strict=True):
+            T = se3.inverse(m.unpack_pose_in_frame(poses[0].proto())) @ m.unpack_pose_in_frame(pose.proto())
+            prior = replace(record, topic=topics.ODOMETRY_PRIOR.of("bravo"))
+            yield prior, m.pack_pose_in_frame(pose.publish_time_ns, "odometry", T), pose.publish_time_ns
+
+    def with_prior(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+        rows = [*nothing(records), *change(records)]
+        yield from sorted(rows, key=lambda row: row[0].log_time_ns)
+
+    for scale, sound_ in ((1.0, True), (2.0, False)):
+        out = planted(sound, tmp_path / f"{scale}", with_prior, scale=scale, truth=False)
+        report = checks.check(out)
+        assert report.sound == sound_, checks.format_report(report)
+
+
+@pytest.mark.parametrize("source", ["redkitchen", "replica_office0/office0"])
+def test_real_recordings_raise_no_alarm(tmp_path: Path, source: str) -> None:
+    import converters
+
+    if not (SHARED / source).is_dir():
+        pytest.skip("needs ../shared/data")
+    if source == "redkitchen":
+        src = tmp_path / "src"
+        src.mkdir()
+        for number in range(300, 324):
+            for file in (SHARED / source).glob(f"frame-{number:06d}.*"):
+                (src / file.name).symlink_to(file)
+        converters.convert("7scenes", src, tmp_path / "rec", robots=2)
+    else:
+        converters.convert("replica", SHARED / source, tmp_path / "rec")
+    report = checks.check(tmp_path / "rec")
+    alarms = report.of(checks.Severity.ERROR) + report.of(checks.Severity.WARNING)
+    assert not alarms, checks.format_report(report)

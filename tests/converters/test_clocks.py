@@ -1,0 +1,192 @@
+"""Clocks that differ by planted amounts: of robots in one log, of robots with common messages, of the truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import converters
+from converters.logs import clocks
+from pipeline.errors import DuagError
+from pipeline.geometry import so3
+from pipeline.recording import format_info, info, open_rgbd, read_log
+from tests.converters.box_room import path
+from tests.converters.test_kimera_multi import imu
+from tests.converters.test_ros import FRAMES, START_NS, STEP_NS, Ros, scene
+
+HUSKY_LATE_NS = 3_250_000_000  # husky's own clock is this much behind jackal's
+
+
+def moved_headers(r: Ros, rows: list[tuple[str, int, Any]], by_ns: int) -> list[tuple[str, int, Any]]:
+    """The same messages with other times in their headers."""
+    for _, _, message in rows:
+        if hasattr(message, "header"):
+            stamp = message.header.stamp
+            time = stamp.sec * 10**9 + stamp.nanosec + by_ns
+            object.__setattr__(stamp, "sec", time // 10**9)
+            object.__setattr__(stamp, "nanosec", time % 10**9)
+    return rows
+
+
+def both(r: Ros) -> tuple[list[tuple[str, int, Any]], list[tuple[str, int, Any]]]:
+    jackal = scene(r, prefix="/jackal")
+    husky = scene(r, prefix="/husky", poses=path(FRAMES, 0.2))
+    return jackal, moved_headers(r, husky, -HUSKY_LATE_NS)
+
+
+def clocks_of(recording: Path) -> dict[str, Any]:
+    return json.loads((recording / "recording.json").read_text())["clocks"]
+
+
+def start(recording: Path, robot: str) -> int:
+    with open_rgbd(recording / f"{robot}.mcap") as log:
+        return log.frame(0).stamp_ns
+
+
+def test_one_recorder_tells_how_headers_differ(tmp_path: Path) -> None:
+    """Told always, applied only if asked."""
+    r = Ros(2)
+    jackal, husky = both(r)
+    bag = r.write(tmp_path / "bag", sorted(jackal + husky, key=lambda x: x[1]), "mcap")
+    options = ["namespaces=/jackal,/husky"]
+    converters.convert("ros", bag, tmp_path / "kept", options=options)
+    told = clocks_of(tmp_path / "kept")["husky"]
+    assert told["offset_s"] == pytest.approx(HUSKY_LATE_NS / 1e9, abs=1e-6)
+    assert told["low_s"] <= HUSKY_LATE_NS / 1e9 <= told["high_s"]
+    assert told["how"] == "one recorder"
+    assert told["added_s"] == 0
+    assert start(tmp_path / "kept", "husky") == START_NS + STEP_NS - HUSKY_LATE_NS
+    warnings = json.loads((tmp_path / "kept" / "recording.json").read_text())["warnings"]
+    assert any("husky: its times" in w and "none in common" in w for w in warnings)
+    converters.convert("ros", bag, tmp_path / "moved", options=[*options, "clocks=estimated"])
+    assert abs(start(tmp_path / "moved", "husky") - START_NS - STEP_NS) < 1000
+    assert start(tmp_path / "moved", "jackal") == START_NS + STEP_NS
+    assert clocks_of(tmp_path / "moved")["husky"]["added_s"] == pytest.approx(HUSKY_LATE_NS / 1e9, abs=1e-6)
+    shown = format_info(info(tmp_path / "moved"))
+    assert "clock 3.250000 s behind the first robot's (one recorder), 3.250000 s were added" in shown
+    converters.convert("ros", bag, tmp_path / "zero", options=[*options, "clocks=from_zero"])
+    assert [start(tmp_path / "zero", robot) for robot in ("jackal", "husky")] == [0, 0]
+
+
+def test_readings_before_the_first_frame_have_no_place_from_zero(tmp_path: Path) -> None:
+    """An IMU that was on before the camera: with all clocks from zero it begins with the first frame."""
+    r = Ros(2)
+    rows = scene(r)
+    identity = r.tf(r.transform(START_NS, "_color", "_imu", np.eye(4)))
+    times = [START_NS + STEP_NS + k * 10_000_000 for k in range(-4, 10)]
+    rows += [("/imu", t, imu(r, t, "_imu", np.array([0.0, 0.1, 0.0]))) for t in times] + [
+        ("/tf_static", START_NS, identity)
+    ]
+    bag = r.write(tmp_path / "bag", sorted(rows, key=lambda x: x[1]), "mcap")
+    for clocks_option, count in (("from_zero", 10), ("as_recorded", 14)):
+        out = tmp_path / clocks_option
+        converters.convert("ros", bag, out, options=["imu=/imu", f"clocks={clocks_option}"])
+        assert len(list(read_log(out / "alpha.mcap", ["/alpha/imu"]))) == count
+    with pytest.raises(DuagError, match="leads before 1970"):
+        converters.convert("ros", bag, tmp_path / "rec", options=["clock_offset_s=-1e10"])
+
+
+def test_clocks_that_agree_are_left_alone(tmp_path: Path) -> None:
+    r = Ros(2)
+    rows = scene(r, prefix="/jackal") + scene(r, prefix="/husky", poses=path(FRAMES, 0.2))
+    bag = r.write(tmp_path / "bag", sorted(rows, key=lambda x: x[1]), "mcap")
+    converters.convert(
+        "ros", bag, tmp_path / "rec", options=["namespaces=/jackal,/husky", "clocks=estimated"]
+    )
+    assert clocks_of(tmp_path / "rec")["husky"]["added_s"] == 0
+    assert start(tmp_path / "rec", "husky") == START_NS + STEP_NS
+
+
+RECORDER_NS = 1_700_000_000  # husky's recorder is so much ahead of jackal's
+
+
+def chat(r: Ros, sender: str, at_own: bool, seed: int) -> list[tuple[str, int, Any]]:
+    """What a robot says, as a recorder notes it: at once on the robot itself, after some milliseconds on the other."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for k in range(20):
+        sent = START_NS + k * 10_000_000
+        way = 0 if at_own else int(rng.integers(4_000_000, 15_000_000))
+        ahead = RECORDER_NS if (sender == "husky") == at_own else 0
+        message = r.make("std_msgs/msg/String", data=f"{sender} {k}")
+        rows.append((f"/{sender}/chat", sent + way + ahead, message))
+    return rows
+
+
+def two_logs(tmp_path: Path, speakers: tuple[str, ...], namespaces: bool) -> Path:
+    """A log of jackal's recorder and one of husky's, each with what both say, and a TOML file that names them."""
+    r = Ros(2)
+    lines = []
+    for robot, seed in (("jackal", 1), ("husky", 2)):
+        poses = path(FRAMES, 0.2) if robot == "husky" else None
+        ahead = RECORDER_NS if robot == "husky" else 0
+        rows = [
+            (t, ns + ahead, m) for t, ns, m in moved_headers(r, scene(r, f"/{robot}", poses=poses), ahead)
+        ]
+        for k, speaker in enumerate(speakers):
+            rows += chat(r, speaker, speaker == robot, seed + 10 * k)
+        r.write(tmp_path / robot, sorted(rows, key=lambda x: x[1]), "mcap")
+        space = f'namespace = "/{robot}"\n' if namespaces else ""
+        lines.append(f'[robots.{robot}]\nlogs = ["{robot}"]\n{space}')
+        for option, topic in (("color", "color/image_raw"), ("depth", "depth/image_rect_raw")):
+            lines.append(f'{option} = "/{robot}/camera/{topic}"\n')
+    (tmp_path / "team.toml").write_text("".join(lines))
+    return tmp_path / "team.toml"
+
+
+def test_messages_in_both_directions_bound_the_difference(tmp_path: Path) -> None:
+    team = two_logs(tmp_path, ("jackal", "husky"), namespaces=True)
+    converters.convert("ros", team, tmp_path / "rec", options=["clocks=estimated"])
+    told = clocks_of(tmp_path / "rec")["jackal"]  # husky is first by name
+    assert told["low_s"] <= RECORDER_NS / 1e9 <= told["high_s"]
+    assert told["high_s"] - told["low_s"] < 0.025
+    assert told["how"] == "40 messages that both recorded, sent by both"
+    assert abs(start(tmp_path / "rec", "jackal") - start(tmp_path / "rec", "husky")) < 6_000_000
+
+
+def test_one_direction_bounds_one_side(tmp_path: Path) -> None:
+    team = two_logs(tmp_path, ("jackal",), namespaces=True)
+    converters.convert("ros", team, tmp_path / "rec")
+    told = clocks_of(tmp_path / "rec")["jackal"]
+    assert told["low_s"] is None
+    assert told["high_s"] >= RECORDER_NS / 1e9
+    assert abs(told["offset_s"] - RECORDER_NS / 1e9) < 0.016  # the way takes up to 15 ms
+    assert "sent by one" in told["how"]
+
+
+def test_without_common_messages_nothing_is_made_up(tmp_path: Path) -> None:
+    team = two_logs(tmp_path, (), namespaces=True)
+    converters.convert("ros", team, tmp_path / "rec", options=["clocks=estimated"])
+    told = clocks_of(tmp_path / "rec")["jackal"]
+    assert told["offset_s"] is None
+    assert told["added_s"] == 0
+    warnings = json.loads((tmp_path / "rec" / "recording.json").read_text())["warnings"]
+    assert any("jackal: its clock is kept: recorders of their own" in w for w in warnings)
+
+
+@pytest.mark.parametrize("late_s", [0.137, -0.42, 0.0])
+def test_truth_that_turns_later_is_found(late_s: float) -> None:
+    """A gyroscope at 200 Hz and poses at 30 Hz of one body; the poses' clock is behind."""
+    rng = np.random.default_rng(3)
+    phases, rates = rng.uniform(0, 6, 5), rng.uniform(0.3, 4, 5)
+
+    def angle(t: np.ndarray) -> np.ndarray:
+        return np.sum(0.4 * np.sin(np.outer(t, rates) + phases), axis=1)
+
+    times = np.arange(0, 20, 0.005)
+    speed = np.abs(np.gradient(angle(times), times)) + 0.02 * rng.standard_normal(len(times))
+    poses_at = np.arange(0, 20, 1 / 30)
+    T = np.tile(np.eye(4), (len(poses_at), 1, 1))
+    T[:, :3, :3] = so3.exp(np.outer(angle(poses_at), [0.0, 0.0, 1.0]))
+    stamps = np.round((poses_at + late_s) * 1e9).astype(np.int64)
+    found = clocks.lag(np.round(times * 1e9).astype(np.int64), speed, *clocks.angular_speed(stamps, T))
+    assert found is not None
+    assert found[0] == pytest.approx(late_s, abs=0.005)
+    still = clocks.lag(np.round(times * 1e9).astype(np.int64), 0 * speed, *clocks.angular_speed(stamps, T))
+    assert still is None
+    other = np.abs(rng.standard_normal(len(times)))
+    assert clocks.lag(np.round(times * 1e9).astype(np.int64), other, *clocks.angular_speed(stamps, T)) is None

@@ -1,0 +1,433 @@
+"""MCAP of other programs: the same scene in every encoding gives the same recording, message for message."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from google.protobuf.json_format import MessageToDict
+from mcap.writer import CompressionType, IndexType, Writer
+
+import converters
+import schemas
+from converters.logs import open_log
+from pipeline.checks import check
+from pipeline.errors import DuagError
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.recording import open_rgbd, read_log
+from tests.converters.test_ros import COLOR, DISTORTION, Ros, scene
+
+Row = tuple[str, int, Any]
+
+
+def foxglove(message: Any) -> Any:
+    """The Foxglove message that says what a ROS message says."""
+    name = message.__msgtype__.rpartition("/")[2]
+
+    def new(schema: str, **fields: Any) -> Any:
+        return schemas.message_class(f"foxglove.{schema}")(**fields)
+
+    def head(header: Any, frame: str = "frame_id") -> dict[str, Any]:
+        time = {"seconds": header.stamp.sec, "nanos": header.stamp.nanosec}
+        return {"timestamp": time, frame: header.frame_id}
+
+    def xyz(v: Any) -> dict[str, float]:
+        return {"x": v.x, "y": v.y, "z": v.z}
+
+    def xyzw(q: Any) -> dict[str, float]:
+        return {**xyz(q), "w": q.w}
+
+    if name == "Image":
+        kind = np.dtype(">u2" if message.is_bigendian else "<u2")
+        data = np.asarray(message.data)
+        if message.encoding == "16UC1":
+            rows = data.reshape(message.height, message.step)
+            used = 2 * message.width
+            values = np.ascontiguousarray(rows[:, :used]).view(kind).astype("<u2").view(np.uint8)
+            data = np.concatenate([values, rows[:, used:]], axis=1).ravel()
+        fields = {k: getattr(message, k) for k in ("width", "height", "encoding", "step")}
+        return new("RawImage", **head(message.header), **fields, data=data.tobytes())
+    if name == "CompressedImage":
+        fields = {"format": message.format, "data": message.data.tobytes()}
+        return new("CompressedImage", **head(message.header), **fields)
+    if name == "CameraInfo":
+        fields = {
+            k: list(getattr(message, k if hasattr(message, k) else k.lower())) for k in ("D", "K", "R", "P")
+        }
+        size = {"width": message.width, "height": message.height}
+        model = message.distortion_model
+        return new("CameraCalibration", **head(message.header), **size, distortion_model=model, **fields)
+    if name == "TFMessage":
+        transforms = [
+            {
+                **head(t.header, "parent_frame_id"),
+                "child_frame_id": t.child_frame_id,
+                "translation": xyz(t.transform.translation),
+                "rotation": xyzw(t.transform.rotation),
+            }
+            for t in message.transforms
+        ]
+        return new("FrameTransforms", transforms=transforms)
+    pose = {"position": xyz(message.pose.pose.position), "orientation": xyzw(message.pose.pose.orientation)}
+    return new("Odometry", **head(message.header), body_frame_id=message.child_frame_id, pose=pose)
+
+
+def as_json(message: Any) -> bytes:
+    """Foxglove's JSON of a message: bytes in base64, times as sec and nsec."""
+
+    def times(members: Any, message: Any) -> Any:
+        for field, value in message.ListFields():
+            if field.message_type and field.message_type.full_name == "google.protobuf.Timestamp":
+                members[field.name] = {"sec": value.seconds, "nsec": value.nanos}
+            elif field.message_type and field.is_repeated:
+                members[field.name] = [times(m, v) for m, v in zip(members[field.name], value, strict=True)]
+            elif field.message_type:
+                times(members[field.name], value)
+        return members
+
+    members = MessageToDict(
+        message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True
+    )
+    return json.dumps(times(members, message)).encode()
+
+
+def write(path: Path, rows: list[Row], kind: str, ros: Ros, **settings: Any) -> Path:
+    """Write messages of ROS into an MCAP file as "ros1", "cdr", "protobuf" or "json"."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=1 << 16, **settings)
+        writer.start(profile={"ros1": "ros1", "cdr": "ros2"}.get(kind, ""))
+        channels: dict[str, int] = {}
+        for topic, log_ns, message in rows:
+            name, encoding, text, data = encoded(message, kind, ros)
+            if topic not in channels:
+                channels[topic] = writer.register_channel(
+                    topic, kind, writer.register_schema(name, encoding, text)
+                )
+            writer.add_message(channels[topic], log_ns, data, log_ns - 1_000_000)
+        writer.finish()
+    return path
+
+
+def encoded(message: Any, kind: str, ros: Ros) -> tuple[str, str, bytes, bytes]:
+    """Name, encoding and text of the schema, and the message's bytes."""
+    if kind in ("ros1", "cdr"):
+        name = message.__msgtype__
+        text, _ = ros.store.generate_msgdef(name, ros_version=1 if kind == "ros1" else 2)
+        if kind == "ros1":
+            return (
+                name.replace("/msg/", "/"),
+                "ros1msg",
+                text.encode(),
+                bytes(ros.store.serialize_ros1(message, name)),
+            )
+        return name, "ros2msg", text.encode(), bytes(ros.store.serialize_cdr(message, name))
+    proto = foxglove(message)
+    name = proto.DESCRIPTOR.full_name
+    if kind == "json":
+        return name, "jsonschema", b'{"type": "object"}', as_json(proto)
+    return name, "protobuf", schemas.descriptor_set(name), proto.SerializeToString()
+
+
+def digests(recording: Path) -> dict[str, str]:
+    robots = json.loads((recording / "recording.json").read_text())["robots"]
+    return {name: digest for row in robots.values() for name, digest in row["digests"].items()}
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Digests of the recording made from a bag of ROS 1."""
+    folder, r = tmp_path_factory.mktemp("bag"), Ros(1)
+    bag = r.write(folder / "bag", scene(r), "plain")
+    converters.convert("ros", bag, folder / "rec", options=["truth=/odom"])
+    return digests(folder / "rec")
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    [
+        ("ros1", {}),
+        ("cdr", {"compression": CompressionType.LZ4}),
+        ("protobuf", {}),
+        ("protobuf", {"compression": CompressionType.NONE}),
+        ("protobuf", {"index_types": IndexType.NONE}),
+        ("protobuf", {"use_chunking": False}),
+        ("json", {"compression": CompressionType.LZ4, "index_types": IndexType.NONE}),
+        ("json", {}),
+    ],
+    ids=lambda v: v if isinstance(v, str) else "-".join(f"{k}={getattr(x, 'name', x)}" for k, x in v.items()),
+)
+def test_every_encoding_gives_the_same_recording(
+    tmp_path: Path, expected: dict[str, str], kind: str, settings: dict[str, Any]
+) -> None:
+    r = Ros(1 if kind == "ros1" else 2)
+    log = write(tmp_path / "log.mcap", scene(r), kind, r, **settings)
+    converters.convert("ros", log, tmp_path / "rec", options=["truth=/odom"])
+    assert digests(tmp_path / "rec") == expected
+    report = check(tmp_path / "rec")
+    assert report.sound, report.findings
+
+
+def test_pieces_of_a_log_are_one_log(tmp_path: Path, expected: dict[str, str]) -> None:
+    """Cut in time, in containers of different kinds, in the order of their numbers: the same recording."""
+    r, r1 = Ros(2), Ros(1)
+    rows, rows1 = scene(r), scene(r1)
+    write(tmp_path / "src" / "jackal" / "part_2.mcap", rows[:8], "cdr", r)
+    write(tmp_path / "src" / "jackal" / "part_10.mcap", rows[8:11], "json", r)
+    r1.write(tmp_path / "src" / "jackal" / "part_11", rows1[11:], "lz4")
+    converters.convert(
+        "ros", tmp_path / "src" / "jackal", tmp_path / "rec", options=["truth=/odom", "pieces=true"]
+    )
+    assert digests(tmp_path / "rec") == expected
+    converters.convert("ros", tmp_path / "src", tmp_path / "rec2", options=["truth=/odom"])
+    assert digests(tmp_path / "rec2") == expected
+
+
+def test_transforms_that_never_change_are_extrinsics(tmp_path: Path, expected: dict[str, str]) -> None:
+    """Foxglove's logs have no tf_static: what is repeated without change ties the cameras, what moves does not."""
+    r = Ros(2)
+    rows = scene(r)
+    (static,) = [m for t, _, m in rows if t == "/tf_static"]
+    repeated = [("/tf", ns, static) for t, ns, _ in rows if t == "/odom"]
+    others = [row for row in rows if row[0] != "/tf_static"]
+    log = write(tmp_path / "log.mcap", sorted(others + repeated, key=lambda x: x[1]), "protobuf", r)
+    converters.convert("ros", log, tmp_path / "rec", options=["truth=/odom"])
+    assert digests(tmp_path / "rec") == expected
+    T_moved = se3.from_rotation_translation(np.eye(3), [0.01, 0.0, 0.0])
+    moved = ("/tf", repeated[-1][1] + 1, r.tf(r.transform(1, "_depth", "_color", T_moved)))
+    path = write(
+        tmp_path / "moving.mcap", sorted([*others, *repeated, moved], key=lambda x: x[1]), "protobuf", r
+    )
+    with pytest.raises(DuagError, match="does not tie them"):
+        converters.convert("ros", path, tmp_path / "rec3")
+
+
+def test_times_of_publication(tmp_path: Path) -> None:
+    r = Ros(2)
+    log = write(tmp_path / "log.mcap", scene(r), "json", r)
+    converters.convert("ros", log, tmp_path / "rec", options=["time_source=publish"])
+    row = json.loads((tmp_path / "rec" / "recording.json").read_text())["robots"]["alpha"]
+    first = next(ns for topic, ns, _ in scene(r) if topic == "/camera/color/image_raw")
+    assert row["start_ns"] == first - 1_000_000
+    bag = r.write(tmp_path / "bag", scene(r), "sqlite3")
+    with pytest.raises(DuagError, match="no times of publication"):
+        converters.convert("ros", bag, tmp_path / "rec2", options=["time_source=publish"])
+
+
+def test_compressed_images_of_foxglove(tmp_path: Path) -> None:
+    """JPEG colour keeps its bytes; a gray PNG of 16 bits is depth, whatever its format says."""
+    r, rows = Ros(2), []
+    jpegs = []
+    for topic, ns, m in scene(r):
+        if topic.endswith("image_raw"):
+            pixels = (
+                np.asarray(m.data).reshape(m.height, m.step)[:, : 3 * m.width].reshape(m.height, m.width, 3)
+            )
+            jpegs.append(cv2.imencode(".jpg", pixels[..., ::-1])[1].tobytes())
+            m = r.compressed(m.header.stamp.sec * 10**9 + m.header.stamp.nanosec, "_color", jpegs[-1], "jpeg")
+        elif topic.endswith("image_rect_raw"):
+            kind = ">u2" if m.is_bigendian else "<u2"
+            raw = np.ascontiguousarray(np.asarray(m.data).reshape(m.height, m.step)[:, : 2 * m.width]).view(
+                kind
+            )
+            png = cv2.imencode(".png", raw.astype(np.uint16))[1].tobytes()
+            m = r.compressed(m.header.stamp.sec * 10**9 + m.header.stamp.nanosec, "_depth", png, "png")
+        rows.append((topic, ns, m))
+    log = write(tmp_path / "log.mcap", rows, "protobuf", r)
+    converters.convert("ros", log, tmp_path / "rec", options=["undistort=false"])
+    colors = [
+        record.proto().data for record in read_log(tmp_path / "rec" / "alpha.mcap", ["/alpha/camera/color"])
+    ]
+    assert colors == jpegs
+
+
+def spoil(path: Path, change: Callable[[bytes], bytes]) -> None:
+    path.write_bytes(change(path.read_bytes()))
+
+
+def test_broken_files_are_errors(tmp_path: Path) -> None:
+    r = Ros(2)
+    log = write(tmp_path / "log.mcap", scene(r), "protobuf", r)
+    data = log.read_bytes()
+    for name, broken, message in (
+        ("cut", data[: len(data) // 2], "cut short or no MCAP"),
+        ("empty", b"", "cut short or no MCAP"),
+        ("flipped", data[:5000] + bytes([data[5000] ^ 4]) + data[5001:], "expected a sound MCAP log"),
+    ):
+        path = tmp_path / f"{name}.mcap"
+        path.write_bytes(broken)
+        with pytest.raises(DuagError, match=message):
+            converters.convert("ros", path, tmp_path / "rec")
+        assert not (tmp_path / "rec").exists()
+
+
+def test_messages_that_do_not_fit_their_schema_are_errors(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    for kind, data, message in (
+        (
+            "json",
+            b'{"timestamp": {"sec": 1, "nsec": 2}, "frame_id": "c", "data": "!"}',
+            "foxglove.CompressedImage that cannot be read",
+        ),
+        ("json", b"[1, 2]", "cannot be read"),
+        ("json", b"{", "no foxglove.CompressedImage in json"),
+        ("protobuf", b"\xff\xff", "no foxglove.CompressedImage in protobuf"),
+    ):
+        with path.open("wb") as stream:
+            writer = Writer(stream)
+            writer.start()
+            schema = writer.register_schema("foxglove.CompressedImage", "jsonschema", b"{}")
+            writer.add_message(writer.register_channel("/image", kind, schema), 5, data, 5)
+            writer.finish()
+        with pytest.raises(DuagError, match=message):
+            converters.convert("ros", path, tmp_path / "rec")
+    assert base64.b64decode("!") == b""  # what a lenient decoder would have made of the first
+
+
+def test_a_camera_that_changes_is_refused(tmp_path: Path) -> None:
+    """As of a telephone that focuses: by a tenth of a pixel it may, by more not."""
+    r = Ros(2)
+    rows = scene(r)
+    info = next(m for t, _, m in rows if t == "/camera/color/camera_info")
+    for by, kind in ((0.1, "cdr"), (0.1, "protobuf"), (3.0, "cdr"), (3.0, "json")):
+        camera = PinholeCamera(COLOR.width, COLOR.height, COLOR.fx + by, COLOR.fy, COLOR.cx, COLOR.cy)
+        later = (
+            "/camera/color/camera_info",
+            rows[-1][1] + 1,
+            r.info(rows[-1][1], info.header.frame_id, camera, DISTORTION),
+        )
+        log = write(tmp_path / "log.mcap", [*rows, later], kind, r)
+        if by < 1:
+            converters.convert("ros", log, tmp_path / f"rec_{kind}")
+            continue
+        with pytest.raises(DuagError, match=r"camera_info changes at .* from .*\[140.0, .*\[143.0"):
+            converters.convert("ros", log, tmp_path / "rec")
+
+
+def raw_log(path: Path, topic: str, schema: tuple[str, str, bytes], data: bytes) -> Path:
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        channel = writer.register_channel(topic, "cdr", writer.register_schema(*schema))
+        writer.add_message(channel, 7, data, 7)
+        writer.finish()
+    return path
+
+
+def test_definitions_that_are_missing_are_those_of_ros(tmp_path: Path) -> None:
+    r = Ros(2)
+    message = r.header(5, "camera")
+    data = bytes(r.store.serialize_cdr(message, message.__msgtype__))
+    path = raw_log(tmp_path / "log.mcap", "/h", ("std_msgs/msg/Header", "", b""), data)
+    with open_log([path]) as log:
+        assert log.first("/h").frame_id == "camera"
+
+
+def test_definitions_in_idl(tmp_path: Path) -> None:
+    """Two types, the inner one in a part of its own, as recorders of ROS 2 write them."""
+    inner = "module demo { module msg { struct Inner { long value; }; }; };"
+    struct_outer = "struct Outer { demo::msg::Inner inner; string name; };"
+    outer = f'#include "demo/msg/Inner.idl"\nmodule demo {{ module msg {{ {struct_outer} }}; }};'
+    line = "=" * 80 + "\n"
+    for text in (
+        f"{line}IDL: demo/msg/Outer\n{outer}\n{line}IDL: demo/msg/Inner\n{inner}\n",
+        f"{inner}\n{outer}",
+    ):
+        data = b"\x00\x01\x00\x00" + struct.pack("<iI", 42, 6) + b"hello\x00"
+        path = raw_log(tmp_path / "log.mcap", "/o", ("demo/msg/Outer", "ros2idl", text.encode()), data)
+        with open_log([path]) as log:
+            assert (log.first("/o").inner.value, log.first("/o").name) == (42, "hello")
+
+
+@pytest.mark.parametrize(
+    ("log_ns", "stamp_ns", "message"),
+    [
+        (2**64 - 1, 5, "time 18446744073709551615 ns"),
+        (7, -(10**9), "time -1000000000 ns"),
+        (7, 2**62, "time 46"),
+    ],
+)
+def test_times_that_cannot_be_are_refused(tmp_path: Path, log_ns: int, stamp_ns: int, message: str) -> None:
+    r = Ros(2)
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic, _, ros in scene(r):
+            proto = foxglove(ros)
+            if topic == "/camera/color/image_raw":
+                proto.timestamp.seconds, proto.timestamp.nanos = divmod(stamp_ns, 10**9)
+            name = proto.DESCRIPTOR.full_name
+            schema = writer.register_schema(name, "protobuf", schemas.descriptor_set(name))
+            writer.add_message(
+                writer.register_channel(topic, "protobuf", schema), log_ns, proto.SerializeToString(), 7
+            )
+        writer.finish()
+    with pytest.raises(DuagError, match=message):
+        converters.convert("ros", path, tmp_path / "rec")
+
+
+def test_definitions_that_are_not_those_of_ros_are_refused(tmp_path: Path) -> None:
+    r = Ros(2)
+    info = next(m for t, _, m in scene(r) if t.endswith("camera_info"))
+    name, encoding, text, data = encoded(info, "cdr", r)
+    path = raw_log(
+        tmp_path / "log.mcap", "/i", (name, encoding, text.replace(b"binning_x", b"binnimg_x")), data
+    )
+    with (
+        open_log([path]) as log,
+        pytest.raises(DuagError, match="its sensor_msgs/msg/CameraInfo has no field binning_x"),
+    ):
+        log.first("/i")
+
+
+KITCHEN = Path(__file__).parents[3] / "shared" / "data" / "redkitchen"
+
+
+@pytest.mark.skipif(not KITCHEN.is_dir(), reason="the real images are not there")
+def test_real_images_in_a_log_are_those_of_the_dataset(tmp_path: Path) -> None:
+    """RedKitchen as a log of Foxglove's: the same colours, and depth as 7-Scenes' own converter registers it."""
+    color = PinholeCamera(640, 480, 525, 525, 320, 237.8)
+    depth = PinholeCamera(640, 480, 585, 585, 320, 240)
+    r, start = Ros(2), 10**18
+    T_color_depth = se3.from_rotation_translation(np.eye(3), [-0.025, 0.0, 0.0])
+    rows: list[Row] = [
+        ("/color/camera_info", start, r.info(start, "color", color)),
+        ("/depth/camera_info", start, r.info(start, "depth", depth)),
+        ("/tf", start, r.tf(r.transform(start, "color", "depth", T_color_depth))),
+    ]
+    (tmp_path / "seq").mkdir()
+    for k, path in enumerate(sorted(KITCHEN.glob("*.color.*"))[:3]):
+        at, stem = start + k * 10**9 // 30, path.name.split(".")[0]
+        for file in KITCHEN.glob(f"{stem}.*"):
+            (tmp_path / "seq" / file.name).symlink_to(file)
+        raw = cv2.imread(str(KITCHEN / f"{stem}.depth.png"), cv2.IMREAD_UNCHANGED)
+        rows.append(("/color/image", at, r.compressed(at, "color", path.read_bytes(), "jpeg")))
+        rows.append(
+            (
+                "/depth/image",
+                at,
+                r.image(at, "depth", np.where(raw == 65535, 0, raw).astype(np.uint16), "16UC1"),
+            )
+        )
+    log = write(tmp_path / "log.mcap", rows, "protobuf", r)
+    converters.convert("ros", log, tmp_path / "log_rec")
+    converters.convert("7scenes", tmp_path / "seq", tmp_path / "own_rec")
+    with (
+        open_rgbd(tmp_path / "log_rec" / "alpha.mcap") as a,
+        open_rgbd(tmp_path / "own_rec" / "alpha.mcap") as b,
+    ):
+        for i in range(3):
+            assert np.array_equal(a.frame(i).color, b.frame(i).color)
+            ours, theirs = a.frame(i).depth, b.frame(i).depth
+            both = (ours > 0) & (theirs > 0)
+            assert both.mean() > 0.7
+            assert np.percentile(np.abs(ours - theirs)[both] / theirs[both], 95) < 0.002

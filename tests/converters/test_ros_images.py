@@ -1,0 +1,195 @@
+"""Images and cameras as ROS holds them: every encoding of colour and depth, every lens, and broken ones."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from converters import ros_images
+from pipeline.errors import DuagError
+from tests.converters.test_ros import COLOR, Ros
+
+
+@pytest.mark.parametrize(
+    ("model", "D", "message"),
+    [
+        ("double_sphere", [0.1, 0.2], "distortion model 'double_sphere', expected one of plumb_bob"),
+        (
+            "plumb_bob",
+            [0.1, 0.2],
+            r"distortion \[0.1, 0.2\] of 'plumb_bob', expected 4 or 5 or 8 or 12 or 14 numbers",
+        ),
+        ("equidistant", [0.1, 0, 0, 0, 0], "of 'equidistant', expected 4 numbers"),
+        ("plumb_bob", [float("nan"), 0, 0, 0, 0], "of 'plumb_bob', expected"),
+        ("Inverse Brown Conrady", [0.1, 0, 0, 0, 0], "distortion model 'Inverse Brown Conrady'"),
+    ],
+)
+def test_lenses_that_are_not_known_are_refused(model: str, D: list[float], message: str) -> None:
+    info = Ros(2).info(1, "c", COLOR)
+    object.__setattr__(info, "distortion_model", model)
+    object.__setattr__(info, "d", np.array(D))
+    with pytest.raises(DuagError, match=message):
+        ros_images.RosCamera.of(info, False, "here")
+    object.__setattr__(info, "d", np.zeros(0))
+    assert ros_images.RosCamera.of(info, False, "here").maps() is None
+
+
+def test_one_fisheye_model_has_three_names() -> None:
+    maps = []
+    for model in ("equidistant", "fisheye", "kannala_brandt"):
+        info = Ros(2).info(1, "c", COLOR)
+        object.__setattr__(info, "distortion_model", model)
+        object.__setattr__(info, "d", np.array([0.05, -0.01, 0.002, 0.0]))
+        maps.append(ros_images.RosCamera.of(info, False, "here").maps())
+    assert all(np.array_equal(maps[0], other) for other in maps[1:])
+
+
+def gray_card() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return cv2.GaussianBlur(rng.integers(0, 256, (12, 16, 3)).astype(np.uint8), (5, 5), 0)
+
+
+def decoded(message: Any) -> np.ndarray:
+    data, _ = ros_images.color_bytes(message, "here")
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "rgba8", "bgra8", "mono8"])
+def test_colour_encodings(encoding: str) -> None:
+    card = gray_card()
+    alpha = np.full((12, 16, 1), 255, np.uint8)
+    pixels = {
+        "rgb8": card,
+        "bgr8": card[..., ::-1],
+        "rgba8": np.concatenate([card, alpha], axis=2),
+        "bgra8": np.concatenate([card[..., ::-1], alpha], axis=2),
+        "mono8": card[..., 0],
+    }[encoding]
+    expected = np.repeat(card[..., :1], 3, axis=2) if encoding == "mono8" else card
+    assert np.array_equal(
+        decoded(Ros(2).image(1, "c", np.ascontiguousarray(pixels), encoding, pad=5)), expected
+    )
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_bayer_patterns_have_the_right_red(pattern: str) -> None:
+    """A red card stays red whatever the pattern."""
+    tile = {"r": 200, "g": 30, "b": 10}
+    pixels = np.tile(np.array([tile[c] for c in pattern], np.uint8).reshape(2, 2), (6, 8))
+    rgb = decoded(Ros(1).image(1, "c", pixels, f"bayer_{pattern}8"))[3:-3, 3:-3]
+    assert np.allclose(rgb.reshape(-1, 3).mean(axis=0), [200, 30, 10], atol=2)
+
+
+def depth_image() -> np.ndarray:
+    raw = (1000 + 37 * np.arange(12)[:, None] + 11 * np.arange(16)).astype(np.uint16)
+    raw[2:4, 3:9] = 0
+    return raw
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_depth_of_sixteen_bits_and_of_floats(big: bool) -> None:
+    raw = depth_image()
+    sixteen = Ros(1).image(1, "d", raw, "16UC1", pad=4, big=big)
+    assert np.array_equal(
+        ros_images.depth_m(sixteen, "here", 0.001), raw.astype(np.float32) * np.float32(0.001)
+    )
+    metres = raw.astype(np.float32) / 1000
+    metres[0, :4] = [np.nan, np.inf, -1.0, 0.0]
+    floats = Ros(2).image(1, "d", metres, "32FC1", big=big)
+    got = ros_images.depth_m(floats, "here", 0.001)
+    assert (got[0, :4] == 0).all()
+    assert np.array_equal(got[1:], metres[1:])
+
+
+def rvl(raw: np.ndarray) -> bytes:
+    """RVL encoder, as the paper has it."""
+    nibbles: list[int] = []
+
+    def put(value: int) -> None:
+        while True:
+            nibble, value = value & 7, value >> 3
+            nibbles.append(nibble | (8 if value else 0))
+            if not value:
+                return
+
+    flat, at, previous = raw.ravel().astype(int).tolist(), 0, 0
+    while at < len(flat):
+        zeros = at
+        while at < len(flat) and flat[at] == 0:
+            at += 1
+        put(at - zeros)
+        end = at
+        while end < len(flat) and flat[end] != 0:
+            end += 1
+        put(end - at)
+        for value in flat[at:end]:
+            delta = value - previous
+            put((delta << 1) ^ (delta >> 63))
+            previous = value
+        at = end
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [
+        sum(n << (28 - 4 * k) for k, n in enumerate(nibbles[i : i + 8])) for i in range(0, len(nibbles), 8)
+    ]
+    return struct.pack("<II", raw.shape[1], raw.shape[0]) + struct.pack(f"<{len(words)}I", *words)
+
+
+def test_compressed_depth() -> None:
+    raw = depth_image()
+    r = Ros(2)
+    head = struct.pack("<iff", 0, 0.0, 0.0)
+    png = cv2.imencode(".png", raw)[1].tobytes()
+    for text, data in (
+        ("16UC1; compressedDepth png", head + png),
+        ("16UC1; compressedDepth", head + png),
+        ("16UC1; compressedDepth rvl", head + rvl(raw)),
+        ("16UC1; compressedDepth png", png),
+    ):
+        got = ros_images.depth_m(r.compressed(1, "d", data, text), "here", 0.001)
+        assert np.array_equal(got, raw.astype(np.float32) * np.float32(0.001)), text
+    metres = raw / 1000.0
+    a, b = 100.0 * 101.0, 1 - 100.0 * 101.0 / 10.0
+    inverse = np.where(raw > 0, np.rint(a / np.where(raw > 0, metres, 1.0) + b), 0).astype(np.uint16)
+    data = struct.pack("<iff", 0, a, b) + cv2.imencode(".png", inverse)[1].tobytes()
+    got = ros_images.depth_m(r.compressed(1, "d", data, "32FC1; compressedDepth png"), "here", 0.001)
+    assert np.abs(got - metres).max() < 3e-4
+    jpeg = cv2.imencode(".jpg", (raw >> 8).astype(np.uint8))[1].tobytes()
+    for data, message in ((jpeg, "depth as JPEG"), (head + b"\0" * 40, "broken RVL"), (b"123", "3 bytes")):
+        with pytest.raises(DuagError, match=message):
+            ros_images.depth_m(r.compressed(1, "d", data, "16UC1; compressedDepth png"), "here", 0.001)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_broken_rvl_is_an_error_or_depth(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    data = bytearray(rvl(depth_image()))
+    for _ in range(5):
+        data[rng.integers(8, len(data))] = int(rng.integers(256))
+    with contextlib.suppress(DuagError):  # the only error it may raise
+        assert ros_images._rvl(bytes(data[: rng.integers(8, len(data) + 1)]), "here").shape == (12, 16)
+
+
+@pytest.mark.parametrize("extension", [".jpg", ".png"])
+@pytest.mark.parametrize(
+    "quality", [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]]
+)
+def test_the_size_of_an_encoded_image_is_told_without_decoding(extension: str, quality: list[int]) -> None:
+    pixels = np.random.default_rng(1).integers(0, 255, (30, 50, 3)).astype(np.uint8)
+    data = cv2.imencode(extension, pixels, quality if extension == ".jpg" else [])[1].tobytes()
+    assert ros_images.encoded_size(data) == (50, 30)
+    assert ros_images.encoded_size(data[: len(data) // 2]) is None
+    assert ros_images.encoded_size(b"") is None
+    if extension == ".jpg":
+        assert ros_images.encoded_size(data + b"\0" * 100 + b"more") == (50, 30)
+        assert ros_images.encoded_size(data[:2] + b"\xff" + data[2:]) == (50, 30)  # a marker may be filled up
+
+
+def test_inverse_depth_needs_its_header() -> None:
+    png = cv2.imencode(".png", depth_image())[1].tobytes()
+    with pytest.raises(DuagError, match="inverse depth without its header"):
+        ros_images.depth_m(Ros(2).compressed(1, "d", png, "32FC1; compressedDepth png"), "here", 0.001)

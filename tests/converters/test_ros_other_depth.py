@@ -1,0 +1,197 @@
+"""Logs of ROS without depth images: depth of a stereo pair, however its calibration is told, and of a LiDAR."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import converters
+from converters.stereo import RawCamera, StereoOptions, StereoRig
+from pipeline.errors import DuagError
+from pipeline.geometry import se3, so3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.recording import Recording, open_rgbd
+from tests.converters.stereo_room import path, render, right_of
+from tests.converters.test_ros import Ros, odometry
+from tests.converters.test_s3e import (
+    D_LEFT,
+    D_RIGHT,
+    LEFT,
+    RATE,
+    RIGHTS,
+    START_NS,
+    STEP_NS,
+    T_IMU_LEFT,
+    T_LIDAR_LEFT,
+    T_right_left_of,
+    cloud,
+    pose_at,
+    turning_sweep,
+)
+
+RIGHT, T_RIGHT_LEFT = RIGHTS["bob"], T_right_left_of("bob")
+T_LEFT_RIGHT = se3.inverse(T_RIGHT_LEFT)
+FRAMES = 3
+START = path(1)[0]
+TEXT = " ".join(f"{v:.12f}" for v in (*T_LEFT_RIGHT[:3, 3], *so3.to_quat_wxyz(T_LEFT_RIGHT[:3, :3])))
+
+
+def raw_rig() -> StereoRig:
+    cameras = [RawCamera(c.matrix(), D, c.width, c.height) for c, D in ((LEFT, D_LEFT), (RIGHT, D_RIGHT))]
+    return StereoRig.of(cameras[0], cameras[1], T_RIGHT_LEFT, "here", StereoOptions(min_depth_m=1.5))
+
+
+def poses() -> list[np.ndarray]:
+    return [START @ se3.exp([0.03 * k, 0, 0.02 * k, 0, 0.01 * k, 0]) for k in range(FRAMES)]
+
+
+def calibrated(info: Any, R: np.ndarray, P: np.ndarray) -> Any:
+    info.r, info.p = np.asarray(R, float).ravel(), np.asarray(P, float).ravel()
+    return info
+
+
+def stereo_log(folder: Path, told: str) -> Path:
+    """A bag of a pair. told: how ("p", "rect", "tf", "option" or "wrong") the right camera's place is."""
+    r = Ros(2)
+    D = [(*D_LEFT, 0.0), (*D_RIGHT, 0.0)]
+    size = (LEFT.width, LEFT.height)
+    turns = cv2.stereoRectify(
+        LEFT.matrix(), np.array(D[0]), RIGHT.matrix(), np.array(D[1]), size, T_RIGHT_LEFT[:3, :3],
+        T_RIGHT_LEFT[:3, 3:], flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
+    )  # fmt: skip
+    rig = raw_rig()
+    name = "image_rect" if told == "rect" else "image_raw"
+    infos = [r.info(START_NS, frame, c, d) for frame, c, d in (("l", LEFT, D[0]), ("r", RIGHT, D[1]))]
+    if told in ("p", "rect", "wrong"):
+        infos = [calibrated(infos[k], turns[k], turns[2 + k]) for k in (0, 1)]
+    if told == "wrong":
+        infos[1].r = turns[1].T.ravel()
+    rows = [
+        (f"/eyes/{side}/camera_info", START_NS, info)
+        for side, info in zip(("left", "right"), infos, strict=True)
+    ]
+    if told == "tf":
+        rows.append(("/tf_static", START_NS, r.tf(r.transform(START_NS, "l", "r", T_LEFT_RIGHT))))
+    for k, T in enumerate(poses()):
+        at = START_NS + k * STEP_NS
+        images = [render(LEFT, T, D_LEFT)[0], render(RIGHT, right_of(T, T_RIGHT_LEFT), D_RIGHT)[0]]
+        if told == "rect":
+            images = [rig.rectify_left(images[0]), rig.rectify_right(images[1])]
+        for side, frame, image in zip(("left", "right"), "lr", images, strict=True):
+            late = 0 if side == "left" else 1_000_000
+            message = r.image(at + late, frame, image, "rgb8")
+            rows.append((f"/eyes/{side}/{name}", at + 5_000_000 + late, message))
+        rows.append(("/odom", at + 6_000_000, odometry(r, at, "l", T)))
+    return r.write(folder / told, rows, "sqlite3")
+
+
+@pytest.mark.parametrize("told", ["p", "rect", "tf", "option"])
+def test_a_stereo_pair(tmp_path: Path, told: str) -> None:
+    options = ["depth_from=stereo", "truth=/odom", "min_depth_m=1.5", "max_relative_sigma=0.1"]
+    options += [f"T_color_depth={TEXT}"] if told == "option" else []
+    converters.convert("ros", stereo_log(tmp_path, told), tmp_path / "rec", options=options)
+    recording, rig = Recording(tmp_path / "rec"), raw_rig()
+    assert recording.description["checks"]["alpha"]["row_difference_px"] < 0.3
+    assert recording.description["checks"]["alpha"]["reprojection_median_m"] is not None
+    turn = np.eye(4)
+    turn[:3, :3] = rig.R_rectified_left.T
+    with open_rgbd(recording.log("alpha")) as log:
+        np.testing.assert_allclose(log.camera.matrix(), rig.camera.matrix(), rtol=1e-6)
+        for frame, T in zip(log.frames(), poses(), strict=True):
+            color, truth = render(rig.camera, T @ turn)
+            known = frame.depth > 0
+            assert frame.depth_sigma is not None
+            assert known.mean() > 0.7
+            assert np.median((np.abs(frame.depth - truth) / truth)[known]) < 0.01
+            assert np.median(np.abs(frame.color.astype(int) - color)) < 12
+
+
+def test_a_pair_whose_rows_do_not_meet_is_refused(tmp_path: Path) -> None:
+    log = stereo_log(tmp_path, "wrong")
+    with pytest.raises(
+        DuagError, match=r"/eyes/left/image_raw and /eyes/right/image_raw: matched features lie"
+    ):
+        converters.convert("ros", log, tmp_path / "rec", options=["depth_from=stereo"])
+    assert not (tmp_path / "rec").exists()
+    log = stereo_log(tmp_path, "option")  # and no option
+    with pytest.raises(
+        DuagError, match=r"P of /eyes/right/camera_info has no base line, and /tf_static does not tie"
+    ):
+        converters.convert("ros", log, tmp_path / "rec", options=["depth_from=stereo"])
+
+
+def lidar_log(folder: Path, tied: bool = True) -> Path:
+    """A camera that turns with a LiDAR and an IMU on it."""
+    r, camera = Ros(2), PinholeCamera(240, 180, 200.0, 200.0, 119.5, 89.5)
+    rows = [("/camera/camera_info", START_NS, r.info(START_NS, "cam", camera))]
+    if tied:
+        ties = [("cam", "velo", se3.inverse(T_LIDAR_LEFT)), ("cam", "imu", se3.inverse(T_IMU_LEFT))]
+        rows.append(("/tf_static", START_NS, r.tf(*(r.transform(START_NS, *tie) for tie in ties))))
+    for k in range(FRAMES):
+        at = START_NS + k * STEP_NS
+        T = pose_at(START, at)
+        message = r.image(at, "cam", render(camera, T)[0], "rgb8")
+        rows.append(("/camera/image_raw", at + 5_000_000, message))
+        rows.append(("/odom", at + 6_000_000, odometry(r, at, "cam", T)))
+        sweep = cloud(at + 30_000_000, *turning_sweep(START, at + 30_000_000))
+        sweep.header.frame_id = "velo"
+        rows.append(("/points", at + 35_000_000, sweep))
+    for k in range(50):
+        at = START_NS - 150_000_000 + k * 10_000_000
+        w = T_IMU_LEFT[:3, :3] @ RATE
+        vector = [
+            r.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", v, strict=True)))
+            for v in (w, [0.0, 0.0, 9.8])
+        ]
+        message = r.make(
+            "sensor_msgs/msg/Imu",
+            header=r.header(at, "imu"),
+            orientation=r.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+            orientation_covariance=np.zeros(9),
+            angular_velocity=vector[0],
+            angular_velocity_covariance=np.zeros(9),
+            linear_acceleration=vector[1],
+            linear_acceleration_covariance=np.zeros(9),
+        )
+        rows.append(("/imu", at, message))
+    rows.sort(key=lambda row: row[1])
+    return r.write(folder / f"lidar{tied}", rows, "sqlite3")
+
+
+def test_a_lidar_and_what_turns_it(tmp_path: Path) -> None:
+    log, errors = lidar_log(tmp_path), {}
+    for motion in ("imu=/imu", "odometry=/odom", ""):
+        out = tmp_path / f"rec{motion[:3]}"
+        options = ["depth_from=lidar", "truth=/odom", *([motion] if motion else [])]
+        converters.convert("ros", log, out, options=options)
+        recording = Recording(out)
+        told = any("hold what the LiDAR moved" in text for text in recording.description["warnings"])
+        assert told == (motion == "")
+        assert recording.description["checks"]["alpha"]["reprojection_median_m"] < 0.1
+        with open_rgbd(recording.log("alpha")) as found:
+            assert len(found) == FRAMES
+            frame = found.frame(1)
+            truth = render(found.camera, pose_at(START, START_NS + STEP_NS))[1]
+            known = frame.depth > 0
+            assert frame.depth_sigma is not None
+            assert known.mean() > 0.4
+            errors[motion] = np.median((np.abs(frame.depth - truth) / truth)[known])
+            assert (found.motion_prior() is None) == (motion == "")
+    assert errors["imu=/imu"] < 0.001
+    assert errors["odometry=/odom"] < 0.001 or errors["odometry=/odom"] < 0.5 * errors[""]
+    assert errors[""] > 0.002
+
+
+def test_logs_without_depth_say_what_could_be_used(tmp_path: Path) -> None:
+    with pytest.raises(DuagError, match=r"holds depth images, but there are points \(depth_from=lidar\)"):
+        converters.convert("ros", lidar_log(tmp_path), tmp_path / "rec")
+    with pytest.raises(DuagError, match=r"/points is of 'velo', and /tf_static does not tie it to 'cam'"):
+        converters.convert(
+            "ros", lidar_log(tmp_path, tied=False), tmp_path / "rec", options=["depth_from=lidar"]
+        )
+    with pytest.raises(DuagError, match="depth_from"):
+        converters.convert("ros", lidar_log(tmp_path / "b"), tmp_path / "rec", options=["depth_from=radar"])

@@ -1,0 +1,77 @@
+"""Poses of a round: what is written is read, whichever component of a quaternion is left out."""
+
+import numpy as np
+import pytest
+
+from pipeline.consensus.links import PosePacket
+from pipeline.exchange.packets import MalformedError
+from pipeline.exchange.poses_wire import poses_per_packet, read_poses, write_poses, write_poses_in_parts
+from pipeline.geometry import se3, so3
+
+
+def poses(rng, n):
+    return se3.from_quat_translation(rng.normal(size=(n, 4)), 10 * rng.normal(size=(n, 3)))
+
+
+def pose_packet(rng, n, dtype="float32", curvature=None):
+    T = poses(rng, n)
+    return PosePacket(
+        sequence=7,
+        version=3,
+        keyframes=(2 * np.arange(n)).astype(np.int32),
+        quats_wxyz=so3.to_quat_wxyz(T[:, :3, :3]).astype(dtype),
+        translations=T[:, :3, 3].astype(dtype),
+        penalties=np.array([0.5, 0.25], np.float32),
+        curvature=curvature,
+        converged=True,
+    )
+
+
+@pytest.mark.parametrize(("dtype", "atol"), [("float32", 3e-7), ("float64", 1e-15)])
+def test_poses_come_back_whichever_component_was_left_out(dtype, atol):
+    rng = np.random.default_rng(0)
+    packet = pose_packet(rng, 41, dtype)
+    assert len(set(np.argmax(np.abs(packet.quats_wxyz), axis=1).tolist())) == 4
+    data = write_poses(packet, 3, 30, decides=True)
+    read = read_poses(data, packet.keyframes, from_decider=True)
+    np.testing.assert_array_equal(read.keyframes, packet.keyframes[3:33])
+    np.testing.assert_array_equal(read.translations, packet.translations[3:33])
+    np.testing.assert_array_equal(read.penalties, packet.penalties)
+    assert (read.sequence, read.version, read.converged, read.curvature) == (7, 3, True, None)
+    dots = np.abs(np.sum(read.quats_wxyz * packet.quats_wxyz[3:33].astype(np.float64), axis=1))
+    np.testing.assert_allclose(dots, 1.0, atol=atol)
+    angle = so3.log(
+        so3.from_quat_wxyz(read.quats_wxyz).swapaxes(1, 2) @ so3.from_quat_wxyz(packet.quats_wxyz[3:33])
+    )
+    assert np.abs(angle).max() < 10 * atol
+
+
+def test_a_full_packet_of_poses_fits():
+    for dtype in ("float32", "float64"):
+        n = poses_per_packet(1166, dtype == "float64")
+        packet = pose_packet(np.random.default_rng(1), n, dtype)
+        assert 1166 - 60 < len(write_poses(packet, 0, n, decides=False)) <= 1166
+
+
+def test_the_other_end_sends_its_curvature_instead():
+    rng, curvature = np.random.default_rng(2), np.array([2.0, 3.0], np.float32)
+    packet = pose_packet(rng, 5, curvature=curvature)
+    data = write_poses(packet, 0, 5, decides=False)
+    np.testing.assert_array_equal(read_poses(data, packet.keyframes, from_decider=False).curvature, curvature)
+    with pytest.raises(MalformedError, match="not from this end"):
+        read_poses(data, packet.keyframes, from_decider=True)
+
+
+@pytest.mark.parametrize("n", [1, 47, 48, 130])
+def test_parts_hold_every_keyframe_once_and_fit(n):
+    packet = pose_packet(np.random.default_rng(3), n)
+    parts = write_poses_in_parts(packet, 1140, decides=True)
+    assert max(len(part) for part in parts) <= 1140
+    read = [read_poses(part, packet.keyframes, from_decider=True).keyframes for part in parts]
+    np.testing.assert_array_equal(np.concatenate(read), packet.keyframes)
+
+
+def test_keyframes_that_are_not_shared_are_refused():
+    packet = pose_packet(np.random.default_rng(4), 6)
+    with pytest.raises(MalformedError, match="shared"):
+        read_poses(write_poses(packet, 0, 6, True), packet.keyframes[:5], True)

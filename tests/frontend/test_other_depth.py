@@ -1,0 +1,130 @@
+"""The front end on depth of a stereo pair and of a LiDAR in a simulated room, with the sigma of every pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from converters.base import RecordingWriter
+from converters.simulate import _camera, bake, paths
+from converters.simulate.render import Renderer
+from converters.simulate.scene import build
+from converters.stereo import StereoRig
+from pipeline.frontend.config import FrontendConfig
+from pipeline.frontend.stage import run_frontend
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.geometry.trajectory import align
+from pipeline.kernels import Rasterizer
+from pipeline.recording import RgbdLog, read_log
+from pipeline.splat.losses import depth_error
+
+CAMERA = _camera((240, 180))
+FRAMES = 30
+BASELINE_M = 0.12
+RANGE_SIGMA_M = 0.02
+R_CAMERA_LIDAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+T_CAMERA_LIDAR = se3.from_rotation_translation(R_CAMERA_LIDAR, [0.02, -0.2, -0.05])
+WIDE = PinholeCamera(
+    1000, 600, 400.0, 400.0, 499.5, 299.5
+)  # in the LiDAR's place: its beams are pixels of it
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Logs of one robot by what its depth comes from, true poses [n, 4, 4] and true depths."""
+
+    logs: dict[str, Path]
+    poses: np.ndarray
+    depths: list[np.ndarray]
+
+
+def beams(rings: int, columns: int) -> np.ndarray:
+    """Pixels [n, 2] of the wide camera that a LiDAR of these rings, 30 degrees in all, measures."""
+    elevation, azimuth = np.meshgrid(
+        np.radians(np.linspace(-15, 15, rings)), np.radians(np.arange(-45, 45, 360 / columns)), indexing="ij"
+    )
+    rays = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=-1).reshape(-1, 3)
+    return np.rint(WIDE.project(rays @ R_CAMERA_LIDAR.T)).astype(int)
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
+    """A room filmed by a stereo rig with a LiDAR on top, grey values and ranges with noise."""
+    room = build("room", 0)
+    eye, wide = Renderer(room, bake.bake(room, 0.012), CAMERA), Renderer(room, None, WIDE)
+    poses = paths.plan(room, 1, 160, 0.6, CAMERA)[0][:FRAMES]
+    pixels, rng, rig = beams(32, 900), np.random.default_rng(1), StereoRig(CAMERA, BASELINE_M)
+    rays = WIDE.rays()[pixels[:, 1], pixels[:, 0]]
+    units = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    views = [eye.render(T) for T in poses]
+    rights = [eye.render(T @ se3.exp([BASELINE_M, 0, 0, 0, 0, 0])) for T in poses]
+    out = tmp_path_factory.mktemp("walk")
+    for kind in ("stereo", "lidar"):
+        with RecordingWriter(out / kind) as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
+            if kind == "lidar":
+                robot.set_lidar(T_CAMERA_LIDAR, RANGE_SIGMA_M)
+            for k, (T, view, right) in enumerate(zip(poses, views, rights, strict=True)):
+                left, other = (
+                    np.clip(np.rint(v.color + rng.normal(0, 2.5, v.color.shape)), 0, 255).astype(np.uint8)
+                    for v in (view, right)
+                )
+                png, stamp_ns = cv2.imencode(".png", left[..., ::-1])[1].tobytes(), k * 33_333_333
+                if kind == "lidar":
+                    z, _ = wide.depth(T @ se3.from_rotation_translation(np.eye(3), T_CAMERA_LIDAR[:3, 3]))
+                    z = z[pixels[:, 1], pixels[:, 0], None]
+                    points = rays * z + units * rng.normal(0, RANGE_SIGMA_M, z.shape)
+                    robot.add_points(stamp_ns, points[z[:, 0] > 0] @ R_CAMERA_LIDAR)
+                    robot.add_frame(stamp_ns, png, "png", None, T)
+                    continue
+                gray = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, other))
+                depth_m, sigma_m = rig.depth(*gray)
+                raw = np.rint(depth_m / 0.001).astype(np.uint16)
+                robot.add_frame(stamp_ns, png, "png", raw, T, depth_sigma_m=sigma_m)
+    logs = {kind: out / kind / "alpha.mcap" for kind in ("stereo", "lidar")}
+    return Walk(logs, poses, [view.depth for view in views])
+
+
+def followed(walk: Walk, kind: str, out: Path, mapping: bool) -> tuple[list, list, float]:
+    """Tracked frames, the final map if there is one, and the ATE in metres."""
+    config = FrontendConfig(mapping_enabled=mapping)
+    quick = config.mapping.model_copy(update={"final_iterations": 10, "max_gaussians": 20_000})
+    run_frontend(walk.logs[kind], out, config.model_copy(update={"mapping": quick}))
+    messages = [(record.topic, record.message()) for record in read_log(out)]
+    odometry = [m for topic, m in messages if topic == "/alpha/odometry" and m.status != "lost"]
+    found = np.array([m.T_map_camera for m in odometry])
+    true = np.array([walk.poses[m.frame_index] for m in odometry])
+    T_world_map = align(true[:, :3, 3], found[:, :3, 3])
+    apart = true[:, :3, 3] - se3.transform(T_world_map, found[:, :3, 3])
+    maps = [m.gaussians for topic, m in messages if topic == "/alpha/map"]
+    return odometry, maps[:1], float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+
+
+@pytest.mark.parametrize(("kind", "most_m", "most_depth_m"), [("stereo", 0.006, 0.15), ("lidar", 0.004, 0.1)])
+def test_it_tracks_and_maps(
+    walk: Walk, tmp_path: Path, kind: str, most_m: float, most_depth_m: float
+) -> None:
+    odometry, (gaussians,), error_m = followed(walk, kind, tmp_path / "f.mcap", True)
+    assert len(odometry) == FRAMES
+    assert error_m < most_m
+    errors = []
+    for k in (3, 13, 23):
+        render = Rasterizer().forward(gaussians, CAMERA, se3.inverse(odometry[k].T_map_camera))
+        errors.append(depth_error(render, walk.depths[k].astype(np.float32))[0])
+    assert np.mean(errors) < most_depth_m
+
+
+def test_stereo_is_tracked_better_by_its_sigma_than_by_a_sensor_model(
+    walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told, _, error_m = followed(walk, "stereo", tmp_path / "told.mcap", False)
+    frame = RgbdLog.frame
+    monkeypatch.setattr(RgbdLog, "frame", lambda log, k: replace(frame(log, k), depth_sigma=None))
+    model, _, without_m = followed(walk, "stereo", tmp_path / "model.mcap", False)
+    assert len(told) == FRAMES
+    assert error_m < 0.006
+    assert without_m > 2 * error_m or len(model) < FRAMES

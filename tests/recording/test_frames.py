@@ -1,0 +1,195 @@
+"""Colour, depth and masks, frame by frame."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from converters.base import RecordingWriter
+from pipeline import messages as m
+from pipeline.errors import DuagError
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.recording import (
+    LogWriter,
+    info,
+    open_rgbd,
+)
+from pipeline.recording.pairing import TOLERANCE_NS, pair
+from schemas import topics
+from tests.recording.logs import CALIBRATION, CAMERA, COLOR, DEPTH, FRAME_NS, depth, image, png, write_camera
+
+
+def test_frames_come_back_in_any_order(tmp_path: Path) -> None:
+    with open_rgbd(write_camera(tmp_path / "alpha.mcap", frames=9)) as log:
+        assert (log.robot, log.camera, log.depth_scale, len(log)) == ("alpha", CAMERA, 0.001, 9)
+        for frame in [*log.frames(), log.frame(7), log.frame(0)]:
+            assert frame.stamp_ns == frame.index * FRAME_NS
+            assert np.array_equal(frame.color, image(frame.index)[:, :, ::-1])  # OpenCV encodes BGR
+            assert np.array_equal(frame.depth, depth(frame.index) * np.float32(0.001))
+            assert frame.depth.dtype == np.float32
+        with pytest.raises(IndexError):
+            log.frame(9)
+
+
+def usable(index: int) -> np.ndarray:
+    return np.random.default_rng(2000 + index).random((CAMERA.height, CAMERA.width)) < 0.6
+
+
+def test_masks_come_with_their_images(tmp_path: Path) -> None:
+    """Some frames have one; a masked pixel keeps its depth, but not its usable depth."""
+    masks = {k: m.pack_mask(k * FRAME_NS, "alpha", usable(k)) for k in (1, 4, 5)}
+    with open_rgbd(write_camera(tmp_path / "alpha.mcap", frames=7, masks=masks)) as log:
+        for frame in [*log.frames(), log.frame(4)]:
+            if frame.index in masks:
+                assert frame.mask is not None
+                assert np.array_equal(frame.mask, usable(frame.index))
+                assert np.array_equal(frame.usable_depth, frame.depth * usable(frame.index))
+            else:
+                assert frame.mask is None
+                assert frame.usable_depth is frame.depth
+
+
+def test_masks_can_be_recorded(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "rec") as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
+        for k in range(3):
+            robot.add_frame(k * FRAME_NS, png(image(k)), "png", depth(k), mask=usable(k) if k else None)
+        with pytest.raises(ValueError, match="an image is"):
+            robot.add_frame(3 * FRAME_NS, png(image(3)), "png", depth(3), mask=usable(3).T)
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
+        assert [frame.mask is None for frame in log.frames()] == [True, False, False]
+
+
+def odd_mask(**fields: Any) -> Any:
+    message = m.pack_mask(0, "alpha", usable(0))
+    for name, value in fields.items():
+        setattr(message, name, value)
+    return message
+
+
+@pytest.mark.parametrize(
+    ("mask", "words"),
+    [
+        (odd_mask(encoding="mono8"), "at 0 ns is mono8, expected 8UC1"),
+        (odd_mask(step=15), "has rows of 15 bytes for 16x12 pixels"),
+        (odd_mask(data=b"x"), "has 1 bytes, expected 192"),
+        (
+            odd_mask(data=bytes([255] * 191 + [7])),
+            "has the value 7, expected 0 (ignore) and 255 (usable) only",
+        ),
+        (odd_mask(width=8, height=24, step=8), "is 8x24, expected 16x12"),
+    ],
+)
+def test_unsound_masks_are_one_line(tmp_path: Path, mask: Any, words: str) -> None:
+    path = write_camera(tmp_path / "alpha.mcap", masks={0: mask})
+    with pytest.raises(DuagError) as caught:
+        list(open_rgbd(path).frames())
+    assert str(caught.value).startswith(f"{path}: /alpha/camera/mask")
+    assert words in str(caught.value)
+
+
+def test_a_mask_of_no_image_is_an_error(tmp_path: Path) -> None:
+    skipped = {"skip_color": (2,), "skip_depth": (2,)}
+    masks = {2: m.pack_mask(2 * FRAME_NS, "alpha", usable(2))}
+    with pytest.raises(DuagError, match="has a mask at 66666666 ns, expected one in /alpha/camera/color"):
+        open_rgbd(write_camera(tmp_path / "alpha.mcap", masks=masks, **skipped))
+
+
+def test_frames_stream(tmp_path: Path) -> None:
+    """Only a few chunks are in memory, however long the log."""
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 2**16, (480, 640), dtype=np.uint16)
+    camera = PinholeCamera(640, 480, 500, 500, 320, 240)
+    picture = png(np.zeros((480, 640, 3), np.uint8))
+    path = write_camera(
+        tmp_path / "a.mcap", 12, cameras={0: camera}, color=lambda _: picture, depth=lambda _: noise
+    )
+    log = open_rgbd(path)
+    for frame in log.frames():
+        assert frame.depth[0, 0] == np.float32(noise[0, 0]) * np.float32(0.001)
+        assert sum(len(chunk) for chunk in log._log._chunks.values()) < 6_000_000
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"skip_color": (0, 2), "skip_depth": (1, 3)}, "none of them within 20 ms of each other"),
+        ({"skip_depth": (0, 1, 2, 3)}, "has a message, expected depth from one of them"),
+        ({"frames": 0}, "expected exactly one robot"),
+        ({"cameras": {}}, f"{CALIBRATION} has no message"),
+        ({"cameras": {1: CAMERA}}, f"{CALIBRATION} begins at 33333333 ns"),
+        ({"cameras": {0: CAMERA, 2: CAMERA.halved()}}, f"{CALIBRATION} changes at 66666666 ns"),
+        ({"cameras": {0: CAMERA.halved()}}, f"{COLOR} at 0 ns is 16x12, expected 8x6"),
+        ({"cameras": {0: PinholeCamera(16, 12, np.nan, 1, 1, 1)}}, f"{CALIBRATION}: K is"),
+        ({"scale": None}, f"{DEPTH}: channel metadata depth_scale is None"),
+        ({"scale": "-1"}, f"{DEPTH}: channel metadata depth_scale is '-1'"),
+        ({"scale": "nan"}, "depth_scale is 'nan'"),
+        ({"color": lambda _: b"no image"}, f"{COLOR} at 0 ns has 8 bytes that no decoder reads"),
+        ({"color": lambda _: b""}, f"{COLOR} at 0 ns has 0 bytes"),
+        ({"depth": lambda _: np.zeros((3, 4), np.uint16)}, f"{DEPTH} at 0 ns is 4x3, expected 16x12"),
+    ],
+)
+def test_unsound_cameras_are_one_line(tmp_path: Path, change: dict[str, Any], words: str) -> None:
+    path = write_camera(tmp_path / "alpha.mcap", **change)
+    with pytest.raises(DuagError) as caught:
+        list(open_rgbd(path).frames())
+    assert str(caught.value).startswith(str(path))
+    assert words in str(caught.value)
+
+
+def test_images_without_a_partner_are_no_frames(tmp_path: Path) -> None:
+    path = write_camera(tmp_path / "alpha.mcap", 8, skip_color=(1,), skip_depth=(4, 5))
+    with open_rgbd(path) as log:
+        assert [f.stamp_ns // FRAME_NS for f in log.frames()] == [0, 2, 3, 6, 7]
+        assert [f.index for f in log.frames()] == [0, 1, 2, 3, 4]
+        for frame in log.frames():
+            assert np.array_equal(frame.depth, depth(frame.stamp_ns // FRAME_NS) * np.float32(0.001))
+        assert log.pairing.color_alone == (4 * FRAME_NS, 5 * FRAME_NS)
+        assert log.pairing.depth_alone == (FRAME_NS,)
+    warnings = info(path)["warnings"]
+    assert f"{COLOR}: 2 images have none of {DEPTH} within 20 ms and are no frames" in warnings
+    assert f"{DEPTH}: 1 images have none of {COLOR} within 20 ms and are no frames" in warnings
+
+
+def test_colour_and_depth_may_come_at_their_own_rates(tmp_path: Path) -> None:
+    """Colour at 30 Hz, depth at 10 Hz and 7 ms late: every third colour image has its nearest depth."""
+    path = tmp_path / "alpha.mcap"
+    events = [(k * FRAME_NS, topics.COLOR, k) for k in range(9)]
+    events += [(3 * k * FRAME_NS + 7_000_000, topics.DEPTH, k) for k in range(3)]
+    with LogWriter(path, "alpha") as log:
+        log.channel(DEPTH, topics.DEPTH.schema, {"depth_scale": "0.001"})
+        log.write(CALIBRATION, m.pack_calibration(0, "alpha", CAMERA), 0)
+        for stamp, topic, k in sorted(events, key=lambda event: event[0]):
+            color = topic is topics.COLOR
+            message = (
+                m.pack_color(stamp, "alpha", png(image(k)), "png")
+                if color
+                else m.pack_depth(stamp, "alpha", depth(k))
+            )
+            log.write(topic.of("alpha"), message, stamp)
+    with open_rgbd(path) as log:
+        frames = list(log.frames())
+    assert [f.stamp_ns // FRAME_NS for f in frames] == [0, 3, 6]
+    assert [f.depth_offset_ns for f in frames] == [7_000_000] * 3
+    for k, frame in enumerate(frames):
+        assert np.array_equal(frame.color, image(3 * k)[:, :, ::-1])
+        assert np.array_equal(frame.depth, depth(k) * np.float32(0.001))
+    assert f"{DEPTH}: up to 7.0 ms from {COLOR}" in info(path)["warnings"]
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    color=st.lists(st.integers(0, 10**9), unique=True, min_size=1, max_size=20),
+    depth_times=st.lists(st.integers(0, 10**9), unique=True, min_size=1, max_size=20),
+)
+def test_pairs_are_each_others_nearest(color: list[int], depth_times: list[int]) -> None:
+    found = pair(color, depth_times)
+    for c, d in found.pairs:
+        assert abs(c - d) <= TOLERANCE_NS
+        assert abs(c - d) == min(abs(c - other) for other in depth_times)
+        assert abs(c - d) == min(abs(other - d) for other in color)
+    assert sorted([c for c, _ in found.pairs] + list(found.color_alone)) == sorted(color)
+    assert sorted([d for _, d in found.pairs] + list(found.depth_alone)) == sorted(depth_times)
+    assert len({d for _, d in found.pairs}) == len(found.pairs)

@@ -1,0 +1,144 @@
+"""Recordings: folders of logs that are written whole or not at all."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from converters.base import RecordingWriter, RobotWriter, robot_names
+from pipeline import messages as m
+from pipeline.errors import DuagError
+from pipeline.geometry import se3
+from pipeline.recording import (
+    Recording,
+    log_metadata,
+    open_rgbd,
+    read_log,
+)
+from tests.recording.logs import CAMERA, depth, image, png, write_recording, write_robot
+
+
+def test_a_recording_reads_back(tmp_path: Path) -> None:
+    recording = Recording(write_recording(tmp_path / "rec"))
+    assert recording.name == "rec"
+    assert recording.robots == ["alpha", "bravo"]
+    assert len(open_rgbd(recording.log("bravo"))) == 3
+    truth = recording.groundtruth("alpha")
+    assert truth is not None
+    poses = [m.unpack_pose_in_frame(r.proto()) for r in read_log(truth, ["/alpha/groundtruth/pose"])]
+    np.testing.assert_allclose(
+        poses, [se3.exp([0.1 * i, 0, 0, 0, 0, 0.01 * i]) for i in range(3)], atol=1e-14
+    )
+    assert not any("groundtruth" in r.topic for r in read_log(recording.log("alpha")))
+    truth.unlink()
+    assert recording.groundtruth("alpha") is None  # optional even where it is listed
+    with pytest.raises(DuagError, match="expected 'charlie' among them"):
+        recording.log("charlie")
+
+
+def test_robots_written_apart_make_the_same_recording(tmp_path: Path) -> None:
+    """As parallel workers do: one RobotWriter each, in any order."""
+    together = write_recording(tmp_path / "a" / "rec")
+    with RecordingWriter(tmp_path / "b" / "rec", source={"dataset": "test"}, converter="test") as recording:
+        for name in reversed(robot_names(2)):
+            with RobotWriter(recording.folder, name, CAMERA, 0.001) as robot:
+                write_robot(robot, 3)
+            recording.add(json.loads(json.dumps(robot.summary)))  # plain enough to cross processes
+    for path in sorted(together.iterdir()):
+        assert path.read_bytes() == (tmp_path / "b" / "rec" / path.name).read_bytes(), path.name
+
+
+def test_exact_depth_and_geometry_lie_apart(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "rec") as writer:
+        with writer.robot("alpha", CAMERA, 0.0002, {"depth_noise": "kinect"}) as robot:
+            write_robot(robot, 2, exact=True)
+        writer.add_geometry(lambda path: path.write_text("ply\n") and None)
+    recording = Recording(tmp_path / "rec")
+    truth = recording.groundtruth("alpha")
+    assert truth is not None
+    exact = [m.unpack_depth(r.proto(), "") for r in read_log(truth, ["/alpha/groundtruth/depth"])]
+    assert np.array_equal(exact, [depth(50), depth(51)])
+    assert recording.geometry() == tmp_path / "rec" / "groundtruth.ply"
+    assert log_metadata(recording.log("alpha")) == {"robot": "alpha", "depth_noise": "kinect"}
+
+
+def test_an_unfinished_recording_leaves_nothing(tmp_path: Path) -> None:
+    def write_and_fail(error: type[BaseException]) -> None:
+        with RecordingWriter(tmp_path / "rec") as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
+            write_robot(robot, 1)
+            raise error
+
+    for error in (RuntimeError, KeyboardInterrupt):
+        with pytest.raises(error):
+            write_and_fail(error)
+        assert list(tmp_path.iterdir()) == []
+    with pytest.raises(DuagError, match="no robot"), RecordingWriter(tmp_path / "rec"):
+        pass
+    with (
+        pytest.raises(DuagError, match="no frame"),
+        RecordingWriter(tmp_path / "rec") as recording,
+        recording.robot("alpha", CAMERA, 0.001),
+    ):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_existing_outputs_are_kept(tmp_path: Path) -> None:
+    out = write_recording(tmp_path / "rec", robots=1)
+    with pytest.raises(DuagError, match="exists already"):
+        write_recording(out)
+    assert Recording(out).robots == ["alpha"]
+    write_recording(out, robots=2, force=True)
+    assert Recording(out).robots == ["alpha", "bravo"]
+    other = tmp_path / "precious"
+    other.mkdir()
+    (other / "file").write_text("x")
+    with pytest.raises(DuagError, match="--force replaces nothing else"):
+        write_recording(other, force=True)
+    assert (other / "file").read_text() == "x"
+
+
+def test_bugs_of_converters_are_errors(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "rec") as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
+        robot.add_frame(5, png(image(0)), "png", depth(0))
+        for stamp, kind, array in ((5, "png", depth(0)), (6, "bmp", depth(0)), (6, "png", depth(0).T)):
+            with pytest.raises(ValueError, match=r"expected|comes after"):
+                robot.add_frame(stamp, b"", kind, array)
+    with pytest.raises(DuagError, match="robot 'A b'"):
+        RobotWriter(tmp_path, "A b", CAMERA, 0.001)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("not json", "expected the JSON of a recording"),
+        ("[]", "format is 'list'"),
+        ({"format": "other"}, "format is 'other'"),
+        ({"schema": 99}, "schema is 99, expected 1"),
+        ({"robots": {}}, "no robots"),
+        ({"robots": {"alpha": {}}}, "'alpha' has no log"),
+        ({"robots": {"../alpha": {"log": "alpha.mcap"}}}, "robot '../alpha'"),
+        ({"robots": {"alpha": {"log": "../alpha.mcap"}}}, "alpha.log is '../alpha.mcap'"),
+        ({"robots": {"alpha": {"log": "a.mcap", "groundtruth": 5}}}, "alpha.groundtruth is 5"),
+        ({"geometry": "/etc/passwd"}, "geometry is '/etc/passwd'"),
+    ],
+)
+def test_broken_descriptions_are_one_line(tmp_path: Path, change: str | dict[str, Any], words: str) -> None:
+    path = write_recording(tmp_path / "rec", robots=1, frames=1) / "recording.json"
+    path.write_text(
+        change if isinstance(change, str) else json.dumps({**json.loads(path.read_text()), **change})
+    )
+    with pytest.raises(DuagError, match=r"recording\.json") as caught:
+        Recording(path.parent)
+    assert words in str(caught.value)
+
+
+def test_missing_parts_of_a_recording(tmp_path: Path) -> None:
+    with pytest.raises(DuagError, match=r"recording\.json: no such file"):
+        Recording(tmp_path)
+    out = write_recording(tmp_path / "rec", robots=1)
+    (out / "alpha.mcap").unlink()
+    with pytest.raises(DuagError, match=r"alpha\.mcap: no such file"):
+        Recording(out).log("alpha")

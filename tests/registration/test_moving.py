@@ -1,0 +1,101 @@
+"""What moved is found where others looked through it, and a rigid room is left alone."""
+
+import numpy as np
+import pytest
+
+from pipeline.geometry import se3
+from pipeline.registration.moving import FreeSpace, MovingConfig
+from tests.registration.room import CAMERA, pose, render
+
+CONFIG = MovingConfig(halvings=1, grow_px=2)
+POSES = [pose(x=-0.2 + 0.1 * k, z=-1.4, yaw=0.1 - 0.05 * k) for k in range(5)]
+RADIUS_M = 0.2
+
+
+def with_ball(
+    depth: np.ndarray, T_world_camera: np.ndarray, centre_world: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The depth image with a ball in the room, and the pixels that show it."""
+    centre = se3.transform(se3.inverse(T_world_camera), centre_world[None])[0]
+    rays = CAMERA.rays()
+    b, a = rays @ centre, (rays**2).sum(axis=-1)
+    inside = b * b - a * (centre @ centre - RADIUS_M**2)
+    z = np.where(inside > 0, (b - np.sqrt(np.maximum(inside, 0))) / a, np.inf)
+    shows = (z > 0) & (z < depth)
+    return np.where(shows, z, depth).astype(np.float32), shows
+
+
+def ball_at(k: int) -> np.ndarray:
+    return np.array([-0.5 + 0.25 * k, -0.3, 0.4])
+
+
+def scene(
+    centres: list[np.ndarray], config: MovingConfig = CONFIG, noise: np.random.Generator | None = None
+) -> tuple[FreeSpace, list[np.ndarray], list[np.ndarray]]:
+    """The set of all views, their depth images and where they show the ball."""
+    free, depths, shown = FreeSpace(CAMERA, config), [], []
+    for T, centre in zip(POSES, centres, strict=True):
+        depth, shows = with_ball(render(T, noise)[1], T, centre)
+        free.add(depth, T)
+        depths.append(depth)
+        shown.append(shows)
+    return free, depths, shown
+
+
+def test_a_ball_that_moves_is_found_and_nothing_else() -> None:
+    free, depths, shown = scene([ball_at(k) for k in range(5)])
+    for T, depth, shows in zip(POSES, depths, shown, strict=True):
+        assert np.count_nonzero(shows) > 100
+        moving = free.moving(depth, T)
+        assert np.count_nonzero(moving & shows) > 0.9 * np.count_nonzero(shows)
+        assert np.count_nonzero(moving & ~shows) < 0.5 * np.count_nonzero(shows)  # the margin around it
+
+
+def test_a_ball_that_rests_is_part_of_the_room() -> None:
+    free, depths, _ = scene([ball_at(2)] * 5)
+    assert not any(free.moving(depth, T).any() for depth, T in zip(depths, POSES, strict=True))
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.03])
+def test_a_rigid_room_with_noise_and_poses_that_are_off_is_left_alone(off_m: float) -> None:
+    rng = np.random.default_rng(0)
+    free = FreeSpace(CAMERA, CONFIG)
+    seen = []
+    for T in POSES:
+        depth = render(T, rng, depth_sigma_m=0.02)[1]
+        depth[rng.random(depth.shape) < 0.05] = 0
+        T = T @ se3.exp(off_m * rng.uniform(-1, 1, 6) * [1, 1, 1, 0.3, 0.3, 0.3])
+        free.add(depth, T)
+        seen.append((depth, T))
+    assert not any(free.moving(depth, T).any() for depth, T in seen)
+
+
+def test_one_view_is_not_enough() -> None:
+    free = FreeSpace(CAMERA, CONFIG)
+    empty = render(POSES[2])[1]
+    depth, shows = with_ball(empty, POSES[2], ball_at(2))
+    free.add(empty, POSES[1])
+    assert not free.moving(depth, POSES[2]).any()
+    free.add(render(POSES[3])[1], POSES[3])
+    free.add(render(POSES[1])[1], POSES[1])
+    assert free.moving(depth, POSES[2])[shows].mean() > 0.8
+
+
+def test_the_mask_given_stays_and_nothing_found_is_no_mask() -> None:
+    free, depths, shown = scene([ball_at(k) for k in range(5)])
+    given = np.ones(depths[0].shape, bool)
+    given[:10] = False
+    usable = free.usable(depths[2], POSES[2], given)
+    assert usable is not None
+    assert not usable[:10].any()
+    assert not usable[shown[2]].mean() > 0.1
+    still, depths, _ = scene([ball_at(2)] * 5)
+    assert still.usable(depths[2], POSES[2], None) is None
+    off, depths, _ = scene([ball_at(k) for k in range(5)], CONFIG.model_copy(update={"enabled": False}))
+    assert off.usable(depths[2], POSES[2], given) is given
+
+
+def test_no_depth_is_nothing() -> None:
+    free, _, _ = scene([ball_at(k) for k in range(5)])
+    free.add(np.zeros((CAMERA.height, CAMERA.width), np.float32), POSES[0] @ se3.exp(np.full(6, 0.01)))
+    assert not free.moving(np.zeros((CAMERA.height, CAMERA.width), np.float32), POSES[1]).any()
