@@ -32,7 +32,7 @@ def points_of(message: Any, where: str) -> tuple[Array, Array]:
     row = int(message.row_step) or step * width
     missing = [name for name in "xyz" if name not in fields]
     data = np.frombuffer(bytes(message.data), np.uint8)
-    if missing or row < step * width or len(data) < row * height:
+    if missing or step < 1 or row < step * width or len(data) < row * height:
         raise DuagError(
             f"{where} has fields {sorted(fields)} and {len(data)} bytes for {width}x{height} points "
             f"of {step}, expected x, y, z and {max(row, step * width) * height} bytes"

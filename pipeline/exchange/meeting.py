@@ -57,7 +57,9 @@ class OwnPlaces:
         if self._features is None:
             most = self.config.places.features_per_keyframe
             camera = self.data.camera
-            self._features = [extract(*self.data.images(k), camera, most) for k in range(self.data.keyframes)]
+            self._features = [
+                extract(*self.data.images(k)[:2], camera, most) for k in range(self.data.keyframes)
+            ]
         return self._features
 
     def pyramid(self, keyframe: int) -> RgbdPyramid:
@@ -65,8 +67,10 @@ class OwnPlaces:
         return self._pyramid(keyframe)
 
     def _build_pyramid(self, keyframe: int) -> RgbdPyramid:
-        color, depth = self.data.images(keyframe)
-        return RgbdPyramid.build(color.astype(np.float32) / np.float32(255), depth, self.data.camera)
+        images = self.data.images(keyframe)
+        color = images.color.astype(np.float32) / np.float32(255)
+        camera, sigma_m = self.data.camera, images.depth_sigma_m
+        return RgbdPyramid.build(color, images.depth_m, camera, depth_sigma_m=sigma_m)
 
     @property
     def digest(self) -> bytes:
