@@ -51,7 +51,7 @@ class McapFile:
         self._stream.seek(-min(len(MAGIC), self.path.stat().st_size), 2)
         if self._stream.read() != MAGIC:
             raise DuagError(
-                f"{self.path}: is cut short or no MCAP; what it holds can be saved with `mcap recover`"
+                f"{self.path}: is cut short or no MCAP; what it holds can be saved with `duagc recover`"
             )
         self._stream.seek(0)
         self._reader = SeekingReader(self._stream, validate_crcs=True, record_size_limit=LARGEST_CHUNK)
@@ -238,22 +238,27 @@ class _Foxglove:
         self.name, self.encoding = foxglove.plain_name(schema.name), encoding
 
     def read(self, data: bytes, where: str) -> Any:
+        return foxglove.as_ros(self.name, self._message(data, where), where)
+
+    def header_ns(self, data: bytes, where: str) -> int:
+        """Without unpacking the image: of transforms in a list the first one's."""
+        message = self._message(data, where)
+        if self.name == "foxglove.FrameTransforms":
+            return stamp_ns(foxglove.as_ros(self.name, message, where))
+        return foxglove.stamp_ns(message, where)
+
+    def _message(self, data: bytes, where: str) -> Any:
         import schemas
 
         try:
             if self.encoding == "json":
                 members = json.loads(data)
-                message = foxglove.JsonFields(members if isinstance(members, dict) else {})
-            else:
-                message = schemas.message_class(self.name).FromString(data)
+                return foxglove.JsonFields(members if isinstance(members, dict) else {})
+            return schemas.message_class(self.name).FromString(data)
         except Exception as error:  # protobuf's DecodeError, broken JSON, broken text
             raise DuagError(
                 f"{where} holds {len(data)} bytes that are no {self.name} in {self.encoding} ({reason(error)})"
             ) from error
-        return foxglove.as_ros(self.name, message, where)
-
-    def header_ns(self, data: bytes, where: str) -> int:
-        return stamp_ns(self.read(data, where))
 
 
 class _Unknown:

@@ -121,14 +121,15 @@ def reason(error: Exception) -> str:
 
 
 def check_definitions(found: Mapping[str, Any]) -> None:
-    """Refuse a log whose definitions of types that are read here lack fields that ROS's have. found: fields by type."""
+    """Refuse a log that defines types that are read here otherwise than ROS does. found: fields by type."""
     from rosbags.typesys import Stores, get_typestore
 
     standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
     for name in sorted(set(found) & READ_TYPES):
-        has, wanted = ({field.lower() for field, _ in types[name][1]} for types in (found, standard))
-        if not wanted <= has:
-            raise ValueError(f"its {name} has no field {sorted(wanted - has)[0]}")
+        has, wanted = ({field.lower(): kind for field, kind in types[name][1]} for types in (found, standard))
+        for field in wanted:
+            if has.get(field) != wanted[field]:
+                raise ValueError(f"its {name} has no field {field} as ROS has it")
 
 
 def deserialised(read: Any, raw: bytes, kind: str, where: str) -> Any:
