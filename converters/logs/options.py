@@ -38,7 +38,7 @@ class LogOptions(AssociationOptions, StereoOptions):
     """Frame that the true poses are of; by default what the message says, which /tf_static must tie to the camera."""
     namespaces: str = ""
     """Namespaces of several robots in one log, separated by commas, for example "/acl_jackal,/sparkal1"; they name the
-    robots."""
+    robots, and stand for {namespace} in the names of other topics."""
     registered: Literal["auto", "yes", "no"] = "auto"
     """Whether depth is seen from the colour camera; auto: by name of the topic, frame and camera."""
     T_color_depth: str = ""

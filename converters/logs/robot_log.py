@@ -275,7 +275,8 @@ class RobotLog:
         """What the times of the images say about the robot's clock."""
         first, last = min(self.pairs), max(self.pairs)
         header = self.settings.time_source == "header"
-        return RobotClock(robot, self.log, self.namespace, self._delays_ns, first, last, header)
+        files = frozenset(part.path for part in self.log.parts if self.color in part.topics)
+        return RobotClock(robot, self.log, files, self.namespace, self._delays_ns, first, last, header)
 
     def frames(self) -> Iterator[tuple[int, Any, Any]]:
         """Time, colour and depth message of every pair, in order of time; holds no more than it must."""

@@ -3,8 +3,8 @@
     higher end                                          lower end
     HELLO        digest of what was seen              <->
     DESCRIPTORS  compact descriptors of all keyframes ->
-                                                      <- REQUEST   keyframes worth a closer look
-    SAMPLE       one per requested keyframe           ->
+                                                      <- REQUEST   keyframes worth a closer look    } until nothing
+    SAMPLE       one per requested keyframe           ->                                            } is worth it
                                                       <- CLOSURES  verdict, shared keyframes
 
 The lower end is the one with the lower digest (and name, should they be equal): who verifies decides which of two
@@ -29,7 +29,7 @@ from pipeline.consensus.links import SharedKeyframes, link_metric
 from pipeline.exchange import injection, places, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.packets import Kind, MalformedError
-from pipeline.exchange.places import Candidate
+from pipeline.exchange.places import Candidate, Planner
 from pipeline.exchange.verification import Verdict, Verified, verify
 from pipeline.exchange.wire import KeyframeSample, PlaceBook, Verdicts
 from pipeline.geometry import se3
@@ -142,6 +142,10 @@ class Meeting:
 class HigherEnd(Meeting):
     """Sends descriptors and the samples it is asked for; gets the verdict."""
 
+    def __init__(self, own: str, peer: str, places_: OwnPlaces, config: ExchangeConfig, seed: int) -> None:
+        super().__init__(own, peer, places_, config, seed)
+        self.answered: set[int] = set()
+
     def begin(self, send: Send) -> None:
         send(Kind.DESCRIPTORS, wire.write_places(self.places.book()))
 
@@ -149,6 +153,9 @@ class HigherEnd(Meeting):
         limit = self.places.data.keyframes
         if kind is Kind.REQUEST:
             for keyframe in wire.read_indices(payload, limit):
+                if keyframe in self.answered:
+                    raise MalformedError(f"request: keyframe {keyframe} was asked for before")
+                self.answered.add(keyframe)
                 send(Kind.SAMPLE, wire.write_sample(self.places.sample(keyframe)))
         elif kind is Kind.CLOSURES and self.verdicts is None:
             verdicts = wire.read_verdicts(payload, limit)
@@ -165,6 +172,7 @@ class LowerEnd(Meeting):
     def __init__(self, own: str, peer: str, places_: OwnPlaces, config: ExchangeConfig, seed: int) -> None:
         super().__init__(own, peer, places_, config, seed)
         self.book: PlaceBook | None = None
+        self.planner: Planner | None = None
         self.waiting: dict[int, list[Candidate]] = {}  # by keyframe of the neighbour
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
@@ -176,35 +184,35 @@ class LowerEnd(Meeting):
                 raise MalformedError(f"sample of keyframe {sample.keyframe} was not asked for, or came twice")
             self._verify(sample)
             if not self.waiting:
-                self._decide(send)
+                self._ask(send)
         else:
             raise MalformedError(f"{kind.name} is not for the lower end, or came twice")
 
     def _choose(self, book: PlaceBook, send: Send) -> None:
-        """Score all pairs of keyframes and ask for the samples of the best."""
+        """Score all pairs of keyframes and ask for the samples of the most promising."""
         self.book = book
         c = self.config.places
-        choice = places.candidates(
-            self.places.features,
-            book.descriptors,
-            c.ratio,
-            c.min_score,
-            c.candidates_per_keyframe,
-            c.max_requested_keyframes,
-        )
-        for candidate in choice.left:
-            self.tried.append(Tried(candidate, Verified(Verdict.NOT_ASKED_FOR, 0, 0)))
-        for candidate in choice.unlike:
+        candidates, unlike = places.scored(self.places.features, book.descriptors, c.ratio, c.min_score)
+        for candidate in unlike:
             detail = f"{candidate.score} descriptors match at best, {c.min_score} needed"
             self.tried.append(Tried(candidate, Verified(Verdict.UNLIKE, 0, 0, detail)))
-        for candidate in choice.kept:
+        self.planner = Planner(candidates, self.places.drift, book.drift, c, self.config.consensus.closures)
+        self._ask(send)
+
+    def _ask(self, send: Send) -> None:
+        """Ask for what is worth most now; decide when nothing is worth a sample any more."""
+        assert self.planner is not None
+        for candidate in self.planner.next():
             self.waiting.setdefault(candidate.peer_keyframe, []).append(candidate)
         if self.waiting:
             send(Kind.REQUEST, wire.write_indices(sorted(self.waiting)))
-        else:
-            self._decide(send)
+            return
+        for candidate, reason in self.planner.not_asked_for():
+            self.tried.append(Tried(candidate, Verified(Verdict.NOT_ASKED_FOR, 0, 0, reason)))
+        self._decide(send)
 
     def _verify(self, sample: KeyframeSample) -> None:
+        assert self.planner is not None
         for candidate in self.waiting.pop(sample.keyframe):
             ends = (self.places.features[candidate.own_keyframe], sample.features)
             own, peer = (hashlib.sha256(f.descriptors.tobytes()).hexdigest() for f in ends)
@@ -221,6 +229,7 @@ class LowerEnd(Meeting):
                 rng,
             )
             self.tried.append(Tried(candidate, result))
+            self.planner.take(candidate, result.closure is not None)
 
     def _inject(self) -> None:
         """Add the false closures that the configuration asks for."""

@@ -12,13 +12,15 @@ from typer.testing import CliRunner
 
 import converters
 from converters.logs import describe
+from pipeline import messages as m
 from pipeline.cli import app
 from pipeline.errors import DuagError
+from pipeline.recording import read_log
 from tests.converters.box_room import path
+from tests.converters.ros_bags import FRAMES, REAL, START_NS, Ros, scene
 from tests.converters.test_clocks import both
 from tests.converters.test_foreign_mcap import digests, write
 from tests.converters.test_kimera_multi import imu
-from tests.converters.test_ros import FRAMES, REAL, START_NS, Ros, scene
 
 run = CliRunner()
 
@@ -87,6 +89,23 @@ def test_namespaces_that_decide_become_robots(tmp_path: Path) -> None:
     assert list(robots) == ["husky", "jackal"]
     same = describe.describe(tmp_path / "team.toml")["robots"]
     assert [row["namespace"] for row in same.values()] == ["/husky", "/jackal"]
+
+
+def test_a_topic_that_is_said_is_of_one_robot(tmp_path: Path) -> None:
+    """Of several robots in one log each gets its own: nobody's odometry becomes another's truth."""
+    r = Ros(2)
+    rows = scene(r, prefix="/jackal") + scene(r, prefix="/husky", poses=path(FRAMES, 0.2))
+    log = r.write(tmp_path / "bag", sorted(rows, key=lambda x: x[1]), "mcap")
+    options = ["namespaces=/jackal,/husky"]
+    for option in ("truth=/jackal/odom", "odometry=/jackal/odom", "truth_file=gt.tum"):
+        with pytest.raises(DuagError, match=r"for several robots, expected .* a TOML file that says whose"):
+            converters.convert("ros", log, tmp_path / "rec", options=[*options, option])
+    converters.convert("ros", log, tmp_path / "rec", options=[*options, "truth={namespace}/odom"])
+    for robot, start in (("jackal", 0.0), ("husky", 0.2)):
+        records = read_log(tmp_path / "rec" / f"{robot}.groundtruth.mcap")
+        assert np.allclose(
+            [m.unpack_pose_in_frame(e.proto()) for e in records], path(FRAMES, start), atol=1e-9
+        )
 
 
 def test_what_is_not_decided_lists_its_candidates(tmp_path: Path) -> None:

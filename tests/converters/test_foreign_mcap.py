@@ -23,7 +23,7 @@ from pipeline.errors import DuagError
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.recording import open_rgbd, read_log
-from tests.converters.test_ros import COLOR, DISTORTION, Ros, scene
+from tests.converters.ros_bags import COLOR, DISTORTION, Ros, scene
 
 Row = tuple[str, int, Any]
 

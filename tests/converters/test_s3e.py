@@ -114,9 +114,7 @@ def turning_sweep(start: np.ndarray, stamp_ns: int) -> tuple[np.ndarray, np.ndar
     for k in range(20):
         time_s = -0.1 + 0.005 * k + 0.0025
         T = pose_at(start, stamp_ns + round(time_s * 1e9)) @ se3.inverse(T_LIDAR_LEFT)
-        turn = sweep(T, columns=900).reshape(900, 16, 3)
-        angle = np.degrees(np.arctan2(turn[:, 0, 1], turn[:, 0, 0]))
-        part = turn[(angle <= 80 - 8 * k) & (angle > 72 - 8 * k)].reshape(-1, 3)
+        part = sweep(T, part=(80.0 - 8 * k, 72.0 - 8 * k))
         points.append(part)
         seconds.append(np.full(len(part), time_s))
     return np.concatenate(points), np.concatenate(seconds)

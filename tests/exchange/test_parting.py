@@ -140,7 +140,7 @@ def test_a_false_link_is_parted_and_the_others_stay(
         assert result.agreed
         assert result.converged
         T_true = se3.inverse(team[root][1][0]) @ team[name][1]
-        assert se3.distance(T_true, result.T_world_keyframe)[0].max() < 0.01
+        assert se3.distance(T_true, result.T_world_keyframe)[0].max() < 0.015
         assert set(result.evidence) == set(together) - {name}
     if topology == "chain":
         assert is_alone(results["alpha"], team["alpha"][0])

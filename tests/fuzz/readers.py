@@ -22,7 +22,7 @@ from pipeline.config import load
 from pipeline.errors import DuagError
 from pipeline.recording import Recording, format_info, info, open_rgbd, read_log
 from tests.converters import test_foreign_mcap, test_image_folders, test_kimera_multi, test_simulate_meshes
-from tests.converters.test_ros import Ros, scene
+from tests.converters.ros_bags import Ros, scene
 from tests.converters.test_seven_scenes import make_sequence
 from tests.fuzz.mutate import damaged
 from tests.recording.logs import write_recording
