@@ -12,7 +12,7 @@ import pytest
 
 from converters import ros_images
 from pipeline.errors import DuagError
-from tests.converters.test_ros import COLOR, Ros
+from tests.converters.ros_bags import COLOR, Ros
 
 
 @pytest.mark.parametrize(
