@@ -131,7 +131,7 @@ class RobotWriter:
         self._files = ExitStack()
         self._log = LogWriter(self.folder / f"{name}.mcap", name, self.sensors)
         self._truth: LogWriter | None = None
-        self._has_exact_depth = self._has_sigma = False
+        self._has_depth = self._has_exact_depth = self._has_sigma = False
         self._sensors: dict[
             str, NDArray[np.float64]
         ] = {}  # topic of a pose in the camera that is still to be written
@@ -140,9 +140,6 @@ class RobotWriter:
 
     def __enter__(self) -> RobotWriter:
         self._files.enter_context(self._log)
-        self._log.channel(
-            topics.DEPTH.of(self.name), topics.DEPTH.schema, {DEPTH_SCALE_KEY: repr(self.depth_scale)}
-        )
         return self
 
     def add_frame(
@@ -185,6 +182,10 @@ class RobotWriter:
             topics.COLOR.of(name), messages.pack_color(stamp_ns, name, color, color_format), stamp_ns
         )
         if depth is not None:
+            if not self._has_depth:
+                text = {DEPTH_SCALE_KEY: repr(self.depth_scale)}
+                self._log.channel(topics.DEPTH.of(name), topics.DEPTH.schema, text)
+                self._has_depth = True
             self._log.write(topics.DEPTH.of(name), messages.pack_depth(stamp_ns, name, depth), stamp_ns)
             if depth_sigma_m is not None:
                 self._add_sigma(stamp_ns, depth, depth_sigma_m)

@@ -24,6 +24,7 @@ Image = NDArray[np.uint8]
 STEREO_SCALE_M = 0.002  # per unit of the depth images
 ROW_PAIRS = 6  # image pairs whose rows are tested
 RATIO_FRAMES = 12  # frames whose stereo depth is compared with the LiDAR's
+IMPOSSIBLE = 1e3  # rad/s and m/s^2: no vehicle turns or falls so
 MAX_RATIO_ERROR = 0.02
 
 
@@ -132,7 +133,7 @@ def imu_readings(entries: Iterable[tuple[int, Entry]]) -> list[tuple[int, Array,
         m = entry.read()
         w, a = m.angular_velocity, m.linear_acceleration
         reading = np.array([w.x, w.y, w.z], dtype=float), np.array([a.x, a.y, a.z], dtype=float)
-        if np.isfinite(reading).all():
+        if np.all(np.abs(reading) < IMPOSSIBLE):
             found.setdefault(stamp_ns, reading)
     return [(stamp, *found[stamp]) for stamp in sorted(found)]
 

@@ -49,7 +49,10 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
     sources = sources_of(src, options)
     if robots and robots != len(sources):
         raise DuagError(f"{src}: found {len(sources)} robots, expected --robots {len(sources)}")
-    parameters = {"robots": {s.robot: s.settings.model_dump() for s in sources}}
+    said = {s.robot: s.settings.model_dump() for s in sources}
+    for row in said.values():
+        row["truth_file"] = Path(row["truth_file"]).name  # no paths of this machine
+    parameters = {"robots": said}
     source = {"dataset": "ros", "folder": src.resolve().name, "parts": [s.label for s in sources]}
     with RecordingWriter(out, "", source, "ros", parameters, force) as recording, ExitStack() as opened:
         robot_logs = {}
@@ -209,13 +212,14 @@ class _Readings:
         odometry = self._odometry.body.stamps_ns if self._odometry else np.zeros(0, np.int64)
         self._stamps = np.concatenate([imu, odometry])
         self._order = np.argsort(self._stamps, kind="stable")
-        self._imu_count, self._next, self._shift_ns = len(imu), 0, source.shift_ns
+        self._imu_count, self._shift_ns = len(imu), source.shift_ns
+        self._next = int((self._stamps < -source.shift_ns).sum())
         self._T_color_camera = source.T_color_camera
         if self._imu:
             robot.set_imu(se3.inverse(self._T_color_camera) @ self._imu.T_color_imu)
 
     def write_until(self, stamp_ns: int) -> None:
-        """Write what was measured before a time."""
+        """Write what was measured before a time; what comes before time 0 of the recording is left out."""
         while self._next < len(self._order) and self._stamps[k := self._order[self._next]] < stamp_ns:
             stamp = int(self._stamps[k]) + self._shift_ns
             if k < self._imu_count and self._imu:

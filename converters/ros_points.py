@@ -19,6 +19,7 @@ _TIMES = {
     "offset_time": 1e-9,
     "time_offset": 1e-9,
 }  # name of the field, seconds per unit
+FARTHEST_M, LONGEST_S = 1e4, 10.0  # no point is farther away, no sweep longer
 MOMENT_NS = 2_000_000  # points no further apart in time are moved together
 
 
@@ -32,7 +33,7 @@ def points_of(message: Any, where: str) -> tuple[Array, Array]:
     row = int(message.row_step) or step * width
     missing = [name for name in "xyz" if name not in fields]
     data = np.frombuffer(bytes(message.data), np.uint8)
-    if missing or row < step * width or len(data) < row * height:
+    if missing or step < 1 or row < step * width or len(data) < row * height:
         raise DuagError(
             f"{where} has fields {sorted(fields)} and {len(data)} bytes for {width}x{height} points "
             f"of {step}, expected x, y, z and {max(row, step * width) * height} bytes"
@@ -58,7 +59,9 @@ def points_of(message: Any, where: str) -> tuple[Array, Array]:
     points = np.stack([column(name) for name in "xyz"], axis=-1)
     timed = next((name for name in _TIMES if name in fields), None)
     seconds = np.zeros(len(points)) if timed is None else column(timed) * _TIMES[timed]
-    sound = np.isfinite(points).all(axis=1) & np.isfinite(seconds) & (points != 0).any(axis=1)
+    with np.errstate(invalid="ignore"):
+        sound = (np.abs(points) < FARTHEST_M).all(axis=1) & (np.abs(seconds) < LONGEST_S)
+    sound &= (points != 0).any(axis=1)  # nothing came back
     return points[sound], seconds[sound]
 
 

@@ -52,6 +52,7 @@ EYES_NS = 10_000_000  # left and right farther apart in time are no pair; they d
 SWEEP_NS = 55_000_000  # half a turn of the LiDAR
 FIX_NS = 55_000_000  # a fix is given to the image next to it, one of ten per second
 FIX_GAP_NS = 1_500_000_000  # fixes farther apart are not interpolated
+MOST_NUMBERS = 16  # in a matrix of the calibration
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
@@ -166,7 +167,11 @@ class Calibration:
 
         def numbers(name: str) -> Array | None:
             node = store.getNode(name)
-            return np.asarray(node.mat(), dtype=np.float64) if node.isMap() else None
+            try:
+                size = node.getNode("rows").real() * node.getNode("cols").real() if node.isMap() else 0
+                return np.asarray(node.mat(), dtype=np.float64) if 0 < size <= MOST_NUMBERS else None
+            except (cv2.error, SystemError, TypeError, ValueError) as error:
+                raise DuagError(f"{path}: {name} is no !!opencv-matrix, expected one") from error
 
         def matrix(name: str, *shape: int) -> Array:
             found = numbers(name)

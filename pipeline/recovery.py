@@ -26,6 +26,7 @@ from mcap.summary import Summary
 from mcap.writer import CompressionType, IndexType, Writer
 
 from pipeline.errors import DuagError
+from pipeline.files import check_file, read_bytes
 from pipeline.new_folder import new_folder
 from pipeline.recording import RECORDING_FILE, RECORDING_FORMAT, RECORDING_SCHEMA, open_rgbd
 from pipeline.recording.identity import ContentDigest, channel_identity, framed
@@ -79,7 +80,9 @@ def recover(source: Path, out: Path, force: bool = False) -> list[Salvage]:
     source, out = Path(source), Path(out)
     if not source.exists():
         raise DuagError(f"{source}: no such file or folder, expected a log or a recording")
-    if source.is_dir():
+    if not source.is_dir():
+        check_file(source, "a log or a recording")
+    else:
         with new_folder(out, force) as folder:
             return _recover_recording(source, folder, out.resolve().name)
     if out.exists() and not force:
@@ -409,10 +412,10 @@ class _Copy:
 def _recover_recording(source: Path, folder: Path, name: str) -> list[Salvage]:
     """Every log of a folder that is or was to become a recording, and a description that agrees with them."""
     try:
-        description = json.loads((source / RECORDING_FILE).read_bytes())
+        description = json.loads(read_bytes(source / RECORDING_FILE, "the JSON of a recording"))
         rows = dict(description["robots"])
         warnings = list(description.get("warnings", []))
-    except (OSError, ValueError, KeyError, TypeError):
+    except (DuagError, ValueError, KeyError, TypeError, RecursionError):
         description, rows = {"name": name, "source": {"folder": source.resolve().name}}, {}
         warnings = [f"{RECORDING_FILE} was lost and made again from the logs"]
     salvaged = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,14 @@ from pipeline.splat.gaussians import DepthKind, Gaussians
 from schemas import topics
 
 Array = NDArray[np.float64]
-Images = tuple[NDArray[np.uint8], NDArray[np.float32]]
+
+
+class Images(NamedTuple):
+    """Images of a keyframe: RGB [h, w, 3], depth [h, w] (m, 0 = unknown), its sigma (m) where the log tells it."""
+
+    color: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    depth_sigma_m: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -201,7 +209,7 @@ def load(source: AgentInput) -> RobotData:
     def images(keyframe: int) -> Images:
         with open_rgbd(source.log) as log:
             frame = log.frame(keyframes[keyframe].frame_index)
-        return frame.color, frame.usable_depth
+        return Images(frame.color, frame.usable_depth, frame.depth_sigma)
 
     return RobotData(
         robot,

@@ -14,6 +14,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,13 +33,16 @@ LEAST_CORRELATION = 0.8
 
 @dataclass(frozen=True)
 class RobotClock:
-    """What the times of one robot's images say. delays_ns: time of recording less that of the header, [n].
+    """What the times of one robot's images say.
+
+    files: those that hold images. delays_ns: time of recording less that of the header, [n].
 
     header: times of the recording are those of headers (not of the recorder).
     """
 
     robot: str
     log: Log
+    files: frozenset[Path]
     namespace: str
     delays_ns: NDArray[np.int64]
     start_ns: int
@@ -109,7 +113,7 @@ def _offset(a: RobotClock, b: RobotClock) -> Offset:
 
 def _recorder_offset(a: RobotClock, b: RobotClock) -> Offset:
     """What to add to times of b's recorder to have those of a's."""
-    if {part.path for part in a.log.parts} & {part.path for part in b.log.parts}:
+    if a.files & b.files:
         return Offset(0.0, 0.0, 0.0, "one recorder")
     shared = sorted(set(a.log.topics) & set(b.log.topics))
     shared = [t for t in shared if a.log.topics[t].count and b.log.topics[t].count]

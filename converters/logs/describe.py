@@ -19,8 +19,9 @@ from converters.logs.robot_log import RobotLog
 from converters.logs.sources import Source, is_log, robot_of, sources_of
 from pipeline.errors import DuagError
 from pipeline.progress import track
-from pipeline.recording.names import LIBRARY, MAGIC, RECORDING_FILE
+from pipeline.recording.names import LOG_RECORD, MAGIC, RECORDING_FILE
 
+HEAD_BYTES = 1024
 HEADERS_FIRST, HEADERS_EACH = (
     100,
     20,
@@ -32,8 +33,9 @@ def is_foreign(path: Path) -> bool:
     if path.suffix == ".toml":
         return path.is_file()
     if path.suffix == ".mcap" and path.is_file():
-        with path.open("rb") as stream:  # the header record: opcode, length, profile, library
-            return stream.read(len(MAGIC)) == MAGIC and LIBRARY.split("/")[0].encode() not in stream.read(256)
+        with path.open("rb") as stream:  # our writer's first record says what the log is
+            head = stream.read(HEAD_BYTES)
+        return head.startswith(MAGIC) and LOG_RECORD.encode() not in head
     if path.is_file():
         return path.suffix in SUFFIXES
     if not path.is_dir() or (path / RECORDING_FILE).is_file():

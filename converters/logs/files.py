@@ -21,6 +21,7 @@ from typing import Any, Protocol
 from pipeline.errors import DuagError
 
 NANOSECONDS = 1_000_000_000
+LAST_NS = 1 << 62
 SUFFIXES = (".bag", ".db3", ".mcap")
 
 
@@ -141,6 +142,13 @@ def _open_part(path: Path) -> LogPart:
 
         return RosBag(path)
     raise DuagError(f"{path}: is no log, expected {', '.join(SUFFIXES)} or a folder of `ros2 bag`")
+
+
+def sound_time(time_ns: int, where: str) -> int:
+    """A time that can be computed with. Raises DuagError for one before 1970 or after 2115."""
+    if not 0 <= time_ns < LAST_NS:
+        raise DuagError(f"{where}: time {time_ns} ns, expected one between the years 1970 and 2116")
+    return time_ns
 
 
 def ros_type(schema: str) -> str:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import base64
 import binascii
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace as Fields
 from typing import Any
 
@@ -47,11 +48,24 @@ def as_ros(schema: str, message: Any, where: str) -> Any:
     """
     if schema not in ROS_TYPES:
         return message
-    try:
+    with _readable(schema, where):
         return _MAKERS[schema](message)
-    except (AttributeError, TypeError, ValueError, KeyError, binascii.Error) as error:
+
+
+def stamp_ns(message: Any, where: str) -> int:
+    """The time of a message of Foxglove."""
+    with _readable("timestamp", where):
+        stamp = _stamp(message.timestamp)
+        return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+@contextmanager
+def _readable(what: str, where: str) -> Iterator[None]:
+    try:
+        yield
+    except (AttributeError, TypeError, ValueError, KeyError, OverflowError, binascii.Error) as error:
         raise DuagError(
-            f"{where} holds a {schema} that cannot be read ({' '.join(str(error).split())})"
+            f"{where} holds a {what} that cannot be read ({' '.join(str(error).split())})"
         ) from error
 
 

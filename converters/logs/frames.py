@@ -14,6 +14,7 @@ from pipeline.geometry import se3
 
 Array = NDArray[np.float64]
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+FARTHEST_M = 1e8  # also from the origin of a map of the earth
 SAME = 1e-6  # metres and radians up to which a transform has not changed
 
 
@@ -32,16 +33,27 @@ class Transforms:
         own.sort(key=lambda t: t.count("/") > 1)  # the robot's own word counts last
         self._static_topics = [t for t in own if t.endswith("tf_static")]
         self._other_topics = [t for t in own if not t.endswith("tf_static")]
-        self._known = self._read(self._static_topics)
-        self._complete = not self._other_topics
         self.moving: set[tuple[str, str]] = set()
+        self._known: dict[tuple[str, str], Array] = {}
+        for topic in self._static_topics:
+            self._known.update(self._constant([topic]))
+        self._complete = not self._other_topics
 
-    def _read(self, topics: list[str]) -> dict[tuple[str, str], Array]:
+    def _constant(self, topics: list[str]) -> dict[tuple[str, str], Array]:
+        """The transforms of some topics of which all messages say the same; what differs is `moving`.
+
+        On /tf_static too: two robots may have published there, each its own frames by the same names.
+        """
         found: dict[tuple[str, str], Array] = {}
+        changed = set()
         for topic in topics:
             for _, parent, child, T in self.of_topic(topic):
-                found[parent, child] = T
-        return found
+                first = found.setdefault((parent, child), T)
+                if np.abs(first - T).max() > SAME:
+                    changed.add((parent, child))
+        constant = {pair: T for pair, T in found.items() if pair not in changed}
+        self.moving = (self.moving | changed) - set(constant)
+        return constant
 
     def of_topic(self, topic: str) -> Iterator[tuple[tuple[Entry, int], str, str, Array]]:
         """Message and time of its header (ns), parent, child and T_parent_child of every transform of a topic."""
@@ -50,23 +62,12 @@ class Transforms:
                 T = pose_matrix(t.transform.translation, t.transform.rotation, f"{self._log.name}: {topic}")
                 yield (entry, stamp_ns(t)), frame_name(t.header.frame_id), frame_name(t.child_frame_id), T
 
-    def _read_others(self) -> None:
-        """Constant transforms among those that are repeated."""
-        self._complete = True
-        found: dict[tuple[str, str], Array] = {}
-        for topic in self._other_topics:
-            for _, parent, child, T in self.of_topic(topic):
-                first = found.setdefault((parent, child), T)
-                if np.abs(first - T).max() > SAME:
-                    self.moving.add((parent, child))
-        constant = {pair: T for pair, T in found.items() if pair not in self.moving}
-        self._known = {**constant, **self._known}
-
     def lookup(self, target: str, source: str) -> Array | None:
         """T_target_source [4, 4]; None if nothing constant ties them together."""
         T = self._search(frame_name(target), frame_name(source))
         if T is None and not self._complete:
-            self._read_others()
+            self._complete = True
+            self._known = {**self._constant(self._other_topics), **self._known}
             T = self._search(frame_name(target), frame_name(source))
         return T
 
@@ -97,9 +98,12 @@ def pose_matrix(position: Any, orientation: Any, where: str) -> Array:
     """Matrix [4, 4] of a position and a quaternion with fields x, y, z, w.
 
     Raises:
-        DuagError: the quaternion is no rotation.
+        DuagError: the quaternion is no rotation, or the position is not finite.
     """
     q = np.array([orientation.w, orientation.x, orientation.y, orientation.z], dtype=np.float64)
     if not np.isfinite(q).all() or np.abs(q).max() > 2 or abs(np.linalg.norm(q) - 1) > 0.01:
         raise DuagError(f"{where}: quaternion wxyz {q.tolist()}, expected one of length 1")
-    return np.asarray(se3.from_quat_translation(q, np.array([position.x, position.y, position.z])))
+    t = np.array([position.x, position.y, position.z], dtype=np.float64)
+    if not np.abs(t).max() < FARTHEST_M:
+        raise DuagError(f"{where}: position {t.tolist()}, expected metres, less than {FARTHEST_M:g}")
+    return np.asarray(se3.from_quat_translation(q, t))

@@ -15,9 +15,17 @@ from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from converters.logs import foxglove
-from converters.logs.files import Entry, Topic, ros_type, stamp_ns
-from converters.logs.rosbag_file import LARGEST_CHUNK, deserialised, reading, reason, ros_header_ns
+from converters.logs.files import Entry, Topic, ros_type, sound_time, stamp_ns
+from converters.logs.rosbag_file import (
+    LARGEST_CHUNK,
+    check_definitions,
+    deserialised,
+    reading,
+    reason,
+    ros_header_ns,
+)
 from pipeline.errors import DuagError
+from pipeline.files import check_file
 from pipeline.recording.names import MAGIC
 
 WANTED = "a sound MCAP log"
@@ -30,6 +38,7 @@ class McapFile:
         self.path = path
         self.topics: dict[str, Topic] = {}
         self._decoders: dict[int, _Decoder] = {}
+        check_file(path, WANTED)
         with reading(path, WANTED):
             self._stream = path.open("rb")
             try:
@@ -42,7 +51,7 @@ class McapFile:
         self._stream.seek(-min(len(MAGIC), self.path.stat().st_size), 2)
         if self._stream.read() != MAGIC:
             raise DuagError(
-                f"{self.path}: is cut short or no MCAP; what it holds can be saved with `mcap recover`"
+                f"{self.path}: is cut short or no MCAP; what it holds can be saved with `duagc recover`"
             )
         self._stream.seek(0)
         self._reader = SeekingReader(self._stream, validate_crcs=True, record_size_limit=LARGEST_CHUNK)
@@ -151,8 +160,8 @@ class McapFile:
                 decoder = self._decoders[channel.id]
                 yield Entry(
                     channel.topic,
-                    m.log_time,
-                    m.publish_time,
+                    sound_time(m.log_time, where),
+                    sound_time(m.publish_time, where),
                     m.data,
                     partial(decoder.read, m.data, where),
                     partial(decoder.header_ns, m.data, where),
@@ -187,6 +196,7 @@ class _Ros:
         store = get_typestore(Stores.EMPTY)
         if self.schema.encoding != "ros2idl":
             store.register(get_types_from_msg(text, self.type))
+            check_definitions(store.fielddefs)
             return store
         line = "=" * 80 + "\n"
         parts = (
@@ -200,6 +210,7 @@ class _Ros:
                 get_types_from_idl(re.sub(r"(?m)^\s*#.*$", "", part))
             )  # its parser knows no #include
         store.register(types)
+        check_definitions(store.fielddefs)
         return store
 
     def read(self, data: bytes, where: str) -> Any:
@@ -227,22 +238,27 @@ class _Foxglove:
         self.name, self.encoding = foxglove.plain_name(schema.name), encoding
 
     def read(self, data: bytes, where: str) -> Any:
+        return foxglove.as_ros(self.name, self._message(data, where), where)
+
+    def header_ns(self, data: bytes, where: str) -> int:
+        """Without unpacking the image: of transforms in a list the first one's."""
+        message = self._message(data, where)
+        if self.name == "foxglove.FrameTransforms":
+            return stamp_ns(foxglove.as_ros(self.name, message, where))
+        return foxglove.stamp_ns(message, where)
+
+    def _message(self, data: bytes, where: str) -> Any:
         import schemas
 
         try:
             if self.encoding == "json":
                 members = json.loads(data)
-                message = foxglove.JsonFields(members if isinstance(members, dict) else {})
-            else:
-                message = schemas.message_class(self.name).FromString(data)
+                return foxglove.JsonFields(members if isinstance(members, dict) else {})
+            return schemas.message_class(self.name).FromString(data)
         except Exception as error:  # protobuf's DecodeError, broken JSON, broken text
             raise DuagError(
                 f"{where} holds {len(data)} bytes that are no {self.name} in {self.encoding} ({reason(error)})"
             ) from error
-        return foxglove.as_ros(self.name, message, where)
-
-    def header_ns(self, data: bytes, where: str) -> int:
-        return stamp_ns(self.read(data, where))
 
 
 class _Unknown:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.files import Entry, Log
+from converters.logs.files import NANOSECONDS, Entry, Log, sound_time
 from converters.logs.frames import TF_TYPES, Transforms, frame_name, pose_matrix
 from converters.logs.options import LogOptions
 from converters.tum_layout import Poses
@@ -73,27 +74,44 @@ class MotionReader:
         self._log, self._settings, self._transforms = log, settings, transforms
         self.name, self.color_frame, self._time_ns = log.name, color_frame, time_ns
 
-    def _body_camera(self, topic: str, body: str) -> Array:
-        """T_body_color [4, 4] of the frame that a topic of poses is of."""
-        frame = self._settings.truth_frame if self._settings.truth.split()[:1] == [topic] else ""
-        frame = frame_name(frame or body or self.color_frame)
-        if self._settings.T_body_color:
-            return extrinsics_of("T_body_color", self._settings.T_body_color)
+    def _body_camera(self, option: str, told: str) -> Array:
+        """T_body_color [4, 4] of the body that poses are of. option: truth or odometry. told: its frame in the log."""
+        setting = f"T_{option}_color"
+        text = getattr(self._settings, setting)
+        if text:
+            return extrinsics_of(setting, text)
+        frame = frame_name(
+            (self._settings.truth_frame if option == "truth" else "") or told or self.color_frame
+        )
         if frame in ("camera", frame_name(self.color_frame)):
             return np.eye(4)
         T = self._transforms.lookup(frame, self.color_frame)
         if T is None:
+            camera = " or truth_frame=camera if that is where it is" if option == "truth" else ""
             raise DuagError(
-                f"{self.name}: {topic} is of {frame!r}, and /tf_static does not tie it to "
-                f"{self.color_frame!r}; expected --set T_body_color='x y z qw qx qy qz', or "
-                "truth_frame=camera if that is where it is"
+                f"{self.name}: {option} is of {frame!r}, and /tf_static does not tie it to {self.color_frame!r}; "
+                f"expected --set {setting}='x y z qw qx qy qz'{camera}"
             )
         return T
 
+    def truth(self) -> CameraPoses | None:
+        """True poses of the colour camera, by a topic or a file; None if none were asked for."""
+        s = self._settings
+        if s.truth and s.truth_file:
+            raise DuagError(f"{self.name}: truth and truth_file are both said, expected one of them")
+        if s.truth_file:
+            found = CameraPoses(Poses.read(Path(s.truth_file)), self._body_camera("truth", ""))
+        elif s.truth:
+            found = self.poses(s.truth, "truth")
+        else:
+            return None
+        stamps = found.body.stamps_ns + round(s.truth_offset_s * NANOSECONDS)
+        return replace(found, body=replace(found.body, stamps_ns=stamps))
+
     def poses(self, topic: str, option: str) -> CameraPoses:
-        """Poses of the colour camera by a topic of poses of its body."""
+        """Poses of the colour camera by a topic of poses of its body. option: truth or odometry."""
         if len(topic.split()) == 3:
-            return self._poses_of_tf(*topic.split())
+            return self._poses_of_tf(topic.split(), option)
         known = self._log.of_type(*POSE_TYPES)
         if topic not in known:
             raise DuagError(
@@ -111,10 +129,11 @@ class MotionReader:
             body = getattr(m, "child_frame_id", "")
             if np.isfinite([position.x, position.y, position.z]).all():
                 poses[self._time_ns(entry)] = pose_matrix(position, orientation, where)
-        return self._camera_poses(poses, topic, body)
+        return self._camera_poses(poses, option, body)
 
-    def _poses_of_tf(self, topic: str, parent: str, child: str) -> CameraPoses:
+    def _poses_of_tf(self, said: list[str], option: str) -> CameraPoses:
         """Poses of the colour camera by a transform that changes, "/tf world base_link"."""
+        topic, parent, child = said
         known = self._log.of_type(*TF_TYPES)
         if topic not in known:
             raise DuagError(f"{self.name}: topic {topic} not found, {closest(topic, known, 'transforms')}")
@@ -124,18 +143,18 @@ class MotionReader:
         for (entry, stamp), found_parent, found_child, T in self._transforms.of_topic(topic):
             seen.add(f"{found_parent} {found_child}")
             if (found_parent, found_child) == (frame_name(parent), frame_name(child)):
-                poses[stamp if of_header else self._time_ns(entry)] = T
+                poses[sound_time(stamp, topic) if of_header else self._time_ns(entry)] = T
         if not poses:
             wanted = f"{frame_name(parent)} {frame_name(child)}"
             raise DuagError(
                 f"{self.name}: {topic} has no {wanted}, {closest(wanted, sorted(seen), 'transforms')}"
             )
-        return self._camera_poses(poses, topic, child)
+        return self._camera_poses(poses, option, child)
 
-    def _camera_poses(self, poses: dict[int, Array], topic: str, body: str) -> CameraPoses:
+    def _camera_poses(self, poses: dict[int, Array], option: str, body: str) -> CameraPoses:
         stamps = sorted(poses)
         T = np.array([poses[stamp] for stamp in stamps]).reshape(-1, 4, 4)
-        return CameraPoses(Poses(np.array(stamps, dtype=np.int64), T, 0), self._body_camera(topic, body))
+        return CameraPoses(Poses(np.array(stamps, dtype=np.int64), T, 0), self._body_camera(option, body))
 
     def imu(self, topic: str) -> Imu:
         """What an IMU measured, in order of time."""

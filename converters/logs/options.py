@@ -30,11 +30,15 @@ class LogOptions(AssociationOptions, StereoOptions):
     truth: str = ""
     """Topic of true poses (Odometry, PoseStamped, TransformStamped), or a transform that changes as "/tf PARENT CHILD",
     for evaluation; none if empty."""
+    truth_file: str = ""
+    """File of true poses as of TUM, `time x y z qx qy qz qw` in seconds and metres, instead of a topic."""
+    truth_offset_s: float = Field(default=0.0, allow_inf_nan=False)
+    """Seconds to add to the times of true poses, if their clock is another one; see `truth_lag_s` in recording.json."""
     truth_frame: str = ""
     """Frame that the true poses are of; by default what the message says, which /tf_static must tie to the camera."""
     namespaces: str = ""
     """Namespaces of several robots in one log, separated by commas, for example "/acl_jackal,/sparkal1"; they name the
-    robots."""
+    robots, and stand for {namespace} in the names of other topics."""
     registered: Literal["auto", "yes", "no"] = "auto"
     """Whether depth is seen from the colour camera; auto: by name of the topic, frame and camera."""
     T_color_depth: str = ""
@@ -42,8 +46,10 @@ class LogOptions(AssociationOptions, StereoOptions):
     x_color = T x_depth."""
     T_color_imu: str = ""
     """Extrinsics of the IMU, likewise, where /tf_static does not know them."""
-    T_body_color: str = ""
-    """Pose of the colour camera in the body that odometry and true poses are of, likewise."""
+    T_odometry_color: str = ""
+    """Pose of the colour camera in the body that the odometry is of, likewise."""
+    T_truth_color: str = ""
+    """Pose of the colour camera in the body that the true poses are of, likewise."""
     depth_scale: float = Field(default=0.001, gt=0)
     """Metres per unit of 16-bit depth."""
     range_sigma_m: float = Field(default=0.03, gt=0)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from converters.logs.choice import REGISTERED, Chooser
 from converters.logs.clocks import RobotClock
 from converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
-from converters.logs.files import NANOSECONDS, Entry, Log
+from converters.logs.files import NANOSECONDS, Entry, Log, sound_time
 from converters.logs.frames import Transforms, pose_matrix
 from converters.logs.gather import gathered
 from converters.logs.motion import CameraPoses, Imu, MotionReader, extrinsics_of
@@ -82,7 +82,7 @@ class RobotLog:
         self.color = chooser.color().required(self.log, "color")
         self.color_camera = self._camera(self.color, "color_info", chooser)
         self._motion = MotionReader(self.log, s, self.transforms, self.color_camera.frame_id, self.time_ns)
-        self.truth: CameraPoses | None = self._motion.poses(s.truth, "truth") if s.truth else None
+        self.truth: CameraPoses | None = self._motion.truth()
         self.T_color_depth: Array | None = None
         self.derived = self._derived(chooser) if s.depth_from != "image" else None
         if self.derived:
@@ -219,7 +219,7 @@ class RobotLog:
         """The time of a message by the clock that the options choose."""
         source = self.settings.time_source
         if source == "header":
-            return entry.header_ns()
+            return sound_time(entry.header_ns(), f"{self.name}: {entry.topic}")
         if source == "log":
             return entry.log_ns
         if entry.publish_ns is None:
@@ -267,13 +267,16 @@ class RobotLog:
             self.warnings.append(
                 f"{alone} of {len(listed[self.color])} colour images have no depth near in time"
             )
+        if min(c.stamp_ns for c, _ in found) + self.shift_ns < 0:
+            raise DuagError(f"{self.name}: clock_offset_s = {self.settings.clock_offset_s} leads before 1970")
         return {c.stamp_ns: d.stamp_ns for c, d in found}
 
     def clock(self, robot: str) -> RobotClock:
         """What the times of the images say about the robot's clock."""
         first, last = min(self.pairs), max(self.pairs)
         header = self.settings.time_source == "header"
-        return RobotClock(robot, self.log, self.namespace, self._delays_ns, first, last, header)
+        files = frozenset(part.path for part in self.log.parts if self.color in part.topics)
+        return RobotClock(robot, self.log, files, self.namespace, self._delays_ns, first, last, header)
 
     def frames(self) -> Iterator[tuple[int, Any, Any]]:
         """Time, colour and depth message of every pair, in order of time; holds no more than it must."""

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from converters.logs import foxglove
-from converters.logs.files import NANOSECONDS, Entry, Topic, stamp_ns
+from converters.logs.files import NANOSECONDS, Entry, Topic, sound_time, stamp_ns
 from pipeline.errors import DuagError
+from pipeline.files import check_file
 
+_READ = {
+    "builtin_interfaces": "Time",
+    "std_msgs": "Header",
+    "geometry_msgs": "Point Pose PoseStamped PoseWithCovariance PoseWithCovarianceStamped Quaternion Transform "
+    "TransformStamped Vector3",
+    "nav_msgs": "Odometry",
+    "sensor_msgs": "CameraInfo CompressedImage Image Imu PointCloud2 PointField RegionOfInterest",
+    "tf2_msgs": "TFMessage",
+}
+READ_TYPES = {f"{package}/msg/{name}" for package, names in _READ.items() for name in names.split()}
 LARGEST_CHUNK = 256 << 20  # bytes, unpacked; recorders write some megabytes
 
 
@@ -26,9 +37,13 @@ class RosBag:
 
         self.path = path
         hint = "; `rosbag reindex` mends one that was cut short" if path.suffix == ".bag" else ""
-        with reading(path, f"a bag of ROS 1 or ROS 2{hint}"):
+        wanted = f"a bag of ROS 1 or ROS 2{hint}"
+        for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+            check_file(file, wanted)
+        with reading(path, wanted):
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
+            check_definitions(self._reader.typestore.fielddefs)
             for reader in self._reader.readers:
                 if isinstance(reader, Reader1):
                     _bound_chunks(reader)
@@ -49,7 +64,8 @@ class RosBag:
                 header = partial(ros_header_ns, raw, self._encoding, f"{self.path}: {connection.topic}")
                 if foxglove.plain_name(connection.msgtype) in foxglove.ROS_TYPES:
                     header = partial(_stamp_of, read)
-                yield Entry(connection.topic, log_ns, None, raw, read, header)
+                time_ns = sound_time(log_ns, f"{self.path}: {connection.topic}")
+                yield Entry(connection.topic, time_ns, None, raw, read, header)
 
     def _read(self, connection: Any, raw: bytes) -> Any:
         where = f"{self.path}: {connection.topic}"
@@ -102,6 +118,18 @@ def reading(path: Path, expected: str) -> Iterator[None]:
 def reason(error: Exception) -> str:
     """What an error says, on one line; its kind if it says nothing."""
     return " ".join(str(error).rstrip(".").split())[:200] or type(error).__name__
+
+
+def check_definitions(found: Mapping[str, Any]) -> None:
+    """Refuse a log that defines types that are read here otherwise than ROS does. found: fields by type."""
+    from rosbags.typesys import Stores, get_typestore
+
+    standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
+    for name in sorted(set(found) & READ_TYPES):
+        has, wanted = ({field.lower(): kind for field, kind in types[name][1]} for types in (found, standard))
+        for field in wanted:
+            if has.get(field) != wanted[field]:
+                raise ValueError(f"its {name} has no field {field} as ROS has it")
 
 
 def deserialised(read: Any, raw: bytes, kind: str, where: str) -> Any:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,9 +22,11 @@ from converters.image_files import options_of
 from converters.logs.files import SUFFIXES
 from converters.logs.options import LogOptions
 from pipeline.errors import DuagError, closest
-from pipeline.files import read_text
+from pipeline.files import check_file, read_text
 from schemas import topics
 
+NAMESPACE = "{namespace}"  # stands for that of each robot in the names of topics
+TOPICS = ("color", "depth", "color_info", "depth_info", "imu", "odometry", "truth", "truth_file")
 GROUPING = ("namespaces", "pieces")  # options that say which logs are whose, which a TOML file does itself
 
 
@@ -63,11 +65,35 @@ def sources_of(src: Path, options: Mapping[str, Any]) -> list[Source]:
         groups = _groups(src)
         parts = [(paths, "", label if len(groups) > 1 else "") for label, paths in groups.items()]
     names = [robot_of(space) for space in spaces] or robot_names(len(parts))
+    if len(parts) > 1:
+        _check_shared(settings, spaces)
     if len(set(names)) < len(names):
         raise DuagError(
             f"{src}: namespaces {', '.join(spaces)} name a robot twice, expected different robots"
         )
-    return [Source(name, *part, settings) for name, part in zip(names, parts, strict=True)]
+    return [
+        Source(name, paths, space, label, _filled(settings, space))
+        for name, (paths, space, label) in zip(names, parts, strict=True)
+    ]
+
+
+def _check_shared(settings: LogOptions, spaces: Sequence[str]) -> None:
+    """Refuse a topic that would be every robot's: in one log it is of one of them; in logs of their own it may be."""
+    for option in TOPICS if spaces else ("truth_file",):
+        said = getattr(settings, option)
+        if said and NAMESPACE not in said:
+            hint = f"{option}={NAMESPACE}/... or " if spaces else ""
+            raise DuagError(
+                f"ros: {option}={said} for several robots, expected {hint}a TOML file that says whose it is"
+            )
+
+
+def _filled(settings: LogOptions, space: str) -> LogOptions:
+    """The settings with the namespace of a robot in the names of its topics."""
+    said = {option: getattr(settings, option) for option in TOPICS}
+    return settings.model_copy(
+        update={k: v.replace(NAMESPACE, space) for k, v in said.items() if NAMESPACE in v}
+    )
 
 
 def robot_of(namespace: str) -> str:
@@ -106,6 +132,8 @@ def _from_file(path: Path, options: Mapping[str, Any]) -> list[Source]:
         if not isinstance(namespace, str) or (namespace and not namespace.startswith("/")):
             raise DuagError(f"{where} namespace = {namespace!r}, expected text that begins with a slash")
         _check_names(row, where, "logs", "namespace")
+        if isinstance(row.get("truth_file"), str):
+            row["truth_file"] = str(path.parent / row["truth_file"])
         settings = options_of(LogOptions, {**content, **row, **options}, where)
         paths = tuple(inner for log in logs for inner in logs_in(path.parent / log))
         label = " ".join(Path(log).name for log in logs) if len(robots) > 1 else ""
@@ -132,6 +160,8 @@ def _groups(src: Path) -> dict[str, tuple[Path, ...]]:
         raise DuagError(f"{src}: no such file or folder, expected a log")
     if src.is_file() and src.suffix not in SUFFIXES:
         raise DuagError(f"{src}: is no log, expected one of {', '.join(SUFFIXES)}")
+    if not src.is_dir():
+        check_file(src, "a log")
     if is_log(src):
         return {src.name: (src,)}
     groups = {}

@@ -1,4 +1,4 @@
-"""Simulated recordings: a team of robots with RGB-D cameras in a procedural room or in a scene of textured meshes."""
+"""Simulated recordings: a team of robots with cameras in a procedural scene or among textured meshes."""
 
 import tempfile
 from collections import deque
@@ -14,20 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from converters.base import RecordingWriter, robot_names
-from converters.simulate.scene import SCENES
+from converters.simulate.paradigms import PARADIGMS
+from converters.simulate.scenes import SCENES
 from pipeline import numeric, streams
 from pipeline.errors import DuagError
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.progress import track
 from pipeline.workers import worker_pool
 
-DEPTH_SCALE_M = 1 / 5000
 FRAME_RATE_HZ = 30
 START_NS = 1_000_000_000
 FOCAL_OF_WIDTH = 0.82  # focal length as a share of the image width: 63 degrees across
 NOISES = ("none", "kinect")
 PNG_LEVEL = 1
 MAX_ROBOTS = 8
+OVERLAP_TOLERANCE = 0.1  # beyond it, the recording says so
 
 
 def simulate(
@@ -42,12 +43,14 @@ def simulate(
     workers: int = 2,
     force: bool = False,
     up: str = "auto",
+    paradigm: str = "wander",
+    preview: Path | None = None,
 ) -> None:
     """Render a recording of a robot team, with exact depth, poses and geometry as ground truth.
 
     Args:
         out: folder of the recording, made here.
-        robots: how many; each follows a path of its own, 22 mm per frame in a room, 28 mm among meshes.
+        robots: how many; each follows a path of its own, 22 mm per frame in the room, 60 mm outdoors, else 28 mm.
         frames: per robot, at 30 Hz.
         scene: one of `SCENES`, or else a folder of textured meshes.
         size: width and height of the images, pixels.
@@ -57,25 +60,35 @@ def simulate(
         workers: processes that render.
         force: replace a recording that is there.
         up: of meshes, the axis that is up in the files: "y", "z", or "auto", as is custom for their format.
+        paradigm: the figure that the paths draw together, one of `PARADIGMS`; "wander" is none.
+        preview: a PNG file to write, with what the robots saw and their paths from above.
     Raises:
         DuagError: an argument is out of range, `out` exists, or a mesh cannot be used.
     """
-    _check(robots, frames, scene, size, noise, overlap, workers)
+    _check(robots, frames, scene, size, noise, overlap, workers, paradigm, preview)
     numeric.settle()
     numeric.settle_opencv()
-    from converters.simulate import paths
+    from converters.simulate import paradigms, paths
+    from converters.simulate.preview import Preview
+    from converters.simulate.stages import set_up
 
     camera = _camera(size)
     names = robot_names(robots)
     source, parameters = _about(scene, up)
+    scene_name = parameters["scene"]
     parameters |= {"robots": robots, "frames": frames, "size": list(size)}
     parameters |= {"noise": noise, "seed": seed, "overlap": overlap}
+    if paradigm != "wander":
+        parameters["paradigm"] = paradigm
     with (
         RecordingWriter(out, "", source, "simulate", parameters, force) as recording,
         tempfile.TemporaryDirectory(prefix="duagc-scene-") as cache,
     ):
-        stage = _stage(scene, parameters.get("up", ""), seed, Path(cache))
-        ways = stage.plan(robots, frames, overlap, camera)
+        stage = set_up(scene, parameters.get("up", ""), seed, Path(cache), as_meshes=False)
+        if paradigm == "wander":
+            ways = stage.wander(robots, frames, overlap, camera)
+        else:
+            ways = paradigms.plan(stage, paradigm, robots, frames, overlap, camera, seed)
         small = stage.eye(camera.scaled(*paths.OVERLAP_IMAGE))
         recording.checks["clearance_m"] = {
             name: float(stage.clearance(way[:, :3, 3]).min()) for name, way in zip(names, ways, strict=True)
@@ -84,16 +97,27 @@ def simulate(
             f"{names[i]}-{names[i + 1]}": paths.shared_view(small, ways[i], ways[i + 1])
             for i in range(robots - 1)
         }
-        recording.add_geometry(lambda path: write_points(path, *stage.points()))
+        shared = np.mean(list(recording.checks["shared_view"].values())) if robots > 1 else overlap
+        if abs(shared - overlap) > OVERLAP_TOLERANCE:
+            recording.warnings.append(f"neighbours share {shared:.2f} of the view, expected {overlap:.2f}")
+        if robots > 1 and paradigm != "wander":
+            recording.checks["robots_apart_m"] = paradigms.least_apart(ways)
+        points = stage.points()
+        recording.add_geometry(lambda path: write_points(path, *points))
+        title = f"{scene_name}, {paradigm}, seed {seed}: neighbours share {shared:.2f} of the view"
+        sheet = Preview(title, names, ways, frames)
         jobs = [_Job(name, i, way[i]) for name, way in zip(names, ways, strict=True) for i in range(frames)]
         with _Studio(stage, camera, noise, seed, workers) as studio:
             images = track(studio.images(jobs), "simulate", len(jobs))
             for name, way in zip(names, ways, strict=True):
-                with recording.robot(name, camera, DEPTH_SCALE_M, {"depth_noise": noise}) as robot:
+                with recording.robot(name, camera, stage.depth_scale_m, {"depth_noise": noise}) as robot:
                     for i in range(frames):
                         image = next(images)
+                        sheet.add(name, i, image.png)
                         stamp_ns = START_NS + round(i * 1e9 / FRAME_RATE_HZ)
                         robot.add_frame(stamp_ns, image.png, "png", image.depth, way[i], image.exact_depth)
+        if preview is not None:
+            sheet.write(preview, points[0], points[2])
 
 
 def _about(scene: str, up: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -108,19 +132,16 @@ def _about(scene: str, up: str) -> tuple[dict[str, Any], dict[str, Any]]:
     return source, {"scene": folder.name, "up": meshes.up_axis(files, up)}
 
 
-def _stage(scene: str, up: str, seed: int, cache: Path) -> Any:
-    """The scene, ready to be rendered; meshes are read into `cache`."""
-    from converters.simulate import meshes
-    from converters.simulate.stages import MeshStage, RoomStage
-
-    if scene in SCENES:
-        return RoomStage(scene, seed)
-    meshes.read(Path(scene), up, cache)
-    return MeshStage(seed, cache)
-
-
 def _check(
-    robots: int, frames: int, scene: str, size: tuple[int, int], noise: str, overlap: float, workers: int
+    robots: int,
+    frames: int,
+    scene: str,
+    size: tuple[int, int],
+    noise: str,
+    overlap: float,
+    workers: int,
+    paradigm: str,
+    preview: Path | None,
 ) -> None:
     """Refuse arguments out of range."""
     for name, value, low, high in (
@@ -135,9 +156,15 @@ def _check(
             raise DuagError(f"simulate: {name} is {value}, expected {low} to {high}")
     if noise not in NOISES:
         raise DuagError(f"simulate: noise is {noise!r}, expected one of {', '.join(NOISES)}")
+    if paradigm not in PARADIGMS:
+        raise DuagError(f"simulate: paradigm is {paradigm!r}, expected one of {', '.join(PARADIGMS)}")
+    if preview is not None and (preview.suffix != ".png" or not preview.absolute().parent.is_dir()):
+        raise DuagError(
+            f"{preview}: found no such place for a picture, expected NAME.png in a folder that exists"
+        )
     if scene not in SCENES and not Path(scene).is_dir():
         raise DuagError(
-            f"simulate: scene is {scene!r}, expected {', '.join(sorted(SCENES))} or a folder of textured meshes"
+            f"simulate: scene is {scene!r}, expected {', '.join(SCENES)} or a folder of textured meshes"
         )
 
 
@@ -159,7 +186,7 @@ class _Job:
 
 @dataclass(frozen=True)
 class _Images:
-    """One frame as it goes into the logs; depths uint16 in units of DEPTH_SCALE_M, 0 = none."""
+    """One frame as it goes into the logs; depths uint16 in units of the stage, 0 = none."""
 
     png: bytes
     depth: NDArray[np.uint16]
@@ -171,6 +198,7 @@ class _Artist:
 
     def __init__(self, stage: Any, camera: PinholeCamera, noise: str, seed: int) -> None:
         self.eye, self.camera, self.noise, self.seed = stage.eye(camera), camera, noise, seed
+        self.depth_scale_m = stage.depth_scale_m
 
     def draw(self, job: _Job) -> _Images:
         """The images of one frame."""
@@ -179,20 +207,20 @@ class _Artist:
         from converters.simulate import noise
 
         view = self.eye.render(job.pose)
-        color, exact = view.color, _units(view.depth)
+        color, exact = view.color, _units(view.depth, self.depth_scale_m)
         depth = exact
         if self.noise == "kinect":
             rng = streams.generator(self.seed, "simulate.noise", robot=job.robot, frame=job.index)
-            depth = _units(noise.kinect_depth(view.depth, self.camera, rng))
+            depth = _units(noise.kinect_depth(view.depth, self.camera, rng), self.depth_scale_m)
             color = noise.grey_noise(color, rng)
         settings = [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
         _, png = cv2.imencode(".png", np.ascontiguousarray(color[..., ::-1]), settings)
         return _Images(png.tobytes(), depth, exact if self.noise == "kinect" else None)
 
 
-def _units(depth_m: NDArray[np.float64]) -> NDArray[np.uint16]:
-    """Depth in units of DEPTH_SCALE_M; what does not fit is no measurement."""
-    units = np.rint(depth_m / DEPTH_SCALE_M)
+def _units(depth_m: NDArray[np.float64], scale_m: float) -> NDArray[np.uint16]:
+    """Depth in units of scale_m; what does not fit is no measurement."""
+    units = np.rint(depth_m / scale_m)
     return np.where(units <= np.iinfo(np.uint16).max, units, 0).astype(np.uint16)
 
 
@@ -268,4 +296,4 @@ def write_points(
     path.write_bytes("\n".join(header).encode() + rows.tobytes())
 
 
-__all__ = ["NOISES", "SCENES", "simulate", "write_points"]
+__all__ = ["NOISES", "PARADIGMS", "SCENES", "simulate", "write_points"]

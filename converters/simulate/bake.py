@@ -5,6 +5,7 @@ share one image (the atlas) with its halvings (mip levels). Tiles are separated 
 border, wide enough for the coarsest level.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -22,7 +23,8 @@ ATLAS_WIDTH = 8192
 BAND_LIMIT_TEXELS = 1.1  # sigma of the blur that leaves nothing finer than about five texels
 LIGHT_GRID_M = 0.07
 AMBIENT_RAYS = 24
-AMBIENT_REACH_M = 1.2
+AMBIENT_REACH_M, OUTDOOR_REACH_M = 1.2, 6.0
+SUN_REACH_M = 200.0
 
 
 @dataclass(frozen=True)
@@ -53,14 +55,18 @@ class Atlas:
         return np.asarray(colors, dtype=np.uint8).reshape(-1, 3)[:n]
 
 
-def bake(scene: Scene, texel_m: float) -> Atlas:
-    """Paint and light all surfaces of a scene."""
+# whether anything lies between points [n, 3] and points + way [n, 3]
+Blocked = Callable[[Array, Array], NDArray[np.bool_]]
+
+
+def bake(scene: Scene, texel_m: float, blocked: Blocked | None = None) -> Atlas:
+    """Paint and light all surfaces of a scene; without `blocked`, small things cast no shadow."""
     shapes = [
         (int(np.ceil(surface.size[1] / texel_m)) + 1, int(np.ceil(surface.size[0] / texel_m)) + 1)
         for surface in scene.surfaces
     ]
     corners, height = _pack(shapes)
-    lights = _lights(scene)
+    lights = _lights(scene, blocked)
     atlas = np.zeros((height, ATLAS_WIDTH, 3), dtype=np.uint8)
     for surface, shape, light, (x, y) in zip(scene.surfaces, shapes, lights, corners, strict=True):
         tile = _tile(scene, surface, shape, light, texel_m)
@@ -105,7 +111,7 @@ def _tile(
     return np.clip(np.rint(lit), 0, 255).astype(np.uint8)
 
 
-def _lights(scene: Scene) -> list[NDArray[np.float32]]:
+def _lights(scene: Scene, blocked: Blocked | None) -> list[NDArray[np.float32]]:
     """Brightness of white on a coarse grid over every surface, mostly 0.5 to 1.15."""
     grids, points, normals = [], [], []
     for surface in scene.surfaces:
@@ -115,7 +121,7 @@ def _lights(scene: Scene) -> list[NDArray[np.float32]]:
         grids.append((rows, columns))
         points.append(p)
         normals.append(n)
-    light = exposure(scene, np.concatenate(points), np.concatenate(normals)).astype(np.float32)
+    light = exposure(scene, np.concatenate(points), np.concatenate(normals), blocked).astype(np.float32)
     pieces = np.split(light, np.cumsum([rows * columns for rows, columns in grids])[:-1])
     return [
         np.asarray(
@@ -126,10 +132,12 @@ def _lights(scene: Scene) -> list[NDArray[np.float32]]:
     ]
 
 
-def exposure(scene: Scene, points: Array, normals: Array) -> Array:
+def exposure(scene: Scene, points: Array, normals: Array, blocked: Blocked | None = None) -> Array:
     """Brightness of white at world points [n, 3] with unit normals [n, 3], tone-mapped, [n]."""
     start = points + 0.004 * normals
-    total = 0.5 * _ambient(scene, start, normals)
+    total = scene.even_light * _ambient(scene, start, normals, blocked)
+    if scene.sun is not None:
+        total += _sunlight(scene.sun, start, normals, blocked)
     for lamp in scene.lamps:
         facing = np.cross(lamp.half_a, lamp.half_b)
         facing = facing / np.linalg.norm(facing)
@@ -140,13 +148,34 @@ def exposure(scene: Scene, points: Array, normals: Array) -> Array:
             from_lamp = np.abs(way @ facing) / np.sqrt(distance2)
             shine = lamp.strength / 4 * 3.2 * cosine * (0.3 + 0.7 * from_lamp) / (distance2 + 1.2)
             lit = np.flatnonzero(shine > 1e-3)
-            shine[lit] *= ~_blocked(scene, start[lit], way[lit], 1.0)
+            # just short of the lamp: it is no obstacle to its own light
+            hidden = (
+                blocked(start[lit], 0.97 * way[lit])
+                if blocked
+                else _blocked(scene, start[lit], way[lit], 1.0)
+            )
+            shine[lit] *= ~hidden
             total += shine
     return 1.28 * (1.0 - np.exp(-1.55 * total))
 
 
-def _ambient(scene: Scene, start: Array, normals: Array) -> Array:
+def _sunlight(sun: Array, start: Array, normals: Array, blocked: Blocked | None) -> Array:
+    """Light of the sun, a vector towards it as long as it is strong, at points [n, 3], with a soft edge, [n]."""
+    strength = float(np.linalg.norm(sun))
+    total = np.zeros(len(start))
+    for across in ((0.01, 0.0), (-0.01, 0.0), (0.0, 0.01), (0.0, -0.01)):
+        way = sun / strength + np.array([*across, 0.0])
+        shine = strength / 4 * np.maximum(normals @ way, 0.0)
+        lit = np.flatnonzero(shine > 0)
+        if blocked:
+            shine[lit] *= ~blocked(start[lit], np.broadcast_to(SUN_REACH_M * way, (len(lit), 3)))
+        total += shine
+    return total
+
+
+def _ambient(scene: Scene, start: Array, normals: Array, blocked: Blocked | None) -> Array:
     """Share of the even light that reaches points [n, 3]: nearby surfaces take some of it away, [n]."""
+    reach_m = AMBIENT_REACH_M if scene.sun is None else OUTDOOR_REACH_M
     k = np.arange(AMBIENT_RAYS) + 0.5
     polar, turn = np.arccos(1 - 2 * k / AMBIENT_RAYS), np.pi * (1 + 5**0.5) * k
     sphere = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=1)
@@ -154,9 +183,10 @@ def _ambient(scene: Scene, start: Array, normals: Array) -> Array:
     for direction in sphere:
         cosine = normals @ direction
         up = np.flatnonzero(cosine > 0.05)
-        way = np.broadcast_to(AMBIENT_REACH_M * direction, (len(up), 3))
+        way = np.broadcast_to(reach_m * direction, (len(up), 3))
         weight[up] += cosine[up]
-        open_[up] += cosine[up] * ~_blocked(scene, start[up], way, 1.0, walls=True)
+        hidden = blocked(start[up], way) if blocked else _blocked(scene, start[up], way, 1.0, walls=True)
+        open_[up] += cosine[up] * ~hidden
     return 0.35 + 0.65 * open_ / np.maximum(weight, 1e-9)
 
 

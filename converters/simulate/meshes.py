@@ -215,8 +215,8 @@ def load(cache: Path) -> MeshScene:
     """The scene that `read` has written into a folder, mapped into memory."""
     arrays = {name: np.asarray(np.load(cache / f"{name}.npy", mmap_mode="r")) for name in ARRAYS}
     textures: list[list[NDArray[np.uint8]]] = []
-    while (cache / _texture_file(len(textures), 0)).exists():
-        files = [cache / _texture_file(len(textures), k) for k in range(LEVELS)]
+    while (cache / texture_file(len(textures), 0)).exists():
+        files = [cache / texture_file(len(textures), k) for k in range(LEVELS)]
         textures.append([np.asarray(np.load(path, mmap_mode="r")) for path in files if path.exists()])
     return MeshScene(**arrays, textures=textures)
 
@@ -327,7 +327,8 @@ def _part(
     return _Part(vertices, triangles, texels, NO_TEXTURE, colors)
 
 
-def _texture_file(texture: int, level: int) -> str:
+def texture_file(texture: int, level: int) -> str:
+    """Name of the file with one mip level of a texture."""
     return f"texture-{texture}-{level}.npy"
 
 
@@ -335,7 +336,7 @@ def _store_texture(cache: Path, texture: int, image: NDArray[np.uint8]) -> None:
     """Write a texture and its mip levels, each the mean of 2 x 2 texels of the one before."""
     level = image
     for k in range(LEVELS):
-        np.save(cache / _texture_file(texture, k), level)
+        np.save(cache / texture_file(texture, k), level)
         height, width = level.shape[:2]
         if min(height, width) < 2:
             return

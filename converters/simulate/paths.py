@@ -170,6 +170,7 @@ def sees(camera: PinholeCamera, depth: Array, points_camera: Array) -> NDArray[n
     pixels = np.rint(camera.project(np.where(ahead[:, None], points_camera, (0.0, 0.0, 1.0)))).astype(
         np.int64
     )
-    inside = ahead & (pixels >= 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
-    u, v = np.where(inside[:, None], pixels, 0).T
+    u, v = pixels[:, 0], pixels[:, 1]
+    inside = ahead & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+    u, v = np.where(inside, u, 0), np.where(inside, v, 0)
     return inside & (np.abs(depth[v, u] - z) < OVERLAP_TOLERANCE * z)

@@ -3,7 +3,7 @@
 Rays meet triangles in Embree (Open3D's `RaycastingScene`), in float32. Colour is the mean of 2 x 2 rays per pixel,
 each with a texture sample of its own (bilinear, between the two mip levels around the distance of the samples on the
 surface). Means are taken of the stored values (sRGB), as a Gaussian map blends them, and as in the procedural room.
-Where no ray hits there is a hole of the scan: depth 0, black.
+Where no ray hits there is a hole of the scan: depth 0, black; or, in a scene with a sky, the sky: depth 0.
 """
 
 import numpy as np
@@ -50,6 +50,12 @@ class Caster:
             "normals": hit["primitive_normals"].numpy(),
         }
 
+    def blocked(self, start: Array, way: Array) -> NDArray[np.bool_]:
+        """Whether anything lies between start [n, 3] and start + way [n, 3]."""
+        rays = np.concatenate([start, way], axis=1).astype(np.float32)
+        hidden = self._embree.test_occlusions(self._tensor(rays), tnear=0.0, tfar=1.0, nthreads=1)
+        return np.asarray(hidden.numpy(), dtype=np.bool_)
+
     def clearance(self, points: Array) -> Array:
         """Distance (m) of world points [..., 3] to the nearest surface."""
         flat = np.asarray(points).reshape(-1, 3).astype(np.float32)
@@ -60,8 +66,8 @@ class Caster:
 class MeshRenderer:
     """Renders a scene of meshes with one camera."""
 
-    def __init__(self, caster: Caster, camera: PinholeCamera) -> None:
-        self.caster, self.scene, self.camera = caster, caster.scene, camera
+    def __init__(self, caster: Caster, camera: PinholeCamera, sky: bool = False) -> None:
+        self.caster, self.scene, self.camera, self.sky = caster, caster.scene, camera, sky
         self._texel_density = _texel_density(self.scene)
 
     def depth(self, T_world_camera: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
@@ -81,11 +87,11 @@ class MeshRenderer:
         directions = np.concatenate([self._directions(T, *offset) for offset in OFFSETS])
         hit = self.caster.hits(T[:3, 3], directions)
         missed = np.flatnonzero(~np.isfinite(hit["t"]))
-        hit["t"][missed], hit["triangle"][missed] = 0.0, 0  # black in the end
+        hit["t"][missed], hit["triangle"][missed] = 0.0, 0  # another colour in the end
         index = hit["triangle"].view(np.int32)
         level = self._level(hit["t"], index, directions, hit["normals"])
         colors = self.scene.sample(index, hit["weights"], level)
-        colors[missed] = 0.0
+        colors[missed] = sky_color(directions[missed]) if self.sky else 0.0
         mean = colors.reshape(len(OFFSETS), *depth.shape, 3).mean(axis=0)
         return View(np.clip(np.rint(mean), 0, 255).astype(np.uint8), depth, triangle)
 
@@ -116,6 +122,22 @@ class MeshRenderer:
         apart_m = SAMPLE_SPACING_PX / focal * depth / np.sqrt(np.clip(cosine, LEAST_COSINE, 1.0))
         texels = np.maximum(apart_m * self._texel_density[triangle], 1.0)
         return np.minimum(np.log2(texels), LEVELS - 1).astype(np.float32)
+
+
+def sky_color(directions: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Colours [n, 3], 0 to 255, of the sky in world directions [n, 3]: paler at the horizon, with a few clouds."""
+    d = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    height = np.clip(d[:, 2], 0.0, 1.0)[:, None]
+    blue = np.array((214, 224, 234)) * (1 - height) ** 2 + np.array((92, 144, 206)) * (1 - (1 - height) ** 2)
+    x, y = d[:, 0] / (0.25 + height[:, 0]), d[:, 1] / (0.25 + height[:, 0])
+    waves = sum(
+        np.sin(2.1**k * (x + 0.6 * (-1) ** k * y) + 1.7 * k)
+        * np.sin(2.1**k * (y - 0.4 * x) + 2.3 * k)
+        / 1.5**k
+        for k in range(1, 5)
+    )
+    cloud = np.clip(1.6 * waves - 0.35, 0, 1)[:, None]
+    return np.asarray((1 - 0.75 * cloud) * blue + 0.75 * cloud * 246, dtype=np.float32)
 
 
 def _texel_density(scene: MeshScene) -> NDArray[np.float32]:

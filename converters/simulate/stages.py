@@ -1,4 +1,4 @@
-"""What can be simulated, behind one interface: a procedural room, or a folder of textured meshes."""
+"""What can be simulated, behind one interface: a procedural scene, or a folder of textured meshes."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,42 +7,62 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.simulate import bake, meshes, paths, walks
+from converters.simulate import bake, meshes, paths, triangles, walks
 from converters.simulate.raycast import Caster, MeshRenderer
 from converters.simulate.render import Eye, Renderer
-from converters.simulate.scene import build
+from converters.simulate.scenes import MESHES, SCENES, Manner, build
 from pipeline import streams
 from pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
 Points = tuple[Array, Array, NDArray[np.uint8]]
 
-TEXEL_M = 0.004
+ROOM = SCENES["room"][1]
 ROOM_POINTS = 200_000
 POINTS_PER_M2, MOST_POINTS = 2000, 2_000_000  # of meshes; the room has about as many on a square metre
 
 
-class Stage(Protocol):
+class Stage(walks.Terrain, Protocol):
     """A scene that is ready to be rendered."""
 
-    def eye(self, camera: PinholeCamera) -> Eye:
-        """A renderer."""
+    depth_scale_m: float
 
-    def plan(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
-        """Paths T_world_camera [frames, 4, 4] of every robot."""
-
-    def clearance(self, points: Array) -> Array:
-        """Distance (m) of world points [n, 3] to the nearest surface."""
+    def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
+        """Paths T_world_camera [frames, 4, 4] of every robot, of no particular figure."""
 
     def points(self) -> Points:
         """Points spread evenly over the surfaces: positions (m, world), unit normals, colours, [n, 3] each."""
+
+    def store(self, folder: Path) -> "OnDisk":
+        """Write what other processes need."""
+
+
+class OnDisk(Protocol):
+    """A stage whose large parts lie in a folder; small enough to be sent to another process."""
+
+    def open(self) -> Stage:
+        """The stage."""
+
+
+def set_up(scene: str, up: str, seed: int, cache: Path, as_meshes: bool) -> Stage:
+    """The stage of a procedural scene or of a folder of meshes; meshes are read into `cache`, an empty folder.
+
+    The room has a renderer of its own, which knows rays from one point only; `as_meshes` makes triangles of it too.
+    """
+    if scene not in SCENES:
+        meshes.read(Path(scene), up, cache)
+        return MeshStage(seed, cache)
+    if scene == "room" and not as_meshes:
+        return RoomStage(seed)
+    manner = SCENES[scene][1]
+    triangles.write(build(scene, seed), manner.texel_m, cache)
+    return MeshStage(seed, cache, manner)
 
 
 @dataclass(frozen=True)
 class RoomOnDisk:
     """A procedural room whose baked texture lies in a folder; `open` gives the stage in any process."""
 
-    name: str
     seed: int
     folder: Path
     levels: int
@@ -52,27 +72,37 @@ class RoomOnDisk:
         """The stage."""
         files = [self.folder / f"{k}.npy" for k in range(self.levels)]
         maps = [np.asarray(np.load(path, mmap_mode="r")) for path in files]
-        return RoomStage(self.name, self.seed, bake.Atlas(maps, self.origin, TEXEL_M))
+        return RoomStage(self.seed, bake.Atlas(maps, self.origin, ROOM.texel_m))
 
 
 class RoomStage:
-    """A procedural room."""
+    """The procedural room, without triangles: its depth is exact in float64."""
 
-    def __init__(self, name: str, seed: int, atlas: bake.Atlas | None = None) -> None:
-        self.scene = build(name, seed)
-        self.atlas = bake.bake(self.scene, TEXEL_M) if atlas is None else atlas
+    step_m, depth_scale_m, sky = ROOM.step_m, ROOM.depth_scale_m, ROOM.sky
+
+    def __init__(self, seed: int, atlas: bake.Atlas | None = None) -> None:
+        self.scene = build("room", seed)
+        self.atlas = bake.bake(self.scene, ROOM.texel_m) if atlas is None else atlas
 
     def store(self, folder: Path) -> RoomOnDisk:
-        """Write what other processes need."""
         for k, level in enumerate(self.atlas.levels):
             np.save(folder / f"{k}.npy", level)
-        return RoomOnDisk(self.scene.name, self.scene.seed, folder, len(self.atlas.levels), self.atlas.origin)
+        return RoomOnDisk(self.scene.seed, folder, len(self.atlas.levels), self.atlas.origin)
 
     def eye(self, camera: PinholeCamera) -> Eye:
         return Renderer(self.scene, self.atlas, camera)
 
-    def plan(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
+    def sketch(self, camera: PinholeCamera) -> Eye:
+        return MeshRenderer(Caster(triangles.unpainted(self.scene)), camera)
+
+    def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
         return paths.plan(self.scene, robots, frames, overlap, camera)
+
+    def free_space(self) -> walks.FreeSpace:
+        def closed(places: Array) -> NDArray[np.bool_]:
+            return np.ones(len(places), dtype=np.bool_)
+
+        return walks.space_between(np.zeros(2), self.scene.size[:2], 0.0, self.clearance, closed)
 
     def clearance(self, points: Array) -> Array:
         return self.scene.clearance(points)
@@ -87,32 +117,40 @@ class MeshesOnDisk:
 
     seed: int
     folder: Path
+    manner: Manner
 
     def open(self) -> "MeshStage":
         """The stage."""
-        return MeshStage(self.seed, self.folder)
+        return MeshStage(self.seed, self.folder, self.manner)
 
 
 class MeshStage:
     """A scene of meshes."""
 
-    def __init__(self, seed: int, folder: Path) -> None:
+    def __init__(self, seed: int, folder: Path, manner: Manner = MESHES) -> None:
         """Args:
-        seed: of walks and points. folder: where `meshes.read` has written the scene.
+        seed: of walks and points. folder: where `meshes.read` or `triangles.write` has written the scene.
         """
-        self.seed, self.folder = seed, folder
+        self.seed, self.folder, self.manner = seed, folder, manner
+        self.step_m, self.depth_scale_m, self.sky = manner.step_m, manner.depth_scale_m, manner.sky
         self.scene = meshes.load(folder)
         self.caster = Caster(self.scene)
 
     def store(self, folder: Path) -> MeshesOnDisk:
         """All is on disk already."""
-        return MeshesOnDisk(self.seed, self.folder)
+        return MeshesOnDisk(self.seed, self.folder, self.manner)
 
     def eye(self, camera: PinholeCamera) -> Eye:
-        return MeshRenderer(self.caster, camera)
+        return MeshRenderer(self.caster, camera, self.sky)
 
-    def plan(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
-        return walks.plan(self.caster, robots, frames, overlap, camera, self.seed)
+    def sketch(self, camera: PinholeCamera) -> Eye:
+        return self.eye(camera)
+
+    def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
+        return walks.plan(self, robots, frames, overlap, camera, self.seed)
+
+    def free_space(self) -> walks.FreeSpace:
+        return walks.free_space(self.caster, self.sky)
 
     def clearance(self, points: Array) -> Array:
         return self.caster.clearance(points)

@@ -429,7 +429,9 @@ def paint_onto(base: Material, patches: Sequence[tuple[Material, float, float, f
         for material, left, top, patch_w, patch_h in patches:
             patch = material(rng, patch_w, patch_h, texel_m)
             x, y = round(left / texel_m), round(top / texel_m)
-            patch = patch[: image.shape[0] - y, : image.shape[1] - x]
+            patch = patch[
+                : max(0, image.shape[0] - y), : max(0, image.shape[1] - x)
+            ]  # what does not fit is cut
             image[y : y + patch.shape[0], x : x + patch.shape[1]] = patch
         return image
 
@@ -487,5 +489,58 @@ def marbled(color: Color, vein: Color, wave_m: float = 0.12) -> Material:
         mix = np.clip(0.5 + 2.2 * cloud(rng, (h, w), wave_m / texel_m, 4, 0.6), 0, 1)[..., None]
         image = (1 - mix) * flat((h, w), color) + mix * flat((h, w), vein)
         return image * (1 + 0.06 * cloud(rng, (h, w), 0.05 / texel_m, 3, 0.8))[..., None]
+
+    return paint
+
+
+def carpet(color: Color = (146, 146, 150), tile_m: float = 0.5) -> Material:
+    """Carpet tiles of different tints, each with its own flecks."""
+
+    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+        h, w = shape_of(width_m, height_m, texel_m)
+        image = flat((h, w), color)
+        flecks = cloud(rng, (h, w), 0.06 / texel_m, 3, 0.85)
+        for y in np.arange(0, h, tile_m / texel_m):
+            for x in np.arange(0, w, tile_m / texel_m):
+                some = (
+                    slice(round(y), round(y + tile_m / texel_m)),
+                    slice(round(x), round(x + tile_m / texel_m)),
+                )
+                tint = np.array(shaded(rng, color, 0.12), dtype=np.float32)
+                image[some] = tint * (1 + 0.16 * flecks[some])[..., None]
+        return image
+
+    return paint
+
+
+def tiles(color: Color = (188, 180, 164), tile_m: float = 0.3, joint: Color = (110, 104, 96)) -> Material:
+    """Stone tiles with joints, no two alike; one in eight is dark."""
+
+    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+        h, w = shape_of(width_m, height_m, texel_m)
+        image = flat((h, w), joint)
+        veins = cloud(rng, (h, w), 0.1 / texel_m, 4, 0.75)
+        gap, step = max(1, round(0.008 / texel_m)), tile_m / texel_m
+        for y in np.arange(0, h, step):
+            for x in np.arange(0, w, step):
+                some = (slice(round(y), round(y + step) - gap), slice(round(x), round(x + step) - gap))
+                dark = 0.55 if rng.random() < 0.125 else 1.0
+                tint = dark * np.array(shaded(rng, color, 0.08), dtype=np.float32)
+                image[some] = tint * (1 + 0.09 * veins[some])[..., None]
+        return image
+
+    return paint
+
+
+def panels(color: Color = (214, 212, 204), panel_m: float = 0.6) -> Material:
+    """A hung ceiling: square panels with dark joints and specks."""
+
+    def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
+        image = tiles(color, panel_m, (150, 148, 142))(rng, width_m, height_m, texel_m)
+        h, w = image.shape[:2]
+        for _ in range(int(30 * width_m * height_m)):
+            at = (int(rng.integers(0, w)), int(rng.integers(0, h)))
+            cv2.circle(image, at, max(1, round(0.008 / texel_m)), (130, 128, 122), -1, cv2.LINE_AA)
+        return image
 
     return paint

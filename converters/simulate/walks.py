@@ -8,7 +8,9 @@ that pass, the first robot takes the one whose dullest view shows most; each oth
 part of its view with the robot before.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +20,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from converters.simulate.paths import HEIGHTS_M, OVERLAP_IMAGE, look_at, shared_view
-from converters.simulate.raycast import Caster, MeshRenderer
+from converters.simulate.raycast import Caster
+from converters.simulate.render import Eye
 from pipeline import streams
 from pipeline.errors import DuagError
 from pipeline.geometry import se3
@@ -30,7 +33,7 @@ Array = NDArray[np.float64]
 STEP_M = 0.028
 MAX_TURN_RAD = np.deg2rad(1.5)
 MIN_CLEARANCE_M = 0.3
-CELL_M = 0.1
+CELL_M, LARGE_M2 = 0.1, 600.0  # scenes larger than that have cells twice as wide
 BODY_HEIGHTS_M = (0.6, 1.75, 0.23)  # above the floor, from, to, step: where a robot is in the way
 FLOOR_BIN_M = 0.05
 FLOOR_COSINE = 0.95
@@ -46,7 +49,7 @@ TRIES, ENOUGH = 400, 16
 VIEWS = 12
 VIEW_IMAGE = (80, 60)
 NEAR_M, MAX_NEAR_SHARE = 0.6, 0.25
-MAX_HOLE_SHARE = 0.05
+MAX_HOLE_SHARE, MAX_SKY_SHARE = 0.05, 0.5
 LEAST_MEDIAN_M = 1.0
 EDGE_GREY = 6.0  # of 255, between neighbouring pixels of VIEW_IMAGE
 
@@ -56,35 +59,58 @@ class FreeSpace:
     """Where a robot can stand.
 
     floor_m: height of the floor. cells: [n, 2], x and y (m) of the middles of free cells, all connected. clearance:
-    [n], m. graph: cost of the way between neighbouring cells.
+    [n], m. graph: cost of the way between neighbouring cells. inside: [nx, ny], whether a cell of the whole grid is
+    free. low: [2], middle (m) of its first cell; cell_m: its width.
     """
 
     floor_m: float
     cells: Array
     clearance: Array
     graph: coo_array
+    inside: NDArray[np.bool_]
+    low: Array
+    cell_m: float
+
+
+class Terrain(Protocol):
+    """What a planner must know of a scene."""
+
+    step_m: float  # way of a robot per frame
+    sky: bool  # there is no ceiling
+
+    def eye(self, camera: PinholeCamera) -> Eye:
+        """A renderer."""
+
+    def sketch(self, camera: PinholeCamera) -> Eye:
+        """A renderer for depth alone, the quickest there is."""
+
+    def clearance(self, points: Array) -> Array:
+        """Distance (m) of world points [..., 3] to the nearest surface."""
+
+    def free_space(self) -> FreeSpace:
+        """Where a robot can stand."""
 
 
 def plan(
-    caster: Caster, robots: int, frames: int, overlap: float, camera: PinholeCamera, seed: int
+    terrain: Terrain, robots: int, frames: int, overlap: float, camera: PinholeCamera, seed: int
 ) -> list[Array]:
     """Walks T_world_camera [frames, 4, 4] of every robot.
 
     Args:
-        caster: of the scene where they move.
+        terrain: where they move.
         robots: how many.
-        frames: poses per robot, STEP_M apart.
+        frames: poses per robot, a step of the terrain apart.
         overlap: share, 0 to 1, of what a robot sees that the one before sees as well; met as nearly as may be.
         camera: of all robots.
         seed: of the walks.
     Raises:
         DuagError: there is no free space, or no walk in it that keeps clear and sees something.
     """
-    space = free_space(caster)
-    small = MeshRenderer(caster, camera.scaled(*OVERLAP_IMAGE))
+    space = terrain.free_space()
+    small = terrain.eye(camera.scaled(*OVERLAP_IMAGE))
     walks: list[Array] = []
     for robot in track(range(robots), "plan walks"):
-        found = _candidates(caster, space, robot, frames, camera, seed)
+        found = _candidates(terrain, space, robot, frames, camera, seed)
         if robot == 0:
             walks.append(max(found, key=lambda each: each[0])[1])
         else:
@@ -110,44 +136,66 @@ def floor_height(caster: Caster) -> float:
     return float(np.average(heights[around], weights=areas[around]))
 
 
-def free_space(caster: Caster) -> FreeSpace:
-    """The largest connected free space of a scene.
+def free_space(caster: Caster, sky: bool = False) -> FreeSpace:
+    """The largest connected free space of a scene; under a sky only the floor below matters.
 
     Raises:
         DuagError: it is smaller than LEAST_FREE_M2.
     """
     floor = floor_height(caster)
     low, high = caster.scene.vertices[:, :2].min(axis=0), caster.scene.vertices[:, :2].max(axis=0)
-    nx, ny = np.maximum(np.ceil((high - low) / CELL_M).astype(np.int64), 1)
-    x, y = low[0] + (np.arange(nx) + 0.5) * CELL_M, low[1] + (np.arange(ny) + 0.5) * CELL_M
+
+    def closed(places: Array) -> NDArray[np.bool_]:
+        return _closed_in(caster, places, floor, 0.0 if sky else CLOSED_SHARE)
+
+    return space_between(low, high, floor, caster.clearance, closed)
+
+
+def space_between(
+    low: Array,
+    high: Array,
+    floor: float,
+    distance: Callable[[Array], Array],
+    closed: Callable[[Array], NDArray[np.bool_]],
+) -> FreeSpace:
+    """The largest connected free space on a grid from `low` to `high` (x, y).
+
+    Args:
+        floor: its height. distance: of points [..., 3] to the nearest surface. closed: whether places [n, 2] are
+            inside the scene.
+    """
+    cell_m = CELL_M if np.prod(high - low) < LARGE_M2 else 2 * CELL_M
+    nx, ny = np.maximum(np.ceil((high - low) / cell_m).astype(np.int64), 1)
+    x, y = low[0] + (np.arange(nx) + 0.5) * cell_m, low[1] + (np.arange(ny) + 0.5) * cell_m
     places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-    clearance = _body_clearance(caster, places, floor)
+    clearance = _body_clearance(distance, places, floor)
     free = clearance >= MIN_CLEARANCE_M
-    free[free] = _closed_in(caster, places[free], floor)
+    free[free] = closed(places[free])
     parts, count = label(free, structure=np.ones((3, 3)))
     sizes = np.bincount(parts.ravel(), minlength=count + 1)[1:]
-    area = sizes.max(initial=0) * CELL_M**2
+    area = sizes.max(initial=0) * cell_m**2
     if area < LEAST_FREE_M2:
         raise DuagError(
             f"found {area:.1f} m^2 of free floor {floor:.2f} m high in the scene, expected at least "
             f"{LEAST_FREE_M2} m^2; is it a room in metres, and the right axis up (--up)?"
         )
     inside = parts == 1 + int(np.argmax(sizes))
-    return FreeSpace(floor, places[inside], clearance[inside], _graph(inside, clearance))
+    graph = _graph(inside, clearance, cell_m)
+    return FreeSpace(floor, places[inside], clearance[inside], graph, inside, places[0, 0], cell_m)
 
 
-def _body_clearance(caster: Caster, places: Array, floor: float) -> Array:
+def _body_clearance(distance: Callable[[Array], Array], places: Array, floor: float) -> Array:
     """Least distance (m) from a robot that stands at places [..., 2] to anything."""
     heights = floor + np.arange(*BODY_HEIGHTS_M)
     clearance = np.full(places.shape[:-1], np.inf)
     for z in heights:
         points = np.concatenate([places, np.full((*places.shape[:-1], 1), z)], axis=-1)
-        clearance = np.minimum(clearance, caster.clearance(points))
+        clearance = np.minimum(clearance, distance(points))
     return clearance
 
 
-def _closed_in(caster: Caster, places: Array, floor: float) -> NDArray[np.bool_]:
-    """Whether the scene closes round places [n, 2] at eye height, with a floor below."""
+def _closed_in(caster: Caster, places: Array, floor: float, share: float) -> NDArray[np.bool_]:
+    """Whether places [n, 2] have a floor below and a surface in that share of all directions from eye height."""
     k = np.arange(DIRECTIONS) + 0.5
     polar, turn = np.arccos(1 - 2 * k / DIRECTIONS), np.pi * (1 + 5**0.5) * k
     sphere = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), np.cos(polar)], axis=1)
@@ -156,10 +204,10 @@ def _closed_in(caster: Caster, places: Array, floor: float) -> NDArray[np.bool_]
     for direction in sphere:
         hit += np.isfinite(caster.hits(eyes, np.broadcast_to(direction, eyes.shape))["t"])
     below = caster.hits(eyes, np.broadcast_to([0.0, 0.0, -1.0], eyes.shape))["t"]
-    return (hit >= CLOSED_SHARE * DIRECTIONS) & (below < 1.5 * HEIGHTS_M[0])
+    return (hit >= share * DIRECTIONS) & (below < 1.5 * HEIGHTS_M[0])
 
 
-def _graph(inside: NDArray[np.bool_], clearance: Array) -> coo_array:
+def _graph(inside: NDArray[np.bool_], clearance: Array, cell_m: float) -> coo_array:
     """Costs of steps between neighbouring cells of a grid; dear near obstacles."""
     number = np.full(inside.shape, -1)
     number[inside] = np.arange(inside.sum())
@@ -171,29 +219,31 @@ def _graph(inside: NDArray[np.bool_], clearance: Array) -> coo_array:
         both = inside[here] & inside[there]
         rows.append(number[here][both])
         columns.append(number[there][both])
-        costs.append(CELL_M * np.hypot(dx, dy) * 0.5 * (price[here] + price[there])[both])
+        costs.append(cell_m * np.hypot(dx, dy) * 0.5 * (price[here] + price[there])[both])
     n = int(inside.sum())
     return coo_array((np.concatenate(costs), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n))
 
 
 def _candidates(
-    caster: Caster, space: FreeSpace, robot: int, frames: int, camera: PinholeCamera, seed: int
+    terrain: Terrain, space: FreeSpace, robot: int, frames: int, camera: PinholeCamera, seed: int
 ) -> list[tuple[float, Array]]:
     """Walks of a robot that keep clear and see something, each with how much its dullest view shows."""
     graph = space.graph.tocsr()
-    eye = MeshRenderer(caster, camera.scaled(*VIEW_IMAGE))
+    eye = terrain.eye(camera.scaled(*VIEW_IMAGE))
     found: list[tuple[float, Array]] = []
     reasons = {"too near to something": 0, "turns too fast": 0, "sees holes or a near wall": 0}
     for attempt in range(TRIES):
         rng = streams.generator(seed, "simulate.walk", robot=robot, attempt=attempt)
-        floor_way = _route(space, graph, frames * STEP_M + 2 * AHEAD_M + 1.0, rng)
-        poses = _look_ahead(floor_way, space.floor_m, robot, frames, rng)
+        floor_way = route(space, graph, frames * terrain.step_m + 2 * AHEAD_M + 1.0, rng)
+        poses = _look_ahead(floor_way, space.floor_m, robot, frames, terrain.step_m, rng)
         if poses is None:
             reasons["turns too fast"] += 1
-        elif _body_clearance(caster, poses[:, :2, 3], space.floor_m).min() < MIN_CLEARANCE_M - 0.05:
+        elif (
+            _body_clearance(terrain.clearance, poses[:, :2, 3], space.floor_m).min() < MIN_CLEARANCE_M - 0.05
+        ):
             reasons["too near to something"] += 1
         else:
-            shown = _least_shown(eye, poses)
+            shown = _least_shown(eye, poses, terrain.sky)
             if shown is None:
                 reasons["sees holes or a near wall"] += 1
             else:
@@ -202,14 +252,15 @@ def _candidates(
             break
     if not found:
         why = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
+        area = len(space.cells) * space.cell_m**2
         raise DuagError(
-            f"no walk for robot {robot} in {TRIES} tries ({why}) in {len(space.cells) * CELL_M**2:.1f} m^2 of free "
-            "floor, expected one; give another --seed, or fewer frames"
+            f"no walk for robot {robot} in {TRIES} tries ({why}) in {area:.1f} m^2 of free floor, "
+            " expected one; give another --seed, or fewer frames"
         )
     return found
 
 
-def _route(space: FreeSpace, graph: coo_array, length_m: float, rng: np.random.Generator) -> Array:
+def route(space: FreeSpace, graph: coo_array, length_m: float, rng: np.random.Generator) -> Array:
     """A way over the floor [n, 2] of at least a length, through places drawn at random, smoothed, 25 mm apart."""
     here = int(rng.integers(len(space.cells)))
     cells, total = [here], 0.0
@@ -235,15 +286,17 @@ def _resampled(way: Array, step_m: float) -> Array:
     return np.stack([np.interp(wanted, along[keep], way[keep, k]) for k in range(2)], axis=1)
 
 
-def _look_ahead(way: Array, floor: float, robot: int, frames: int, rng: np.random.Generator) -> Array | None:
-    """Poses [frames, 4, 4] along a way, STEP_M apart, or None if they turn too fast or the way is too short."""
+def _look_ahead(
+    way: Array, floor: float, robot: int, frames: int, step_m: float, rng: np.random.Generator
+) -> Array | None:
+    """Poses [frames, 4, 4] along a way, step_m apart, or None if they turn too fast or the way is too short."""
     along = 0.025 * np.arange(len(way))
     spline = CubicSpline(along, way)
     start = AHEAD_M
     margin = max(GAZE_SMOOTH_FRAMES)
     index = np.arange(-margin, frames + margin)
-    s = np.clip(start + index * STEP_M, 0.0, along[-1] - AHEAD_M)
-    if along[-1] - AHEAD_M < start + (frames - 1) * STEP_M:
+    s = np.clip(start + index * step_m, 0.0, along[-1] - AHEAD_M)
+    if along[-1] - AHEAD_M < start + (frames - 1) * step_m:
         return None
     waver = rng.uniform((0.02, 0.15, 0.02), (0.05, 0.4, 0.1))  # height m, yaw rad, pitch rad
     periods = rng.uniform((2.0, 3.0, 2.5), (3.5, 6.0, 5.0))
@@ -267,13 +320,16 @@ def _look_ahead(way: Array, floor: float, robot: int, frames: int, rng: np.rando
     return None
 
 
-def _least_shown(eye: MeshRenderer, poses: Array) -> float | None:
+def _least_shown(eye: Eye, poses: Array, sky: bool) -> float | None:
     """Share of edges in the view of a walk that has fewest of them; None if a view shows holes or a near wall."""
     least = 1.0
     for k in np.unique(np.linspace(0, len(poses) - 1, VIEWS).round().astype(np.int64)):
         depth, _ = eye.depth(poses[k])
         seen = depth > 0
-        if 1 - seen.mean() > MAX_HOLE_SHARE or np.mean(seen & (depth < NEAR_M)) > MAX_NEAR_SHARE:
+        if (
+            1 - seen.mean() > (MAX_SKY_SHARE if sky else MAX_HOLE_SHARE)
+            or np.mean(seen & (depth < NEAR_M)) > MAX_NEAR_SHARE
+        ):
             return None
         if np.median(depth[seen]) < LEAST_MEDIAN_M:
             return None

@@ -111,7 +111,12 @@ def moves(log: RgbdLog) -> list[Move]:
 
 def _move(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera) -> Move:
     a, b = (
-        RgbdPyramid.build(frame.color.astype(np.float32) / 255, frame.usable_depth, camera)
+        RgbdPyramid.build(
+            frame.color.astype(np.float32) / 255,
+            frame.usable_depth,
+            camera,
+            depth_sigma_m=frame.depth_sigma,
+        )
         for frame in (first, second)
     )
     result = register(Reference.from_pyramid(a), b, np.eye(4))

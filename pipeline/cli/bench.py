@@ -65,15 +65,23 @@ def bench_consensus(
         str, typer.Option(help="evidence (compact), evidence_float32, evidence_float64, admm, paper.")
     ] = "evidence,evidence_float64,admm,paper",
     tracks: Annotated[int, typer.Option(min=1, help="Matched Gaussians.")] = 200,
+    of_run: Annotated[
+        Path | None,
+        typer.Option(
+            "--run", help="Evidence and matches of a finished run instead of made ones.", show_default=False
+        ),
+    ] = None,
     max_rounds: Annotated[int, typer.Option(min=1, help="A session ends here.")] = 3000,
     seed: Annotated[int, typer.Option(help="Seed of evidence and links.")] = 0,
     as_json: Json = False,
 ) -> None:
     """What it costs a team to agree on matched Gaussians, mode by mode, against the central optimum.
 
-    Lists are separated by commas; every combination is a row. The defaults take some minutes.
+    Lists are separated by commas; every combination is a row. The defaults take some minutes. With --run,
+    robots, contrast, unknown and tracks are those of the run.
 
-    Example: duagc bench consensus --robots 4 --topology chain --loss 0,0.9 --contrast 47
+    Examples: `duagc bench consensus --robots 4 --topology chain --loss 0,0.9 --contrast 47`,
+    `duagc bench consensus --run outputs/redkitchen --topology full --loss 0 --mode evidence,admm,paper`
     """
     from pipeline.exchange import bench
 
@@ -95,7 +103,14 @@ def bench_consensus(
         max_rounds=max_rounds,
         seed=seed,
     )
-    result = bench.run(plan)
+    if of_run is None:
+        result = bench.run(plan)
+    else:
+        from pipeline.evaluation.modes import team_of_run
+        from pipeline.run_folder import RunFolder
+
+        parts = [bench.run_on(team_of_run(RunFolder(of_run), t), t, plan) for t in plan.topologies]
+        result = {"plan": parts[0]["plan"], "rows": [row for part in parts for row in part["rows"]]}
     print(json.dumps(result, indent=2) if as_json else bench.format_table(result))
 
 

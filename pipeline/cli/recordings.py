@@ -16,8 +16,15 @@ def simulate(
     robots: Annotated[int, typer.Option(min=1, max=8, help="Number of robots.")] = 2,
     frames: Annotated[int, typer.Option(min=2, help="Frames per robot.")] = 160,
     scene: Annotated[
-        str, typer.Option(help="room, or a folder of textured meshes (GLB, glTF, OBJ, PLY).")
+        str,
+        typer.Option(
+            help="room, office, corridor, outdoor, or a folder of textured meshes (GLB, glTF, OBJ, PLY)."
+        ),
     ] = "room",
+    paradigm: Annotated[
+        str,
+        typer.Option(help="wander, concentric, leader-follower, crossing or parallel: how the paths lie."),
+    ] = "wander",
     up: Annotated[
         str,
         typer.Option(help="Axis that is up in the meshes: y, z, or auto (y for GLB, glTF, OBJ; z for PLY)."),
@@ -29,13 +36,18 @@ def simulate(
     ] = 0.6,
     noise: Annotated[str, typer.Option(help="none or kinect.")] = "none",
     seed: Annotated[int, typer.Option(help="Seed of scene, paths and noise.")] = 0,
+    preview: Annotated[
+        Path | None,
+        typer.Option(metavar="PNG", help="Contact sheet to write: paths from above, views over time."),
+    ] = None,
     workers: Workers = 2,
     force: Force = False,
 ) -> None:
-    """Render a recording of a robot team, in a procedural room or among textured meshes, with exact ground truth.
+    """Render a recording of a robot team, in a procedural scene or among textured meshes, with exact ground truth.
 
     Examples:
     `duagc simulate --robots 3 --noise kinect --out recordings/room`,
+    `duagc simulate --scene office --robots 4 --paradigm crossing --preview office.png --out recordings/office`,
     `duagc simulate --scene scans/house --width 640 --height 480 --frames 300 --out recordings/house`
     """
     from converters.simulate import simulate as simulate_recording
@@ -46,6 +58,8 @@ def simulate(
         frames=frames,
         scene=scene,
         up=up,
+        paradigm=paradigm,
+        preview=preview,
         size=(width, height),
         overlap=overlap,
         noise=noise,
@@ -113,10 +127,15 @@ def info(
         bool,
         typer.Option("--toml", help="Of a log of another program: a file to convert it by, to be edited."),
     ] = False,
+    preview: Annotated[
+        Path | None,
+        typer.Option(help="Write a PNG of some colour and depth images of every robot.", show_default=False),
+    ] = None,
 ) -> None:
     """Say what is in a recording, a run or a log; of a log of another program also what would be converted and why.
 
-    Examples: `duagc info recordings/redkitchen`, `duagc info campus.bag --toml > campus.toml`
+    Examples: `duagc info recordings/redkitchen --preview redkitchen.png`,
+    `duagc info campus.bag --toml > campus.toml`
     """
     from converters.logs import describe
     from pipeline import recording
@@ -129,6 +148,8 @@ def info(
     if as_toml:
         raise DuagError(f"{path}: is none of another program's logs, expected one with --toml")
     content = recording.info(path)
+    if preview is not None:
+        recording.write_preview_of(path, preview)
     print(json.dumps(content, indent=2) if as_json else recording.format_info(content))
 
 

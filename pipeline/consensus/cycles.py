@@ -31,6 +31,10 @@ class Proposal:
     T_a_b: Array
     variance: tuple[float, float]
 
+    def turned(self) -> Proposal:
+        """The same as the other robot says it."""
+        return Proposal(self.support, se3.inverse(self.T_a_b), self.variance)
+
 
 @dataclass(frozen=True)
 class Placement:
@@ -104,7 +108,7 @@ def _turned(pairs: Mapping[Pair, Sequence[Proposal]], a: str, b: str) -> list[Pr
     """Proposals of a pair as motions from b to a."""
     if (a, b) in pairs:
         return list(pairs[a, b])
-    return [Proposal(p.support, se3.inverse(p.T_a_b), p.variance) for p in pairs.get((b, a), ())]
+    return [p.turned() for p in pairs.get((b, a), ())]
 
 
 def _closes(T: Array, variance: Array, margin: float) -> bool:

@@ -176,18 +176,18 @@ def tracks(evidence: Mapping[str, Evidence], pairs: Pairs, config: MatchingConfi
     first = dict(zip(robots, np.cumsum([0, *(len(evidence[r]) for r in robots)]).tolist(), strict=False))
     total = sum(len(evidence[r]) for r in robots)
     owner = np.repeat(np.arange(len(robots)), [len(evidence[r]) for r in robots])
-    parts = []
+    parts, apart = [], []
     for a, b in sorted(p for p in pairs if p[0] in evidence and p[1] in evidence):
         i, known_i = _rows(evidence[a], pairs[a, b][:, 0])
         j, known_j = _rows(evidence[b], pairs[a, b][:, 1])
         i, j = i[known_i & known_j], j[known_i & known_j]
-        d = gaussian_distance(evidence[a], i, evidence[b], j, config) if len(i) else np.zeros(0)
-        parts.append((first[a] + i, first[b] + j, d))
+        parts.append((first[a] + i, first[b] + j))
+        apart.append((evidence[a], i, evidence[b], j))
     if not parts:
         none = np.zeros(0, np.int64)
         return Tracks(robots, none, none, none)
-    i, j, d = (np.concatenate([p[k] for p in parts]) for k in range(3))
-    i, j, d = i.astype(np.int64), j.astype(np.int64), d.astype(np.float64)
+    i, j = (np.concatenate([p[k] for p in parts]).astype(np.int64) for k in range(2))
+    d: Array | None = None  # only of use where a component is broken, which two robots' never are
     while True:
         graph = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(total, total))
         component = csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
@@ -197,6 +197,8 @@ def tracks(evidence: Mapping[str, Evidence], pairs: Pairs, config: MatchingConfi
         broken = np.unique(twice[count > 1] // len(robots))
         if not len(broken):
             break
+        if d is None:
+            d = np.concatenate([gaussian_distance(*pair, config) for pair in apart if len(pair[1])])
         bad = np.flatnonzero(np.isin(component[i], broken))
         worst_first = bad[np.lexsort((j[bad], i[bad], -d[bad], component[i[bad]]))]
         leaders = np.ones(len(worst_first), dtype=bool)

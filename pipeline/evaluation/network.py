@@ -29,6 +29,7 @@ SOLVERS = {
     "elimination": "elimination along a tree of robots (poses), evidence sent once (Gaussians)",
 }
 PURPOSE = {  # of a message, by its kind
+    "HELLO": "set-up",
     "DESCRIPTORS": "set-up",
     "REQUEST": "set-up",
     "SAMPLE": "set-up",

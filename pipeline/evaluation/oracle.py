@@ -80,7 +80,7 @@ def gap_to_oracle(
     Raises:
         DuagError: the settings of the run are not what they should be.
     """
-    config = _section(run, PoseConsensusConfig, "exchange", "consensus")
+    config = section_of(run, PoseConsensusConfig, "exchange", "consensus")
     claims = {robot.component for robot in run.robots.values() if len(robot.component) > 1}
     gaps = []
     for members in sorted(claims):
@@ -142,7 +142,7 @@ def _gaussian_gaps(
     pairs: Mapping[tuple[str, str], NDArray[np.int64]],
 ) -> Array:
     """Largest |x - x*| sqrt(diagonal of the information at x*) of each of a robot's matched Gaussians [m]."""
-    weights = _section(run, ExchangeConfig, "exchange").weights
+    weights = section_of(run, ExchangeConfig, "exchange").weights
     evidence = {name: told(*_map_of(run.robots[name]), weights) for name in members}
     _, own, _, T_map_keyframe = mine = _map_of(run.robots[robot])
     best = fuse(
@@ -155,8 +155,8 @@ def _gaussian_gaps(
         pairs,
         (),
         PinholeCamera(2, 2, 1.0, 1.0, 0.5, 0.5),  # looks at nothing: what is taken over is not compared
-        _section(run, FusionConfig, "fusion").model_copy(update={"coverage": "overlap"}),
-        _section(run, MatchingConfig, "exchange", "matching"),
+        section_of(run, FusionConfig, "fusion").model_copy(update={"coverage": "overlap"}),
+        section_of(run, MatchingConfig, "exchange", "matching"),
         weights=weights,
     )
     matched = best.members[: len(own)] > 1
@@ -226,7 +226,7 @@ def _closures(members: Sequence[str], decisions: Sequence[Any]) -> list[Weighted
     return out
 
 
-def _section(run: RunFolder, model: type[Model], *names: str) -> Model:
+def section_of(run: RunFolder, model: type[Model], *names: str) -> Model:
     """One section of the run's settings."""
     section = run.config
     for name in names:

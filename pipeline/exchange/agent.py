@@ -31,7 +31,7 @@ from pipeline.consensus.closures import plausible
 from pipeline.exchange import injection, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.frames import Frames
-from pipeline.exchange.meeting import HigherEnd, LowerEnd, OwnPlaces, Send
+from pipeline.exchange.meeting import HigherEnd, LowerEnd, Meeting, OwnPlaces, Send
 from pipeline.exchange.neighbour import Neighbour
 from pipeline.exchange.outcome import result_of
 from pipeline.exchange.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError, Packet, parse
@@ -40,12 +40,14 @@ from pipeline.exchange.signatures import Identity
 from pipeline.exchange.solvers import AdmmSolver, EliminationSolver, LinkStart, PoseSolver, SolverStart
 from pipeline.exchange.transport import Arrival, Message, Outgoing, Transport
 from pipeline.exchange.wire import Anchors, PairFrames, State, pair_bit
+from pipeline.geometry import se3
 from pipeline.robot import AgentResult, RobotData
 
 Array = NDArray[np.float64]
 EVERYWHERE = 255  # a hop count that has reached the whole component, for good
 MAX_EARLY_MESSAGES = 64
-MEETING_KINDS = frozenset({Kind.DESCRIPTORS, Kind.REQUEST, Kind.SAMPLE, Kind.CLOSURES})
+LOWER_END_KINDS = frozenset({Kind.DESCRIPTORS, Kind.SAMPLE})  # what the lower end gets
+MEETING_KINDS = LOWER_END_KINDS | {Kind.REQUEST, Kind.CLOSURES}
 
 
 class Agent:
@@ -87,12 +89,10 @@ class Agent:
 
     def _neighbour(self, name: str) -> Neighbour:
         index = self.team.index(name)
-        end = LowerEnd if self.data.robot < name else HigherEnd
-        meeting = end(self.data.robot, name, self.places, self.config, self.seed)
         transport = Transport(
             self.own, index, name, self.config.transport, self._new_id, identity=self.identity
         )
-        return Neighbour(index, name, transport, meeting)
+        return Neighbour(index, name, transport)
 
     # --- one round
 
@@ -107,13 +107,13 @@ class Agent:
             self._take(data)
         self._watch()
         for neighbour in self._living():
-            if neighbour.transport.last_heard is not None and not neighbour.meeting.begun:
-                neighbour.meeting.begin(self._sender(neighbour))
+            if neighbour.transport.last_heard is not None and not neighbour.greeted:
+                neighbour.greeted = True
+                self._send(neighbour, Kind.HELLO, self.places.digest)
         self._hear_of_partings()
         self._settle_frames()
         self._settle_poses()
-        agreed_map = self.frames.T_world_map(self.own) if self.agreed else None
-        self.sharing.tell(self._joined(), self.frames.members, agreed_map)
+        self.sharing.tell(self._joined(), self.frames.members, self._T_world_map() if self.agreed else None)
         if self.agreed:
             self.sharing.match(self.others)
         self._finish()
@@ -126,6 +126,10 @@ class Agent:
     def others(self) -> list[int]:
         """Members of the component besides this robot."""
         return [robot for robot in self.frames.members if robot != self.own]
+
+    def _T_world_map(self) -> Array:  # noqa: N802 (a transform)
+        """Own map frame where it was placed before the pose rounds."""
+        return self.frames.T_world_first(self.own) @ se3.inverse(self.data.T_map_keyframe[0])
 
     def _joined(self) -> list[Neighbour]:
         return [n for n in self.neighbours.values() if n.joined]
@@ -175,14 +179,15 @@ class Agent:
         payload, team = arrival.payload, len(self.team)
         if arrival.kind is Kind.STATE:
             self._take_state(n, payload)
+        elif arrival.kind is Kind.HELLO:
+            digest = wire.read_digest(payload)
+            self._meet(n, lower=(self.places.digest, self.data.robot) < (digest, n.name))
         elif arrival.kind in MEETING_KINDS:
-            if not n.meeting.begun:
-                n.meeting.begin(self._sender(n))
-            n.meeting.take(arrival.kind, payload, self._sender(n))
+            self._meet(n, lower=arrival.kind in LOWER_END_KINDS).take(arrival.kind, payload, self._sender(n))
         elif arrival.kind is Kind.FRAME:
             if self.poses is not None:
                 raise MalformedError("frame: all of them were known before the poses began")
-            n.frames_told.setdefault(self.frames.learn(payload), 0)
+            n.frames_told.setdefault(self.frames.learn(payload, self._held_pairs()), 0)
         elif arrival.kind is Kind.TREE:
             self._take_tree(n, payload)
         elif arrival.kind is Kind.VOXELS:
@@ -197,6 +202,20 @@ class Agent:
                 for provider, message in self.knowledge.forget_incoming(owner):
                     self.neighbours[provider].transport.accept_rest(message, self.round)
                 n.transport.accept_rest(arrival.message, self.round)
+
+    def _meet(self, n: Neighbour, lower: bool) -> Meeting:
+        """The meeting with a neighbour; it begins when it is known which end this robot is."""
+        if n.meeting is None:
+            end = LowerEnd if lower else HigherEnd
+            n.meeting = end(self.data.robot, n.name, self.places, self.config, self.seed)
+            n.meeting.begin(self._sender(n))
+        return n.meeting
+
+    def _held_pairs(self) -> set[tuple[int, int]]:
+        """Pairs of this robot that nobody else may speak for."""
+        return {
+            _pair(self.own, n.index) for n in self.neighbours.values() if not isinstance(n.meeting, HigherEnd)
+        }
 
     def _take_state(self, n: Neighbour, payload: bytes) -> None:
         n.state, poses = wire.read_state(payload, len(self.team))
@@ -309,12 +328,15 @@ class Agent:
         """
         joined = self._joined()
         for n in joined:
-            meeting, pair = n.meeting.joined, (self.own, n.index)
-            if meeting is not None and meeting.proposals and pair not in self.frames.pairs:
-                self.frames.tell(PairFrames(*pair, meeting.proposals))
+            pair = _pair(self.own, n.index)
+            if isinstance(n.meeting, LowerEnd) and n.meeting.joined and pair not in self.frames.pairs:
+                proposals = n.meeting.joined.proposals
+                if pair[0] != self.own:
+                    proposals = tuple(p.turned() for p in proposals)
+                self.frames.tell(PairFrames(*pair, proposals))
         for n in joined:
             for pair in sorted(self.frames.payloads):
-                if pair[0] != n.index and pair not in n.frames_told:
+                if pair not in n.frames_told:
                     n.frames_told[pair] = self._send(n, Kind.FRAME, self.frames.payloads[pair])
         if self.frames_hops == EVERYWHERE:
             return
@@ -366,9 +388,9 @@ class Agent:
         start = SolverStart(
             self.data.robot,
             self.own,
-            self.data.T_map_keyframe,
+            self.places.T_first_keyframe,
             self.places.registrations,
-            self.frames.T_world_map(self.own),
+            self.frames.T_world_first(self.own),
             self.frames.tree(),
             list(self.links.values()),
         )
@@ -385,19 +407,20 @@ class Agent:
 
     def _link_start(self, n: Neighbour) -> LinkStart:
         """A joined neighbour; closures start with weight if they fit to where both robots were placed."""
+        assert n.meeting is not None
         meeting = n.meeting.joined
         assert meeting is not None
         if not isinstance(n.meeting, LowerEnd):
             return LinkStart(n.index, n.name, meeting.shared, (), np.zeros(0, bool), np.zeros((0, 4, 4)))
         assert n.meeting.book is not None
-        T_world_peer = self.frames.T_world_map(n.index) @ n.meeting.book.T_map_keyframe
-        pair = (self.data.robot, n.name)
+        T_world_peer = self.frames.T_world_first(n.index) @ n.meeting.book.T_first_keyframe
+        pair = (min(self.data.robot, n.name), max(self.data.robot, n.name))
         chosen = self.frames.placement.chosen[pair]
         n.contradiction = self.frames.placement.contradictions.get(pair, "")
         keep = np.zeros(len(meeting.closures), bool) if chosen is None else meeting.groups[chosen]
         placed = plausible(
             meeting.closures,
-            self.frames.T_world_map(self.own) @ self.data.T_map_keyframe,
+            self.frames.T_world_first(self.own) @ self.places.T_first_keyframe,
             T_world_peer,
             self.places.drift,
             n.meeting.book.drift,
@@ -433,3 +456,7 @@ class Agent:
     def result(self) -> AgentResult:
         """What the robot takes home."""
         return result_of(self)
+
+
+def _pair(a: int, b: int) -> tuple[int, int]:
+    return min(a, b), max(a, b)

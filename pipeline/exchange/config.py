@@ -116,7 +116,11 @@ class PlacesConfig(Config):
     candidates_per_keyframe: int = Field(default=3, ge=1)
     """Best candidates tried for each keyframe of the neighbour."""
     max_requested_keyframes: int = Field(default=24, ge=1)
-    """Keyframes whose sample is requested from one neighbour, best scores first."""
+    """Most keyframes whose sample is requested from one neighbour."""
+    keyframes_per_request: int = Field(default=6, ge=1)
+    """Keyframes asked for at once; what came of them decides about the next."""
+    worth_nats: float = Field(default=1.0, ge=0.0)
+    """Least information about the two robots that a sample must promise, in nats; 0: all that the budget allows."""
 
 
 class VerificationConfig(Config):

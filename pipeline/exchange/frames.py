@@ -1,7 +1,8 @@
 """Where every robot's map lies: relative frames of pairs, flooded, and what follows from them.
 
-The lower-named end of every pair that shares a frame says so, with one proposal for each group of its closures that
-agrees. Who knows the same pairs places the team the same way (`consensus.cycles`), to the last bit.
+The end of a pair that holds its closures says how the two first keyframes lie to each other, with one proposal for
+each group of closures that agrees. Who knows the same pairs places the team the same way (`consensus.cycles`), to the
+last bit.
 """
 
 from __future__ import annotations
@@ -32,15 +33,17 @@ class Frames:
         self.parted = 0  # links known to have been parted, a mask of pair_bit
         self._placement: Placement | None = None
 
-    def learn(self, payload: bytes) -> Pair:
-        """Take what the lower end of a pair says, if it is news; returns the pair.
+    def learn(self, payload: bytes, held: set[Pair]) -> Pair:
+        """Take what is told of a pair, if it is news; returns the pair.
 
+        Args:
+            held: pairs whose closures this robot holds.
         Raises:
             MalformedError: it says nothing sensible, or speaks for this robot.
         """
         frames = wire.read_frames(payload, len(self.team))
         pair = (frames.lower, frames.higher)
-        if frames.lower == self.own and pair not in self.pairs:
+        if pair in held and pair not in self.pairs:
             raise MalformedError("frame: a neighbour speaks for this robot")
         if pair not in self.pairs:
             self.pairs[pair], self.payloads[pair] = frames, payload
@@ -80,7 +83,7 @@ class Frames:
 
     @property
     def placement(self) -> Placement:
-        """Where the members' maps lie in that of the root."""
+        """Where the members' first keyframes lie in that of the root."""
         if self._placement is None:
             members = self.members
             pairs = {
@@ -91,8 +94,8 @@ class Frames:
             self._placement = place(pairs, [self.team[m] for m in members], self.margin)
         return self._placement
 
-    def T_world_map(self, robot: int) -> Array:  # noqa: N802 (a transform)
-        """Map frame of a member in that of the root, [4, 4]."""
+    def T_world_first(self, robot: int) -> Array:  # noqa: N802 (a transform)
+        """First keyframe of a member in that of the root, [4, 4]."""
         return self.placement.T_world_map[self.team[robot]]
 
     def tree(self) -> TreePlace:

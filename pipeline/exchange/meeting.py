@@ -1,17 +1,20 @@
 """How two robots find out whether they have been in the same place, and where one's map lies in the other's.
 
-    higher-named end                                    lower-named end
+    higher end                                          lower end
+    HELLO        digest of what was seen              <->
     DESCRIPTORS  compact descriptors of all keyframes ->
-                                                      <- REQUEST   keyframes worth a closer look
-    SAMPLE       one per requested keyframe           ->
-                                                      <- CLOSURES  verdict, shared keyframes, relative frame
+                                                      <- REQUEST   keyframes worth a closer look    } until nothing
+    SAMPLE       one per requested keyframe           ->                                            } is worth it
+                                                      <- CLOSURES  verdict, shared keyframes
 
-The lower-named end keeps the closures. It has decided when its verdict has been acknowledged, the other end when
-the verdict has arrived.
+The lower end is the one with the lower digest (and name, should they be equal): who verifies decides which of two
+measurements counts, and that must not depend on names. It keeps the closures. It has decided when its verdict has been
+acknowledged, the other end when the verdict has arrived.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -26,9 +29,10 @@ from pipeline.consensus.links import SharedKeyframes, link_metric
 from pipeline.exchange import injection, places, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.packets import Kind, MalformedError
-from pipeline.exchange.places import Candidate
+from pipeline.exchange.places import Candidate, Planner
 from pipeline.exchange.verification import Verdict, Verified, verify
 from pipeline.exchange.wire import KeyframeSample, PlaceBook, Verdicts
+from pipeline.geometry import se3
 from pipeline.registration import Reference, RgbdPyramid
 from pipeline.registration.features import Features, extract
 from pipeline.robot import RobotData, factors_of
@@ -53,7 +57,9 @@ class OwnPlaces:
         if self._features is None:
             most = self.config.places.features_per_keyframe
             camera = self.data.camera
-            self._features = [extract(*self.data.images(k), camera, most) for k in range(self.data.keyframes)]
+            self._features = [
+                extract(*self.data.images(k)[:2], camera, most) for k in range(self.data.keyframes)
+            ]
         return self._features
 
     def pyramid(self, keyframe: int) -> RgbdPyramid:
@@ -61,8 +67,22 @@ class OwnPlaces:
         return self._pyramid(keyframe)
 
     def _build_pyramid(self, keyframe: int) -> RgbdPyramid:
-        color, depth = self.data.images(keyframe)
-        return RgbdPyramid.build(color.astype(np.float32) / np.float32(255), depth, self.data.camera)
+        images = self.data.images(keyframe)
+        color = images.color.astype(np.float32) / np.float32(255)
+        camera, sigma_m = self.data.camera, images.depth_sigma_m
+        return RgbdPyramid.build(color, images.depth_m, camera, depth_sigma_m=sigma_m)
+
+    @property
+    def digest(self) -> bytes:
+        """Eight bytes that depend on what the robot saw, and on nothing else."""
+        whole = hashlib.sha256(b"".join(f.descriptors.tobytes() for f in self.features))
+        return whole.digest()[: wire.DIGEST_BYTES]
+
+    @property
+    def T_first_keyframe(self) -> Array:  # noqa: N802 (transforms)
+        """Keyframes [n, 4, 4] as seen from the first: no result depends on where a robot's map has its origin."""
+        T = self.data.T_map_keyframe
+        return se3.inverse(T[0]) @ T if len(T) else T
 
     @property
     def drift(self) -> Array:
@@ -73,7 +93,7 @@ class OwnPlaces:
         """What a neighbour gets to recognise places."""
         most = self.config.places.features_per_place
         compact = [f.descriptors[:most] for f in self.features]
-        return PlaceBook(compact, self.data.T_map_keyframe, self.drift)
+        return PlaceBook(compact, self.T_first_keyframe, self.drift)
 
     def sample(self, keyframe: int) -> KeyframeSample:
         """What a neighbour gets to verify closures with one keyframe."""
@@ -103,18 +123,16 @@ class Joined:
 
 
 class Meeting:
-    """The lower-named end of a pair, or the higher-named one: two subclasses."""
+    """The lower end of a pair, or the higher one: two subclasses."""
 
     def __init__(self, own: str, peer: str, places_: OwnPlaces, config: ExchangeConfig, seed: int) -> None:
         self.own, self.peer, self.places, self.config, self.seed = own, peer, places_, config, seed
         self.verdicts: Verdicts | None = None
         self.joined: Joined | None = None
         self.tried: list[Tried] = []
-        self.begun = False
 
     def begin(self, send: Send) -> None:
-        """Called once, when the neighbour has been heard for the first time."""
-        self.begun = True
+        """Called once, when the ends know which is which."""
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
         """Take one complete message of this meeting."""
@@ -124,14 +142,20 @@ class Meeting:
 class HigherEnd(Meeting):
     """Sends descriptors and the samples it is asked for; gets the verdict."""
 
+    def __init__(self, own: str, peer: str, places_: OwnPlaces, config: ExchangeConfig, seed: int) -> None:
+        super().__init__(own, peer, places_, config, seed)
+        self.answered: set[int] = set()
+
     def begin(self, send: Send) -> None:
-        super().begin(send)
         send(Kind.DESCRIPTORS, wire.write_places(self.places.book()))
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
         limit = self.places.data.keyframes
         if kind is Kind.REQUEST:
             for keyframe in wire.read_indices(payload, limit):
+                if keyframe in self.answered:
+                    raise MalformedError(f"request: keyframe {keyframe} was asked for before")
+                self.answered.add(keyframe)
                 send(Kind.SAMPLE, wire.write_sample(self.places.sample(keyframe)))
         elif kind is Kind.CLOSURES and self.verdicts is None:
             verdicts = wire.read_verdicts(payload, limit)
@@ -139,7 +163,7 @@ class HigherEnd(Meeting):
             if verdicts.joined:
                 self.joined = Joined(verdicts.shared)
         else:
-            raise MalformedError(f"{kind.name} is not for the higher-named end, or came twice")
+            raise MalformedError(f"{kind.name} is not for the higher end, or came twice")
 
 
 class LowerEnd(Meeting):
@@ -148,6 +172,7 @@ class LowerEnd(Meeting):
     def __init__(self, own: str, peer: str, places_: OwnPlaces, config: ExchangeConfig, seed: int) -> None:
         super().__init__(own, peer, places_, config, seed)
         self.book: PlaceBook | None = None
+        self.planner: Planner | None = None
         self.waiting: dict[int, list[Candidate]] = {}  # by keyframe of the neighbour
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
@@ -159,44 +184,39 @@ class LowerEnd(Meeting):
                 raise MalformedError(f"sample of keyframe {sample.keyframe} was not asked for, or came twice")
             self._verify(sample)
             if not self.waiting:
-                self._decide(send)
+                self._ask(send)
         else:
-            raise MalformedError(f"{kind.name} is not for the lower-named end, or came twice")
+            raise MalformedError(f"{kind.name} is not for the lower end, or came twice")
 
     def _choose(self, book: PlaceBook, send: Send) -> None:
-        """Score all pairs of keyframes and ask for the samples of the best."""
+        """Score all pairs of keyframes and ask for the samples of the most promising."""
         self.book = book
         c = self.config.places
-        choice = places.candidates(
-            self.places.features,
-            book.descriptors,
-            c.ratio,
-            c.min_score,
-            c.candidates_per_keyframe,
-            c.max_requested_keyframes,
-        )
-        for candidate in choice.left:
-            self.tried.append(Tried(candidate, Verified(Verdict.NOT_ASKED_FOR, 0, 0)))
-        for candidate in choice.unlike:
+        candidates, unlike = places.scored(self.places.features, book.descriptors, c.ratio, c.min_score)
+        for candidate in unlike:
             detail = f"{candidate.score} descriptors match at best, {c.min_score} needed"
             self.tried.append(Tried(candidate, Verified(Verdict.UNLIKE, 0, 0, detail)))
-        for candidate in choice.kept:
+        self.planner = Planner(candidates, self.places.drift, book.drift, c, self.config.consensus.closures)
+        self._ask(send)
+
+    def _ask(self, send: Send) -> None:
+        """Ask for what is worth most now; decide when nothing is worth a sample any more."""
+        assert self.planner is not None
+        for candidate in self.planner.next():
             self.waiting.setdefault(candidate.peer_keyframe, []).append(candidate)
         if self.waiting:
             send(Kind.REQUEST, wire.write_indices(sorted(self.waiting)))
-        else:
-            self._decide(send)
+            return
+        for candidate, reason in self.planner.not_asked_for():
+            self.tried.append(Tried(candidate, Verified(Verdict.NOT_ASKED_FOR, 0, 0, reason)))
+        self._decide(send)
 
     def _verify(self, sample: KeyframeSample) -> None:
+        assert self.planner is not None
         for candidate in self.waiting.pop(sample.keyframe):
-            rng = streams.generator(
-                self.seed,
-                "ransac",
-                robot=self.own,
-                peer=self.peer,
-                own_keyframe=candidate.own_keyframe,
-                peer_keyframe=candidate.peer_keyframe,
-            )
+            ends = (self.places.features[candidate.own_keyframe], sample.features)
+            own, peer = (hashlib.sha256(f.descriptors.tobytes()).hexdigest() for f in ends)
+            rng = streams.generator(self.seed, "ransac", own=own, peer=peer)
             result = verify(
                 candidate.own_keyframe,
                 candidate.peer_keyframe,
@@ -209,6 +229,7 @@ class LowerEnd(Meeting):
                 rng,
             )
             self.tried.append(Tried(candidate, result))
+            self.planner.take(candidate, result.closure is not None)
 
     def _inject(self) -> None:
         """Add the false closures that the configuration asks for."""
@@ -229,8 +250,8 @@ class LowerEnd(Meeting):
         closures = [t.result.closure for t in self.tried if t.result.closure is not None]
         agreement = consistent(
             closures,
-            self.places.data.T_map_keyframe,
-            self.book.T_map_keyframe,
+            self.places.T_first_keyframe,
+            self.book.T_first_keyframe,
             self.places.drift,
             self.book.drift,
             self.config.consensus.closures,
@@ -262,9 +283,9 @@ class LowerEnd(Meeting):
         send(Kind.CLOSURES, wire.write_verdicts(self.verdicts))
 
     def _proposal(self, closures: Sequence[Closure], group: Group) -> Proposal:
-        """What a group of closures says of the relative frame, anywhere in the two maps."""
+        """What a group of closures says of the first keyframe of either robot in that of the other, own frame first."""
         assert self.book is not None
-        own, peer = self.places.data.T_map_keyframe, self.book.T_map_keyframe
+        own, peer = self.places.T_first_keyframe, self.book.T_first_keyframe
         agreeing = [c for c, keep in zip(closures, group.keep.tolist(), strict=True) if keep]
         variance = frame_variance(
             agreeing, own, peer, self.places.drift, self.book.drift, self.config.consensus.closures

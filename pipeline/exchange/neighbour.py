@@ -21,7 +21,8 @@ class Neighbour:
     index: int
     name: str
     transport: Transport
-    meeting: Meeting
+    meeting: Meeting | None = None  # before it is known which end is which
+    greeted: bool = False
     state: State | None = None
     verdict_message: int | None = None
     gone: bool = False  # silent for too long
@@ -44,9 +45,10 @@ class Neighbour:
         if self.gone:
             return True
         told = self.verdict_message is None or not self.transport.is_open(self.verdict_message)
-        return self.meeting.verdicts is not None and told
+        return self.meeting is not None and self.meeting.verdicts is not None and told
 
     @property
     def joined(self) -> bool:
         """Whether the two robots share a frame, and the neighbour knows it."""
-        return not self.gone and not self.parted and self.decided and self.meeting.joined is not None
+        met = self.meeting is not None and self.meeting.joined is not None
+        return met and not self.gone and not self.parted and self.decided

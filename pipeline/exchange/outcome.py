@@ -80,7 +80,7 @@ def _gauge(agent: Agent) -> Array:
 def _closures(agent: Agent) -> Iterator[ClosureRecord]:
     """Every candidate that this robot decided on, with the reason for what became of it."""
     for n in agent.neighbours.values():
-        for t in n.meeting.tried:
+        for t in n.meeting.tried if n.meeting else ():
             r = t.result
             weight = None if r.closure is None else _weight(agent, n, r.closure)
             verdict, detail = r.verdict, r.detail
@@ -109,7 +109,7 @@ def _closures(agent: Agent) -> Iterator[ClosureRecord]:
 
 def _weight(agent: Agent, n: Neighbour, closure: Closure) -> float | None:
     """Robust weight of a closure at the end, or when its link was parted; None if it took no part."""
-    if n.meeting.joined is None:
+    if n.meeting is None or n.meeting.joined is None:
         return None
     if n.parted:
         weights = n.last_weights

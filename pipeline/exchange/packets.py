@@ -52,6 +52,7 @@ class Kind(IntEnum):
     EVIDENCE_EXACT = 12  # the same in float32
     EVIDENCE_DOUBLE = 13  # the same in float64
     POSE_GRAPH = 14  # `duagc posegraph` only: frames and eliminated graphs; its first byte says which
+    HELLO = 16  # digest of what the sender saw; the two ends' roles follow from it
     TREE = 15  # elimination: fronts and blocks up the tree of robots, steps down
 
 

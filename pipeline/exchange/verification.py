@@ -22,7 +22,7 @@ class Verdict(Enum):
 
     KEPT = "kept"
     UNLIKE = "the neighbour's keyframe resembles no own one"
-    NOT_ASKED_FOR = "enough matches, but better pairs used up the budget"
+    NOT_ASKED_FOR = "enough matches, but a closer look was not worth it"
     FEW_MATCHES = "too few matches between all features of the two keyframes"
     FEW_INLIERS = "too few matches agree on one motion"
     NOT_REGISTERED = "registration of the two views failed"

@@ -182,17 +182,27 @@ def read_labelled(data: bytes, team: int) -> tuple[int, bytes]:
 
 # --- places
 
+DIGEST_BYTES = 8
+
+
+def read_digest(data: bytes) -> bytes:
+    """From HELLO."""
+    if len(data) != DIGEST_BYTES:
+        raise MalformedError(f"hello: {len(data)} bytes, expected {DIGEST_BYTES}")
+    return data
+
 
 @dataclass(frozen=True)
 class PlaceBook:
     """What a robot tells its neighbour to let it recognise places.
 
-    descriptors: one array per keyframe. T_map_keyframe: [n, 4, 4]. drift: [n, 2], accumulated variance of its
+    descriptors: one array per keyframe. T_first_keyframe: [n, 4, 4], as seen from its
+    first keyframe. drift: [n, 2], accumulated variance of its
     odometry from keyframe 0 (m^2, rad^2).
     """
 
     descriptors: list[Descriptors]
-    T_map_keyframe: Array
+    T_first_keyframe: Array
     drift: Array
 
 
@@ -204,7 +214,7 @@ def write_places(book: PlaceBook) -> bytes:
     return b"".join(
         [
             _COUNT.pack(len(book.descriptors)),
-            pose_bytes(book.T_map_keyframe),
+            pose_bytes(book.T_first_keyframe),
             array_bytes(book.drift, "float64"),
             array_bytes([len(d) for d in book.descriptors], "uint16"),
             *(array_bytes(d, "uint8") for d in book.descriptors),

@@ -125,7 +125,7 @@ def _views(
 
 def _depth_images(own: RobotData) -> Iterator[tuple[int, NDArray[np.float32]]]:
     for keyframe in range(own.keyframes):
-        yield keyframe, own.images(keyframe)[1]
+        yield keyframe, own.images(keyframe).depth_m
 
 
 def _frames(source: AgentInput) -> list[Odometry]:

@@ -16,7 +16,7 @@ from pipeline.recording.names import (
 )
 from pipeline.recording.read import Record, content_digest, log_metadata, merge, read_log, verify
 from pipeline.recording.rgbd import RgbdFrame, RgbdLog, open_rgbd
-from pipeline.recording.summary import format_info, info
+from pipeline.recording.summary import format_info, info, write_preview_of
 from pipeline.recording.write import LogWriter
 
 __all__ = [
@@ -40,4 +40,5 @@ __all__ = [
     "open_rgbd",
     "read_log",
     "verify",
+    "write_preview_of",
 ]

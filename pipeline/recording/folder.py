@@ -75,6 +75,10 @@ def _read_description(path: Path) -> dict[str, Any]:
     robots = description.get("robots")
     if not isinstance(robots, dict) or not robots or not isinstance(description.get("name"), str):
         raise DuagError(f"{path}: found no name or no robots, expected both")
+    for field, kind in (("source", dict), ("warnings", list), ("checks", dict), ("clocks", dict)):
+        if not isinstance(description.setdefault(field, kind()), kind):
+            found = type(description[field]).__name__
+            raise DuagError(f"{path}: {field} is a {found}, expected a {kind.__name__}")
     _check_file_name(path, "geometry", description.get("geometry"))
     for robot, row in robots.items():
         if not re.fullmatch(

@@ -32,6 +32,7 @@ _DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of everything before
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _PIECE_BYTES = 1 << 20
 _CHUNKS_KEPT = 4
+LATEST_NS = 1 << 63  # what a signed 64-bit number can hold
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +241,8 @@ class LogFile:
                     continue
                 self._stream.seek(position + 9)  # opcode and length
                 index = MessageIndex.read(ReadDataStream(self._stream))
-                out += [(time, chunk.chunk_start_offset, offset) for time, offset in index.records]
+                start = chunk.chunk_start_offset
+                out += [(self._sound_time(time), start, offset) for time, offset in index.records]
         return sorted(out)
 
     def entries_by_time(self, topic: str) -> dict[int, tuple[int, int, int]]:
@@ -259,7 +261,12 @@ class LogFile:
 
     def _publish_time(self, entry: tuple[int, int, int]) -> int:
         with parsing(self.path):
-            return int(_MESSAGE.unpack_from(self._chunk(entry[1]), entry[2])[-1])
+            return self._sound_time(int(_MESSAGE.unpack_from(self._chunk(entry[1]), entry[2])[-1]))
+
+    def _sound_time(self, time_ns: int) -> int:
+        if time_ns >= LATEST_NS:
+            raise DuagError(f"{self.path}: a message is of {time_ns} ns, expected less than {LATEST_NS}")
+        return time_ns
 
     def record_at(self, topic: str, entry: tuple[int, int, int]) -> Record:
         """The message at an entry of `entries(topic)`; the last few chunks are kept unpacked."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ from pipeline.errors import DuagError
 from pipeline.recording.folder import Recording
 from pipeline.recording.names import DIGEST_RECORD, LOG_RECORD, RECORDING_FILE, ROBOT_KEY
 from pipeline.recording.pairing import TOLERANCE_NS, pair
+from pipeline.recording.preview import reach, some_frames, write_preview
 from pipeline.recording.read import LogFile, parsing
+from pipeline.recording.rgbd import open_rgbd
 from schemas import topics as topic_table
 
 GAP_RATIO = 1.5  # an interval this much longer than the median one is a gap
@@ -90,6 +93,8 @@ def _topic_info(log: LogFile, topic: str) -> dict[str, Any]:
         "start_ns": int(times[0]) if len(times) else None,
         "end_ns": int(times[-1]) if len(times) else None,
         "rate_hz": None,
+        "gaps": 0,
+        "longest_gap_s": None,
         "metadata": channel.metadata,
         "warnings": warnings,
     }
@@ -99,6 +104,7 @@ def _topic_info(log: LogFile, topic: str) -> dict[str, Any]:
         row = topic_table.find(topic)
         gaps = intervals[intervals > GAP_RATIO * np.median(intervals)]
         if len(gaps) and row is not None and row[0].scope is topic_table.Scope.SENSOR:
+            out["gaps"], out["longest_gap_s"] = len(gaps), int(gaps.max()) * 1e-9
             warnings.append(f"{len(gaps)} gaps, the longest {gaps.max() * 1e-9:.3f} s")
     return out
 
@@ -110,8 +116,8 @@ def _recording_info(path: Path) -> dict[str, Any]:
     for robot in recording.robots:
         row = dict(recording.description["robots"][robot])
         log = _log_info(recording.log(robot))
-        recorded = row.get("digests", {}).get(row["log"])
-        if recorded and log["digest"] != recorded:
+        recorded = recording.digest(row["log"])
+        if log["digest"] != recorded != "nothing":
             warnings.append(f"{robot}: {row['log']} has digest {log['digest']}, expected {recorded}")
         if recording.groundtruth(robot) is None:
             row["groundtruth"] = None
@@ -121,8 +127,34 @@ def _recording_info(path: Path) -> dict[str, Any]:
             "bytes": log["bytes"],
             "messages": log["messages"],
             "topics": log["topics"],
+            **_frames_info(recording.log(robot)),
         }
     return out
+
+
+def _frames_info(path: Path) -> dict[str, Any]:
+    """What the frames of a robot's log are; what recording.json says of them is not believed."""
+    with open_rgbd(path) as log:
+        stamps = [color for color, _ in log.pairing.pairs]
+        return {
+            "frames": len(log),
+            "start_ns": stamps[0],
+            "end_ns": stamps[-1],
+            "camera": asdict(log.camera),
+            "depth_scale_m": log.depth_scale,
+            **reach(some_frames(log)),
+        }
+
+
+def write_preview_of(path: Path, out: Path) -> None:
+    """Write a picture of a recording, or of the log of one robot; see `preview.write_preview`."""
+    path = Path(path)
+    if path.is_file():
+        logs = [path]
+    else:
+        recording = Recording(path)
+        logs = [recording.log(robot) for robot in recording.robots]
+    write_preview(logs, out)
 
 
 def format_info(content: Mapping[str, Any]) -> str:
@@ -136,27 +168,46 @@ def format_info(content: Mapping[str, Any]) -> str:
     else:
         source = " ".join(str(v) for v in content["source"].values() if isinstance(v, str) and v)
         lines = [f"recording {content['name']}: {source}, {len(content['robots'])} robots"]
+        lines += _robot_table(content["robots"])
         for robot, row in content["robots"].items():
             lines += _robot_lines(robot, row)
             lines += _clock_lines(content.get("clocks", {}).get(robot))
     return "\n".join([*lines, *(f"warning: {w}" for w in content.get("warnings", []))])
 
 
+def _robot_table(robots: Mapping[str, Any]) -> list[str]:
+    """One line per robot under a line of names."""
+    names = ("robot", "frames", "seconds", "rate Hz", "gaps", "MB", "with depth", "depth m (1, 50, 99 %)")
+    rows = [names]
+    for robot, row in robots.items():
+        color = row["topics"][topic_table.COLOR.of(robot)]
+        depth = " ".join(f"{metres:.2f}" for metres in row["depth_m"] or ())
+        rate = f"{color['rate_hz']:.2f}" if color["rate_hz"] else "-"
+        seconds = f"{(row['end_ns'] - row['start_ns']) * 1e-9:.2f}"
+        size, share = f"{row['bytes'] / 1e6:.1f}", f"{row['with_depth']:.0%}"
+        rows.append(
+            (robot, str(row["frames"]), seconds, rate, str(color["gaps"]), size, share, depth or "none")
+        )
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  " + "  ".join(f"{text:<{w}}" for text, w in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]
+
+
 def _robot_lines(robot: str, row: Mapping[str, Any]) -> list[str]:
     c = row["camera"]
-    seconds = (row["end_ns"] - row["start_ns"]) * 1e-9
     lines = [
-        f"  {robot}: {row['frames']} frames in {seconds:.2f} s, {row['bytes'] / 1e6:.1f} MB",
-        f"    camera {c['width']}x{c['height']}, focal length {c['fx']:g} {c['fy']:g} px, "
+        f"  {robot}: camera {c['width']}x{c['height']}, focal length {c['fx']:g} {c['fy']:g} px, "
         f"centre {c['cx']:g} {c['cy']:g} px, depth in {row['depth_scale_m']:g} m",
         f"    ground truth: {row['groundtruth'] or 'none'}",
     ]
-    if row.get("path"):
-        span = ", ".join(
-            f"{low:.2f}..{high:.2f}"
-            for low, high in zip(row["path"]["low_m"], row["path"]["high_m"], strict=True)
-        )
-        lines.append(f"    path {row['path']['length_m']:.2f} m within {span} m")
+    try:
+        path = row["path"]
+        spans = zip(path["low_m"], path["high_m"], strict=True)
+        span = ", ".join(f"{low:.2f}..{high:.2f}" for low, high in spans)
+        lines.append(f"    path {path['length_m']:.2f} m within {span} m")
+    except (KeyError, TypeError, ValueError):  # there is none, or recording.json says nonsense
+        pass
     return lines + _topic_lines(row["topics"], "    ")
 
 

@@ -36,6 +36,7 @@ MAD_TO_SIGMA = 1.4826  # of a normal distribution
 MAD_STRIDE = 4  # residuals between those that estimate a scale, where there are thousands
 SETTLED = 4e-6  # m, rad: steps shrink by a third or more each, so less than half of the last one is left
 SETTLED_COARSE = 4e-5  # the next level begins with an error of its own size anyway
+GATE_SIGMAS = 3  # of depth whose noise is told: the gate is no narrower
 TILES = (10, 8)  # columns and rows of the tiles over which correlated residuals are summed
 
 
@@ -335,6 +336,8 @@ def _linearise(
         # without a depth image every sample may be what is seen there
         z = 1 / inverse_depth if level.has_depth else q[2]
         gate = np.maximum(np.float32(config.depth_gate_m), np.float32(config.depth_gate_relative) * q[2])
+        if told:
+            gate = np.maximum(gate, np.float32(GATE_SIGMAS) * told[0])
         off = z - q[2]
         agree = np.abs(off) < gate
         # beyond the gate in front of the surface: that space was seen to be free; behind it: hidden

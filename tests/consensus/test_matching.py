@@ -138,6 +138,42 @@ def test_a_track_with_two_gaussians_of_one_robot_loses_its_worst_pair():
     assert groups(evidence, pairs) == [{("alpha", 0), ("bravo", 0), ("charlie", 0)}]
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_tracks_of_five_robots_are_what_a_plain_search_finds(seed):
+    """Random pairs, many of which put two Gaussians of a robot into one track: against pairs removed one by one."""
+    rng = np.random.default_rng(seed)
+    names = ["alpha", "bravo", "charlie", "delta", "echo"]
+    evidence = {}
+    for name in names:
+        e = identical(name, list(range(8)))
+        theta = e.theta + np.eye(13)[12] * rng.normal(size=(8, 1))
+        evidence[name] = Evidence(name, e.ids, e.anchors, theta, e.information)
+    pairs = {
+        (a, b): np.stack([rng.permutation(8)[:3], rng.permutation(8)[:3]], axis=1)
+        for i, a in enumerate(names)
+        for b in names[i + 1 :]
+    }
+    edges = [((a, int(x)), (b, int(y))) for (a, b), ids in pairs.items() for x, y in ids]
+
+    def far(edge):
+        (a, x), (b, y) = edge
+        return gaussian_distance(evidence[a], np.array([x]), evidence[b], np.array([y]), CONFIG)[0]
+
+    def parts(edges):
+        found = []
+        for one, other in edges:
+            joined = [p for p in found if one in p or other in p]
+            found = [p for p in found if p not in joined] + [set().union({one, other}, *joined)]
+        return found
+
+    while broken := [p for p in parts(edges) if len({name for name, _ in p}) < len(p)]:
+        worst = [max((e for e in edges if e[0] in p), key=far) for p in broken]
+        edges = [e for e in edges if e not in worst]
+    expected = sorted(parts(edges), key=sorted)
+    assert any(len(p) > 2 for p in expected)
+    assert groups(evidence, pairs) == expected
+
+
 def test_pairs_of_gaussians_that_never_arrived_are_left_out():
     evidence = {"alpha": identical("alpha", [0, 1]), "bravo": identical("bravo", [3])}
     pairs = {("alpha", "bravo"): np.array([[0, 3], [1, 4]]), ("bravo", "zulu"): np.array([[3, 3]])}

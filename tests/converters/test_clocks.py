@@ -11,9 +11,11 @@ import pytest
 
 import converters
 from converters.logs import clocks
+from pipeline.errors import DuagError
 from pipeline.geometry import so3
-from pipeline.recording import format_info, info, open_rgbd
+from pipeline.recording import format_info, info, open_rgbd, read_log
 from tests.converters.box_room import path
+from tests.converters.test_kimera_multi import imu
 from tests.converters.test_ros import FRAMES, START_NS, STEP_NS, Ros, scene
 
 HUSKY_LATE_NS = 3_250_000_000  # husky's own clock is this much behind jackal's
@@ -68,6 +70,24 @@ def test_one_recorder_tells_how_headers_differ(tmp_path: Path) -> None:
     assert "clock 3.250000 s behind the first robot's (one recorder), 3.250000 s were added" in shown
     converters.convert("ros", bag, tmp_path / "zero", options=[*options, "clocks=from_zero"])
     assert [start(tmp_path / "zero", robot) for robot in ("jackal", "husky")] == [0, 0]
+
+
+def test_readings_before_the_first_frame_have_no_place_from_zero(tmp_path: Path) -> None:
+    """An IMU that was on before the camera: with all clocks from zero it begins with the first frame."""
+    r = Ros(2)
+    rows = scene(r)
+    identity = r.tf(r.transform(START_NS, "_color", "_imu", np.eye(4)))
+    times = [START_NS + STEP_NS + k * 10_000_000 for k in range(-4, 10)]
+    rows += [("/imu", t, imu(r, t, "_imu", np.array([0.0, 0.1, 0.0]))) for t in times] + [
+        ("/tf_static", START_NS, identity)
+    ]
+    bag = r.write(tmp_path / "bag", sorted(rows, key=lambda x: x[1]), "mcap")
+    for clocks_option, count in (("from_zero", 10), ("as_recorded", 14)):
+        out = tmp_path / clocks_option
+        converters.convert("ros", bag, out, options=["imu=/imu", f"clocks={clocks_option}"])
+        assert len(list(read_log(out / "alpha.mcap", ["/alpha/imu"]))) == count
+    with pytest.raises(DuagError, match="leads before 1970"):
+        converters.convert("ros", bag, tmp_path / "rec", options=["clock_offset_s=-1e10"])
 
 
 def test_clocks_that_agree_are_left_alone(tmp_path: Path) -> None:

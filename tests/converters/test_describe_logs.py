@@ -6,13 +6,16 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import converters
 from converters.logs import describe
+from pipeline import messages as m
 from pipeline.cli import app
 from pipeline.errors import DuagError
+from pipeline.recording import read_log
 from tests.converters.box_room import path
 from tests.converters.test_clocks import both
 from tests.converters.test_foreign_mcap import digests, write
@@ -86,6 +89,23 @@ def test_namespaces_that_decide_become_robots(tmp_path: Path) -> None:
     assert list(robots) == ["husky", "jackal"]
     same = describe.describe(tmp_path / "team.toml")["robots"]
     assert [row["namespace"] for row in same.values()] == ["/husky", "/jackal"]
+
+
+def test_a_topic_that_is_said_is_of_one_robot(tmp_path: Path) -> None:
+    """Of several robots in one log each gets its own: nobody's odometry becomes another's truth."""
+    r = Ros(2)
+    rows = scene(r, prefix="/jackal") + scene(r, prefix="/husky", poses=path(FRAMES, 0.2))
+    log = r.write(tmp_path / "bag", sorted(rows, key=lambda x: x[1]), "mcap")
+    options = ["namespaces=/jackal,/husky"]
+    for option in ("truth=/jackal/odom", "odometry=/jackal/odom", "truth_file=gt.tum"):
+        with pytest.raises(DuagError, match=r"for several robots, expected .* a TOML file that says whose"):
+            converters.convert("ros", log, tmp_path / "rec", options=[*options, option])
+    converters.convert("ros", log, tmp_path / "rec", options=[*options, "truth={namespace}/odom"])
+    for robot, start in (("jackal", 0.0), ("husky", 0.2)):
+        records = read_log(tmp_path / "rec" / f"{robot}.groundtruth.mcap")
+        assert np.allclose(
+            [m.unpack_pose_in_frame(e.proto()) for e in records], path(FRAMES, start), atol=1e-9
+        )
 
 
 def test_what_is_not_decided_lists_its_candidates(tmp_path: Path) -> None:
@@ -183,6 +203,44 @@ def test_our_own_files_are_not_foreign(tmp_path: Path) -> None:
         assert not describe.is_foreign(own)
     out = run.invoke(app, ["info", str(tmp_path / "rec"), "--toml"])
     assert isinstance(out.exception, DuagError)
+
+
+def test_what_a_cut_log_holds_can_be_saved_and_converted(tmp_path: Path) -> None:
+    r = Ros(2)
+    log = write(tmp_path / "a.mcap", scene(r), "protobuf", r)
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(log.read_bytes()[:-3000])
+    assert "duagc recover" in str(run.invoke(app, ["info", str(cut)]).exception)
+    saved = run.invoke(app, ["recover", str(cut), "--out", str(tmp_path / "saved.mcap")])
+    assert saved.exit_code == 0, saved.exception
+    assert "robot alpha: " in run.invoke(app, ["info", str(tmp_path / "saved.mcap")]).stdout
+    converters.convert("ros", tmp_path / "saved.mcap", tmp_path / "rec")
+    frames = json.loads((tmp_path / "rec" / "recording.json").read_text())["robots"]["alpha"]["frames"]
+    assert 0 < frames <= FRAMES
+
+
+def test_depth_that_is_aligned_goes_before_raw_depth(tmp_path: Path) -> None:
+    """As a RealSense publishes: both, and infrared; aligned depth is taken and not moved."""
+    r = Ros(2)
+    rows = []
+    for topic, ns, message in scene(r):
+        rows.append((topic, ns, message))
+        if topic.endswith("color/camera_info"):
+            rows.append(("/camera/aligned_depth_to_color/camera_info", ns, message))
+        if topic.endswith("image_rect_raw"):
+            time = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+            aligned = np.full((120, 160), 1500, np.uint16)
+            rows.append(
+                ("/camera/aligned_depth_to_color/image_raw", ns, r.image(time, "_color", aligned, "16UC1"))
+            )
+            gray = r.image(time, "_infra", np.zeros((90, 120), np.uint8), "mono8")
+            rows += [(f"/camera/infra{k}/image_rect_raw", ns, gray) for k in (1, 2)]
+    robot = describe.describe(r.write(tmp_path / "bag", rows, "mcap"))["robots"]["alpha"]
+    assert robot["choices"]["depth"]["topic"] == "/camera/aligned_depth_to_color/image_raw"
+    assert robot["choices"]["depth_info"]["topic"] == "/camera/aligned_depth_to_color/camera_info"
+    assert robot["choices"]["color"]["topic"] == "/camera/color/image_raw"
+    assert robot["depth"] == "registered to colour already"
+    assert robot["problem"] is None
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real bags are not there")

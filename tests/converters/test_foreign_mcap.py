@@ -18,10 +18,11 @@ from mcap.writer import CompressionType, IndexType, Writer
 import converters
 import schemas
 from converters.logs import open_log
+from pipeline.checks import check
 from pipeline.errors import DuagError
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import read_log
+from pipeline.recording import open_rgbd, read_log
 from tests.converters.test_ros import COLOR, DISTORTION, Ros, scene
 
 Row = tuple[str, int, Any]
@@ -171,6 +172,8 @@ def test_every_encoding_gives_the_same_recording(
     log = write(tmp_path / "log.mcap", scene(r), kind, r, **settings)
     converters.convert("ros", log, tmp_path / "rec", options=["truth=/odom"])
     assert digests(tmp_path / "rec") == expected
+    report = check(tmp_path / "rec")
+    assert report.sound, report.findings
 
 
 def test_pieces_of_a_log_are_one_log(tmp_path: Path, expected: dict[str, str]) -> None:
@@ -342,3 +345,89 @@ def test_definitions_in_idl(tmp_path: Path) -> None:
         path = raw_log(tmp_path / "log.mcap", "/o", ("demo/msg/Outer", "ros2idl", text.encode()), data)
         with open_log([path]) as log:
             assert (log.first("/o").inner.value, log.first("/o").name) == (42, "hello")
+
+
+@pytest.mark.parametrize(
+    ("log_ns", "stamp_ns", "message"),
+    [
+        (2**64 - 1, 5, "time 18446744073709551615 ns"),
+        (7, -(10**9), "time -1000000000 ns"),
+        (7, 2**62, "time 46"),
+    ],
+)
+def test_times_that_cannot_be_are_refused(tmp_path: Path, log_ns: int, stamp_ns: int, message: str) -> None:
+    r = Ros(2)
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic, _, ros in scene(r):
+            proto = foxglove(ros)
+            if topic == "/camera/color/image_raw":
+                proto.timestamp.seconds, proto.timestamp.nanos = divmod(stamp_ns, 10**9)
+            name = proto.DESCRIPTOR.full_name
+            schema = writer.register_schema(name, "protobuf", schemas.descriptor_set(name))
+            writer.add_message(
+                writer.register_channel(topic, "protobuf", schema), log_ns, proto.SerializeToString(), 7
+            )
+        writer.finish()
+    with pytest.raises(DuagError, match=message):
+        converters.convert("ros", path, tmp_path / "rec")
+
+
+def test_definitions_that_are_not_those_of_ros_are_refused(tmp_path: Path) -> None:
+    r = Ros(2)
+    info = next(m for t, _, m in scene(r) if t.endswith("camera_info"))
+    name, encoding, text, data = encoded(info, "cdr", r)
+    path = raw_log(
+        tmp_path / "log.mcap", "/i", (name, encoding, text.replace(b"binning_x", b"binnimg_x")), data
+    )
+    with (
+        open_log([path]) as log,
+        pytest.raises(DuagError, match="its sensor_msgs/msg/CameraInfo has no field binning_x"),
+    ):
+        log.first("/i")
+
+
+KITCHEN = Path(__file__).parents[3] / "shared" / "data" / "redkitchen"
+
+
+@pytest.mark.skipif(not KITCHEN.is_dir(), reason="the real images are not there")
+def test_real_images_in_a_log_are_those_of_the_dataset(tmp_path: Path) -> None:
+    """RedKitchen as a log of Foxglove's: the same colours, and depth as 7-Scenes' own converter registers it."""
+    color = PinholeCamera(640, 480, 525, 525, 320, 237.8)
+    depth = PinholeCamera(640, 480, 585, 585, 320, 240)
+    r, start = Ros(2), 10**18
+    T_color_depth = se3.from_rotation_translation(np.eye(3), [-0.025, 0.0, 0.0])
+    rows: list[Row] = [
+        ("/color/camera_info", start, r.info(start, "color", color)),
+        ("/depth/camera_info", start, r.info(start, "depth", depth)),
+        ("/tf", start, r.tf(r.transform(start, "color", "depth", T_color_depth))),
+    ]
+    (tmp_path / "seq").mkdir()
+    for k, path in enumerate(sorted(KITCHEN.glob("*.color.*"))[:3]):
+        at, stem = start + k * 10**9 // 30, path.name.split(".")[0]
+        for file in KITCHEN.glob(f"{stem}.*"):
+            (tmp_path / "seq" / file.name).symlink_to(file)
+        raw = cv2.imread(str(KITCHEN / f"{stem}.depth.png"), cv2.IMREAD_UNCHANGED)
+        rows.append(("/color/image", at, r.compressed(at, "color", path.read_bytes(), "jpeg")))
+        rows.append(
+            (
+                "/depth/image",
+                at,
+                r.image(at, "depth", np.where(raw == 65535, 0, raw).astype(np.uint16), "16UC1"),
+            )
+        )
+    log = write(tmp_path / "log.mcap", rows, "protobuf", r)
+    converters.convert("ros", log, tmp_path / "log_rec")
+    converters.convert("7scenes", tmp_path / "seq", tmp_path / "own_rec")
+    with (
+        open_rgbd(tmp_path / "log_rec" / "alpha.mcap") as a,
+        open_rgbd(tmp_path / "own_rec" / "alpha.mcap") as b,
+    ):
+        for i in range(3):
+            assert np.array_equal(a.frame(i).color, b.frame(i).color)
+            ours, theirs = a.frame(i).depth, b.frame(i).depth
+            both = (ours > 0) & (theirs > 0)
+            assert both.mean() > 0.7
+            assert np.percentile(np.abs(ours - theirs)[both] / theirs[both], 95) < 0.002

@@ -13,6 +13,7 @@ import pytest
 import converters
 from converters import kimera_multi
 from pipeline import messages as m
+from pipeline.checks import check
 from pipeline.errors import DuagError
 from pipeline.geometry import se3, so3
 from pipeline.geometry.camera import PinholeCamera
@@ -210,6 +211,8 @@ def test_what_is_known_and_what_is_not_is_told(recording: Path) -> None:
     assert "acl_jackal: true poses are of the body" in warnings
     assert description["checks"]["acl_jackal"]["reprojection_median_m"] < 0.02
     assert sorted(description["robots"]) == ["acl_jackal", "sparkal2", "thoth"]
+    report = check(recording)
+    assert report.sound, report.findings
 
 
 def test_robots_and_ground_truth_can_be_chosen(dataset: Path, tmp_path: Path) -> None:

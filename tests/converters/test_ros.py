@@ -531,3 +531,47 @@ def test_chunks_that_unpack_into_too_much_are_refused(
     monkeypatch.setattr("converters.logs.rosbag_file.LARGEST_CHUNK", 50_000)
     with pytest.raises(DuagError, match="unpacks to more than 50000 bytes"):
         converters.convert("ros", bag, tmp_path / "rec")
+
+
+def test_true_poses_of_a_file(tmp_path: Path) -> None:
+    """In TUM's format and by a clock of their own; of a body whose place the log or an option tells."""
+    r = Ros(2)
+    r.write(tmp_path / "bag", scene(r), "mcap")
+    T_marker_color = se3.from_rotation_translation(so3.exp([0.1, -0.4, 0.3]), [0.02, -0.03, 0.1])
+    lines = ["# time x y z qx qy qz qw"]
+    for i, T in enumerate(path(FRAMES)):
+        T_marker = T @ se3.inverse(T_marker_color)
+        w, x, y, z = so3.to_quat_wxyz(T_marker[:3, :3])
+        time = f"{(START_NS + (i + 1) * STEP_NS - 250_000_000) / 1e9:.9f}"
+        lines.append(" ".join([time, *map(repr, map(float, (*T_marker[:3, 3], x, y, z, w)))]))
+    (tmp_path / "gt.tum").write_text("\n".join(lines))
+    told = " ".join(
+        repr(float(v)) for v in (*T_marker_color[:3, 3], *so3.to_quat_wxyz(T_marker_color[:3, :3]))
+    )
+    (tmp_path / "a.toml").write_text(
+        f'[robots.a]\nlogs = ["bag"]\ntruth_file = "gt.tum"\nT_truth_color = "{told}"\ntruth_offset_s = 0.25\n'
+    )
+    converters.convert("ros", tmp_path / "a.toml", tmp_path / "rec")
+    records = read_log(tmp_path / "rec" / "a.groundtruth.mcap")
+    assert np.allclose(
+        [m.unpack_pose_in_frame(record.proto()) for record in records], path(FRAMES), atol=1e-6
+    )
+    assert str(tmp_path) not in (tmp_path / "rec" / "recording.json").read_text()
+    with pytest.raises(DuagError, match="truth and truth_file are both said"):
+        converters.convert("ros", tmp_path / "a.toml", tmp_path / "rec2", options=["truth=/odom"])
+
+
+def test_robots_whose_frames_have_the_same_names(tmp_path: Path) -> None:
+    """Two robots on one /tf_static tie the same frames differently: neither is believed, their own topics are."""
+    r = Ros(1)
+    rows = scene(r)
+    static = next(m for t, _, m in rows if t == "/tf_static")
+    other = r.tf(r.transform(START_NS, "_depth", "_color", np.eye(4)))
+    bag = r.write(tmp_path / "bag", [("/tf_static", START_NS, other), *rows], "plain")
+    with pytest.raises(
+        DuagError, match=r"does not tie them \(what changes is no extrinsic: _depth to _color\)"
+    ):
+        converters.convert("ros", bag, tmp_path / "rec")
+    own = [("/camera/tf_static", START_NS, static), ("/tf_static", START_NS, other), *rows]
+    bag = r.write(tmp_path / "own", own, "plain")
+    converters.convert("ros", bag, tmp_path / "rec", options=["namespaces=/camera"])

@@ -11,7 +11,8 @@ from scipy.ndimage import map_coordinates
 
 from converters.simulate import _camera, bake, noise, paths, simulate, write_points
 from converters.simulate.render import Renderer
-from converters.simulate.scene import Scene, build
+from converters.simulate.scene import Scene
+from converters.simulate.scenes import build
 from pipeline import messages, streams
 from pipeline.errors import DuagError
 from pipeline.geometry import se3

@@ -273,7 +273,7 @@ def test_points_lie_on_the_surfaces_and_have_their_colours(stage):
 @pytest.mark.parametrize("stage", ["obj"], indirect=True)
 def test_walks_are_smooth_clear_and_overlap(stage):
     camera = _camera((160, 120))
-    ways = stage.plan(2, 40, 0.6, camera)
+    ways = stage.wander(2, 40, 0.6, camera)
     for way in ways:
         step, turn = se3.distance(way[:-1], way[1:])
         assert step == pytest.approx(walks.STEP_M, rel=0.02)
@@ -286,7 +286,7 @@ def test_walks_are_smooth_clear_and_overlap(stage):
         assert np.abs(way[:, 2, 0]).max() < 1e-9  # upright
     eye = MeshRenderer(stage.caster, camera.scaled(48, 36))
     assert abs(shared_view(eye, *ways) - 0.6) < 0.2
-    again = stage.plan(2, 40, 0.6, camera)
+    again = stage.wander(2, 40, 0.6, camera)
     assert all(np.array_equal(a, b) for a, b in zip(ways, again, strict=True))
 
 
@@ -440,7 +440,7 @@ def test_what_cannot_be_simulated_is_said_in_one_line(
 
 
 def test_a_scene_that_is_not_there(tmp_path):
-    with pytest.raises(DuagError, match="expected room or a folder"):
+    with pytest.raises(DuagError, match="expected room, office, corridor, outdoor or a folder"):
         simulate(tmp_path / "rec", scene=str(tmp_path / "nowhere"))
     with pytest.raises(DuagError, match="up is 'x'"):
         simulate(tmp_path / "rec", scene=str(folder_of(tmp_path / "room", "obj")), up="x")

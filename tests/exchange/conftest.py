@@ -13,7 +13,7 @@ from pipeline import streams
 from pipeline.geometry import se3, so3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.messages import GaussianInformation
-from pipeline.robot import RobotData, Step
+from pipeline.robot import Images, RobotData, Step
 from pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]
@@ -74,7 +74,7 @@ def robot(
         steps.append(Step(k - 1, k, T, information))
         T_map.append(T_map[-1] @ T)
     poses = np.array(T_map)
-    images = [view(T) for T in truth]
+    images = [Images(*view(T)) for T in truth]
     anchors = rng.integers(0, keyframes, gaussians)
     v, u = rng.integers(5, CAMERA.height - 5, gaussians), rng.integers(5, CAMERA.width - 5, gaussians)
     depth = np.array([images[a][1][y, x] for a, y, x in zip(anchors, v, u, strict=True)])

@@ -35,7 +35,7 @@ def falsify(
     decide = LowerEnd._decide
 
     def decide_falsely(self: LowerEnd, send: Any) -> None:
-        if (self.own, self.peer) == pair:
+        if {self.own, self.peer} == set(pair):
             assert self.book is not None
             count = 0
             for at, t in enumerate(self.tried):
@@ -44,8 +44,8 @@ def falsify(
                     continue
                 frame = frame_of(count)
                 count += 1
-                own = self.places.data.T_map_keyframe[closure.own_keyframe]
-                peer = self.book.T_map_keyframe[closure.peer_keyframe]
+                own = self.places.T_first_keyframe[closure.own_keyframe]
+                peer = self.book.T_first_keyframe[closure.peer_keyframe]
                 if frame is not None:
                     T_own_peer = se3.inverse(own) @ frame @ peer
                     closure = dataclasses.replace(closure, T_own_peer=T_own_peer)
@@ -110,7 +110,7 @@ def test_two_robots_with_false_closures_only_end_as_if_they_had_not_met(
         )
         assert sent.equal
         assert again.component == (name,)
-    measured = [c for c in results["alpha"].closures if c.T_own_peer is not None]
+    measured = [c for r in results.values() for c in r.closures if c.T_own_peer is not None]
     assert len(measured) == 2
     assert all(c.weight == 0.0 and c.verdict != "kept" for c in measured)
 
@@ -140,11 +140,12 @@ def test_a_false_link_is_parted_and_the_others_stay(
         assert result.agreed
         assert result.converged
         T_true = se3.inverse(team[root][1][0]) @ team[name][1]
-        assert se3.distance(T_true, result.T_world_keyframe)[0].max() < 0.01
+        assert se3.distance(T_true, result.T_world_keyframe)[0].max() < 0.015
         assert set(result.evidence) == set(together) - {name}
     if topology == "chain":
         assert is_alone(results["alpha"], team["alpha"][0])
-    false = [c for c in results["alpha"].closures if c.peer == false_pair[1] and c.T_own_peer is not None]
+    decided = [c for r in results.values() for c in r.closures if c.T_own_peer is not None]
+    false = [c for c in decided if {c.robot, c.peer} == set(false_pair)]
     assert false
     assert all(c.weight == 0.0 and c.verdict != "kept" for c in false)
     if wrong_m > 1 and topology == "full":  # the cycle of the three robots knew it before any weight

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from pipeline import streams
+from pipeline.consensus.config import ClosureConfig
 from pipeline.exchange import places, wire
-from pipeline.exchange.config import ExchangeConfig, VerificationConfig
+from pipeline.exchange.config import ExchangeConfig, PlacesConfig, VerificationConfig
 from pipeline.exchange.meeting import OwnPlaces
+from pipeline.exchange.places import Candidate, Planner
 from pipeline.exchange.verification import Verdict, inverse_information, verify
 from pipeline.geometry import se3
 from pipeline.registration import features
@@ -79,20 +81,57 @@ def test_different_places_are_refused(robots: dict, make_robot: Any) -> None:
     assert "needed" in result.detail
 
 
-def test_candidates_keep_to_the_budget_and_say_what_was_left(robots: dict) -> None:
+DRIFT = np.stack([np.arange(40) * 0.003**2, np.arange(40) * 0.001**2], axis=1)
+
+
+def planner(candidates: list[Candidate], **config: Any) -> Planner:
+    return Planner(candidates, DRIFT, DRIFT, PlacesConfig(**config), ClosureConfig())
+
+
+def test_every_pair_of_keyframes_is_scored_or_has_a_word_said_about_it(robots: dict) -> None:
     (alpha, _), (bravo, _) = robots["alpha"], robots["bravo"]
     peer = [f.descriptors[:80] for f in bravo.features]
-    few = places.candidates(alpha.features, peer, 0.8, 8, per_keyframe=1, max_keyframes=2)
-    every = places.candidates(alpha.features, peer, 0.8, 8, per_keyframe=9, max_keyframes=9)
-    assert 0 < len(few.kept) <= 2
-    assert every.left == []
-    assert (
-        sorted(few.kept + few.left, key=lambda c: (-c.score, c.peer_keyframe, c.own_keyframe)) == every.kept
-    )
-    assert few.kept[0] == every.kept[0]
-    none = places.candidates(alpha.features, peer, 0.8, 1000, per_keyframe=9, max_keyframes=9)
-    assert none.kept == []
-    assert [c.peer_keyframe for c in none.unlike] == [0, 1, 2]  # a word about each
+    found, unlike = places.scored(alpha.features, peer, 0.8, 8)
+    assert found
+    assert [c.score for c in found] == sorted((c.score for c in found), reverse=True)
+    none, unlike = places.scored(alpha.features, peer, 0.8, 1000)
+    assert none == []
+    assert [c.peer_keyframe for c in unlike] == [0, 1, 2]
+
+
+def test_the_plan_keeps_to_the_budget_and_says_why_not_more() -> None:
+    candidates = [Candidate(i, j, 20) for j in range(9) for i in range(5)]
+    plan = planner(candidates, max_requested_keyframes=4, keyframes_per_request=3, worth_nats=0.0)
+    first, second = plan.next(), plan.next()
+    assert [len({c.peer_keyframe for c in batch}) for batch in (first, second)] == [3, 1]
+    assert len(first) == 9  # three of each keyframe
+    assert plan.next() == []
+    left = plan.not_asked_for()
+    assert {c for c, _ in left} | set(first) | set(second) == set(candidates)
+    assert all(reason for _, reason in left)
+    assert any("budget of 4" in reason for _, reason in left)
+
+
+def test_places_far_apart_are_worth_more_than_more_of_one_place() -> None:
+    """Two places, many keyframes at the first: after one look there the other place comes next."""
+    near, far = [Candidate(i, i, 30) for i in range(4)], [Candidate(39, 39, 12)]
+    plan = planner([*near, *far], keyframes_per_request=1)
+    first = plan.next()[0]
+    plan.take(first, closure=True)
+    assert first in near
+    assert plan.worth(39, [(first, 1.0), (near[1], 1.0)]) > plan.worth(2, [(first, 1.0), (near[1], 1.0)])
+
+
+def test_strangers_try_on_and_those_who_met_stop() -> None:
+    candidates = [Candidate(k, k, 14) for k in range(20)]
+    refused, kept = (planner(candidates, keyframes_per_request=1, worth_nats=1.0) for _ in range(2))
+    for plan, closure in ((refused, False), (kept, True)):
+        while batch := plan.next():
+            for c in batch:
+                plan.take(c, closure)
+    assert refused.asked == 20
+    assert kept.asked < 15
+    assert all("nats, 1 needed" in reason for _, reason in kept.not_asked_for())
 
 
 def test_information_of_the_inverse_motion() -> None:

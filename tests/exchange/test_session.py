@@ -238,7 +238,7 @@ def test_injected_false_closures_are_found_out(
 ) -> None:
     faults = InjectionConfig(false_closures=0.3)
     results = meet(team, 2, tmp_path, seed=seed, injection=faults)
-    closures = results["alpha"].closures
+    closures = [c for result in results.values() for c in result.closures]
     false = [c for c in closures if "injected" in c.detail]
     true = [c for c in closures if c.T_own_peer is not None and "injected" not in c.detail]
     assert len(false) == round(3 / 7 * len(true)) > 1
@@ -319,8 +319,42 @@ def test_robots_that_saw_different_places_stay_apart(make_robot: Any, tmp_path: 
         assert results[d.robot].component == (d.robot,)
         assert results[d.robot].converged
         assert np.array_equal(results[d.robot].T_world_keyframe, d.T_map_keyframe)
-    assert len(results["alpha"].closures) >= 2  # why not, for every keyframe of bravo
-    assert all(c.verdict != "kept" for c in results["alpha"].closures)
+    closures = [c for result in results.values() for c in result.closures]
+    assert len(closures) >= 2  # why not, for every keyframe of the robot that sent its descriptors
+    assert all(c.verdict != "kept" for c in closures)
+
+
+@pytest.mark.parametrize("solver", ["admm", "elimination"])
+def test_neither_names_nor_the_origins_of_maps_move_the_team(team: Any, tmp_path: Path, solver: Any) -> None:
+    """Other names and map frames anywhere: the same closures, and the same shape of the team."""
+    rng = np.random.default_rng(0)
+    renamed = dict(zip(NAMES, ("zulu", "alpha", "mike"), strict=True))
+    found = []
+    for change in (False, True):
+        data = [team[name][0] for name in NAMES]
+        if change:
+            data = [dataclasses.replace(moved(d, rng), robot=renamed[d.robot]) for d in data]
+        folder = tmp_path / str(change)
+        folder.mkdir()
+        results = run_session_of(
+            data,
+            ExchangeConfig(solver=solver),
+            seed=0,
+            exchange_path=folder / "exchange.mcap",
+            consensus_path=folder / "consensus.mcap",
+        )
+        names = [renamed[name] if change else name for name in NAMES]
+        poses = np.concatenate([results[name].T_world_keyframe for name in names])
+        found.append(se3.inverse(poses[0]) @ poses)
+    assert (
+        se3.distance(*found)[0].max() < 2e-5
+    )  # the tolerance of the solver; no other closures, no other weights
+
+
+def moved(data: RobotData, rng: np.random.Generator) -> RobotData:
+    """The same robot with another map frame."""
+    T = se3.from_quat_translation(rng.normal(size=(1, 4)), 10 * rng.normal(size=(1, 3))) @ data.T_map_keyframe
+    return dataclasses.replace(data, T_map_keyframe=T, gaussians=data.gaussians.moved(data.T_map_keyframe, T))
 
 
 def test_a_robot_without_a_map_keeps_nobody_waiting(team: Any, tmp_path: Path) -> None:

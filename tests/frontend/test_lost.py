@@ -13,7 +13,7 @@ import pytest
 
 from converters.simulate import _camera, bake, paths
 from converters.simulate.render import Renderer
-from converters.simulate.scene import build
+from converters.simulate.scenes import build
 from pipeline.frontend.config import FrontendConfig, TrackingConfig
 from pipeline.frontend.failure import Reason, StuckImages, intruders
 from pipeline.frontend.tracking import Status, Tracker

@@ -20,7 +20,7 @@ import converters
 from pipeline import checks, digest, recovery
 from pipeline.config import load
 from pipeline.errors import DuagError
-from pipeline.recording import Recording, info, open_rgbd, read_log
+from pipeline.recording import Recording, format_info, info, open_rgbd, read_log
 from tests.converters import test_foreign_mcap, test_image_folders, test_kimera_multi, test_simulate_meshes
 from tests.converters.test_ros import Ros, scene
 from tests.converters.test_seven_scenes import make_sequence
@@ -322,7 +322,7 @@ def read_recording(src: Path, out: Path) -> None:
     """Everything that opens a recording; each part must end well or with one line."""
     errors = []
     for step in (
-        lambda: info(src / "rec"),
+        lambda: format_info(info(src / "rec")),
         lambda: checks.check(src / "rec"),
         lambda: [
             list(open_rgbd(Recording(src / "rec").log(r)).frames()) for r in Recording(src / "rec").robots

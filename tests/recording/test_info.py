@@ -1,16 +1,16 @@
 """What is in a log, a recording or a run."""
 
 import json
+import re
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from pipeline.errors import DuagError
-from pipeline.recording import (
-    format_info,
-    info,
-)
-from tests.recording.logs import COLOR, DEPTH, write_camera, write_recording, write_updates
+from pipeline.recording import format_info, info, open_rgbd, preview, write_preview_of
+from tests.recording.logs import CAMERA, COLOR, DEPTH, write_camera, write_recording, write_updates
 
 
 def test_info_of_a_recording(tmp_path: Path) -> None:
@@ -22,7 +22,24 @@ def test_info_of_a_recording(tmp_path: Path) -> None:
     assert alpha["path"]["high_m"][0] == pytest.approx(0.3, rel=1e-3)  # the path is slightly bent
     assert content["warnings"] == []
     assert json.loads(json.dumps(content)) == content
-    assert "alpha: 4 frames in 0.10 s" in format_info(content)
+    assert alpha["depth_m"][0] < alpha["depth_m"][1] < alpha["depth_m"][2] < 5
+    assert re.search(r"alpha +4 +0\.10 +30\.00 +0 +0\.0 +100%", format_info(content))
+
+
+def test_a_preview_shows_every_robot(tmp_path: Path) -> None:
+    out = write_recording(tmp_path / "rec", frames=4)
+    picture = tmp_path / "preview.png"
+    write_preview_of(out, picture)
+    image = cv2.imread(str(picture))
+    tile = preview.TILE_PX * CAMERA.height // CAMERA.width
+    assert image.shape == (2 * (preview.LINE_PX + 2 * tile), 4 * preview.TILE_PX, 3)
+    first = cv2.resize(image[preview.LINE_PX : preview.LINE_PX + tile, : preview.TILE_PX], (16, 12))
+    with open_rgbd(out / "alpha.mcap") as log:
+        shown = log.frame(0).color[:, :, ::-1]
+    assert np.abs(first.astype(int) - shown).mean() < 30
+    with pytest.raises(DuagError, match="exists already"):
+        write_preview_of(out, picture)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["preview.png", "rec"]
 
 
 def test_info_tells_gaps_and_exchanged_logs(tmp_path: Path) -> None:

@@ -1,0 +1,131 @@
+"""A contact sheet of a simulated recording: the paths from above, and what every robot saw over time."""
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+COLORS = (
+    *((214, 39, 40), (31, 119, 180), (44, 160, 44), (255, 127, 14)),
+    *((148, 103, 189), (23, 190, 207), (227, 119, 194), (188, 189, 34)),
+)
+THUMBS, THUMB_WIDTH = 6, 240
+MAP_SIZE = (900, 720)  # at most
+CUT_M = 0.35  # above the lowest camera: what is higher is not drawn
+POINTS_PER_PIXEL = 4  # of the map, before it is enlarged
+MARGIN, PAPER, INK = 12, (250, 250, 248), (40, 40, 44)
+
+
+class Preview:
+    """Collects what the sheet shows."""
+
+    def __init__(self, title: str, names: list[str], ways: list[Array], frames: int) -> None:
+        """Args:
+        title: one line over the sheet. names: of the robots. ways: T_world_camera [frames, 4, 4] of each.
+        """
+        self.title, self.names, self.ways = title, names, ways
+        self.shown = np.unique(np.linspace(0, frames - 1, THUMBS).round().astype(np.int64)).tolist()
+        self._thumbs: dict[tuple[str, int], Image] = {}
+
+    def add(self, robot: str, index: int, png: bytes) -> None:
+        """Keep a frame, if it is one of those that are shown."""
+        if index in self.shown:
+            image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+            assert image is not None
+            height = round(THUMB_WIDTH * image.shape[0] / image.shape[1])
+            small = cv2.resize(image, (THUMB_WIDTH, height), interpolation=cv2.INTER_AREA)
+            self._thumbs[robot, index] = np.asarray(small[..., ::-1], dtype=np.uint8)
+
+    def write(self, path: Path, points: Array, colors: NDArray[np.uint8]) -> None:
+        """Write the sheet; `points` [n, 3] (m, world) and their colours [n, 3] are the scene for the map."""
+        rows = [self._map(points, colors)] + [self._row(k) for k in range(len(self.names))]
+        width = max(row.shape[1] for row in rows)
+        sheet = [_line(self.title, width)]
+        sheet += [_padded(row, width) for row in rows]
+        _, png = cv2.imencode(".png", np.ascontiguousarray(np.concatenate(sheet)[..., ::-1]))
+        part = path.with_name(f".{path.name}.{os.getpid()}.part")
+        part.write_bytes(png.tobytes())
+        part.rename(path)
+
+    def _row(self, k: int) -> Image:
+        """The frames of one robot."""
+        name, color = self.names[k], COLORS[k % len(COLORS)]
+        pieces = []
+        for index in self.shown:
+            thumb = self._thumbs[name, index].copy()
+            cv2.rectangle(thumb, (0, 0), (thumb.shape[1] - 1, thumb.shape[0] - 1), color, 3)
+            cv2.putText(thumb, f"{name} {index}", (8, 18), 0, 0.5, (0, 0, 0), 3, cv2.LINE_AA)
+            cv2.putText(thumb, f"{name} {index}", (8, 18), 0, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+            pieces.append(thumb)
+        return np.concatenate(pieces, axis=1)
+
+    def _map(self, points: Array, colors: NDArray[np.uint8]) -> Image:
+        """The scene from above, cut below the ceiling, with all paths and where the cameras look."""
+        cameras = np.concatenate([way[:, :3, 3] for way in self.ways])
+        below = points[:, 2] < cameras[:, 2].min() + CUT_M
+        points, colors = points[below], colors[below]
+        low = np.percentile(points[:, :2], 0.2, axis=0) - 0.3
+        high = np.percentile(points[:, :2], 99.8, axis=0) + 0.3
+        scale = float(min(np.array(MAP_SIZE) / (high - low)))
+        image = _from_above(points, colors, low, high, scale)
+
+        def pixel(p: Array) -> tuple[int, int]:
+            return round(scale * (p[0] - low[0])), round(scale * (high[1] - p[1]))
+
+        for k, way in enumerate(self.ways):
+            color = COLORS[k % len(COLORS)]
+            line = np.array([pixel(p) for p in way[:, :2, 3]], dtype=np.int32)[:, None]
+            cv2.polylines(image, [line], False, (255, 255, 255), 5, cv2.LINE_AA)
+            cv2.polylines(image, [line], False, color, 3, cv2.LINE_AA)
+            for index in self.shown:
+                at = way[index, :2, 3]
+                for side in (-0.5, 0.5):  # half the opening angle of a camera, about
+                    c, s = np.cos(side), np.sin(side)
+                    end = at + 28 / scale * (np.array([[c, -s], [s, c]]) @ way[index, :2, 2])
+                    cv2.line(image, pixel(at), pixel(end), color, 1, cv2.LINE_AA)
+            cv2.circle(image, pixel(way[0, :2, 3]), 7, color, -1, cv2.LINE_AA)
+            cv2.putText(
+                image, self.names[k][0], pixel(way[0, :2, 3] + 10 / scale), 0, 0.6, color, 2, cv2.LINE_AA
+            )
+        metres = 10.0 ** np.floor(np.log10(200 / scale))
+        bottom = image.shape[0] - 14
+        cv2.line(image, (14, bottom), (14 + round(metres * scale), bottom), INK, 3)
+        cv2.putText(image, f"{metres:g} m", (14, bottom - 8), 0, 0.5, INK, 1, cv2.LINE_AA)
+        return image
+
+
+def _from_above(points: Array, colors: NDArray[np.uint8], low: Array, high: Array, scale: float) -> Image:
+    """Points seen from above, the highest of each place; places without one have the colour of their surroundings."""
+    whole = tuple(max(1, int(n)) for n in scale * (high - low))
+    scale = min(scale, float(np.sqrt(len(points) / np.prod(high - low) / POINTS_PER_PIXEL)))
+    width, height = (max(1, int(n)) for n in scale * (high - low))
+    order = np.argsort(points[:, 2], kind="stable")
+    u = (scale * (points[order, 0] - low[0])).astype(np.int64)
+    v = (scale * (high[1] - points[order, 1])).astype(np.int64)
+    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    image = np.zeros((height, width, 3), dtype=np.uint8)
+    known = np.zeros((height, width), dtype=np.uint8)
+    image[v[inside], u[inside]] = colors[order][inside]  # the last one, the highest, stays
+    known[v[inside], u[inside]] = 1
+    window = np.ones((3, 3), dtype=np.uint8)
+    for _ in range(2):
+        grown, empty = cv2.dilate(image, window), known == 0
+        image[empty] = grown[empty]
+        known = np.asarray(cv2.dilate(known, window), dtype=np.uint8)
+    image[known == 0] = PAPER
+    return np.asarray(cv2.resize(image, whole, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+
+
+def _line(text: str, width: int) -> Image:
+    strip = np.full((36, width, 3), PAPER, dtype=np.uint8)
+    cv2.putText(strip, text, (MARGIN, 24), 0, 0.6, INK, 1, cv2.LINE_AA)
+    return strip
+
+
+def _padded(image: Image, width: int) -> Image:
+    return np.pad(image, ((0, 4), (0, width - image.shape[1]), (0, 0)), constant_values=250)

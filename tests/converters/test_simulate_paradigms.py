@@ -1,0 +1,153 @@
+"""Paths that draw a figure together, in the room and among meshes; depth rendered again from the recorded poses."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from converters.simulate import PARADIGMS, _camera, bake, paradigms, simulate, walks
+from converters.simulate.paths import OVERLAP_IMAGE, shared_view
+from converters.simulate.stages import RoomStage, set_up
+from pipeline import messages
+from pipeline.errors import DuagError
+from pipeline.geometry import se3
+from pipeline.recording import Recording, open_rgbd, read_log
+from schemas import topics
+from tests.converters.test_simulate_meshes import HOUSE, folder_of
+
+FRAMES = 80
+FIGURES = PARADIGMS[1:]
+
+
+@pytest.fixture(scope="module")
+def room() -> RoomStage:
+    return RoomStage(0, bake.Atlas([], np.zeros((0, 2)), 1.0))  # paths do not ask for colours
+
+
+def ways_of(room: RoomStage, paradigm: str, overlap: float = 0.6, robots: int = 3) -> list[np.ndarray]:
+    return paradigms.plan(room, paradigm, robots, FRAMES, overlap, _camera((160, 120)), 0)
+
+
+@pytest.mark.parametrize("paradigm", FIGURES)
+def test_paths_are_smooth_clear_and_overlap_as_asked(room, paradigm):
+    ways = ways_of(room, paradigm)
+    eye = room.eye(_camera((160, 120)).scaled(*OVERLAP_IMAGE))
+    shared = [shared_view(eye, a, b) for a, b in pairwise(ways)]
+    assert np.mean(shared) == pytest.approx(0.6, abs=0.1)
+    for way in ways:
+        steps, turns = se3.distance(way[:-1], way[1:])
+        assert 0.2 * room.step_m < steps.min()
+        assert steps.max() < 1.6 * room.step_m
+        assert turns.max() < walks.MAX_TURN_RAD + 0.01
+        position = way[:, :3, 3]
+        assert np.abs(np.diff(position, n=2, axis=0)).max() < 2e-3  # metres per frame^2: no corners
+        assert room.clearance(position).min() > walks.MIN_CLEARANCE_M - 0.05
+        assert np.abs(way[:, 2, 0]).max() < 1e-9  # upright
+    assert paradigms.least_apart(ways) > 0.3
+
+
+def test_an_overlap_asked_for_is_met_within_a_tenth(room):
+    eye = room.eye(_camera((160, 120)).scaled(*OVERLAP_IMAGE))
+    for overlap in (0.3, 0.5):
+        one, other = ways_of(room, "crossing", overlap, robots=2)
+        assert shared_view(eye, one, other) == pytest.approx(overlap, abs=0.1)
+
+
+@pytest.mark.parametrize("robots", [2, 5, 8])
+def test_circles_have_one_middle_and_different_radii(robots):
+    """Before they give way to furniture."""
+    middle = np.array([3.0, -2.0])
+    figure = paradigms.Figure(middle, 0.4, length_m=3.0, reach_m=1.8)
+    radii = [np.linalg.norm(curve - middle, axis=1) for curve in paradigms._circles(figure, robots, 0.3)]
+    assert all(np.ptp(radius) < 1e-9 for radius in radii)
+    assert (np.diff([radius[0] for radius in radii]) > 0.1).all()
+    assert radii[-1][0] == pytest.approx(1.8)
+
+
+def test_followers_go_where_the_leader_went(room):
+    leader, *followers = ways_of(room, "leader-follower", overlap=0.8)
+    for follower in followers:
+        gaps = np.linalg.norm(follower[:, None, :2, 3] - leader[None, :, :2, 3], axis=2).min(axis=1)
+        assert gaps[-1] < 0.02  # it ends on the leader's way, and came along it
+        assert (np.diff(gaps[gaps > 0.05]) < 0).all()
+
+
+def nearest(one: np.ndarray, other: np.ndarray) -> float:
+    """Least distance (m) on the floor between two paths, whenever."""
+    return float(np.linalg.norm(one[:, None, :2, 3] - other[None, :, :2, 3], axis=2).min())
+
+
+def test_lines_cross_or_run_side_by_side(room):
+    def heading(way: np.ndarray) -> float:
+        ahead = way[-1, :2, 3] - way[0, :2, 3]
+        return float(np.arctan2(ahead[1], ahead[0]))
+
+    ways = ways_of(room, "crossing")
+    gaps = [nearest(a, b) for a, b in pairwise(ways)]
+    assert max(gaps) < 0.1
+    headings = np.unwrap([heading(way) for way in ways])
+    assert np.abs(np.diff(headings)).min() > np.deg2rad(8)
+    ways = ways_of(room, "parallel")
+    headings = np.unwrap([heading(way) for way in ways])
+    assert np.ptp(headings) < np.deg2rad(12)
+    gaps = [nearest(a, b) for a, b in pairwise(ways)]
+    assert min(gaps) > 0.2
+
+
+def test_the_same_figure_again(room):
+    pairs = zip(ways_of(room, "leader-follower"), ways_of(room, "leader-follower"), strict=True)
+    assert all(np.array_equal(a, b) for a, b in pairs)
+
+
+def check_depth(out: Path, scene: str, cache: Path) -> None:
+    """Depth rendered from the poses of the ground truth is the depth of the logs."""
+    recording = Recording(out)
+    stage = set_up(scene, "y", 0, cache, as_meshes=False)
+    for robot in recording.robots:
+        truth = recording.groundtruth(robot)
+        assert truth is not None
+        poses = [
+            messages.unpack_pose_in_frame(r.proto())
+            for r in read_log(truth, [topics.GROUNDTRUTH_POSE.of(robot)])
+        ]
+        with open_rgbd(recording.log(robot)) as log:
+            eye = stage.eye(log.camera)
+            for frame, pose in zip(log.frames(), poses, strict=True):
+                depth = eye.render(pose).depth
+                exact = np.where(depth < 65535 * stage.depth_scale_m, depth, 0)
+                assert np.abs(frame.depth - exact).max() <= 0.51 * stage.depth_scale_m
+
+
+@pytest.mark.parametrize("paradigm", FIGURES)
+def test_depth_is_that_of_the_recorded_pose(tmp_path, paradigm):
+    folder = folder_of(tmp_path / "flat", "obj")
+    out, sheet = tmp_path / "rec", tmp_path / "sheet.png"
+    kind = {"robots": 2, "frames": 30, "size": (64, 48), "paradigm": paradigm, "workers": 1}
+    simulate(out, scene=str(folder), preview=sheet, **kind)
+    (tmp_path / "cache").mkdir()
+    check_depth(out, str(folder), tmp_path / "cache")
+    picture = cv2.imread(str(sheet))
+    assert picture is not None
+    assert picture.std() > 20
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not HOUSE.is_dir(), reason="the scanned house is not on this machine")
+@pytest.mark.parametrize("paradigm", FIGURES)
+def test_depth_in_a_real_scan_is_that_of_the_recorded_pose(tmp_path, paradigm):
+    out = tmp_path / "rec"
+    kind = {"robots": 3, "frames": 30, "size": (160, 120), "paradigm": paradigm, "workers": 1}
+    simulate(out, scene=str(HOUSE), **kind)
+    (tmp_path / "cache").mkdir()
+    check_depth(out, str(HOUSE), tmp_path / "cache")
+
+
+@pytest.mark.parametrize(
+    "bad", [{"paradigm": "spiral"}, {"preview": Path("nowhere/sheet.png")}, {"preview": Path("a.jpg")}]
+)
+def test_arguments_out_of_range_are_refused(tmp_path, bad):
+    with pytest.raises(DuagError, match="expected"):
+        simulate(tmp_path / "rec", **bad)
+    assert not (tmp_path / "rec").exists()
