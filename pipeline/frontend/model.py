@@ -75,7 +75,7 @@ class ModelTracker:
         return replace(tracked, T_keyframe_camera=tracked.T_keyframe_camera @ found.T_reference_target)
 
     def _register(self, frame: RgbdFrame, T_map_camera: Array, information: Array) -> Registration:
-        """The frame against the map drawn at T_map_camera, which is known with `information`; the motion is from there."""
+        """The frame against the map drawn at T_map_camera, known with `information`; the motion is from there."""
         drawn = self._rasterizer.forward(
             self._gaussians, self._camera, se3.inverse(T_map_camera), depth=self._depth
         )
