@@ -164,7 +164,7 @@ class RobotWriter:
             exact_depth: like depth, without noise, where that differs and is known.
             mask: bool [H, W], False where a pixel must not be used (a moving object); None = all may.
             depth_sigma_m: [H, W], standard deviation of the depth in metres, where it is known pixel by pixel: then
-                with every frame. Counts to 6.5 m in steps of 0.1 mm.
+                with every frame. It is kept to 3 %, and from 0.1 mm to 6.5 m.
         """
         for image in (depth, mask, depth_sigma_m):
             if image is not None:
@@ -211,8 +211,11 @@ class RobotWriter:
             self._log.channel(topic, topics.DEPTH_SIGMA.schema, {DEPTH_SCALE_KEY: repr(SIGMA_SCALE_M)})
             self._has_sigma = True
         told = (depth > 0) & (np.asarray(sigma_m) > 0)
-        units = np.clip(np.rint(sigma_m / SIGMA_SCALE_M), 1, np.iinfo(np.uint16).max)
-        raw = np.where(told, units, 0).astype(np.uint16)
+        most = np.iinfo(np.uint16).max
+        units = np.clip(np.rint(np.asarray(sigma_m, dtype=np.float64) / SIGMA_SCALE_M), 1, most)
+        # five binary digits say all that a sigma can, and take a third of the space
+        step = 2.0 ** np.maximum(np.frexp(units)[1] - 5, 0)
+        raw = np.where(told, np.minimum(np.rint(units / step) * step, most), 0).astype(np.uint16)
         self._log.write(topic, messages.pack_depth(stamp_ns, self.name, raw), stamp_ns)
 
     def set_depth_camera(

@@ -118,6 +118,25 @@ class Inspector:
             link["kinds"], link["dropped"] = dict(link["kinds"]), dict(link["dropped"])
         return out
 
+    # --- closures
+
+    def closures(self) -> Facts:
+        """Every candidate for a closure by the pair of robots, with what became of it and why."""
+        out: Facts = {}
+        for robot in self.run.robots:
+            for m in self._consensus(topics.CLOSURE_DECISION, robot):
+                facts = {
+                    "keyframes": f"{m.own_keyframe} and {m.peer_keyframe}",
+                    "descriptors": m.score,
+                    "matches": m.matches,
+                    "inliers": m.inliers,
+                    "weight": None if m.weight < 0 else m.weight,
+                    "verdict": m.verdict,
+                    "detail": m.detail,
+                }
+                out.setdefault(f"{robot} of {m.peer}", []).append(facts)
+        return out
+
     # --- one packet
 
     def packet(self, number: int) -> Facts:

@@ -10,10 +10,11 @@ from converters.simulate import simulate
 from pipeline.config import load
 from pipeline.digest import digest, digest_file, result_files
 from pipeline.errors import DuagError
-from pipeline.evaluation import evaluate
+from pipeline.evaluation import evaluate, team_bench
 from pipeline.evaluation.network import Session
 from pipeline.exchange.record import read_session
 from pipeline.inspection import Inspector, format_facts
+from pipeline.recording import Recording
 from pipeline.replay import replay
 from pipeline.run_folder import RunFolder
 from pipeline.runner import RunConfig, run
@@ -191,6 +192,35 @@ def test_what_happened_can_be_asked_for(finished: Path) -> None:
     ):
         with pytest.raises(DuagError, match=complaint):
             ask()
+
+
+def test_every_candidate_of_a_run_can_be_asked_for_with_its_reason(finished: Path) -> None:
+    facts = Inspector(RunFolder(finished)).closures()
+    candidates = [c for of_pair in facts.values() for c in of_pair]
+    assert len(facts) == 1  # one end of the pair decided
+    assert any(c["verdict"] == "kept" and c["weight"] == 1.0 for c in candidates)
+    assert all(c["verdict"] for c in candidates)
+    assert all(c["detail"] for c in candidates if c["verdict"] != "kept")
+    assert "verdict kept" in format_facts(facts)
+
+
+def test_the_exchange_of_a_run_can_be_repeated_under_faults(finished: Path, recording: Path) -> None:
+    settings = load(RunConfig, finished / "config.toml", [])
+    checks = ["frames", "names", "closures", "silence", "solver"]
+    result = team_bench.run(
+        RunFolder(finished), Recording(recording), settings.exchange, settings.seed, checks, 1
+    )
+    told = json.loads((finished / "metrics.json").read_text())["team"]["ate_rmse_m"]
+    assert result["base"]["team_ate_rmse_m"] == pytest.approx(told, abs=1e-9)
+    rows = {row["case"]: row for row in result["rows"]}
+    assert rows["silence"]["as_if_alone"]
+    assert rows["silence"]["team_ate_rmse_m"] is None
+    for case in ("frames", "names", "elimination"):
+        assert result["worst"][case]["difference_m"] < 1e-6
+        assert result["worst"][case]["apart"] == 0
+    assert rows["closures"]["closures_measured"] > result["base"]["closures_measured"]
+    assert rows["closures"]["false_closures_kept"] == 0
+    assert "not together" in team_bench.format_table(result)
 
 
 def test_a_signed_packet_can_be_asked_for(folder: Path, recording: Path) -> None:

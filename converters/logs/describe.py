@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from array import array
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -57,11 +58,9 @@ def describe(src: Path) -> dict[str, Any]:
     robots: dict[str, Any] = {}
     sources = list(_robots(src))
     clocks = []
-    opened = []
-    try:
+    with ExitStack() as opened:
         for source in sources:
-            log = open_log(source.paths, source.name)
-            opened.append(log)
+            log = opened.enter_context(open_log(source.paths, source.name))
             if log.name not in logs:
                 logs[log.name] = _log(log)
             robot_log, robots[source.robot] = _robot(log, source)
@@ -70,9 +69,6 @@ def describe(src: Path) -> dict[str, Any]:
         if len(clocks) > 1:
             for robot, offset in compare(clocks).items():
                 robots[robot]["clock"] = offset.row()
-    finally:
-        for log in opened:
-            log.__exit__()
     return {
         "kind": "foreign",
         "logs": logs,
@@ -154,11 +150,8 @@ def _delay(entry: Any, known: list[int], first: bool) -> int | None:
 
 
 def _rate(times: array[int]) -> float | None:
-    return (
-        (len(times) - 1) * NANOSECONDS / (times[-1] - times[0])
-        if len(times) > 1 and times[-1] > times[0]
-        else None
-    )
+    span_ns = times[-1] - times[0] if times else 0
+    return (len(times) - 1) * NANOSECONDS / span_ns if span_ns > 0 else None
 
 
 def _median_s(delays: list[int]) -> float | None:

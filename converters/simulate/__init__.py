@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from converters.base import RecordingWriter, robot_names
+from converters.simulate.movers import Mover, walk
 from converters.simulate.paradigms import PARADIGMS
 from converters.simulate.scenes import SCENES
+from converters.simulate.sensors import BASELINE_M, RANGE_SIGMA_M, SENSORS, T_CAMERA_LIDAR, Rig, with_gain
 from pipeline import numeric, streams
 from pipeline.errors import DuagError
 from pipeline.geometry.camera import PinholeCamera
@@ -45,6 +47,8 @@ def simulate(
     up: str = "auto",
     paradigm: str = "wander",
     preview: Path | None = None,
+    rig: Rig | None = None,
+    movers: int = 0,
 ) -> None:
     """Render a recording of a robot team, with exact depth, poses and geometry as ground truth.
 
@@ -62,15 +66,19 @@ def simulate(
         up: of meshes, the axis that is up in the files: "y", "z", or "auto", as is custom for their format.
         paradigm: the figure that the paths draw together, one of `PARADIGMS`; "wander" is none.
         preview: a PNG file to write, with what the robots saw and their paths from above.
+        rig: the sensors, if other than an RGB-D camera that stands still while it looks.
+        movers: figures that walk through the scene; a mask says where they are.
     Raises:
         DuagError: an argument is out of range, `out` exists, or a mesh cannot be used.
     """
+    rig = rig or Rig()
     _check(robots, frames, scene, size, noise, overlap, workers, paradigm, preview)
+    _check_rig(rig, movers, noise)
     numeric.settle()
     numeric.settle_opencv()
     from converters.simulate import paradigms, paths
     from converters.simulate.preview import Preview
-    from converters.simulate.stages import set_up
+    from converters.simulate.stages import MeshStage, set_up
 
     camera = _camera(size)
     names = robot_names(robots)
@@ -80,11 +88,15 @@ def simulate(
     parameters |= {"noise": noise, "seed": seed, "overlap": overlap}
     if paradigm != "wander":
         parameters["paradigm"] = paradigm
+    if rig != Rig() or movers:
+        parameters |= asdict(rig) | {"movers": movers}
     with (
         RecordingWriter(out, "", source, "simulate", parameters, force) as recording,
         tempfile.TemporaryDirectory(prefix="duagc-scene-") as cache,
     ):
-        stage = set_up(scene, parameters.get("up", ""), seed, Path(cache), as_meshes=False)
+        stage = set_up(
+            scene, parameters.get("up", ""), seed, Path(cache), as_meshes=not rig.plain or movers > 0
+        )
         if paradigm == "wander":
             ways = stage.wander(robots, frames, overlap, camera)
         else:
@@ -104,18 +116,44 @@ def simulate(
             recording.checks["robots_apart_m"] = paradigms.least_apart(ways)
         points = stage.points()
         recording.add_geometry(lambda path: write_points(path, *points))
+        walkers: list[Mover] = []
+        if movers:
+            assert isinstance(stage, MeshStage)
+            walkers = walk(movers, stage.free_space(), stage.caster, ways, seed, Path(cache))
         title = f"{scene_name}, {paradigm}, seed {seed}: neighbours share {shared:.2f} of the view"
-        sheet = Preview(title, names, ways, frames)
-        jobs = [_Job(name, i, way[i]) for name, way in zip(names, ways, strict=True) for i in range(frames)]
-        with _Studio(stage, camera, noise, seed, workers) as studio:
+        sheet = Preview(title, names, ways, [mover.poses for mover in walkers])
+        twists = [_twists(way) for way in ways]
+        jobs = [_Job(names[k], i, ways[k][i], twists[k][i]) for k in range(robots) for i in range(frames)]
+        clocks = {name: rig.clock_offset_ns(seed, name) for name in names}
+        if rig.clock_s > 0:
+            recording.checks["clock_offset_ns"] = clocks
+        if rig.gain_stops > 0:
+            recording.checks["exposure_gain"] = {
+                name: [rig.gain(seed, name, i / FRAME_RATE_HZ) for i in range(frames)] for name in names
+            }
+        sensors = _told(rig, noise)
+        with _Studio(stage, camera, noise, seed, workers, rig, walkers) as studio:
             images = track(studio.images(jobs), "simulate", len(jobs))
             for name, way in zip(names, ways, strict=True):
-                with recording.robot(name, camera, stage.depth_scale_m, {"depth_noise": noise}) as robot:
+                with recording.robot(name, camera, stage.depth_scale_m, sensors) as robot:
+                    if rig.sensor == "lidar":
+                        robot.set_lidar(T_CAMERA_LIDAR, RANGE_SIGMA_M)
                     for i in range(frames):
                         image = next(images)
                         sheet.add(name, i, image.png)
-                        stamp_ns = START_NS + round(i * 1e9 / FRAME_RATE_HZ)
-                        robot.add_frame(stamp_ns, image.png, "png", image.depth, way[i], image.exact_depth)
+                        stamp_ns = START_NS + clocks[name] + round(i * 1e9 / FRAME_RATE_HZ)
+                        robot.add_frame(
+                            stamp_ns,
+                            image.png,
+                            "png",
+                            image.depth,
+                            way[i],
+                            image.exact_depth,
+                            image.mask,
+                            image.sigma_m,
+                        )
+                        if image.points is not None:
+                            robot.add_points(stamp_ns, image.points)
         if preview is not None:
             sheet.write(preview, points[0], points[2])
 
@@ -177,11 +215,12 @@ def _camera(size: tuple[int, int]) -> PinholeCamera:
 
 @dataclass(frozen=True)
 class _Job:
-    """One frame to render: robot, index, T_world_camera [4, 4]."""
+    """One frame to render: robot, index, T_world_camera [4, 4], its motion per second (right tangent [6])."""
 
     robot: str
     index: int
     pose: NDArray[np.float64]
+    twist: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -189,33 +228,116 @@ class _Images:
     """One frame as it goes into the logs; depths uint16 in units of the stage, 0 = none."""
 
     png: bytes
-    depth: NDArray[np.uint16]
+    depth: NDArray[np.uint16] | None
     exact_depth: NDArray[np.uint16] | None
+    mask: NDArray[np.bool_] | None = None
+    sigma_m: NDArray[np.float32] | None = None
+    points: NDArray[np.float64] | None = None
 
 
 class _Artist:
     """Renders, disturbs and encodes frames; what it makes of a job depends on nothing but the job."""
 
-    def __init__(self, stage: Any, camera: PinholeCamera, noise: str, seed: int) -> None:
+    def __init__(
+        self, stage: Any, camera: PinholeCamera, noise: str, seed: int, rig: Rig, movers: list[Mover]
+    ) -> None:
+        from converters.simulate.sensors import MovingCamera
+        from converters.stereo import StereoRig
+
         self.eye, self.camera, self.noise, self.seed = stage.eye(camera), camera, noise, seed
-        self.depth_scale_m = stage.depth_scale_m
+        self.depth_scale_m, self.rig, self.has_movers = stage.depth_scale_m, rig, bool(movers)
+        self.moving = None if rig.plain and not movers else MovingCamera(self.eye, rig, movers)
+        self.stereo = StereoRig.rectified(camera, camera, BASELINE_M, "simulate")
 
     def draw(self, job: _Job) -> _Images:
         """The images of one frame."""
-        import cv2
-
         from converters.simulate import noise
 
-        view = self.eye.render(job.pose)
+        view, mask = self._view(job, job.pose)
         color, exact = view.color, _units(view.depth, self.depth_scale_m)
-        depth = exact
+        depth: NDArray[np.uint16] | None = exact
+        sigma_m, points = None, None
         if self.noise == "kinect":
             rng = streams.generator(self.seed, "simulate.noise", robot=job.robot, frame=job.index)
             depth = _units(noise.kinect_depth(view.depth, self.camera, rng), self.depth_scale_m)
             color = noise.grey_noise(color, rng)
-        settings = [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
-        _, png = cv2.imencode(".png", np.ascontiguousarray(color[..., ::-1]), settings)
-        return _Images(png.tobytes(), depth, exact if self.noise == "kinect" else None)
+        elif self.rig.sensor == "stereo":
+            depth, sigma_m = self._by_stereo(job, color)
+        elif self.rig.sensor == "lidar":
+            assert self.moving is not None
+            rng = streams.generator(self.seed, "simulate.lidar", robot=job.robot, frame=job.index)
+            depth, points = None, self.moving.sweep(job.pose, job.index, rng)
+        if self.rig.gain_stops > 0:
+            color = with_gain(color, self.rig.gain(self.seed, job.robot, job.index / FRAME_RATE_HZ))
+        return _Images(
+            _png(color),
+            depth,
+            None if depth is exact else exact,
+            mask if self.has_movers else None,
+            sigma_m,
+            points,
+        )
+
+    def _view(self, job: _Job, pose: NDArray[np.float64]) -> tuple[Any, NDArray[np.bool_] | None]:
+        if self.moving is None:
+            return self.eye.render(pose), None
+        return self.moving.render(pose, job.twist, job.index)
+
+    def _by_stereo(
+        self, job: _Job, left: NDArray[np.uint8]
+    ) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
+        """Depth and its standard deviation (m) by matching with a second camera to the right."""
+        import cv2
+
+        right_pose = job.pose.copy()
+        right_pose[:3, 3] += BASELINE_M * job.pose[:3, 0]
+        right, _ = self._view(job, right_pose)
+        grey = [np.asarray(cv2.cvtColor(each, cv2.COLOR_RGB2GRAY), np.uint8) for each in (left, right.color)]
+        depth_m, sigma_m = self.stereo.depth(grey[0], grey[1])
+        return _units(depth_m.astype(np.float64), self.depth_scale_m), sigma_m
+
+
+def _png(color: NDArray[np.uint8]) -> bytes:
+    import cv2
+
+    settings = [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
+    _, png = cv2.imencode(".png", np.ascontiguousarray(color[..., ::-1]), settings)
+    return png.tobytes()
+
+
+def _twists(way: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Motion per second, right tangents [frames, 6], of a path; the last frame moves on as the one before."""
+    from pipeline.geometry import se3
+
+    twist = FRAME_RATE_HZ * se3.log(se3.inverse(way[:-1]) @ way[1:])
+    return np.concatenate([twist, twist[-1:]])
+
+
+def _told(rig: Rig, noise: str) -> dict[str, str]:
+    """What a log says about its sensors."""
+    told = {"depth_noise": noise} if rig.sensor == "rgbd" else {"depth": rig.sensor}
+    if rig.readout_s > 0:
+        told["rolling_shutter_s"] = repr(rig.readout_s)
+    if rig.exposure_s > 0:
+        told["exposure_s"] = repr(rig.exposure_s)
+    return told
+
+
+def _check_rig(rig: Rig, movers: int, noise: str) -> None:
+    """Refuse sensors that cannot be."""
+    if rig.sensor not in SENSORS:
+        raise DuagError(f"simulate: sensor is {rig.sensor!r}, expected one of {', '.join(SENSORS)}")
+    if rig.sensor != "rgbd" and noise != "none":
+        raise DuagError(f"simulate: noise is {noise!r} with {rig.sensor}, expected it with rgbd")
+    for name, value, high in (
+        ("readout", rig.readout_s, 1 / FRAME_RATE_HZ),
+        ("exposure", rig.exposure_s, 1 / FRAME_RATE_HZ),
+        ("gain", rig.gain_stops, 3.0),
+        ("clock offset", rig.clock_s, 0.9),  # logs begin at 1 s, and no time is negative
+        ("movers", movers, 8),
+    ):
+        if not 0 <= value <= high:
+            raise DuagError(f"simulate: {name} is {value:g}, expected 0 to {high:g}")
 
 
 def _units(depth_m: NDArray[np.float64], scale_m: float) -> NDArray[np.uint16]:
@@ -227,9 +349,18 @@ def _units(depth_m: NDArray[np.float64], scale_m: float) -> NDArray[np.uint16]:
 class _Studio:
     """Artists in as many processes as asked for, which share one scene on disk; one worker paints right here."""
 
-    def __init__(self, stage: Any, camera: PinholeCamera, noise: str, seed: int, workers: int) -> None:
+    def __init__(
+        self,
+        stage: Any,
+        camera: PinholeCamera,
+        noise: str,
+        seed: int,
+        workers: int,
+        rig: Rig,
+        movers: list[Mover],
+    ) -> None:
         self.stage, self.workers = stage, workers
-        self._about = (camera, noise, seed)
+        self._about = (camera, noise, seed, rig, movers)
         self._pool: ProcessPoolExecutor | None = None
         self._open = ExitStack()
 
@@ -263,11 +394,13 @@ class _Studio:
 _artist: _Artist | None = None
 
 
-def _start_worker(stored: Any, camera: PinholeCamera, noise: str, seed: int) -> None:
+def _start_worker(
+    stored: Any, camera: PinholeCamera, noise: str, seed: int, rig: Rig, movers: list[Mover]
+) -> None:
     """Set up the artist of a worker process."""
     global _artist
     numeric.settle_opencv()
-    _artist = _Artist(stored.open(), camera, noise, seed)
+    _artist = _Artist(stored.open(), camera, noise, seed, rig, movers)
 
 
 def _draw(job: _Job) -> _Images:
@@ -296,4 +429,4 @@ def write_points(
     path.write_bytes("\n".join(header).encode() + rows.tobytes())
 
 
-__all__ = ["NOISES", "PARADIGMS", "SCENES", "simulate", "write_points"]
+__all__ = ["NOISES", "PARADIGMS", "SCENES", "SENSORS", "Rig", "simulate", "write_points"]

@@ -24,7 +24,9 @@ from converters.simulate.walks import (
     MAX_TURN_RAD,
     MIN_CLEARANCE_M,
     NEAR_M,
+    VIEW_IMAGE,
     Terrain,
+    least_shown,
     route,
 )
 from pipeline import streams
@@ -39,6 +41,7 @@ DRAWS = 160  # figures drawn per size
 PLACES, MOST_PLACES = 4, 16  # of each size, and of all, that are looked at from the cameras
 SPREADS, HALVINGS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0), 3
 OVERLAP_NEAR_ENOUGH = 0.04
+ENOUGH = 6  # figures with that overlap: the one whose dullest view shows most is taken
 GIVE_WAY_M = 0.5  # what a curve may be moved by what stands there
 GAZES_RAD = [np.deg2rad((a, b)) for a in (0.0, 40.0, -40.0, 80.0, -80.0) for b in sorted({a, -a})]  # by turns
 SMOOTH_GAZE_M = 0.35
@@ -134,13 +137,19 @@ def plan(
     """
     ground = _Ground(terrain, camera)
     draw = _followers if paradigm == "leader-follower" else _figures
+    eye = terrain.eye(camera.scaled(*VIEW_IMAGE))
     best: tuple[float, list[Array]] | None = None
+    found: list[tuple[float, list[Array]]] = []
     for place in islice(draw(ground, paradigm, robots, frames, seed), MOST_PLACES):
         for error, paths in _by_overlap(ground, place, overlap):
             if best is None or error < best[0]:
                 best = error, paths
-            if error < OVERLAP_NEAR_ENOUGH:
-                return paths
+            if error < OVERLAP_NEAR_ENOUGH and (shown := _shown(eye, paths, terrain.sky)) is not None:
+                found.append((shown, paths))
+        if len(found) >= ENOUGH:
+            break
+    if found:
+        return max(found, key=lambda each: each[0])[1]
     if best is None:
         area = len(ground.space.cells) * ground.space.cell_m**2
         raise DuagError(
@@ -360,6 +369,12 @@ def _halve(
         seen[spread] = _shared(ground.eye, paths), paths
         same_side = (seen[spread][0] > overlap) == (seen[low][0] > overlap)
         low, high = (spread, high) if same_side else (low, spread)
+
+
+def _shown(eye: Eye, paths: list[Array], sky: bool) -> float | None:
+    """Share of edges in the dullest view of all paths; None if one shows holes or something near."""
+    shares = [least_shown(eye, path, sky) for path in paths]
+    return None if None in shares else min(share for share in shares if share is not None)
 
 
 def _error(shared: float, paths: list[Array], overlap: float) -> float:

@@ -24,11 +24,13 @@ MARGIN, PAPER, INK = 12, (250, 250, 248), (40, 40, 44)
 class Preview:
     """Collects what the sheet shows."""
 
-    def __init__(self, title: str, names: list[str], ways: list[Array], frames: int) -> None:
+    def __init__(self, title: str, names: list[str], ways: list[Array], walks: list[Array]) -> None:
         """Args:
         title: one line over the sheet. names: of the robots. ways: T_world_camera [frames, 4, 4] of each.
+        walks: poses [frames, 4, 4] of what moves besides.
         """
-        self.title, self.names, self.ways = title, names, ways
+        self.title, self.names, self.ways, self.walks = title, names, ways, walks
+        frames = len(ways[0])
         self.shown = np.unique(np.linspace(0, frames - 1, THUMBS).round().astype(np.int64)).tolist()
         self._thumbs: dict[tuple[str, int], Image] = {}
 
@@ -77,6 +79,10 @@ class Preview:
         def pixel(p: Array) -> tuple[int, int]:
             return round(scale * (p[0] - low[0])), round(scale * (high[1] - p[1]))
 
+        for walk in self.walks:
+            dots = [pixel(p) for p in walk[:: max(1, len(walk) // 20), :2, 3]]
+            for dot in dots:
+                cv2.circle(image, dot, 3, INK, -1, cv2.LINE_AA)
         for k, way in enumerate(self.ways):
             color = COLORS[k % len(COLORS)]
             line = np.array([pixel(p) for p in way[:, :2, 3]], dtype=np.int32)[:, None]

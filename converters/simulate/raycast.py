@@ -84,16 +84,23 @@ class MeshRenderer:
         """Colour and depth from a camera pose T_world_camera [4, 4]."""
         depth, triangle = self.depth(T_world_camera)
         T = np.asarray(T_world_camera, dtype=np.float64)
-        directions = np.concatenate([self._directions(T, *offset) for offset in OFFSETS])
-        hit = self.caster.hits(T[:3, 3], directions)
-        missed = np.flatnonzero(~np.isfinite(hit["t"]))
+        _, colors = self.shade(T[:3, 3], np.concatenate([self._directions(T, *offset) for offset in OFFSETS]))
+        mean = colors.reshape(len(OFFSETS), *depth.shape, 3).mean(axis=0)
+        return View(np.clip(np.rint(mean), 0, 255).astype(np.uint8), depth, triangle)
+
+    def shade(
+        self, origins: Array, directions: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """What rays [n, 3], one metre along z, half a pixel apart, meet: z [n], inf = nothing; colours [n, 3]."""
+        hit = self.caster.hits(origins, directions)
+        t = hit["t"].copy()
+        missed = np.flatnonzero(~np.isfinite(t))
         hit["t"][missed], hit["triangle"][missed] = 0.0, 0  # another colour in the end
         index = hit["triangle"].view(np.int32)
         level = self._level(hit["t"], index, directions, hit["normals"])
         colors = self.scene.sample(index, hit["weights"], level)
         colors[missed] = sky_color(directions[missed]) if self.sky else 0.0
-        mean = colors.reshape(len(OFFSETS), *depth.shape, 3).mean(axis=0)
-        return View(np.clip(np.rint(mean), 0, 255).astype(np.uint8), depth, triangle)
+        return t, colors
 
     def _directions(self, T_world_camera: Array, du: float, dv: float) -> NDArray[np.float32]:
         """World directions [h * w, 3] of rays beside the pixel centres by (du, dv) px, one metre along z.

@@ -243,7 +243,7 @@ def _candidates(
         ):
             reasons["too near to something"] += 1
         else:
-            shown = _least_shown(eye, poses, terrain.sky)
+            shown = least_shown(eye, poses, terrain.sky)
             if shown is None:
                 reasons["sees holes or a near wall"] += 1
             else:
@@ -320,7 +320,7 @@ def _look_ahead(
     return None
 
 
-def _least_shown(eye: Eye, poses: Array, sky: bool) -> float | None:
+def least_shown(eye: Eye, poses: Array, sky: bool) -> float | None:
     """Share of edges in the view of a walk that has fewest of them; None if a view shows holes or a near wall."""
     least = 1.0
     for k in np.unique(np.linspace(0, len(poses) - 1, VIEWS).round().astype(np.int64)):

@@ -114,6 +114,45 @@ def bench_consensus(
     print(json.dumps(result, indent=2) if as_json else bench.format_table(result))
 
 
+@bench_app.command("team")
+def bench_team(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A finished run.", show_default=False)],
+    checks: Annotated[
+        str, typer.Option(help="frames, names, closures, loss, silence, solver.")
+    ] = "frames,names,closures,loss,silence,solver",
+    seeds: Annotated[int, typer.Option(min=1, help="How often what is drawn is drawn.")] = 3,
+    recording: Annotated[
+        Path | None, typer.Option(help="Folder of its recording, if it moved.", show_default=False)
+    ] = None,
+    overrides: Overrides = None,
+    as_json: Json = False,
+) -> None:
+    """Repeat the exchange of a run under faults, and say what they do to the team's error.
+
+    frames: every map in a random frame; names: robots under each other's names; closures: 20 % false ones; loss: 30,
+    60 and 90 % of the packets; silence: all of them; solver: the other one. The front ends are those of the run.
+
+    Example: `duagc bench team outputs/redkitchen --checks frames --seeds 100`
+    """
+    from pipeline.config import load
+    from pipeline.evaluation import team_bench
+    from pipeline.recording import Recording
+    from pipeline.run_folder import RunFolder
+    from pipeline.runner import RunConfig
+
+    chosen = checks.split(",")
+    for name in chosen:
+        if name not in team_bench.CHECKS:
+            raise typer.BadParameter(
+                f"{name!r} is not one of {', '.join(team_bench.CHECKS)}", param_hint="--checks"
+            )
+    run = RunFolder(run_folder)
+    settings = load(RunConfig, run.config_file, overrides or [])
+    source = Recording(run.recording if recording is None else recording)
+    result = team_bench.run(run, source, settings.exchange, settings.seed, chosen, seeds)
+    print(json.dumps(result, indent=2) if as_json else team_bench.format_table(result))
+
+
 @bench_app.command("frontend")
 def bench_frontend(
     recording: Annotated[

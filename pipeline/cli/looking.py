@@ -38,22 +38,27 @@ def inspect(
         str | None,
         typer.Option("--gaussian", metavar="ROBOT:ID", help="Of a robot's own map.", show_default=False),
     ] = None,
+    closures: Annotated[
+        bool, typer.Option("--closures", help="Every candidate between robots, and why it was kept or not.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """What happened to one round, one packet or one Gaussian of a run, in words and numbers.
+    """What happened to one round, one packet, one Gaussian or the closures of a run, in words and numbers.
 
     Example: duagc inspect outputs/demo/run --gaussian alpha:1200
     """
     from pipeline.inspection import Inspector, format_facts
     from pipeline.run_folder import RunFolder
 
-    if [round_, packet, gaussian].count(None) != 2:
-        raise typer.BadParameter("expected exactly one of --round, --packet, --gaussian")
+    if [round_, packet, gaussian, closures or None].count(None) != 3:
+        raise typer.BadParameter("expected exactly one of --round, --packet, --gaussian, --closures")
     inspector = Inspector(RunFolder(run_folder))
     if round_ is not None:
         facts = inspector.round(round_)
     elif packet is not None:
         facts = inspector.packet(packet)
+    elif closures:
+        facts = inspector.closures()
     else:
         robot, colon, number = str(gaussian).partition(":")
         if not colon or not number.isdecimal():

@@ -36,6 +36,14 @@ def simulate(
     ] = 0.6,
     noise: Annotated[str, typer.Option(help="none or kinect.")] = "none",
     seed: Annotated[int, typer.Option(help="Seed of scene, paths and noise.")] = 0,
+    sensor: Annotated[
+        str, typer.Option(help="rgbd, stereo (depth by matching), or lidar (points beside the images).")
+    ] = "rgbd",
+    readout_ms: Annotated[float, typer.Option(help="Rolling shutter: from the first row to the last.")] = 0,
+    exposure_ms: Annotated[float, typer.Option(help="Motion blur: how long the shutter is open.")] = 0,
+    gain_stops: Annotated[float, typer.Option(help="Largest change of the exposure over time.")] = 0,
+    clock_ms: Annotated[float, typer.Option(help="Largest offset of a robot's clock.")] = 0,
+    movers: Annotated[int, typer.Option(min=0, max=8, help="Figures that walk about, with masks.")] = 0,
     preview: Annotated[
         Path | None,
         typer.Option(metavar="PNG", help="Contact sheet to write: paths from above, views over time."),
@@ -50,6 +58,7 @@ def simulate(
     `duagc simulate --scene office --robots 4 --paradigm crossing --preview office.png --out recordings/office`,
     `duagc simulate --scene scans/house --width 640 --height 480 --frames 300 --out recordings/house`
     """
+    from converters.simulate import Rig
     from converters.simulate import simulate as simulate_recording
 
     simulate_recording(
@@ -60,6 +69,8 @@ def simulate(
         up=up,
         paradigm=paradigm,
         preview=preview,
+        rig=Rig(sensor, readout_ms / 1000, exposure_ms / 1000, gain_stops, clock_ms / 1000),
+        movers=movers,
         size=(width, height),
         overlap=overlap,
         noise=noise,

@@ -72,11 +72,20 @@ def path(frames: int, start: float = 0.0, step: float = 0.03) -> list[np.ndarray
 
 
 def sweep(
-    T_world_lidar: np.ndarray, rings: int = 16, columns: int = 900, sigma_m: float = 0.0, seed: int = 0
+    T_world_lidar: np.ndarray,
+    rings: int = 16,
+    columns: int = 900,
+    sigma_m: float = 0.0,
+    seed: int = 0,
+    part: tuple[float, float] = (180.0, -180.0),
 ) -> np.ndarray:
-    """Points [n, 3] in the frame of a spinning LiDAR (x forward, z up): rings over 30 degrees, columns of a turn."""
+    """Points [n, 3] in the frame of a spinning LiDAR (x forward, z up): rings over 30 degrees, columns of a turn.
+
+    part: of the turn, degrees, from the first column to the last, which is left out.
+    """
     elevation = np.radians(np.linspace(-15, 15, rings))[None, :]
-    azimuth = np.linspace(np.pi, -np.pi, columns, endpoint=False)[:, None]
+    count = round(columns * (part[0] - part[1]) / 360)
+    azimuth = np.radians(np.linspace(*part, count, endpoint=False))[:, None]
     rays = np.stack(
         [
             np.cos(elevation) * np.cos(azimuth),

@@ -15,8 +15,8 @@ from pipeline.errors import DuagError
 from pipeline.geometry import so3
 from pipeline.recording import format_info, info, open_rgbd, read_log
 from tests.converters.box_room import path
+from tests.converters.ros_bags import FRAMES, START_NS, STEP_NS, Ros, scene
 from tests.converters.test_kimera_multi import imu
-from tests.converters.test_ros import FRAMES, START_NS, STEP_NS, Ros, scene
 
 HUSKY_LATE_NS = 3_250_000_000  # husky's own clock is this much behind jackal's
 

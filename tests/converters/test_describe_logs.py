@@ -17,10 +17,10 @@ from pipeline.cli import app
 from pipeline.errors import DuagError
 from pipeline.recording import read_log
 from tests.converters.box_room import path
+from tests.converters.ros_bags import FRAMES, REAL, START_NS, Ros, scene
 from tests.converters.test_clocks import both
 from tests.converters.test_foreign_mcap import digests, write
 from tests.converters.test_kimera_multi import imu
-from tests.converters.test_ros import FRAMES, REAL, START_NS, Ros, scene
 
 run = CliRunner()
 

@@ -21,7 +21,7 @@ from pipeline.recording import open_rgbd, read_log
 from pipeline.recording.motion import GyroPrior, motion_prior
 from pipeline.recording.read import LogFile
 from tests.converters.box_room import look, render
-from tests.converters.test_ros import Ros, odometry
+from tests.converters.ros_bags import Ros, odometry
 
 COLOR = PinholeCamera(160, 120, 95.0, 95.2, 80.4, 59.1)
 INFRA = PinholeCamera(160, 120, 94.3073, 94.37165, 81.588, 59.915)  # the dataset's, at a quarter of its size

@@ -15,8 +15,8 @@ from pipeline.errors import DuagError
 from pipeline.geometry import se3, so3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.recording import Recording, open_rgbd
+from tests.converters.ros_bags import Ros, odometry
 from tests.converters.stereo_room import path, render, right_of
-from tests.converters.test_ros import Ros, odometry
 from tests.converters.test_s3e import (
     D_LEFT,
     D_RIGHT,

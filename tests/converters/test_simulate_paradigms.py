@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from converters.simulate import PARADIGMS, _camera, bake, paradigms, simulate, walks
+from converters.simulate import PARADIGMS, _camera, paradigms, simulate, walks
 from converters.simulate.paths import OVERLAP_IMAGE, shared_view
 from converters.simulate.stages import RoomStage, set_up
 from pipeline import messages
@@ -23,7 +23,7 @@ FIGURES = PARADIGMS[1:]
 
 @pytest.fixture(scope="module")
 def room() -> RoomStage:
-    return RoomStage(0, bake.Atlas([], np.zeros((0, 2)), 1.0))  # paths do not ask for colours
+    return RoomStage(0)
 
 
 def ways_of(room: RoomStage, paradigm: str, overlap: float = 0.6, robots: int = 3) -> list[np.ndarray]:
@@ -101,17 +101,19 @@ def test_the_same_figure_again(room):
     assert all(np.array_equal(a, b) for a, b in pairs)
 
 
+def true_poses(recording: Recording, robot: str) -> list[np.ndarray]:
+    truth = recording.groundtruth(robot)
+    assert truth is not None
+    records = read_log(truth, [topics.GROUNDTRUTH_POSE.of(robot)])
+    return [messages.unpack_pose_in_frame(record.proto()) for record in records]
+
+
 def check_depth(out: Path, scene: str, cache: Path) -> None:
     """Depth rendered from the poses of the ground truth is the depth of the logs."""
     recording = Recording(out)
     stage = set_up(scene, "y", 0, cache, as_meshes=False)
     for robot in recording.robots:
-        truth = recording.groundtruth(robot)
-        assert truth is not None
-        poses = [
-            messages.unpack_pose_in_frame(r.proto())
-            for r in read_log(truth, [topics.GROUNDTRUTH_POSE.of(robot)])
-        ]
+        poses = true_poses(recording, robot)
         with open_rgbd(recording.log(robot)) as log:
             eye = stage.eye(log.camera)
             for frame, pose in zip(log.frames(), poses, strict=True):

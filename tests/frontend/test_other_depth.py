@@ -12,7 +12,7 @@ import pytest
 from converters.base import RecordingWriter
 from converters.simulate import _camera, bake, paths
 from converters.simulate.render import Renderer
-from converters.simulate.scene import build
+from converters.simulate.scenes import build
 from converters.stereo import StereoRig
 from pipeline.frontend.config import FrontendConfig
 from pipeline.frontend.stage import run_frontend
@@ -24,7 +24,7 @@ from pipeline.recording import RgbdLog, read_log
 from pipeline.splat.losses import depth_error
 
 CAMERA = _camera((240, 180))
-FRAMES = 30
+FRAMES = 20
 BASELINE_M = 0.12
 RANGE_SIGMA_M = 0.02
 R_CAMERA_LIDAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -56,9 +56,9 @@ def beams(rings: int, columns: int) -> np.ndarray:
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
     """A room filmed by a stereo rig with a LiDAR on top, grey values and ranges with noise."""
     room = build("room", 0)
-    eye, wide = Renderer(room, bake.bake(room, 0.012), CAMERA), Renderer(room, None, WIDE)
+    eye, wide = Renderer(room, bake.bake(room, 0.02), CAMERA), Renderer(room, None, WIDE)
     poses = paths.plan(room, 1, 160, 0.6, CAMERA)[0][:FRAMES]
-    pixels, rng, rig = beams(32, 900), np.random.default_rng(1), StereoRig(CAMERA, BASELINE_M)
+    pixels, rng, rig = beams(16, 720), np.random.default_rng(1), StereoRig(CAMERA, BASELINE_M)
     rays = WIDE.rays()[pixels[:, 1], pixels[:, 0]]
     units = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     views = [eye.render(T) for T in poses]
@@ -92,7 +92,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
 def followed(walk: Walk, kind: str, out: Path, mapping: bool) -> tuple[list, list, float]:
     """Tracked frames, the final map if there is one, and the ATE in metres."""
     config = FrontendConfig(mapping_enabled=mapping)
-    quick = config.mapping.model_copy(update={"final_iterations": 10, "max_gaussians": 20_000})
+    quick = config.mapping.model_copy(update={"final_iterations": 5, "max_gaussians": 20_000})
     run_frontend(walk.logs[kind], out, config.model_copy(update={"mapping": quick}))
     messages = [(record.topic, record.message()) for record in read_log(out)]
     odometry = [m for topic, m in messages if topic == "/alpha/odometry" and m.status != "lost"]
@@ -112,9 +112,10 @@ def test_it_tracks_and_maps(
     assert len(odometry) == FRAMES
     assert error_m < most_m
     errors = []
-    for k in (3, 13, 23):
+    for k in (3, 10, 17):
         render = Rasterizer().forward(gaussians, CAMERA, se3.inverse(odometry[k].T_map_camera))
         errors.append(depth_error(render, walk.depths[k].astype(np.float32))[0])
+    print(kind, error_m, errors)
     assert np.mean(errors) < most_depth_m
 
 
@@ -126,5 +127,6 @@ def test_stereo_is_tracked_better_by_its_sigma_than_by_a_sensor_model(
     monkeypatch.setattr(RgbdLog, "frame", lambda log, k: replace(frame(log, k), depth_sigma=None))
     model, _, without_m = followed(walk, "stereo", tmp_path / "model.mcap", False)
     assert len(told) == FRAMES
+    print(error_m, without_m, len(model))
     assert error_m < 0.006
     assert without_m > 2 * error_m or len(model) < FRAMES

@@ -1,0 +1,110 @@
+"""Things that move through a scene: figures as tall as people that walk where robots could."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+
+from converters.simulate import meshes, triangles
+from converters.simulate import textures as tex
+from converters.simulate.raycast import Caster, MeshRenderer
+from converters.simulate.scene import Scene
+from converters.simulate.walks import FreeSpace, route
+from pipeline import streams
+from pipeline.geometry.camera import PinholeCamera
+
+Array = NDArray[np.float64]
+
+STEP_M = 0.025  # per frame
+TALL_M, REACH_M = 1.75, 1.0  # a ball of that radius about its middle holds a figure
+APART_M = 1.2  # from every robot, if a walk allows it
+TRIES = 24
+
+
+@dataclass(frozen=True)
+class Mover:
+    """A figure. folder: where its triangles lie. poses: T_world_mover [frames, 4, 4], between its feet."""
+
+    folder: Path
+    poses: Array
+
+    def eye(self, camera: PinholeCamera) -> MeshRenderer:
+        """A renderer of the figure alone."""
+        return MeshRenderer(Caster(meshes.load(self.folder)), camera)
+
+    def near(
+        self, T_world_mover: Array, origins: Array, directions: NDArray[np.float32]
+    ) -> NDArray[np.bool_]:
+        """Which rays [n, 3] pass its middle so near that they may meet it."""
+        to = T_world_mover[:3, 3] + np.array([0, 0, TALL_M / 2]) - origins
+        along = np.einsum("ij,ij->i", to, directions)
+        length2 = np.einsum("ij,ij->i", directions, directions)
+        return np.asarray(np.einsum("ij,ij->i", to, to) - along * np.abs(along) / length2 < REACH_M**2)
+
+
+def walk(
+    count: int, space: FreeSpace, caster: Caster, ways: list[Array], seed: int, cache: Path
+) -> list[Mover]:
+    """Figures that walk through the free space, clear of the robots and in their view as long as can be found.
+
+    Args:
+        caster: of the scene. ways: of the robots, T_world_camera [frames, 4, 4]. cache: an existing folder.
+    """
+    graph, frames = space.graph.tocsr(), len(ways[0])
+    cameras = np.stack(ways)
+    movers = []
+    for k in range(count):
+        best: tuple[float, Array] | None = None
+        for attempt in range(TRIES):
+            rng = streams.generator(seed, "simulate.mover", mover=k, attempt=attempt)
+            way = route(space, graph, frames * STEP_M + 1.0, rng)
+            spline = CubicSpline(0.025 * np.arange(len(way)), way)
+            floor = spline(0.5 + STEP_M * np.arange(frames))
+            middle = np.column_stack([floor, np.full(frames, space.floor_m + 1.1)])
+            gap = np.linalg.norm(cameras[:, :, :2, 3] - floor, axis=2).min()
+            score = _seen(caster, cameras, middle) + min(0.0, gap - APART_M)
+            if best is None or score > best[0]:
+                best = score, floor
+        assert best is not None
+        folder = cache / f"mover-{k}"
+        folder.mkdir()
+        triangles.write(_figure(k, seed), 0.006, folder)
+        movers.append(Mover(folder, _upright(best[1], space.floor_m)))
+    return movers
+
+
+def _seen(caster: Caster, cameras: Array, middle: Array) -> float:
+    """Share of all frames of all robots [robots, frames, 4, 4] in whose view points [frames, 3] lie."""
+    to = middle - cameras[:, :, :3, 3]
+    away = np.linalg.norm(to, axis=2)
+    ahead = np.einsum("rfi,rfi->rf", to, cameras[:, :, :3, 2]) / away
+    shown = (ahead > np.cos(np.deg2rad(28))) & (away < 6.0)
+    hidden = caster.blocked(cameras[:, :, :3, 3].reshape(-1, 3), 0.95 * to.reshape(-1, 3))
+    return float(np.mean(shown & ~hidden.reshape(shown.shape)))
+
+
+def _upright(floor: Array, height: float) -> Array:
+    """Poses [n, 4, 4] at places [n, 2] that face where they go."""
+    ahead = np.gradient(gaussian_filter1d(floor, 8.0, axis=0, mode="nearest"), axis=0)
+    yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
+    poses = np.tile(np.eye(4), (len(floor), 1, 1))
+    poses[:, 0, 0], poses[:, 0, 1] = np.cos(yaw), -np.sin(yaw)
+    poses[:, 1, 0], poses[:, 1, 1] = np.sin(yaw), np.cos(yaw)
+    poses[:, :2, 3], poses[:, 2, 3] = floor, height
+    return poses
+
+
+def _figure(k: int, seed: int) -> Scene:
+    """Legs, a coat, arms and a head, in the axes of the mover."""
+    scene = Scene(f"mover{k}", seed, np.full(3, 1e6), even_light=0.9)
+    rng = streams.generator(seed, "simulate.figure-colors", mover=k)
+    coat = tex.fabric(tex.vivid(rng, 0.8), tex.vivid(rng, 0.5))
+    for side, y in (("left", 0.1), ("right", -0.1)):
+        scene.cylinder(f"leg {side}", (0.0, y, 0.02), 0.085, 0.8, tex.fabric((62, 70, 92), (90, 86, 80)))
+        scene.cylinder(f"arm {side}", (0.0, 2.7 * y, 0.8), 0.06, 0.58, coat)
+    scene.cylinder("coat", (0.0, 0.0, 0.78), 0.2, 0.66, coat)
+    scene.sphere("head", (0.0, 0.0, 1.58), 0.14, tex.marbled((206, 164, 136), (96, 64, 44), 0.2))
+    return scene

@@ -1,0 +1,169 @@
+"""Sensors and moving figures of the simulator, held against the exact scene."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from converters.simulate import Rig, _camera, _twists, simulate
+from converters.simulate.movers import Mover, walk
+from converters.simulate.sensors import RANGE_SIGMA_M, T_CAMERA_LIDAR, MovingCamera, with_gain
+from converters.simulate.stages import MeshStage, set_up
+from pipeline import streams
+from pipeline.errors import DuagError
+from pipeline.geometry import se3
+from pipeline.recording import Recording, open_rgbd
+from tests.converters.test_simulate_meshes import ROOM, folder_of, some_poses
+from tests.converters.test_simulate_paradigms import true_poses
+
+CAMERA = _camera((80, 60))
+TWIST = np.array([0.5, -0.2, 0.3, 0.4, 0.6, -0.3])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return folder_of(tmp_path_factory.mktemp("scene") / "flat", "obj")
+
+
+@pytest.fixture(scope="module")
+def stage(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> MeshStage:
+    stage = set_up(str(folder), "y", 0, tmp_path_factory.mktemp("cache"), as_meshes=True)
+    assert isinstance(stage, MeshStage)
+    return stage
+
+
+@pytest.fixture(scope="module")
+def movers(stage: MeshStage, tmp_path_factory: pytest.TempPathFactory) -> list[Mover]:
+    ways = [np.tile(pose, (4, 1, 1)) for pose in some_poses()]
+    return walk(2, stage.free_space(), stage.caster, ways, 0, tmp_path_factory.mktemp("movers"))
+
+
+def test_a_camera_that_stands_still_sees_what_a_plain_one_sees(stage):
+    eye = stage.eye(CAMERA)
+    for T in some_poses():
+        view, still = MovingCamera(eye, Rig(readout_s=0.02), []).render(T, np.zeros(6), 0)
+        plain = eye.render(T)
+        assert np.array_equal(view.depth, plain.depth)
+        assert np.abs(view.color.astype(int) - plain.color).max() <= 1  # sums in another order
+        assert still.all()
+
+
+def test_every_row_of_a_rolling_shutter_is_a_view_of_its_own_time(stage):
+    eye, T = stage.eye(CAMERA), some_poses()[0]
+    view, _ = MovingCamera(eye, Rig(readout_s=0.03), []).render(T, TWIST, 0)
+    assert np.array_equal(view.depth, eye.render(T).depth)  # depth is of one moment
+    for row in (0, 17, 59):
+        time_s = (row - 29.5) / 59 * 0.03
+        then = eye.render(T @ se3.exp(time_s * TWIST))
+        assert np.abs(view.color[row].astype(int) - then.color[row]).max() <= 2
+
+
+def test_motion_blur_is_the_mean_over_the_exposure(stage):
+    eye, T = stage.eye(CAMERA), some_poses()[1]
+    view, _ = MovingCamera(eye, Rig(exposure_s=0.03), []).render(T, TWIST, 0)
+    times = (np.arange(16) + 0.5) / 16 * 0.03 - 0.015
+    mean = np.mean([eye.render(T @ se3.exp(t * TWIST)).color for t in times], axis=0)
+    blurred, sharp = np.abs(view.color - mean).mean(), np.abs(eye.render(T).color - mean).mean()
+    assert blurred < 0.5 * sharp
+
+
+def test_the_mask_is_where_something_moves(stage, movers):
+    eye = stage.eye(CAMERA)
+    hidden = 0
+    for T in some_poses():
+        for frame in range(4):
+            view, still = MovingCamera(eye, Rig(), movers).render(T, np.zeros(6), frame)
+            plain = eye.render(T)
+            assert np.array_equal(view.depth[still], plain.depth[still])
+            assert np.abs(view.color[still].astype(int) - plain.color[still]).max() <= 1
+            moved = view.depth != plain.depth
+            assert not (moved & still).any()
+            assert (view.depth[moved] < plain.depth[moved]).all()
+            hidden += int(moved.sum())
+    assert hidden > 200
+
+
+def test_movers_keep_clear_of_walls_and_robots(stage, movers):
+    for mover in movers:
+        places = mover.poses[:, :3, 3] + np.array([0, 0, 1.0])
+        assert stage.clearance(places).min() > 0.25
+        assert np.linalg.norm(np.diff(mover.poses[:, :2, 3], axis=0), axis=1).max() < 0.03
+
+
+def test_lidar_points_lie_on_surfaces(stage):
+    for T in some_poses():
+        points = MovingCamera(stage.eye(CAMERA), Rig(sensor="lidar"), []).sweep(
+            T, 0, streams.generator(0, "test")
+        )
+        world = se3.transform(T @ T_CAMERA_LIDAR, points)
+        assert len(points) > 20_000
+        away = stage.clearance(world)
+        assert np.sqrt(np.mean(away**2)) < RANGE_SIGMA_M
+        assert away.max() < 6 * RANGE_SIGMA_M
+        assert (world > -0.1).all()
+        assert (world < ROOM + 0.1).all()
+
+
+def test_gain_changes_the_light():
+    grey = np.full((4, 4, 3), 60, dtype=np.uint8)
+    assert with_gain(grey, 1.0).mean() == 60
+    assert with_gain(grey, 2.0).mean() == pytest.approx(60 * 2 ** (1 / 2.2), abs=1)
+
+
+def test_stereo_depth_is_as_good_as_its_sigma_says(folder, tmp_path):
+    simulate(
+        tmp_path / "rec", scene=str(folder), robots=1, frames=2, size=(320, 240), workers=1, rig=Rig("stereo")
+    )
+    recording = Recording(tmp_path / "rec")
+    (tmp_path / "cache").mkdir()
+    stage = set_up(str(folder), "y", 0, tmp_path / "cache", as_meshes=True)
+    with open_rgbd(recording.log("alpha")) as log:
+        frames = list(log.frames())
+        eye = stage.eye(log.camera)
+    for frame, pose in zip(frames, true_poses(recording, "alpha"), strict=True):
+        assert frame.depth_sigma is not None
+        seen = frame.depth > 0
+        assert seen.mean() > 0.5
+        error = np.abs(frame.depth - eye.render(pose).depth)[seen] / frame.depth_sigma[seen]
+        assert 0.1 < np.median(error) < 1.5
+
+
+def test_all_together_do_not_depend_on_the_number_of_workers(folder, tmp_path):
+    rig = Rig("lidar", readout_s=0.02, exposure_s=0.01, gain_stops=1.0, clock_s=0.2)
+    kind = {"scene": str(folder), "frames": 3, "size": (64, 48), "rig": rig, "movers": 1}
+    for workers, name in ((1, "one"), (2, "two")):
+        simulate(tmp_path / name / "rec", workers=workers, **kind)
+    for path in sorted((tmp_path / "one" / "rec").iterdir()):
+        assert path.read_bytes() == (tmp_path / "two" / "rec" / path.name).read_bytes(), path.name
+    description = json.loads((tmp_path / "one" / "rec" / "recording.json").read_text())
+    offsets = description["checks"]["clock_offset_ns"]
+    assert len(set(offsets.values())) == 2
+    for robot, offset in offsets.items():
+        assert description["robots"][robot]["start_ns"] == 1_000_000_000 + offset
+        assert abs(offset) < 2e8
+    with open_rgbd(Recording(tmp_path / "one" / "rec").log("alpha")) as log:
+        assert all(frame.mask is not None for frame in log.frames())
+
+
+def test_twists_lead_to_the_next_pose():
+    way = np.stack([se3.exp(k * TWIST / 30) for k in range(4)])
+    twists = _twists(way)
+    assert way[1] @ se3.exp(twists[1] / 30) == pytest.approx(way[2], abs=1e-12)
+    assert np.array_equal(twists[-1], twists[-2])
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"rig": Rig("sonar")},
+        {"rig": Rig("lidar"), "noise": "kinect"},
+        {"rig": Rig(readout_s=0.1)},
+        {"rig": Rig(clock_s=2.0)},
+        {"movers": 20},
+    ],
+)
+def test_sensors_that_cannot_be_are_refused(tmp_path, bad):
+    with pytest.raises(DuagError, match="expected"):
+        simulate(tmp_path / "rec", **bad)
+    assert not (tmp_path / "rec").exists()
