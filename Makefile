@@ -9,7 +9,7 @@ SOURCES := pyproject.toml CMakeLists.txt $(wildcard pipeline/kernels/src/*)
 SANITIZED := build/sanitize/.built
 DEMO := outputs/demo
 
-.PHONY: help setup demo test bench lint format sanitize check-full clean
+.PHONY: help setup demo test bench lint format sanitize check-full fuzz clean
 .DEFAULT_GOAL := help
 
 help:
@@ -18,6 +18,7 @@ help:
 	@echo "make lint        ruff and mypy"
 	@echo "make bench       speed of the kernels, side by side with plain torch"
 	@echo "make check-full  the slow checks as well, and the kernels under sanitizers (minutes)"
+	@echo "make fuzz        5000 damaged files for every reader (hours)"
 
 setup: $(STAMP)
 
@@ -40,6 +41,9 @@ test: setup
 
 check-full: setup sanitize
 	$(BIN)/python -m pytest
+
+fuzz: setup
+	$(BIN)/python -m tests.fuzz.run --count 5000
 
 # The tests of the kernels with every access to memory and every operation checked. CPython itself leaks on purpose.
 sanitize: setup $(SANITIZED)

@@ -214,7 +214,7 @@ class RobotWriter:
         most = np.iinfo(np.uint16).max
         units = np.clip(np.rint(np.asarray(sigma_m, dtype=np.float64) / SIGMA_SCALE_M), 1, most)
         # five binary digits say all that a sigma can, and take a third of the space
-        step = 2.0 ** np.maximum(np.floor(np.log2(units)) - 4, 0)
+        step = 2.0 ** np.maximum(np.frexp(units)[1] - 5, 0)
         raw = np.where(told, np.minimum(np.rint(units / step) * step, most), 0).astype(np.uint16)
         self._log.write(topic, messages.pack_depth(stamp_ns, self.name, raw), stamp_ns)
 

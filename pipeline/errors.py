@@ -11,7 +11,7 @@ class DuagError(Exception):
 
 
 def closest(word: str, known: Sequence[str], kind: str) -> str:
-    """The end of a line about a wrong name: what was perhaps meant, else what there is, else that there is no `kind`."""
+    """The end of a line about a wrong name: what was perhaps meant, else what there is, else that no `kind` is."""
     import difflib
 
     near = difflib.get_close_matches(word, known, n=1, cutoff=0.6)

@@ -126,7 +126,11 @@ def check_definitions(found: Mapping[str, Any]) -> None:
 
     standard = get_typestore(Stores.ROS2_HUMBLE).fielddefs
     for name in sorted(set(found) & READ_TYPES):
-        has, wanted = ({field.lower(): kind for field, kind in types[name][1]} for types in (found, standard))
+        # the matrices D, K, R, P of ROS 1 have small letters in ROS 2
+        has, wanted = (
+            {(field if len(field) > 1 else field.lower()): kind for field, kind in types[name][1]}
+            for types in (found, standard)
+        )
         for field in wanted:
             if has.get(field) != wanted[field]:
                 raise ValueError(f"its {name} has no field {field} as ROS has it")

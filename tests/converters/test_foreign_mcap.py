@@ -376,17 +376,19 @@ def test_times_that_cannot_be_are_refused(tmp_path: Path, log_ns: int, stamp_ns:
 
 
 def test_definitions_that_are_not_those_of_ros_are_refused(tmp_path: Path) -> None:
+    """A name that is another, also by its case alone; a type that is another."""
     r = Ros(2)
     info = next(m for t, _, m in scene(r) if t.endswith("camera_info"))
     name, encoding, text, data = encoded(info, "cdr", r)
-    path = raw_log(
-        tmp_path / "log.mcap", "/i", (name, encoding, text.replace(b"binning_x", b"binnimg_x")), data
-    )
-    with (
-        open_log([path]) as log,
-        pytest.raises(DuagError, match="its sensor_msgs/msg/CameraInfo has no field binning_x"),
+    for ours, theirs, field in (
+        (b"binning_x", b"binnimg_x", "binning_x"),
+        (b"distortion_model", b"distortion_Model", "distortion_model"),
+        (b"uint32 width", b"uint16 width", "width"),
     ):
-        log.first("/i")
+        path = raw_log(tmp_path / "log.mcap", "/i", (name, encoding, text.replace(ours, theirs)), data)
+        message = f"its sensor_msgs/msg/(CameraInfo|RegionOfInterest) has no field {field}"
+        with open_log([path]) as log, pytest.raises(DuagError, match=message):
+            log.first("/i")
 
 
 KITCHEN = Path(__file__).parents[3] / "shared" / "data" / "redkitchen"

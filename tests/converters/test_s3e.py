@@ -260,6 +260,13 @@ def rig_of(name: str, shrink: int) -> StereoRig:
     return StereoRig.of(cameras[0], cameras[1], T_right_left_of(name), name, StereoOptions(shrink=shrink))
 
 
+def checks_of(recording: Path) -> list[str]:
+    """What `duagc check` finds wrong."""
+    from pipeline import checks
+
+    return [f.found for f in checks.check(recording).findings if f.severity is checks.Severity.ERROR]
+
+
 def truth_depth(rig: StereoRig, k: int, frame: int) -> np.ndarray:
     T = pose_at(path(3, step=0.3)[k], START_NS + frame * STEP_NS)
     T[:3, :3] = T[:3, :3] @ rig.R_rectified_left.T
@@ -304,6 +311,7 @@ def test_stereo_of_three_vehicles(dataset: Path, tmp_path: Path) -> None:
         found = unpack_pose_in_frame(record.message())[:3, 3] + parameters["origin_m"]
         np.testing.assert_allclose(found, position(name, stamp), atol=1e-6)
     assert any("no rotations" in text for text in recording.description["warnings"])
+    assert not checks_of(tmp_path / "rec")
 
 
 def test_lidar_is_unturned_by_the_gyroscope(dataset: Path, tmp_path: Path) -> None:
@@ -318,6 +326,7 @@ def test_lidar_is_unturned_by_the_gyroscope(dataset: Path, tmp_path: Path) -> No
                 assert known.mean() > 0.3
                 assert frame.depth_sigma is not None
                 errors.append((np.abs(frame.depth - truth) / truth)[known])
+        assert not checks_of(tmp_path / "rec")
         # 0.25 rad/s over 0.1 s are 7 px: without the gyroscope 0.5 % (median)
         assert np.median(np.concatenate(errors)) < 0.002
         assert np.mean(np.concatenate(errors) > 0.1) < 0.03

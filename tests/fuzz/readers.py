@@ -21,7 +21,13 @@ from pipeline import checks, digest, recovery
 from pipeline.config import load
 from pipeline.errors import DuagError
 from pipeline.recording import Recording, format_info, info, open_rgbd, read_log
-from tests.converters import test_foreign_mcap, test_image_folders, test_kimera_multi, test_simulate_meshes
+from tests.converters import (
+    test_foreign_mcap,
+    test_image_folders,
+    test_kimera_multi,
+    test_s3e,
+    test_simulate_meshes,
+)
 from tests.converters.ros_bags import Ros, scene
 from tests.converters.test_seven_scenes import make_sequence
 from tests.fuzz.mutate import damaged
@@ -305,6 +311,15 @@ def kimera(root: Path) -> Path:
     return folder
 
 
+def s3e(root: Path) -> Path:
+    sequence = root / "S3E_Playground_2"
+    test_s3e.write_bag(sequence, test_s3e.NAMES)
+    for name in test_s3e.NAMES:
+        test_s3e.write_calibration(root / "Calibration" / f"{name.lower()}.yaml", name.lower())
+        test_s3e.write_truth(sequence / f"{name.lower()}_gt.txt", name)
+    return sequence
+
+
 def small_sequence(root: Path) -> Path:
     """Two frames are enough, and each takes a while to register."""
     folder = make_sequence(root / "seq-01")
@@ -462,6 +477,7 @@ READERS: dict[str, Reader] = {
         converter("mcap-json", foreign("json"), "ros", []),
         converter("mcap-protobuf", foreign("protobuf"), "ros", []),
         converter("kimera-multi", kimera, "kimera-multi", []),
+        converter("s3e", s3e, "s3e", []),
         Reader("recording", make_recording, read_recording, any_special),
         Reader("run", make_run, read_run, any_special),
         Reader("config", make_config, read_config, _no_special),
