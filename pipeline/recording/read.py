@@ -116,6 +116,8 @@ def verify(path: Path) -> None:
     path = Path(path)
     with parsing(path):
         status = path.stat()
+        if not (path.is_file() or path.is_dir()):  # a pipe might never end
+            raise DuagError(f"{path}: is no regular file, expected an MCAP log")
         key = (str(path.resolve()), status.st_size, status.st_mtime_ns, status.st_ino)
         if key not in _verified:
             with path.open("rb") as stream:
