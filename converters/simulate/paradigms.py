@@ -206,7 +206,8 @@ class _Ground:
             push = np.stack([self._at(slope, way) for slope in self._slope], axis=1)
             way = gaussian_filter1d(way + lack[:, None] * push, 3.0, axis=0, mode="nearest")
         moved = np.linalg.norm(way - curve, axis=1).max()
-        return way if self.margin(way).min() > 0.0 and moved < GIVE_WAY_M else None
+        shrunk = _length(way) < 0.7 * _length(curve)  # smoothing draws a short one together
+        return way if self.margin(way).min() > 0.0 and moved < GIVE_WAY_M and not shrunk else None
 
     def way(
         self, curve: Array, start_m: float, length_m: float, robot: int, frames: int, seed: int
@@ -254,6 +255,11 @@ def _poses(ways: list[_Way], gaze_rad: Array) -> list[Array]:
     return [way.poses(float(gaze_rad[k % 2])) for k, way in enumerate(ways)]
 
 
+def _length(curve: Array) -> float:
+    """Length (m) of a curve [n, 2]."""
+    return float(np.linalg.norm(np.diff(curve, axis=0), axis=1).sum())
+
+
 def _figures(ground: _Ground, paradigm: str, robots: int, frames: int, seed: int) -> Iterator[Place]:
     """Places where a figure is free, the largest first."""
     space, shape = ground.space, FIGURES[paradigm]
@@ -283,8 +289,7 @@ def _figures(ground: _Ground, paradigm: str, robots: int, frames: int, seed: int
                     bent = ground.bent(curve)
                     if bent is None:
                         return None
-                    reached = np.linalg.norm(np.diff(bent, axis=0), axis=1).sum()
-                    way = ground.way(bent, 0.0, float(reached), robot, frames, seed)
+                    way = ground.way(bent, 0.0, _length(bent), robot, frames, seed)
                     if way is None:
                         return None
                     ways.append(way)
