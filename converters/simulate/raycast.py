@@ -2,7 +2,8 @@
 
 Rays meet triangles in Embree (Open3D's `RaycastingScene`), in float32. Colour is the mean of 2 x 2 rays per pixel (of
 two where these have nearly the same colour), each with a texture sample of its own (bilinear, between the two mip
-levels around the distance of the samples on the surface). Means are taken of the stored values (sRGB), as a Gaussian map blends them, and as in the procedural room.
+levels around the distance of the samples on the surface). Means are taken of the stored values (sRGB), as a Gaussian
+map blends them, and as in the procedural room.
 Where no ray hits there is a hole of the scan: depth 0, black; or, in a scene with a sky, the sky: depth 0.
 """
 
