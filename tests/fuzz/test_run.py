@@ -17,7 +17,7 @@ def crash(src: Path, out: Path) -> None:
 
 
 def die(src: Path, out: Path) -> None:
-    os.kill(os.getpid(), signal.SIGSEGV)
+    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def swell(src: Path, out: Path) -> None:
@@ -44,7 +44,7 @@ def write(src: Path, out: Path) -> None:
     ("read", "kind", "words"),
     [
         (crash, "failed", "ValueError: a bug"),
-        (die, "failed", "signal 11"),
+        (die, "failed", "signal 15"),
         (swell, "failed", "MemoryError"),
         (escape, "failed", "changed outside its output: a/b/c/evil"),
         (change, "failed", "changed outside its output: a/b/c/src/file"),
