@@ -32,6 +32,7 @@ _COLOR_CODES = {  # encoding: channels, and the name of OpenCV's conversion to B
     "yuv422_yuy2": (2, "COLOR_YUV2BGR_YUY2"),
     "yuyv": (2, "COLOR_YUV2BGR_YUY2"),
 }
+LONGEST_LENS = 200  # focal length over the longer side of the image, and the inverse
 FISHEYE = (
     "equidistant",
     "fisheye",
@@ -262,14 +263,23 @@ class RosCamera:
             np.array(getattr(message, name if hasattr(message, name) else name.lower()), dtype=np.float64)
             for name in ("K", "D", "P")
         )
+        if K.size != 9 or P.size not in (0, 12):
+            raise DuagError(f"{where}: K and P of {K.size} and {P.size} numbers, expected 9 and 12")
         model = message.distortion_model
         if rectified and np.any(P):
             fx, cx, fy, cy = P[0], P[2], P[5], P[6]
             D = np.zeros(0)
         else:
             fx, cx, fy, cy = K[0], K[2], K[4], K[5]
-        if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
-            raise DuagError(f"{where}: focal length {fx:g}, {fy:g}, expected positive numbers")
+        side = max(message.width, message.height)
+        if not (
+            np.abs([cx, cy]).max() < LONGEST_LENS * side
+            and all(side / LONGEST_LENS < f < LONGEST_LENS * side for f in (fx, fy))
+        ):
+            raise DuagError(
+                f"{where}: focal length {fx:g}, {fy:g} px and centre {cx:g}, {cy:g} px of {message.width}x"
+                f"{message.height}, expected those of a camera"
+            )
         binning = max(1, message.binning_x), max(1, message.binning_y)
         roi = message.roi
         width, height = (roi.width or message.width), (roi.height or message.height)

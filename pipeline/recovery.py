@@ -28,6 +28,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from pipeline.errors import DuagError
 from pipeline.files import check_file, read_bytes
 from pipeline.new_folder import new_folder
+from pipeline.progress import track
 from pipeline.recording import RECORDING_FILE, RECORDING_FORMAT, RECORDING_SCHEMA, open_rgbd
 from pipeline.recording.identity import ContentDigest, channel_identity, framed
 from pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, MAGIC, ROBOT_KEY
@@ -104,7 +105,9 @@ def _recover_log(source: Path, out: Path) -> Salvage:
             summary = _summary_of(stream)
             if summary:
                 copy.know([*summary.schemas.values(), *summary.channels.values()])
-            for record in _records(stream, source.stat().st_size, salvage):
+            records = _records(stream, source.stat().st_size, salvage)
+            count = summary.statistics.message_count if summary and summary.statistics else None
+            for record in track(records, f"recover {source.name}", count):
                 copy.add(record)
             if summary and summary.statistics:
                 salvage.lost = max(0, summary.statistics.message_count - salvage.messages)

@@ -1,8 +1,9 @@
 """Ray casting of textured meshes: exact depth at the pixel centres, colour averaged over the pixel.
 
-Rays meet triangles in Embree (Open3D's `RaycastingScene`), in float32. Colour is the mean of 2 x 2 rays per pixel,
-each with a texture sample of its own (bilinear, between the two mip levels around the distance of the samples on the
-surface). Means are taken of the stored values (sRGB), as a Gaussian map blends them, and as in the procedural room.
+Rays meet triangles in Embree (Open3D's `RaycastingScene`), in float32. Colour is the mean of 2 x 2 rays per pixel (of
+two where these have nearly the same colour), each with a texture sample of its own (bilinear, between the two mip
+levels around the distance of the samples on the surface). Means are taken of the stored values (sRGB), as a Gaussian
+map blends them, and as in the procedural room.
 Where no ray hits there is a hole of the scan: depth 0, black; or, in a scene with a sky, the sky: depth 0.
 """
 
@@ -16,6 +17,7 @@ from pipeline.geometry.camera import PinholeCamera
 Array = NDArray[np.float64]
 
 OFFSETS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
+UNEVEN_GREY = 4.0  # of 255: where the first and the last of these differ less, the two others are left out
 SAMPLE_SPACING_PX = 0.5
 LEAST_COSINE = 0.1  # a texture seen at a more grazing angle is blurred no further
 
@@ -84,9 +86,14 @@ class MeshRenderer:
         """Colour and depth from a camera pose T_world_camera [4, 4]."""
         depth, triangle = self.depth(T_world_camera)
         T = np.asarray(T_world_camera, dtype=np.float64)
-        _, colors = self.shade(T[:3, 3], np.concatenate([self._directions(T, *offset) for offset in OFFSETS]))
-        mean = colors.reshape(len(OFFSETS), *depth.shape, 3).mean(axis=0)
-        return View(np.clip(np.rint(mean), 0, 255).astype(np.uint8), depth, triangle)
+        directions = [self._directions(T, *offset) for offset in OFFSETS]
+        _, colors = self.shade(T[:3, 3], np.concatenate(directions[::3]))
+        one, other = colors.reshape(2, -1, 3)
+        mean = 0.5 * (one + other)
+        uneven = np.flatnonzero(np.abs(one - other).max(axis=1) > UNEVEN_GREY)
+        _, more = self.shade(T[:3, 3], np.concatenate([each[uneven] for each in directions[1:3]]))
+        mean[uneven] = 0.5 * mean[uneven] + 0.25 * more.reshape(2, -1, 3).sum(axis=0)
+        return View(np.clip(np.rint(mean), 0, 255).astype(np.uint8).reshape(*depth.shape, 3), depth, triangle)
 
     def shade(
         self, origins: Array, directions: NDArray[np.float32]

@@ -14,16 +14,17 @@ from pipeline.errors import DuagError
 class Manner:
     """texel_m: of the texture. step_m: way of a robot per frame. depth_scale_m: metres per unit of depth images.
 
-    sky: there is a sky above instead of a ceiling.
+    sky: there is a sky above instead of a ceiling. solid: things are closed, and only their fronts can be seen.
     """
 
     texel_m: float = 0.005
     step_m: float = 0.028
     depth_scale_m: float = 1 / 5000
     sky: bool = False
+    solid: bool = True
 
 
-MESHES = Manner()
+MESHES = Manner(solid=False)
 SCENES: dict[str, tuple[Callable[[int], Scene], Manner]] = {
     "room": (room, Manner(texel_m=0.004, step_m=0.022)),
     "office": (office, Manner()),

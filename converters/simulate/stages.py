@@ -159,4 +159,9 @@ class MeshStage:
         areas = self.scene.areas()
         count = int(np.clip(POINTS_PER_M2 * areas.sum(), ROOM_POINTS, MOST_POINTS))
         rng = streams.generator(self.seed, "simulate.points")
-        return meshes.surface_points(self.scene, areas, count, rng)
+        points, normals, colors = meshes.surface_points(self.scene, areas, count, rng)
+        if not self.manner.solid:
+            return points, normals, colors
+        hit = self.caster.hits(points + 0.002 * normals, normals.astype(np.float32))
+        inside = np.isfinite(hit["t"]) & (np.einsum("ij,ij->i", hit["normals"], normals) > 0)  # sees a back
+        return points[~inside], normals[~inside], colors[~inside]

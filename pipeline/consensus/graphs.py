@@ -182,8 +182,11 @@ def read_g2o(path: Path) -> Edges:
             keys, row = [int(word) for word in words[1:3]], [float(word) for word in words[3:]]
         except ValueError:
             raise DuagError(f"{path}: line {number} holds something that is not a number") from None
-        if len(row) != 28 or not np.isfinite(row).all() or min(keys) < 0 or not any(row[3:7]):
-            raise DuagError(f"{path}: line {number} is not an edge: 2 keys and 28 finite numbers expected")
+        sound = len(row) == 28 and np.isfinite(row).all() and min(keys) >= 0 and max(keys) < 1 << 64
+        if not sound or not any(row[3:7]):
+            raise DuagError(
+                f"{path}: line {number} is not an edge: 2 keys of 64 bits and 28 finite numbers expected"
+            )
         i.append(_symbol(keys[0]))
         j.append(_symbol(keys[1]))
         rows.append(row)

@@ -142,10 +142,14 @@ def _candidates(means_own: Array, means_peer: Array, config: MatchingConfig) -> 
 
 def _first_of_each(group: Index, d: Array, tie: Index) -> Index:
     """Position of the least (d, tie) of every group."""
-    order = np.lexsort((tie, d, group))
-    first = np.ones(len(order), dtype=bool)
-    first[1:] = group[order][1:] != group[order][:-1]
-    return order[first]
+    if not len(group):
+        return np.zeros(0, np.int64)
+    order = np.argsort(group, kind="stable")
+    starts = np.flatnonzero(np.diff(group[order], prepend=-1))
+    least = np.minimum.reduceat(d[order], starts)
+    nearest = order[d[order] == np.repeat(least, np.diff(starts, append=len(order)))]
+    nearest = nearest[np.lexsort((tie[nearest], group[nearest]))]
+    return nearest[np.diff(group[nearest], prepend=-1) > 0]
 
 
 @dataclass(frozen=True)

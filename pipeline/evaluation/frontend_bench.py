@@ -38,9 +38,10 @@ SCHEMA = 1
 OPEN3D = {"Open3D, hybrid": "Hybrid", "Open3D, point-to-plane": "PointToPlane"}
 DEPTH_MAX_M = 10.0
 
-# What changes against the configuration given; tracking only. The order is that of the table.
+WITHOUT_MAP = "no model refinement"
+# What changes against the configuration given, all without a map. The order is that of the table.
 ABLATION: dict[str, dict[str, Any]] = {
-    "all": {},
+    WITHOUT_MAP: {},
     "point-to-plane only": {
         "tracking.registration.residuals": "depth",
         "tracking.recovery.residuals": "depth",
@@ -124,7 +125,7 @@ def _jobs(plan: Plan, robot: str) -> Iterator[_Job]:
         yield _Job(
             robot, "map", changed(plan.config, {"mapping_enabled": True, "mapping.max_gaussians": cap})
         )
-    names = list(ABLATION) if plan.ablation else ["all"]
+    names = list(ABLATION) if plan.ablation else [WITHOUT_MAP]
     for name in names:
         yield _Job(robot, name, changed(tracking_only, ABLATION[name]))
     if plan.open3d:
@@ -210,9 +211,16 @@ def _timed(calls: Calls, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _functions(parts: Mapping[str, tuple[str, str]]) -> dict[str, tuple[Any, str]]:
-    from pipeline.frontend import mapping, stage, tracking
+    from pipeline.frontend import mapping, model, stage, tracking
+    from pipeline.registration import align
 
-    modules: dict[str, ModuleType] = {"mapping": mapping, "stage": stage, "tracking": tracking}
+    modules: dict[str, ModuleType] = {
+        "mapping": mapping,
+        "stage": stage,
+        "tracking": tracking,
+        "model": model,
+        "align": align,
+    }
     found = {}
     for label, (path, name) in parts.items():
         module, _, owner = path.partition(".")
@@ -236,6 +244,55 @@ def summary(calls: Calls) -> dict[str, float]:
         "cpu_ms_last_quarter": float(ms[-quarter:].mean()),
         "wall_ms": float(1000 * np.mean(calls.wall_s)),
     }
+
+
+@dataclass
+class Work:
+    """What is counted beside time: it is the same on every machine. Totals after each call of the whole."""
+
+    total: int = 0
+    after: list[int] = field(default_factory=list)
+
+    def summary(self, name: str) -> dict[str, float]:
+        """Mean per call, in the first and in the last quarter of the calls."""
+        counts = np.diff(np.array([0, *self.after]))
+        quarter = max(1, len(counts) // 4)
+        return {
+            name: float(counts.mean()),
+            f"{name}_first_quarter": float(counts[:quarter].mean()),
+            f"{name}_last_quarter": float(counts[-quarter:].mean()),
+        }
+
+
+@contextmanager
+def _counted(
+    whole: tuple[str, str], part: tuple[str, str], amount: Callable[..., int] = lambda *_: 1
+) -> Iterator[Work]:
+    """Add up `amount` of the arguments of the calls of a part while the whole runs; noted at the end of its calls."""
+    work = Work()
+
+    def counting(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            result = function(*args, **kwargs)
+            work.total += amount(*args)
+            return result
+
+        return call
+
+    def noting(function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            work.total = work.after[-1] if work.after else 0  # what happens between the calls is not counted
+            result = function(*args, **kwargs)
+            work.after.append(work.total)
+            return result
+
+        return call
+
+    found = _functions({"whole": whole, "part": part})
+    with _replaced(*found["part"], counting), _replaced(*found["whole"], noting):
+        yield work
 
 
 def _parts(whole: Calls, parts: Mapping[str, Calls]) -> dict[str, float]:
@@ -264,16 +321,31 @@ def measure(log: Path, folder: Path, config: FrontendConfig, seed: int, threads:
     whole = {"frame": ("tracking.Tracker", "track"), "poses": ("stage", "_refine")}
     if config.mapping_enabled:
         whole |= {"keyframe": ("mapping.Mapper", "add_keyframe"), "final": ("mapping.Mapper", "finish")}
-    with Stopwatch(_functions(whole)) as outer, _in_turn(config) as inner:
+        whole |= {"model": ("model.ModelTracker", "refine")}
+    with ExitStack() as stack:
+        steps = stack.enter_context(_counted(("tracking.Tracker", "track"), ("align", "_linearise")))
+        drawn = stack.enter_context(
+            _counted(
+                ("mapping.Mapper", "add_keyframe"),
+                ("mapping.Mapper", "_optimise"),
+                lambda mapper, *_: mapper.rasterizer.visible,
+            )
+        )
+        outer = stack.enter_context(Stopwatch(_functions(whole)))
+        inner = stack.enter_context(_in_turn(config))
         start = time.process_time()
         laps = run_frontend(log, folder / "frontend.mcap", config, seed=seed, threads=threads)
         cpu_s = time.process_time() - start
     frame = outer.calls["frame"]
     times: dict[str, Any] = {"frame": summary(frame) | {"parts_cpu_ms": _parts(frame, inner.of("frame"))}}
+    times["frame"] |= steps.summary("steps")
     times["pose_optimisation_cpu_s"] = sum(outer.calls["poses"].cpu_s)
     if config.mapping_enabled:
         keyframe = outer.calls["keyframe"]
         times["keyframe"] = summary(keyframe) | {"parts_cpu_ms": _parts(keyframe, inner.of("keyframe"))}
+        times["keyframe"] |= drawn.summary("gaussians_drawn")
+        if outer.calls["model"].cpu_s:
+            times["model"] = summary(outer.calls["model"])
         times["final_refinement_cpu_s"] = sum(outer.calls["final"].cpu_s)
     return {"times": times, "laps_wall_s": laps, "cpu_s": cpu_s, "peak_memory_mb": peak_memory_mb()}
 
@@ -416,8 +488,8 @@ def _map_errors(source: Recording, robot: RobotRun, estimated: Trajectory, threa
             continue
         task = RenderTask(found.gaussians, robot, estimated, keyframes=False, depth=found.depth)
         scores = views.summary([s for _, s in task.scores(source, threads, None)], "no view is held out")
-        kept = ("views", "psnr_db", "ssim", "depth_l1_m", "depth_l1_exact_m", "depth_completeness")
-        row[name] = {key: scores[key] for key in kept}
+        kept = ("views", "psnr_db", "ssim", "depth_l1_m", "depth_l1_exact_m", "depth_l1_layer_m")
+        row[name] = {key: scores[key] for key in (*kept, "depth_completeness")}
     return row
 
 
@@ -435,19 +507,28 @@ def format_tables(result: dict[str, Any]) -> str:
     ]
     about += [f"load {machine['load_average']:.1f}", "processor time"]
     head = ["robot", "", "frames", "lost", "keyframes", "ATE mm", "RPE mm", "RPE mrad"]
-    head += ["ms/frame", "p95", "first, last quarter", "poses s", "peak MB"]
+    head += ["ms/frame", "p95", "first, last quarter", "steps", "model ms", "poses s", "peak MB"]
     lines = [", ".join(about), "", "Tracking"]
-    lines += _table(head, [_tracking_cells(row) for row in rows if row["name"] != "map"])
+    lines += _table(head, [_tracking_cells(row) for row in rows])
     mapped = [row for row in rows if row["name"] == "map"]
     if mapped:
-        head = ["robot", "cap", "Gaussians", "PSNR dB", "before refinement", "depth L1 mm", "exact mm"]
-        head += ["ms/keyframe", "p95", "first, last quarter", "refinement s", "all s", "peak MB"]
+        head = [
+            "robot",
+            "cap",
+            "Gaussians",
+            "PSNR dB",
+            "before refinement",
+            "depth L1 mm",
+            "exact mm",
+            "layer mm",
+        ]
+        head += ["ms/keyframe", "p95", "first, last quarter", "k drawn", "refinement s", "all s", "peak MB"]
         lines += ["", "Mapping; scores of held-out views", *_table(head, [_map_cells(row) for row in mapped])]
     parts = [
         [row["robot"], row.get("max_gaussians", row["name"]), whole, _parts_text(row["times"][whole])]
         for row in rows
         for whole in ("frame", "keyframe")
-        if whole in row["times"] and row["name"] in ("map", "all")
+        if whole in row["times"] and row["name"] in ("map", WITHOUT_MAP)
     ]
     lines += ["", "Parts, ms", *_table(["robot", "cap", "of a", "parts"], parts)]
     return "\n".join(lines)
@@ -458,7 +539,7 @@ def _tracking_cells(row: dict[str, Any]) -> list[Any]:
     return [
         *(
             row["robot"],
-            row["name"],
+            f"all, map of {row['max_gaussians']}" if row["name"] == "map" else row["name"],
             row["frames"],
             row.get("lost", row.get("failed")),
             row.get("keyframes", "-"),
@@ -469,6 +550,7 @@ def _tracking_cells(row: dict[str, Any]) -> list[Any]:
             _number(row["rpe_rot_rad"], 1e3, 3),
         ),
         *(f"{frame['cpu_ms']:.1f}", f"{frame['cpu_ms_p95']:.1f}", _quarters(frame)),
+        *(_work(frame, "steps", 1.0), _model(row["times"].get("model"))),
         *(_number(row["times"].get("pose_optimisation_cpu_s"), 1, 1), f"{row['peak_memory_mb']:.0f}"),
     ]
 
@@ -479,7 +561,9 @@ def _map_cells(row: dict[str, Any]) -> list[Any]:
         *(row["robot"], row["max_gaussians"], row["gaussians"], _number(refined["psnr_db"], 1, 2)),
         _number(unrefined.get("psnr_db"), 1, 2),
         *(_number(refined["depth_l1_m"], 1e3, 2), _number(refined["depth_l1_exact_m"], 1e3, 2)),
+        _number(refined["depth_l1_layer_m"], 1e3, 2),
         *(f"{keyframe['cpu_ms']:.0f}", f"{keyframe['cpu_ms_p95']:.0f}", _quarters(keyframe)),
+        _work(keyframe, "gaussians_drawn", 1e-3),
         *(
             f"{row['times']['final_refinement_cpu_s']:.1f}",
             f"{row['cpu_s']:.1f}",
@@ -490,6 +574,16 @@ def _map_cells(row: dict[str, Any]) -> list[Any]:
 
 def _quarters(times: dict[str, float]) -> str:
     return f"{times['cpu_ms_first_quarter']:.1f}, {times['cpu_ms_last_quarter']:.1f}"
+
+
+def _work(times: dict[str, float], name: str, scale: float) -> str:
+    if name not in times:
+        return "-"
+    return f"{scale * times[f'{name}_first_quarter']:.1f}, {scale * times[f'{name}_last_quarter']:.1f}"
+
+
+def _model(times: dict[str, float] | None) -> str:
+    return "-" if times is None else f"{times['calls']} x {times['cpu_ms']:.1f}"
 
 
 def _parts_text(times: dict[str, Any]) -> str:

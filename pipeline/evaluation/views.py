@@ -25,6 +25,7 @@ Score = float | Absent
 PSNR_CEILING_DB = 100.0  # of a render equal to its image: infinity has no place in a JSON file
 MS_SSIM_MIN_SIDE_PX = 176  # the 11 px window at the fifth scale
 MIN_ALPHA = 0.5
+NO_LAYER = Absent("the depth of one layer was not drawn")
 NO_LPIPS = Absent("LPIPS needs the weights of a trained network, which this build does not carry")
 
 
@@ -37,6 +38,7 @@ class ViewScore:
     ms_ssim: Score
     depth_l1_m: Score
     depth_l1_exact_m: Score
+    depth_l1_layer_m: Score
     depth_completeness: Score
 
 
@@ -49,7 +51,11 @@ def surface_depth(render: Render) -> NDArray[np.float32]:
 
 
 def score_view(
-    render: Render, color: NDArray[np.uint8], depth_m: NDArray[np.float32], exact_m: Any
+    render: Render,
+    color: NDArray[np.uint8],
+    depth_m: NDArray[np.float32],
+    exact_m: Any,
+    layer_m: Any = NO_LAYER,
 ) -> ViewScore:
     """Compare a render with the image of the same pose.
 
@@ -57,6 +63,7 @@ def score_view(
         render: of the map, at the pose of the frame, black background, no exposure fitted.
         color: [h, w, 3] RGB. depth_m: recorded depth [h, w], 0 where there is none.
         exact_m: exact depth [h, w] in metres, or Absent.
+        layer_m: depth of one layer per pixel (`Rasterizer.layer_depth`), [h, w] in metres, or Absent.
     """
     image = color.astype(np.float64) / 255.0
     l1_m, completeness = _depth(render, depth_m, "recorded")
@@ -69,8 +76,17 @@ def score_view(
         else Absent(f"the shorter side is {side} px; five scales need {MS_SSIM_MIN_SIDE_PX} px"),
         depth_l1_m=l1_m,
         depth_l1_exact_m=exact_m if isinstance(exact_m, Absent) else _depth(render, exact_m, "exact")[0],
+        depth_l1_layer_m=layer_m if isinstance(layer_m, Absent) else _layer(layer_m, depth_m),
         depth_completeness=completeness,
     )
+
+
+def _layer(layer_m: NDArray[np.float32], depth_m: NDArray[np.float32]) -> Score:
+    """L1 of the depth of one layer over the pixels that have both depths."""
+    both = (layer_m > 0) & (depth_m > 0)
+    if not both.any():
+        return Absent("no pixel has both a layer that stops half of its light and a recorded depth")
+    return float(np.mean(np.abs(layer_m[both] - depth_m[both]), dtype=np.float64))
 
 
 def _depth(render: Render, reference_m: NDArray[np.float32], name: str) -> tuple[Score, Score]:
@@ -121,7 +137,8 @@ def score_map(
         if not hasattr(own, "rasterizer"):
             own.rasterizer = Rasterizer(threads=1)
         render = own.rasterizer.forward(gaussians, camera, se3.inverse(T_map_camera), depth=depth)
-        return view.frame.index, score_view(render, view.frame.color, view.frame.depth, view.exact_depth_m)
+        frame, layer_m = view.frame, own.rasterizer.layer_depth()
+        return frame.index, score_view(render, frame.color, frame.depth, view.exact_depth_m, layer_m)
 
     with ThreadPoolExecutor(threads) as pool:
         batch: list[View] = []
@@ -154,5 +171,6 @@ def summary(scores: Sequence[ViewScore | Absent], reason_if_none: str) -> dict[s
         "st_lpips": NO_LPIPS,
         "depth_l1_m": means["depth_l1_m"],
         "depth_l1_exact_m": means["depth_l1_exact_m"],
+        "depth_l1_layer_m": means["depth_l1_layer_m"],
         "depth_completeness": means["depth_completeness"],
     }

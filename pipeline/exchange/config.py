@@ -176,6 +176,8 @@ class ExchangeConfig(Config):
     weights: WeightKind = "block"
     """How sure a robot says it is of a Gaussian: its information, or one of the simpler kinds to compare with
     (`docs/consensus.md`)."""
+    evidence_order: Literal["gain", "paper"] = "gain"
+    """Which Gaussians go first: those that promise the receiver most information per byte, or by the paper's (4)."""
     overlap_voxel_m: float = Field(default=0.25, gt=0.0)
     """Edge of the voxels that say which space a robot saw (coverage = overlap)."""
     link: LinkConfig = LinkConfig()

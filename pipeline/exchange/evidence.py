@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,9 +55,15 @@ def gain(records: Records) -> Array:
     return 0.5 * np.log1p(known * PRIOR_SIGMA**2).sum(axis=1)
 
 
-def best_first(records: Records) -> NDArray[np.int64]:
-    """Order by falling gain, ties by id."""
-    return np.lexsort((records["id"], -gain(records)))
+def paper_priority(records: Records) -> Array:
+    """The paper's (4) [n]: the sum of the information over all dimensions, which depends on the unit of length."""
+    return np.maximum(records["information"][:, DIAGONAL].astype(np.float64), 0.0).sum(axis=1)
+
+
+def best_first(records: Records, order: Literal["gain", "paper"] = "gain") -> NDArray[np.int64]:
+    """Order by falling gain (all records have the same size), or by the paper's priority; ties by id."""
+    value = gain(records) if order == "gain" else paper_priority(records)
+    return np.lexsort((records["id"], -value))
 
 
 def voxel_keys(points: Array, edge_m: float) -> NDArray[np.int64]:

@@ -50,7 +50,7 @@ class Sharing:
         """Own evidence as it is sent, best first."""
         if self._body is None:
             records = own_records(self.data, self.kind, self.config.weights)
-            self._body = wire.to_body(self.kind, records[best_first(records)])
+            self._body = wire.to_body(self.kind, records[best_first(records, self.config.evidence_order)])
         return self._body
 
     def own_records(self) -> NDArray[Any]:

@@ -73,7 +73,7 @@ def optimise(
     Returns:
         The poses, and one factor per pair of keyframes: sum of factors = the joint cost at the answer, to second order.
     """
-    neighbourhood = _Neighbourhood(views, config)
+    neighbourhood = Neighbourhood(views, config)
     costs = _Costs(views, images, tracked, config, registration)
     refined = refine(T_map_keyframes, tracked, config.huber_sigmas)
     coarse_rounds = COARSE_ROUNDS if _far(T_map_keyframes, tracked) else 0
@@ -188,7 +188,7 @@ def _factor(
     return KeyframePair(first, second, T_first_second @ se3.exp(step), information)
 
 
-class _Neighbourhood:
+class Neighbourhood:
     """Which keyframes see each other.
 
     Overlaps are computed only where the balls around what two views see meet, and with no more than so many of them,
@@ -228,8 +228,3 @@ class _Neighbourhood:
             if share >= config.optimisation_overlap:
                 found.append((-share, -first))
         return [-first for _, first in sorted(found)[: config.optimisation_neighbours]]
-
-
-def overlapping(T: Array, views: Sequence[View], config: KeyframeConfig) -> list[Ends]:
-    """Pairs (earlier, later) of keyframes that overlap, as `optimise` would choose them at the poses T [k, 4, 4]."""
-    return _Neighbourhood(views, config).pairs(T)

@@ -1,7 +1,7 @@
 """The front-end stage: from one robot's sensor log to its odometry, keyframes and Gaussian map.
 
-Three passes over the log: all frames are tracked; the keyframe poses are optimised together, loops included; the map
-is grown at the poses found. Frames hang on keyframes, so their poses are final before the first message is written.
+Passes over the log: all frames are tracked; the keyframe poses are optimised together, loops included; the map is grown
+at the poses found; the other frames are registered to it where that pays. Frames hang on keyframes.
 The stage is offline in this sense; times in the log are those of the recording all the same.
 """
 
@@ -71,7 +71,7 @@ def run_frontend(
         keyframes = _keyframe_messages(log.robot, tracker.keyframes, refined)
         factors = _factor_messages(log.robot, tracker.keyframes, pairs, refined)
         clock.lap("refinement_s")
-        updates, maps = _map(log, keyframes, frames, config, seed, threads, progress, clock)
+        updates, maps, frames = _map(log, keyframes, frames, config, seed, threads, progress, clock)
         clock.lap("final_refinement_s")
         alone = {
             "color_without_depth": str(len(log.pairing.color_alone)),
@@ -176,20 +176,20 @@ def _factor_messages(
 def _map(
     log: RgbdLog,
     keyframes: Sequence[Keyframe],
-    frames: Sequence[TrackedFrame],
+    frames: list[TrackedFrame],
     config: FrontendConfig,
     seed: int,
     threads: int,
     progress: bool,
     clock: _Clock,
-) -> tuple[list[MapUpdate], _Maps]:
+) -> tuple[list[MapUpdate], _Maps, list[TrackedFrame]]:
     """Grow the map at the keyframes' poses; one update per keyframe, and one for the final refinement.
 
-    Other tracked frames support that refinement; held-out frames are not even decoded.
+    The other frames are registered to the grown map, and some of them, never held-out ones, support its refinement.
     """
     if not config.mapping_enabled:
         clock.lap("mapping_s")
-        return [], _Maps(Gaussians.empty(), None, config.mapping.depth)
+        return [], _Maps(Gaussians.empty(), None, config.mapping.depth), frames
     from pipeline.frontend.mapping import Mapper, MappingStats
 
     def update(keyframe: Keyframe, stats: MappingStats) -> MapUpdate:
@@ -221,6 +221,10 @@ def _map(
             depth_sigma_m=frame.depth_sigma,
         )
         updates.append(update(keyframe, stats))
+    unrefined = mapper.gaussians
+    clock.lap("mapping_s")
+    frames = _refine_to_model(log, unrefined, keyframes, frames, config, threads, progress)
+    clock.lap("model_s")
     for supporting in _support(frames, keyframes, config):
         frame = log.frame(supporting.frame_index)
         T_map_camera = keyframes[supporting.keyframe_index].T_map_camera @ supporting.T_keyframe_camera
@@ -232,10 +236,34 @@ def _map(
             mask=free.usable(frame.usable_depth, T_map_camera, frame.mask),
             depth_sigma_m=frame.depth_sigma,
         )
-    unrefined = mapper.gaussians
-    clock.lap("mapping_s")
     updates.append(update(keyframes[-1], mapper.finish()))
-    return updates, _Maps(mapper.gaussians, unrefined, config.mapping.depth)
+    return updates, _Maps(mapper.gaussians, unrefined, config.mapping.depth), frames
+
+
+def _refine_to_model(
+    log: RgbdLog,
+    gaussians: Gaussians,
+    keyframes: Sequence[Keyframe],
+    frames: Sequence[TrackedFrame],
+    config: FrontendConfig,
+    threads: int,
+    progress: bool,
+) -> list[TrackedFrame]:
+    """The frames with those between keyframes registered to the map, where that pays."""
+    from pipeline.frontend.model import ModelTracker
+
+    model = ModelTracker(
+        gaussians, config.mapping.depth, log.camera, config.model, config.tracking.registration, threads
+    )
+    taken = {keyframe.frame_index for keyframe in keyframes}
+    refined = []
+    for frame in progress_bar.track(frames, f"model {log.robot}") if progress else frames:
+        usable = frame.status is not Status.LOST and frame.reason is Reason.NONE
+        if model.pays and usable and frame.frame_index not in taken:
+            T_map_keyframe = keyframes[frame.keyframe_index].T_map_camera
+            frame = model.refine(frame, log.frame(frame.frame_index), T_map_keyframe)
+        refined.append(frame)
+    return refined
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class FusionConfig(Config):
     standard deviation of 0.55 cells."""
     scatter_position_m: float = Field(default=0.01, gt=0.0)
     """Standard deviation by which two robots' splats of one place are expected to differ across the surface. What is
-    expected counts as much as `scatter_support` matched Gaussians; the rest is measured."""
+    expected counts as much as `scatter_support` matched Gaussians, the rest is measured (association = neighbours)."""
     scatter_log_covariance: float = Field(default=1.0, gt=0.0)
     """The same for a coordinate of vec log Sigma."""
     scatter_color: float = Field(default=0.07, gt=0.0)

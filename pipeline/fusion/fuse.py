@@ -170,7 +170,8 @@ def _weighted_move_diagonal(weights: Array, values: Array, first: Index) -> Arra
 @dataclass(frozen=True)
 class Scatter:
     """How far two robots' splats of one place lie apart, standard deviations: of the mean across the surface (m), of
-    coordinates of vec log Sigma, of colours (0..1), of opacity logits. Measured by the receiver on its own tracks.
+    coordinates of vec log Sigma, of colours (0..1), of opacity logits. Measured by the receiver on its own tracks, but
+    where all robots shall end with the same Gaussian: there what is expected stands.
 
     It is no estimation error: each robot cut the surface into splats of its own, which make up for each other.
     """
@@ -186,6 +187,13 @@ class Scatter:
 
         What the settings expect counts as much as `scatter_support` members.
         """
+        if config.association == "members":
+            return Scatter(
+                config.scatter_position_m,
+                config.scatter_log_covariance,
+                config.scatter_color,
+                config.scatter_opacity,
+            )
         size = np.diff(np.append(first, len(delta)))
         informed = np.trace(rows.position, axis1=-2, axis2=-1) > 0
         informed[reference] = False

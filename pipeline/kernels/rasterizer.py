@@ -294,9 +294,19 @@ class Rasterizer:
         _, size = self._last_forward()
         if not (isinstance(tolerance, Real) and 0 <= float(tolerance) <= 1):
             raise ValueError(f"tolerance is {tolerance!r}, expected a number from 0 to 1")
+        if not hasattr(self._raster, "layer_depth"):
+            raise RuntimeError(
+                "the compiled kernels are older than their sources; build them again (make setup)"
+            )
         depth = empty(*size)
         self._raster.layer_depth(float(tolerance), depth)
         return depth
+
+    @property
+    def visible(self) -> int:
+        """Gaussians on the screen in the last view; `statistics` says more, and counts longer."""
+        self._last_forward()
+        return self._raster.visible
 
     def statistics(self) -> Statistics:
         """The work of the last view."""

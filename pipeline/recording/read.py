@@ -24,6 +24,7 @@ from mcap.summary import Summary
 import schemas
 from pipeline import messages
 from pipeline.errors import DuagError
+from pipeline.progress import track
 from pipeline.recording.identity import ContentDigest, channel_identity, framed
 from pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, MAGIC
 
@@ -32,6 +33,7 @@ _DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of everything before
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _PIECE_BYTES = 1 << 20
 _CHUNKS_KEPT = 4
+_LONG_BYTES = 1 << 30  # takes long enough that somebody wonders
 LATEST_NS = 1 << 63  # what a signed 64-bit number can hold
 
 
@@ -93,12 +95,11 @@ def parsing(path: Path) -> Iterator[None]:
 
 def _crc_of(stream: IO[bytes], start: int, stop: int) -> int:
     stream.seek(start)
-    crc, left = 0, stop - start
-    while left > 0:
-        piece = stream.read(min(left, _PIECE_BYTES))
-        if not piece:
-            break
-        crc, left = zlib.crc32(piece, crc), left - len(piece)
+    crc = 0
+    pieces = range(start, stop, _PIECE_BYTES)
+    long = stop - start > _LONG_BYTES
+    for at in track(pieces, "compare checksums, MB") if long else pieces:
+        crc = zlib.crc32(stream.read(min(stop - at, _PIECE_BYTES)), crc)
     return crc
 
 
@@ -115,6 +116,8 @@ def verify(path: Path) -> None:
     path = Path(path)
     with parsing(path):
         status = path.stat()
+        if not (path.is_file() or path.is_dir()):  # a pipe might never end
+            raise DuagError(f"{path}: is no regular file, expected an MCAP log")
         key = (str(path.resolve()), status.st_size, status.st_mtime_ns, status.st_ino)
         if key not in _verified:
             with path.open("rb") as stream:

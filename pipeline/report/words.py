@@ -85,6 +85,7 @@ RENDERING = {
     "lpips": ("LPIPS", "perceptual distance by a trained network"),
     "depth_l1_m": ("Depth L1", "mean error against the recorded depth, where both exist"),
     "depth_l1_exact_m": ("Depth L1, exact", "the same against the exact depth"),
+    "depth_l1_layer_m": ("Depth L1, one layer", "the same, drawn as the surface that stops a pixel's light"),
     "depth_completeness": ("Completeness", "share of recorded depth pixels that the map covers"),
 }  # fmt: skip
 

@@ -193,3 +193,20 @@ def test_inverse_depth_needs_its_header() -> None:
     png = cv2.imencode(".png", depth_image())[1].tobytes()
     with pytest.raises(DuagError, match="inverse depth without its header"):
         ros_images.depth_m(Ros(2).compressed(1, "d", png, "32FC1; compressedDepth png"), "here", 0.001)
+
+
+@pytest.mark.parametrize(
+    ("K", "message"),
+    [
+        ([0.0] * 9, r"focal length 0, 0 px .* expected those of a camera"),
+        ([1e300, 0, 80, 0, 140, 60, 0, 0, 1], "expected those of a camera"),
+        ([140, 0, float("nan"), 0, 140, 60, 0, 0, 1], "expected those of a camera"),
+        ([140, 0, 80, 0, 1e-9, 60, 0, 0, 1], "expected those of a camera"),
+        ([140, 0, 80], "K and P of 3 and 12 numbers"),
+    ],
+)
+def test_cameras_that_cannot_be_are_refused(K: list[float], message: str) -> None:
+    info = Ros(2).info(1, "c", COLOR)
+    object.__setattr__(info, "k", np.array(K))
+    with pytest.raises(DuagError, match=message):
+        ros_images.RosCamera.of(info, False, "here")

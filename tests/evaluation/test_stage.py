@@ -21,7 +21,8 @@ ROBOT = {
 }  # fmt: skip
 VIEWS = {
     "views": int, "views_without_pose": int, "psnr_db": NUMBER, "ssim": NUMBER, "ms_ssim": NUMBER, "lpips": NUMBER,
-    "st_lpips": NUMBER, "depth_l1_m": NUMBER, "depth_l1_exact_m": NUMBER, "depth_completeness": NUMBER,
+    "st_lpips": NUMBER, "depth_l1_m": NUMBER, "depth_l1_exact_m": NUMBER,
+    "depth_l1_layer_m": NUMBER, "depth_completeness": NUMBER,
 }  # fmt: skip
 SCHEMA = {
     "schema": int,

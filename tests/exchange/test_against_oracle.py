@@ -25,17 +25,22 @@ NAMES = ("alpha", "bravo", "charlie", "delta", "echo", "foxtrot", "golf", "hotel
 BURSTS = {"burst_gap_ns": 900_000_000, "burst_length_ns": 300_000_000}
 
 
-def meet(data: list[RobotData], folder: Path, **link: Any) -> tuple[dict[str, AgentResult], ExchangeConfig]:
-    config = ExchangeConfig(
+def unrounded(**link: Any) -> ExchangeConfig:
+    return ExchangeConfig(
         link=LinkConfig(**link),
         evidence_wire="float64",
         consensus=PoseConsensusConfig(wire="float64", tolerance=1e-12),
         max_rounds=20_000,
     )
+
+
+def meet(data: list[RobotData], folder: Path, config: ExchangeConfig) -> dict[str, AgentResult]:
     results = run_session_of(
         data, config, seed=0, exchange_path=folder / "exchange.mcap", consensus_path=folder / "consensus.mcap"
     )
-    return results, config
+    assert all(result.converged for result in results.values())
+    assert all(result.component == tuple(sorted(results)) for result in results.values())
+    return results
 
 
 def oracle_poses(
@@ -85,6 +90,22 @@ def fused_theta(
     return whole.theta, np.sqrt(Weights.of(whole).diagonal()), fused.members[:n] > 1
 
 
+def gaps(
+    data: list[RobotData], results: dict[str, AgentResult], config: ExchangeConfig
+) -> tuple[float, float, np.ndarray]:
+    """Metres and radians of poses, and of every matched Gaussian [m, 13] in standard deviations, from the oracle."""
+    poses, central = oracle_poses(data, results, config.consensus)
+    exact = {d.robot: Evidence.from_map(d.robot, d.gaussians, d.information, d.T_map_keyframe) for d in data}
+    found = []
+    for d in data:
+        result = results[d.robot]
+        heard = {d.robot: result.own_evidence, **result.evidence}
+        theta, _, matched = fused_theta(data, d.robot, heard, result.T_world_keyframe_of, result.pairs)
+        best, roots, _ = fused_theta(data, d.robot, exact, central, result.pairs)
+        found.append((np.abs(theta - best) * roots)[matched])
+    return *pose_gap(poses, central), np.concatenate(found)
+
+
 @pytest.mark.parametrize(
     ("robots", "link"),
     [
@@ -101,23 +122,40 @@ def test_the_team_is_at_the_oracle(
     make_robot: Any, tmp_path: Path, robots: int, link: dict[str, Any]
 ) -> None:
     data = [make_robot(name, 0.6 * i, keyframes=4)[0] for i, name in enumerate(NAMES[:robots])]
-    results, config = meet(data, tmp_path, **link)
-    assert all(result.converged for result in results.values())
-    assert all(result.component == NAMES[:robots] for result in results.values())
-    poses, central = oracle_poses(data, results, config.consensus)
-    metres, radians = pose_gap(poses, central)
-    assert metres < 1e-9
-    assert radians < 1e-9
-    exact = {d.robot: Evidence.from_map(d.robot, d.gaussians, d.information, d.T_map_keyframe) for d in data}
-    gaps = []
-    for d in data:
-        result = results[d.robot]
-        heard = {d.robot: result.own_evidence, **result.evidence}
-        theta, _, matched = fused_theta(data, d.robot, heard, result.T_world_keyframe_of, result.pairs)
-        best, roots, _ = fused_theta(data, d.robot, exact, central, result.pairs)
-        gaps.append((np.abs(theta - best) * roots)[matched])
-    gap_sigma = np.concatenate(gaps)
+    config = unrounded(**link)
+    results = meet(data, tmp_path, config)
+    metres, radians, gap_sigma = gaps(data, results, config)
     rounds = max(r.rounds for r in results.values())
     print(f"{robots} robots, {link}: {rounds} rounds, {metres:.1e} m, {gap_sigma.max():.1e} sigma")
+    assert metres < 1e-9
+    assert radians < 1e-9
     assert len(gap_sigma) > 10
     assert gap_sigma.max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("robots", "link", "most_m"),
+    [
+        (2, {}, 1e-6),
+        (3, {"topology": "chain", "loss_probability": 0.3}, 1e-6),
+        # where loss hides the last small steps, "holds still" within 1e-5 m is said a little early
+        pytest.param(4, {"topology": "ring", "loss_probability": 0.6}, 3e-6, marks=pytest.mark.slow),
+        pytest.param(
+            8, {"topology": "full", "loss_probability": 0.3, **BURSTS}, 1e-6, marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_on_the_default_wire_the_team_is_near_the_oracle(
+    make_robot: Any, tmp_path: Path, robots: int, link: dict[str, Any], most_m: float
+) -> None:
+    """Rounded evidence, poses in float32, at the tolerance of runs."""
+    data = [make_robot(name, 0.6 * i, keyframes=4)[0] for i, name in enumerate(NAMES[:robots])]
+    config = ExchangeConfig(link=LinkConfig(**link), max_rounds=20_000)
+    results = meet(data, tmp_path, config)
+    metres, radians, gap_sigma = gaps(data, results, config)
+    print(
+        f"{robots} robots, {link}: {metres:.1e} m, {np.percentile(gap_sigma.max(axis=1), 99):.1e} sigma at 99 %"
+    )
+    assert metres < most_m
+    assert radians < 1e-6
+    assert np.percentile(gap_sigma.max(axis=1), 99) < 0.05

@@ -14,6 +14,7 @@ import pytest
 from pipeline.consensus.config import PoseConsensusConfig
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.config import ExchangeConfig, InjectionConfig, LinkConfig, TransportConfig
+from pipeline.exchange.evidence import best_first, own_records, paper_priority
 from pipeline.exchange.packets import Kind, Packet, chunk_bytes, parse, serialise
 from pipeline.exchange.record import read_session
 from pipeline.exchange.replay import replay_agent_of
@@ -156,6 +157,19 @@ def test_every_candidate_has_a_verdict_with_a_reason(lossy_chain: Any) -> None:
     kept = [d for d in decisions if d.verdict == "kept"]
     assert kept
     assert all(d.weight == 1.0 and d.measured for d in kept)
+
+
+def test_the_printed_order_of_evidence_depends_on_the_unit_of_length(team: Any) -> None:
+    """The default order does not: information and prior change alike. Both orders hold every Gaussian once."""
+    records = own_records(team["alpha"][0], Kind.EVIDENCE_DOUBLE, ExchangeConfig().weights)
+    in_cm = records.copy()
+    in_cm["information"][:, :6] /= 100.0**2
+    by_paper = [best_first(r, "paper") for r in (records, in_cm)]
+    assert not np.array_equal(*by_paper)
+    for order in (*by_paper, best_first(records)):
+        assert np.array_equal(np.sort(order), np.arange(len(records)))
+    value = paper_priority(records)[by_paper[0]]
+    assert np.all(np.diff(value) <= 0)
 
 
 def test_two_sessions_are_the_same_bit_for_bit(team: Any, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.frontend import bundle
-from pipeline.frontend.bundle import optimise, overlapping
+from pipeline.frontend.bundle import Neighbourhood, optimise
 from pipeline.frontend.config import KeyframeConfig, LoopConfig, RelocalisationConfig
 from pipeline.frontend.keyframes import KeyframePair, refine
 from pipeline.frontend.loops import find_loops
@@ -181,7 +181,7 @@ def test_known_overlaps_and_foreign_places_are_no_loops(circle: Walk) -> None:
 
 def test_overlapping_pairs_are_those_that_see_each_other(circle: Walk) -> None:
     config = KeyframeConfig(optimisation_neighbours=3)
-    pairs = overlapping(circle.truth, circle.views, config)
+    pairs = Neighbourhood(circle.views, config).pairs(circle.truth)
     assert (0, 16) in pairs
     assert (0, 8) not in pairs
     assert all(first < second for first, second in pairs)

@@ -15,9 +15,9 @@ CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 CONFIG = FusionConfig(
     explained_opacity=0.0
 )  # what was measured explains, though these maps draw hardly anything
-# every robot ends with the same Gaussian; nothing is measured
+# every robot ends with the same Gaussian
 ALIKE = FusionConfig(
-    association="members", scatter_support=10**12, scatter_position_m=0.004, scatter_log_covariance=0.14
+    association="members", scatter_position_m=0.004, scatter_log_covariance=0.14, explained_opacity=0.0
 )
 MATCHING = MatchingConfig()
 NAMES = ("alpha", "bravo", "charlie")

@@ -9,7 +9,7 @@ import pytest
 from tests.fuzz.readers import READERS
 
 QUICK = ("recording", "run", "config", "g2o", "csv", "map-ply", "ros1", "ros2-db3", "mcap-json")
-OPEN3D = ("scene-obj", "scene-ply")  # its readers of meshes crash on some files; docs/recordings.md says so
+OPEN3D = ("scene-obj", "scene-ply")  # its readers of meshes crash on some files; docs/checks.md says so
 
 
 def fuzz(count: int, *names: str) -> None:

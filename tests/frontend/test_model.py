@@ -1,0 +1,83 @@
+"""Frames registered to a map: noise goes where the map is better than one view, exact poses stay where it is worse."""
+
+import numpy as np
+import pytest
+
+from pipeline.frontend.config import ModelConfig
+from pipeline.frontend.failure import Reason
+from pipeline.frontend.mapping import Mapper
+from pipeline.frontend.mapping_config import MappingConfig
+from pipeline.frontend.model import ModelTracker
+from pipeline.frontend.tracking import Status, TrackedFrame
+from pipeline.geometry import se3
+from pipeline.recording import RgbdFrame
+from pipeline.registration import RegistrationConfig
+from pipeline.splat.gaussians import Gaussians
+from tests.registration.room import CAMERA, pose, render
+
+KEYFRAME = pose(z=-0.9)
+FRAME = pose(x=0.06, z=-0.88, yaw=0.04)
+T_KEYFRAME_FRAME = se3.inverse(KEYFRAME) @ FRAME
+OFF = se3.exp(np.array([0.006, -0.004, 0.005, 0.003, -0.004, 0.002]))
+CONFIG = ModelConfig(level=0, strides=(2, 1, 1))
+
+
+def image(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    gray, depth = render(T_world_camera)
+    return np.repeat(np.rint(255 * np.clip(gray, 0, 1)).astype(np.uint8)[..., None], 3, axis=2), depth
+
+
+@pytest.fixture(scope="module")
+def gaussians() -> Gaussians:
+    """The room from three places; the map frame is the keyframe's camera."""
+    mapper = Mapper(CAMERA, MappingConfig(max_gaussians=6000, iterations=20), seed=0)
+    for k, T in enumerate((KEYFRAME, pose(x=-0.1, z=-0.9), pose(x=0.12, z=-0.85, yaw=0.05))):
+        mapper.add_keyframe(k, *image(T), se3.inverse(KEYFRAME) @ T)
+    return mapper.gaussians
+
+
+def tracked(sigma_m: float) -> TrackedFrame:
+    """The frame, a few millimetres and milliradians from where it is."""
+    information = np.diag([sigma_m**-2.0] * 6)
+    T = T_KEYFRAME_FRAME @ OFF
+    return TrackedFrame(1, 10, 0, T, information, Status.OK, 0.9, 0.001, 0.01, Reason.NONE)
+
+
+def seen(color: np.ndarray | None = None) -> RgbdFrame:
+    exact, depth = image(FRAME)
+    return RgbdFrame(1, 10, exact if color is None else color, depth)
+
+
+def tracker(gaussians: Gaussians, config: ModelConfig = CONFIG, threads: int = 1) -> ModelTracker:
+    return ModelTracker(gaussians, "blended", CAMERA, config, RegistrationConfig(), threads)
+
+
+def test_a_poor_pose_becomes_a_good_one(gaussians: Gaussians) -> None:
+    before = tracked(0.02)
+    after = tracker(gaussians).refine(before, seen(), np.eye(4))
+    error = [se3.distance(f.T_keyframe_camera, T_KEYFRAME_FRAME) for f in (before, after)]
+    assert error[1][0] < 0.4 * error[0][0]
+    assert error[1][1] < 0.4 * error[0][1]
+    np.testing.assert_array_equal(after.information, before.information)
+    assert (after.frame_index, after.status, after.keyframe_index) == (1, Status.OK, 0)
+
+
+def test_a_pose_that_is_known_better_stays(gaussians: Gaussians) -> None:
+    model = tracker(gaussians, CONFIG.model_copy(update={"patience": 2}))
+    sure = tracked(1e-6)
+    assert model.refine(sure, seen(), np.eye(4)) is sure
+    assert model.pays
+    assert model.refine(sure, seen(), np.eye(4)) is sure
+    assert not model.pays
+
+
+def test_a_frame_that_the_map_does_not_show_stays(gaussians: Gaussians) -> None:
+    poor, elsewhere = tracked(0.02), pose(yaw=np.pi)
+    assert tracker(gaussians).refine(poor, seen(), se3.inverse(KEYFRAME) @ elsewhere) is poor
+    assert tracker(Gaussians.empty()).refine(poor, seen(), np.eye(4)) is poor
+
+
+def test_threads_change_no_bit_and_the_setting_turns_it_off(gaussians: Gaussians) -> None:
+    one, three = (tracker(gaussians, threads=n).refine(tracked(0.02), seen(), np.eye(4)) for n in (1, 3))
+    np.testing.assert_array_equal(one.T_keyframe_camera, three.T_keyframe_camera)
+    assert not tracker(gaussians, ModelConfig(enabled=False)).pays
