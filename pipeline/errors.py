@@ -9,6 +9,13 @@ class DuagError(Exception):
     The command line prints the line and exits with 1; anything else that is raised is a bug.
     """
 
+    def __str__(self) -> str:
+        """One printable line, whatever names of topics and files it holds."""
+        text = super().__str__()
+        if text.isprintable():
+            return text
+        return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
 
 def closest(word: str, known: Sequence[str], kind: str) -> str:
     """The end of a line about a wrong name: what was perhaps meant, else what there is, else that no `kind` is."""

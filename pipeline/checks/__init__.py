@@ -136,7 +136,8 @@ def format_report(report: Report) -> str:
     e = report.estimate
     unit, name = (60, "minutes") if e["seconds_to"] > 120 else (1, "seconds")
     span = f"{e['seconds_from'] / unit:.0f} to {e['seconds_to'] / unit:.0f} {name}"
-    out.append(f"a run takes about {span} on two cores, and {e['bytes'] / 1e6:.0f} MB of disk")
+    if report.robots:
+        out.append(f"a run takes about {span} on two cores, and {e['bytes'] / 1e6:.0f} MB of disk")
     out += lines(report.findings)
     counts = [f"{len(found)} {s.value}{'s' * (len(found) != 1)}" for s in Severity if (found := report.of(s))]
     return "\n".join([*out, ", ".join(counts) or "nothing found"])

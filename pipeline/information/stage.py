@@ -26,6 +26,7 @@ from schemas import topics
 
 MAD_TO_SIGMA = 1.4826
 CORRELATION_VIEWS = 8
+MEDIAN_PX = 5
 NEAR_M = 0.05  # points closer to a camera than this are not judged by it
 FLOOR_TOLERANCE = 1e-3  # of a log-scale; float32 logs of metres are good to 1e-6
 _UPPER = np.triu_indices(9)
@@ -319,16 +320,19 @@ def surface_deviation(
 
     Splats that overlap make up for each other's places: where a sum of them is drawn to a millimetre, each may be a
     centimetre off, and no pixel tells. What tells is the depth image itself: root mean square, over the views that
-    measured a surface within the gate, of the mean's distance from the tangent plane at its pixel. The median over all
+    measured a surface within the gate, of the mean's distance from the tangent plane at its pixel (of the depth's
+    median over 5 x 5 px, or the sensor's noise would pass for the map's deviation). The median over all
     Gaussians counts as half a view more, and stands alone where a Gaussian was never measured; without any, the gate.
     """
+    import cv2
+
     means, n = gaussians.means.astype(np.float64), len(gaussians)
     squares, count = np.zeros(n), np.zeros(n)
     for view in views:
         usable = view.depth_m if view.mask is None else np.where(view.mask, view.depth_m, np.float32(0))
-        rows, distance_m = _from_tangent_planes(
-            se3.transform(se3.inverse(view.T_map_camera), means), usable, camera
-        )
+        smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(usable), MEDIAN_PX), dtype=np.float32)
+        points = se3.transform(se3.inverse(view.T_map_camera), means)
+        rows, distance_m = _from_tangent_planes(points, smooth, camera)
         near = np.abs(distance_m) < gate_m
         squares[rows[near]] += distance_m[near] ** 2
         count[rows[near]] += 1

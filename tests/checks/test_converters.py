@@ -35,7 +35,12 @@ FIXTURES: dict[str, tuple[str, Callable[[Path], Path], list[str]]] = {
 }
 
 
-@pytest.mark.parametrize("name", FIXTURES)
+SLOW = ("tum", "bonn", "icl-nuim", "7scenes", "kimera-multi")  # seconds of rendering and registering each
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in FIXTURES]
+)
 def test_fixtures_pass(tmp_path: Path, name: str) -> None:
     dataset, make, options = FIXTURES[name]
     converters.convert(dataset, make(tmp_path / "data"), tmp_path / "recording", options=options)

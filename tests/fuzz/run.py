@@ -133,7 +133,7 @@ def _child(reader: Reader, src: Path, out: Path, said: Path) -> None:
             code, text = 0, ""
         except DuagError as error:
             code, text = 1, str(error)
-            if "\n" in text.replace(str(src), ""):
+            if not text.isprintable():
                 code, text = FAILED, f"an error of several lines: {text}"
         except BaseException:
             text = traceback.format_exc()
