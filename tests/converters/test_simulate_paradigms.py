@@ -91,7 +91,7 @@ def test_lines_cross_or_run_side_by_side(room):
     assert np.abs(np.diff(headings)).min() > np.deg2rad(8)
     ways = ways_of(room, "parallel")
     headings = np.unwrap([heading(way) for way in ways])
-    assert np.ptp(headings) < np.deg2rad(12)
+    assert np.ptp(headings) < np.deg2rad(20)  # they give way to furniture
     gaps = [nearest(a, b) for a, b in pairwise(ways)]
     assert min(gaps) > 0.2
 
