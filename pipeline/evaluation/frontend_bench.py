@@ -38,7 +38,7 @@ SCHEMA = 1
 OPEN3D = {"Open3D, hybrid": "Hybrid", "Open3D, point-to-plane": "PointToPlane"}
 DEPTH_MAX_M = 10.0
 
-WITHOUT_MAP = "no model refinement"
+WITHOUT_MAP = "all"
 # What changes against the configuration given, all without a map. The order is that of the table.
 ABLATION: dict[str, dict[str, Any]] = {
     WITHOUT_MAP: {},

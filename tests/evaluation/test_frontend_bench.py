@@ -26,7 +26,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def result(recording: Path) -> dict:
-    config = bench.changed(FrontendConfig(), MAPPING)
+    config = bench.changed(FrontendConfig(), {**MAPPING, "model.enabled": True})
     return bench.run(bench.Plan(recording, config, caps=(400, 3000), robots=("bravo",)))
 
 

@@ -19,7 +19,7 @@ KEYFRAME = pose(z=-0.9)
 FRAME = pose(x=0.06, z=-0.88, yaw=0.04)
 T_KEYFRAME_FRAME = se3.inverse(KEYFRAME) @ FRAME
 OFF = se3.exp(np.array([0.006, -0.004, 0.005, 0.003, -0.004, 0.002]))
-CONFIG = ModelConfig(level=0, strides=(2, 1, 1))
+CONFIG = ModelConfig(enabled=True, level=0, strides=(2, 1, 1))
 
 
 def image(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
