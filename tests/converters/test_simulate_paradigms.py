@@ -55,6 +55,17 @@ def test_an_overlap_asked_for_is_met_within_a_tenth(room):
         assert shared_view(eye, one, other) == pytest.approx(overlap, abs=0.1)
 
 
+def test_a_short_curve_that_gives_way_keeps_its_length(room):
+    ground = paradigms._Ground(room, _camera((160, 120)))
+    short = np.linspace(0, 0.12, 12)[:, None] * [1.0, 0.0]
+    free = room.free_space()
+    places = free.low + np.argwhere(~free.inside)[::7] * free.cell_m
+    bent = [way for place in places if (way := ground.bent(place + short)) is not None]
+    assert len(bent) > 10
+    for way in bent:
+        assert np.linalg.norm(np.diff(way, axis=0), axis=1).sum() > 0.7 * 0.12 - 1e-9
+
+
 @pytest.mark.parametrize("robots", [2, 5, 8])
 def test_circles_have_one_middle_and_different_radii(robots):
     """Before they give way to furniture."""
