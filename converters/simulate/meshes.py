@@ -7,30 +7,23 @@ sides of a triangle look the same.
 """
 
 import hashlib
-import os
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from converters.mesh_reader import LEVELS, NO_TEXTURE, texture_file
+from converters.simulate import mesh_process
 from pipeline.errors import DuagError
-from pipeline.progress import track
+from pipeline.files import check_file
 
 Array = NDArray[np.float64]
 
 UP_OF_SUFFIX = {".glb": "y", ".gltf": "y", ".obj": "y", ".ply": "z"}  # glTF says so, the others by custom
 UPS = ("auto", "y", "z")
-LEVELS = 6
-NO_TEXTURE = -1
-WHITE = 255
 ARRAYS = ("vertices", "triangles", "texels", "texture_of", "colors")
-MAX_VERTICES = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -136,6 +129,8 @@ def mesh_files(folder: Path) -> list[Path]:
         raise DuagError(f"{folder}: {error.strerror or error}, expected a folder of meshes") from error
     if not files:
         raise DuagError(f"{folder}: found no mesh, expected files {_suffixes()}")
+    for path in files:
+        check_file(path, "a mesh")
     return files
 
 
@@ -146,9 +141,14 @@ def _suffixes() -> str:
 def digests(files: list[Path]) -> dict[str, str]:
     """SHA-256 of every file by its name."""
     try:
-        return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+        return {path.name: _digest(path) for path in files}
     except OSError as error:
         raise DuagError(f"{error.filename}: {error.strerror or error}, expected a mesh") from error
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def up_axis(files: list[Path], up: str) -> str:
@@ -180,34 +180,7 @@ def read(folder: Path, up: str, cache: Path) -> MeshScene:
     Raises:
         DuagError: no folder, no mesh, a file that cannot be read, or one with neither texture nor colours.
     """
-    files = mesh_files(folder)
-    parts: list[_Part] = []
-    textures = 0
-    for path in track(files, "read meshes"):
-        for part, image in _parts(path):
-            if image is not None:
-                _store_texture(cache, textures, image)
-                part = _Part(part.vertices, part.triangles, part.texels, textures, part.colors)
-                textures += 1
-            parts.append(part)
-    if sum(len(part.triangles) for part in parts) == 0:
-        raise DuagError(f"{folder}: found no triangle, expected meshes")
-    starts = np.cumsum([0] + [len(part.vertices) for part in parts])
-    if starts[-1] > MAX_VERTICES:
-        raise DuagError(f"{folder}: found {starts[-1]} vertices, expected at most {MAX_VERTICES}")
-    vertices = np.concatenate([part.vertices for part in parts])
-    if up == "y":
-        vertices = np.stack([vertices[:, 0], -vertices[:, 2], vertices[:, 1]], axis=1)
-    arrays = {
-        "vertices": vertices,
-        "triangles": np.concatenate([p.triangles + s for p, s in zip(parts, starts[:-1], strict=True)]),
-        "texels": np.concatenate([p.texels for p in parts]),
-        "texture_of": np.concatenate([np.full(len(p.triangles), p.texture) for p in parts]),
-        "colors": np.concatenate([p.colors for p in parts]),
-    }
-    kinds = {"triangles": np.int32, "texels": np.float32, "texture_of": np.int32, "colors": np.uint8}
-    for name, values in arrays.items():
-        np.save(cache / f"{name}.npy", values.astype(kinds.get(name, np.float64)))
+    mesh_process.read(mesh_files(folder), up, cache)
     return load(cache)
 
 
@@ -219,130 +192,6 @@ def load(cache: Path) -> MeshScene:
         files = [cache / texture_file(len(textures), k) for k in range(LEVELS)]
         textures.append([np.asarray(np.load(path, mmap_mode="r")) for path in files if path.exists()])
     return MeshScene(**arrays, textures=textures)
-
-
-@dataclass(frozen=True)
-class _Part:
-    """A part of a file with one texture or none; as in `MeshScene`, in the axes of the file."""
-
-    vertices: Array
-    triangles: NDArray[np.int32]
-    texels: NDArray[np.float32]
-    texture: int
-    colors: NDArray[np.uint8]
-
-
-def _parts(path: Path) -> Iterator[tuple[_Part, NDArray[np.uint8] | None]]:
-    """The parts of a file, each with its texture, uint8 [h, w, 3], if it has one."""
-    import open3d as o3d
-
-    materials: list[Any] = []
-    try:
-        with _silence():
-            if path.suffix.lower() == ".ply":  # the reader of models knows no PLY, the other one few textures
-                meshes = [(o3d.io.read_triangle_mesh(path), -1, "the mesh")]
-            else:
-                model = o3d.io.read_triangle_model(path)  # type: ignore[arg-type]
-                meshes = [(part.mesh, part.material_idx, f"part {part.mesh_name!r}") for part in model.meshes]
-                materials = model.materials
-    except RuntimeError as error:
-        raise DuagError(f"{path}: {str(error).splitlines()[0]}, expected a mesh") from error
-    meshes = [each for each in meshes if len(each[0].triangles)]
-    if not meshes:
-        raise DuagError(f"{path}: found no triangle, or a file that cannot be read; expected a mesh")
-    images = [_texture(materials, index) for _, index, _ in meshes]
-    painted = any(image is not None for image in images) or any(m.has_vertex_colors() for m, _, _ in meshes)
-    for (mesh, index, name), image in zip(meshes, images, strict=True):
-        flat = _flat_color(path, materials, index) if painted else None
-        yield _part(path, name, mesh, image, flat), image
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Keep the words of C libraries from standard error: what is wrong with a file is said in one line."""
-    sys.stderr.flush()
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
-
-
-def _texture(materials: Any, index: int) -> NDArray[np.uint8] | None:
-    """The base colour texture of a material, uint8 [h, w, 3], or None."""
-    if not 0 <= index < len(materials) or materials[index].albedo_img is None:
-        return None
-    image = np.asarray(materials[index].albedo_img)
-    if image.size == 0:
-        return None
-    if image.dtype == np.uint16:
-        image = (image >> 8).astype(np.uint8)
-    if image.ndim == 2:
-        image = image[..., None]
-    if image.shape[2] < 3:
-        image = np.repeat(image[..., :1], 3, axis=2)
-    return np.ascontiguousarray(image[..., :3])
-
-
-def _flat_color(path: Path, materials: list[Any], index: int) -> NDArray[np.uint8] | None:
-    """The one colour of a material, uint8 [3]; for parts without texture beside others that have one."""
-    if not 0 <= index < len(materials):
-        return None
-    color = np.clip(np.asarray(materials[index].base_color, dtype=np.float64)[:3], 0, 1)
-    if path.suffix.lower() in (".glb", ".gltf"):  # linear there, everything else here is sRGB
-        color = np.where(color <= 0.0031308, 12.92 * color, 1.055 * color ** (1 / 2.4) - 0.055)
-    return np.rint(255 * color).astype(np.uint8)
-
-
-def _part(
-    path: Path, name: str, mesh: Any, image: NDArray[np.uint8] | None, flat: NDArray[np.uint8] | None
-) -> _Part:
-    """A part as arrays; `flat` is its colour if it has neither a texture nor colours of its vertices."""
-    vertices = np.asarray(mesh.vertices, dtype=np.float64)
-    triangles = np.asarray(mesh.triangles, dtype=np.int32)
-    if not np.isfinite(vertices).all():
-        raise DuagError(f"{path}: {name} has vertices that are not finite, expected metres")
-    texels = np.zeros((len(triangles), 3, 2), dtype=np.float32)
-    colors = np.full(vertices.shape, WHITE, dtype=np.uint8)
-    if image is not None:
-        uvs = np.asarray(mesh.triangle_uvs)
-        if len(uvs) != 3 * len(triangles):
-            raise DuagError(
-                f"{path}: {name} has a texture and {len(uvs)} texture coordinates, expected {3 * len(triangles)}"
-            )
-        height, width = image.shape[:2]
-        u, v = uvs.reshape(-1, 3, 2).transpose(2, 0, 1)
-        texels = np.stack([u * width - 0.5, (1 - v) * height - 0.5], axis=-1).astype(np.float32)
-        if not np.isfinite(texels).all():
-            raise DuagError(f"{path}: {name} has texture coordinates that are not finite, expected 0 to 1")
-    elif mesh.has_vertex_colors():
-        colors = np.clip(np.rint(255 * np.asarray(mesh.vertex_colors)), 0, 255).astype(np.uint8)
-    elif flat is not None:
-        colors[:] = flat
-    else:
-        raise DuagError(f"{path}: {name} has neither a texture nor colours of its vertices, expected one")
-    return _Part(vertices, triangles, texels, NO_TEXTURE, colors)
-
-
-def texture_file(texture: int, level: int) -> str:
-    """Name of the file with one mip level of a texture."""
-    return f"texture-{texture}-{level}.npy"
-
-
-def _store_texture(cache: Path, texture: int, image: NDArray[np.uint8]) -> None:
-    """Write a texture and its mip levels, each the mean of 2 x 2 texels of the one before."""
-    level = image
-    for k in range(LEVELS):
-        np.save(cache / texture_file(texture, k), level)
-        height, width = level.shape[:2]
-        if min(height, width) < 2:
-            return
-        level = np.asarray(
-            cv2.resize(level, (width // 2, height // 2), interpolation=cv2.INTER_AREA), dtype=np.uint8
-        )
 
 
 def surface_points(

@@ -374,7 +374,11 @@ def read_scene(src: Path, out: Path) -> None:
     files = meshes.mesh_files(src / "scene")
     (out / "cache").mkdir()
     meshes.read(src / "scene", meshes.up_axis(files, "auto"), out / "cache")
-    meshes.load(out / "cache")
+    scene = meshes.load(out / "cache")
+    areas = scene.areas()
+    assert np.isfinite(areas).all()
+    if areas.sum() > 0:
+        meshes.surface_points(scene, areas, 1000, np.random.default_rng(0))
 
 
 CSV_COLUMNS = "robot_src,pose_src,robot_dst,pose_dst,qx,qy,qz,qw,tx,ty,tz,kappa,tau"

@@ -9,7 +9,6 @@ import pytest
 from tests.fuzz.readers import READERS
 
 QUICK = ("recording", "run", "config", "g2o", "csv", "map-ply", "ros1", "ros2-db3", "mcap-json")
-OPEN3D = ("scene-obj", "scene-ply")  # its readers of meshes crash on some files; docs/checks.md says so
 
 
 def fuzz(count: int, *names: str) -> None:
@@ -23,7 +22,11 @@ def test_damaged_input_ends_with_one_line_or_a_sound_result() -> None:
     fuzz(8, *QUICK)
 
 
+def test_damaged_meshes_end_with_one_line_or_a_sound_result() -> None:
+    fuzz(3, "scene-glb", "scene-obj", "scene-ply")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(set(READERS) - set(OPEN3D)))
+@pytest.mark.parametrize("name", sorted(READERS))
 def test_more_damaged_input(name: str) -> None:
     fuzz(200, name)
