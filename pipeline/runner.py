@@ -56,6 +56,17 @@ class RunConfig(Config):
                 )
         return self
 
+    @model_validator(mode="after")
+    def _one_mask(self) -> Self:
+        """What the map was not made of is in no Fisher sum, and the fused map is not trained on it."""
+        for name, other in (
+            ("information.moving", self.information.moving),
+            ("fusion.refine.moving", self.fusion.refine.moving),
+        ):
+            if other != self.frontend.moving:
+                raise ValueError(f"{name} is {other}, expected frontend.moving: {self.frontend.moving}")
+        return self
+
 
 class Timing:
     """Wall time, processor time and peak memory per stage; not part of any digest."""

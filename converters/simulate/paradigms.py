@@ -7,6 +7,7 @@ look, follows from the share of the view that neighbours shall have in common: i
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice, pairwise
 
 import numpy as np
@@ -105,7 +106,8 @@ def _line(figure: Figure, turn_rad: float, aside_m: float, along_m: float) -> Ar
     return np.asarray(figure.middle + aside_m * left + s[:, None] * ahead)
 
 
-FIGURES: dict[str, Callable[[Figure, int, float], list[Array]]] = {
+Shape = Callable[[Figure, int, float], list[Array]]  # the robots' curves at a spread
+FIGURES: dict[str, Shape] = {
     "concentric": _circles,
     "crossing": _crossing,
     "parallel": _parallel,
@@ -260,78 +262,84 @@ def _length(curve: Array) -> float:
     return float(np.linalg.norm(np.diff(curve, axis=0), axis=1).sum())
 
 
+def _free(places: Iterator[Place]) -> Iterator[Place]:
+    """The first places whose ways are free at a middling spread."""
+    return islice((place for place in places if place(SPREADS[1]) is not None), PLACES)
+
+
 def _figures(ground: _Ground, paradigm: str, robots: int, frames: int, seed: int) -> Iterator[Place]:
     """Places where a figure is free, the largest first."""
-    space, shape = ground.space, FIGURES[paradigm]
+    space = ground.space
     extent = float(np.ptp(space.cells, axis=0).max())
     share = space.clearance / space.clearance.sum()
-    for size in SIZES:
-        found = 0
+
+    def drawn(size: float, attempt: int) -> Place:
         length = size * (frames - 1) * ground.terrain.step_m
-        for attempt in range(DRAWS):
-            rng = streams.generator(
-                seed, "simulate.figure", paradigm=paradigm, size=str(size), attempt=attempt
-            )
-            middle = space.cells[rng.choice(len(share), p=share)]
-            if paradigm == "concentric":
-                middle = middle + rng.normal(0, 0.1 * extent, 2)
-                reach = float(rng.uniform(0.8, max(1.0, 0.4 * extent))) * size
-            else:
-                reach = float(rng.uniform(0.3, 1.2)) * max(1.0, 0.35 * length) * size
-            figure = Figure(middle, float(rng.uniform(0, 2 * np.pi)), length, reach)
+        rng = streams.generator(seed, "simulate.figure", paradigm=paradigm, size=str(size), attempt=attempt)
+        middle = space.cells[rng.choice(len(share), p=share)]
+        if paradigm == "concentric":
+            middle = middle + rng.normal(0, 0.1 * extent, 2)
+            reach = float(rng.uniform(0.8, max(1.0, 0.4 * extent))) * size
+        else:
+            reach = float(rng.uniform(0.3, 1.2)) * max(1.0, 0.35 * length) * size
+        figure = Figure(middle, float(rng.uniform(0, 2 * np.pi)), length, reach)
+        return partial(_ways_of_figure, ground, FIGURES[paradigm], figure, robots, frames, seed)
 
-            def place(spread: float, figure: Figure = figure) -> list[_Way] | None:
-                ways = []
-                curves = shape(figure, robots, spread)
-                if ground.margin(np.concatenate(curves)).min() < GIVE_WAY_M - 0.95:
-                    return None
-                for robot, curve in enumerate(curves):
-                    bent = ground.bent(curve)
-                    if bent is None:
-                        return None
-                    way = ground.way(bent, 0.0, _length(bent), robot, frames, seed)
-                    if way is None:
-                        return None
-                    ways.append(way)
-                return ways
+    for size in SIZES:
+        yield from _free(drawn(size, attempt) for attempt in range(DRAWS))
 
-            if place(SPREADS[1]) is not None:
-                yield place
-                found += 1
-                if found == PLACES:
-                    break
+
+def _ways_of_figure(
+    ground: _Ground, shape: Shape, figure: Figure, robots: int, frames: int, seed: int, spread: float
+) -> list[_Way] | None:
+    """The robots' ways along the curves of a figure, bent aside where they must; None if one is not free."""
+    curves = shape(figure, robots, spread)
+    if ground.margin(np.concatenate(curves)).min() < GIVE_WAY_M - 0.95:
+        return None
+    ways = []
+    for robot, curve in enumerate(curves):
+        bent = ground.bent(curve)
+        way = None if bent is None else ground.way(bent, 0.0, _length(bent), robot, frames, seed)
+        if way is None:
+            return None
+        ways.append(way)
+    return ways
 
 
 def _followers(ground: _Ground, paradigm: str, robots: int, frames: int, seed: int) -> Iterator[Place]:
     """Routes along which one robot leads and the others follow, each behind the one before by the spread."""
     graph = ground.space.graph.tocsr()
-    for size in SIZES:
-        found = 0
+
+    def drawn(size: float, attempt: int) -> Place:
         length = size * (frames - 1) * ground.terrain.step_m
         longest = min(length, 5.0, 15.0 / max(robots - 1, 1))
-        for attempt in range(DRAWS // 8):
-            rng = streams.generator(seed, "simulate.lead", size=str(size), attempt=attempt)
-            total = length + (robots - 1) * longest
-            curve = route(ground.space, graph, total + 1.5, rng)
+        rng = streams.generator(seed, "simulate.lead", size=str(size), attempt=attempt)
+        curve = route(ground.space, graph, length + (robots - 1) * longest + 1.5, rng)
+        return partial(_ways_behind, ground, curve, length, longest, robots, frames, seed)
 
-            def place(
-                spread: float, curve: Array = curve, length: float = length, longest: float = longest
-            ) -> list[_Way] | None:
-                lag = min(APART_M, longest) + spread * (longest - min(APART_M, longest))
-                ways = []
-                for robot in range(robots):
-                    start = 0.5 + (robots - 1 - robot) * lag
-                    way = ground.way(curve, start, length, robot, frames, seed)
-                    if way is None:
-                        return None
-                    ways.append(way)
-                return ways
+    for size in SIZES:
+        yield from _free(drawn(size, attempt) for attempt in range(DRAWS // 8))
 
-            if place(SPREADS[1]) is not None:
-                yield place
-                found += 1
-                if found == PLACES:
-                    break
+
+def _ways_behind(
+    ground: _Ground,
+    curve: Array,
+    length: float,
+    longest: float,
+    robots: int,
+    frames: int,
+    seed: int,
+    spread: float,
+) -> list[_Way] | None:
+    """The robots' ways along one curve, each behind the one before, at most by `longest` m; None if one is not free."""
+    lag = min(APART_M, longest) + spread * (longest - min(APART_M, longest))
+    ways = []
+    for robot in range(robots):
+        way = ground.way(curve, 0.5 + (robots - 1 - robot) * lag, length, robot, frames, seed)
+        if way is None:
+            return None
+        ways.append(way)
+    return ways
 
 
 def _by_overlap(ground: _Ground, place: Place, overlap: float) -> Iterator[tuple[float, list[Array]]]:

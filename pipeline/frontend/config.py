@@ -219,4 +219,4 @@ class FrontendConfig(Config):
     mapping: MappingConfig = MappingConfig()
     model: ModelConfig = ModelConfig()
     moving: MovingConfig = MovingConfig()
-    """What moves, by depth: not mapped. `information.moving` keeps the same out of the Fisher sums."""
+    """What moves, by depth: not mapped. `information.moving` and `fusion.refine.moving` must be the same."""

@@ -26,7 +26,7 @@ class RefineConfig(Config):
     rates: LearningRates = LearningRates()
     loss: LossConfig = LossConfig()
     moving: MovingConfig = MovingConfig()
-    """What moves, by depth, is not trained on; as in the front end."""
+    """What moves, by depth, is not trained on; must be `frontend.moving`."""
 
 
 class FusionConfig(Config):

@@ -30,6 +30,6 @@ class InformationConfig(Config):
     deviation_gate_m: float = Field(default=0.1, gt=0.0)
     """A surface measured farther than this from a Gaussian is another one's."""
     moving: MovingConfig = MovingConfig()
-    """What moves, by depth, is in no sum; as in the front end."""
+    """What moves, by depth, is in no sum; must be `frontend.moving`."""
     thickness_floor_m: float = THICKNESS_FLOOR_M
     """Log-scales at this floor carry no information; must be the floor that the map was made with."""
