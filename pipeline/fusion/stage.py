@@ -20,7 +20,7 @@ from pipeline.fusion.refine import View, refine
 from pipeline.geometry.trajectory import Trajectory, write_tum
 from pipeline.messages import WORLD_FRAME, CorrectedKeyframes, GaussianInformation, GaussianMap, Odometry
 from pipeline.recording import LogWriter, open_rgbd, read_log
-from pipeline.registration.moving import FreeSpace
+from pipeline.registration.moving import FreeSpace, MovingConfig
 from pipeline.robot import AgentInput, AgentResult, RobotData, load
 from pipeline.splat.gaussians import DepthKind, Gaussians
 from pipeline.splat.ply import write_ply
@@ -35,6 +35,7 @@ def run_fusion(
     folder: Path,
     config: FusionConfig,
     matching: MatchingConfig,
+    moving: MovingConfig,
     weights: WeightKind = "block",
     *,
     seed: int = 0,
@@ -47,6 +48,7 @@ def run_fusion(
         result: what it took home from the session.
         folder: where the results go.
         matching: as the pairs of the session were found. weights: kind of the session.
+        moving: as the front end looked for what moves.
         seed: of the run. threads: of the rasterizer; changes no bit.
     Returns:
         The fused map, in the world frame.
@@ -71,7 +73,7 @@ def run_fusion(
     stamp_ns = frames[-1].stamp_ns
     refined = None
     if len(result.component) > 1:
-        views = _views(source, frames, result, config.refine)
+        views = _views(source, frames, result, config.refine, moving)
         info = own.information
         fused = weigh_by_own_pixels(
             fused,
@@ -102,7 +104,11 @@ def run_fusion(
 
 
 def _views(
-    source: AgentInput, frames: Sequence[Odometry], result: AgentResult, config: RefineConfig
+    source: AgentInput,
+    frames: Sequence[Odometry],
+    result: AgentResult,
+    config: RefineConfig,
+    moving: MovingConfig,
 ) -> list[View]:
     """The robot's keyframes and, evenly spread, frames between them, at their corrected poses; none held out."""
     topic = topics.KEYFRAME.of(source.robot)
@@ -112,7 +118,7 @@ def _views(
     middles = [others[(2 * k + 1) * len(others) // (2 * count)] for k in range(count)]
     views = []
     with open_rgbd(source.log) as log:
-        free = FreeSpace(log.camera, config.moving)
+        free = FreeSpace(log.camera, moving)
         for f in [*(f for f in frames if f.frame_index in keyframes), *middles]:
             frame = log.frame(f.frame_index)
             T_world_camera = result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera
