@@ -22,19 +22,22 @@ ROBOT = {
 VIEWS = {
     "views": int, "views_without_pose": int, "psnr_db": NUMBER, "ssim": NUMBER, "ms_ssim": NUMBER, "lpips": NUMBER,
     "st_lpips": NUMBER, "depth_l1_m": NUMBER, "depth_l1_exact_m": NUMBER,
-    "depth_l1_layer_m": NUMBER, "depth_completeness": NUMBER,
+    "depth_l1_layer_m": NUMBER, "depth_l1_common_m": NUMBER, "depth_completeness": NUMBER,
 }  # fmt: skip
+COMPARED = {
+    kind: {"held_out": VIEWS, "peers": VIEWS, "team": VIEWS}
+    for kind in ("own", "own_longer", "fused", "refined")
+}
 SCHEMA = {
     "schema": int,
-    "robots": {"alpha": ROBOT, "bravo": ROBOT},
+    "robots": dict.fromkeys(("alpha", "bravo"), ROBOT | {"rendering": COMPARED}),
     "team": {
         "robots": int, "robots_in_largest_component": int, "ate_rmse_m": NUMBER, "ate_rmse_m_mean_of_robots": NUMBER,
         "inter_robot_closures": int, "inter_robot_closures_rejected": int,
     },
     "rendering": {
-        **{kind: {"held_out": VIEWS, "training": VIEWS, "peers": VIEWS} for kind in ("own", "fused")},
+        **{kind: COMPARED[kind] | ({"training": VIEWS} if kind in ("own", "fused") else {}) for kind in COMPARED},
         "own_unrefined": {"held_out": VIEWS},
-        "refined": {"held_out": VIEWS, "peers": VIEWS},
     },
     "calibration": dict.fromkeys(
         ("ece_paper", "ece_rank", "ece_rank_shuffled", "spearman", "ause", "nll", "coverage_95", "nll_scaled",
@@ -54,8 +57,8 @@ SCHEMA = {
     "protocol": dict.fromkeys(
         ("alignment", "ate", "team_ate", "rpe", "depth_agreement",
          "initial_relative_poses", "held_out", "peers", "training", "poses",
-         "exposure", "own_unrefined", "refined", "background", "psnr", "ssim", "ms_ssim", "depth", "calibration",
-         "oracle"),
+         "exposure", "own_unrefined", "own_longer", "refined", "team", "common", "background", "psnr", "ssim",
+         "ms_ssim", "depth", "calibration", "oracle"),
         str,
     ),
 }  # fmt: skip
