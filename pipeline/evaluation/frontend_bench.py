@@ -25,8 +25,8 @@ import numpy as np
 
 from pipeline.errors import DuagError
 from pipeline.evaluation import groundtruth, trajectory_errors, views
+from pipeline.evaluation.rendering import PosedMap, RenderTask
 from pipeline.evaluation.results import Absent, split_reasons
-from pipeline.evaluation.stage import RenderTask
 from pipeline.frontend.config import FrontendConfig
 from pipeline.geometry.trajectory import Trajectory
 from pipeline.progress import track
@@ -486,8 +486,10 @@ def _map_errors(source: Recording, robot: RobotRun, estimated: Trajectory, threa
         if found is None:
             row[name] = Absent("the front end wrote no map before its refinement")
             continue
-        task = RenderTask(found.gaussians, robot, estimated, keyframes=False, depth=found.depth)
-        scores = views.summary([s for _, s in task.scores(source, threads, None)], "no view is held out")
+        task = RenderTask({name: PosedMap(found.gaussians, estimated)}, robot, "held_out", found.depth)
+        scores = views.summary(
+            [s[name] for _, s in task.scores(source, threads, None)], "no view is held out"
+        )
         kept = ("views", "psnr_db", "ssim", "depth_l1_m", "depth_l1_exact_m", "depth_l1_layer_m")
         row[name] = {key: scores[key] for key in (*kept, "depth_completeness")}
     return row

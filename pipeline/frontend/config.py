@@ -219,4 +219,4 @@ class FrontendConfig(Config):
     mapping: MappingConfig = MappingConfig()
     model: ModelConfig = ModelConfig()
     moving: MovingConfig = MovingConfig()
-    """What moves, by depth: not mapped. `information.moving` and `fusion.refine.moving` must be the same."""
+    """What moves, by depth: not mapped, in no Fisher sum, not trained on after fusion."""

@@ -5,7 +5,6 @@ from typing import Literal
 from pydantic import Field
 
 from pipeline.config import Config
-from pipeline.registration.moving import MovingConfig
 from pipeline.splat.losses import LossConfig
 from pipeline.splat.optimiser import LearningRates
 
@@ -25,8 +24,6 @@ class RefineConfig(Config):
     """They fall exponentially to this share."""
     rates: LearningRates = LearningRates()
     loss: LossConfig = LossConfig()
-    moving: MovingConfig = MovingConfig()
-    """What moves, by depth, is not trained on; must be `frontend.moving`."""
 
 
 class FusionConfig(Config):
