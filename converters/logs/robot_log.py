@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.choice import REGISTERED, Chooser
+from converters.logs.choice import REGISTERED, Chooser, video_words
 from converters.logs.clocks import RobotClock
 from converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
 from converters.logs.files import NANOSECONDS, Entry, Log, sound_time
@@ -80,7 +80,8 @@ class RobotLog:
         chooser = Chooser(self.log, self.namespace, s.model_dump())
         if not chooser.images:
             where = f" below {self.namespace}" if self.namespace else ""
-            raise DuagError(f"{self.name}: found no topic of images{where}, expected colour and depth")
+            video = video_words(self.log, self.namespace)
+            raise DuagError(f"{self.name}: found no topic of images{where}{video}; expected colour and depth")
         self.depth = chooser.depth().required(self.log, "depth")
         self.color = chooser.color().required(self.log, "color")
         self.color_camera = self._camera(self.color, "color_info", chooser)
