@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import DuagError
+from pipeline.files import read_text
 from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
@@ -46,10 +47,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 def read_tum(path: Path) -> Trajectory:
     """Read a TUM trajectory. Raises DuagError for a line that is not eight finite numbers."""
     stamps, rows = [], []
-    try:
-        text = path.read_text()
-    except OSError as error:
-        raise DuagError(f"{path}: {error.strerror or error}, expected a TUM trajectory") from error
+    text = read_text(path, "a TUM trajectory")
     for number, line in enumerate(text.splitlines(), start=1):
         fields = line.replace(",", " ").split()
         if not fields or fields[0].startswith("#"):
