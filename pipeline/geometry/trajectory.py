@@ -54,8 +54,8 @@ def read_tum(path: Path) -> Trajectory:
             continue
         try:
             row = [float(f) for f in fields[1:]]
-            stamp = _nanoseconds(fields[0])
-        except ValueError:
+            stamp = np.int64(_nanoseconds(fields[0]))
+        except (ValueError, OverflowError):
             row = []
         if len(row) != 7 or not np.all(np.isfinite(row)):
             raise DuagError(f"{path}: line {number} is {line.strip()[:60]!r}, expected eight finite numbers")
