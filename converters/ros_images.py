@@ -121,10 +121,10 @@ def rows_of(message: Any, where: str, dtype: str, channels: int) -> NDArray[Any]
             f"{where}: {len(message.data)} bytes with rows of {message.step}, expected {message.height} rows of at "
             f"least {used}"
         )
-    data = np.frombuffer(bytes(message.data), np.uint8)  # the last row may come without its padding
+    data = np.frombuffer(message.data, np.uint8)  # the last row may come without its padding
     step = message.step if message.height > 1 else used  # of a single row, nothing bounds it
-    rows = np.ascontiguousarray(as_strided(data, (message.height, used), (step, 1)))
-    return rows.view(kind).reshape(message.height, message.width, channels).astype(dtype)
+    rows = as_strided(data, (message.height, used), (step, 1), writeable=False).view(kind)
+    return rows.reshape(message.height, message.width, channels).astype(dtype)
 
 
 def color_bytes(message: Any, where: str) -> tuple[bytes, str]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from converters.logs import foxglove
+from converters.logs.bag_messages import messages
 from converters.logs.files import NANOSECONDS, Entry, Topic, sound_time, stamp_ns
 from pipeline.errors import DuagError
 from pipeline.files import check_file
@@ -56,22 +57,15 @@ class RosBag:
             kind = foxglove.ROS_TYPES.get(foxglove.plain_name(c.msgtype), c.msgtype)
             self.topics[c.topic] = Topic(c.topic, kind, c.msgtype, self._encoding, count)
 
-    def entries(self, topics: Sequence[str]) -> Iterator[Entry]:
-        connections = [c for c in self._reader.connections if c.topic in topics]
-        if not connections:
-            return
+    def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
+        heads = [t for t in heads if foxglove.plain_name(self.topics[t].schema) not in foxglove.ROS_TYPES]
         with reading(self.path, "a sound bag of ROS 1 or ROS 2"):
-            for connection, log_ns, raw in self._reader.messages(connections=connections):
+            for connection, log_ns, raw in messages(self._reader, topics, heads):
                 read = partial(self._read, connection, raw)
                 header = partial(ros_header_ns, raw, self._encoding, f"{self.path}: {connection.topic}")
                 if foxglove.plain_name(connection.msgtype) in foxglove.ROS_TYPES:
                     header = partial(_stamp_of, read)
                 time_ns = sound_time(log_ns, f"{self.path}: {connection.topic}")
-                if not isinstance(raw, bytes | memoryview):  # a database holds anything in any column
-                    kind = type(raw).__name__
-                    raise DuagError(
-                        f"{self.path}: {connection.topic} holds {kind}, expected the bytes of messages"
-                    )
                 yield Entry(connection.topic, time_ns, None, raw, read, header)
 
     def _read(self, connection: Any, raw: bytes) -> Any:
@@ -80,7 +74,8 @@ class RosBag:
         return foxglove.as_ros(foxglove.plain_name(connection.msgtype), message, where)
 
     def close(self) -> None:
-        self._reader.close()
+        with reading(self.path, "a sound bag of ROS 1 or ROS 2"):  # a database may notice its damage only now
+            self._reader.close()
 
 
 def _bound_chunks(reader: Any) -> None:
