@@ -50,6 +50,8 @@ class RosBag:
         self._encoding = "cdr" if self._reader.is2 else "ros1"
         self.topics: dict[str, Topic] = {}
         for c in self._reader.connections:
+            if not isinstance(c.msgcount, int):  # it stands in the metadata of a bag of ROS 2
+                raise DuagError(f"{path}: {c.topic} has {c.msgcount!r} messages, expected a number")
             count = c.msgcount + (self.topics[c.topic].count if c.topic in self.topics else 0)
             kind = foxglove.ROS_TYPES.get(foxglove.plain_name(c.msgtype), c.msgtype)
             self.topics[c.topic] = Topic(c.topic, kind, c.msgtype, self._encoding, count)
@@ -65,6 +67,11 @@ class RosBag:
                 if foxglove.plain_name(connection.msgtype) in foxglove.ROS_TYPES:
                     header = partial(_stamp_of, read)
                 time_ns = sound_time(log_ns, f"{self.path}: {connection.topic}")
+                if not isinstance(raw, bytes | memoryview):  # a database holds anything in any column
+                    kind = type(raw).__name__
+                    raise DuagError(
+                        f"{self.path}: {connection.topic} holds {kind}, expected the bytes of messages"
+                    )
                 yield Entry(connection.topic, time_ns, None, raw, read, header)
 
     def _read(self, connection: Any, raw: bytes) -> Any:

@@ -15,6 +15,7 @@ from pipeline.errors import DuagError
 from pipeline.evaluation import (
     calibration,
     depth_agreement,
+    feature_agreement,
     groundtruth,
     map_errors,
     trajectory_errors,
@@ -45,6 +46,7 @@ PROTOCOL = {
     "team_ate": "one alignment for all robots of the largest component, pooled root mean square",
     "rpe": "root mean square from each frame to the next",
     "depth_agreement": "pairs of at most 40 held-out views that share 30 % under all poses compared; median of medians",
+    "feature_agreement": "matched features of the same views, sifted by the images alone; median of medians",
     "initial_relative_poses": "unknown",
     "held_out": "index % 8 == 4",
     "training": "keyframes",
@@ -179,32 +181,35 @@ def _robot_section(robot: RobotRun, truth: TruePaths) -> dict[str, Any]:
 
 
 def _agreement_section(robot: RobotRun, source: Recording, truth: TruePaths) -> dict[str, Any]:
-    """How well the depth of held-out views agrees under the estimate, and under the ground truth where there is one."""
+    """How well held-out views agree under the estimate, and under the ground truth where there is one."""
     stamp_of = {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
-    paths = {
-        "depth_agreement_m": poses_by_stamp(robot.trajectory),
-        "depth_agreement_m_before_consensus": poses_by_stamp(robot.odometry),
-    }
+    paths = {"": poses_by_stamp(robot.trajectory), "_before_consensus": poses_by_stamp(robot.odometry)}
     section: dict[str, Any] = {}
     paired = truth.after[robot.robot]
-    if isinstance(paired, Absent):
-        section["depth_agreement_m_of_truth"] = paired
-    elif paired.positions_only:
-        section["depth_agreement_m_of_truth"] = trajectory_errors.NO_ROTATIONS
+    if isinstance(paired, Absent) or paired.positions_only:
+        absent = paired if isinstance(paired, Absent) else trajectory_errors.NO_ROTATIONS
+        section = {"depth_agreement_m_of_truth": absent, "feature_agreement_px_of_truth": absent}
     else:
-        paths["depth_agreement_m_of_truth"] = dict(zip(paired.stamps_ns.tolist(), paired.true, strict=True))
+        paths["_of_truth"] = dict(zip(paired.stamps_ns.tolist(), paired.true, strict=True))
     known = [i for i, stamp in stamp_of.items() if all(stamp in path for path in paths.values())]
     most = min(AGREEMENT_VIEWS, len(known))
     chosen = [known[(2 * k + 1) * len(known) // (2 * most)] for k in range(most)]
     with open_rgbd(source.log(robot.robot)) as log:
         frames = [log.frame(index) for index in chosen]
-        depths = [f.depth if f.mask is None else np.where(f.mask, f.depth, np.float32(0)) for f in frames]
-        poses = {
-            name: np.array([path[stamp_of[index]] for index in chosen]).reshape(-1, 4, 4)
-            for name, path in paths.items()
-        }
-        pairs, values = depth_agreement.depth_agreement(depths, log.camera, poses)
-    return {"depth_agreement_pairs": pairs} | values | section
+    depths = [f.depth if f.mask is None else np.where(f.mask, f.depth, np.float32(0)) for f in frames]
+    poses = {
+        name: np.array([path[stamp_of[index]] for index in chosen]).reshape(-1, 4, 4)
+        for name, path in paths.items()
+    }
+    pairs, by_depth = depth_agreement.depth_agreement(depths, log.camera, poses)
+    matched, by_features = feature_agreement.feature_agreement(
+        [f.color for f in frames], depths, log.camera, poses
+    )
+    section |= {"depth_agreement_pairs": pairs, "feature_agreement_pairs": matched}
+    for name in paths:
+        section[f"depth_agreement_m{name}"] = by_depth[name]
+        section[f"feature_agreement_px{name}"] = by_features[name]
+    return section
 
 
 def _ate_of_keyframes(robot: RobotRun, pairs: Paired) -> float | Absent:
