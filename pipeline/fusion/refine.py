@@ -3,10 +3,10 @@
 Consensus moves keyframes and fusion moves Gaussians; nobody asks the images whether the result still draws them. Some
 steps of the mapper's own kind do: colour and depth loss of the robot's keyframes and frames between them, never of
 held-out ones. Own images alone would teach the map to look right from where the robot stood and from nowhere else, so
-every few steps comes a view of a neighbour's map from where the neighbour stood (`peer_views`). Without such views only
-the robot's own Gaussians move: the few own views that see one taken over, from afar or through a door, know less of it
-than its owner's many. The information is that of before: what is learned here comes from the same pixels and is not
-counted again.
+every few steps comes a view of a neighbour's map from where the neighbour stood (`peer_views`); own images, which are
+no copies, have the last word. Without such views only the robot's own Gaussians move: the few own views that see one
+taken over, from afar or through a door, know less of it than its owner's many. The information is that of before: what
+is learned here comes from the same pixels and is not counted again.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ class View:
     depth_sigma_m: NDArray[np.float32] | None = None
 
 
+PEERS_UNTIL = 0.6
+"""Share of the steps after which only own images come."""
 _TRAINED = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
 
 
@@ -65,7 +67,7 @@ def refine(
     steps: tuple[int, int] | None = None,
 ) -> Gaussians:
     """The map after some steps, each on one view: own ones in random order, each once before any comes again, and
-    neighbours' likewise, evenly spread among them.
+    neighbours' likewise, evenly spread among the first.
 
     Args:
         gaussians: in the world frame of the views. trained: [n], which of them may change.
@@ -80,6 +82,7 @@ def refine(
     if not own_steps or not len(gaussians):
         return gaussians
     total = own_steps + peer_steps
+    head = max(peer_steps, round(PEERS_UNTIL * total))
     rasterizer, adam = Rasterizer(threads=threads), CompiledAdam(len(gaussians), threads=threads)
     weights = LossWeights(**config.loss.model_dump())
     floor = np.minimum(
@@ -87,7 +90,7 @@ def refine(
     )  # thinner ones stay as they are
     own, peer = _in_turn(views, seed, "fusion.refine"), _in_turn(peer_views, seed, "fusion.refine.peers")
     for step in range(total):
-        of_peer = (step + 1) * peer_steps // total > step * peer_steps // total
+        of_peer = step < head and (step + 1) * peer_steps // head > step * peer_steps // head
         view = next(peer if of_peer else own)
         certainty = None
         if view.depth_sigma_m is not None:
