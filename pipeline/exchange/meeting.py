@@ -27,6 +27,7 @@ from pipeline.consensus.closures import Closure, Group, consistent, drift, frame
 from pipeline.consensus.cycles import Proposal
 from pipeline.consensus.links import SharedKeyframes, link_metric
 from pipeline.exchange import injection, places, wire
+from pipeline.exchange.agreement import agreement, coarse_depth
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.packets import Kind, MalformedError
 from pipeline.exchange.places import Candidate, Planner
@@ -49,18 +50,25 @@ class OwnPlaces:
         self.data, self.config = data, config
         self._pyramid = lru_cache(maxsize=PYRAMIDS_KEPT)(self._build_pyramid)
         self._features: list[Features] | None = None
+        self._coarse_depths: list[NDArray[np.float32]] = []
         self.registrations = factors_of(data.registrations)
 
     @property
     def features(self) -> list[Features]:
         """All features of every keyframe."""
         if self._features is None:
-            most = self.config.places.features_per_keyframe
-            camera = self.data.camera
-            self._features = [
-                extract(*self.data.images(k)[:2], camera, most) for k in range(self.data.keyframes)
-            ]
+            self._features = []
+            for k in range(self.data.keyframes):
+                color, depth_m, _ = self.data.images(k)
+                most = self.config.places.features_per_keyframe
+                self._features.append(extract(color, depth_m, self.data.camera, most))
+                self._coarse_depths.append(coarse_depth(depth_m))
         return self._features
+
+    def agreement(self, samples: Sequence[NDArray[np.floating]], T_first_peer: Array) -> float:
+        """How well own depth images agree with a neighbour's samples [m, 3], keyframes at T_first_peer [k, 4, 4]."""
+        assert len(self.features) == len(self._coarse_depths)  # which reads the images
+        return agreement(self._coarse_depths, self.data.camera, self.T_first_keyframe, samples, T_first_peer)
 
     def pyramid(self, keyframe: int) -> RgbdPyramid:
         """Images of a keyframe at several resolutions."""
@@ -174,6 +182,7 @@ class LowerEnd(Meeting):
         self.book: PlaceBook | None = None
         self.planner: Planner | None = None
         self.waiting: dict[int, list[Candidate]] = {}  # by keyframe of the neighbour
+        self.samples: dict[int, NDArray[np.floating]] = {}  # points [m, 3] of a keyframe of the neighbour
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
         if kind is Kind.DESCRIPTORS and self.book is None:
@@ -182,6 +191,7 @@ class LowerEnd(Meeting):
             sample = wire.read_sample(payload, len(self.book.descriptors))
             if sample.keyframe not in self.waiting:
                 raise MalformedError(f"sample of keyframe {sample.keyframe} was not asked for, or came twice")
+            self.samples[sample.keyframe] = sample.reference.levels[0].points
             self._verify(sample)
             if not self.waiting:
                 self._ask(send)
@@ -290,4 +300,6 @@ class LowerEnd(Meeting):
         variance = frame_variance(
             agreeing, own, peer, self.places.drift, self.book.drift, self.config.consensus.closures
         )
-        return Proposal(len(agreeing), group.T_ownmap_peermap, variance)
+        placed = group.T_ownmap_peermap @ peer[sorted(self.samples)]
+        alike = self.places.agreement([self.samples[k] for k in sorted(self.samples)], placed)
+        return Proposal(len(agreeing), group.T_ownmap_peermap, variance, alike)

@@ -380,7 +380,7 @@ def _shorts(points: NDArray[np.float32]) -> tuple[float, bytes]:
 
 
 _FRAME = struct.Struct("<HHB")
-_PROPOSAL = struct.Struct("<Idd")
+_PROPOSAL = struct.Struct("<Iddd")
 MAX_PROPOSALS = 8
 
 
@@ -397,7 +397,7 @@ def write_frames(frames: PairFrames) -> bytes:
     """Bytes of FRAME."""
     parts = [_FRAME.pack(frames.lower, frames.higher, len(frames.proposals))]
     for p in frames.proposals:
-        parts += [_PROPOSAL.pack(p.support, *p.variance), pose_bytes(p.T_a_b)]
+        parts += [_PROPOSAL.pack(p.support, *p.variance, p.agreement), pose_bytes(p.T_a_b)]
     return b"".join(parts)
 
 
@@ -409,10 +409,10 @@ def read_frames(data: bytes, team: int) -> PairFrames:
         raise MalformedError("frame: the two robots must be in the team, lower first, and have a frame")
     proposals = []
     for _ in range(n):
-        support, *variance = reader.fields(_PROPOSAL)
-        if not all(0 < v < MAX_COORDINATE**2 for v in variance):
-            raise MalformedError("frame: impossible variance")
-        proposals.append(Proposal(support, reader.poses(1)[0], (variance[0], variance[1])))
+        support, *variance, agreement = reader.fields(_PROPOSAL)
+        if not (all(0 < v < MAX_COORDINATE**2 for v in variance) and 0 <= agreement <= 1):
+            raise MalformedError("frame: impossible variance or agreement")
+        proposals.append(Proposal(support, reader.poses(1)[0], (variance[0], variance[1]), agreement))
     reader.done()
     return PairFrames(lower, higher, tuple(proposals))
 

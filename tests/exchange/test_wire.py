@@ -104,7 +104,7 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
     ),
     "frame": (
         wire.write_frames(
-            wire.PairFrames(1, 2, tuple(Proposal(n, poses(1)[0], (0.01 * n, 0.02)) for n in (7, 2)))
+            wire.PairFrames(1, 2, tuple(Proposal(n, poses(1)[0], (0.01 * n, 0.02), 0.1 * n) for n in (7, 2)))
         ),
         lambda d: wire.read_frames(d, TEAM),
     ),
