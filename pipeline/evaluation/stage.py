@@ -61,8 +61,8 @@ PROTOCOL = {
     "depth": "blended depth / alpha where alpha >= 0.5, of a Gaussian as its map says: that of its centre or of its "
     "plane; mean over pixels with both depths, then over views",
     "own_unrefined": "the own map before its final refinement, seen as the own map",
-    "own_longer": "the own map trained again with the same settings, alone; seen as the own map",
-    "refined": "the fused map trained again on the robot's own images, seen as the fused map",
+    "own_longer": "the own map trained again with the same settings and as many steps, alone; seen as the own map",
+    "refined": "the final map: the fused one trained again on own images and peers' maps, seen as the fused map",
     "calibration": "distance of fused Gaussians from the true surface against sigma along its normal; mean of robots",
 }
 
