@@ -118,11 +118,12 @@ def rows_of(message: Any, where: str, dtype: str, channels: int) -> NDArray[Any]
             f"{where}: {len(message.data)} bytes with rows of {message.step}, expected {message.height} rows of at "
             f"least {used}"
         )
-    padded = np.zeros(message.step * message.height, np.uint8)
-    data = np.frombuffer(bytes(message.data), np.uint8)[: len(padded)]
-    padded[: len(data)] = data
-    rows = np.ascontiguousarray(padded.reshape(message.height, message.step)[:, :used])
-    return rows.view(kind).reshape(message.height, message.width, channels).astype(dtype)
+    size = message.step * message.height
+    data = np.frombuffer(message.data, np.uint8)[:size]
+    if len(data) < size:  # the last row without its padding
+        data = np.concatenate([data, np.zeros(size - len(data), np.uint8)])
+    rows = data.reshape(message.height, message.step)[:, :used].view(kind)
+    return rows.reshape(message.height, message.width, channels).astype(dtype)
 
 
 def color_bytes(message: Any, where: str) -> tuple[bytes, str]:

@@ -22,6 +22,7 @@ from pipeline.runner import RunConfig, run
 SMALL = (
     "frontend.mapping.max_gaussians=3000",
     "exchange.max_rounds=400",
+    "fusion.refine.steps_per_view=2",
 )
 
 

@@ -228,6 +228,30 @@ def bench_frontend(
     print(json.dumps(result, indent=2) if as_json else frontend_bench.format_tables(result))
 
 
+@bench_app.command("convert")
+def bench_convert(
+    log: Annotated[Path, typer.Argument(help="A .bag, .db3 or .mcap of one robot.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder that is written to and removed; must not exist.")
+    ] = Path("bench-convert"),
+    options: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Option of `duagc convert ros`; repeatable."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """What converting a log costs beside reading its messages and writing them as they are.
+
+    Needs as much room on the disk as the log has, at most.
+
+    Example: `duagc bench convert ~/logs/kitchen.bag --set imu=/imu/data`
+    """
+    from converters.logs import bench
+
+    result = bench.run(log, options or [], out)
+    print(json.dumps(result, indent=2) if as_json else bench.format_table(result))
+
+
 def _numbers(option: str, text: str, low: float, high: float) -> list[float]:
     """Numbers within limits out of text like 0,0.3."""
     numbers = []
