@@ -153,6 +153,34 @@ def bench_team(
     print(json.dumps(result, indent=2) if as_json else team_bench.format_table(result))
 
 
+@bench_app.command("reference")
+def bench_reference(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A finished run.", show_default=False)],
+    recording: Annotated[
+        Path | None, typer.Option(help="Folder of its recording, if it moved.", show_default=False)
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """A team's error beside what its images allow: all keyframes optimised in one place.
+
+    From the run's poses and from the true ones. A run of one robot is also cut in parts. Needs ground truth.
+
+    Example: `duagc bench reference outputs/redkitchen`
+    """
+    from pipeline import numeric
+    from pipeline.config import load
+    from pipeline.evaluation import reference_bench
+    from pipeline.recording import Recording
+    from pipeline.run_folder import RunFolder
+    from pipeline.runner import RunConfig
+
+    numeric.settle_opencv()
+    run = RunFolder(run_folder)
+    source = Recording(run.recording if recording is None else recording)
+    result = reference_bench.run(run, source, load(RunConfig, run.config_file, []).frontend)
+    print(json.dumps(result, indent=2) if as_json else reference_bench.format_table(result))
+
+
 @bench_app.command("frontend")
 def bench_frontend(
     recording: Annotated[
@@ -234,6 +262,30 @@ def bench_paths(
     asked = _numbers("--overlap", overlap, 0, 1)
     rows = paths.survey(scenes.split(","), paradigms.split(","), counts, asked, frames, seed, up)
     print(json.dumps(rows, indent=2) if as_json else paths.format_table(rows))
+
+
+@bench_app.command("convert")
+def bench_convert(
+    log: Annotated[Path, typer.Argument(help="A .bag, .db3 or .mcap of one robot.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder that is written to and removed; must not exist.")
+    ] = Path("bench-convert"),
+    options: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Option of `duagc convert ros`; repeatable."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """What converting a log costs beside reading its messages and writing them as they are.
+
+    Needs as much room on the disk as the log has, at most.
+
+    Example: `duagc bench convert ~/logs/kitchen.bag --set imu=/imu/data`
+    """
+    from converters.logs import bench
+
+    result = bench.run(log, options or [], out)
+    print(json.dumps(result, indent=2) if as_json else bench.format_table(result))
 
 
 def _numbers(option: str, text: str, low: float, high: float) -> list[float]:
