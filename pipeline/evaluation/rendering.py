@@ -18,7 +18,7 @@ from pipeline.evaluation import groundtruth, views
 from pipeline.evaluation.oracle import section_of
 from pipeline.evaluation.results import Absent, Row
 from pipeline.fusion.config import RefineConfig
-from pipeline.fusion.refine import refine
+from pipeline.fusion.refine import refine, steps_of
 from pipeline.fusion.stage import training_views
 from pipeline.geometry.trajectory import Trajectory
 from pipeline.progress import track
@@ -133,7 +133,7 @@ def _maps(run: RunFolder, robot: RobotRun, source: Recording, threads: int) -> d
 
 
 def own_longer(run: RunFolder, robot: RobotRun, source: Recording, threads: int) -> Gaussians:
-    """The own map trained again as the refined one was, on the same images, at its own poses and alone.
+    """The own map trained again as the refined one was, with as many steps, on own images at own poses alone.
 
     Without it nobody could tell what the refined map owes to the team and what to more training.
     """
@@ -145,16 +145,18 @@ def own_longer(run: RunFolder, robot: RobotRun, source: Recording, threads: int)
     own = robot.own_map
     with open_rgbd(log) as camera_log:
         camera = camera_log.camera
+    views = training_views(files, frames, poses, config, section_of(run, MovingConfig, "frontend", "moving"))
     return refine(
         own.gaussians,
         np.ones(len(own.gaussians), bool),
-        training_views(files, frames, poses, config, section_of(run, MovingConfig, "frontend", "moving")),
+        views,
         camera,
         config,
         section_of(run, MatchingConfig, "exchange", "matching").thickness_floor_m,
         own.depth,
         run.config.get("seed", 0),
         threads,
+        steps=(sum(steps_of(config, len(views), 1)), 0),
     )
 
 

@@ -16,6 +16,7 @@ from pipeline.errors import DuagError
 from pipeline.fusion.config import FusionConfig, RefineConfig
 from pipeline.fusion.fuse import FusedMap, fuse
 from pipeline.fusion.own_pixels import weigh_by_own_pixels
+from pipeline.fusion.peer_views import peer_views
 from pipeline.fusion.refine import View, refine
 from pipeline.geometry.trajectory import Trajectory, write_tum
 from pipeline.messages import WORLD_FRAME, CorrectedKeyframes, GaussianInformation, GaussianMap, Odometry
@@ -89,10 +90,27 @@ def run_fusion(
             threads,
         )
         if config.refine.steps_per_view:
+            shown = peer_views(
+                result.evidence,
+                result.T_world_keyframe_of,
+                own.camera,
+                config.refine.peer_views if config.refine.peer_share else 0,
+                own.depth,
+                weights,
+                threads,
+            )
             owned = fused.source == fused.robots.index(own.robot)
-            floor_m = matching.thickness_floor_m
             refined = refine(
-                fused.gaussians, owned, views, own.camera, config.refine, floor_m, own.depth, seed, threads
+                fused.gaussians,
+                np.ones_like(owned) if shown else owned,
+                views,
+                own.camera,
+                config.refine,
+                matching.thickness_floor_m,
+                own.depth,
+                seed,
+                threads,
+                peer_views=shown,
             )
     write_ply(folder / "fused.ply", fused.gaussians)
     write_ply(folder / "refined.ply", fused.gaussians if refined is None else refined)
