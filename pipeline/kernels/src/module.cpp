@@ -183,23 +183,23 @@ public:
         return static_cast<int>(kernels_->forward(frame_, gaussians, color.data(), depth.data(), alpha.data()));
     }
 
-    // Forward, loss and backward; weights: of the loss, then gain and offset. values: as LossValues.
+    // Forward, loss and backward; weights: as in Loss, gain and offset last. values: as LossValues.
     int fit(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
             const Inputs& pose, const Inputs& intrinsics, const Inputs& background, const Bytes& mask, bool ray_plane, int width,
-            int height, int threads, const Inputs& color, const Inputs& depth_m, const Inputs& weights, const Array<double>& values, const Floats& g_means,
+            int height, int threads, const Inputs& color, const Inputs& depth_m, const Inputs& certainty, const Inputs& weights, const Array<double>& values, const Floats& g_means,
             const Floats& g_quats, const Floats& g_log_scales, const Floats& g_colors, const Floats& g_logits,
             const Array<double>& g_pose) {
         const Use use(busy_);
         look(pose, intrinsics, background, mask, ray_plane, width, height, threads);
         const float* w = weights.data();
-        const Loss loss = {color.data(), depth_m.data(), w[0], w[1], w[2], w[3], w[4], w[5]};
+        const Loss loss = {color.data(), depth_m.data(), data_or_null(certainty), w[0], w[1], w[2], w[3], w[4], w[5], w[6]};
         const GradientArrays out = {data_or_null(g_means),  data_or_null(g_quats), data_or_null(g_log_scales), data_or_null(g_colors),
                                     data_or_null(g_logits), nullptr,               data_or_null(g_pose)};
         const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
         const nb::gil_scoped_release unlocked;
         LossValues found = {};
         const Status status = kernels_->fit(frame_, gaussians, loss, found, out);
-        const double all[LOSS_SUMS] = {found.color, found.depth, found.missing_alpha, found.by_log_gain, found.by_offset};
+        const double all[LOSS_SUMS] = {found.color, found.depth, found.missing_alpha, found.by_log_gain, found.by_offset, found.surface};
         std::copy(all, all + LOSS_SUMS, values.data());
         return static_cast<int>(status);
     }
