@@ -73,10 +73,11 @@ def convert(
     """
     module = _module(dataset)
     count = {} if robots is None else {"robots": robots}
-    module.convert(Path(src), Path(out), force=force, **count, **_parse(options))
+    module.convert(Path(src), Path(out), force=force, **count, **parse_options(options))
 
 
-def _parse(options: Sequence[str]) -> dict[str, Any]:
+def parse_options(options: Sequence[str]) -> dict[str, Any]:
+    """Options by name. options: `name=value`, values in TOML notation; what is none is text."""
     values: dict[str, Any] = {}
     for option in options:
         name, separator, text = option.partition("=")

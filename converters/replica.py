@@ -41,9 +41,11 @@ def _read_camera(src: Path) -> tuple[PinholeCamera, float]:
         raise DuagError(f"{src.parent / 'cam_params.json'}: not found, expected the camera of the renders")
     try:
         c = json.loads(read_text(path, "the camera of the renders"))["camera"]
-        camera = PinholeCamera(int(c["w"]), int(c["h"]), c["fx"], c["fy"], c["cx"], c["cy"])
+        camera = PinholeCamera(
+            int(c["w"]), int(c["h"]), *(float(c[name]) for name in ("fx", "fy", "cx", "cy"))
+        )
         return camera, 1.0 / float(c["scale"])
-    except (ValueError, TypeError, KeyError, ZeroDivisionError) as error:
+    except (ValueError, TypeError, KeyError, ArithmeticError) as error:
         raise DuagError(
             f"{path}: {type(error).__name__} {error}, expected camera with w, h, fx, fy, cx, cy, scale"
         ) from error

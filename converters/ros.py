@@ -130,7 +130,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
         robot.add_frame(at_ns, *encoded, picture.depth, T, depth_sigma_m=picture.depth_sigma_m)
         if check.needs(index, T):
             check.add(index, source.depth_m(picture), T)
-        empty += 0 if picture.depth is None else int((picture.depth == 0).sum())
+        empty += 0 if picture.depth is None else picture.depth.size - int(np.count_nonzero(picture.depth))
     if cut:
         source.warnings.append(f"{cut} frames have colour or depth that is cut short; left out")
     if far:

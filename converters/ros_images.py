@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from pipeline.errors import DuagError
@@ -112,17 +113,18 @@ def size_of(message: Any, where: str) -> tuple[int, int]:
 def rows_of(message: Any, where: str, dtype: str, channels: int) -> NDArray[Any]:
     """Pixels [h, w, channels] of an Image, without the padding of its rows, in native byte order."""
     kind = np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<")
+    if not (message.width > 0 and message.height > 0):
+        raise DuagError(f"{where}: is {message.width}x{message.height} pixels, expected an image")
     used = message.width * channels * kind.itemsize
     if message.step < used or len(message.data) < message.step * (message.height - 1) + used:
         raise DuagError(
             f"{where}: {len(message.data)} bytes with rows of {message.step}, expected {message.height} rows of at "
             f"least {used}"
         )
-    padded = np.zeros(message.step * message.height, np.uint8)
-    data = np.frombuffer(bytes(message.data), np.uint8)[: len(padded)]
-    padded[: len(data)] = data
-    rows = np.ascontiguousarray(padded.reshape(message.height, message.step)[:, :used])
-    return rows.view(kind).reshape(message.height, message.width, channels).astype(dtype)
+    data = np.frombuffer(message.data, np.uint8)  # the last row may come without its padding
+    step = message.step if message.height > 1 else used  # of a single row, nothing bounds it
+    rows = as_strided(data, (message.height, used), (step, 1), writeable=False).view(kind)
+    return rows.reshape(message.height, message.width, channels).astype(dtype)
 
 
 def color_bytes(message: Any, where: str) -> tuple[bytes, str]:

@@ -47,18 +47,23 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         content = json.loads(read_text(path, "cameras and poses of ScanNet++"))
         size = int(content["w"]), int(content["h"])
         camera = PinholeCamera(
-            *size, content["fl_x"], content["fl_y"], float(content["cx"]) - 0.5, float(content["cy"]) - 0.5
+            *size,
+            *(float(content[name]) for name in ("fl_x", "fl_y")),
+            *(float(content[name]) - 0.5 for name in ("cx", "cy")),
         )
         rows = [*content["frames"], *content.get("test_frames", [])]
         entries = sorted(
             (
-                str(row["file_path"]),
-                np.array(row["transform_matrix"], dtype=np.float64),
-                row.get("is_bad", False),
-            )
-            for row in rows
+                (
+                    str(row["file_path"]),
+                    np.array(row["transform_matrix"], dtype=np.float64).reshape(4, 4),
+                    row.get("is_bad", False),
+                )
+                for row in rows
+            ),
+            key=lambda entry: entry[0],
         )
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
         raise DuagError(
             f"{path}: {type(error).__name__} {error}, expected w, h, fl_x, fl_y, cx, cy and frames"
         ) from error

@@ -90,7 +90,7 @@ class RobotRun:
 
     @cached_property
     def refined_map(self) -> GaussianMap | None:
-        """The fused map trained again on the robot's own images, world frame; None if it met nobody."""
+        """The robot's final map: the fused one after training, world frame; None if it met nobody."""
         maps = self._all("fused.mcap", topics.REFINED_MAP)
         return maps[-1] if maps else None
 

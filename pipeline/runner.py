@@ -56,17 +56,6 @@ class RunConfig(Config):
                 )
         return self
 
-    @model_validator(mode="after")
-    def _one_mask(self) -> Self:
-        """What the map was not made of is in no Fisher sum, and the fused map is not trained on it."""
-        for name, other in (
-            ("information.moving", self.information.moving),
-            ("fusion.refine.moving", self.fusion.refine.moving),
-        ):
-            if other != self.frontend.moving:
-                raise ValueError(f"{name} is {other}, expected frontend.moving: {self.frontend.moving}")
-        return self
-
 
 class Timing:
     """Wall time, processor time and peak memory per stage; not part of any digest."""
@@ -117,7 +106,12 @@ def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, thread
     timing.stages[f"frontend.{robot}"]["parts"] = parts
     with timing.stage("information", robot):
         run_information(
-            log, folder / "frontend.mcap", folder / "information.mcap", config.information, threads=threads
+            log,
+            folder / "frontend.mcap",
+            folder / "information.mcap",
+            config.information,
+            config.frontend.moving,
+            threads,
         )
     return timing.stages
 
@@ -218,6 +212,7 @@ def fuse_robot(robot: str, log: Path, folder: Path, result: AgentResult, config:
         folder,
         config.fusion,
         config.exchange.matching,
+        config.frontend.moving,
         config.exchange.weights,
         seed=config.seed,
         threads=threads_per_worker(1),

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from pipeline.errors import DuagError
 from pipeline.evaluation.network import Session
 from pipeline.evaluation.paths import Path3, paths
+from pipeline.evaluation.rendering import poses_by_stamp
 from pipeline.evaluation.results import Absent
-from pipeline.evaluation.stage import poses_by_stamp
 from pipeline.geometry import so3
 from pipeline.messages import camera_frame
 from pipeline.recording import RECORDING_FILE, Recording, open_rgbd

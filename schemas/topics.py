@@ -161,7 +161,7 @@ REFINED_MAP = Topic(
     "duagc.v1.GaussianMap",
     "fusion",
     Scope.ROBOT,
-    "the fused map trained again on the robot's own images",
+    "the fused map trained again, on own images and on what peers' maps show: the final map",
 )
 CORRECTED_KEYFRAMES = Topic(
     "/<robot>/corrected_keyframes",

@@ -6,7 +6,6 @@ import pytest
 
 from pipeline.config import Config, dump, load
 from pipeline.errors import DuagError
-from pipeline.runner import RunConfig
 
 
 class Link(Config):
@@ -65,12 +64,3 @@ def test_broken_file_is_named(tmp_path: Path) -> None:
         load(Whole, path)
     with pytest.raises(DuagError, match=r"absent\.toml"):
         load(Whole, tmp_path / "absent.toml")
-
-
-@pytest.mark.parametrize("section", ["information.moving", "fusion.refine.moving"])
-def test_what_moves_is_the_same_in_every_stage(section: str) -> None:
-    with pytest.raises(DuagError, match=rf"{section} is .*expected frontend\.moving"):
-        load(RunConfig, overrides=[f"{section}.min_views=3"])
-    sections = ("frontend.moving", "information.moving", "fusion.refine.moving")
-    config = load(RunConfig, overrides=[f"{each}.min_views=3" for each in sections])
-    assert config.frontend.moving.min_views == 3

@@ -64,7 +64,13 @@ if __name__ == "__main__":
         print(pool.submit(os.getpid).result(), flush=True)
         pool.submit(time.sleep, 100).result()
 """
-    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,  # Python says there that it cleared the semaphores of the killed parent
+        text=True,
+        cwd=ROOT,
+    )
     assert parent.stdout is not None
     with parent.stdout as lines:
         pid = int(lines.readline())

@@ -14,7 +14,7 @@ import numpy as np
 
 from converters.logs.choice import POINTS_TYPE, Chooser
 from converters.logs.clocks import compare, overlap_warnings
-from converters.logs.files import NANOSECONDS, SUFFIXES, Log, open_log
+from converters.logs.files import NANOSECONDS, SUFFIXES, Entry, Log, open_log
 from converters.logs.motion import IMU_TYPE, POSE_TYPES
 from converters.logs.robot_log import RobotLog
 from converters.logs.sources import Source, is_log, robot_of, sources_of
@@ -104,16 +104,19 @@ def namespaces(log: Log) -> list[str]:
 def _log(log: Log) -> dict[str, Any]:
     """Size, span and topics of a log."""
     times: dict[str, array[int]] = {name: array("q") for name in log.topics}
-    delays: dict[str, list[int]] = {name: [] for name in log.topics}
+    delays: dict[str, list[int]] = {name: [] for name in log.topics if _has_header(log, name)}
     publish = False
     messages = sum(topic.count for topic in log.topics.values())
-    for entry in track(log.entries(*log.topics), f"read {Path(log.name).name}", messages):
+    entries = log.entries(*log.topics, heads=log.topics)
+    for entry in track(entries, f"read {Path(log.name).name}", messages):
         seen = times[entry.topic]
         publish |= entry.publish_ns is not None
-        if len(seen) < HEADERS_FIRST or len(seen) % HEADERS_EACH == 0:
-            delay = _delay(entry, delays[entry.topic], first=not seen)
-            if delay is not None:
-                delays[entry.topic].append(delay)
+        if entry.topic in delays and (len(seen) < HEADERS_FIRST or len(seen) % HEADERS_EACH == 0):
+            stamp = _header_ns(entry)
+            if stamp:
+                delays[entry.topic].append(entry.log_ns - stamp)
+            elif not delays[entry.topic]:  # the first one says nothing
+                del delays[entry.topic]
         seen.append(entry.log_ns)
     spans = [(t[0], t[-1]) for t in times.values() if t]
     return {
@@ -129,24 +132,27 @@ def _log(log: Log) -> dict[str, Any]:
                 "encoding": topic.encoding,
                 "messages": topic.count,
                 "rate_hz": _rate(times[name]),
-                "recorded_after_header_s": _median_s(delays[name]),
+                "recorded_after_header_s": _median_s(delays.get(name, [])),
             }
             for name, topic in sorted(log.topics.items())
         },
     }
 
 
-def _delay(entry: Any, known: list[int], first: bool) -> int | None:
-    """Time of recording less that of the header; None where there is no header or it says nothing."""
-    if not first and not known:  # the first message had none
-        return None
+def _has_header(log: Log, topic: str) -> bool:
+    """Whether the messages of a topic have a header, by the first one; False where it cannot be read."""
     try:
-        if first and not hasattr(entry.read(), "header"):
-            return None
-        stamp = int(entry.header_ns())
+        return log.topics[topic].count > 0 and hasattr(log.first(topic), "header")
     except DuagError:
-        return None
-    return int(entry.log_ns) - stamp if stamp else None
+        return False
+
+
+def _header_ns(entry: Entry) -> int:
+    """The time in a header, 0 where it says nothing."""
+    try:
+        return int(entry.header_ns())
+    except DuagError:
+        return 0
 
 
 def _rate(times: array[int]) -> float | None:

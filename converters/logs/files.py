@@ -12,7 +12,7 @@ Types and fields are those of ROS: Foxglove's messages are brought into that for
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -61,8 +61,11 @@ class LogPart(Protocol):
     path: Path
     topics: dict[str, Topic]
 
-    def entries(self, topics: Sequence[str]) -> Iterator[Entry]:
-        """Messages of these topics in order of recording."""
+    def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
+        """Messages of these topics in order of recording.
+
+        heads: those of which `header_ns` is all that will be asked; `data` may be cut behind it.
+        """
         ...
 
     def close(self) -> None: ...
@@ -99,10 +102,12 @@ class Log:
             if t.type in types and t.count and t.name.startswith(f"{below.rstrip('/')}/")
         )
 
-    def entries(self, *topics: str) -> Iterator[Entry]:
-        """Messages of these topics, in order of recording over all parts."""
+    def entries(self, *topics: str, heads: Collection[str] = ()) -> Iterator[Entry]:
+        """Messages of these topics, in order of recording over all parts; heads: see `LogPart.entries`."""
         streams = [
-            part.entries(wanted) for part in self.parts if (wanted := [t for t in topics if t in part.topics])
+            part.entries(wanted, [t for t in wanted if t in heads])
+            for part in self.parts
+            if (wanted := [t for t in topics if t in part.topics])
         ]
         return streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda entry: entry.log_ns)
 

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import base64
 import binascii
+import json
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace as Fields
 from typing import Any
 
 import numpy as np
+from google.protobuf.message import DecodeError
 
 from pipeline.errors import DuagError
 
@@ -81,6 +84,53 @@ class JsonFields:
         return _wrapped(self._members[name])
 
 
+class Base64(bytes):
+    """Bytes in base64 that are not unpacked yet."""
+
+
+LONG_TEXT = 4096
+_SPACE = b" \t\r\n"
+_STAMP = re.compile(
+    rb'\s*\{\s*"timestamp"\s*:\s*\{\s*"sec"\s*:\s*(\d{1,18})\s*,\s*"nsec"\s*:\s*(\d{1,9})\s*\}'
+)
+
+
+def json_members(data: bytes) -> Any:
+    """A JSON text as Python has it. Long `data` without escapes is not walked through: it comes as `Base64`."""
+    name = data.find(b'"data"')
+    colon = data[name + 6 : name + 64].lstrip(_SPACE)
+    if name < 0 or not colon.startswith(b":") or not colon[1:].lstrip(_SPACE).startswith(b'"'):
+        return json.loads(data)
+    start = data.index(b'"', name + 6) + 1
+    end = data.find(b'"', start)
+    if end - start < LONG_TEXT or data.find(b"\\", start, end) >= 0:
+        return json.loads(data)
+    rest = data[:start] + data[end:]
+    members = json.loads(rest)
+    if not isinstance(members, dict) or members.get("data") != "" or rest.count(b'"data"') > 1:
+        return json.loads(data)  # the name stands elsewhere too
+    return {**members, "data": Base64(data[start:end])}
+
+
+def first_stamp_of_json(head: bytes) -> int | None:
+    """The time of a message whose first member is `timestamp`; None if that is not so."""
+    found = _STAMP.match(head)
+    return int(found[1]) * 1_000_000_000 + int(found[2]) if found else None
+
+
+def first_stamp_of_protobuf(head: bytes) -> int | None:
+    """The time of a message whose first field is `timestamp` (number 1, as in all of Foxglove's but lists)."""
+    from google.protobuf.timestamp_pb2 import Timestamp
+
+    if head[:1] != b"\x0a" or not 2 <= (length := head[1] if len(head) > 1 else 0) <= min(127, len(head) - 2):
+        return None
+    try:
+        stamp = Timestamp.FromString(head[2 : 2 + length])
+    except DecodeError:
+        return None
+    return int(stamp.seconds) * 1_000_000_000 + int(stamp.nanos)
+
+
 def _wrapped(value: Any) -> Any:
     if isinstance(value, dict):
         return JsonFields(value)
@@ -99,6 +149,11 @@ def _header(m: Any, frame: str = "frame_id") -> Fields:
 
 
 def _bytes(data: Any) -> bytes:
+    """Bytes, of JSON in base64 or as a list; a number would become as many zeros."""
+    if not isinstance(data, str | bytes | list):
+        raise TypeError(f"data is {type(data).__name__}, expected bytes")
+    if isinstance(data, Base64):
+        return binascii.a2b_base64(data, strict_mode=True)
     return base64.b64decode(data, validate=True) if isinstance(data, str) else bytes(data)
 
 

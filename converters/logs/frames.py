@@ -47,20 +47,14 @@ class Transforms:
         found: dict[tuple[str, str], Array] = {}
         changed = set()
         for topic in topics:
-            for _, parent, child, T in self.of_topic(topic):
-                first = found.setdefault((parent, child), T)
-                if np.abs(first - T).max() > SAME:
-                    changed.add((parent, child))
+            for entry in self._log.entries(topic):
+                for _, parent, child, T in transforms_in(entry, f"{self._log.name}: {topic}"):
+                    first = found.setdefault((parent, child), T)
+                    if np.abs(first - T).max() > SAME:
+                        changed.add((parent, child))
         constant = {pair: T for pair, T in found.items() if pair not in changed}
         self.moving = (self.moving | changed) - set(constant)
         return constant
-
-    def of_topic(self, topic: str) -> Iterator[tuple[tuple[Entry, int], str, str, Array]]:
-        """Message and time of its header (ns), parent, child and T_parent_child of every transform of a topic."""
-        for entry in self._log.entries(topic):
-            for t in entry.read().transforms:
-                T = pose_matrix(t.transform.translation, t.transform.rotation, f"{self._log.name}: {topic}")
-                yield (entry, stamp_ns(t)), frame_name(t.header.frame_id), frame_name(t.child_frame_id), T
 
     def lookup(self, target: str, source: str) -> Array | None:
         """T_target_source [4, 4]; None if nothing constant ties them together."""
@@ -87,6 +81,13 @@ class Transforms:
                         reached[other] = reached[at] @ step
                         queue.append(other)
         return reached.get(source)
+
+
+def transforms_in(entry: Entry, where: str) -> Iterator[tuple[int, str, str, Array]]:
+    """Time of the header (ns), parent, child and T_parent_child [4, 4] of every transform of a message."""
+    for t in entry.read().transforms:
+        T = pose_matrix(t.transform.translation, t.transform.rotation, where)
+        yield stamp_ns(t), frame_name(t.header.frame_id), frame_name(t.child_frame_id), T
 
 
 def frame_name(name: str) -> str:

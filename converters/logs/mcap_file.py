@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -16,6 +15,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from converters.logs import foxglove
 from converters.logs.files import Entry, Topic, ros_type, sound_time, stamp_ns
+from converters.logs.mcap_chunks import Chunks
 from converters.logs.rosbag_file import (
     LARGEST_CHUNK,
     check_definitions,
@@ -54,8 +54,8 @@ class McapFile:
                 f"{self.path}: is cut short or no MCAP; what it holds can be saved with `duagc recover`"
             )
         self._stream.seek(0)
-        self._reader = SeekingReader(self._stream, validate_crcs=True, record_size_limit=LARGEST_CHUNK)
-        summary = self._reader.get_summary()
+        reader = SeekingReader(self._stream, validate_crcs=True, record_size_limit=LARGEST_CHUNK)
+        summary = reader.get_summary()
         statistics = summary.statistics if summary else None
         self._indexed = bool(
             summary
@@ -64,6 +64,7 @@ class McapFile:
             and all(chunk.message_index_offsets for chunk in summary.chunk_indexes)
         )
         if summary and statistics and self._indexed:
+            self._chunks = Chunks(self._stream, summary.chunk_indexes)
             for index in summary.chunk_indexes:
                 self._check_size(self._beginning(index.chunk_start_offset))
             counts = Counter(statistics.channel_message_counts)
@@ -144,27 +145,33 @@ class McapFile:
         if size > LARGEST_CHUNK:
             raise DuagError(f"{self.path}: a chunk unpacks to {size} bytes, expected at most {LARGEST_CHUNK}")
 
-    def _messages(self, topics: Sequence[str]) -> Iterator[tuple[Channel, Message]]:
+    def _messages(self, topics: Sequence[str], heads: Sequence[str]) -> Iterator[tuple[int, int, int, bytes]]:
+        """Channel, time of recording, time of publication and bytes."""
+        wanted = {
+            number: (self._decoders[number].tells_time if channel.topic in heads else None)
+            for number, channel in self._channels.items()
+            if channel.topic in topics
+        }
         if self._indexed:
-            for _, channel, message in self._reader.iter_messages(topics, log_time_order=True):
-                yield channel, message
+            for m in self._chunks.messages(wanted):
+                yield m.channel, m.log_ns, m.publish_ns, m.data
             return
         for record in self._records():
-            if isinstance(record, Message) and self._channels[record.channel_id].topic in topics:
-                yield self._channels[record.channel_id], record
+            if isinstance(record, Message) and record.channel_id in wanted:
+                yield record.channel_id, record.log_time, record.publish_time, record.data
 
-    def entries(self, topics: Sequence[str]) -> Iterator[Entry]:
+    def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
         with reading(self.path, WANTED):
-            for channel, m in self._messages(topics):
-                where = f"{self.path}: {channel.topic}"
-                decoder = self._decoders[channel.id]
+            for number, log_ns, publish_ns, data in self._messages(topics, heads):
+                topic, decoder = self._channels[number].topic, self._decoders[number]
+                where = f"{self.path}: {topic}"
                 yield Entry(
-                    channel.topic,
-                    sound_time(m.log_time, where),
-                    sound_time(m.publish_time, where),
-                    m.data,
-                    partial(decoder.read, m.data, where),
-                    partial(decoder.header_ns, m.data, where),
+                    topic,
+                    sound_time(log_ns, where),
+                    sound_time(publish_ns, where),
+                    data,
+                    partial(decoder.read, data, where),
+                    partial(decoder.header_ns, data, where),
                 )
 
     def close(self) -> None:
@@ -178,12 +185,17 @@ class _Decoder(Protocol):
 
     def header_ns(self, data: bytes, where: str) -> int: ...
 
+    def tells_time(self, head: bytes) -> bool:
+        """Whether `header_ns` needs no more than these first bytes of a message."""
+        ...
+
 
 class _Ros:
     """Messages of ROS by the definitions that the file carries."""
 
     def __init__(self, schema: Schema, encoding: str) -> None:
         self.schema, self.encoding, self.type = schema, encoding, ros_type(schema.name)
+        self._of_ros = foxglove.plain_name(schema.name) not in foxglove.ROS_TYPES
         self._deserialise: Any = None
 
     def _store(self) -> Any:
@@ -226,9 +238,10 @@ class _Ros:
         return foxglove.as_ros(foxglove.plain_name(self.schema.name), message, where)
 
     def header_ns(self, data: bytes, where: str) -> int:
-        if foxglove.plain_name(self.schema.name) in foxglove.ROS_TYPES:
-            return stamp_ns(self.read(data, where))
-        return ros_header_ns(data, self.encoding, where)
+        return ros_header_ns(data, self.encoding, where) if self._of_ros else stamp_ns(self.read(data, where))
+
+    def tells_time(self, head: bytes) -> bool:
+        return self._of_ros
 
 
 class _Foxglove:
@@ -242,17 +255,31 @@ class _Foxglove:
 
     def header_ns(self, data: bytes, where: str) -> int:
         """Without unpacking the image: of transforms in a list the first one's."""
+        first = self._first_stamp(data)
+        if first is not None:
+            return first
         message = self._message(data, where)
         if self.name == "foxglove.FrameTransforms":
             return stamp_ns(foxglove.as_ros(self.name, message, where))
         return foxglove.stamp_ns(message, where)
+
+    def tells_time(self, head: bytes) -> bool:
+        return self._first_stamp(head) is not None
+
+    def _first_stamp(self, head: bytes) -> int | None:
+        """The time, where it stands in the first bytes of the message, as it most often does."""
+        if self.name == "foxglove.FrameTransforms":  # has no time of its own
+            return None
+        if self.encoding == "json":
+            return foxglove.first_stamp_of_json(head)
+        return foxglove.first_stamp_of_protobuf(head)
 
     def _message(self, data: bytes, where: str) -> Any:
         import schemas
 
         try:
             if self.encoding == "json":
-                members = json.loads(data)
+                members = foxglove.json_members(data)
                 return foxglove.JsonFields(members if isinstance(members, dict) else {})
             return schemas.message_class(self.name).FromString(data)
         except Exception as error:  # protobuf's DecodeError, broken JSON, broken text
@@ -272,3 +299,6 @@ class _Unknown:
 
     def header_ns(self, data: bytes, where: str) -> int:
         return 0
+
+    def tells_time(self, head: bytes) -> bool:
+        return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from converters.logs.files import NANOSECONDS, Entry, Log, sound_time
-from converters.logs.frames import TF_TYPES, Transforms, frame_name, pose_matrix
+from converters.logs.frames import TF_TYPES, Transforms, frame_name, pose_matrix, transforms_in
 from converters.logs.options import LogOptions
 from converters.tum_layout import Poses
 from pipeline.errors import DuagError, closest
@@ -57,8 +58,71 @@ class CameraPoses:
         return OdometryPrior(self.body.stamps_ns.tolist(), self.body.T_world_body @ self.T_body_color)
 
 
+class _ImuReadings:
+    """What the messages of an IMU say, as they come."""
+
+    def __init__(self, time_ns: Callable[[Entry], int]) -> None:
+        self._time_ns = time_ns
+        self.stamps, self.values, self.frame = array("q"), array("d"), ""
+
+    def take(self, entry: Entry) -> None:
+        m = entry.read()
+        self.frame, w, a = m.header.frame_id, m.angular_velocity, m.linear_acceleration
+        self.stamps.append(self._time_ns(entry))
+        self.values.extend((w.x, w.y, w.z, a.x, a.y, a.z))
+
+
+class _PoseReadings:
+    """What messages say about the pose of a body, as they come; of a transform that changes: "/tf world base_link"."""
+
+    def __init__(
+        self, said: str, option: str, name: str, of_header: bool, time_ns: Callable[[Entry], int]
+    ) -> None:
+        self.option, self._name, self._of_header, self._time_ns = option, name, of_header, time_ns
+        self.topic, *frames = said.split() if len(said.split()) == 3 else [said]
+        self._frames = tuple(frame_name(f) for f in frames)
+        self._seen: set[str] = set()
+        self._stamps, self._poses, self._body = array("q"), array("d"), frames[1] if frames else ""
+
+    def take(self, entry: Entry) -> None:
+        if self._frames:
+            self._take_transforms(entry)
+            return
+        m, where = entry.read(), f"{self._name}: {self.topic} at {entry.log_ns} ns"
+        if hasattr(m, "transform"):
+            position, orientation = m.transform.translation, m.transform.rotation
+        else:
+            pose = m.pose.pose if hasattr(m.pose, "pose") else m.pose
+            position, orientation = pose.position, pose.orientation
+        self._body = getattr(m, "child_frame_id", "")
+        if np.isfinite([position.x, position.y, position.z]).all():
+            self._add(self._time_ns(entry), pose_matrix(position, orientation, where))
+
+    def _take_transforms(self, entry: Entry) -> None:
+        for stamp, parent, child, T in transforms_in(entry, f"{self._name}: {self.topic}"):
+            self._seen.add(f"{parent} {child}")
+            if (parent, child) == self._frames:
+                self._add(sound_time(stamp, self.topic) if self._of_header else self._time_ns(entry), T)
+
+    def _add(self, stamp_ns: int, T: Array) -> None:
+        self._stamps.append(stamp_ns)
+        self._poses.extend(T.ravel().tolist())
+
+    def result(self) -> tuple[Poses, str]:
+        """Poses in order of time, of equal times the last one, and the frame of the body."""
+        if self._frames and not self._stamps:
+            wanted = " ".join(self._frames)
+            raise DuagError(
+                f"{self._name}: {self.topic} has no {wanted}, {closest(wanted, sorted(self._seen), 'transforms')}"
+            )
+        backwards = np.array(self._stamps, dtype=np.int64)[::-1]
+        stamps, last = np.unique(backwards, return_index=True)
+        T = np.array(self._poses, dtype=np.float64).reshape(-1, 4, 4)[::-1][last]
+        return Poses(stamps, T, 0), self._body
+
+
 class MotionReader:
-    """Reads topics of motion for one robot's colour camera."""
+    """Topics of motion for one robot's colour camera: `take` has who wants their messages, all to be given once."""
 
     def __init__(
         self,
@@ -70,9 +134,38 @@ class MotionReader:
     ) -> None:
         """Args:
         color_frame: of the colour camera. time_ns: the time of a message by the clock that the options choose.
+
+        Raises:
+            DuagError: a topic that was asked for is not there, or the file of true poses cannot be read.
         """
         self._log, self._settings, self._transforms = log, settings, transforms
-        self.name, self.color_frame, self._time_ns = log.name, color_frame, time_ns
+        self.name, self.color_frame = log.name, color_frame
+        self.take: list[tuple[str, Callable[[Entry], None]]] = []
+        s = settings
+        self._imu = self._odometry = self._truth = None
+        if s.imu:
+            self._check("imu", s.imu, log.of_type(IMU_TYPE), "an IMU")
+            self._imu = _ImuReadings(time_ns)
+            self.take.append((s.imu, self._imu.take))
+        if s.odometry:
+            self._odometry = self._poses(s.odometry, "odometry", time_ns)
+        if s.truth and s.truth_file:
+            raise DuagError(f"{self.name}: truth and truth_file are both said, expected one of them")
+        self._truth_file = Poses.read(Path(s.truth_file)) if s.truth_file else None
+        if s.truth:
+            self._truth = self._poses(s.truth, "truth", time_ns)
+
+    def _check(self, option: str, topic: str, known: list[str], what: str) -> None:
+        if topic not in known:
+            raise DuagError(f"{self.name}: {option} topic {topic} not found, {closest(topic, known, what)}")
+
+    def _poses(self, said: str, option: str, time_ns: Callable[[Entry], int]) -> _PoseReadings:
+        of_header = self._settings.time_source == "header"
+        readings = _PoseReadings(said, option, self.name, of_header, time_ns)
+        types, what = (POSE_TYPES, "poses") if readings.topic == said else (TF_TYPES, "transforms")
+        self._check(option, readings.topic, self._log.of_type(*types), what)
+        self.take.append((readings.topic, readings.take))
+        return readings
 
     def _body_camera(self, option: str, told: str) -> Array:
         """T_body_color [4, 4] of the body that poses are of. option: truth or odometry. told: its frame in the log."""
@@ -96,81 +189,29 @@ class MotionReader:
 
     def truth(self) -> CameraPoses | None:
         """True poses of the colour camera, by a topic or a file; None if none were asked for."""
-        s = self._settings
-        if s.truth and s.truth_file:
-            raise DuagError(f"{self.name}: truth and truth_file are both said, expected one of them")
-        if s.truth_file:
-            found = CameraPoses(Poses.read(Path(s.truth_file)), self._body_camera("truth", ""))
-        elif s.truth:
-            found = self.poses(s.truth, "truth")
+        if self._truth_file:
+            found, body = self._truth_file, ""
+        elif self._truth:
+            found, body = self._truth.result()
         else:
             return None
-        stamps = found.body.stamps_ns + round(s.truth_offset_s * NANOSECONDS)
-        return replace(found, body=replace(found.body, stamps_ns=stamps))
+        stamps = found.stamps_ns + round(self._settings.truth_offset_s * NANOSECONDS)
+        return CameraPoses(replace(found, stamps_ns=stamps), self._body_camera("truth", body))
 
-    def poses(self, topic: str, option: str) -> CameraPoses:
-        """Poses of the colour camera by a topic of poses of its body. option: truth or odometry."""
-        if len(topic.split()) == 3:
-            return self._poses_of_tf(topic.split(), option)
-        known = self._log.of_type(*POSE_TYPES)
-        if topic not in known:
-            raise DuagError(
-                f"{self.name}: {option} topic {topic} not found, {closest(topic, known, 'poses')}"
-            )
-        poses: dict[int, Array] = {}
-        body = ""
-        for entry in self._log.entries(topic):
-            m, where = entry.read(), f"{self.name}: {topic} at {entry.log_ns} ns"
-            if hasattr(m, "transform"):
-                position, orientation = m.transform.translation, m.transform.rotation
-            else:
-                pose = m.pose.pose if hasattr(m.pose, "pose") else m.pose
-                position, orientation = pose.position, pose.orientation
-            body = getattr(m, "child_frame_id", "")
-            if np.isfinite([position.x, position.y, position.z]).all():
-                poses[self._time_ns(entry)] = pose_matrix(position, orientation, where)
-        return self._camera_poses(poses, option, body)
+    def odometry(self) -> CameraPoses | None:
+        """Poses of the colour camera by another odometry; None if none was asked for."""
+        if not self._odometry:
+            return None
+        found, body = self._odometry.result()
+        return CameraPoses(found, self._body_camera("odometry", body))
 
-    def _poses_of_tf(self, said: list[str], option: str) -> CameraPoses:
-        """Poses of the colour camera by a transform that changes, "/tf world base_link"."""
-        topic, parent, child = said
-        known = self._log.of_type(*TF_TYPES)
-        if topic not in known:
-            raise DuagError(f"{self.name}: topic {topic} not found, {closest(topic, known, 'transforms')}")
-        poses: dict[int, Array] = {}
-        seen = set()
-        of_header = self._settings.time_source == "header"
-        for (entry, stamp), found_parent, found_child, T in self._transforms.of_topic(topic):
-            seen.add(f"{found_parent} {found_child}")
-            if (found_parent, found_child) == (frame_name(parent), frame_name(child)):
-                poses[sound_time(stamp, topic) if of_header else self._time_ns(entry)] = T
-        if not poses:
-            wanted = f"{frame_name(parent)} {frame_name(child)}"
-            raise DuagError(
-                f"{self.name}: {topic} has no {wanted}, {closest(wanted, sorted(seen), 'transforms')}"
-            )
-        return self._camera_poses(poses, option, child)
-
-    def _camera_poses(self, poses: dict[int, Array], option: str, body: str) -> CameraPoses:
-        stamps = sorted(poses)
-        T = np.array([poses[stamp] for stamp in stamps]).reshape(-1, 4, 4)
-        return CameraPoses(Poses(np.array(stamps, dtype=np.int64), T, 0), self._body_camera(option, body))
-
-    def imu(self, topic: str) -> Imu:
-        """What an IMU measured, in order of time."""
-        known = self._log.of_type(IMU_TYPE)
-        if topic not in known:
-            raise DuagError(f"{self.name}: imu topic {topic} not found, {closest(topic, known, 'an IMU')}")
-        stamps: list[int] = []
-        rows: list[list[float]] = []
-        frame = ""
-        for entry in self._log.entries(topic):
-            m = entry.read()
-            frame, w, a = m.header.frame_id, m.angular_velocity, m.linear_acceleration
-            stamps.append(self._time_ns(entry))
-            rows.append([w.x, w.y, w.z, a.x, a.y, a.z])
-        times, first = np.unique(np.array(stamps, dtype=np.int64), return_index=True)
-        values = np.array(rows, dtype=np.float64)[first]
+    def imu(self) -> Imu | None:
+        """What an IMU measured, in order of time; None if none was asked for."""
+        if not self._imu:
+            return None
+        topic, frame = self._settings.imu, self._imu.frame
+        times, first = np.unique(np.array(self._imu.stamps, dtype=np.int64), return_index=True)
+        values = np.array(self._imu.values, dtype=np.float64).reshape(-1, 6)[first]
         if not np.isfinite(values).all():
             raise DuagError(
                 f"{self.name}: {topic} holds numbers that are not finite, expected rad/s and m/s^2"

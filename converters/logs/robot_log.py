@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from array import array
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from converters.ros_images import RosCamera, is_integer_depth, size_of
 from converters.tum_layout import Listed, associate
 from pipeline.errors import DuagError
 from pipeline.geometry import se3
+from pipeline.progress import track
 
 Array = NDArray[np.float64]
 HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
@@ -83,7 +85,6 @@ class RobotLog:
         self.color = chooser.color().required(self.log, "color")
         self.color_camera = self._camera(self.color, "color_info", chooser)
         self._motion = MotionReader(self.log, s, self.transforms, self.color_camera.frame_id, self.time_ns)
-        self.truth: CameraPoses | None = self._motion.truth()
         self.T_color_depth: Array | None = None
         self.derived = self._derived(chooser) if s.depth_from != "image" else None
         if self.derived:
@@ -213,12 +214,20 @@ class RobotLog:
     @cached_property
     def imu(self) -> Imu | None:
         """What the IMU measured, in order of time."""
-        return self._motion.imu(self.settings.imu) if self.settings.imu else None
+        self._seen  # noqa: B018 (looks through the log)
+        return self._motion.imu()
 
     @cached_property
     def odometry(self) -> CameraPoses | None:
         """Poses of the colour camera by another odometry."""
-        return self._motion.poses(self.settings.odometry, "odometry") if self.settings.odometry else None
+        self._seen  # noqa: B018
+        return self._motion.odometry()
+
+    @cached_property
+    def truth(self) -> CameraPoses | None:
+        """True poses of the colour camera, for evaluation only."""
+        self._seen  # noqa: B018
+        return self._motion.truth()
 
     # --- which messages
 
@@ -236,18 +245,32 @@ class RobotLog:
         return entry.publish_ns
 
     @cached_property
-    def pairs(self) -> dict[int, int]:
-        """Time of a colour image -> time of its depth image."""
-        stamps: dict[str, list[int]] = {self.color: [], self.depth: []}
-        delays = []
-        cameras = _Cameras(self._cameras, self.name)
-        for entry in self.log.entries(self.color, self.depth, *self._cameras):
-            if entry.topic in self._cameras:
-                cameras.see(entry)
-                continue
+    def _seen(self) -> dict[str, array[int]]:
+        """Times of the images by topic. Looks through the log once, for all that is to be known before the images."""
+        stamps = {self.color: array("q"), self.depth: array("q")}
+        delays = array("q")
+
+        def take_image(entry: Entry) -> None:
             stamps[entry.topic].append(self.time_ns(entry))
             delays.append(entry.log_ns - stamps[entry.topic][-1])
+
+        cameras = _Cameras(self._cameras, self.name)
+        takers: list[tuple[str, Callable[[Entry], None]]] = [*self._motion.take]
+        takers += [(topic, take_image) for topic in stamps]
+        takers += [(topic, cameras.see) for topic in self._cameras]
+        total = sum(self.log.topics[topic].count for topic in {topic for topic, _ in takers})
+        entries = self.log.entries(*sorted({topic for topic, _ in takers}), heads=stamps)
+        for entry in track(entries, f"look through {PurePath(self.name).name}", total):
+            for topic, take in takers:
+                if topic == entry.topic:
+                    take(entry)
         self._delays_ns = np.array(delays, dtype=np.int64)
+        return stamps
+
+    @cached_property
+    def pairs(self) -> dict[int, int]:
+        """Time of a colour image -> time of its depth image."""
+        stamps = {topic: times.tolist() for topic, times in self._seen.items()}
         for topic, times in stamps.items():
             if times != sorted(times):
                 self.warnings.append(f"{topic}: times go backwards; images are taken in order of time")
@@ -289,8 +312,9 @@ class RobotLog:
         """Time, colour and depth message of every pair, in order of time; holds no more than it must."""
         order = sorted(self.pairs)
         groups = [{self.color: time, self.depth: self.pairs[time]} for time in order]
-        for time, found in zip(order, gathered(self.log, groups, self.time_ns), strict=False):
-            yield time, found[self.color].read(), found[self.depth].read()
+        # to the end of the log, so that all its checksums are compared
+        for index, found in enumerate(gathered(self.log, groups, self.time_ns)):
+            yield order[index], found[self.color].read(), found[self.depth].read()
 
     def sensors(self) -> dict[str, str]:
         """What the log says about its source."""

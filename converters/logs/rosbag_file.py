@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from converters.logs import foxglove
+from converters.logs.bag_messages import messages
 from converters.logs.files import NANOSECONDS, Entry, Topic, sound_time, stamp_ns
 from pipeline.errors import DuagError
 from pipeline.files import check_file
@@ -50,16 +51,16 @@ class RosBag:
         self._encoding = "cdr" if self._reader.is2 else "ros1"
         self.topics: dict[str, Topic] = {}
         for c in self._reader.connections:
+            if not isinstance(c.msgcount, int):  # it stands in the metadata of a bag of ROS 2
+                raise DuagError(f"{path}: {c.topic} has {c.msgcount!r} messages, expected a number")
             count = c.msgcount + (self.topics[c.topic].count if c.topic in self.topics else 0)
             kind = foxglove.ROS_TYPES.get(foxglove.plain_name(c.msgtype), c.msgtype)
             self.topics[c.topic] = Topic(c.topic, kind, c.msgtype, self._encoding, count)
 
-    def entries(self, topics: Sequence[str]) -> Iterator[Entry]:
-        connections = [c for c in self._reader.connections if c.topic in topics]
-        if not connections:
-            return
+    def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
+        heads = [t for t in heads if foxglove.plain_name(self.topics[t].schema) not in foxglove.ROS_TYPES]
         with reading(self.path, "a sound bag of ROS 1 or ROS 2"):
-            for connection, log_ns, raw in self._reader.messages(connections=connections):
+            for connection, log_ns, raw in messages(self._reader, topics, heads):
                 read = partial(self._read, connection, raw)
                 header = partial(ros_header_ns, raw, self._encoding, f"{self.path}: {connection.topic}")
                 if foxglove.plain_name(connection.msgtype) in foxglove.ROS_TYPES:
@@ -73,7 +74,8 @@ class RosBag:
         return foxglove.as_ros(foxglove.plain_name(connection.msgtype), message, where)
 
     def close(self) -> None:
-        self._reader.close()
+        with reading(self.path, "a sound bag of ROS 1 or ROS 2"):  # a database may notice its damage only now
+            self._reader.close()
 
 
 def _bound_chunks(reader: Any) -> None:

@@ -153,6 +153,34 @@ def bench_team(
     print(json.dumps(result, indent=2) if as_json else team_bench.format_table(result))
 
 
+@bench_app.command("reference")
+def bench_reference(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A finished run.", show_default=False)],
+    recording: Annotated[
+        Path | None, typer.Option(help="Folder of its recording, if it moved.", show_default=False)
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """A team's error beside what its images allow: all keyframes optimised in one place.
+
+    From the run's poses and from the true ones. A run of one robot is also cut in parts. Needs ground truth.
+
+    Example: `duagc bench reference outputs/redkitchen`
+    """
+    from pipeline import numeric
+    from pipeline.config import load
+    from pipeline.evaluation import reference_bench
+    from pipeline.recording import Recording
+    from pipeline.run_folder import RunFolder
+    from pipeline.runner import RunConfig
+
+    numeric.settle_opencv()
+    run = RunFolder(run_folder)
+    source = Recording(run.recording if recording is None else recording)
+    result = reference_bench.run(run, source, load(RunConfig, run.config_file, []).frontend)
+    print(json.dumps(result, indent=2) if as_json else reference_bench.format_table(result))
+
+
 @bench_app.command("frontend")
 def bench_frontend(
     recording: Annotated[
@@ -214,6 +242,66 @@ def bench_frontend(
         partial.write_text(figures.map_sizes(frontend_bench.by_cap(result)), encoding="utf-8")
         partial.replace(plot)
     print(json.dumps(result, indent=2) if as_json else frontend_bench.format_tables(result))
+
+
+@bench_app.command("paths")
+def bench_paths(
+    scenes: Annotated[
+        str, typer.Option(help="Scenes, or folders of textured meshes.")
+    ] = "room,office,corridor,outdoor",
+    paradigms: Annotated[
+        str, typer.Option(help="Of concentric, leader-follower, crossing, parallel.")
+    ] = "concentric,leader-follower,crossing,parallel",
+    robots: Annotated[str, typer.Option(help="Numbers of robots.")] = "2,3,4,8",
+    overlap: Annotated[str, typer.Option(help="Shares of the view to ask for.")] = "0.2,0.4,0.6,0.8",
+    frames: Annotated[int, typer.Option(min=2, help="Frames per robot.")] = 160,
+    up: Annotated[str, typer.Option(help="Axis that is up in meshes: y, z, or auto.")] = "auto",
+    seed: Annotated[int, typer.Option(help="Seed of scenes and paths.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Plan paths for every combination, without images: the overlap reached, speed, distances, processor time.
+
+    Lists are separated by commas. A cell of the table has the overlap asked for that was met worst, what neighbours
+    share then, and how fast the slowest and the fastest robot go, of the scene's usual speed.
+
+    Example: `duagc bench paths --scenes scans/house --robots 3`
+    """
+    from converters.simulate import MAX_ROBOTS, PARADIGMS
+    from converters.simulate import survey as paths
+
+    for name in paradigms.split(","):
+        if name not in PARADIGMS[1:]:
+            raise typer.BadParameter(
+                f"{name!r} is not one of {', '.join(PARADIGMS[1:])}", param_hint="--paradigms"
+            )
+    counts = [round(n) for n in _numbers("--robots", robots, 1, MAX_ROBOTS)]
+    asked = _numbers("--overlap", overlap, 0, 1)
+    rows = paths.survey(scenes.split(","), paradigms.split(","), counts, asked, frames, seed, up)
+    print(json.dumps(rows, indent=2) if as_json else paths.format_table(rows))
+
+
+@bench_app.command("convert")
+def bench_convert(
+    log: Annotated[Path, typer.Argument(help="A .bag, .db3 or .mcap of one robot.", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder that is written to and removed; must not exist.")
+    ] = Path("bench-convert"),
+    options: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Option of `duagc convert ros`; repeatable."),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """What converting a log costs beside reading its messages and writing them as they are.
+
+    Needs as much room on the disk as the log has, at most.
+
+    Example: `duagc bench convert ~/logs/kitchen.bag --set imu=/imu/data`
+    """
+    from converters.logs import bench
+
+    result = bench.run(log, options or [], out)
+    print(json.dumps(result, indent=2) if as_json else bench.format_table(result))
 
 
 def _numbers(option: str, text: str, low: float, high: float) -> list[float]:

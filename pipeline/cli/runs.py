@@ -103,16 +103,23 @@ def evaluate(
 ) -> None:
     """Measure a run against ground truth, where there is any, and write metrics.json.
 
+    Prints how each robot's maps compare: own, own trained as long, fused, refined.
+
     Example: `duagc evaluate outputs/demo/run --json`
     """
     from pipeline.evaluation import evaluate as evaluate_run
+    from pipeline.report.words import comparison_text
     from pipeline.run_folder import RunFolder
     from pipeline.runner import threads_per_worker
 
     metrics = evaluate_run(
         run_folder, recording or RunFolder(run_folder).recording, threads=threads_per_worker(1)
     )
-    print(json.dumps(metrics, indent=2) if as_json else run_folder / "metrics.json")
+    if as_json:
+        print(json.dumps(metrics, indent=2))
+        return
+    print(comparison_text(metrics))
+    print(run_folder / "metrics.json")
 
 
 @app.command()

@@ -17,6 +17,8 @@ from pipeline.consensus.robust import RobustWeights
 Array = NDArray[np.float64]
 BLOCK = [0, 0, 0, 1, 1, 1]
 """Translation, rotation -> the six rows of a tangent."""
+REMEMBERED = 8
+"""Arrivals that must have changed little before an end holds still."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,7 @@ class Link:
     newest: NDArray[np.int64] = field(init=False)  # [s] sequence last used
     newest_header: int = 0
     change: Array = field(init=False)  # [s] last change by an arrival (m, rad)
+    recent: Array = field(init=False)  # [s, REMEMBERED] the same of the last arrivals, newest last
     reference: tuple[Array, Array] | None = None  # force and poses when the curvature window began
     peer_curvature: Array | None = None
     peer_converged: bool = False
@@ -95,6 +98,7 @@ class Link:
         self.offset = np.zeros((len(self.keyframes), 6))
         self.newest = np.zeros(len(self.keyframes), np.int64)
         self.change = np.full(len(self.keyframes), np.inf)
+        self.recent = np.full((len(self.keyframes), REMEMBERED), np.inf)
 
     @property
     def holds(self) -> bool:
@@ -109,9 +113,22 @@ class Link:
         """W (x - y) [s, 6]: the multiplier of this end (dual)."""
         return self.penalty() * self.offset
 
+    def moved(self, at: NDArray[np.int64], change: Array) -> None:
+        """Note by how much an arrival moved the edge variables `at` (m, rad)."""
+        self.change[at] = change
+        self.recent[at] = np.concatenate([self.recent[at, 1:], change[:, None]], axis=1)
+
     def largest_change(self) -> float:
         """Largest change of an edge variable by the last arrivals (m, rad); infinite before the first."""
         return float(self.change.max())
+
+    def largest_recent_change(self) -> float:
+        """The same over the last arrivals; infinite before there were so many.
+
+        A neighbour that has not heard since says nearly the same again: the less arrives, the less a single small
+        change means.
+        """
+        return float(self.recent.max())
 
 
 def link_metric(

@@ -284,7 +284,7 @@ class PoseAgent:
         delta = self.config.relaxation * difference(m, y)
         link.offset[at] -= delta
         link.newest[at] = packet.sequence
-        link.change[at] = np.abs(delta).max(axis=1)
+        link.moved(at, np.abs(delta).max(axis=1))
         share = len(at) / len(link.keyframes)
         link.received += share
         link.received_total += share
@@ -388,8 +388,8 @@ class PoseAgent:
 
     @property
     def largest_change(self) -> float:
-        """Largest change of a pose or an edge variable in the last round (m, rad)."""
-        return max([self.step_change, *(link.largest_change() for link in self.links.values())])
+        """Largest change of a pose in the last step or of an edge variable by recent arrivals (m, rad)."""
+        return max([self.step_change, *(link.largest_recent_change() for link in self.links.values())])
 
     @property
     def settled(self) -> bool:

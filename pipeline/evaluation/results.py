@@ -66,7 +66,7 @@ def unit_of(name: str) -> str:
         return {"bytes": "B", "nll": "nat"}[words[0]]
     if words[-1] in ("db", "sigma"):
         return {"db": "dB", "sigma": "sigma"}[words[-1]]
-    return next((unit for unit in ("m", "rad") if unit in words), "1")
+    return next((unit for unit in ("m", "rad", "px") if unit in words), "1")
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from pipeline.errors import DuagError
 from pipeline.evaluation import (
+    agreement,
     calibration,
-    depth_agreement,
     groundtruth,
     map_errors,
     trajectory_errors,
-    views,
 )
 from pipeline.evaluation.network import Session
+from pipeline.evaluation.rendering import poses_by_stamp, rendering_sections
 from pipeline.evaluation.results import (
     Absent,
     Row,
@@ -32,16 +32,10 @@ from pipeline.evaluation.results import (
 )
 from pipeline.evaluation.trajectory_errors import Paired, TeamError
 from pipeline.geometry.trajectory import Trajectory
-from pipeline.progress import track
-from pipeline.recording import Recording, RgbdLog, open_rgbd
+from pipeline.recording import Recording
 from pipeline.run_folder import RobotRun, RunFolder
-from pipeline.splat.gaussians import DepthKind, Gaussians
 
 SCHEMA = 1
-AGREEMENT_VIEWS = 40
-"""Held-out views, evenly spread, whose depth is compared in pairs."""
-MAPS = ("own", "fused")
-VIEW_SETS = ("held_out", "training", "peers")
 
 PROTOCOL = {
     "alignment": "se3",
@@ -49,9 +43,13 @@ PROTOCOL = {
     "team_ate": "one alignment for all robots of the largest component, pooled root mean square",
     "rpe": "root mean square from each frame to the next",
     "depth_agreement": "pairs of at most 40 held-out views that share 30 % under all poses compared; median of medians",
+    "feature_agreement": "matched features of the same views, sifted by the images alone; median of medians",
     "initial_relative_poses": "unknown",
     "held_out": "index % 8 == 4",
     "training": "keyframes",
+    "team": "held-out and peers' views together, of robots that have peers",
+    "common": "pixels that own, own_longer, fused and refined all cover; else what a map does not cover is no part of "
+    "its depth error and lowers its completeness",
     "peers": "held-out views of the other robots of the component, at their own poses; own map moved into the world",
     "poses": "own: odometry.tum in the robot's map frame; fused: trajectory.tum in the world frame",
     "exposure": "none fitted",
@@ -63,7 +61,8 @@ PROTOCOL = {
     "depth": "blended depth / alpha where alpha >= 0.5, of a Gaussian as its map says: that of its centre or of its "
     "plane; mean over pixels with both depths, then over views",
     "own_unrefined": "the own map before its final refinement, seen as the own map",
-    "refined": "the fused map trained again on the robot's own images, seen as the fused map",
+    "own_longer": "the own map trained again with the same settings and as many steps, alone; seen as the own map",
+    "refined": "the final map: the fused one trained again on own images and peers' maps, seen as the fused map",
     "calibration": "distance of fused Gaussians from the true surface against sigma along its normal; mean of robots",
 }
 
@@ -86,14 +85,17 @@ def evaluate(run_dir: Path, recording: Path, threads: int = 2, progress: bool = 
         raise DuagError(f"{recording}: has no robot {strangers[0]}, expected the robots of {run_dir}")
     truth, session = TruePaths.of(run, source), Session(run)
     rows: list[Row] = []
+    rendering, rendering_of = rendering_sections(run, source, threads, progress, rows)
     tree = {
         "schema": SCHEMA,
         "robots": {
-            name: _robot_section(robot, truth) | _agreement_section(robot, source, truth)
+            name: _robot_section(robot, truth)
+            | _agreement_section(robot, source, truth)
+            | {"rendering": rendering_of[name]}
             for name, robot in run.robots.items()
         },
         "team": _team_section(run, truth) | session.closure_counts(),
-        "rendering": _rendering_section(run, source, threads, progress, rows),
+        "rendering": rendering,
         "calibration": _calibration_section(run, source, truth, rows),
         "exchange": session.exchange_section(),
         "consensus": session.consensus_section(),
@@ -176,32 +178,9 @@ def _robot_section(robot: RobotRun, truth: TruePaths) -> dict[str, Any]:
 
 
 def _agreement_section(robot: RobotRun, source: Recording, truth: TruePaths) -> dict[str, Any]:
-    """How well the depth of held-out views agrees under the estimate, and under the ground truth where there is one."""
-    stamp_of = {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
-    paths = {
-        "depth_agreement_m": poses_by_stamp(robot.trajectory),
-        "depth_agreement_m_before_consensus": poses_by_stamp(robot.odometry),
-    }
-    section: dict[str, Any] = {}
-    paired = truth.after[robot.robot]
-    if isinstance(paired, Absent):
-        section["depth_agreement_m_of_truth"] = paired
-    elif paired.positions_only:
-        section["depth_agreement_m_of_truth"] = trajectory_errors.NO_ROTATIONS
-    else:
-        paths["depth_agreement_m_of_truth"] = dict(zip(paired.stamps_ns.tolist(), paired.true, strict=True))
-    known = [i for i, stamp in stamp_of.items() if all(stamp in path for path in paths.values())]
-    most = min(AGREEMENT_VIEWS, len(known))
-    chosen = [known[(2 * k + 1) * len(known) // (2 * most)] for k in range(most)]
-    with open_rgbd(source.log(robot.robot)) as log:
-        frames = [log.frame(index) for index in chosen]
-        depths = [f.depth if f.mask is None else np.where(f.mask, f.depth, np.float32(0)) for f in frames]
-        poses = {
-            name: np.array([path[stamp_of[index]] for index in chosen]).reshape(-1, 4, 4)
-            for name, path in paths.items()
-        }
-        pairs, values = depth_agreement.depth_agreement(depths, log.camera, poses)
-    return {"depth_agreement_pairs": pairs} | values | section
+    held_out = {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
+    paths = {"": poses_by_stamp(robot.trajectory), "_before_consensus": poses_by_stamp(robot.odometry)}
+    return agreement.section(source.log(robot.robot), held_out, paths, truth.after[robot.robot])
 
 
 def _ate_of_keyframes(robot: RobotRun, pairs: Paired) -> float | Absent:
@@ -230,157 +209,6 @@ def _team_section(run: RunFolder, truth: TruePaths) -> dict[str, Any]:
         "ate_rmse_m": truth.team if isinstance(truth.team, Absent) else truth.team.ate_rmse_m,
         "ate_rmse_m_mean_of_robots": missing[0] if missing else mean(solo),
     }
-
-
-# --- rendering ---------------------------------------------------------------------------------------------------
-
-
-def _rendering_section(
-    run: RunFolder, source: Recording, threads: int, progress: bool, rows: list[Row]
-) -> dict[str, Any]:
-    """Scores of both maps of all robots over all sets of views; one row per view and score."""
-    scores: dict[tuple[str, str], list[Any]] = {(m, s): [] for m in MAPS for s in VIEW_SETS}
-    for name, robot in run.robots.items():
-        mates = [
-            run.robots[r] for r in robot.component if r != name and run.robots[r].component == robot.component
-        ]
-        for camera_robot in (robot, *mates):
-            of_peer = camera_robot is not robot
-            maps = _maps_in_world(robot) if of_peer else _maps(robot)
-            poses = dict.fromkeys(MAPS, camera_robot.trajectory) if of_peer else _own_poses(robot)
-            for kind in MAPS:
-                task = RenderTask(
-                    maps[kind], camera_robot, poses[kind], keyframes=not of_peer, depth=robot.own_map.depth
-                )
-                title = f"render {kind} map of {name}" + (f" from {camera_robot.robot}" if of_peer else "")
-                for index, score in task.scores(source, threads, title if progress else None):
-                    view_set = "peers" if of_peer else "held_out" if index in robot.held_out else "training"
-                    scores[kind, view_set].append(score)
-                    rows += _view_rows(name, f"{kind}/{view_set}", index, score)
-    reasons = dict.fromkeys(VIEW_SETS, "there is no such view") | {"peers": "no two robots met"}
-    sections = {m: {s: views.summary(scores[m, s], reasons[s]) for s in VIEW_SETS} for m in MAPS}
-    return (
-        sections
-        | {"own_unrefined": {"held_out": _unrefined(run, source, threads, progress, rows)}}
-        | {"refined": _refined(run, source, threads, progress, rows)}
-    )
-
-
-def _refined(
-    run: RunFolder, source: Recording, threads: int, progress: bool, rows: list[Row]
-) -> dict[str, Any]:
-    """Scores of the fused maps after their training, over own held-out views and those of the peers."""
-    scores: dict[str, list[Any]] = {"held_out": [], "peers": []}
-    for name, robot in run.robots.items():
-        refined = robot.refined_map
-        if refined is None:
-            continue
-        mates = [run.robots[r] for r in robot.component if r != name]
-        for camera_robot in (robot, *(mate for mate in mates if mate.component == robot.component)):
-            view_set = "held_out" if camera_robot is robot else "peers"
-            task = RenderTask(
-                refined.gaussians, camera_robot, camera_robot.trajectory, keyframes=False, depth=refined.depth
-            )
-            title = f"render refined map of {name} from {camera_robot.robot}"
-            for index, score in task.scores(source, threads, title if progress else None):
-                scores[view_set].append(score)
-                rows += _view_rows(name, f"refined/{view_set}", index, score)
-    return {s: views.summary(found, "no robot met another") for s, found in scores.items()}
-
-
-def _unrefined(
-    run: RunFolder, source: Recording, threads: int, progress: bool, rows: list[Row]
-) -> dict[str, Any]:
-    """Scores of the own maps before their final refinement, over the robots' own held-out views."""
-    scores = []
-    for name, robot in run.robots.items():
-        unrefined = robot.unrefined_map
-        if unrefined is None:
-            continue
-        task = RenderTask(unrefined.gaussians, robot, robot.odometry, keyframes=False, depth=unrefined.depth)
-        for index, score in task.scores(
-            source, threads, f"render unrefined map of {name}" if progress else None
-        ):
-            scores.append(score)
-            rows += _view_rows(name, "own_unrefined/held_out", index, score)
-    return views.summary(scores, "the front end wrote no map before its refinement")
-
-
-def _maps(robot: RobotRun) -> dict[str, Gaussians]:
-    """The own map in the robot's map frame, the fused one in the world."""
-    return {"own": robot.own_map.gaussians, "fused": robot.fused_map.gaussians}
-
-
-def _own_poses(robot: RobotRun) -> dict[str, Trajectory]:
-    """The robot's own poses in the frames of `_maps`."""
-    return {"own": robot.odometry, "fused": robot.trajectory}
-
-
-def _maps_in_world(robot: RobotRun) -> dict[str, Gaussians]:
-    """Both maps in the world: Gaussians of the own map move with their keyframes."""
-    T_map_keyframe = np.array([k.T_map_camera for k in robot.keyframes])
-    own = robot.own_map.gaussians.moved(T_map_keyframe, robot.corrected.T_world_keyframe)
-    return {"own": own, "fused": robot.fused_map.gaussians}
-
-
-@dataclass(frozen=True)
-class RenderTask:
-    """A map to be rendered where one robot's camera stood: at its held-out frames, and at its keyframes if asked."""
-
-    gaussians: Gaussians
-    camera_robot: RobotRun
-    trajectory: Trajectory
-    keyframes: bool
-    depth: DepthKind
-
-    def scores(
-        self, source: Recording, threads: int, title: str | None
-    ) -> Iterator[tuple[int, views.ViewScore | Absent]]:
-        """Frame index and score of every view, in order; progress under `title`."""
-        name, robot = self.camera_robot.robot, self.camera_robot
-        with open_rgbd(source.log(name)) as log:
-            chosen = set(robot.held_out)
-            if self.keyframes:
-                chosen |= {k.frame_index for k in robot.keyframes}
-            stamps = {f.stamp_ns for f in robot.frames if f.frame_index in chosen}
-            exact = groundtruth.exact_depths(source, name, stamps)
-            frames = _views(log, sorted(chosen), exact, groundtruth.recorded_depth_is_exact(source, name))
-            found = views.score_map(
-                self.gaussians, log.camera, frames, poses_by_stamp(self.trajectory), threads, self.depth
-            )
-            yield from track(found, title, total=len(chosen)) if title else found
-
-
-def _views(
-    log: RgbdLog, indices: list[int], exact: Mapping[int, Any] | Absent, recorded_is_exact: bool
-) -> Iterator[views.View]:
-    for index in indices:
-        frame = log.frame(index)
-        if recorded_is_exact:
-            yield views.View(frame, frame.depth)
-        elif isinstance(exact, Absent):
-            yield views.View(frame, exact)
-        else:
-            yield views.View(frame, exact.get(frame.stamp_ns, Absent("the frame has no exact depth")))
-
-
-def poses_by_stamp(trajectory: Trajectory) -> dict[int, NDArray[np.float64]]:
-    """Poses [4, 4] by time stamp in ns."""
-    return dict(zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True))
-
-
-def _view_rows(robot: str, view_set: str, frame_index: int, score: views.ViewScore | Absent) -> list[Row]:
-    return [
-        Row(
-            "view",
-            robot,
-            view_set,
-            frame_index,
-            f.name,
-            score if isinstance(score, Absent) else getattr(score, f.name),
-        )
-        for f in fields(views.ViewScore)
-    ]
 
 
 # --- calibration -------------------------------------------------------------------------------------------------
@@ -440,7 +268,7 @@ def _rows_of(tree: Mapping[str, Any]) -> list[Row]:
             continue
         scope, name = path[0].removesuffix("s") if path[0] == "robots" else path[0], path[-1]
         robot = path[1] if path[0] == "robots" else ""
-        view_set = "/".join(path[1:-1]) if path[0] == "rendering" else ""
+        view_set = "/".join(path[path.index("rendering") + 1 : -1]) if "rendering" in path else ""
         rows.append(
             Row(scope, robot, view_set, -1, name, value if isinstance(value, Absent) else float(value))
         )

@@ -26,6 +26,7 @@ PSNR_CEILING_DB = 100.0  # of a render equal to its image: infinity has no place
 MS_SSIM_MIN_SIDE_PX = 176  # the 11 px window at the fifth scale
 MIN_ALPHA = 0.5
 NO_LAYER = Absent("the depth of one layer was not drawn")
+NO_OTHER = Absent("no other map was drawn from this view")
 NO_LPIPS = Absent("LPIPS needs the weights of a trained network, which this build does not carry")
 
 
@@ -39,6 +40,7 @@ class ViewScore:
     depth_l1_m: Score
     depth_l1_exact_m: Score
     depth_l1_layer_m: Score
+    depth_l1_common_m: Score
     depth_completeness: Score
 
 
@@ -56,6 +58,7 @@ def score_view(
     depth_m: NDArray[np.float32],
     exact_m: Any,
     layer_m: Any = NO_LAYER,
+    common: NDArray[np.bool_] | None = None,
 ) -> ViewScore:
     """Compare a render with the image of the same pose.
 
@@ -64,6 +67,7 @@ def score_view(
         color: [h, w, 3] RGB. depth_m: recorded depth [h, w], 0 where there is none.
         exact_m: exact depth [h, w] in metres, or Absent.
         layer_m: depth of one layer per pixel (`Rasterizer.layer_depth`), [h, w] in metres, or Absent.
+        common: [h, w], pixels that the maps that this one is compared with cover, too; None: there are none.
     """
     image = color.astype(np.float64) / 255.0
     l1_m, completeness = _depth(render, depth_m, "recorded")
@@ -77,6 +81,7 @@ def score_view(
         depth_l1_m=l1_m,
         depth_l1_exact_m=exact_m if isinstance(exact_m, Absent) else _depth(render, exact_m, "exact")[0],
         depth_l1_layer_m=layer_m if isinstance(layer_m, Absent) else _layer(layer_m, depth_m),
+        depth_l1_common_m=NO_OTHER if common is None else _common(render, depth_m, common),
         depth_completeness=completeness,
     )
 
@@ -87,6 +92,12 @@ def _layer(layer_m: NDArray[np.float32], depth_m: NDArray[np.float32]) -> Score:
     if not both.any():
         return Absent("no pixel has both a layer that stops half of its light and a recorded depth")
     return float(np.mean(np.abs(layer_m[both] - depth_m[both]), dtype=np.float64))
+
+
+def _common(render: Render, depth_m: NDArray[np.float32], common: NDArray[np.bool_]) -> Score:
+    """L1 over the pixels that all compared maps cover."""
+    l1_m, completeness = losses.depth_error(render, np.where(common, depth_m, np.float32(0)), MIN_ALPHA)
+    return l1_m if completeness > 0 else Absent("no pixel with recorded depth is covered by all maps")
 
 
 def _depth(render: Render, reference_m: NDArray[np.float32], name: str) -> tuple[Score, Score]:
@@ -108,37 +119,54 @@ class View:
     exact_depth_m: Any
 
 
-def score_map(
-    gaussians: Gaussians,
+def score_maps(
+    maps: Mapping[str, tuple[Gaussians, Mapping[int, NDArray[np.float64]]]],
     camera: PinholeCamera,
     views: Iterable[View],
-    poses: Mapping[int, NDArray[np.float64]],
     threads: int,
     depth: DepthKind = "blended",
-) -> Iterator[tuple[int, ViewScore | Absent]]:
-    """Render a map from every view and score it, in order of the views.
+    compared: Sequence[str] = (),
+) -> Iterator[tuple[int, dict[str, ViewScore | Absent]]]:
+    """Render maps from every view and score them, in order of the views.
 
     Args:
-        gaussians: the map. camera: of the views.
-        poses: T_map_camera [4, 4] by time stamp in ns; a view without a pose is Absent.
-        depth: of a Gaussian at a pixel, as the map was made.
+        maps: by name, with the T_frame_camera [4, 4] of the views in the map's frame, by time stamp in ns; a map whose
+            poses lack a view is Absent there.
+        camera: of the views.
         threads: views at a time, each with a rasterizer of one thread; changes no bit of the result.
+        depth: of a Gaussian at a pixel, as the maps were made.
+        compared: names of the maps whose common pixels `depth_l1_common_m` is over.
     Yields:
-        Frame index and scores.
+        Frame index and scores by the maps' names.
     """
     from pipeline.kernels import Rasterizer
 
     own = local()
 
-    def score(view: View) -> tuple[int, ViewScore | Absent]:
-        T_map_camera = poses.get(view.frame.stamp_ns)
-        if T_map_camera is None:
-            return view.frame.index, Absent("the trajectory has no pose of this frame")
+    def score(view: View) -> tuple[int, dict[str, ViewScore | Absent]]:
         if not hasattr(own, "rasterizer"):
             own.rasterizer = Rasterizer(threads=1)
-        render = own.rasterizer.forward(gaussians, camera, se3.inverse(T_map_camera), depth=depth)
-        frame, layer_m = view.frame, own.rasterizer.layer_depth()
-        return frame.index, score_view(render, frame.color, frame.depth, view.exact_depth_m, layer_m)
+        frame, drawn = view.frame, {}
+        for name, (gaussians, poses) in maps.items():
+            T = poses.get(frame.stamp_ns)
+            if T is not None:
+                render = own.rasterizer.forward(gaussians, camera, se3.inverse(T), depth=depth)
+                drawn[name] = render, own.rasterizer.layer_depth()
+        together = [drawn[name][0].alpha >= MIN_ALPHA for name in compared if name in drawn]
+        common = np.logical_and.reduce(together) if len(together) > 1 else None
+        scores: dict[str, ViewScore | Absent] = dict.fromkeys(
+            maps, Absent("the trajectory has no pose of this frame")
+        )
+        for name, (render, layer_m) in drawn.items():
+            scores[name] = score_view(
+                render,
+                frame.color,
+                frame.depth,
+                view.exact_depth_m,
+                layer_m,
+                common if name in compared else None,
+            )
+        return frame.index, scores
 
     with ThreadPoolExecutor(threads) as pool:
         batch: list[View] = []
@@ -172,5 +200,6 @@ def summary(scores: Sequence[ViewScore | Absent], reason_if_none: str) -> dict[s
         "depth_l1_m": means["depth_l1_m"],
         "depth_l1_exact_m": means["depth_l1_exact_m"],
         "depth_l1_layer_m": means["depth_l1_layer_m"],
+        "depth_l1_common_m": means["depth_l1_common_m"],
         "depth_completeness": means["depth_completeness"],
     }

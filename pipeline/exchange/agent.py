@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.consensus.closures import plausible
-from pipeline.exchange import injection, wire
+from pipeline.exchange import injection, places_wire, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.frames import Frames
 from pipeline.exchange.meeting import HigherEnd, LowerEnd, Meeting, OwnPlaces, Send
@@ -180,7 +180,7 @@ class Agent:
         if arrival.kind is Kind.STATE:
             self._take_state(n, payload)
         elif arrival.kind is Kind.HELLO:
-            digest = wire.read_digest(payload)
+            digest = places_wire.read_digest(payload)
             self._meet(n, lower=(self.places.digest, self.data.robot) < (digest, n.name))
         elif arrival.kind in MEETING_KINDS:
             self._meet(n, lower=arrival.kind in LOWER_END_KINDS).take(arrival.kind, payload, self._sender(n))
@@ -303,12 +303,18 @@ class Agent:
 
     def _part(self, known: int) -> None:
         """Begin again with frames, without the links of this mask; forget what depended on them."""
+        undecided = self.frames.placement.undecided
         self.frames.part(known)
         for n in self.neighbours.values():
             if not n.parted and known & pair_bit(self.own, n.index):
                 n.parted = True
+                reason = undecided.get((min(self.data.robot, n.name), max(self.data.robot, n.name)))
+                if reason is not None:
+                    n.undecided, n.contradiction = True, reason
                 if self.poses is not None and n.index in self.links:
                     n.last_weights = self.poses.weights(n.name).tolist()
+                elif n.meeting is not None and n.meeting.joined is not None:
+                    n.last_weights = [0.0] * len(n.meeting.joined.closures)
                 n.transport.cancel_all()
                 n.evidence_sent.clear()
         self.frames_hops = self.still_hops = 0
@@ -356,6 +362,9 @@ class Agent:
         if self.frames_hops < EVERYWHERE or not joined:
             return
         if self.poses is None:
+            if undecided := self.frames.undecided:
+                self._part(self.frames.parted | undecided)
+                return
             self._start_poses()
         assert self.poses is not None
         if not self._all_agreed():

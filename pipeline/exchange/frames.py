@@ -94,6 +94,12 @@ class Frames:
             self._placement = place(pairs, [self.team[m] for m in members], self.margin)
         return self._placement
 
+    @property
+    def undecided(self) -> int:
+        """Links of the component that contradict each other while nothing tells which are false, as a mask."""
+        pairs = self.placement.undecided
+        return sum(pair_bit(self.team.index(a), self.team.index(b)) for a, b in pairs)
+
     def T_world_first(self, robot: int) -> Array:  # noqa: N802 (a transform)
         """First keyframe of a member in that of the root, [4, 4]."""
         return self.placement.T_world_map[self.team[robot]]

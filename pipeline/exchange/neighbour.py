@@ -28,6 +28,7 @@ class Neighbour:
     gone: bool = False  # silent for too long
     parted: bool = False  # its closures were refuted: as if never met
     contradiction: str = ""  # what the placement of the team has against the link
+    undecided: bool = False  # parted because other links contradict it and nothing tells which is false
     last_weights: list[float] = field(default_factory=list)  # of the closures held, when the link was parted
     early: list[tuple[int, bytes]] = field(
         default_factory=list

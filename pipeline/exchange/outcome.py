@@ -86,7 +86,9 @@ def _closures(agent: Agent) -> Iterator[ClosureRecord]:
             verdict, detail = r.verdict, r.detail
             if weight is not None:
                 detail = f"{detail}; the link {n.contradiction}" if n.contradiction else detail
-                if n.parted:
+                if n.undecided:
+                    verdict, weight = Verdict.UNDECIDED, 0.0
+                elif n.parted:
                     verdict = Verdict.ALONE if weight >= COUNTS else Verdict.OUTWEIGHED
                     detail, weight = f"weight {weight:.2f} when the link was parted; {detail}", 0.0
                 else:  # the graduated weights have the last word

@@ -29,6 +29,7 @@ class Verdict(Enum):
     MOVED = "registration moved far from what the matches say"
     OUTWEIGHED = "lost its weight in the pose consensus"
     ALONE = "kept its weight, but too few others of this pair of robots did"
+    UNDECIDED = "other links of the team contradict it, and nothing tells which are false"
     INCONSISTENT = "disagrees with the other closures of this pair of robots"
 
 

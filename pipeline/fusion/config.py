@@ -5,18 +5,21 @@ from typing import Literal
 from pydantic import Field
 
 from pipeline.config import Config
-from pipeline.registration.moving import MovingConfig
 from pipeline.splat.losses import LossConfig
 from pipeline.splat.optimiser import LearningRates
 
 
 class RefineConfig(Config):
-    """Training of the fused map on the robot's own images."""
+    """Training of the fused map on the robot's own images and on what its neighbours' maps show."""
 
-    steps_per_view: int = Field(default=6, ge=0)
-    """Steps for each view; 0: the fused map stays as fusion left it."""
-    steps_max: int = Field(default=400, ge=0)
-    """Most steps in all."""
+    steps_per_view: int = Field(default=9, ge=0)
+    """Steps for each own view; 0: the fused map stays as fusion left it."""
+    steps_max: int = Field(default=600, ge=0)
+    """Most steps on own views."""
+    peer_share: float = Field(default=0.25, ge=0.0, le=1.0)
+    """Steps on views of neighbours' maps for every step on an own view; 0: none, and only own Gaussians are trained."""
+    peer_views: int = Field(default=40, ge=1)
+    """Most views of neighbours' maps."""
     support_views: int = Field(default=40, ge=0)
     """Most tracked frames between keyframes that take part."""
     rate: float = Field(default=0.1, gt=0.0)
@@ -25,8 +28,6 @@ class RefineConfig(Config):
     """They fall exponentially to this share."""
     rates: LearningRates = LearningRates()
     loss: LossConfig = LossConfig()
-    moving: MovingConfig = MovingConfig()
-    """What moves, by depth, is not trained on; must be `frontend.moving`."""
 
 
 class FusionConfig(Config):

@@ -346,7 +346,7 @@ def fuse(
     ids = np.concatenate([world[n].ids for n in names])
     anchors = np.concatenate([world[n].anchors for n in names])
     next_id = int(gaussians.ids.max()) + 1 if len(gaussians) else 0
-    taken = _from_theta(next_id + np.arange(len(added)), anchors[added], rows.theta[added] + move[added])
+    taken = gaussians_of(next_id + np.arange(len(added)), anchors[added], rows.theta[added] + move[added])
     order = np.concatenate([own_rows, added])
     return FusedMap(
         gaussians=Gaussians.concatenate([kept, taken]),
@@ -395,7 +395,7 @@ def _applied(gaussians: Gaussians, move: Array, vec_log_covariance: Array) -> Ga
     )
 
 
-def _from_theta(ids: Index, anchors: NDArray[np.int32], theta: Array) -> Gaussians:
+def gaussians_of(ids: Index, anchors: NDArray[np.int32], theta: Array) -> Gaussians:
     """Gaussians of theta [n, 13]."""
     quats, scales = spd.from_log_covariance(theta[:, LOG_COVARIANCE])
     return Gaussians(

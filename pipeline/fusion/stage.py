@@ -16,16 +16,18 @@ from pipeline.errors import DuagError
 from pipeline.fusion.config import FusionConfig, RefineConfig
 from pipeline.fusion.fuse import FusedMap, fuse
 from pipeline.fusion.own_pixels import weigh_by_own_pixels
+from pipeline.fusion.peer_views import peer_views
 from pipeline.fusion.refine import View, refine
 from pipeline.geometry.trajectory import Trajectory, write_tum
 from pipeline.messages import WORLD_FRAME, CorrectedKeyframes, GaussianInformation, GaussianMap, Odometry
 from pipeline.recording import LogWriter, open_rgbd, read_log
-from pipeline.registration.moving import FreeSpace
+from pipeline.registration.moving import FreeSpace, MovingConfig
 from pipeline.robot import AgentInput, AgentResult, RobotData, load
 from pipeline.splat.gaussians import DepthKind, Gaussians
 from pipeline.splat.ply import write_ply
 from schemas import topics
 
+Array = NDArray[np.float64]
 FUSED_KIND = "gauss_newton"
 
 
@@ -35,6 +37,7 @@ def run_fusion(
     folder: Path,
     config: FusionConfig,
     matching: MatchingConfig,
+    moving: MovingConfig,
     weights: WeightKind = "block",
     *,
     seed: int = 0,
@@ -47,6 +50,7 @@ def run_fusion(
         result: what it took home from the session.
         folder: where the results go.
         matching: as the pairs of the session were found. weights: kind of the session.
+        moving: as the front end looked for what moves.
         seed: of the run. threads: of the rasterizer; changes no bit.
     Returns:
         The fused map, in the world frame.
@@ -68,10 +72,11 @@ def run_fusion(
         weights,
     )
     frames = _frames(source)
+    hung = np.array([result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera for f in frames])
     stamp_ns = frames[-1].stamp_ns
     refined = None
     if len(result.component) > 1:
-        views = _views(source, frames, result, config.refine)
+        views = training_views(source, frames, hung, config.refine, moving)
         info = own.information
         fused = weigh_by_own_pixels(
             fused,
@@ -85,10 +90,27 @@ def run_fusion(
             threads,
         )
         if config.refine.steps_per_view:
+            shown = peer_views(
+                result.evidence,
+                result.T_world_keyframe_of,
+                own.camera,
+                config.refine.peer_views if config.refine.peer_share else 0,
+                own.depth,
+                weights,
+                threads,
+            )
             owned = fused.source == fused.robots.index(own.robot)
-            floor_m = matching.thickness_floor_m
             refined = refine(
-                fused.gaussians, owned, views, own.camera, config.refine, floor_m, own.depth, seed, threads
+                fused.gaussians,
+                np.ones_like(owned) if shown else owned,
+                views,
+                own.camera,
+                config.refine,
+                matching.thickness_floor_m,
+                own.depth,
+                seed,
+                threads,
+                peer_views=shown,
             )
     write_ply(folder / "fused.ply", fused.gaussians)
     write_ply(folder / "refined.ply", fused.gaussians if refined is None else refined)
@@ -96,30 +118,38 @@ def run_fusion(
     stamps = np.array([f.stamp_ns for f in frames], dtype=np.int64)
     before = np.array([f.T_map_camera for f in frames])
     write_tum(folder / "odometry.tum", Trajectory(stamps, before))
-    hung = np.array([result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera for f in frames])
     write_tum(folder / "trajectory.tum", Trajectory(stamps, hung))
     return fused
 
 
-def _views(
-    source: AgentInput, frames: Sequence[Odometry], result: AgentResult, config: RefineConfig
+def training_views(
+    source: AgentInput,
+    frames: Sequence[Odometry],
+    T_frame_camera: Array,
+    config: RefineConfig,
+    moving: MovingConfig,
 ) -> list[View]:
-    """The robot's keyframes and, evenly spread, frames between them, at their corrected poses; none held out."""
+    """The robot's keyframes and, evenly spread, frames between them; none held out.
+
+    Args:
+        frames: that have a pose, in order. T_frame_camera: [n, 4, 4], these poses, in the frame of the views.
+        moving: as the front end looked for what moves.
+    """
     topic = topics.KEYFRAME.of(source.robot)
     keyframes = {record.message().frame_index for record in read_log(source.frontend, (topic,))}
-    others = [f for f in frames if f.frame_index not in keyframes and not f.held_out]
+    first = [k for k, f in enumerate(frames) if f.frame_index in keyframes]
+    others = [k for k, f in enumerate(frames) if f.frame_index not in keyframes and not f.held_out]
     count = min(config.support_views, len(others))
     middles = [others[(2 * k + 1) * len(others) // (2 * count)] for k in range(count)]
     views = []
     with open_rgbd(source.log) as log:
-        free = FreeSpace(log.camera, config.moving)
-        for f in [*(f for f in frames if f.frame_index in keyframes), *middles]:
-            frame = log.frame(f.frame_index)
-            T_world_camera = result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera
+        free = FreeSpace(log.camera, moving)
+        for k in (*first, *middles):
+            frame = log.frame(frames[k].frame_index)
             usable = frame.usable_depth
-            if f.frame_index in keyframes:
-                free.add(usable, T_world_camera)
-            views.append(View(frame.color, usable, T_world_camera, frame.mask, frame.depth_sigma))
+            if frames[k].frame_index in keyframes:
+                free.add(usable, T_frame_camera[k])
+            views.append(View(frame.color, usable, T_frame_camera[k], frame.mask, frame.depth_sigma))
     return [replace(v, mask=free.usable(v.depth_m, v.T_world_camera, v.mask)) for v in views]
 
 

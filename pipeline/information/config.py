@@ -5,7 +5,6 @@ from typing import Literal
 from pydantic import Field
 
 from pipeline.config import Config
-from pipeline.registration.moving import MovingConfig
 from pipeline.splat.seeding import THICKNESS_FLOOR_M
 
 
@@ -29,7 +28,5 @@ class InformationConfig(Config):
     they share counts once; 0 takes every pixel for independent."""
     deviation_gate_m: float = Field(default=0.1, gt=0.0)
     """A surface measured farther than this from a Gaussian is another one's."""
-    moving: MovingConfig = MovingConfig()
-    """What moves, by depth, is in no sum; must be `frontend.moving`."""
     thickness_floor_m: float = THICKNESS_FLOOR_M
     """Log-scales at this floor carry no information; must be the floor that the map was made with."""

@@ -20,7 +20,7 @@ from pipeline.information.config import InformationConfig
 from pipeline.kernels import FisherSums, Rasterizer
 from pipeline.messages import GaussianInformation, GaussianMap, Keyframe, Odometry
 from pipeline.recording import LogWriter, open_rgbd, read_log
-from pipeline.registration.moving import FreeSpace
+from pipeline.registration.moving import FreeSpace, MovingConfig
 from pipeline.splat.gaussians import DepthKind, Gaussians
 from schemas import topics
 
@@ -82,12 +82,18 @@ class Noise:
 
 
 def run_information(
-    log_path: Path, frontend_path: Path, out_path: Path, config: InformationConfig, threads: int = 1
+    log_path: Path,
+    frontend_path: Path,
+    out_path: Path,
+    config: InformationConfig,
+    moving: MovingConfig,
+    threads: int = 1,
 ) -> GaussianInformation:
     """Write the Fisher information of a robot's final map, from its own keyframes.
 
     Args:
         log_path: the robot's sensor log. frontend_path: its frontend.mcap. out_path: information.mcap.
+        moving: as the front end looked for what moves.
         threads: of the rasterizer; changes no bit of the result.
     Returns:
         What was written, in the order of the map's Gaussians.
@@ -109,7 +115,7 @@ def run_information(
             frame = log.frame(keyframe.frame_index)
             views.append(View(frame.color, frame.depth, keyframe.T_map_camera, frame.mask, frame.depth_sigma))
         camera = log.camera
-    views = without_moving(views, camera, config)
+    views = without_moving(views, camera, moving)
     noise = estimate_noise(final.gaussians, camera, views, config, threads, depth=final.depth)
     noise, overlap = with_correlation(noise, final.gaussians, camera, views, config, threads, final.depth)
     sums = sum_information(final.gaussians, camera, views, noise, config, threads, depth=final.depth)
@@ -139,9 +145,9 @@ def run_information(
     return result
 
 
-def without_moving(views: Sequence[View], camera: PinholeCamera, config: InformationConfig) -> list[View]:
+def without_moving(views: Sequence[View], camera: PinholeCamera, config: MovingConfig) -> list[View]:
     """The views with what moved masked, as the front end did before it mapped them."""
-    free = FreeSpace(camera, config.moving)
+    free = FreeSpace(camera, config)
     depths = [v.depth_m if v.mask is None else np.where(v.mask, v.depth_m, np.float32(0)) for v in views]
     for view, depth_m in zip(views, depths, strict=True):
         free.add(depth_m, view.T_map_camera)

@@ -209,9 +209,8 @@ class LogFile:
         with parsing(self.path):
             for schema, channel, m in self._reader.iter_messages(topics=topics, log_time_order=True):
                 name, data = (schema.name, schema.data) if schema else ("", b"")
-                yield Record(
-                    self.path, channel.topic, name, m.log_time, m.publish_time, m.sequence, m.data, data
-                )
+                times = self._sound_time(m.log_time), self._sound_time(m.publish_time)
+                yield Record(self.path, channel.topic, name, *times, m.sequence, m.data, data)
 
     def metadata(self) -> list[tuple[str, dict[str, str]]]:
         """Metadata records: name and text."""
@@ -284,7 +283,8 @@ class LogFile:
                 )
             body = data[offset + _MESSAGE.size : offset + 9 + length]
             name, schema_data = self.schema_of(channel)
-            return Record(self.path, topic, name, log_time, publish_time, sequence, body, schema_data)
+            times = self._sound_time(log_time), self._sound_time(publish_time)
+            return Record(self.path, topic, name, *times, sequence, body, schema_data)
 
     def _chunk(self, start: int) -> bytes:
         if start not in self._chunks:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,10 +14,11 @@ from numpy.typing import NDArray
 from pipeline.errors import DuagError
 from pipeline.evaluation.network import Session
 from pipeline.evaluation.paths import Path3, paths, top_view_axes
+from pipeline.evaluation.rendering import COMPARED_SETS, in_world, mates, poses_by_stamp
 from pipeline.evaluation.results import Absent
-from pipeline.evaluation.stage import poses_by_stamp
 from pipeline.evaluation.views import score_view, surface_depth
 from pipeline.geometry import se3
+from pipeline.messages import GaussianMap
 from pipeline.recording import Recording, open_rgbd
 from pipeline.report import figures, pictures, words
 from pipeline.run_folder import RobotRun, RunFolder, position_information
@@ -91,6 +93,9 @@ def content(run: RunFolder, source: Recording) -> dict[str, Any]:
         "sections": SECTIONS,
         "cards": _cards(metrics, reasons),
         **_paths_content(run, source, metrics),
+        "comparison_sets": [words.VIEW_SETS[s] for s in COMPARED_SETS],
+        "comparison_columns": list(words.COMPARISON.values()),
+        "comparison": words.comparison_rows(metrics),
         "rendering_columns": list(words.RENDERING.values()),
         "rendering": _rendering_rows(metrics),
         "exposure_note": "No exposure is fitted to a view.",
@@ -130,24 +135,25 @@ def _known(metrics: dict[str, Any]) -> str:
     ]
 
 
-def _own_at_peers(metrics: dict[str, Any]) -> str:
-    value = metrics["rendering"]["own"]["peers"]["psnr_db"]
-    return "none" if value is None else words.text("psnr_db", value)
-
-
 def _cards(metrics: dict[str, Any], reasons: dict[str, str]) -> list[dict[str, str]]:
     """The few numbers to look at first."""
-    fused, meaning = "rendering.fused.held_out", "fused maps, views never mapped"
+    own = metrics["rendering"]["own"]
+    final = "fused" if metrics["rendering"]["refined"]["held_out"]["psnr_db"] is None else "refined"
+
+    def meaning(view_set: str, name: str, what: str) -> str:
+        return f"{final} maps, {what}; own maps: {words.text(name, own[view_set][name])}"
+
+    held_out, peers = f"rendering.{final}.held_out", f"rendering.{final}.peers"
     chosen = (
         ("team.ate_rmse_m", *words.TEAM["ate_rmse_m"]),
         ("team.ate_rmse_m_mean_of_robots", *words.TEAM["ate_rmse_m_mean_of_robots"]),
-        (f"{fused}.psnr_db", "PSNR", meaning),
+        (f"{held_out}.psnr_db", "PSNR", meaning("held_out", "psnr_db", "views never mapped")),
+        (f"{peers}.psnr_db", "PSNR, peers' views", meaning("peers", "psnr_db", "where the others stood")),
         (
-            "rendering.fused.peers.psnr_db",
-            "PSNR, peers' views",
-            f"fused maps, where the other robots stood; own maps there: {_own_at_peers(metrics)}",
+            f"{held_out}.depth_l1_common_m",
+            "Depth L1",
+            meaning("held_out", "depth_l1_common_m", "views never mapped, pixels that all maps cover"),
         ),
-        (f"{fused}.depth_l1_m", "Depth L1", f"{meaning}; against the recorded depth"),
         ("team.inter_robot_closures", *words.TEAM["inter_robot_closures"]),
         ("exchange.bytes_sent", *words.EXCHANGE["bytes_sent"]),
         ("exchange.rounds", *words.EXCHANGE["rounds"]),
@@ -225,33 +231,52 @@ def _top_view(ways: Sequence[Path3], names: Sequence[str]) -> str:
 def _rendering_rows(metrics: dict[str, Any]) -> list[dict[str, Any]]:
     return [
         {
-            "map": kind.replace("_", ", "),
-            "view_set": view_set.replace("_", " "),
+            "map": word,
+            "view_set": words.VIEW_SETS[view_set],
             "values": [
                 words.text(name, metrics["rendering"][kind][view_set][name]) for name in words.RENDERING
             ],
         }
-        for kind in ("own", "own_unrefined", "fused", "refined")
-        for view_set in ("held_out", "training", "peers")
-        if view_set in metrics["rendering"].get(kind, {})
+        for kind, word in words.MAPS.items()
+        for view_set in words.VIEW_SETS
+        if view_set in metrics["rendering"][kind]
     ]
 
 
 def _pictures(run: RunFolder, source: Recording) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Renders beside images, and the fused map coloured by its uncertainty, for a few held-out views per robot."""
+    """Renders beside images, and the fused map coloured by its uncertainty, for a few held-out views per robot, and
+    beside the image of a peer."""
     from pipeline.kernels import Rasterizer
 
     rasterizer = Rasterizer(threads=1)
     shown, colored = [], []
     for i, (name, robot) in enumerate(run.robots.items()):
-        head = {"robot": name, "color": figures.color_of(i)}
+        head = {"robot": name, "color": figures.color_of(i), "where": ""}
+        final = _final(robot)
         with open_rgbd(source.log(name)) as log:
             chosen = _chosen_frames(robot, len(log))
             frames = [log.frame(index) for index in chosen]
-            shown += [head | _view(robot, log, frame, rasterizer) for frame in frames]
+            before, after = poses_by_stamp(robot.odometry), poses_by_stamp(robot.trajectory)
+            for frame in frames:
+                own = robot.own_map, before[frame.stamp_ns]
+                maps = {"own": own, final[0]: (final[1], after[frame.stamp_ns])}
+                shown.append(head | _view(maps, log, frame, rasterizer))
             if run.robots[name].fused_map.information is not None and frames:
                 colored.append(head | _information_view(robot, log, frames, rasterizer))
+        for peer in mates(run, robot)[:1]:
+            moved = replace(robot.own_map, gaussians=in_world(robot, "own", robot.own_map.gaussians))
+            with open_rgbd(source.log(peer.robot)) as log:
+                for frame in [log.frame(index) for index in _chosen_frames(peer, len(log))[:1]]:
+                    T = poses_by_stamp(peer.trajectory)[frame.stamp_ns]
+                    maps = {"own": (moved, T), final[0]: (final[1], T)}
+                    where = {"where": f" of {peer.robot}"}
+                    shown.append(head | where | _view(maps, log, frame, rasterizer))
     return shown, colored
+
+
+def _final(robot: RobotRun) -> tuple[str, GaussianMap]:
+    """The map that a robot has in the end, and what it is called."""
+    return ("fused", robot.fused_map) if robot.refined_map is None else ("refined", robot.refined_map)
 
 
 def _chosen_frames(robot: RobotRun, frames: int) -> list[int]:
@@ -266,21 +291,13 @@ def _chosen_frames(robot: RobotRun, frames: int) -> list[int]:
     return sorted({able[place] for place in places}) if able else []
 
 
-def _view(robot: RobotRun, log: RgbdLog, frame: RgbdFrame, rasterizer: Rasterizer) -> dict[str, Any]:
-    """Image, own render, fused render; their depths; their errors."""
+def _view(
+    maps: Mapping[str, tuple[GaussianMap, Array]], log: RgbdLog, frame: RgbdFrame, rasterizer: Rasterizer
+) -> dict[str, Any]:
+    """Image and renders of maps at poses, their depths, their errors."""
     renders = {
-        "own": rasterizer.forward(
-            robot.own_map.gaussians,
-            log.camera,
-            se3.inverse(poses_by_stamp(robot.odometry)[frame.stamp_ns]),
-            depth=robot.own_map.depth,
-        ),
-        "fused": rasterizer.forward(
-            robot.fused_map.gaussians,
-            log.camera,
-            se3.inverse(poses_by_stamp(robot.trajectory)[frame.stamp_ns]),
-            depth=robot.own_map.depth,
-        ),
+        kind: rasterizer.forward(shown.gaussians, log.camera, se3.inverse(T), depth=shown.depth)
+        for kind, (shown, T) in maps.items()
     }
     measured = frame.depth > 0
     low, high = _range_m(frame.depth[measured])
@@ -298,16 +315,14 @@ def _view(robot: RobotRun, log: RgbdLog, frame: RgbdFrame, rasterizer: Rasterize
         error = np.abs(np.clip(render.color, 0, 1) - frame.color / np.float32(255)).mean(axis=2)
         return pictures.colored(error, 0.0, COLOR_ERROR_END, np.ones(error.shape, dtype=bool), "magma")
 
+    kinds = tuple(renders)
     columns = [
         ("image", frame.color),
-        ("own map", pictures.to_uint8(renders["own"].color)),
-        ("fused map", pictures.to_uint8(renders["fused"].color)),
+        *((f"{kind} map", pictures.to_uint8(renders[kind].color)) for kind in kinds),
         ("recorded depth", depth_picture(frame.depth)),
-        ("depth, own map", depth_picture(depths["own"])),
-        ("depth, fused map", depth_picture(depths["fused"])),
-        ("colour error, fused map", color_error_picture(renders["fused"])),
-        ("depth error, own map", depth_error_picture(depths["own"])),
-        ("depth error, fused map", depth_error_picture(depths["fused"])),
+        *((f"depth, {kind} map", depth_picture(depths[kind])) for kind in kinds),
+        (f"colour error, {kinds[-1]} map", color_error_picture(renders[kinds[-1]])),
+        *((f"depth error, {kind} map", depth_error_picture(depths[kind])) for kind in kinds),
     ]
     return {
         "frame_index": frame.index,

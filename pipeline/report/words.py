@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.evaluation.rendering import COMPARED, COMPARED_SETS
 from pipeline.evaluation.results import unit_of
 
 NONE = "–"
@@ -77,6 +78,28 @@ ROBOT = {
     "rpe_rot_rad": ("RPE, rotation", "error of the turn from one frame to the next"),
 }  # fmt: skip
 
+MAPS = {
+    "own": "own",
+    "own_unrefined": "own, before its final refinement",
+    "own_longer": "own, trained as long as refined",
+    "fused": "fused",
+    "refined": "refined: the final map",
+}  # fmt: skip
+
+VIEW_SETS = {
+    "held_out": "own held-out views",
+    "peers": "peers' held-out views",
+    "team": "the team's held-out views",
+    "training": "own keyframes",
+}  # fmt: skip
+
+COMPARISON = {
+    "psnr_db": ("PSNR", "likeness of colours; what a map does not cover is black and counts"),
+    "depth_l1_common_m": ("Depth L1", "mean error against the recorded depth, over pixels that all four maps cover"),
+    "depth_l1_layer_m": ("one layer", "the same over what the map itself covers, drawn as one surface"),
+    "depth_completeness": ("Covered", "share of recorded depth pixels that the map covers"),
+}  # fmt: skip
+
 RENDERING = {
     "views": ("Views", "rendered and compared with the image taken there"),
     "psnr_db": ("PSNR", "likeness of colours; higher is better"),
@@ -86,6 +109,7 @@ RENDERING = {
     "depth_l1_m": ("Depth L1", "mean error against the recorded depth, where both exist"),
     "depth_l1_exact_m": ("Depth L1, exact", "the same against the exact depth"),
     "depth_l1_layer_m": ("Depth L1, one layer", "the same, drawn as the surface that stops a pixel's light"),
+    "depth_l1_common_m": ("Depth L1, common", "over pixels that own, longer trained, fused and refined map all cover"),
     "depth_completeness": ("Completeness", "share of recorded depth pixels that the map covers"),
 }  # fmt: skip
 
@@ -145,3 +169,45 @@ def rows(
         for name, (label, meaning) in words.items()
         if name in section
     ]
+
+
+def comparison_rows(metrics: dict[str, Any]) -> list[dict[str, Any]]:
+    """A robot's maps beside each other, for all robots and for each: own views, peers' views, both.
+
+    Returns:
+        Rows of "robot", "map", "first" (of its robot) and "values": the columns of COMPARISON for each set of views.
+    """
+    everybody = [("all robots", metrics["rendering"])]
+    each = [(name, robot["rendering"]) for name, robot in metrics["robots"].items()]
+    return [
+        {
+            "robot": name,
+            "map": MAPS[kind],
+            "first": kind == COMPARED[0],
+            "values": [
+                text(column, found[kind][view_set][column])
+                for view_set in COMPARED_SETS
+                for column in COMPARISON
+            ],
+        }
+        for name, found in everybody + each
+        for kind in COMPARED
+    ]
+
+
+def comparison_text(metrics: dict[str, Any]) -> str:
+    """`comparison_rows` as lines of text."""
+    labels = [label for label, _ in COMPARISON.values()]
+    heads = [f"{VIEW_SETS[view_set]}: {labels[0]}" for view_set in COMPARED_SETS]
+    table = [["", ""] + [cell for head in heads for cell in (head, *labels[1:])]]
+    table += [
+        [row["robot"] if row["first"] else "", row["map"], *row["values"]] for row in comparison_rows(metrics)
+    ]
+    widths = [max(len(row[k]) for row in table) for k in range(len(table[0]))]
+    lines = []
+    for row in table:
+        cells = [
+            c.ljust(w) if k < 2 else c.rjust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)

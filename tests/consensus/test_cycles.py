@@ -21,7 +21,7 @@ def world(seed, robots=3):
     noise = iter(0.005 * rng.normal(size=(20, 6)))
 
     def right(a, b, support):
-        return Proposal(support, se3.inverse(T[a]) @ T[b] @ se3.exp(next(noise)), VARIANCE)
+        return Proposal(support, se3.inverse(T[a]) @ T[b] @ se3.exp(next(noise)), VARIANCE, 0.6)
 
     return T, right
 
@@ -40,7 +40,7 @@ def test_a_smaller_group_that_closes_the_cycle_wins():
     """Alpha and charlie have more closures that agree on a wrong place than on the right one."""
     T, right = world(0)
     good = right("alpha", "charlie", 3)
-    bad = Proposal(8, good.T_a_b @ WRONG, VARIANCE)
+    bad = Proposal(8, good.T_a_b @ WRONG, VARIANCE, 0.6)
     pairs = {
         ("alpha", "bravo"): [right("alpha", "bravo", 6)],
         ("bravo", "charlie"): [right("bravo", "charlie", 6)],
@@ -56,7 +56,7 @@ def test_a_wrong_link_that_is_the_best_supported_one_is_outvoted_by_cycles():
     """Four robots: the links that close cycles place delta, not the one with most closures of its own."""
     T, right = world(1, robots=4)
     pairs = {(a, b): [right(a, b, 5)] for a, b in itertools.combinations(T, 2)}
-    pairs["alpha", "delta"] = [Proposal(9, pairs["alpha", "delta"][0].T_a_b @ WRONG, VARIANCE)]
+    pairs["alpha", "delta"] = [Proposal(9, pairs["alpha", "delta"][0].T_a_b @ WRONG, VARIANCE, 0.6)]
     found = place(pairs, list(T), 4.0)
     assert_placed(found, T)
     assert found.chosen["alpha", "delta"] is None
@@ -68,9 +68,47 @@ def test_a_wrong_link_that_is_the_best_supported_one_is_outvoted_by_cycles():
     assert others == [0] * 5
 
 
+def triangle(seed, supports, agreement):
+    """Three robots; alpha and charlie are wrong about each other."""
+    T, right = world(seed)
+    links = [("alpha", "bravo"), ("bravo", "charlie"), ("alpha", "charlie")]
+    pairs = {link: [right(*link, n)] for link, n in zip(links, supports, strict=True)}
+    false = pairs["alpha", "charlie"][0]
+    pairs["alpha", "charlie"] = [Proposal(false.support, false.T_a_b @ WRONG, VARIANCE, agreement)]
+    return T, pairs
+
+
+@pytest.mark.parametrize("supports", [(5, 6, 9), (9, 4, 20)])
+def test_a_false_link_with_more_closures_gives_way_to_true_ones_whose_images_agree(supports):
+    T, pairs = triangle(4, supports, 0.05)
+    found = place(pairs, list(T), 4.0)
+    assert_placed(found, T)
+    assert not found.undecided
+    assert found.chosen["alpha", "charlie"] is None
+    assert "off the way by bravo" in found.contradictions["alpha", "charlie"]
+
+
+@pytest.mark.parametrize("supports", [(5, 5, 5), (5, 6, 9), (3, 4, 9)])
+def test_where_images_agree_everywhere_no_link_of_a_cycle_that_does_not_close_counts(supports):
+    T, pairs = triangle(5, supports, 0.6)
+    found = place(pairs, list(T), 4.0)
+    assert set(found.undecided) == set(pairs)
+    weight = 0.6 * supports[2] ** 0.5
+    assert all(f"alpha-charlie {weight:.2f}" in reason for reason in found.undecided.values())
+
+
+def test_links_that_another_cycle_confirms_are_not_in_doubt():
+    T, right = world(6, robots=4)
+    pairs = {(a, b): [right(a, b, 3)] for a, b in itertools.combinations(T, 2)}
+    pairs["alpha", "delta"] = [Proposal(9, pairs["alpha", "delta"][0].T_a_b @ WRONG, VARIANCE, 0.6)]
+    found = place(pairs, list(T), 4.0)
+    assert_placed(found, T)
+    assert not found.undecided
+
+
 def test_without_a_cycle_the_largest_group_counts():
     T, right = world(2)
-    pairs = {("alpha", "bravo"): [right("alpha", "bravo", 4), Proposal(2, WRONG, VARIANCE)]}
+    pairs = {("alpha", "bravo"): [right("alpha", "bravo", 4), Proposal(2, WRONG, VARIANCE, 0.6)]}
     found = place(pairs, list(T), 4.0)
     assert found.chosen == {("alpha", "bravo"): 0}
     assert np.array_equal(found.T_world_map["charlie"], np.eye(4))  # nobody met it
@@ -81,7 +119,7 @@ def test_the_order_of_what_arrived_changes_no_bit(order):
     T, right = world(3)
     links = [
         (("alpha", "bravo"), [right("alpha", "bravo", 4)]),
-        (("alpha", "charlie"), [right("alpha", "charlie", 4), Proposal(2, WRONG, VARIANCE)]),
+        (("alpha", "charlie"), [right("alpha", "charlie", 4), Proposal(2, WRONG, VARIANCE, 0.6)]),
         (("bravo", "charlie"), [right("bravo", "charlie", 4)]),
     ]
     first = place(dict(links), list(T), 4.0)

@@ -54,4 +54,5 @@ def save(path: Path, image: np.ndarray) -> None:
     """Write an RGB or 16-bit image by the extension of its name."""
     path.parent.mkdir(parents=True, exist_ok=True)
     pixels = image[..., ::-1] if image.ndim == 3 else image
-    assert cv2.imwrite(str(path), np.ascontiguousarray(pixels), [cv2.IMWRITE_JPEG_QUALITY, 95])
+    quality = [cv2.IMWRITE_JPEG_QUALITY, 95] if path.suffix.lower() in (".jpg", ".jpeg") else []
+    assert cv2.imwrite(str(path), np.ascontiguousarray(pixels), quality)

@@ -18,6 +18,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 import converters
 import schemas
 from converters.logs import open_log
+from converters.logs.foxglove import JsonFields, as_ros
 from pipeline.checks import check
 from pipeline.errors import DuagError
 from pipeline.geometry import se3
@@ -373,6 +374,15 @@ def test_times_that_cannot_be_are_refused(tmp_path: Path, log_ns: int, stamp_ns:
         writer.finish()
     with pytest.raises(DuagError, match=message):
         converters.convert("ros", path, tmp_path / "rec")
+
+
+@pytest.mark.parametrize("data", [2_147_483_647, True, None, {"a": 1}])
+def test_image_data_of_json_that_is_no_text_is_refused(data: Any) -> None:
+    """A number would become as many zeros."""
+    time = {"sec": 1, "nsec": 2}
+    members = {"timestamp": time, "frame_id": "c", "width": 1, "height": 1, "encoding": "mono8", "step": 1}
+    with pytest.raises(DuagError, match="that cannot be read"):
+        as_ros("foxglove.RawImage", JsonFields({**members, "data": data}), "here")
 
 
 def test_definitions_that_are_not_those_of_ros_are_refused(tmp_path: Path) -> None:

@@ -214,10 +214,14 @@ def write_calibration(file: Path, name: str, transposed: bool = False, metres: b
     R = T[:3, :3].T if transposed else T[:3, :3]
     t = np.array(BASELINES_MM[name]) / (1000 if metres else 1)
     eye = np.c_[LEFT.matrix(), np.zeros(3)]
-    text = f"%YAML:1.0\n---\nCamera.fx: {LEFT.fx}\nCamera.width: 306\nCamera.bf: {LEFT.fx * 0.36}\n"
-    text += matrix("Tic", T_IMU_LEFT) + "LEFT.height: 256\nLEFT.width: 306\n"
+    text = f"%YAML:1.0\n---\nCamera.fx: {LEFT.fx}\nCamera.width: {LEFT.width}\nCamera.bf: {LEFT.fx * 0.36}\n"
+    text += matrix("Tic", T_IMU_LEFT) + f"LEFT.height: {LEFT.height}\nLEFT.width: {LEFT.width}\n"
     text += matrix("LEFT.D", np.array([[*D_LEFT, 0.0]])) + matrix("LEFT.K", LEFT.matrix())
-    text += matrix("LEFT.R", np.eye(3)) + matrix("LEFT.P", eye) + "RIGHT.height: 256\nRIGHT.width: 306\n"
+    text += (
+        matrix("LEFT.R", np.eye(3))
+        + matrix("LEFT.P", eye)
+        + f"RIGHT.height: {right.height}\nRIGHT.width: {right.width}\n"
+    )
     text += matrix("RIGHT.D", np.array([[*D_RIGHT, 0.0]])) + matrix("RIGHT.K", right.matrix())
     text += matrix("RIGHT.R", R) + matrix("RIGHT.P", np.c_[right.matrix(), t]) + matrix("Tlc", T_LIDAR_LEFT)
     file.parent.mkdir(exist_ok=True)

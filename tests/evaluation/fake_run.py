@@ -130,7 +130,9 @@ def make(
     recording, run = folder / "recording", folder / "run"
     _write_recording(recording, robots, truth, depth_noise)
     run.mkdir()
-    (run / "config.toml").write_text("seed = 0\n\n[exchange.consensus]\ntolerance = 1e-5\n")
+    (run / "config.toml").write_text(
+        "seed = 0\n\n[exchange.consensus]\ntolerance = 1e-5\n\n[fusion.refine]\nsteps_per_view = 1\n"
+    )
     (run / "timing.json").write_text(
         '{"stages": {"frontend.alpha": {"stage": "frontend", "robot": "alpha", "wall_s": 3.5, "cpu_s": 6.5, '
         '"peak_rss_mb": 210.0}, "exchange": {"stage": "exchange", "robot": null, "wall_s": 1.25, "cpu_s": 1.2, '

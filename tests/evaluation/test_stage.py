@@ -18,23 +18,28 @@ ROBOT = {
     "ate_rmse_m_before_consensus": NUMBER, "ate_rmse_m_keyframes": NUMBER, "ate_rmse_m_joint": NUMBER,
     "rpe_trans_m": NUMBER, "rpe_rot_rad": NUMBER, "depth_agreement_pairs": int, "depth_agreement_m": NUMBER,
     "depth_agreement_m_before_consensus": NUMBER, "depth_agreement_m_of_truth": NUMBER,
+    "feature_agreement_pairs": int, "feature_agreement_px": NUMBER, "feature_agreement_px_before_consensus": NUMBER,
+    "feature_agreement_px_of_truth": NUMBER,
 }  # fmt: skip
 VIEWS = {
     "views": int, "views_without_pose": int, "psnr_db": NUMBER, "ssim": NUMBER, "ms_ssim": NUMBER, "lpips": NUMBER,
     "st_lpips": NUMBER, "depth_l1_m": NUMBER, "depth_l1_exact_m": NUMBER,
-    "depth_l1_layer_m": NUMBER, "depth_completeness": NUMBER,
+    "depth_l1_layer_m": NUMBER, "depth_l1_common_m": NUMBER, "depth_completeness": NUMBER,
 }  # fmt: skip
+COMPARED = {
+    kind: {"held_out": VIEWS, "peers": VIEWS, "team": VIEWS}
+    for kind in ("own", "own_longer", "fused", "refined")
+}
 SCHEMA = {
     "schema": int,
-    "robots": {"alpha": ROBOT, "bravo": ROBOT},
+    "robots": dict.fromkeys(("alpha", "bravo"), ROBOT | {"rendering": COMPARED}),
     "team": {
         "robots": int, "robots_in_largest_component": int, "ate_rmse_m": NUMBER, "ate_rmse_m_mean_of_robots": NUMBER,
         "inter_robot_closures": int, "inter_robot_closures_rejected": int,
     },
     "rendering": {
-        **{kind: {"held_out": VIEWS, "training": VIEWS, "peers": VIEWS} for kind in ("own", "fused")},
+        **{kind: COMPARED[kind] | ({"training": VIEWS} if kind in ("own", "fused") else {}) for kind in COMPARED},
         "own_unrefined": {"held_out": VIEWS},
-        "refined": {"held_out": VIEWS, "peers": VIEWS},
     },
     "calibration": dict.fromkeys(
         ("ece_paper", "ece_rank", "ece_rank_shuffled", "spearman", "ause", "nll", "coverage_95", "nll_scaled",
@@ -52,10 +57,10 @@ SCHEMA = {
         "gap_to_oracle_sigma_p99": NUMBER, "gap_to_oracle_m": NUMBER, "gap_to_oracle_rad": NUMBER,
     },
     "protocol": dict.fromkeys(
-        ("alignment", "ate", "team_ate", "rpe", "depth_agreement",
+        ("alignment", "ate", "team_ate", "rpe", "depth_agreement", "feature_agreement",
          "initial_relative_poses", "held_out", "peers", "training", "poses",
-         "exposure", "own_unrefined", "refined", "background", "psnr", "ssim", "ms_ssim", "depth", "calibration",
-         "oracle"),
+         "exposure", "own_unrefined", "own_longer", "refined", "team", "common", "background", "psnr", "ssim",
+         "ms_ssim", "depth", "calibration", "oracle"),
         str,
     ),
 }  # fmt: skip
@@ -198,7 +203,7 @@ def test_the_table_says_what_the_json_says_and_has_every_view(fake, metrics):
     absent = [r for r in rows if r["value"] is None]
     assert absent
     assert all(r["reason"] for r in absent)
-    assert {r["unit"] for r in rows} <= {"m", "rad", "dB", "B", "nat", "sigma", "1"}
+    assert {r["unit"] for r in rows} <= {"m", "rad", "px", "dB", "B", "nat", "sigma", "1"}
 
 
 def test_threads_change_no_bit(fake, metrics, tmp_path):

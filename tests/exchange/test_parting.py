@@ -15,11 +15,13 @@ from pipeline.exchange.config import ExchangeConfig, LinkConfig
 from pipeline.exchange.meeting import LowerEnd
 from pipeline.exchange.replay import replay_agent_of
 from pipeline.exchange.session import run_session_of
+from pipeline.exchange.verification import Verdict
 from pipeline.geometry import se3
 from pipeline.recording import read_log
 from pipeline.robot import AgentResult, RobotData
 
 NAMES = ("alpha", "bravo", "charlie")
+TRUE = np.eye(4)
 Team = dict[str, tuple[RobotData, np.ndarray]]
 
 
@@ -31,7 +33,10 @@ def team(make_robot: Any) -> Team:
 def falsify(
     monkeypatch: pytest.MonkeyPatch, pair: tuple[str, str], frame_of: Callable[[int], np.ndarray | None]
 ) -> None:
-    """Replace every closure of a pair: number k says that the peer's map lies at frame_of(k); None takes it away."""
+    """Replace every closure of a pair: number k says that the peer's map lies at frame_of(k); None takes it away.
+
+    A frame `TRUE` leaves the closure as it is.
+    """
     decide = LowerEnd._decide
 
     def decide_falsely(self: LowerEnd, send: Any) -> None:
@@ -46,7 +51,7 @@ def falsify(
                 count += 1
                 own = self.places.T_first_keyframe[closure.own_keyframe]
                 peer = self.book.T_first_keyframe[closure.peer_keyframe]
-                if frame is not None:
+                if frame is not None and frame is not TRUE:
                     T_own_peer = se3.inverse(own) @ frame @ peer
                     closure = dataclasses.replace(closure, T_own_peer=T_own_peer)
                 result = dataclasses.replace(t.result, closure=None if frame is None else closure)
@@ -154,3 +159,50 @@ def test_a_false_link_is_parted_and_the_others_stay(
         )
     rounds = [r.message() for r in read_log(tmp_path / "consensus.mcap", ["/alpha/consensus/agent"])]
     assert rounds[-1].parted_links == 1
+
+
+def more_false_than_true(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All closures of alpha and bravo say the same wrong thing; charlie has two with either."""
+    wrong = se3.exp([1.0, 0.0, 0.5, 0.0, 0.5, 0.0])
+    falsify(monkeypatch, ("alpha", "bravo"), lambda k: wrong)
+    falsify(monkeypatch, ("alpha", "charlie"), lambda k: TRUE if k < 2 else None)
+    falsify(monkeypatch, ("bravo", "charlie"), lambda k: TRUE if k < 2 else None)
+
+
+def test_a_false_link_with_more_closures_than_the_true_ones_is_parted(
+    team: Team, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three robots: it spoils their cycle, and the rest of their images speaks against it."""
+    more_false_than_true(monkeypatch)
+    results = meet(team, NAMES, tmp_path)
+    closures = [c for r in results.values() for c in r.closures if c.T_own_peer is not None]
+    false = [c for c in closures if {c.robot, c.peer} == {"alpha", "bravo"}]
+    true = [c for c in closures if c not in false]
+    assert len(false) > len(true) / 2 >= 2, "the test needs more false ones than true ones of either pair"
+    for name in NAMES:
+        assert results[name].component == NAMES
+        T_true = se3.inverse(team["alpha"][1][0]) @ team[name][1]
+        assert se3.distance(T_true, results[name].T_world_keyframe)[0].max() < 0.02
+    assert all(c.weight == 0.0 and c.verdict != "kept" for c in false)
+    assert all(c.verdict == "kept" for c in true)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.5])
+def test_where_nothing_tells_which_link_is_false_nobody_is_put_anywhere(
+    team: Team, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, loss: float
+) -> None:
+    """Rooms that are alike in every image: the cycle of the three does not close, and that is all that is known."""
+    more_false_than_true(monkeypatch)
+    monkeypatch.setattr("pipeline.exchange.meeting.agreement", lambda *_: 0.6)
+    config = {"link": LinkConfig(loss_probability=loss)}
+    results = meet(team, NAMES, tmp_path, **config)
+    for name in NAMES:
+        assert is_alone(results[name], team[name][0])
+        _, sent = replay_agent_of(
+            team[name][0], ExchangeConfig(**config), seed=0, exchange_path=tmp_path / "exchange.mcap"
+        )
+        assert sent.equal
+    closures = [c for r in results.values() for c in r.closures if c.T_own_peer is not None]
+    assert len(closures) > 4
+    assert {c.verdict for c in closures} == {Verdict.UNDECIDED.value}
+    assert all("nothing tells which is false (alpha-bravo" in c.detail for c in closures)

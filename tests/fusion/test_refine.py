@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from pipeline.consensus.evidence import Evidence
 from pipeline.fusion.config import RefineConfig
-from pipeline.fusion.refine import View, refine
+from pipeline.fusion.peer_views import peer_views
+from pipeline.fusion.refine import View, refine, steps_of
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels import Rasterizer
@@ -109,3 +111,57 @@ def test_no_steps_change_nothing(spoilt: tuple[Gaussians, list[View]]) -> None:
         is gaussians
     )
     assert refine(gaussians, ALL, [], CAMERA, RefineConfig(), 1e-3, "blended", seed=0) is gaussians
+
+
+def test_a_neighbours_map_shows_what_it_would_from_where_the_neighbour_stood() -> None:
+    true, T_world_map = wall(), se3.exp(np.array([0.3, -0.2, 0.1, 0.02, 0.1, 0.05]))
+    poses, anchors = np.array(POSES[:3]), np.arange(400) % 3
+    scattered = true.means + [0, 0, 0.02] * np.random.default_rng(2).normal(
+        size=(400, 3)
+    )  # no two at one depth
+    true = true.replace(means=scattered.astype(np.float32))
+    hung = true.replace(anchors=anchors.astype(np.int32))
+    evidence = Evidence.from_map("zulu", hung, None, poses)
+    there = T_world_map @ poses
+    all_of_them = peer_views({"zulu": evidence}, {"zulu": there}, CAMERA, 40, "blended")
+    assert len(all_of_them) == 5  # three keyframes and the two places between them
+    for k, view in enumerate(all_of_them[::2]):
+        np.testing.assert_allclose(view.T_world_camera, there[k], atol=1e-12)
+        render = Rasterizer().forward(true, CAMERA, se3.inverse(poses[k]))
+        sure = render.alpha > 0.901  # turning the map moves alpha by rounding
+        assert sure.any()
+        assert view.mask is not None
+        assert view.mask[sure].all()
+        assert not view.mask[render.alpha < 0.899].any()
+        assert not view.depth_m[~view.mask].any()
+        share = render.alpha[sure]
+        np.testing.assert_allclose(view.depth_m[sure], render.depth[sure] / share, atol=1e-3)
+        np.testing.assert_allclose(view.color[sure], 255 * render.color[sure] / share[:, None], atol=1)
+    some = peer_views({"zulu": evidence}, {"zulu": there}, CAMERA, 2, "blended", threads=2)
+    assert [v.T_world_camera.tolist() for v in some] == [
+        all_of_them[k].T_world_camera.tolist() for k in (1, 3)
+    ]
+    assert np.array_equal(some[0].color, all_of_them[1].color)
+    assert peer_views({}, {}, CAMERA, 40, "blended") == []
+
+
+def test_neighbours_views_teach_what_own_ones_do_not_see(spoilt: tuple[Gaussians, list[View]]) -> None:
+    gaussians, views = spoilt
+    half = np.zeros((48, 64), bool)
+    half[:, :20] = True
+    own = [View(v.color, v.depth_m, v.T_world_camera, half) for v in views[::2]]
+    config = RefineConfig(steps_per_view=30, rate=0.3, peer_share=1.0)
+    alone = refine(gaussians, ALL, own, CAMERA, config, 1e-3, "blended", seed=0)
+    together = refine(gaussians, ALL, own, CAMERA, config, 1e-3, "blended", seed=0, peer_views=views[1::2])
+    assert score(together, views) > score(alone, views) + 3
+    same = refine(
+        gaussians, ALL, own, CAMERA, config, 1e-3, "blended", seed=0, peer_views=views[1::2], threads=2
+    )
+    assert np.array_equal(together.means, same.means)
+
+
+def test_steps_are_shared_out() -> None:
+    config = RefineConfig(steps_per_view=5, steps_max=100, peer_share=0.25)
+    assert steps_of(config, 4, 7) == (20, 5)
+    assert steps_of(config, 40, 7) == (100, 25)
+    assert steps_of(config, 40, 0) == (100, 0)

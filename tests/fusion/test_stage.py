@@ -27,6 +27,7 @@ from pipeline.messages import (
     map_frame,
 )
 from pipeline.recording import LogWriter, read_log
+from pipeline.registration.moving import MovingConfig
 from pipeline.robot import AgentInput
 from pipeline.splat.gaussians import Gaussians
 from pipeline.splat.ply import write_ply
@@ -135,7 +136,7 @@ def robot(tmp_path_factory):
 
 def fuse_files(robot, result, folder):
     source = AgentInput("bravo", robot.log, robot.frontend, robot.information)
-    run_fusion(source, result, folder, FusionConfig(explained_opacity=0.0), MatchingConfig())
+    run_fusion(source, result, folder, FusionConfig(explained_opacity=0.0), MatchingConfig(), MovingConfig())
     fused = [topics.FUSED_MAP.of("bravo"), topics.CORRECTED_KEYFRAMES.of("bravo")]
     return {type(r.message()): r.message() for r in read_log(folder / "fused.mcap", topics=fused)}
 
@@ -195,5 +196,12 @@ def test_information_of_another_map_is_refused(robot, tmp_path):
         log.write(topics.INFORMATION.of("bravo"), replace(robot.sums, ids=other), 5 * 10**8)
     source = AgentInput("bravo", robot.log, robot.frontend, tmp_path / "information.mcap")
     with pytest.raises(DuagError, match="other Gaussians"):
-        run_fusion(source, robot.alone(), tmp_path, FusionConfig(explained_opacity=0.0), MatchingConfig())
+        run_fusion(
+            source,
+            robot.alone(),
+            tmp_path,
+            FusionConfig(explained_opacity=0.0),
+            MatchingConfig(),
+            MovingConfig(),
+        )
     assert [p.name for p in tmp_path.iterdir()] == ["information.mcap"]

@@ -6,17 +6,21 @@ import os
 import re
 import shutil
 import struct
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 HOSTILE = (0, 1, 0x7F, 0xFF, 0x7FFF, 0xFFFF, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**63 - 1, 2**64 - 1)
+REALS = (np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-300, 1e300, 1e38, 1e9, -1e9, 0.5)
 NUMBERS = (
     *("nan", "inf", "-inf", "1e309", "-1", "0", "1e-300", "99999999999999999999", "4294967296", "0x10"),
     *("", "1.5", "-0", "9" * 400, "\u0661", "1_000", "true", "null", "[]", "{}"),
 )
+EVIL = f"{tempfile.gettempdir()}/duagc-fuzz-evil"  # nothing may write there
 PATHS = (
+    EVIL,
     "../../../evil",
     "/etc/passwd",
     "/dev/zero",
@@ -38,9 +42,9 @@ Bytes = bytes
 
 def damaged(data: bytes, rng: np.random.Generator) -> bytes:
     """Bytes with one to four damages."""
-    kinds = [truncate, flip, number, cut_out, repeat, insert, zero, swap]
+    kinds = [truncate, flip, number, real, cut_out, repeat, insert, zero, swap]
     if _is_text(data):
-        kinds += [text_number, text_word, text_line] * 3
+        kinds += [text_number, text_other, text_word, text_line] * 5
     for _ in range(int(rng.choice([1, 1, 1, 2, 4]))):
         data = kinds[int(rng.integers(len(kinds)))](data, rng)[:LARGEST]
     return data
@@ -83,9 +87,24 @@ def number(data: bytes, rng: np.random.Generator) -> bytes:
     return data[:at] + packed + data[at + size :]
 
 
+def real(data: bytes, rng: np.random.Generator) -> bytes:
+    """A hostile number of 4 or 8 bytes with a fraction, where such a number may lie."""
+    value, size = float(rng.choice(REALS)), int(rng.choice([4, 8]))
+    with np.errstate(over="ignore"):
+        packed = np.array(value, dtype=f"<f{size}").tobytes()
+    at = _place(data, rng) // 4 * 4
+    return data[:at] + packed + data[at + size :]
+
+
 def cut_out(data: bytes, rng: np.random.Generator) -> bytes:
     at = _place(data, rng)
     return data[:at] + data[at + int(rng.choice([1, 4, 30, 4000])) :]
+
+
+def in_place(data: bytes, rng: np.random.Generator) -> bytes:
+    """Damage that keeps the length."""
+    kinds = (flip, number, real, zero)
+    return kinds[int(rng.integers(len(kinds)))](data, rng)[: len(data)].ljust(len(data), b"\0")
 
 
 def repeat(data: bytes, rng: np.random.Generator) -> bytes:
@@ -122,6 +141,12 @@ def text_number(data: bytes, rng: np.random.Generator) -> bytes:
     return _replace_match(data, TEXT, str(rng.choice(NUMBERS)), rng)
 
 
+def text_other(data: bytes, rng: np.random.Generator) -> bytes:
+    """A number from elsewhere in the text: of the right kind, and wrong."""
+    found = TEXT.findall(data)
+    return _replace_match(data, TEXT, found[int(rng.integers(len(found)))].decode(), rng) if found else data
+
+
 def text_word(data: bytes, rng: np.random.Generator) -> bytes:
     return _replace_match(data, WORDS, PATHS[int(rng.integers(len(PATHS)))], rng)
 
@@ -138,21 +163,27 @@ def text_line(data: bytes, rng: np.random.Generator) -> bytes:
     return b"".join(lines)
 
 
+def replace(path: Path, data: bytes) -> bool:
+    """Put other bytes in a file; files of a copied folder are links to the seed."""
+    path.unlink()
+    path.write_bytes(data)
+    return True
+
+
 # --- folders ---------------------------------------------------------------------------------------------------------
 
 
 def damage(root: Path, rng: np.random.Generator, special: Callable[[Path, np.random.Generator], bool]) -> str:
     """Damage one file below `root`, or its name; returns what was done. special: damage that the format suggests, done
-    in a quarter of the cases; False if it does not apply."""
+    in most cases; False if it does not apply."""
     files = sorted(p for p in root.rglob("*") if p.is_file()) if root.is_dir() else [root]
     path = files[int(rng.integers(len(files)))]
-    if rng.random() < 0.25 and special(path, rng):
+    if rng.random() < 0.6 and special(path, rng):
         return f"special {path.name}"
     if rng.random() < 0.12 and root.is_dir():
         return _damage_name(root, path, rng)
     new = damaged(path.read_bytes(), rng)
-    path.unlink()  # files of a copied folder are links to the seed
-    path.write_bytes(new)
+    replace(path, new)
     return f"bytes {path.name}"
 
 

@@ -2,14 +2,17 @@
 
 import os
 import signal
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from pipeline.errors import DuagError
+from tests.fuzz.cases import cases
 from tests.fuzz.readers import Reader
-from tests.fuzz.run import run
 
 
 def crash(src: Path, out: Path) -> None:
@@ -32,12 +35,56 @@ def change(src: Path, out: Path) -> None:
     (src / "file").unlink()
 
 
+def edit(src: Path, out: Path) -> None:
+    with (src / "file").open("r+b") as stream:
+        stream.write(b"4")
+
+
 def refuse(src: Path, out: Path) -> None:
     raise DuagError(f"{src}: found\ndamage, expected none")
 
 
 def write(src: Path, out: Path) -> None:
     (out / "result").write_text("x")
+
+
+def leave_open(src: Path, out: Path) -> None:
+    LEFT.append((src / "file").open())
+
+
+def start_thread(src: Path, out: Path) -> None:
+    threading.Thread(target=time.sleep, args=[9], daemon=True).start()
+
+
+def wait(src: Path, out: Path) -> None:
+    os.read(os.pipe()[0], 1)
+
+
+def work(src: Path, out: Path) -> None:
+    while True:
+        pass
+
+
+def third_fails(src: Path, out: Path) -> None:
+    LEFT.append(None)
+    if len(LEFT) == 3:
+        raise ValueError("too many")
+
+
+LEFT: list[Any] = []
+
+
+def fake(read: Callable[[Path, Path], None]) -> Reader:
+    """A reader whose sound file is read, and damaged ones by `read`."""
+
+    def after_the_seed(src: Path, out: Path) -> None:
+        if src.name != "seed":
+            read(src, out)
+
+    def make(seed: Path) -> None:
+        (seed / "file").write_text("1 2 3")
+
+    return Reader("fake", make, after_the_seed, lambda path, rng: False)
 
 
 @pytest.mark.parametrize(
@@ -48,25 +95,32 @@ def write(src: Path, out: Path) -> None:
         (swell, "failed", "MemoryError"),
         (escape, "failed", "changed outside its output: a/b/c/evil"),
         (change, "failed", "changed outside its output: a/b/c/src/file"),
-        (refuse, "refused", ""),
+        (edit, "failed", "changed outside its output: a/b/c/src/file"),
+        (leave_open, "failed", "left open: "),
+        (start_thread, "failed", "left threads: "),
+        (refuse, "refused", "expected none"),
         (write, "read", ""),
     ],
 )
 def test_outcomes(read: Callable[[Path, Path], None], kind: str, words: str) -> None:
-    sound = True
+    outcomes = list(cases(fake(read), 3))
+    assert [outcome.number for outcome in outcomes] == [0, 1, 2]
+    for outcome in outcomes:
+        assert (outcome.kind, words in outcome.text) == (kind, True), outcome.text
 
-    def after_the_seed(src: Path, out: Path) -> None:
-        nonlocal sound
-        if not sound:
-            read(src, out)
-        sound = False
 
-    def make(seed: Path) -> None:
-        (seed / "file").write_text("1 2 3")
+@pytest.mark.parametrize(("read", "words"), [(wait, "waits"), (work, "more than 1 s")])
+def test_hangs(read: Callable[[Path, Path], None], words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.fuzz.cases.CPU_S", 1)
+    monkeypatch.setattr("tests.fuzz.cases.IDLE_S", 1)
+    (outcome,) = cases(fake(read), 1)
+    assert (outcome.kind, words in outcome.text) == ("failed", True), outcome.text
 
-    outcomes, failures = run(Reader("fake", make, after_the_seed, lambda path, rng: False), 1)
-    assert dict(outcomes) == {kind: 1}
-    assert words in "".join(failures)
+
+def test_a_case_that_depends_on_those_before_it_is_named() -> None:
+    outcomes = list(cases(fake(third_fails), 4))
+    assert [outcome.kind for outcome in outcomes] == ["read", "read", "failed", "read"]
+    assert "sound alone, but not after 0 to 1: " in outcomes[2].text
 
 
 def test_errors_are_one_printable_line() -> None:

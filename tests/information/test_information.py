@@ -323,7 +323,7 @@ def write_logs(
 def test_the_stage_writes_what_it_returns_and_the_threads_do_not_show(tmp_path: Path) -> None:
     gaussians = write_logs(tmp_path)
     paths = [tmp_path / name for name in ("alpha.mcap", "frontend.mcap", "information.mcap")]
-    result = run_information(*paths, InformationConfig())
+    result = run_information(*paths, InformationConfig(), MovingConfig())
     (record,) = read_log(paths[2])
     assert record.topic == "/alpha/information"
     back = record.message()
@@ -333,7 +333,7 @@ def test_the_stage_writes_what_it_returns_and_the_threads_do_not_show(tmp_path: 
     assert back.window == "all"
     assert back.observations.max() == 3
     assert back.color_sigma == pytest.approx(0.05, rel=0.15)
-    run_information(*paths[:2], tmp_path / "again.mcap", InformationConfig(), threads=3)
+    run_information(*paths[:2], tmp_path / "again.mcap", InformationConfig(), MovingConfig(), threads=3)
     (again,) = read_log(tmp_path / "again.mcap")
     assert again.data == record.data
 
@@ -342,7 +342,11 @@ def test_held_out_frames_never_enter(tmp_path: Path) -> None:
     write_logs(tmp_path, held_out=(1,))
     with pytest.raises(DuagError, match=r"has frame 1, expected no frame that is held out"):
         run_information(
-            tmp_path / "alpha.mcap", tmp_path / "frontend.mcap", tmp_path / "out.mcap", InformationConfig()
+            tmp_path / "alpha.mcap",
+            tmp_path / "frontend.mcap",
+            tmp_path / "out.mcap",
+            InformationConfig(),
+            MovingConfig(),
         )
     assert not (tmp_path / "out.mcap").exists()
 
@@ -353,7 +357,11 @@ def test_a_front_end_without_a_map_is_one_line(tmp_path: Path) -> None:
         pass
     with pytest.raises(DuagError, match="has no message, expected the map"):
         run_information(
-            tmp_path / "alpha.mcap", tmp_path / "unfinished.mcap", tmp_path / "out.mcap", InformationConfig()
+            tmp_path / "alpha.mcap",
+            tmp_path / "unfinished.mcap",
+            tmp_path / "out.mcap",
+            InformationConfig(),
+            MovingConfig(),
         )
 
 
@@ -370,15 +378,14 @@ def test_what_moved_is_in_no_sum() -> None:
         card = depth.copy()
         card[8:24, 2 + 11 * k : 12 + 11 * k] = 1.0
         crossed.append(View(color, card, T))
-    config = InformationConfig(moving=MovingConfig(halvings=1, grow_px=4))
+    config = MovingConfig(halvings=1, grow_px=4)
     assert all(view.mask is None for view in without_moving(plain, CAMERA, config))
     masked = without_moving(crossed, CAMERA, config)
     for view in masked:
         assert view.mask is not None
         assert view.mask[view.depth_m < 1.5].mean() < 0.05
         assert view.mask.mean() > 0.7
-    off = config.model_copy(update={"moving": MovingConfig(enabled=False)})
-    assert without_moving(crossed, CAMERA, off) == crossed
-    less = sum_information(gaussians, CAMERA, masked, NOISE, config)
-    more = sum_information(gaussians, CAMERA, crossed, NOISE, config)
+    assert without_moving(crossed, CAMERA, MovingConfig(enabled=False)) == crossed
+    less = sum_information(gaussians, CAMERA, masked, NOISE, InformationConfig())
+    more = sum_information(gaussians, CAMERA, crossed, NOISE, InformationConfig())
     assert less.weight.sum() < 0.95 * more.weight.sum()

@@ -1,0 +1,96 @@
+"""How well matched features of views meet under a trajectory: a measure that needs no ground truth.
+
+Pairs of views are chosen and their matches sifted by the images alone (descriptors, then the one motion that
+the matched points agree on), so no trajectory is favoured. A feature of one view, at the depth measured there, is
+moved into the other by the poses and compared with the pixel of its partner. The front end uses features only to find
+places, so this is evidence that it did not fit. It also judges the ground truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import streams
+from pipeline.evaluation.results import Absent
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.registration.features import Features, extract, matches, ransac
+
+Array = NDArray[np.float64]
+
+FEATURES = 600
+"""The strongest of a view that have depth."""
+RATIO = 0.8
+INLIER_M = 0.05
+"""Distance at one metre of depth below which a match agrees with the motion of a pair; grows with depth."""
+HYPOTHESES = 200
+MIN_MATCHES = 15
+MIN_SHARE = 0.5
+"""Share of a pair's matches that must agree on one motion."""
+MIN_PAIRS = 10
+
+
+def feature_agreement(
+    colors: Sequence[NDArray[np.uint8]],
+    depths_m: Sequence[NDArray[np.float32]],
+    camera: PinholeCamera,
+    trajectories: Mapping[str, Array],
+) -> tuple[int, dict[str, float | Absent]]:
+    """Median over pairs of views of the median distance between a moved feature and its partner, pixels.
+
+    Args:
+        colors: uint8 RGB [h, w, 3] of every view. depths_m: [h, w], 0 = unknown.
+        trajectories: T_frame_camera [n, 4, 4] of the same views, by name.
+    Returns:
+        Number of pairs, and the value of every trajectory.
+    """
+    features = [extract(c, d, camera, FEATURES) for c, d in zip(colors, depths_m, strict=True)]
+    medians: dict[str, list[float]] = {name: [] for name in trajectories}
+    pairs = 0
+    for a, b in combinations(range(len(features)), 2):
+        matched = _matched(features[a], features[b], a, b)
+        if matched is None:
+            continue
+        pairs += 1
+        for name, T in trajectories.items():
+            medians[name].append(_distance_px(*matched, se3.inverse(T[a]) @ T[b], camera))
+    if pairs < MIN_PAIRS:
+        absent = Absent(
+            f"only {pairs} pairs of held-out views have features in common, {MIN_PAIRS} are needed"
+        )
+        return pairs, dict.fromkeys(trajectories, absent)
+    return pairs, {name: float(np.median(values)) for name, values in medians.items()}
+
+
+def _matched(ours: Features, theirs: Features, a: int, b: int) -> tuple[Array, Array] | None:
+    """Points of matches that agree on one motion, each [k, 3] in its own camera frame; None if too few do."""
+    pairs = matches(ours.descriptors, theirs.descriptors, RATIO)
+    if len(pairs) < MIN_MATCHES:
+        return None
+    points_a, points_b = ours.points[pairs[:, 0]].astype(float), theirs.points[pairs[:, 1]].astype(float)
+    rng = streams.generator(0, "evaluation.feature_agreement", first=a, second=b)
+    _, agree = ransac(points_a, points_b, INLIER_M, HYPOTHESES, rng)
+    if agree.sum() < max(MIN_MATCHES, MIN_SHARE * len(pairs)):
+        return None
+    return points_a[agree], points_b[agree]
+
+
+def _distance_px(points_a: Array, points_b: Array, T_a_b: Array, camera: PinholeCamera) -> float:
+    """Median distance in the image, both ways together; a point behind the other camera is infinitely far."""
+    ways = ((points_b, points_a, T_a_b), (points_a, points_b, se3.inverse(T_a_b)))
+    distances = []
+    for moved, seen, T in ways:
+        there = se3.transform(T, moved)
+        front = there[:, 2] > 0.05
+        distance = np.full(len(there), np.inf)
+        off = camera.project(there[front]) - camera.project(seen[front])
+        distance[front] = np.linalg.norm(off, axis=1)
+        distances.append(distance)
+    median = float(np.median(np.concatenate(distances)))
+    return min(
+        median, float(np.hypot(camera.width, camera.height))
+    )  # nothing is farther than the image is wide

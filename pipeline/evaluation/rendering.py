@@ -1,0 +1,230 @@
+"""What the maps show where cameras stood: own, own trained longer, fused and refined, on the same pixels.
+
+Every robot's maps are drawn at its own held-out views, at those of the robots that share its world (`peers`), and both
+together are the views of the team (`team`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.consensus.config import MatchingConfig
+from pipeline.evaluation import groundtruth, views
+from pipeline.evaluation.oracle import section_of
+from pipeline.evaluation.results import Absent, Row
+from pipeline.fusion.config import RefineConfig
+from pipeline.fusion.refine import refine, steps_of
+from pipeline.fusion.stage import training_views
+from pipeline.geometry.trajectory import Trajectory
+from pipeline.progress import track
+from pipeline.recording import Recording, RgbdLog, open_rgbd
+from pipeline.registration.moving import MovingConfig
+from pipeline.robot import AgentInput
+from pipeline.run_folder import RobotRun, RunFolder
+from pipeline.splat.gaussians import DepthKind, Gaussians
+
+COMPARED = ("own", "own_longer", "fused", "refined")
+COMPARED_SETS = ("held_out", "peers", "team")
+NOBODY_MET = "no robot met another"
+REASONS = {
+    "held_out": "there is no such view",
+    "training": "there is no such view",
+    "peers": "no two robots met",
+    "team": "no two robots met",
+}
+Scores = list[views.ViewScore | Absent]
+
+
+@dataclass(frozen=True)
+class PosedMap:
+    """A map and where the camera stood in its frame: T_frame_camera of a robot's views."""
+
+    gaussians: Gaussians
+    trajectory: Trajectory
+
+
+@dataclass
+class _Found:
+    """Scores by robot, map and set of views; and the rows of the long table."""
+
+    rows: list[Row]
+    scores: dict[tuple[str, str, str], Scores] = field(default_factory=dict)
+
+    def add(self, robot: str, kind: str, view_set: str, index: int, score: views.ViewScore | Absent) -> None:
+        self.scores.setdefault((robot, kind, view_set), []).append(score)
+        self.rows += _view_rows(robot, f"{kind}/{view_set}", index, score)
+
+    def of(self, robot: str, kind: str, view_set: str) -> Scores:
+        """`team`: own and peers' held-out views of a robot that has peers."""
+        if view_set == "team":
+            peers = self.of(robot, kind, "peers")
+            return self.of(robot, kind, "held_out") + peers if peers else []
+        return self.scores.get((robot, kind, view_set), [])
+
+    def summary(self, robots: list[str], kind: str, view_set: str) -> dict[str, Any]:
+        lone = kind in ("own_longer", "refined")
+        reason = (
+            "the front end wrote no map before its refinement"
+            if kind == "own_unrefined"
+            else NOBODY_MET
+            if lone
+            else REASONS[view_set]
+        )
+        return views.summary([s for r in robots for s in self.of(r, kind, view_set)], reason)
+
+
+def rendering_sections(
+    run: RunFolder, source: Recording, threads: int, progress: bool, rows: list[Row]
+) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Scores of all maps over all sets of views: of all robots together, and of each; one row per view and score."""
+    found = _Found(rows)
+    for name, robot in run.robots.items():
+        maps = _maps(run, robot, source, threads)
+        own = {kind: PosedMap(g, _own_trajectory(robot, kind)) for kind, g in maps.items()}
+        task = RenderTask(own, robot, "held_out", robot.own_map.depth)
+        for index, scores in task.scores(source, threads, f"render maps of {name}" if progress else None):
+            for kind, score in scores.items():
+                found.add(name, kind, "held_out", index, score)
+        task = RenderTask({k: own[k] for k in ("own", "fused")}, robot, "keyframes", robot.own_map.depth)
+        for index, scores in task.scores(
+            source, threads, f"render keyframes of {name}" if progress else None
+        ):
+            for kind, score in scores.items():
+                found.add(name, kind, "training", index, score)
+        world = {kind: in_world(robot, kind, g) for kind, g in maps.items() if kind in COMPARED}
+        for peer in mates(run, robot):
+            there = {kind: PosedMap(g, peer.trajectory) for kind, g in world.items()}
+            task = RenderTask(there, peer, "held_out", robot.own_map.depth)
+            title = f"render maps of {name} from {peer.robot}" if progress else None
+            for index, scores in task.scores(source, threads, title):
+                for kind, score in scores.items():
+                    found.add(name, kind, "peers", index, score)
+    everybody = list(run.robots)
+    sets: dict[str, tuple[str, ...]] = dict.fromkeys(COMPARED, COMPARED_SETS)
+    sets |= {"own_unrefined": ("held_out",)} | dict.fromkeys(("own", "fused"), (*COMPARED_SETS, "training"))
+    team = {kind: {s: found.summary(everybody, kind, s) for s in sets[kind]} for kind in sets}
+    robots = {
+        name: {kind: {s: found.summary([name], kind, s) for s in COMPARED_SETS} for kind in COMPARED}
+        for name in run.robots
+    }
+    return team, robots
+
+
+def mates(run: RunFolder, robot: RobotRun) -> list[RobotRun]:
+    """The other robots that agree with this one on who shares their world."""
+    others = [run.robots[r] for r in robot.component if r != robot.robot]
+    return [other for other in others if other.component == robot.component]
+
+
+def _maps(run: RunFolder, robot: RobotRun, source: Recording, threads: int) -> dict[str, Gaussians]:
+    """The own maps in the robot's map frame, the others in the world; those that exist."""
+    maps = {"own": robot.own_map.gaussians, "fused": robot.fused_map.gaussians}
+    if robot.unrefined_map is not None:
+        maps["own_unrefined"] = robot.unrefined_map.gaussians
+    if robot.refined_map is not None:
+        maps["refined"] = robot.refined_map.gaussians
+        maps["own_longer"] = own_longer(run, robot, source, threads)
+    return maps
+
+
+def own_longer(run: RunFolder, robot: RobotRun, source: Recording, threads: int) -> Gaussians:
+    """The own map trained again as the refined one was, with as many steps, on own images at own poses alone.
+
+    Without it nobody could tell what the refined map owes to the team and what to more training.
+    """
+    log = source.log(robot.robot)
+    files = AgentInput(robot.robot, log, robot.folder / "frontend.mcap", robot.folder / "information.mcap")
+    frames = [f for f in robot.frames if f.status != "lost"]
+    config = section_of(run, RefineConfig, "fusion", "refine")
+    poses = np.array([f.T_map_camera for f in frames])
+    own = robot.own_map
+    with open_rgbd(log) as camera_log:
+        camera = camera_log.camera
+    views = training_views(files, frames, poses, config, section_of(run, MovingConfig, "frontend", "moving"))
+    return refine(
+        own.gaussians,
+        np.ones(len(own.gaussians), bool),
+        views,
+        camera,
+        config,
+        section_of(run, MatchingConfig, "exchange", "matching").thickness_floor_m,
+        own.depth,
+        run.config.get("seed", 0),
+        threads,
+        steps=(sum(steps_of(config, len(views), 1)), 0),
+    )
+
+
+def _own_trajectory(robot: RobotRun, kind: str) -> Trajectory:
+    """The robot's own poses in the frame of `_maps`."""
+    return robot.odometry if kind.startswith("own") else robot.trajectory
+
+
+def in_world(robot: RobotRun, kind: str, gaussians: Gaussians) -> Gaussians:
+    """A map of `_maps` in the world: Gaussians of the own maps move with their keyframes."""
+    if not kind.startswith("own"):
+        return gaussians
+    T_map_keyframe = np.array([k.T_map_camera for k in robot.keyframes])
+    return gaussians.moved(T_map_keyframe, robot.corrected.T_world_keyframe)
+
+
+@dataclass(frozen=True)
+class RenderTask:
+    """Maps to be rendered where one robot's camera stood: at its held-out frames, or at its keyframes."""
+
+    maps: Mapping[str, PosedMap]
+    camera_robot: RobotRun
+    view_set: Literal["held_out", "keyframes"]
+    depth: DepthKind
+
+    def scores(
+        self, source: Recording, threads: int, title: str | None
+    ) -> Iterator[tuple[int, dict[str, views.ViewScore | Absent]]]:
+        """Frame index and the maps' scores of every view, in order; progress under `title`."""
+        name, robot = self.camera_robot.robot, self.camera_robot
+        keyframes = {k.frame_index for k in robot.keyframes}
+        chosen = robot.held_out if self.view_set == "held_out" else keyframes
+        with open_rgbd(source.log(name)) as log:
+            stamps = {f.stamp_ns for f in robot.frames if f.frame_index in chosen}
+            exact = groundtruth.exact_depths(source, name, stamps)
+            frames = _views(log, sorted(chosen), exact, groundtruth.recorded_depth_is_exact(source, name))
+            maps = {kind: (m.gaussians, poses_by_stamp(m.trajectory)) for kind, m in self.maps.items()}
+            found = views.score_maps(maps, log.camera, frames, threads, self.depth, COMPARED)
+            yield from track(found, title, total=len(chosen)) if title else found
+
+
+def _views(
+    log: RgbdLog, indices: list[int], exact: Mapping[int, Any] | Absent, recorded_is_exact: bool
+) -> Iterator[views.View]:
+    for index in indices:
+        frame = log.frame(index)
+        if recorded_is_exact:
+            yield views.View(frame, frame.depth)
+        elif isinstance(exact, Absent):
+            yield views.View(frame, exact)
+        else:
+            yield views.View(frame, exact.get(frame.stamp_ns, Absent("the frame has no exact depth")))
+
+
+def poses_by_stamp(trajectory: Trajectory) -> dict[int, NDArray[np.float64]]:
+    """Poses [4, 4] by time stamp in ns."""
+    return dict(zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True))
+
+
+def _view_rows(robot: str, view_set: str, frame_index: int, score: views.ViewScore | Absent) -> list[Row]:
+    return [
+        Row(
+            "view",
+            robot,
+            view_set,
+            frame_index,
+            f.name,
+            score if isinstance(score, Absent) else getattr(score, f.name),
+        )
+        for f in fields(views.ViewScore)
+    ]

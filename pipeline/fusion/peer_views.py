@@ -1,0 +1,69 @@
+"""What neighbours' maps show from where the neighbours stood: views to train on that no own camera took.
+
+A robot has its neighbours' whole maps and the poses of their keyframes, both by packets. What a neighbour's map draws
+from there stands in for the images that the neighbour took and never sent. From such views the fused map learns what
+two robots saw from different sides, which neither robot's own images can tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.consensus.config import WeightKind
+from pipeline.consensus.evidence import Evidence
+from pipeline.consensus.weighting import in_world
+from pipeline.fusion.fuse import gaussians_of
+from pipeline.fusion.refine import View
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.kernels import Rasterizer
+from pipeline.splat.gaussians import DepthKind
+
+Array = NDArray[np.float64]
+COVERED = 0.9
+"""Opacity from which on a pixel of a neighbour's map counts as seen by it."""
+
+
+def peer_views(
+    evidence: Mapping[str, Evidence],
+    T_world_keyframe: Mapping[str, Array],
+    camera: PinholeCamera,
+    most: int,
+    depth: DepthKind,
+    weights: WeightKind = "block",
+    threads: int = 1,
+) -> list[View]:
+    """Colour and depth of every neighbour's map at its keyframes and half way between them.
+
+    Args:
+        evidence: of the neighbours, by name, in anchor frames. T_world_keyframe: by name, [k, 4, 4] by anchor.
+        camera: the robot's own; what the neighbour's map does not cover counts as not seen.
+        most: so many views in all, evenly spread.
+        depth: as the maps were made. threads: changes no bit.
+    """
+    rasterizer = Rasterizer(threads=threads)
+    poses = [(name, T) for name in sorted(evidence) for T in _with_middles(T_world_keyframe[name])]
+    count = min(most, len(poses))
+    chosen = [poses[(2 * k + 1) * len(poses) // (2 * count)] for k in range(count)]
+    views, drawn = [], ""
+    for name, T_world_camera in chosen:
+        if name != drawn:
+            there = in_world(evidence[name], T_world_keyframe[name], weights)
+            gaussians, drawn = gaussians_of(there.ids, there.anchors, there.theta), name
+        render = rasterizer.forward(gaussians, camera, se3.inverse(T_world_camera), depth=depth)
+        seen = render.alpha >= COVERED
+        share = np.where(seen, render.alpha, np.float32(1))
+        color = np.rint(np.clip(render.color / share[..., None], 0, 1) * 255).astype(np.uint8)
+        depth_m = np.where(seen, render.depth / share, np.float32(0))
+        views.append(View(color, depth_m, T_world_camera, seen))
+    return views
+
+
+def _with_middles(T: Array) -> Array:
+    """Poses [k, 4, 4] and those half way from each to the next: [2 k - 1, 4, 4]."""
+    out = np.repeat(T, 2, axis=0)[:-1]
+    out[1::2] = T[:-1] @ se3.exp(0.5 * se3.log(se3.inverse(T[:-1]) @ T[1:]))
+    return out
