@@ -130,20 +130,24 @@ class Rasterizer:
         measured = (
             _checked_image("color", color, (height, width, 3), "the camera"),
             _checked_image("depth_m", depth_m, (height, width), "the camera"),
-            _NOTHING
-            if depth_certainty is None
-            else _checked_image("depth_certainty", depth_certainty, (height, width), "the camera"),
         )
-        gain, offset = _checked_exposure(exposure)
+        gain_and_offset = _checked_exposure(exposure)
         _check_type("loss", loss, LossWeights)
-        weights = np.array(
-            [*astuple(loss), gain, offset],
-            np.float32,
-        )
+        *of_images, surface_weight = astuple(loss)
+        weights = np.array([*of_images, *gain_and_offset, surface_weight], np.float32)
         _check_wanted(pose, parameters, fisher=False)
         out = _outputs(gaussians, parameters)
         by_pose, values = np.zeros(6 if pose else 0), np.zeros(6)
-        status = self._raster.fit(*_arrays(gaussians), *view, *measured, weights, values, *out, by_pose)
+        arguments = [*_arrays(gaussians), *view, *measured, weights, values, *out, by_pose]
+        if depth_certainty is not None:
+            arguments.append(
+                _checked_image("depth_certainty", depth_certainty, (height, width), "the camera")
+            )
+        elif surface_weight > 0:
+            arguments.append(
+                None
+            )  # kernels built before there was this term refuse it, rather than leave it out
+        status = self._raster.fit(*arguments)
         self._gaussians = None
         _refuse_bad_image(status, {"color": _NOT_FINITE, "depth_m": _NEGATIVE, "depth_certainty": _NEGATIVE})
         self._finish(gaussians, (height, width), status)
