@@ -228,6 +228,42 @@ def bench_frontend(
     print(json.dumps(result, indent=2) if as_json else frontend_bench.format_tables(result))
 
 
+@bench_app.command("paths")
+def bench_paths(
+    scenes: Annotated[
+        str, typer.Option(help="Scenes, or folders of textured meshes.")
+    ] = "room,office,corridor,outdoor",
+    paradigms: Annotated[
+        str, typer.Option(help="Of concentric, leader-follower, crossing, parallel.")
+    ] = "concentric,leader-follower,crossing,parallel",
+    robots: Annotated[str, typer.Option(help="Numbers of robots.")] = "2,3,4,8",
+    overlap: Annotated[str, typer.Option(help="Shares of the view to ask for.")] = "0.2,0.4,0.6,0.8",
+    frames: Annotated[int, typer.Option(min=2, help="Frames per robot.")] = 160,
+    up: Annotated[str, typer.Option(help="Axis that is up in meshes: y, z, or auto.")] = "auto",
+    seed: Annotated[int, typer.Option(help="Seed of scenes and paths.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Plan paths for every combination, without images: the overlap reached, speed, distances, processor time.
+
+    Lists are separated by commas. A cell of the table has the overlap asked for that was met worst, what neighbours
+    share then, and how fast the slowest and the fastest robot go, of the scene's usual speed.
+
+    Example: `duagc bench paths --scenes scans/house --robots 3`
+    """
+    from converters.simulate import MAX_ROBOTS, PARADIGMS
+    from converters.simulate import survey as paths
+
+    for name in paradigms.split(","):
+        if name not in PARADIGMS[1:]:
+            raise typer.BadParameter(
+                f"{name!r} is not one of {', '.join(PARADIGMS[1:])}", param_hint="--paradigms"
+            )
+    counts = [round(n) for n in _numbers("--robots", robots, 1, MAX_ROBOTS)]
+    asked = _numbers("--overlap", overlap, 0, 1)
+    rows = paths.survey(scenes.split(","), paradigms.split(","), counts, asked, frames, seed, up)
+    print(json.dumps(rows, indent=2) if as_json else paths.format_table(rows))
+
+
 @bench_app.command("convert")
 def bench_convert(
     log: Annotated[Path, typer.Argument(help="A .bag, .db3 or .mcap of one robot.", show_default=False)],
