@@ -81,9 +81,9 @@ ROBOT = {
 MAPS = {
     "own": "own",
     "own_unrefined": "own, before its final refinement",
-    "own_longer": "own, trained as long as refined",
+    "own_longer": "own, trained longer",
     "fused": "fused",
-    "refined": "refined: the final map",
+    "refined": "refined (final)",
 }  # fmt: skip
 
 VIEW_SETS = {
@@ -109,7 +109,7 @@ RENDERING = {
     "depth_l1_m": ("Depth L1", "mean error against the recorded depth, where both exist"),
     "depth_l1_exact_m": ("Depth L1, exact", "the same against the exact depth"),
     "depth_l1_layer_m": ("Depth L1, one layer", "the same, drawn as the surface that stops a pixel's light"),
-    "depth_l1_common_m": ("Depth L1, common", "over pixels that own, longer trained, fused and refined map all cover"),
+    "depth_l1_common_m": ("Depth L1, common", "over pixels that all maps but the unrefined cover"),
     "depth_completeness": ("Completeness", "share of recorded depth pixels that the map covers"),
 }  # fmt: skip
 
