@@ -16,7 +16,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -24,9 +24,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import DuagError
-from pipeline.evaluation import groundtruth, trajectory_errors, views
+from pipeline.evaluation import agreement, groundtruth, trajectory_errors, views
 from pipeline.evaluation.rendering import PosedMap, RenderTask
 from pipeline.evaluation.results import Absent, split_reasons
+from pipeline.evaluation.trajectory_errors import Paired
 from pipeline.frontend.config import FrontendConfig
 from pipeline.geometry.trajectory import Trajectory
 from pipeline.progress import track
@@ -457,6 +458,7 @@ def _row(plan: Plan, source: Recording, job: _Job) -> dict[str, Any]:
             "keyframes": len(robot.keyframes),
         }
         row |= _trajectory_errors(source, job.robot, estimated)
+        row |= _agreement(source, robot, estimated)
         if job.config.mapping_enabled:
             row |= {"max_gaussians": job.config.mapping.max_gaussians}
             row |= _map_errors(source, robot, estimated, plan.threads)
@@ -478,6 +480,17 @@ def _trajectory_errors(source: Recording, robot: str, estimated: Trajectory) -> 
     }
 
 
+def _agreement(source: Recording, robot: RobotRun, estimated: Trajectory) -> dict[str, Any]:
+    """How well held-out views agree, under the estimate and under the ground truth."""
+    true = groundtruth.trajectory(source, robot.robot)
+    pairs: Paired | Absent = true if isinstance(true, Absent) else trajectory_errors.pair(true, estimated)
+    if not isinstance(pairs, Absent):
+        pairs = replace(pairs, positions_only=not groundtruth.knows_rotations(source, robot.robot))
+    held_out = {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
+    path = dict(zip(estimated.stamps_ns.tolist(), estimated.poses, strict=True))
+    return agreement.section(source.log(robot.robot), held_out, {"": path}, pairs)
+
+
 def _map_errors(source: Recording, robot: RobotRun, estimated: Trajectory, threads: int) -> dict[str, Any]:
     """Scores of the map over the held-out views, after and before its final refinement."""
     maps = {"refined": robot.own_map, "unrefined": robot.unrefined_map}
@@ -493,6 +506,23 @@ def _map_errors(source: Recording, robot: RobotRun, estimated: Trajectory, threa
         kept = ("views", "psnr_db", "ssim", "depth_l1_m", "depth_l1_exact_m", "depth_l1_layer_m")
         row[name] = {key: scores[key] for key in (*kept, "depth_completeness")}
     return row
+
+
+def by_cap(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """What `report.figures.map_sizes` draws: the runs with a map, robot by robot, smallest cap first."""
+    robots: dict[str, list[dict[str, Any]]] = {}
+    for row in sorted(result["rows"], key=lambda row: row.get("max_gaussians", 0)):
+        if row["name"] == "map":
+            times, scores = row["times"], row["refined"]
+            robots.setdefault(row["robot"], []).append(
+                {"cap": row["max_gaussians"], "peak_memory_mb": row["peak_memory_mb"]}
+                | {name: scores[name] for name in ("psnr_db", "depth_l1_m", "depth_l1_layer_m")}
+                | {
+                    "keyframe_s": times["keyframe"]["cpu_ms"] / 1e3,
+                    "refinement_s": times["final_refinement_cpu_s"],
+                }
+            )
+    return robots
 
 
 # --- words -------------------------------------------------------------------------------------------------------
@@ -512,6 +542,9 @@ def format_tables(result: dict[str, Any]) -> str:
     head += ["ms/frame", "p95", "first, last quarter", "steps", "model ms", "poses s", "peak MB"]
     lines = [", ".join(about), "", "Tracking"]
     lines += _table(head, [_tracking_cells(row) for row in rows])
+    head = ["robot", "", "depth mm", "of ground truth", "features px", "of ground truth"]
+    judged = [_agreement_cells(row) for row in rows if "depth_agreement_m" in row]
+    lines += ["", "Agreement of held-out views", *_table(head, judged)]
     mapped = [row for row in rows if row["name"] == "map"]
     if mapped:
         head = [
@@ -554,6 +587,14 @@ def _tracking_cells(row: dict[str, Any]) -> list[Any]:
         *(f"{frame['cpu_ms']:.1f}", f"{frame['cpu_ms_p95']:.1f}", _quarters(frame)),
         *(_work(frame, "steps", 1.0), _model(row["times"].get("model"))),
         *(_number(row["times"].get("pose_optimisation_cpu_s"), 1, 1), f"{row['peak_memory_mb']:.0f}"),
+    ]
+
+
+def _agreement_cells(row: dict[str, Any]) -> list[Any]:
+    return [
+        *(row["robot"], row["name"]),
+        *(_number(row[f"depth_agreement_m{of}"], 1e3, 2) for of in ("", agreement.OF_TRUTH)),
+        *(_number(row[f"feature_agreement_px{of}"], 1, 2) for of in ("", agreement.OF_TRUTH)),
     ]
 
 

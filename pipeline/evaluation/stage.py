@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import DuagError
 from pipeline.evaluation import (
+    agreement,
     calibration,
-    depth_agreement,
-    feature_agreement,
     groundtruth,
     map_errors,
     trajectory_errors,
@@ -33,12 +32,10 @@ from pipeline.evaluation.results import (
 )
 from pipeline.evaluation.trajectory_errors import Paired, TeamError
 from pipeline.geometry.trajectory import Trajectory
-from pipeline.recording import Recording, open_rgbd
+from pipeline.recording import Recording
 from pipeline.run_folder import RobotRun, RunFolder
 
 SCHEMA = 1
-AGREEMENT_VIEWS = 40
-"""Held-out views, evenly spread, whose depth is compared in pairs."""
 
 PROTOCOL = {
     "alignment": "se3",
@@ -181,35 +178,9 @@ def _robot_section(robot: RobotRun, truth: TruePaths) -> dict[str, Any]:
 
 
 def _agreement_section(robot: RobotRun, source: Recording, truth: TruePaths) -> dict[str, Any]:
-    """How well held-out views agree under the estimate, and under the ground truth where there is one."""
-    stamp_of = {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
+    held_out = {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
     paths = {"": poses_by_stamp(robot.trajectory), "_before_consensus": poses_by_stamp(robot.odometry)}
-    section: dict[str, Any] = {}
-    paired = truth.after[robot.robot]
-    if isinstance(paired, Absent) or paired.positions_only:
-        absent = paired if isinstance(paired, Absent) else trajectory_errors.NO_ROTATIONS
-        section = {"depth_agreement_m_of_truth": absent, "feature_agreement_px_of_truth": absent}
-    else:
-        paths["_of_truth"] = dict(zip(paired.stamps_ns.tolist(), paired.true, strict=True))
-    known = [i for i, stamp in stamp_of.items() if all(stamp in path for path in paths.values())]
-    most = min(AGREEMENT_VIEWS, len(known))
-    chosen = [known[(2 * k + 1) * len(known) // (2 * most)] for k in range(most)]
-    with open_rgbd(source.log(robot.robot)) as log:
-        frames = [log.frame(index) for index in chosen]
-    depths = [f.depth if f.mask is None else np.where(f.mask, f.depth, np.float32(0)) for f in frames]
-    poses = {
-        name: np.array([path[stamp_of[index]] for index in chosen]).reshape(-1, 4, 4)
-        for name, path in paths.items()
-    }
-    pairs, by_depth = depth_agreement.depth_agreement(depths, log.camera, poses)
-    matched, by_features = feature_agreement.feature_agreement(
-        [f.color for f in frames], depths, log.camera, poses
-    )
-    section |= {"depth_agreement_pairs": pairs, "feature_agreement_pairs": matched}
-    for name in paths:
-        section[f"depth_agreement_m{name}"] = by_depth[name]
-        section[f"feature_agreement_px{name}"] = by_features[name]
-    return section
+    return agreement.section(source.log(robot.robot), held_out, paths, truth.after[robot.robot])
 
 
 def _ate_of_keyframes(robot: RobotRun, pairs: Paired) -> float | Absent:

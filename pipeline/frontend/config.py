@@ -23,6 +23,8 @@ class LoopConfig(Config):
     """Keyframes that lie between the two at least, less one."""
     known_overlap: float = 0.3
     """Overlap by the tracked poses from which a pair needs no recognition."""
+    compared: int = 32
+    """Earlier keyframes, those that share most visual words, whose features are compared."""
     features_compared: int = 120
     """The strongest features, by which earlier keyframes are ranked."""
     ratio: float = 0.8

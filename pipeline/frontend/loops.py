@@ -14,6 +14,7 @@ from pipeline.frontend.keyframes import KeyframePair, overlap
 from pipeline.geometry import se3
 from pipeline.registration import RegistrationConfig, register
 from pipeline.registration.features import matches, ransac
+from pipeline.registration.places import Places
 
 Array = NDArray[np.float64]
 
@@ -36,8 +37,9 @@ def find_loops(
         T_map_keyframes: [k, 4, 4], as tracked. seed, robot: of the random stream.
     """
     found = []
+    places = Places([view.features.descriptors[: config.features_compared] for view in views])
     for second in range(config.min_gap, len(views)):
-        candidates = _resembling(views, second, config)
+        candidates = _resembling(views, second, places, config)
         for first in candidates:
             T_first_second = se3.inverse(T_map_keyframes[first]) @ T_map_keyframes[second]
             seen = overlap(views[first].reference.levels[-1], views[second].coarsest, T_first_second)
@@ -49,12 +51,15 @@ def find_loops(
     return found
 
 
-def _resembling(views: Sequence[View], second: int, config: LoopConfig) -> list[int]:
-    """Earlier keyframes with most matches among the strongest features, ascending."""
+def _resembling(views: Sequence[View], second: int, places: Places, config: LoopConfig) -> list[int]:
+    """Earlier keyframes with most matches among the strongest features, ascending.
+
+    Features are compared with those of a bounded number of keyframes only, however many there are.
+    """
     most = config.features_compared
     theirs = views[second].features.descriptors[:most]
     scored = []
-    for first in range(second - config.min_gap + 1):
+    for first in places.alike(second, second - config.min_gap + 1, config.compared):
         score = len(matches(views[first].features.descriptors[:most], theirs, config.ratio))
         if score >= config.min_matches:
             scored.append((-score, first))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.frontend import bundle
+from pipeline.frontend import bundle, loops
 from pipeline.frontend.bundle import Neighbourhood, optimise
 from pipeline.frontend.config import KeyframeConfig, LoopConfig, RelocalisationConfig
 from pipeline.frontend.keyframes import KeyframePair, refine
@@ -16,7 +16,7 @@ from pipeline.frontend.relocalisation import features_of
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.registration import Level, Reference, RegistrationConfig, RgbdPyramid, register
-from pipeline.registration.features import Features
+from pipeline.registration.features import Features, matches
 from tests.registration.room import pose, render
 
 CAMERA = PinholeCamera(320, 240, 220.0, 220.0, 159.5, 119.5)
@@ -165,6 +165,23 @@ def test_loop_is_found_and_closes_the_drift(circle: Walk) -> None:
     closed, _ = optimise(start, circle.views, circle.images, [*wrong, *loops], CONFIG, REGISTRATION)
     # association is projective, rounds converge as ICP does: ten of them end at 6 mm, forty at 2
     assert circle.error_m(closed.T_map_keyframe) < 0.01 < 0.2 * circle.error_m(start)
+
+
+def test_loops_are_looked_for_among_a_bounded_number(circle: Walk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many keyframes there are, features are compared with those of so many only; the loop is among them."""
+    rng = np.random.default_rng(0)
+    none = Features(rng.integers(0, 120, (120, 128), dtype=np.uint8), np.ones((120, 3), np.float32))
+    start, _ = drifted(circle)
+    views = [circle.views[0], *[View(circle.views[1].reference, circle.views[1].coarsest, none)] * 40]
+    views.append(circle.views[16])
+    poses = np.concatenate([start[:1], np.repeat(start[1:2], 40, axis=0), start[16:]])
+    images = {0: circle.pyramids[0], 41: circle.pyramids[16]}
+    compared = []
+    monkeypatch.setattr(loops, "matches", lambda *a: compared.append(a) or matches(*a))
+    config = LoopConfig(compared=3, min_matches=60)
+    found = find_loops(poses, views, lambda k, _: images[k], config, REGISTRATION, 0, "alpha")
+    assert [(p.first, p.second) for p in found] == [(0, 41)]
+    assert len(compared) <= 3 * len(views)
 
 
 def test_known_overlaps_and_foreign_places_are_no_loops(circle: Walk) -> None:
