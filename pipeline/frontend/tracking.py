@@ -292,9 +292,10 @@ class Tracker:
             for guess in starts:
                 information = known if guess is predicted else None
                 result = register(keyframe.reference, pyramid, guess, tracking.registration, information)
-                if result.ok:
-                    return _Found(self._current, result)
-                reason = reason if reason is not Reason.NONE else Reason(result.outcome.value)
+                found = _Found(self._current, result)
+                if result.ok and self._tells_enough(pyramid, found):
+                    return found
+                reason = reason if reason is not Reason.NONE else found.why_not()
         view = features_of(pyramid, tracking.relocalisation) if view is None else view
         for guess in starts:
             found = _Found(self._current, self._settle(keyframe, pyramid, guess, tracking.recovery))
@@ -352,6 +353,18 @@ class Tracker:
             return found
         self._unconfirmed = _Unconfirmed(found, stamp_ns, before.agreed + 1)
         return Reason.UNCONFIRMED
+
+    def _tells_enough(self, pyramid: RgbdPyramid, found: _Found) -> bool:
+        """Whether what something before the camera leaves to be seen still says well where the camera is."""
+        failure = self.config.tracking.failure
+        # along weak directions a prior knows the pose, or the outcome would not be OK
+        covariance = np.linalg.pinv(found.result.information, rcond=1e-12, hermitian=True)
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+        if sigma_m <= failure.max_sigma_obstructed_m:
+            return True
+        keyframe = self.keyframes[found.keyframe_index].coarsest
+        intruding, told = intruders(pyramid.levels[-1], keyframe, found.result.T_reference_target, failure)
+        return intruding <= failure.max_intruders * told
 
     def _believable(self, stamp_ns: int, pyramid: RgbdPyramid, found: _Found, view: Features) -> bool:
         """Whether a pose that was not simply followed can be true.

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.frontend.config import FrontendConfig
 from pipeline.frontend.tracking import Status, TrackedFrame, Tracker
 from pipeline.geometry import se3
 
@@ -159,9 +160,11 @@ class Undisturbed:
         start: int,
         disturbance: Callable[[Sequence[Shot], np.random.Generator], Iterator[Shot]],
         frames: int = 45,
+        config: FrontendConfig | None = None,
     ) -> list[Row]:
-        """Track on from frame `start` with a disturbance that begins there."""
+        """Track on from frame `start` with a disturbance that begins there, maybe with another configuration."""
         tracker = _copied(self._before[start])
+        tracker.config = config or tracker.config
         rows = []
         for shot in disturbance(self.shots[start : start + frames], np.random.default_rng(start)):
             frame, pose = track(tracker, shot)

@@ -90,6 +90,18 @@ def test_a_hand_before_the_lens_does_not_take_the_pose_along(run: Undisturbed, s
     assert_found_again(rows, within=4)
 
 
+def test_what_a_hand_leaves_must_tell_the_position(run: Undisturbed) -> None:
+    """With a limit that no image keeps, every frame behind the hand is lost, and no other."""
+    strict = FrontendConfig.model_validate(
+        {"tracking": {"strides": (2, 1, 1, 1), "failure": {"max_sigma_obstructed_m": 1e-7}}}
+    )
+    rows = run.disturbed(STARTS[0], d.hand, config=strict)
+    assert not any(row.good for row in during(rows))
+    assert during(rows)[0].frame.reason is Reason.OBSTRUCTED
+    assert_found_again(rows, within=4)
+    assert all(row.good for row in run.disturbed(STARTS[0], d.dropped, config=strict))
+
+
 @pytest.mark.parametrize("start", STARTS)
 def test_a_foreign_room_is_nowhere(run: Undisturbed, other_room: list[Shot], start: int) -> None:
     for disturbance in (d.foreign(other_room), d.mirrored):
@@ -186,12 +198,16 @@ def test_intruders_are_what_stands_in_free_space(run: Undisturbed) -> None:
 
 
 @pytest.mark.slow
-def test_red_kitchen_is_never_silently_wrong(other_room: list[Shot]) -> None:
-    """A real sensor: nine disturbances at four places of the log of the first robot."""
-    if not (RED_KITCHEN / "alpha.mcap").is_file():
+@pytest.mark.parametrize(
+    ("robot", "starts"), [("alpha", (60, 120, 180, 240)), ("bravo", (40, 110, 170, 230))], ids=str
+)
+def test_red_kitchen_is_never_silently_wrong(
+    robot: str, starts: tuple[int, ...], other_room: list[Shot]
+) -> None:
+    """A real sensor: nine disturbances at four places of the log of each robot."""
+    if not (RED_KITCHEN / f"{robot}.mcap").is_file():
         pytest.skip("needs recordings/redkitchen")
-    starts = (60, 120, 180, 240)
-    with open_rgbd(RED_KITCHEN / "alpha.mcap") as log:
+    with open_rgbd(RED_KITCHEN / f"{robot}.mcap") as log:
         camera = log.camera
         shots = [Shot(f.index, f.stamp_ns, f.color, f.depth) for f in map(log.frame, range(starts[-1] + 45))]
     run = Undisturbed(Tracker(camera, FrontendConfig()), shots, starts)
