@@ -155,6 +155,10 @@ class Undisturbed:
             self.frames.append(frame)
             self.poses.append(pose)
 
+    def tracker(self, start: int) -> Tracker:
+        """A tracker as it was before frame `start`."""
+        return _copied(self._before[start])
+
     def disturbed(
         self,
         start: int,
@@ -163,7 +167,7 @@ class Undisturbed:
         config: FrontendConfig | None = None,
     ) -> list[Row]:
         """Track on from frame `start` with a disturbance that begins there, maybe with another configuration."""
-        tracker = _copied(self._before[start])
+        tracker = self.tracker(start)
         tracker.config = config or tracker.config
         rows = []
         for shot in disturbance(self.shots[start : start + frames], np.random.default_rng(start)):
