@@ -2,8 +2,8 @@
 
 from pipeline.config import Config
 from pipeline.frontend.mapping_config import MappingConfig
-from pipeline.registration.align import RegistrationConfig
 from pipeline.registration.moving import MovingConfig
+from pipeline.registration.residuals import RegistrationConfig
 
 # Not settings: the files of a run and their readers promise this rule.
 HELD_OUT_PERIOD = 8
