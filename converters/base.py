@@ -19,6 +19,7 @@ written by a process of its own:
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
@@ -125,6 +126,8 @@ class RobotWriter:
         if not re.fullmatch(topics.ROBOT_NAME, name):
             raise DuagError(f"robot {name!r}: expected lower-case letters, digits and underscores")
         check_camera(camera, f"robot {name}")
+        if not (math.isfinite(depth_scale) and depth_scale > 0):
+            raise DuagError(f"robot {name}: a unit of depth is {depth_scale} m, expected a positive number")
         self.folder, self.name, self.camera, self.depth_scale = Path(folder), name, camera, float(depth_scale)
         self.sensors = dict(sensors or {})
         self.summary: dict[str, Any] = {}

@@ -21,6 +21,7 @@ from pipeline.files import read_text
 from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
+LAST_NS = 1 << 62  # about the year 2116
 
 
 class AssociationOptions(Config):
@@ -52,9 +53,12 @@ class Listed:
 def nanoseconds(text: str, where: str) -> int:
     """Decimal seconds as integer nanoseconds, exactly."""
     try:
-        return int((Decimal(text) * NANOSECONDS).to_integral_value())
-    except (InvalidOperation, ValueError, OverflowError) as error:
+        time_ns = Decimal(text) * NANOSECONDS
+        if abs(time_ns) < LAST_NS:
+            return int(time_ns.to_integral_value())
+    except (InvalidOperation, ValueError) as error:
         raise DuagError(f"{where}: {text!r}, expected a time in seconds") from error
+    raise DuagError(f"{where}: {text[:60]!r}, expected a time in seconds before the year 2116")
 
 
 def read_list(path: Path) -> list[Listed]:

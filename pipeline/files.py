@@ -57,7 +57,19 @@ def decode_image(data: bytes, flags: int) -> NDArray[Any] | None:
     import cv2
     import numpy as np
 
+    if not data or _is_torn_png(data):
+        return None
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:  # it refuses large sizes by an exception
         return None
+
+
+def _is_torn_png(data: bytes) -> bool:
+    """Whether a chunk of a PNG claims more bytes than follow: OpenCV takes up to 4 GB of memory to find that out."""
+    if not data.startswith(b"\x89PNG"):
+        return False
+    at = 8
+    while at + 8 <= len(data) and data[at + 4 : at + 8] != b"IEND":
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+    return at + 8 > len(data)

@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Evidence, theta_of
 from pipeline.consensus.gaussians import Weights
 from pipeline.errors import DuagError
-from pipeline.exchange import wire
+from pipeline.exchange import evidence_wire, wire
 from pipeline.exchange.packets import (
     EVIDENCE_KINDS,
     HEADER_BYTES,
@@ -191,7 +191,7 @@ class Inspector:
                     "bytes_of_poses": len(poses),
                 }
             if kind in EVIDENCE_KINDS:
-                owner, _, records = wire.read_evidence(kind, payload, team)
+                owner, _, records = evidence_wire.read_evidence(kind, payload, team)
                 return {"owner": self._session.team[owner], "gaussians": records["id"].tolist()}
         except MalformedError as error:
             return {"unreadable": str(error)}

@@ -149,6 +149,9 @@ def _header(m: Any, frame: str = "frame_id") -> Fields:
 
 
 def _bytes(data: Any) -> bytes:
+    """Bytes, of JSON in base64 or as a list; a number would become as many zeros."""
+    if not isinstance(data, str | bytes | list):
+        raise TypeError(f"data is {type(data).__name__}, expected bytes")
     if isinstance(data, Base64):
         return binascii.a2b_base64(data, strict_mode=True)
     return base64.b64decode(data, validate=True) if isinstance(data, str) else bytes(data)

@@ -66,11 +66,6 @@ class RosBag:
                 if foxglove.plain_name(connection.msgtype) in foxglove.ROS_TYPES:
                     header = partial(_stamp_of, read)
                 time_ns = sound_time(log_ns, f"{self.path}: {connection.topic}")
-                if not isinstance(raw, bytes | memoryview):  # a database holds anything in any column
-                    kind = type(raw).__name__
-                    raise DuagError(
-                        f"{self.path}: {connection.topic} holds {kind}, expected the bytes of messages"
-                    )
                 yield Entry(connection.topic, time_ns, None, raw, read, header)
 
     def _read(self, connection: Any, raw: bytes) -> Any:
@@ -79,7 +74,8 @@ class RosBag:
         return foxglove.as_ros(foxglove.plain_name(connection.msgtype), message, where)
 
     def close(self) -> None:
-        self._reader.close()
+        with reading(self.path, "a sound bag of ROS 1 or ROS 2"):  # a database may notice its damage only now
+            self._reader.close()
 
 
 def _bound_chunks(reader: Any) -> None:

@@ -140,27 +140,40 @@ def _loop(scene: Scene, robot: int) -> Loop:
     )
 
 
-def shared_view(renderer: Eye, poses_a: Array, poses_b: Array) -> float:
-    """Share of the pixels of path a [n, 4, 4] whose points path b sees too, and the other way round, averaged."""
-    picked = [
-        poses[np.unique(np.linspace(0, len(poses) - 1, OVERLAP_VIEWS).round().astype(np.int64))]
-        for poses in (poses_a, poses_b)
-    ]
-    depths = [np.stack([renderer.depth(T)[0] for T in poses]) for poses in picked]
+@dataclass(frozen=True)
+class Views:
+    """What a camera sees on its path: poses T_world_camera [n, 4, 4], depths [n, h, w], world points [n * h * w, 3]."""
+
+    poses: Array
+    depths: Array
+    points: Array
+
+
+def look(renderer: Eye, path: Array) -> Views:
+    """Some views, evenly spread, along a path T_world_camera [frames, 4, 4]."""
+    poses = path[np.unique(np.linspace(0, len(path) - 1, OVERLAP_VIEWS).round().astype(np.int64))]
+    depths = np.stack([renderer.depth(T)[0] for T in poses])
     rays = renderer.camera.rays()
+    points = [
+        se3.transform(T, (rays * d[..., None]).reshape(-1, 3)) for T, d in zip(poses, depths, strict=True)
+    ]
+    return Views(poses, depths, np.concatenate(points))
+
+
+def shared(camera: PinholeCamera, a: Views, b: Views) -> float:
+    """Share of the pixels of views a whose points views b see too, and the other way round, averaged."""
     shares = []
-    for one, other in ((0, 1), (1, 0)):
-        points = np.concatenate(
-            [
-                se3.transform(T, (rays * d[..., None]).reshape(-1, 3))
-                for T, d in zip(picked[one], depths[one], strict=True)
-            ]
-        )
-        seen = np.zeros(len(points), dtype=bool)
-        for T, depth in zip(picked[other], depths[other], strict=True):
-            seen |= sees(renderer.camera, depth, se3.transform(se3.inverse(T), points))
+    for one, other in ((a, b), (b, a)):
+        seen = np.zeros(len(one.points), dtype=bool)
+        for T, depth in zip(other.poses, other.depths, strict=True):
+            seen |= sees(camera, depth, se3.transform(se3.inverse(T), one.points))
         shares.append(seen.mean())
     return float(np.mean(shares))
+
+
+def shared_view(renderer: Eye, path_a: Array, path_b: Array) -> float:
+    """Share of the pixels along path a [n, 4, 4] whose points path b sees too, and the other way round, averaged."""
+    return shared(renderer.camera, look(renderer, path_a), look(renderer, path_b))
 
 
 def sees(camera: PinholeCamera, depth: Array, points_camera: Array) -> NDArray[np.bool_]:

@@ -135,6 +135,7 @@ class MeshStage:
         self.step_m, self.depth_scale_m, self.sky = manner.step_m, manner.depth_scale_m, manner.sky
         self.scene = meshes.load(folder)
         self.caster = Caster(self.scene)
+        self._space: walks.FreeSpace | None = None
 
     def store(self, folder: Path) -> MeshesOnDisk:
         """All is on disk already."""
@@ -150,7 +151,9 @@ class MeshStage:
         return walks.plan(self, robots, frames, overlap, camera, self.seed)
 
     def free_space(self) -> walks.FreeSpace:
-        return walks.free_space(self.caster, self.sky)
+        if self._space is None:
+            self._space = walks.free_space(self.caster, self.sky)
+        return self._space
 
     def clearance(self, points: Array) -> Array:
         return self.caster.clearance(points)

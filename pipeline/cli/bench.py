@@ -153,6 +153,34 @@ def bench_team(
     print(json.dumps(result, indent=2) if as_json else team_bench.format_table(result))
 
 
+@bench_app.command("reference")
+def bench_reference(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A finished run.", show_default=False)],
+    recording: Annotated[
+        Path | None, typer.Option(help="Folder of its recording, if it moved.", show_default=False)
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """A team's error beside what its images allow: all keyframes optimised in one place.
+
+    From the run's poses and from the true ones. A run of one robot is also cut in parts. Needs ground truth.
+
+    Example: `duagc bench reference outputs/redkitchen`
+    """
+    from pipeline import numeric
+    from pipeline.config import load
+    from pipeline.evaluation import reference_bench
+    from pipeline.recording import Recording
+    from pipeline.run_folder import RunFolder
+    from pipeline.runner import RunConfig
+
+    numeric.settle_opencv()
+    run = RunFolder(run_folder)
+    source = Recording(run.recording if recording is None else recording)
+    result = reference_bench.run(run, source, load(RunConfig, run.config_file, []).frontend)
+    print(json.dumps(result, indent=2) if as_json else reference_bench.format_table(result))
+
+
 @bench_app.command("frontend")
 def bench_frontend(
     recording: Annotated[
@@ -166,12 +194,16 @@ def bench_frontend(
     robot: Annotated[str | None, typer.Option(help="One robot; all by default.")] = None,
     threads: Annotated[int, typer.Option(min=1, help="Of the kernels.")] = 1,
     config: ConfigFile = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(help="SVG file to write: scores, time and memory against the caps.", show_default=False),
+    ] = None,
     overrides: Overrides = None,
     as_json: Json = False,
 ) -> None:
     """Time, memory and accuracy of tracking and mapping, part by part, beside Open3D's odometry.
 
-    Examples: `duagc bench frontend recordings/house --caps 30k,60k,200k,600k`,
+    Examples: `duagc bench frontend recordings/house --caps 30k,60k,200k,600k --plot caps.svg`,
     `duagc bench frontend recordings/redkitchen --no-ablation --json`
     """
     import tempfile
@@ -182,6 +214,12 @@ def bench_frontend(
     from pipeline.runner import RunConfig
 
     settings = load(RunConfig, config, overrides or [])
+    chosen = () if caps == "none" else tuple(_counts("--caps", caps))
+    if plot is not None:
+        if not chosen:
+            raise typer.BadParameter("there is nothing to draw without maps; see --caps", param_hint="--plot")
+        if plot.suffix != ".svg" or not plot.parent.is_dir():
+            raise typer.BadParameter(f"{plot} is not a name.svg in a folder that exists", param_hint="--plot")
     with tempfile.TemporaryDirectory(prefix="duagc-bench-") as folder:
         if recording is None:
             recording = Path(folder) / "room"
@@ -189,7 +227,7 @@ def bench_frontend(
         plan = frontend_bench.Plan(
             recording,
             settings.frontend,
-            () if caps == "none" else tuple(_counts("--caps", caps)),
+            chosen,
             ablation,
             open3d,
             threads,
@@ -197,7 +235,49 @@ def bench_frontend(
             (robot,) if robot else (),
         )
         result = frontend_bench.run(plan)
+    if plot is not None:
+        from pipeline.report import figures
+
+        partial = plot.with_name(plot.name + ".part")
+        partial.write_text(figures.map_sizes(frontend_bench.by_cap(result)), encoding="utf-8")
+        partial.replace(plot)
     print(json.dumps(result, indent=2) if as_json else frontend_bench.format_tables(result))
+
+
+@bench_app.command("paths")
+def bench_paths(
+    scenes: Annotated[
+        str, typer.Option(help="Scenes, or folders of textured meshes.")
+    ] = "room,office,corridor,outdoor",
+    paradigms: Annotated[
+        str, typer.Option(help="Of concentric, leader-follower, crossing, parallel.")
+    ] = "concentric,leader-follower,crossing,parallel",
+    robots: Annotated[str, typer.Option(help="Numbers of robots.")] = "2,3,4,8",
+    overlap: Annotated[str, typer.Option(help="Shares of the view to ask for.")] = "0.2,0.4,0.6,0.8",
+    frames: Annotated[int, typer.Option(min=2, help="Frames per robot.")] = 160,
+    up: Annotated[str, typer.Option(help="Axis that is up in meshes: y, z, or auto.")] = "auto",
+    seed: Annotated[int, typer.Option(help="Seed of scenes and paths.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Plan paths for every combination, without images: the overlap reached, speed, distances, processor time.
+
+    Lists are separated by commas. A cell of the table has the overlap asked for that was met worst, what neighbours
+    share then, and how fast the slowest and the fastest robot go, of the scene's usual speed.
+
+    Example: `duagc bench paths --scenes scans/house --robots 3`
+    """
+    from converters.simulate import MAX_ROBOTS, PARADIGMS
+    from converters.simulate import survey as paths
+
+    for name in paradigms.split(","):
+        if name not in PARADIGMS[1:]:
+            raise typer.BadParameter(
+                f"{name!r} is not one of {', '.join(PARADIGMS[1:])}", param_hint="--paradigms"
+            )
+    counts = [round(n) for n in _numbers("--robots", robots, 1, MAX_ROBOTS)]
+    asked = _numbers("--overlap", overlap, 0, 1)
+    rows = paths.survey(scenes.split(","), paradigms.split(","), counts, asked, frames, seed, up)
+    print(json.dumps(rows, indent=2) if as_json else paths.format_table(rows))
 
 
 @bench_app.command("convert")

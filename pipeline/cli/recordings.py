@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import EXIT_FAILED, Force, Json, Out, Workers, app
+from pipeline.cli.common import EXIT_FAILED, Force, Json, Out, Workers, app, say
 from pipeline.errors import DuagError
 
 
@@ -78,7 +78,14 @@ def simulate(
         workers=workers,
         force=force,
     )
+    _say_warnings(out)
     print(out)
+
+
+def _say_warnings(out: Path) -> None:
+    """What a new recording says about itself that its maker may not have wanted."""
+    for line in json.loads((out / "recording.json").read_text())["warnings"]:
+        say(f"{out}: warning: {line}")
 
 
 @app.command()
@@ -125,6 +132,7 @@ def convert(
         raise typer.BadParameter("expected DATASET SRC --out REC, or --list")
     said = [*(options or []), *([f"time_source={time_source}"] if time_source else [])]
     converters.convert(dataset, source, out, robots=robots, force=force, options=said)
+    _say_warnings(out)
     print(out)
 
 

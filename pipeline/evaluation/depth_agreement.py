@@ -8,6 +8,7 @@ ground truth, whose poses may be worse than the estimate.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -42,8 +43,28 @@ def depth_agreement(
     Returns:
         Number of pairs, and the value of every trajectory.
     """
+    found = pair_medians(depths_m, camera, trajectories)
+    if len(found.pairs) < MIN_PAIRS:
+        absent = Absent(f"only {len(found.pairs)} pairs of held-out views overlap, {MIN_PAIRS} are needed")
+        return len(found.pairs), dict.fromkeys(trajectories, absent)
+    return len(found.pairs), {name: float(np.median(values)) for name, values in found.of.items()}
+
+
+@dataclass(frozen=True)
+class PairMedians:
+    """pairs: of views that are judged under all trajectories. of: their medians [pairs], metres, by trajectory."""
+
+    pairs: list[tuple[int, int]]
+    of: dict[str, Array]
+
+
+def pair_medians(
+    depths_m: Sequence[Depth], camera: PinholeCamera, trajectories: Mapping[str, Array]
+) -> PairMedians:
+    """What `depth_agreement` takes the median of."""
     inverse = [np.where(d > 0, 1 / np.where(d > 0, d, 1), np.nan) for d in depths_m]
     clouds = [_points(d, camera) for d in depths_m]
+    pairs: list[tuple[int, int]] = []
     medians: dict[str, list[float]] = {name: [] for name in trajectories}
     for a, b in combinations(range(len(depths_m)), 2):
         found = {
@@ -53,14 +74,11 @@ def depth_agreement(
             for name, T in trajectories.items()
         }
         if all(value is not None for value in found.values()):
+            pairs.append((a, b))
             for name, value in found.items():
                 assert value is not None
                 medians[name].append(value)
-    pairs = len(next(iter(medians.values()), []))
-    if pairs < MIN_PAIRS:
-        absent = Absent(f"only {pairs} pairs of held-out views overlap, {MIN_PAIRS} are needed")
-        return pairs, dict.fromkeys(trajectories, absent)
-    return pairs, {name: float(np.median(values)) for name, values in medians.items()}
+    return PairMedians(pairs, {name: np.array(values) for name, values in medians.items()})
 
 
 def _points(depth_m: Depth, camera: PinholeCamera) -> Array:

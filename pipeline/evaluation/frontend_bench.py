@@ -508,6 +508,23 @@ def _map_errors(source: Recording, robot: RobotRun, estimated: Trajectory, threa
     return row
 
 
+def by_cap(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """What `report.figures.map_sizes` draws: the runs with a map, robot by robot, smallest cap first."""
+    robots: dict[str, list[dict[str, Any]]] = {}
+    for row in sorted(result["rows"], key=lambda row: row.get("max_gaussians", 0)):
+        if row["name"] == "map":
+            times, scores = row["times"], row["refined"]
+            robots.setdefault(row["robot"], []).append(
+                {"cap": row["max_gaussians"], "peak_memory_mb": row["peak_memory_mb"]}
+                | {name: scores[name] for name in ("psnr_db", "depth_l1_m", "depth_l1_layer_m")}
+                | {
+                    "keyframe_s": times["keyframe"]["cpu_ms"] / 1e3,
+                    "refinement_s": times["final_refinement_cpu_s"],
+                }
+            )
+    return robots
+
+
 # --- words -------------------------------------------------------------------------------------------------------
 
 

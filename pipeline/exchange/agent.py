@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.consensus.closures import plausible
-from pipeline.exchange import injection, wire
+from pipeline.exchange import injection, places_wire, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.frames import Frames
 from pipeline.exchange.meeting import HigherEnd, LowerEnd, Meeting, OwnPlaces, Send
@@ -180,7 +180,7 @@ class Agent:
         if arrival.kind is Kind.STATE:
             self._take_state(n, payload)
         elif arrival.kind is Kind.HELLO:
-            digest = wire.read_digest(payload)
+            digest = places_wire.read_digest(payload)
             self._meet(n, lower=(self.places.digest, self.data.robot) < (digest, n.name))
         elif arrival.kind in MEETING_KINDS:
             self._meet(n, lower=arrival.kind in LOWER_END_KINDS).take(arrival.kind, payload, self._sender(n))

@@ -29,7 +29,7 @@ from pipeline.consensus.gaussians import (
     optimum,
     total_weights,
 )
-from pipeline.exchange import wire
+from pipeline.exchange import evidence_wire
 from pipeline.exchange.config import LinkConfig, TransportConfig
 from pipeline.exchange.links import LinkModel, neighbours
 from pipeline.exchange.packets import EVIDENCE_HEAD_BYTES, HEADER_BYTES, MAX_PAYLOAD_BYTES, Kind, parse
@@ -235,7 +235,9 @@ def _evidence(team: Team, model: LinkModel, case: dict[str, Any], plan: Plan) ->
     index = {name: k for k, name in enumerate(team.names)}
     children = {owner: _tree(owner, team.linked) for owner in team.names}
     payloads = {
-        n: wire.write_evidence(kind, index[n], 1, wire.to_body(kind, _records(team, n, kind)))
+        n: evidence_wire.write_evidence(
+            kind, index[n], 1, evidence_wire.to_body(kind, _records(team, n, kind))
+        )
         for n in team.names
     }
     ids = {name: itertools.count(1) for name in team.names}
@@ -267,7 +269,9 @@ def _evidence(team: Team, model: LinkModel, case: dict[str, Any], plan: Plan) ->
             if arrival is None or not arrival.complete or arrival.kind is not kind:
                 continue
             owner = team.names[
-                wire.read_evidence_head(kind, arrival.payload[:EVIDENCE_HEAD_BYTES], len(team.names))[0]
+                evidence_wire.read_evidence_head(
+                    kind, arrival.payload[:EVIDENCE_HEAD_BYTES], len(team.names)
+                )[0]
             ]
             known[peer][owner] = arrival.payload
             for child in children[owner][peer]:
@@ -287,7 +291,7 @@ def _sum(kind: Kind, payloads: dict[str, bytes], team: int) -> Array:
     """What a robot makes of the evidence that it has, its own as the others read it."""
     theta, weights = [], []
     for _, payload in sorted(payloads.items()):
-        _, _, records = wire.read_evidence(kind, payload, team)
+        _, _, records = evidence_wire.read_evidence(kind, payload, team)
         theta.append(records["theta"].astype(np.float64))
         evidence = Evidence(
             "", records["id"], records["anchor"], theta[-1], records["information"].astype(np.float64)
@@ -314,7 +318,7 @@ def _tree(owner: str, linked: dict[str, tuple[str, ...]]) -> dict[str, list[str]
 def _records(team: Team, name: str, kind: Kind) -> NDArray[Any]:
     """A robot's evidence as records of the wire."""
     W, theta = team.weights[name], team.theta[name]
-    out = np.zeros(len(theta), wire.record_dtype(kind))
+    out = np.zeros(len(theta), evidence_wire.record_dtype(kind))
     out["id"] = np.arange(len(theta))
     out["theta"] = theta
     out["information"] = pack_information(W.position, W.shape, W.color, W.opacity)

@@ -42,7 +42,7 @@ _PIVOT = (
 
 
 def encode(records: NDArray[Any]) -> NDArray[Any]:
-    """Compact records [n] of records [n] as `wire.RECORD`.
+    """Compact records [n] of records [n] as `evidence_wire.RECORD`.
 
     Raises:
         ValueError: an id beyond 32 bits or an anchor beyond 16; no map of this project has them.
@@ -69,7 +69,7 @@ def encode(records: NDArray[Any]) -> NDArray[Any]:
 
 
 def decode(compact: NDArray[Any], record: np.dtype[Any]) -> NDArray[Any]:
-    """Records of dtype `record` (`wire.RECORD`) from compact ones."""
+    """Records of dtype `record` (`evidence_wire.RECORD`) from compact ones."""
     out = np.zeros(len(compact), record)
     out["id"], out["anchor"] = compact["id"], compact["anchor"]
     out["theta"][:, :3] = compact["mean"]

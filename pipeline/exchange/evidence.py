@@ -11,8 +11,8 @@ from pipeline.consensus.config import MatchingConfig, WeightKind
 from pipeline.consensus.evidence import Evidence
 from pipeline.consensus.matching import match
 from pipeline.consensus.weighting import told
+from pipeline.exchange.evidence_wire import record_dtype
 from pipeline.exchange.packets import Kind
-from pipeline.exchange.wire import record_dtype
 from pipeline.geometry import se3
 from pipeline.robot import RobotData
 from pipeline.splat.gaussians import Gaussians

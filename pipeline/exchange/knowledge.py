@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange import wire
+from pipeline.exchange import evidence_wire, wire
 from pipeline.exchange.packets import Kind, MalformedError
 from pipeline.exchange.wire import Anchors, PairList
 
@@ -45,7 +45,7 @@ class Knowledge:
     def take_evidence(self, provider: int, message: int, payload: bytes, complete: bool) -> int | None:
         """Take a chunk, or the complete message. Returns the owner if its evidence is here completely."""
         if not complete:
-            owner, _ = wire.read_evidence_head(self.kind, payload, self.team)
+            owner, _ = evidence_wire.read_evidence_head(self.kind, payload, self.team)
             if owner not in self.evidence:
                 entry = self.incoming.setdefault((provider, message), Incoming(owner, provider))
                 if entry.owner != owner:
@@ -53,7 +53,7 @@ class Knowledge:
                 entry.chunks.append(payload)
             return owner if owner in self.evidence else None
         self.incoming.pop((provider, message), None)
-        owner, body, records = wire.read_evidence(self.kind, payload, self.team)
+        owner, body, records = evidence_wire.read_evidence(self.kind, payload, self.team)
         if owner == self.own:
             raise MalformedError("evidence: a neighbour speaks for this robot")
         if owner not in self.evidence:
@@ -114,16 +114,16 @@ class Knowledge:
             for key in sorted(k for k, entry in self.incoming.items() if entry.owner == owner):
                 for chunk in self.incoming[key].chunks:
                     try:
-                        parts.append(wire.read_evidence(self.kind, chunk, self.team)[2])
+                        parts.append(evidence_wire.read_evidence(self.kind, chunk, self.team)[2])
                     except MalformedError:
                         continue
-            records = np.concatenate(parts) if parts else np.zeros(0, wire.record_dtype(self.kind))
+            records = np.concatenate(parts) if parts else np.zeros(0, evidence_wire.record_dtype(self.kind))
         _, first = np.unique(records["id"], return_index=True)
         return records[first]
 
     def sound_records(self, owner: int) -> Records:
         """`records` whose anchor is among the owner's agreed poses; none without agreed poses."""
         if owner not in self.anchors:
-            return np.zeros(0, wire.record_dtype(self.kind))
+            return np.zeros(0, evidence_wire.record_dtype(self.kind))
         records = self.records(owner)
         return records[records["anchor"] < len(self.anchors[owner].T_common_keyframe)]

@@ -26,13 +26,13 @@ from pipeline import streams
 from pipeline.consensus.closures import Closure, Group, consistent, drift, frame_variance
 from pipeline.consensus.cycles import Proposal
 from pipeline.consensus.links import SharedKeyframes, link_metric
-from pipeline.exchange import injection, places, wire
+from pipeline.exchange import injection, places, places_wire
 from pipeline.exchange.agreement import agreement, coarse_depth
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.packets import Kind, MalformedError
 from pipeline.exchange.places import Candidate, Planner
+from pipeline.exchange.places_wire import KeyframeSample, PlaceBook, Verdicts
 from pipeline.exchange.verification import Verdict, Verified, verify
-from pipeline.exchange.wire import KeyframeSample, PlaceBook, Verdicts
 from pipeline.geometry import se3
 from pipeline.registration import Reference, RgbdPyramid
 from pipeline.registration.features import Features, extract
@@ -84,7 +84,7 @@ class OwnPlaces:
     def digest(self) -> bytes:
         """Eight bytes that depend on what the robot saw, and on nothing else."""
         whole = hashlib.sha256(b"".join(f.descriptors.tobytes() for f in self.features))
-        return whole.digest()[: wire.DIGEST_BYTES]
+        return whole.digest()[: places_wire.DIGEST_BYTES]
 
     @property
     def T_first_keyframe(self) -> Array:  # noqa: N802 (transforms)
@@ -155,18 +155,18 @@ class HigherEnd(Meeting):
         self.answered: set[int] = set()
 
     def begin(self, send: Send) -> None:
-        send(Kind.DESCRIPTORS, wire.write_places(self.places.book()))
+        send(Kind.DESCRIPTORS, places_wire.write_places(self.places.book()))
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
         limit = self.places.data.keyframes
         if kind is Kind.REQUEST:
-            for keyframe in wire.read_indices(payload, limit):
+            for keyframe in places_wire.read_indices(payload, limit):
                 if keyframe in self.answered:
                     raise MalformedError(f"request: keyframe {keyframe} was asked for before")
                 self.answered.add(keyframe)
-                send(Kind.SAMPLE, wire.write_sample(self.places.sample(keyframe)))
+                send(Kind.SAMPLE, places_wire.write_sample(self.places.sample(keyframe)))
         elif kind is Kind.CLOSURES and self.verdicts is None:
-            verdicts = wire.read_verdicts(payload, limit)
+            verdicts = places_wire.read_verdicts(payload, limit)
             self.verdicts = verdicts
             if verdicts.joined:
                 self.joined = Joined(verdicts.shared)
@@ -182,13 +182,13 @@ class LowerEnd(Meeting):
         self.book: PlaceBook | None = None
         self.planner: Planner | None = None
         self.waiting: dict[int, list[Candidate]] = {}  # by keyframe of the neighbour
-        self.samples: dict[int, NDArray[np.floating]] = {}  # points [m, 3] of a keyframe of the neighbour
+        self.samples: dict[int, NDArray[np.floating]] = {}  # until decided: points [m, 3] of its keyframes
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
         if kind is Kind.DESCRIPTORS and self.book is None:
-            self._choose(wire.read_places(payload), send)
+            self._choose(places_wire.read_places(payload), send)
         elif kind is Kind.SAMPLE and self.book is not None:
-            sample = wire.read_sample(payload, len(self.book.descriptors))
+            sample = places_wire.read_sample(payload, len(self.book.descriptors))
             if sample.keyframe not in self.waiting:
                 raise MalformedError(f"sample of keyframe {sample.keyframe} was not asked for, or came twice")
             self.samples[sample.keyframe] = sample.reference.levels[0].points
@@ -215,7 +215,7 @@ class LowerEnd(Meeting):
         for candidate in self.planner.next():
             self.waiting.setdefault(candidate.peer_keyframe, []).append(candidate)
         if self.waiting:
-            send(Kind.REQUEST, wire.write_indices(sorted(self.waiting)))
+            send(Kind.REQUEST, places_wire.write_indices(sorted(self.waiting)))
             return
         for candidate, reason in self.planner.not_asked_for():
             self.tried.append(Tried(candidate, Verified(Verdict.NOT_ASKED_FOR, 0, 0, reason)))
@@ -258,7 +258,7 @@ class LowerEnd(Meeting):
         self._inject()
         self.tried.sort(key=lambda t: (t.candidate.peer_keyframe, t.candidate.own_keyframe))
         closures = [t.result.closure for t in self.tried if t.result.closure is not None]
-        agreement = consistent(
+        consistency = consistent(
             closures,
             self.places.T_first_keyframe,
             self.book.T_first_keyframe,
@@ -266,7 +266,7 @@ class LowerEnd(Meeting):
             self.book.drift,
             self.config.consensus.closures,
         )
-        verdicts = iter(zip(agreement.keep.tolist(), agreement.reasons, strict=True))
+        verdicts = iter(zip(consistency.keep.tolist(), consistency.reasons, strict=True))
         for at, t in enumerate(self.tried):
             if t.result.closure is not None:
                 keep, reason = next(verdicts)
@@ -276,21 +276,22 @@ class LowerEnd(Meeting):
                     result = replace(t.result, verdict=Verdict.INCONSISTENT, detail=reason)
                     self.tried[at] = Tried(t.candidate, result)
         shared = SharedKeyframes(np.zeros(0, np.int32), np.zeros((0, 6), np.float32))
-        if agreement.T_ownmap_peermap is not None:
+        if consistency.T_ownmap_peermap is not None:
             keyframes = np.unique([c.peer_keyframe for c in closures])
             metric = link_metric(closures, keyframes, self.config.consensus.closures)
             shared = SharedKeyframes(keyframes.astype(np.int32), metric)
-            groups = (Group(agreement.keep, agreement.T_ownmap_peermap), *agreement.others)
+            groups = (Group(consistency.keep, consistency.T_ownmap_peermap), *consistency.others)
             proposals = tuple(self._proposal(closures, group) for group in groups)
             self.joined = Joined(shared, tuple(closures), tuple(g.keep for g in groups), proposals)
+        self.samples.clear()
         self.verdicts = Verdicts(
             candidates=sum(t.result.verdict is not Verdict.UNLIKE for t in self.tried),
             verified=len(closures),
-            consistent=int(agreement.keep.sum()),
+            consistent=int(consistency.keep.sum()),
             joined=self.joined is not None,
             shared=shared,
         )
-        send(Kind.CLOSURES, wire.write_verdicts(self.verdicts))
+        send(Kind.CLOSURES, places_wire.write_verdicts(self.verdicts))
 
     def _proposal(self, closures: Sequence[Closure], group: Group) -> Proposal:
         """What a group of closures says of the first keyframe of either robot in that of the other, own frame first."""

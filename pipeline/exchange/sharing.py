@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange import injection, wire
+from pipeline.exchange import evidence_wire, injection, wire
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.evidence import best_first, match_pairs, own_records, seen_voxels, within
 from pipeline.exchange.knowledge import Knowledge
@@ -50,19 +50,21 @@ class Sharing:
         """Own evidence as it is sent, best first."""
         if self._body is None:
             records = own_records(self.data, self.kind, self.config.weights)
-            self._body = wire.to_body(self.kind, records[best_first(records, self.config.evidence_order)])
+            self._body = evidence_wire.to_body(
+                self.kind, records[best_first(records, self.config.evidence_order)]
+            )
         return self._body
 
     def own_records(self) -> NDArray[Any]:
         """Own evidence as the others read it, best first."""
         if self._records is None:
-            self._records = wire.from_body(self.kind, self.own_body())
+            self._records = evidence_wire.from_body(self.kind, self.own_body())
         return self._records
 
     def _own_evidence(self) -> bytes:
         k = self.knowledge
         if self.own not in k.evidence_bytes:
-            k.evidence_bytes[self.own] = wire.write_evidence(self.kind, self.own, 1, self.own_body())
+            k.evidence_bytes[self.own] = evidence_wire.write_evidence(self.kind, self.own, 1, self.own_body())
         return k.evidence_bytes[self.own]
 
     # --- telling others
@@ -122,7 +124,7 @@ class Sharing:
             return None
         known = records["anchor"] < len(T_common)
         keep = within(records[known], T_common, n.voxels, self.config.overlap_voxel_m)
-        return wire.write_evidence(self.kind, owner, 1, body[known][keep])
+        return evidence_wire.write_evidence(self.kind, owner, 1, body[known][keep])
 
     # --- matching
 

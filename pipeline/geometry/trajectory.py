@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import DuagError
+from pipeline.files import read_text
 from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
@@ -46,18 +47,15 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 def read_tum(path: Path) -> Trajectory:
     """Read a TUM trajectory. Raises DuagError for a line that is not eight finite numbers."""
     stamps, rows = [], []
-    try:
-        text = path.read_text()
-    except OSError as error:
-        raise DuagError(f"{path}: {error.strerror or error}, expected a TUM trajectory") from error
+    text = read_text(path, "a TUM trajectory")
     for number, line in enumerate(text.splitlines(), start=1):
         fields = line.replace(",", " ").split()
         if not fields or fields[0].startswith("#"):
             continue
         try:
             row = [float(f) for f in fields[1:]]
-            stamp = _nanoseconds(fields[0])
-        except ValueError:
+            stamp = np.int64(_nanoseconds(fields[0]))
+        except (ValueError, OverflowError):
             row = []
         if len(row) != 7 or not np.all(np.isfinite(row)):
             raise DuagError(f"{path}: line {number} is {line.strip()[:60]!r}, expected eight finite numbers")

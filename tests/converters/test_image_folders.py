@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -301,17 +302,34 @@ def edit(path: Path, change: Callable[[str], str]) -> None:
     path.write_text(change(path.read_text()))
 
 
+def swap(path: Path, pattern: str, new: str) -> None:
+    edit(path, lambda text: re.sub(pattern, new, text, count=1))
+
+
+def tear(path: Path) -> None:
+    """Let the second chunk of a PNG claim 2 GB."""
+    data = bytearray(path.read_bytes())
+    data[33] |= 0x80
+    path.write_bytes(data)
+
+
 BROKEN = [
     ("replica", lambda p: (p.parent / "cam_params.json").unlink(), "cam_params.json: not found"),
     ("replica", lambda p: (p / "results" / "depth000001.png").unlink(), "has no partner, expected depth000001"),
     ("replica", lambda p: edit(p / "traj.txt", lambda t: "\n".join(t.splitlines()[:2])), "has 2 poses"),
     ("replica", lambda p: edit(p / "traj.txt", lambda t: t.replace("e", "x", 1)), "traj.txt:1"),
     ("replica", lambda p: save(p / "results" / "frame000000.jpg", np.zeros((9, 9, 3), np.uint8)), "is 9x9"),
+    ("replica", lambda p: swap(p.parent / "cam_params.json", '"fx": ', '"fx": "x", "f": '), "expected camera with"),
+    ("replica", lambda p: swap(p.parent / "cam_params.json", '"w": ', '"w": Infinity, "f": '), "OverflowError"),
+    ("replica", lambda p: swap(p.parent / "cam_params.json", '"scale": ', '"scale": -'), "a positive number"),
+    ("replica", lambda p: tear(p / "results" / "depth000001.png"), "that no decoder reads"),
     ("replica-multiagent", lambda p: shutil.rmtree(p / "office_0_part2"), "for 2 robots, expected --robots 1"),
     ("aria-multiagent", lambda p: [shutil.rmtree(a) for a in p.iterdir()], "found no folder agent_"),
     ("tum", lambda p: (p / "depth.txt").unlink(), "depth.txt: No such file"),
     ("tum", lambda p: edit(p / "rgb.txt", lambda t: t + "x rgb/y.png\n"), "expected a time in seconds"),
     ("tum", lambda p: edit(p / "groundtruth.txt", lambda t: t + "1 2 3\n"), "expected eight numbers"),
+    ("tum", lambda p: edit(p / "rgb.txt", lambda t: t + "1e99 rgb/y.png\n"), "before the year 2116"),
+    ("tum", lambda p: edit(p / "groundtruth.txt", lambda t: t + "9" * 30 + " 0 0 0 0 0 0 1\n"), "before the year 2116"),
     ("bonn", lambda p: edit(p / "groundtruth.txt", lambda t: "# nothing\n"), "found no pose"),
     ("icl-nuim", lambda p: (p / "traj0.gt.freiburg").unlink(), "found 0 files *.gt.freiburg"),
     ("icl-nuim", lambda p: edit(p / "traj0.gt.freiburg", lambda t: t[: len(t) // 2].rsplit("\n", 1)[0]), "has no pose"),
@@ -319,6 +337,8 @@ BROKEN = [
     ("scannet", lambda p: shutil.rmtree(p / "depth"), "depth: no such folder"),
     ("scannetpp", lambda p: shutil.rmtree(p / "dslr" / "undistorted_depths"), "are not shipped"),
     ("scannetpp", lambda p: edit(next(p.rglob("*.json")), lambda t: t.replace("fl_x", "f")), "KeyError 'fl_x'"),
+    ("scannetpp", lambda p: swap(next(p.rglob("*.json")), '"fl_x": ', '"fl_x": "x", "f": '), "expected w, h, fl_x"),
+    ("scannetpp", lambda p: swap(next(p.rglob("*.json")), r"\[\[.*?\]\]", "3"), "cannot reshape"),
 ]  # fmt: skip
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -260,6 +262,35 @@ def test_what_is_missing_is_named(tmp_path: Path, change: Callable[[Any], Any], 
     with pytest.raises(DuagError, match=message):
         converters.convert("ros", bag, tmp_path / "rec")
     assert not (tmp_path / "rec").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda bag: edit_rows(bag, "update messages set data = 'text' where id = 4"), "holds 4 bytes that are no"),
+        (lambda bag: edit_rows(bag, "update messages set data = 7"), "cannot open value of type integer"),
+        (
+            lambda bag: (bag / "metadata.yaml").write_text(
+                re.sub("message_count: [0-9]+", "message_count: many", (bag / "metadata.yaml").read_text())
+            ),
+            "'many'",
+        ),
+    ],
+)  # fmt: skip
+def test_a_database_with_anything_in_it_is_refused(
+    tmp_path: Path, change: Callable[[Path], Any], message: str
+) -> None:
+    r = Ros(2)
+    bag = r.write(tmp_path / "bag", scene(r), "sqlite3")
+    change(bag)
+    with pytest.raises(DuagError, match=message):
+        converters.convert("ros", bag, tmp_path / "rec")
+
+
+def edit_rows(bag: Path, statement: str) -> None:
+    with sqlite3.connect(next(bag.glob("*.db3"))) as base:
+        base.execute(statement)
+    base.close()
 
 
 @pytest.mark.parametrize("keep", [0.3, 0.7, 0.95])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from converters import ros_images
+from converters.logs.foxglove import Fields
 from pipeline.errors import DuagError
 from tests.converters.ros_bags import COLOR, Ros
 
@@ -74,6 +75,17 @@ def test_colour_encodings(encoding: str) -> None:
     assert np.array_equal(
         decoded(Ros(2).image(1, "c", np.ascontiguousarray(pixels), encoding, pad=5)), expected
     )
+
+
+def test_sizes_that_cannot_be_are_refused() -> None:
+    """JSON holds any number; a padded row may claim any length."""
+    image = Ros(2).image(1, "c", gray_card(), "rgb8")
+    for width, height in ((0, 12), (16, 0), (16, -1)):
+        bad = Fields(**vars(image) | {"width": width, "height": height})
+        with pytest.raises(DuagError, match=f"is {width}x{height} pixels"):
+            ros_images.color_bytes(bad, "here")
+    one = Fields(**vars(image) | {"height": 1, "step": 1 << 40})
+    assert np.array_equal(decoded(one), gray_card()[:1])
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])

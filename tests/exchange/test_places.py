@@ -7,7 +7,7 @@ import pytest
 
 from pipeline import streams
 from pipeline.consensus.config import ClosureConfig
-from pipeline.exchange import places, wire
+from pipeline.exchange import places, places_wire
 from pipeline.exchange.config import ExchangeConfig, PlacesConfig, VerificationConfig
 from pipeline.exchange.meeting import OwnPlaces
 from pipeline.exchange.places import Candidate, Planner
@@ -54,7 +54,7 @@ def test_ransac_finds_the_motion_among_false_matches() -> None:
 
 def test_a_closure_is_as_good_as_its_information_says(robots: dict) -> None:
     (alpha, truth_a), (bravo, truth_b) = robots["alpha"], robots["bravo"]
-    sample = wire.read_sample(wire.write_sample(bravo.sample(0)), 3)
+    sample = places_wire.read_sample(places_wire.write_sample(bravo.sample(0)), 3)
     result = verify(
         2, 0, alpha.features[2], alpha.pyramid(2), sample.features, sample.reference, 0.8, VerificationConfig(),
         streams.generator(0, "test"),

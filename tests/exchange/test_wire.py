@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pipeline.consensus.cycles import Proposal
 from pipeline.consensus.evidence import pack_symmetric, unpack_symmetric
 from pipeline.consensus.links import PosePacket, SharedKeyframes
-from pipeline.exchange import wire
+from pipeline.exchange import evidence_wire, places_wire, wire
 from pipeline.exchange.packets import EVIDENCE_KINDS, Kind, MalformedError, chunk_bytes
 from pipeline.exchange.poses_wire import read_poses, write_poses
 from pipeline.geometry import se3
@@ -38,7 +38,7 @@ def pose_packet() -> PosePacket:
 
 def records_of(kind: Kind, n: int) -> np.ndarray:
     """Records in the precision of a kind."""
-    out = np.zeros(n, wire.record_dtype(kind))
+    out = np.zeros(n, evidence_wire.record_dtype(kind))
     single = records(n)
     for name in out.dtype.names or ():
         out[name] = single[name]
@@ -47,20 +47,20 @@ def records_of(kind: Kind, n: int) -> np.ndarray:
 
 def as_sent(kind: Kind, sent: np.ndarray) -> np.ndarray:
     """Records as a receiver reads them."""
-    return wire.from_body(kind, wire.to_body(kind, sent))
+    return evidence_wire.from_body(kind, evidence_wire.to_body(kind, sent))
 
 
-def sample() -> wire.KeyframeSample:
+def sample() -> places_wire.KeyframeSample:
     points = RNG.uniform(-2, 3, (30, 3)).astype(np.float32)
     normals = RNG.normal(size=(30, 3))
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
     levels = tuple(ReferenceLevel(points, normals, RNG.random(30).astype(np.float32)) for _ in range(3))
     features = Features(RNG.integers(0, 256, (9, 128)).astype(np.uint8), points[:9])
-    return wire.KeyframeSample(2, features, Reference(levels))
+    return places_wire.KeyframeSample(2, features, Reference(levels))
 
 
 def records(n: int) -> np.ndarray:
-    out = np.zeros(n, wire.RECORD)
+    out = np.zeros(n, evidence_wire.RECORD)
     out["id"], out["anchor"] = RNG.permutation(n) + 5, RNG.integers(0, 4, n)
     out["theta"] = RNG.normal(size=(n, 13))
     L3, L6 = (np.tril(RNG.normal(size=(n, size, size))) for size in (3, 6))
@@ -75,20 +75,20 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
         lambda d: wire.read_state(d, TEAM),
     ),
     "places": (
-        wire.write_places(
-            wire.PlaceBook(
+        places_wire.write_places(
+            places_wire.PlaceBook(
                 [RNG.integers(0, 256, (n, 128)).astype(np.uint8) for n in (3, 0, 2)],
                 poses(3),
                 np.array([[0, 0], [1, 1], [1, 3.0]]),
             )
         ),
-        wire.read_places,
+        places_wire.read_places,
     ),
-    "request": (wire.write_indices([1, 5, 6]), lambda d: wire.read_indices(d, 7)),
-    "sample": (wire.write_sample(sample()), lambda d: wire.read_sample(d, 3)),
+    "request": (places_wire.write_indices([1, 5, 6]), lambda d: places_wire.read_indices(d, 7)),
+    "sample": (places_wire.write_sample(sample()), lambda d: places_wire.read_sample(d, 3)),
     "closures": (
-        wire.write_verdicts(
-            wire.Verdicts(
+        places_wire.write_verdicts(
+            places_wire.Verdicts(
                 9,
                 5,
                 4,
@@ -96,7 +96,7 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
                 SharedKeyframes(np.array([2, 6], np.int32), np.ones((2, 6), np.float32)),
             )
         ),
-        lambda d: wire.read_verdicts(d, 7),
+        lambda d: places_wire.read_verdicts(d, 7),
     ),
     "poses": (
         write_poses(pose_packet(), 0, 2, False),
@@ -121,12 +121,12 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
         lambda d: wire.read_pairs(d, TEAM),
     ),
     "evidence": (
-        wire.write_evidence(Kind.EVIDENCE, 1, 1, wire.to_body(Kind.EVIDENCE, records(15))),
-        lambda d: wire.read_evidence(Kind.EVIDENCE, d, TEAM),
+        evidence_wire.write_evidence(Kind.EVIDENCE, 1, 1, evidence_wire.to_body(Kind.EVIDENCE, records(15))),
+        lambda d: evidence_wire.read_evidence(Kind.EVIDENCE, d, TEAM),
     ),
     "exact evidence": (
-        wire.write_evidence(Kind.EVIDENCE_EXACT, 1, 1, records(15)),
-        lambda d: wire.read_evidence(Kind.EVIDENCE_EXACT, d, TEAM),
+        evidence_wire.write_evidence(Kind.EVIDENCE_EXACT, 1, 1, records(15)),
+        lambda d: evidence_wire.read_evidence(Kind.EVIDENCE_EXACT, d, TEAM),
     ),
 }
 
@@ -166,7 +166,7 @@ def test_final_poses_and_voxels_come_back_bit_for_bit() -> None:
 
 def test_a_sample_comes_back_within_its_quantisation() -> None:
     before = sample()
-    after = wire.read_sample(wire.write_sample(before), 3)
+    after = places_wire.read_sample(places_wire.write_sample(before), 3)
     assert np.array_equal(after.features.descriptors, before.features.descriptors)
     assert np.abs(after.features.points - before.features.points).max() < 1e-4  # 3 m / 32767
     for a, b in zip(after.reference.levels, before.reference.levels, strict=True):
@@ -180,13 +180,15 @@ def test_a_sample_comes_back_within_its_quantisation() -> None:
 @settings(max_examples=20, deadline=None)
 def test_evidence_comes_back_and_every_chunk_is_useful_alone(kind: Kind, n: int) -> None:
     sent = records_of(kind, n)
-    data = wire.write_evidence(kind, 1, 1, wire.to_body(kind, sent))
-    owner, body, back = wire.read_evidence(kind, data, TEAM)
+    data = evidence_wire.write_evidence(kind, 1, 1, evidence_wire.to_body(kind, sent))
+    owner, body, back = evidence_wire.read_evidence(kind, data, TEAM)
     assert owner == 1
     assert np.array_equal(back, as_sent(kind, sent))
-    assert wire.write_evidence(kind, 1, 1, body) == data  # handed on unchanged
+    assert evidence_wire.write_evidence(kind, 1, 1, body) == data  # handed on unchanged
     step = chunk_bytes(kind)
-    parts = [wire.read_evidence(kind, data[i : i + step], TEAM)[2] for i in range(0, len(data), step)]
+    parts = [
+        evidence_wire.read_evidence(kind, data[i : i + step], TEAM)[2] for i in range(0, len(data), step)
+    ]
     assert np.array_equal(np.concatenate(parts), back)
 
 
@@ -204,9 +206,9 @@ def test_exact_evidence_is_exact() -> None:
 def test_impossible_information_is_refused(field: int, value: float, reason: str) -> None:
     sent = records(20)
     sent["information"][7, field] = value
-    data = wire.write_evidence(Kind.EVIDENCE_EXACT, 1, 1, sent)
+    data = evidence_wire.write_evidence(Kind.EVIDENCE_EXACT, 1, 1, sent)
     with pytest.raises(MalformedError, match=reason):
-        wire.read_evidence(Kind.EVIDENCE_EXACT, data, TEAM)
+        evidence_wire.read_evidence(Kind.EVIDENCE_EXACT, data, TEAM)
 
 
 def evidence_with_information(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -22,10 +22,10 @@ Special = Callable[[Path, np.random.Generator], bool]
 def any_special(path: Path, rng: np.random.Generator) -> bool:
     """What suits the extension; False if nothing does, or if the file is none of its kind any more."""
     kinds: dict[str, tuple[Special, ...]] = {
-        ".png": (image_bomb, png_inside, png_inside, png_inside),
-        ".jpg": (image_bomb, jpeg_inside, jpeg_inside, jpeg_inside),
+        ".png": (image_bomb, *[png_inside] * 9),
+        ".jpg": (image_bomb, *[jpeg_inside] * 9),
         ".mcap": (mcap_rewritten, mcap_rewritten, mcap_rewritten, mcap_records),
-        ".bag": (bag_bomb, *[bag_inside] * 11),
+        ".bag": (bag_bomb, *[bag_inside] * 24),
         ".db3": (database, database_rows, database_rows),
         ".json": (json_inside,),
         ".glb": (glb_inside,),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sys
+import tomllib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,10 +17,12 @@ import numpy as np
 
 import converters
 from converters import mesh_reader
+from converters.logs import describe
 from converters.simulate import mesh_process, meshes
 from pipeline import checks, digest, recovery
 from pipeline.config import load
 from pipeline.errors import DuagError
+from pipeline.geometry.trajectory import read_tum
 from pipeline.recording import Recording, format_info, info, open_rgbd, read_log
 from tests.converters import test_image_folders
 from tests.fuzz import seeds
@@ -167,6 +171,19 @@ def graph_reader(name: str, make: Callable[[Path], None], file: str, robots: int
     return Reader(name, make, read, any_special)
 
 
+def read_logs(src: Path, out: Path) -> None:
+    """What `duagc info` says of logs of other programs."""
+    assert describe.is_foreign(src / "logs") or not any((src / "logs").glob("*/*"))
+    described = describe.describe(src / "logs")
+    json.dumps(described, allow_nan=False)
+    describe.format_description(described)
+    tomllib.loads(describe.toml_text(described))
+
+
+def _read(result: object) -> None:
+    """Is enough; whatever was read is thrown away."""
+
+
 def read_config(src: Path, out: Path) -> None:
     from pipeline.runner import RunConfig
 
@@ -215,6 +232,9 @@ CONVERTERS = (
     converter("ros1-lz4", seeds.ros_bag(1, "lz4"), "ros", _truth),
     converter("ros2-db3", seeds.ros_bag(2, "sqlite3"), "ros", _truth),
     converter("ros2-mcap", seeds.ros_bag(2, "mcap"), "ros", _truth),
+    converter("ros2-compressed", seeds.compressed_bag, "ros", _truth),
+    converter("ros2-lidar", seeds.lidar_bag, "ros", lambda: list(seeds.LIDAR_OPTIONS)),
+    converter("ros-toml", seeds.team_file, "ros"),
     converter("mcap-json", seeds.foreign("json"), "ros"),
     converter("mcap-protobuf", seeds.foreign("protobuf"), "ros"),
     converter("kimera-multi", seeds.kimera, "kimera-multi"),
@@ -223,6 +243,10 @@ CONVERTERS = (
 OTHERS = (
     Reader("recording", seeds.make_recording, read_recording, any_special),
     Reader("run", seeds.make_run, read_run, any_special),
+    Reader(
+        "trajectory", seeds.make_trajectory, lambda src, out: _read(read_tum(src / "poses.tum")), any_special
+    ),
+    Reader("logs", seeds.make_logs, read_logs, any_special),
     Reader("config", seeds.make_config, read_config, any_special),
     graph_reader("g2o", seeds.make_g2o, "graph.g2o", 3),
     graph_reader("csv", seeds.make_csv, ".", None),
@@ -231,5 +255,6 @@ OTHERS = (
         Reader(f"scene-{kind}", seeds.make_scene(kind), read_scene, any_special)
         for kind in ("glb", "obj", "ply")
     ),
+    Reader("scene-gltf", seeds.make_gltf, read_scene, any_special),
 )
 READERS = {reader.name: reader for reader in (*CONVERTERS, *OTHERS)}

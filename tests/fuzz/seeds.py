@@ -5,21 +5,31 @@ In a small file, damage hits what is read more often, and a case takes less time
 
 from __future__ import annotations
 
+import json
+import struct
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
+import cv2
+from rosbags.highlevel import anyreader
+
 from converters import bonn, icl_nuim, seven_scenes, tum
+from converters.ros_images import rows_of
 from pipeline.geometry.camera import PinholeCamera
 from tests.converters import (
+    box_room,
     ros_bags,
     test_foreign_mcap,
     test_image_folders,
     test_kimera_multi,
+    test_ros_other_depth,
     test_s3e,
     test_seven_scenes,
     test_simulate_meshes,
 )
 from tests.converters.ros_bags import Ros, scene
+from tests.converters.test_ros_images import rvl
 from tests.evaluation import fake_run
 from tests.recording.logs import write_recording
 
@@ -52,7 +62,10 @@ def shrink() -> None:
     seven_scenes.WIDTH, seven_scenes.HEIGHT = SMALL_PX, round(SMALL_PX * 0.75)
     wall = fake_run.wall
     fake_run.wall = lambda seed=0: wall(seed).select(slice(None, None, 50))
-    test_simulate_meshes.TEXEL_M = 0.2
+    test_simulate_meshes.TEXEL_M = 0.1
+    test_simulate_meshes.QUADS = 4 * test_simulate_meshes.QUADS[9:]  # sides of the table
+    # most of the time to open a bag goes into texts that every bag holds
+    anyreader.get_types_from_msg = cache(anyreader.get_types_from_msg)
 
 
 def image_options(dataset: str) -> list[str]:
@@ -71,6 +84,65 @@ def ros_bag(version: int, container: str) -> Callable[[Path], Path]:
     return make
 
 
+def compressed_bag(root: Path) -> Path:
+    """Colour as JPEG, depth as PNG and RVL in turns, with the headers that `image_transport` writes."""
+    root.mkdir(parents=True)
+    r = Ros(2)
+    rows = []
+    for topic, at, message in scene(r):
+        if topic.endswith("image_raw"):
+            pixels = rows_of(message, "", "uint8", 3)
+            data = cv2.imencode(".jpg", pixels[..., ::-1])[1].tobytes()
+            topic, text = f"{topic}/compressed", "rgb8; jpeg compressed bgr8"
+        elif topic.endswith("image_rect_raw"):
+            raw = rows_of(message, "", "uint16", 1)[..., 0]
+            packing = ("png", "rvl")[len(rows) // 3 % 2]
+            packed = rvl(raw) if packing == "rvl" else cv2.imencode(".png", raw)[1].tobytes()
+            data = struct.pack("<iff", 0, 0.0, 0.0) + packed
+            topic, text = f"{topic}/compressedDepth", f"16UC1; compressedDepth {packing}"
+        else:
+            rows.append((topic, at, message))
+            continue
+        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        rows.append((topic, at, r.compressed(stamp, message.header.frame_id, data, text)))
+    return r.write(root / "bag", rows, "sqlite3")
+
+
+def lidar_bag(root: Path) -> Path:
+    """A camera, a LiDAR and an IMU."""
+    root.mkdir(parents=True)
+    return test_ros_other_depth.lidar_log(root)
+
+
+LIDAR_OPTIONS = ("depth_from=lidar", "truth=/odom", "imu=/imu")
+
+
+def team_file(root: Path) -> Path:
+    """A TOML file about two robots, their bags, and true poses in a file."""
+    root.mkdir(parents=True)
+    r = Ros(2)
+    lines = []
+    for name in ("a", "b"):
+        rows = scene(r, f"/{name}")
+        r.write(root / name, rows, "mcap")
+        lines += [f"[robots.{name}]", f'logs = ["{name}"]', f'namespace = "/{name}"', 'truth_file = "gt.tum"']
+        lines += ["truth_offset_s = 0.25", 'T_truth_color = "0 0 0 1 0 0 0"', ""]
+    poses = [
+        test_image_folders.tum_line((ros_bags.START_NS + (i + 1) * ros_bags.STEP_NS) / 1e9 - 0.25, T)
+        for i, T in enumerate(box_room.path(FRAMES))
+    ]
+    (root / "gt.tum").write_text("\n".join(poses) + "\n")
+    (root / "team.toml").write_text("\n".join(lines))
+    return root / "team.toml"
+
+
+def make_logs(seed: Path) -> None:
+    """Logs of other programs, one of each kind."""
+    foreign("json")(seed / "logs" / "json")
+    foreign("ros1")(seed / "logs" / "ros1")
+    ros_bag(2, "sqlite3")(seed / "logs" / "ros2")
+
+
 def foreign(kind: str) -> Callable[[Path], Path]:
     def make(root: Path) -> Path:
         r = Ros(1 if kind == "ros1" else 2)
@@ -83,17 +155,17 @@ def kimera(root: Path) -> Path:
     folder = root / "campus_outdoor_1014_compressed"
     folder.mkdir(parents=True)
     r = Ros(1)
-    for k, robot in enumerate(("acl_jackal", "sparkal2")):
-        rows = test_kimera_multi.bag_rows(r, robot, 0.3 * k, robot)
-        r.write(folder / f"10_14_{robot}", rows, "lz4" if k else "plain")
-        test_kimera_multi.write_truth(root / "ground_truth" / "1014" / f"{robot}_gt_odom.csv", 0.3 * k)
+    rows = test_kimera_multi.bag_rows(r, "sparkal2", 0.3, "sparkal2")
+    r.write(folder / "10_14_sparkal2", rows, "lz4")
+    test_kimera_multi.write_truth(root / "ground_truth" / "1014" / "sparkal2_gt_odom.csv", 0.3)
     return folder
 
 
 def s3e(root: Path) -> Path:
     sequence = root / "S3E_Playground_2"
-    test_s3e.write_bag(sequence, test_s3e.NAMES)
-    for name in test_s3e.NAMES:
+    names = test_s3e.NAMES[:2]
+    test_s3e.write_bag(sequence, names)
+    for name in names:
         test_s3e.write_calibration(root / "Calibration" / f"{name.lower()}.yaml", name.lower())
         test_s3e.write_truth(sequence / f"{name.lower()}_gt.txt", name)
     return sequence
@@ -120,6 +192,25 @@ def make_scene(kind: str) -> Callable[[Path], None]:
         test_simulate_meshes.folder_of(seed / "scene", kind)
 
     return make
+
+
+def make_gltf(seed: Path) -> None:
+    """A glTF file with its arrays in another file, and its images in files of their own."""
+    test_simulate_meshes.folder_of(seed / "scene", "glb")
+    (seed / "scene" / "walls.glb").unlink()
+    glb = seed / "scene" / "table.glb"
+    data = glb.read_bytes()
+    glb.unlink()
+    (size,) = struct.unpack_from("<I", data, 12)
+    content, blob = json.loads(data[20 : 20 + size]), data[28 + size :]
+    for k, image in enumerate(content["images"]):
+        view = content["bufferViews"][image.pop("bufferView")]
+        image["uri"] = f"image{k}.png"
+        start = view["byteOffset"]
+        (seed / "scene" / image["uri"]).write_bytes(blob[start : start + view["byteLength"]])
+    content["buffers"][0]["uri"] = "table.bin"
+    (seed / "scene" / "table.bin").write_bytes(blob)
+    (seed / "scene" / "table.gltf").write_text(json.dumps(content))
 
 
 CSV_COLUMNS = "robot_src,pose_src,robot_dst,pose_dst,qx,qy,qz,qw,tx,ty,tz,kappa,tau"
@@ -156,3 +247,8 @@ def make_gaussians(seed: Path) -> None:
 def make_run(seed: Path) -> None:
     fake_run._write_recording = lambda *arguments: None  # is not read
     fake_run.make(seed)
+
+
+def make_trajectory(seed: Path) -> None:
+    lines = [f"{1305031452 + 0.1 * i:.4f} {0.1 * i} 1.5 -0.2 0 0 0.6 0.8" for i in range(20)]
+    (seed / "poses.tum").write_text("\n".join(["# stamp x y z qx qy qz qw", *lines]))

@@ -8,6 +8,7 @@ import pytest
 
 from tests.fuzz.readers import READERS
 
+
 def fuzz(count: int, *names: str) -> None:
     """In a process that has neither the threads nor the memory of the tests before."""
     command = [sys.executable, "-m", "tests.fuzz.run", "--count", str(count), *names]

@@ -29,10 +29,16 @@ def test_tum_files_keep_nanoseconds_and_poses(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["t.tum"]
 
 
-@pytest.mark.parametrize("line", ["1.0 1 2 3 0 0 0", "1.0 1 2 3 0 0 0 nan", "x 1 2 3 0 0 0 1", ""])
+@pytest.mark.parametrize(
+    "line",
+    [
+        *("1.0 1 2 3 0 0 0", "1.0 1 2 3 0 0 0 nan", "x 1 2 3 0 0 0 1", ""),
+        *("1e999 1 2 3 0 0 0 1", "9999999999 1 2 3 0 0 0 1", "\udcff"),  # the last is no UTF-8
+    ],
+)
 def test_bad_tum_lines_are_named(tmp_path: Path, line: str) -> None:
     path = tmp_path / "bad.tum"
-    path.write_text(line + "\n")
+    path.write_bytes(line.encode(errors="surrogateescape") + b"\n")
     with pytest.raises(DuagError, match=r"bad\.tum"):
         trajectory.read_tum(path)
 

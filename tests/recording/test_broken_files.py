@@ -116,6 +116,19 @@ def test_files_that_are_no_logs(tmp_path: Path, content: bytes | None, words: st
         content_digest(tmp_path)
 
 
+def test_times_that_no_clock_shows_are_refused(tmp_path: Path) -> None:
+    """Also those of publication, which the index does not tell."""
+    for times in ((2**63, 0), (0, 2**63)):
+        with (tmp_path / "x.mcap").open("wb") as stream:
+            writer = Writer(stream)
+            writer.start()
+            schema = writer.register_schema("s", "", b"")
+            writer.add_message(writer.register_channel("/a", "x", schema), times[0], b"", times[1])
+            writer.finish()
+        with pytest.raises(DuagError, match="a message is of 9223372036854775808 ns, expected less than"):
+            list(read_log(tmp_path / "x.mcap"))
+
+
 def test_a_changed_file_is_verified_again(tmp_path: Path) -> None:
     path = tmp_path / "alpha.mcap"
     write_updates(path, "alpha", [0, 1, 2])
