@@ -199,7 +199,8 @@ class RobotWriter:
             far_m = float(np.abs(np.asarray(T_world_camera)[:3, 3]).max())
             if not far_m < FAR_M:
                 raise DuagError(
-                    f"robot {name}: the true pose at {stamp_ns} ns is {far_m:.3g} m away, expected less than {FAR_M:.0e} m"
+                    f"robot {name}: the true pose at {stamp_ns} ns is {far_m:.3g} m away, "
+                    f"expected less than {FAR_M:.0e} m"
                 )
             pose = messages.pack_pose_in_frame(stamp_ns, messages.WORLD_FRAME, T_world_camera)
             self._truth_log().write(topics.GROUNDTRUTH_POSE.of(name), pose, stamp_ns)
