@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.frontend.mapping import Mapper, MappingStats, overlap
+from pipeline.frontend.mapping import Mapper, MappingStats
 from pipeline.frontend.mapping_config import MappingConfig
+from pipeline.frontend.mapping_views import overlap
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels import Rasterizer
