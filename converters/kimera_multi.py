@@ -29,7 +29,7 @@ from converters.logs.options import LogOptions
 from converters.logs.robot_log import RobotLog
 from converters.logs.sources import logs_in
 from converters.ros import settle_clocks, write_robot
-from converters.tum_layout import AssociationOptions, Poses
+from converters.tum_layout import LAST_NS, AssociationOptions, Poses
 from pipeline import numeric
 from pipeline.errors import DuagError, closest
 from pipeline.files import read_text
@@ -237,7 +237,8 @@ def read_truth(path: Path) -> Poses:
             stamp, values = int(row[0]), [float(v) for v in row[1:]]
         except ValueError:
             stamp, values = 0, []
-        if len(values) != 7 or not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1) > 0.01:
+        known = -LAST_NS < stamp < LAST_NS and len(values) == 7
+        if not known or not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1) > 0.01:
             raise DuagError(
                 f"{path}:{number}: {','.join(row)[:80]}, expected integer nanoseconds and a pose, w first"
             )

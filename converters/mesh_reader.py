@@ -105,6 +105,10 @@ def _read(files: list[tuple[Path, int]], up: str, cache: Path) -> Iterator[Path]
                     part = replace(part, texture=textures)
                     textures += 1
                 parts.append(part)
+        except UnicodeDecodeError as error:
+            raise DuagError(
+                f"{path}: its reader finds a name that is no UTF-8, expected a sound mesh"
+            ) from error
         except MemoryError as error:
             raise DuagError(
                 f"{path}: takes more than {most / 1e6:.0f} MB of memory to read, expected a sound mesh with textures "

@@ -66,6 +66,8 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
 
 def settle_clocks(recording: RecordingWriter, robot_logs: Mapping[str, RobotLog]) -> None:
     """Say how the robots' clocks differ, and shift their times as the options ask."""
+    for robot_log in robot_logs.values():
+        robot_log.settle_drift()
     clocks = [robot_log.clock(robot) for robot, robot_log in robot_logs.items()]
     offsets = compare(clocks)
     for robot, robot_log in robot_logs.items():
@@ -124,7 +126,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
         T = None if T is None else T @ source.T_color_camera
         without += T is None
         readings.write_until(stamp_ns)
-        at_ns, encoded = stamp_ns + source.shift_ns, (picture.color, picture.color_format)
+        at_ns, encoded = source.written_ns(stamp_ns), (picture.color, picture.color_format)
         if picture.points_lidar is not None:
             robot.add_points(at_ns, picture.points_lidar)
         robot.add_frame(at_ns, *encoded, picture.depth, T, depth_sigma_m=picture.depth_sigma_m)
@@ -145,7 +147,8 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
         rows["without_depth"] = empty / max(
             1, (len(pairs) - cut) * source.camera.width * source.camera.height
         )
-    return {**rows, **check.result(log, max_ratio), **_truth_lag(source)}
+    drift = {} if source.drift is None else {"clock_drift_ppm": 1e6 * source.drift.rate}
+    return {**rows, **check.result(log, max_ratio), **_truth_lag(source), **drift}
 
 
 def _measured(source: RobotLog, stamp_ns: int, color: Any, depth: Any) -> tuple[Picture, int]:
@@ -212,7 +215,7 @@ class _Readings:
         odometry = self._odometry.body.stamps_ns if self._odometry else np.zeros(0, np.int64)
         self._stamps = np.concatenate([imu, odometry])
         self._order = np.argsort(self._stamps, kind="stable")
-        self._imu_count, self._shift_ns = len(imu), source.shift_ns
+        self._imu_count, self._source = len(imu), source
         self._next = int((self._stamps < -source.shift_ns).sum())
         self._T_color_camera = source.T_color_camera
         if self._imu:
@@ -221,7 +224,7 @@ class _Readings:
     def write_until(self, stamp_ns: int) -> None:
         """Write what was measured before a time; what comes before time 0 of the recording is left out."""
         while self._next < len(self._order) and self._stamps[k := self._order[self._next]] < stamp_ns:
-            stamp = int(self._stamps[k]) + self._shift_ns
+            stamp = self._source.written_ns(int(self._stamps[k]))
             if k < self._imu_count and self._imu:
                 values = self._imu.values[k]
                 self._robot.add_imu(stamp, values[:3], values[3:])

@@ -69,11 +69,13 @@ def encoded_size(data: bytes) -> tuple[int, int] | None:
 
 
 def is_cut_short(message: Any) -> bool:
-    """Whether a CompressedImage is a JPEG or PNG that lacks its end; that of compressedDepth has 12 bytes before it."""
+    """Whether a CompressedImage lacks its end (JPEG, PNG, WebP); that of compressedDepth has 12 bytes before it."""
     if not hasattr(message, "format"):
         return False
     data = bytes(message.data)
     data = data[12:] if data[12:].startswith(b"\x89PNG") else data
+    if _is_webp(data):
+        return len(data) < 8 + int.from_bytes(data[4:8], "little")
     return data.startswith((b"\xff\xd8\xff", b"\x89PNG")) and encoded_size(data) is None
 
 
@@ -137,7 +139,11 @@ def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
             return data, "jpeg"
         if data.startswith(b"\x89PNG"):
             return data, "png"
-        raise DuagError(f"{where}: {len(data)} bytes of format {message.format!r}, expected JPEG or PNG")
+        if _is_webp(data):
+            return _webp_as_png(data, where), "png"
+        raise DuagError(
+            f"{where}: {len(data)} bytes of format {message.format!r}, expected JPEG, PNG or WebP"
+        )
     if message.encoding not in _COLOR_CODES:
         known = ", ".join(_COLOR_CODES)
         raise DuagError(f"{where}: encoding {message.encoding!r}, expected one of {known}")
@@ -147,6 +153,20 @@ def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
         pixels = cv2.cvtColor(pixels, getattr(cv2, conversion))
     settings = [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
     return cv2.imencode(".png", np.ascontiguousarray(pixels), settings)[1].tobytes(), "png"
+
+
+def _is_webp(data: bytes) -> bool:
+    return data.startswith(b"RIFF") and data[8:12] == b"WEBP"
+
+
+def _webp_as_png(data: bytes, where: str) -> bytes:
+    """The pixels of a WebP, which recordings do not hold, as PNG."""
+    import cv2
+
+    image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise DuagError(f"{where}: {len(data)} bytes of WebP that no decoder reads, expected an image")
+    return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1].tobytes()
 
 
 def depth_m(message: Any, where: str, scale: float) -> Depth:

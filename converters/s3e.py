@@ -39,6 +39,7 @@ from converters.logs import open_log
 from converters.logs.files import Entry, Log
 from converters.logs.gather import gathered, nearest
 from converters.stereo import RawCamera, StereoOptions, StereoRig
+from converters.tum_layout import nanoseconds
 from pipeline import numeric
 from pipeline.errors import DuagError
 from pipeline.files import read_text
@@ -246,9 +247,10 @@ def read_fixes(path: Path) -> Fixes | None:
             raise DuagError(
                 f"{path}:{number}: {line.strip()[:60]!r}, expected eight numbers t x y z qx qy qz qw"
             )
-        whole, _, part = words[0].partition(".")
-        seconds = int(whole) * NANOSECONDS + int(part[:9].ljust(9, "0") or 0)
-        rows.setdefault(seconds, [float(word) for word in words[1:4]])
+        place = [float(word) for word in words[1:4]]
+        if not np.isfinite(place).all():
+            raise DuagError(f"{path}:{number}: {line.strip()[:60]!r}, expected metres")
+        rows.setdefault(nanoseconds(words[0], f"{path}:{number}"), place)
     if len(rows) < 3 and all(stamp < 10 * NANOSECONDS for stamp in rows):
         return None
     stamps = sorted(rows)

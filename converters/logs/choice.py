@@ -14,6 +14,7 @@ from pipeline.errors import DuagError, closest
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 POINTS_TYPE = "sensor_msgs/msg/PointCloud2"
+VIDEO = ("CompressedVideo", "FFMPEGPacket")  # how the names of schemas of video end
 LEFT, RIGHT = ("left", "infra1", "cam0"), ("right", "infra2", "cam1")
 REGISTERED = ("aligned_depth_to_color", "depth_registered", "registered", "aligned")
 
@@ -58,7 +59,12 @@ class Chooser:
         """Images that are not depth, and are not named so."""
         found = [t for t, m in self.images.items() if not is_depth(m) and "depth" not in t.lower()]
         left = LEFT if self._wanted.get("depth_from") == "stereo" else ()
-        return self._one("color", found, (*left, "color", "rgb"))
+        choice = self._one("color", found, (*left, "color", "rgb"))
+        return (
+            choice
+            if choice.topic
+            else replace(choice, why=choice.why + video_words(self.log, self.namespace))
+        )
 
     def depth(self) -> Choice:
         """Images that say that they are depth; mono16 may be infrared and counts only where nothing else does.
@@ -139,6 +145,20 @@ class Chooser:
                 f"{self.log.name}: {option} topic {wanted} not found, {closest(wanted, known, 'a topic')}"
             )
         return Choice(wanted, "told", tuple(known))
+
+
+def video_words(log: Log, namespace: str) -> str:
+    """What to add to a complaint that there are no images: topics that hold them as video."""
+    found = sorted(
+        f"{t.name} ({t.schema})"
+        for t in log.topics.values()
+        if t.schema.endswith(VIDEO) and t.count and t.name.startswith(f"{namespace.rstrip('/')}/")
+    )
+    if not found:
+        return ""
+    return (
+        f"; {', '.join(found)} is video, which is not read: republish or export it as JPEG, PNG or raw images"
+    )
 
 
 def shared_parts(a: str, b: str) -> int:

@@ -6,6 +6,8 @@
   difference and by the way from one robot to the other. Messages in both directions bound the difference from
   both sides; from one direction the way cannot be told apart.
 - Otherwise nothing can be said: robots that do not see each other move independently.
+- Within one log, the least delay between header and recording changes evenly if the clocks of the two run at different
+  rates (`drift`).
 - Within one log, true poses and a gyroscope or odometry turn together: `lag` finds how far apart in time.
 """
 
@@ -29,6 +31,70 @@ LEAST_SHARED = 5
 LEAST_OFFSET_S = 0.02  # what pairing of images bears, and what transport takes
 RATE_HZ = 100.0  # of angular speeds that are compared
 LEAST_CORRELATION = 0.8
+LEAST_DRIFT_S = 60.0  # length of a log that can tell a drift
+PIECES = 20  # of a log, in each of which one message is taken to have been recorded without delay
+DRIFT_SIGMAS = 5.0
+MOST_RATE = 1e-3  # by which two clocks differ; more is a recorder that cannot keep up
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How much later, by its header, a message was recorded: at the start and at the end of a log.
+
+    seconds: between the two. scatter_s: how far the least delays lie from a line.
+    """
+
+    start_s: float
+    end_s: float
+    seconds: float
+    scatter_s: float
+
+    @property
+    def rate(self) -> float:
+        """Seconds that the recorder's clock gains in one second of the headers'."""
+        return (self.end_s - self.start_s) / self.seconds
+
+    @property
+    def matters(self) -> bool:
+        """Whether it adds up to more than pairs of images bear, and is no play of the delays."""
+        change = abs(self.end_s - self.start_s)
+        return abs(self.rate) < MOST_RATE and change > max(LEAST_OFFSET_S, DRIFT_SIGMAS * self.scatter_s)
+
+    def words(self) -> str:
+        """One line for people."""
+        return (
+            f"the recorder's clock gains {1e6 * self.rate:.0f} ppm on that of the headers ({self.start_s:.3f} s after "
+            f"them at the start, {self.end_s:.3f} s at the end, {self.seconds:.0f} s later), or it fell behind evenly"
+        )
+
+
+def drift(stamps_ns: NDArray[np.int64], delays_ns: NDArray[np.int64]) -> Drift | None:
+    """The line through the least delays of pieces of a log; its slope is the median of those between two of them.
+
+    Args:
+        stamps_ns: times of headers [n]. delays_ns: time of recording less those [n].
+    Returns:
+        None for a log that is too short to tell.
+    """
+    if len(stamps_ns) < 2:
+        return None
+    start, span = int(stamps_ns.min()), int(stamps_ns.max()) - int(stamps_ns.min())
+    if span < LEAST_DRIFT_S * NANOSECONDS:
+        return None
+    seconds = (stamps_ns - start) / NANOSECONDS
+    piece = np.minimum((seconds / (span / NANOSECONDS) * PIECES).astype(np.int64), PIECES - 1)
+    order = np.lexsort((delays_ns, piece))
+    _, first = np.unique(piece[order], return_index=True)
+    least = order[first]
+    if len(least) < PIECES // 2:
+        return None
+    t, d = seconds[least], delays_ns[least] / NANOSECONDS
+    i, j = np.triu_indices(len(t), 1)
+    slope = float(np.median((d[j] - d[i]) / (t[j] - t[i])))
+    level = float(np.median(d - slope * t))
+    scatter = float(np.median(np.abs(d - slope * t - level)))
+    length = span / NANOSECONDS
+    return Drift(level, level + slope * length, length, scatter)
 
 
 @dataclass(frozen=True)

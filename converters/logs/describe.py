@@ -65,6 +65,9 @@ def describe(src: Path) -> dict[str, Any]:
                 logs[log.name] = _log(log)
             robot_log, robots[source.robot] = _robot(log, source)
             if robot_log:
+                if robot_log.drift is not None:
+                    robots[source.robot]["drift_ppm"] = 1e6 * robot_log.drift.rate
+                robot_log.settle_drift()
                 clocks.append(robot_log.clock(source.robot))
         if len(clocks) > 1:
             for robot, offset in compare(clocks).items():

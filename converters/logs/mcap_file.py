@@ -13,7 +13,7 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from converters.logs import foxglove
+from converters.logs import foxglove, ros_json
 from converters.logs.files import Entry, Topic, ros_type, sound_time, stamp_ns
 from converters.logs.mcap_chunks import Chunks
 from converters.logs.rosbag_file import (
@@ -92,6 +92,9 @@ class McapFile:
             self._decoders[channel.id] = _Ros(schema, encoding)
         elif schema and kind and encoding in ("protobuf", "json"):
             self._decoders[channel.id] = _Foxglove(schema, encoding)
+        elif schema and encoding == "json" and ros_json.is_read(ros_type(name)):
+            kind = ros_type(name)
+            self._decoders[channel.id] = _RosJson(kind)
         else:  # nothing that is read here; still shown to people
             kind = f"{name or 'no schema'} as {encoding or 'nothing known'}"
             self._decoders[channel.id] = _Unknown(kind)
@@ -242,6 +245,22 @@ class _Ros:
 
     def tells_time(self, head: bytes) -> bool:
         return self._of_ros
+
+
+class _RosJson:
+    """Messages of ROS in JSON."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+
+    def read(self, data: bytes, where: str) -> Any:
+        return ros_json.read(self.kind, data, where)
+
+    def header_ns(self, data: bytes, where: str) -> int:
+        return stamp_ns(self.read(data, where))
+
+    def tells_time(self, head: bytes) -> bool:
+        return False
 
 
 class _Foxglove:

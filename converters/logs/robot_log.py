@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.choice import REGISTERED, Chooser
-from converters.logs.clocks import RobotClock
+from converters.logs.choice import REGISTERED, Chooser, video_words
+from converters.logs.clocks import Drift, RobotClock, drift
 from converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
 from converters.logs.files import NANOSECONDS, Entry, Log, sound_time
 from converters.logs.frames import Transforms, pose_matrix
@@ -70,6 +70,7 @@ class RobotLog:
         self.warnings: list[str] = []
         # added to all times when they are written
         self.shift_ns = round(settings.clock_offset_s * NANOSECONDS)
+        self._rate, self._origin_ns = 0.0, 0  # of the clock, see `settle_drift`
         # by topic of a CameraInfo: the camera as first told, and whether its images are rectified
         self._cameras: dict[str, tuple[RosCamera, bool]] = {}
         self.transforms = Transforms(log, self.namespace)
@@ -80,7 +81,8 @@ class RobotLog:
         chooser = Chooser(self.log, self.namespace, s.model_dump())
         if not chooser.images:
             where = f" below {self.namespace}" if self.namespace else ""
-            raise DuagError(f"{self.name}: found no topic of images{where}, expected colour and depth")
+            video = video_words(self.log, self.namespace)
+            raise DuagError(f"{self.name}: found no topic of images{where}{video}; expected colour and depth")
         self.depth = chooser.depth().required(self.log, "depth")
         self.color = chooser.color().required(self.log, "color")
         self.color_camera = self._camera(self.color, "color_info", chooser)
@@ -248,11 +250,12 @@ class RobotLog:
     def _seen(self) -> dict[str, array[int]]:
         """Times of the images by topic. Looks through the log once, for all that is to be known before the images."""
         stamps = {self.color: array("q"), self.depth: array("q")}
-        delays = array("q")
+        delays, recorded = array("q"), array("q")
 
         def take_image(entry: Entry) -> None:
             stamps[entry.topic].append(self.time_ns(entry))
             delays.append(entry.log_ns - stamps[entry.topic][-1])
+            recorded.append(entry.log_ns)
 
         cameras = _Cameras(self._cameras, self.name)
         takers: list[tuple[str, Callable[[Entry], None]]] = [*self._motion.take]
@@ -265,7 +268,29 @@ class RobotLog:
                 if topic == entry.topic:
                     take(entry)
         self._delays_ns = np.array(delays, dtype=np.int64)
+        self._image_ns = np.array(recorded, dtype=np.int64) - self._delays_ns
         return stamps
+
+    @cached_property
+    def drift(self) -> Drift | None:
+        """How the clocks of headers and recorder differ in rate; None if that cannot be told, or was not asked for."""
+        self._seen  # noqa: B018
+        return drift(self._image_ns, self._delays_ns) if self.settings.time_source == "header" else None
+
+    def settle_drift(self) -> None:
+        """Bring the times of the headers to the rate of the recorder's clock, if that matters and was asked for."""
+        if self.drift is None or not self.drift.matters:
+            return
+        if self.settings.clocks != "estimated":
+            self.warnings.append(f"{self.drift.words()}; expected one rate, or --set clocks=estimated")
+            return
+        self.warnings.append(f"{self.drift.words()}; taken out")
+        self._rate, self._origin_ns = self.drift.rate, int(self._image_ns.min())
+        self._delays_ns -= np.rint(self._rate * (self._image_ns - self._origin_ns)).astype(np.int64)
+
+    def written_ns(self, stamp_ns: int) -> int:
+        """The time of the recording for a time of the log: by the robot's clock as it was settled."""
+        return stamp_ns + self.shift_ns + round(self._rate * (stamp_ns - self._origin_ns))
 
     @cached_property
     def pairs(self) -> dict[int, int]:

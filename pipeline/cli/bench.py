@@ -194,12 +194,16 @@ def bench_frontend(
     robot: Annotated[str | None, typer.Option(help="One robot; all by default.")] = None,
     threads: Annotated[int, typer.Option(min=1, help="Of the kernels.")] = 1,
     config: ConfigFile = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(help="SVG file to write: scores, time and memory against the caps.", show_default=False),
+    ] = None,
     overrides: Overrides = None,
     as_json: Json = False,
 ) -> None:
     """Time, memory and accuracy of tracking and mapping, part by part, beside Open3D's odometry.
 
-    Examples: `duagc bench frontend recordings/house --caps 30k,60k,200k,600k`,
+    Examples: `duagc bench frontend recordings/house --caps 30k,60k,200k,600k --plot caps.svg`,
     `duagc bench frontend recordings/redkitchen --no-ablation --json`
     """
     import tempfile
@@ -210,6 +214,12 @@ def bench_frontend(
     from pipeline.runner import RunConfig
 
     settings = load(RunConfig, config, overrides or [])
+    chosen = () if caps == "none" else tuple(_counts("--caps", caps))
+    if plot is not None:
+        if not chosen:
+            raise typer.BadParameter("there is nothing to draw without maps; see --caps", param_hint="--plot")
+        if plot.suffix != ".svg" or not plot.parent.is_dir():
+            raise typer.BadParameter(f"{plot} is not a name.svg in a folder that exists", param_hint="--plot")
     with tempfile.TemporaryDirectory(prefix="duagc-bench-") as folder:
         if recording is None:
             recording = Path(folder) / "room"
@@ -217,7 +227,7 @@ def bench_frontend(
         plan = frontend_bench.Plan(
             recording,
             settings.frontend,
-            () if caps == "none" else tuple(_counts("--caps", caps)),
+            chosen,
             ablation,
             open3d,
             threads,
@@ -225,6 +235,12 @@ def bench_frontend(
             (robot,) if robot else (),
         )
         result = frontend_bench.run(plan)
+    if plot is not None:
+        from pipeline.report import figures
+
+        partial = plot.with_name(plot.name + ".part")
+        partial.write_text(figures.map_sizes(frontend_bench.by_cap(result)), encoding="utf-8")
+        partial.replace(plot)
     print(json.dumps(result, indent=2) if as_json else frontend_bench.format_tables(result))
 
 

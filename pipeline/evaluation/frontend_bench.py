@@ -324,7 +324,7 @@ def measure(log: Path, folder: Path, config: FrontendConfig, seed: int, threads:
         whole |= {"keyframe": ("mapping.Mapper", "add_keyframe"), "final": ("mapping.Mapper", "finish")}
         whole |= {"model": ("model.ModelTracker", "refine")}
     with ExitStack() as stack:
-        steps = stack.enter_context(_counted(("tracking.Tracker", "track"), ("align", "_linearise")))
+        steps = stack.enter_context(_counted(("tracking.Tracker", "track"), ("align", "linearise_at")))
         drawn = stack.enter_context(
             _counted(
                 ("mapping.Mapper", "add_keyframe"),
@@ -506,6 +506,23 @@ def _map_errors(source: Recording, robot: RobotRun, estimated: Trajectory, threa
         kept = ("views", "psnr_db", "ssim", "depth_l1_m", "depth_l1_exact_m", "depth_l1_layer_m")
         row[name] = {key: scores[key] for key in (*kept, "depth_completeness")}
     return row
+
+
+def by_cap(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
+    """What `report.figures.map_sizes` draws: the runs with a map, robot by robot, smallest cap first."""
+    robots: dict[str, list[dict[str, Any]]] = {}
+    for row in sorted(result["rows"], key=lambda row: row.get("max_gaussians", 0)):
+        if row["name"] == "map":
+            times, scores = row["times"], row["refined"]
+            robots.setdefault(row["robot"], []).append(
+                {"cap": row["max_gaussians"], "peak_memory_mb": row["peak_memory_mb"]}
+                | {name: scores[name] for name in ("psnr_db", "depth_l1_m", "depth_l1_layer_m")}
+                | {
+                    "keyframe_s": times["keyframe"]["cpu_ms"] / 1e3,
+                    "refinement_s": times["final_refinement_cpu_s"],
+                }
+            )
+    return robots
 
 
 # --- words -------------------------------------------------------------------------------------------------------

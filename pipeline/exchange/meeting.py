@@ -182,7 +182,7 @@ class LowerEnd(Meeting):
         self.book: PlaceBook | None = None
         self.planner: Planner | None = None
         self.waiting: dict[int, list[Candidate]] = {}  # by keyframe of the neighbour
-        self.samples: dict[int, NDArray[np.floating]] = {}  # points [m, 3] of a keyframe of the neighbour
+        self.samples: dict[int, NDArray[np.floating]] = {}  # until decided: points [m, 3] of its keyframes
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
         if kind is Kind.DESCRIPTORS and self.book is None:
@@ -258,7 +258,7 @@ class LowerEnd(Meeting):
         self._inject()
         self.tried.sort(key=lambda t: (t.candidate.peer_keyframe, t.candidate.own_keyframe))
         closures = [t.result.closure for t in self.tried if t.result.closure is not None]
-        agreement = consistent(
+        consistency = consistent(
             closures,
             self.places.T_first_keyframe,
             self.book.T_first_keyframe,
@@ -266,7 +266,7 @@ class LowerEnd(Meeting):
             self.book.drift,
             self.config.consensus.closures,
         )
-        verdicts = iter(zip(agreement.keep.tolist(), agreement.reasons, strict=True))
+        verdicts = iter(zip(consistency.keep.tolist(), consistency.reasons, strict=True))
         for at, t in enumerate(self.tried):
             if t.result.closure is not None:
                 keep, reason = next(verdicts)
@@ -276,17 +276,18 @@ class LowerEnd(Meeting):
                     result = replace(t.result, verdict=Verdict.INCONSISTENT, detail=reason)
                     self.tried[at] = Tried(t.candidate, result)
         shared = SharedKeyframes(np.zeros(0, np.int32), np.zeros((0, 6), np.float32))
-        if agreement.T_ownmap_peermap is not None:
+        if consistency.T_ownmap_peermap is not None:
             keyframes = np.unique([c.peer_keyframe for c in closures])
             metric = link_metric(closures, keyframes, self.config.consensus.closures)
             shared = SharedKeyframes(keyframes.astype(np.int32), metric)
-            groups = (Group(agreement.keep, agreement.T_ownmap_peermap), *agreement.others)
+            groups = (Group(consistency.keep, consistency.T_ownmap_peermap), *consistency.others)
             proposals = tuple(self._proposal(closures, group) for group in groups)
             self.joined = Joined(shared, tuple(closures), tuple(g.keep for g in groups), proposals)
+        self.samples.clear()
         self.verdicts = Verdicts(
             candidates=sum(t.result.verdict is not Verdict.UNLIKE for t in self.tried),
             verified=len(closures),
-            consistent=int(agreement.keep.sum()),
+            consistent=int(consistency.keep.sum()),
             joined=self.joined is not None,
             shared=shared,
         )

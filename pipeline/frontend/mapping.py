@@ -9,23 +9,20 @@ threads. See docs/mapping.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import streams
 from pipeline.frontend.mapping_config import MappingConfig
+from pipeline.frontend.mapping_views import Bytes, Image, View, overlap
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels import CompiledAdam, FisherSums, Gradients, LossWeights, Rasterizer, Render, ViewLoss
 from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.losses import depth_certainty, halve
-from pipeline.splat.optimiser import BETA_1, BETA_2, LearningRates
+from pipeline.splat.optimiser import LearningRates
 from pipeline.splat.seeding import seed_discs, unexplained, worst_drawn
-
-Image = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -37,56 +34,6 @@ class MappingStats:
     total: int
     loss_before: float
     loss_after: float
-
-
-@dataclass
-class _View:
-    """A keyframe as the mapper keeps it: colours as bytes, depth in metres, 0 also where a mask forbids the pixel.
-
-    mask, half_mask: pixels that may be used; None = all. certainty, half_certainty: factors of the depth residuals
-    (`splat.losses.depth_certainty`); None = all 1. depth_sigma_m: standard deviation of the depth; None = not told.
-    """
-
-    index: int
-    color: Bytes
-    depth_m: Image
-    half_color: Image
-    half_depth_m: Image
-    T_map_camera: NDArray[np.float64]
-    median_depth_m: float
-    mask: NDArray[np.bool_] | None = None
-    half_mask: NDArray[np.bool_] | None = None
-    depth_sigma_m: Image | None = None
-    certainty: Image | None = None
-    half_certainty: Image | None = None
-    exposure: tuple[float, float] = (0.0, 0.0)
-    exposure_moments: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 2)))
-    exposure_steps: int = 0
-
-    @property
-    def centre_map(self) -> NDArray[np.float64]:
-        """The point [3] that the camera looks at: on its axis, at the median depth."""
-        return self.T_map_camera[:3, 3] + self.median_depth_m * self.T_map_camera[:3, 2]
-
-    def images(self, level: int) -> tuple[Image, Image]:
-        if level == 0:
-            return _from_bytes(self.color), self.depth_m
-        return self.half_color, self.half_depth_m
-
-    def usable(self, level: int) -> NDArray[np.bool_] | None:
-        """The mask of a level; None = all pixels."""
-        return self.mask if level == 0 else self.half_mask
-
-    def step_exposure(self, gradient: tuple[float, float], rate: float) -> None:
-        """One Adam step of (a, b)."""
-        self.exposure_steps += 1
-        g = np.array(gradient)
-        first, second = self.exposure_moments
-        first, second = BETA_1 * first + (1 - BETA_1) * g, BETA_2 * second + (1 - BETA_2) * g * g
-        self.exposure_moments = np.stack([first, second])
-        unbiased = np.sqrt(second / (1 - BETA_2**self.exposure_steps)) + 1e-12
-        a, b = np.array(self.exposure) - rate * first / (1 - BETA_1**self.exposure_steps) / unbiased
-        self.exposure = (float(a), float(b))
 
 
 class Mapper:
@@ -103,8 +50,8 @@ class Mapper:
         self._loss_weights = LossWeights(**config.loss.model_dump())
         self._gaussians = Gaussians.empty()
         self._adam = CompiledAdam(threads=threads)
-        self._views: list[_View] = []
-        self._support: list[tuple[_View, NDArray[np.float64]]] = []  # with T_keyframe_camera
+        self._views: list[View] = []
+        self._support: list[tuple[View, NDArray[np.float64]]] = []  # with T_keyframe_camera
         self._next_id = 0
         self._contribution = np.zeros(0)  # of every Gaussian, as last measured; infinite if never
 
@@ -139,7 +86,8 @@ class Mapper:
         """
         if keyframe_index != len(self._views):
             raise ValueError(f"keyframe {keyframe_index} added after {len(self._views)} keyframes")
-        view = self._view(keyframe_index, color, depth_m, T_map_camera, mask, depth_sigma_m)
+        huber_m = self.config.loss.depth_huber_m
+        view = View.of(keyframe_index, color, depth_m, T_map_camera, mask, depth_sigma_m, huber_m)
         self._views.append(view)
         self._adam.freeze_after(self.config.stable_steps or None)
         inserted, pruned = self._seed(
@@ -188,7 +136,8 @@ class Mapper:
         It seeds no Gaussians. Never give a frame that is held out for evaluation.
         """
         T_map_camera = self._views[keyframe_index].T_map_camera @ T_keyframe_camera
-        view = self._view(keyframe_index, color, depth_m, T_map_camera, mask, depth_sigma_m)
+        huber_m = self.config.loss.depth_huber_m
+        view = View.of(keyframe_index, color, depth_m, T_map_camera, mask, depth_sigma_m, huber_m)
         self._support.append((view, T_keyframe_camera))
 
     def finish(self) -> MappingStats:
@@ -226,23 +175,7 @@ class Mapper:
 
     # --- one view -----------------------------------------------------------------------------------------------
 
-    def _view(
-        self,
-        index: int,
-        color: Bytes,
-        depth_m: Image,
-        T_map_camera: NDArray[np.float64],
-        mask: NDArray[np.bool_] | None,
-        depth_sigma_m: Image | None,
-    ) -> _View:
-        view = _view(index, color, depth_m, T_map_camera, mask)
-        if depth_sigma_m is not None:
-            view.depth_sigma_m = depth_sigma_m
-            view.certainty = depth_certainty(depth_sigma_m, self.config.loss.depth_huber_m)
-            view.half_certainty = halve(view.certainty)
-        return view
-
-    def _draw(self, view: _View, level: int, mask: NDArray[np.bool_] | None = None) -> Render:
+    def _draw(self, view: View, level: int, mask: NDArray[np.bool_] | None = None) -> Render:
         return self.rasterizer.forward(
             self._gaussians,
             self.cameras[level],
@@ -251,10 +184,10 @@ class Mapper:
             depth=self.config.depth,
         )
 
-    def _loss(self, view: _View, level: int) -> float:
+    def _loss(self, view: View, level: int) -> float:
         return self._view_gradients(view, level)[0].value
 
-    def _view_gradients(self, view: _View, level: int) -> tuple[ViewLoss, Gradients]:
+    def _view_gradients(self, view: View, level: int) -> tuple[ViewLoss, Gradients]:
         color, depth_m = view.images(level)
         return self.rasterizer.view_gradients(
             self._gaussians,
@@ -272,7 +205,7 @@ class Mapper:
     def _mean_loss(self) -> float:
         return float(np.mean([self._loss(view, 0) for view in self._views])) if self._views else 0.0
 
-    def _optimise(self, view: _View, level: int, rates: LearningRates) -> None:
+    def _optimise(self, view: View, level: int, rates: LearningRates) -> None:
         """One Adam step of all Gaussians in one view."""
         loss, gradients = self._view_gradients(view, level)
         if self.config.exposure and view is not self._views[0]:
@@ -285,7 +218,7 @@ class Mapper:
             opacity_logits=np.clip(stepped.opacity_logits, np.float32(-6), np.float32(6)),
         )
 
-    def _centre_exposures(self, views: Sequence[_View]) -> None:
+    def _centre_exposures(self, views: Sequence[View]) -> None:
         """Give the map the keyframes' mean exposure, so that (0, 0) is the best guess for an image that has none.
 
         Nothing that is drawn in an exposure changes, but for what shines through from the background.
@@ -300,7 +233,7 @@ class Mapper:
 
     # --- what is in the map -------------------------------------------------------------------------------------
 
-    def _seed(self, view: _View, share: float) -> tuple[int, int]:
+    def _seed(self, view: View, share: float) -> tuple[int, int]:
         """Insert discs for what the map does not explain of a view; returns how many came and how many had to go."""
         config = self.config
         budget = int(share * config.max_gaussians)
@@ -319,14 +252,14 @@ class Mapper:
         self._append(new)
         return len(new), pruned
 
-    def _as_drawn(self, view: _View, color: Image, render: Render) -> Image:
+    def _as_drawn(self, view: View, color: Image, render: Render) -> Image:
         """The view's colours in the map's exposure; where the mask forbids a pixel, those of the render."""
         color = (color - np.float32(view.exposure[1])) * np.float32(np.exp(-view.exposure[0]))
         # errors are smoothed: a masked pixel must not speak through its neighbours
         return color if view.mask is None else np.where(view.mask[..., None], color, render.color)
 
     def _discs(
-        self, view: _View, color: Image, depth_m: Image, wanted: NDArray[np.bool_], budget: int
+        self, view: View, color: Image, depth_m: Image, wanted: NDArray[np.bool_], budget: int
     ) -> Gaussians:
         return seed_discs(
             color,
@@ -367,7 +300,7 @@ class Mapper:
             inserted += len(new)
         return inserted, pruned
 
-    def _contributions(self, views: Sequence[_View]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def _contributions(self, views: Sequence[View]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Squared change of these views' images, in units of the noise, if a Gaussian was removed; and if any saw it.
 
         A pixel is linear in each Gaussian's blending factor, and the derivative by the opacity logit is that
@@ -388,7 +321,7 @@ class Mapper:
         transparency = 1.0 / (1.0 + np.exp(self._gaussians.opacity_logits.astype(np.float64)))
         return sums.opacity / transparency**2, sums.observations > 0
 
-    def _measure(self, views: Sequence[_View]) -> None:
+    def _measure(self, views: Sequence[View]) -> None:
         """Measure again what the Gaussians that these views see contribute; the others keep what was found before.
 
         Views that are left out may still need a Gaussian: what it was found to contribute fades by a tenth at a
@@ -421,7 +354,7 @@ class Mapper:
 
     # --- which views --------------------------------------------------------------------------------------------
 
-    def _window(self, newest: _View) -> list[_View]:
+    def _window(self, newest: View) -> list[View]:
         """The views of this keyframe's iterations: every second one the newest, the others in turn."""
         chosen = self._covisible(newest, self.config.window)[1:]
         taken = {view.index for view in chosen}
@@ -434,7 +367,7 @@ class Mapper:
             return [newest] * steps
         return [newest if k % 2 == 0 else others[(k // 2) % len(others)] for k in range(steps)]
 
-    def _covisible(self, newest: _View, count: int) -> list[_View]:
+    def _covisible(self, newest: View, count: int) -> list[View]:
         """A view, the keyframe before it, and the older ones that see most of what it sees, best first.
 
         `count` in all, ties to the later. Only the `candidates` keyframes whose centre of view is nearest are compared.
@@ -455,66 +388,6 @@ class Mapper:
         return [newest, *(older[k] for k in ranked[: count - 1])]
 
 
-def overlap(
-    depth_m: Image,
-    T_map_camera: NDArray[np.float64],
-    other_depth_m: Image,
-    T_map_other: NDArray[np.float64],
-    camera: PinholeCamera,
-    stride_px: int = 16,
-) -> float:
-    """Share of one view's measured pixels (every `stride_px`-th) that another view measured too.
-
-    A pixel counts if its point projects into the other image and lies within 10 % of the depth measured there.
-    """
-    first = stride_px // 2
-    z = depth_m[first::stride_px, first::stride_px].astype(np.float64)
-    row, column = np.nonzero(z > 0)
-    if len(row) == 0:
-        return 0.0
-    z = z[row, column]
-    u, v = first + stride_px * column, first + stride_px * row
-    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
-    seen = se3.transform(se3.inverse(T_map_other) @ T_map_camera, points)
-    seen = seen[seen[:, 2] > 0.05]
-    uv = np.rint(camera.project(seen)).astype(np.int64)
-    inside = (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
-    there = other_depth_m[uv[inside, 1], uv[inside, 0]]
-    agree = np.abs(there - seen[inside, 2]) < 0.1 * seen[inside, 2]
-    return float(np.count_nonzero(agree)) / len(points)
-
-
-def _view(
-    index: int,
-    color: Bytes,
-    depth_m: Image,
-    T_map_camera: NDArray[np.float64],
-    mask: NDArray[np.bool_] | None = None,
-) -> _View:
-    if color.dtype != np.uint8:
-        raise ValueError(f"color is an array of {color.dtype}, expected uint8")
-    depth_m = np.asarray(depth_m, dtype=np.float32)
-    if mask is not None:
-        depth_m = np.where(mask, depth_m, np.float32(0))
-    near = depth_m[::8, ::8]
-    return _View(
-        index=index,
-        color=color,
-        depth_m=depth_m,
-        half_color=halve(_from_bytes(color)),
-        half_depth_m=_halve_depth(depth_m),
-        T_map_camera=np.array(T_map_camera, dtype=np.float64),
-        median_depth_m=float(np.median(near[near > 0])) if near.any() else 0.0,
-        mask=mask,
-        half_mask=None if mask is None else _halve_mask(mask),
-    )
-
-
-def _from_bytes(color: Bytes) -> Image:
-    """Colours 0..1."""
-    return color * np.float32(1 / 255)
-
-
 def _first_exposure(
     render: Render, color: Image, mask: NDArray[np.bool_] | None = None
 ) -> tuple[float, float]:
@@ -526,17 +399,3 @@ def _first_exposure(
         return 0.0, 0.0
     ratio = np.median(color[covered]) / max(float(np.median(render.color[covered])), 0.02)
     return float(np.log(np.clip(ratio, 0.25, 4.0))), 0.0
-
-
-def _halve_depth(depth_m: Image) -> Image:
-    """Means of 2x2 blocks of measured depths on one surface (within 2 %); 0 where a pixel is missing or differs."""
-    h, w = depth_m.shape[0] // 2 * 2, depth_m.shape[1] // 2 * 2
-    quarters = np.stack([depth_m[i:h:2, j:w:2] for i in (0, 1) for j in (0, 1)])
-    nearest, farthest = quarters.min(axis=0), quarters.max(axis=0)
-    return np.where((nearest > 0) & (farthest <= 1.02 * nearest), halve(depth_m), np.float32(0))
-
-
-def _halve_mask(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Blocks of 2x2 pixels that may all be used; a last odd row or column is cut."""
-    h, w = mask.shape[0] // 2 * 2, mask.shape[1] // 2 * 2
-    return mask[0:h:2, :w:2] & mask[0:h:2, 1:w:2] & mask[1:h:2, :w:2] & mask[1:h:2, 1:w:2]

@@ -139,6 +139,7 @@ class Tracker:
         self._unconfirmed: _Unconfirmed | None = None
         self._gray_rms: list[float] = []  # of the last frames that were followed
         self._obstructed = False  # something stands before the camera
+        self._clear: tuple[Level, Array] | None = None  # the last view without, coarse, and its T_map_camera
         self._without_depth = self._without_color = 0  # frames in a row without a usable image
 
     def track(
@@ -233,12 +234,14 @@ class Tracker:
         self._stamp_ns, self._unconfirmed = stamp_ns, None
         if followed and found.without is Reason.NONE:
             self._gray_rms = [*self._gray_rms[1 - USUAL_FRAMES :], result.rms_gray]
+        if found.without is Reason.NONE:
+            self._look_for_obstructions(pyramid, found)
         if (
             not is_held_out(frame_index)
             and found.without is Reason.NONE
             and becomes_keyframe(result, pyramid, self.config.keyframes)
             and self._well_exposed(pyramid, result)
-            and self._unobstructed(pyramid, found)
+            and not self._obstructed
         ):
             return self._promote(frame_index, stamp_ns, pyramid, keyframe_index, result, status)
         return _tracked(frame_index, stamp_ns, keyframe_index, result, status, found.without)
@@ -292,9 +295,10 @@ class Tracker:
             for guess in starts:
                 information = known if guess is predicted else None
                 result = register(keyframe.reference, pyramid, guess, tracking.registration, information)
-                if result.ok:
-                    return _Found(self._current, result)
-                reason = reason if reason is not Reason.NONE else Reason(result.outcome.value)
+                found = _Found(self._current, result)
+                if result.ok and self._tells_enough(pyramid, found):
+                    return found
+                reason = reason if reason is not Reason.NONE else found.why_not()
         view = features_of(pyramid, tracking.relocalisation) if view is None else view
         for guess in starts:
             found = _Found(self._current, self._settle(keyframe, pyramid, guess, tracking.recovery))
@@ -352,6 +356,14 @@ class Tracker:
             return found
         self._unconfirmed = _Unconfirmed(found, stamp_ns, before.agreed + 1)
         return Reason.UNCONFIRMED
+
+    def _tells_enough(self, pyramid: RgbdPyramid, found: _Found) -> bool:
+        """Whether what something before the camera leaves to be seen still says well where the camera is."""
+        failure = self.config.tracking.failure
+        # along weak directions a prior knows the pose, or the outcome would not be OK
+        covariance = np.linalg.pinv(found.result.information, rcond=1e-12, hermitian=True)
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+        return sigma_m <= failure.max_sigma_obstructed_m or not self._intruded(pyramid, found)[0]
 
     def _believable(self, stamp_ns: int, pyramid: RgbdPyramid, found: _Found, view: Features) -> bool:
         """Whether a pose that was not simply followed can be true.
@@ -419,21 +431,38 @@ class Tracker:
         leaving = min(result.overlap, result.view) < config.relocalisation.min_overlap
         return leaving and saturated_share(pyramid.levels[0]) <= config.max_saturated
 
-    def _unobstructed(self, pyramid: RgbdPyramid, found: _Found) -> bool:
-        """Whether little of a view stands in space that the keyframe saw to be free.
+    def _look_for_obstructions(self, pyramid: RgbdPyramid, found: _Found) -> None:
+        """Notice what stands before the camera, and when it is gone.
 
-        Once something stands before the camera it is gone only when the keyframe can judge most of the view: what
-        moves with the camera soon stands beside the keyframe's view.
+        It is gone only when most of the view can be judged: what moves with the camera soon stands beside the
+        keyframe's view.
         """
-        config, coarsest = self.config.tracking.failure, pyramid.levels[-1]
-        keyframe = self.keyframes[found.keyframe_index].coarsest
-        intruding, told = intruders(coarsest, keyframe, found.result.T_reference_target, config)
-        known = int(np.count_nonzero(coarsest.inverse_depth))
-        if intruding > config.max_intruders * told:
+        coarsest = pyramid.levels[-1]
+        intruded, told = self._intruded(pyramid, found)
+        if intruded:
             self._obstructed = True
-        elif told >= config.min_told * known:
+        elif told >= self.config.tracking.failure.min_told * int(np.count_nonzero(coarsest.inverse_depth)):
             self._obstructed = False
-        return not self._obstructed
+        if not self._obstructed:
+            keyframe = self.keyframes[found.keyframe_index]
+            self._clear = coarsest, keyframe.T_map_keyframe @ found.result.T_reference_target
+
+    def _intruded(self, pyramid: RgbdPyramid, found: _Found) -> tuple[bool, int]:
+        """Whether much of a view stands in space that its keyframe, or the last clear view, saw to be free.
+
+        The last clear view was taken nearby: what appears from one frame to the next is inside it. The keyframe is
+        older: it also knows what came in slowly. Second, how many pixels of the view the better of them could judge.
+        """
+        config, keyframe = self.config.tracking.failure, self.keyframes[found.keyframe_index]
+        T_keyframe_camera = found.result.T_reference_target
+        earlier = [(keyframe.coarsest, T_keyframe_camera)]
+        if self._clear is not None:
+            clear, T_map_clear = self._clear
+            T_clear_camera = se3.inverse(T_map_clear) @ keyframe.T_map_keyframe @ T_keyframe_camera
+            earlier.append((clear, T_clear_camera))
+        judged = [intruders(pyramid.levels[-1], level, T, config) for level, T in earlier]
+        intruded = any(intruding > config.max_intruders * told for intruding, told in judged)
+        return intruded, max(told for _, told in judged)
 
     # --- keyframes ------------------------------------------------------------------------------------------------
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import reprlib
-from dataclasses import asdict
+from dataclasses import astuple
 from numbers import Real
 from typing import Any
 
@@ -118,41 +118,48 @@ class Rasterizer:
     ) -> tuple[ViewLoss, Gradients]:
         """Forward, loss and backward of one view in one pass: `splat.losses.rgbd_loss` and its derivatives.
 
+        The surface term (`LossWeights.surface_weight`) is this function's own: the mean over measured pixels of the sum
+        over Gaussians of blending weight times the Huber loss of the Gaussian's depth at the pixel minus the measured
+        one. The blended depth may be right because what lies in front and behind cancels; this one may not.
+
         color: measured, float32 [H, W, 3], compared with exp(a) * rendered + b for exposure (a, b). depth_m: measured,
         float32 [H, W], 0 where there is none. The rest as in `forward` and `backward`; `fisher` and the others may
-        follow as after a `forward`. depth_certainty: factor [H, W] of the depth residuals, then in three passes.
+        follow as after a `forward`. depth_certainty: factor [H, W] of the depth residuals, all 1 if absent.
         """
-        if depth_certainty is not None:
-            from pipeline.splat.losses import LossConfig, rgbd_loss
-
-            render = self.forward(gaussians, camera, T_camera_map, background, mask=mask, depth=depth)
-            config = LossConfig(**asdict(loss))
-            found = rgbd_loss(render, color, depth_m, config, exposure, mask, depth_certainty)
-            by_images = found.d_color, found.d_depth, found.d_alpha
-            gradients = self.backward(*by_images, pose=pose, parameters=parameters)
-            return ViewLoss(found.value, found.color, found.depth, found.d_exposure), gradients
         height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth)
         measured = (
             _checked_image("color", color, (height, width, 3), "the camera"),
             _checked_image("depth_m", depth_m, (height, width), "the camera"),
         )
-        gain, offset = _checked_exposure(exposure)
+        gain_and_offset = _checked_exposure(exposure)
         _check_type("loss", loss, LossWeights)
-        weights = np.array(
-            [loss.color_huber, loss.depth_weight, loss.depth_huber_m, loss.alpha_weight, gain, offset],
-            np.float32,
-        )
+        *of_images, surface_weight = astuple(loss)
+        weights = np.array([*of_images, *gain_and_offset, surface_weight], np.float32)
         _check_wanted(pose, parameters, fisher=False)
         out = _outputs(gaussians, parameters)
-        by_pose, values = np.zeros(6 if pose else 0), np.zeros(5)
-        status = self._raster.fit(*_arrays(gaussians), *view, *measured, weights, values, *out, by_pose)
+        by_pose, values = np.zeros(6 if pose else 0), np.zeros(6)
+        arguments = [*_arrays(gaussians), *view, *measured, weights, values, *out, by_pose]
+        if depth_certainty is not None:
+            arguments.append(
+                _checked_image("depth_certainty", depth_certainty, (height, width), "the camera")
+            )
+        elif surface_weight > 0:
+            arguments.append(
+                None
+            )  # kernels built before there was this term refuse it, rather than leave it out
+        status = self._raster.fit(*arguments)
         self._gaussians = None
-        _refuse_bad_image(status, {"color": _NOT_FINITE, "depth_m": _NEGATIVE})
+        _refuse_bad_image(status, {"color": _NOT_FINITE, "depth_m": _NEGATIVE, "depth_certainty": _NEGATIVE})
         self._finish(gaussians, (height, width), status)
-        of_color, of_depth, missing, by_gain, by_offset = (float(value) for value in values)
-        value = of_color + loss.depth_weight * of_depth + loss.alpha_weight * missing
+        of_color, of_depth, missing, by_gain, by_offset, surface = (float(value) for value in values)
+        value = (
+            of_color
+            + loss.depth_weight * of_depth
+            + loss.alpha_weight * missing
+            + loss.surface_weight * surface
+        )
         return (
-            ViewLoss(value, of_color, of_depth, (by_gain, by_offset)),
+            ViewLoss(value, of_color, of_depth, (by_gain, by_offset), surface),
             _gradients(out if parameters else None, by_pose if pose else None),
         )
 

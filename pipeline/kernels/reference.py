@@ -152,18 +152,21 @@ class ReferenceRasterizer:
         depth: DepthKind = "blended",
         pose: bool = False,
         parameters: bool = True,
+        depth_certainty: ArrayLike | None = None,
     ) -> tuple[ViewLoss, Gradients]:
         """Draw, compare with a measured image, differentiate; see `Rasterizer.view_gradients`."""
         import torch
 
         self.forward(gaussians, camera, T_camera_map, background, depth=depth, mask=mask)
-        of_color, of_depth = (_tensor(np.asarray(image)[self._drawn]) for image in (color, depth_m))
+        certainty = np.ones(self._drawn.shape) if depth_certainty is None else depth_certainty
+        rgb, z, sure = (_tensor(np.asarray(image)[self._drawn]) for image in (color, depth_m, certainty))
         gain_and_offset = _tensor(exposure).requires_grad_()
-        value, of_color, of_depth = view_loss(self._painting, of_color, of_depth, loss, gain_and_offset)
-        (by_exposure,) = torch.autograd.grad(value, [gain_and_offset], retain_graph=True)
+        found = view_loss(self._painting, rgb, z, sure, loss, gain_and_offset)
+        (by_exposure,) = torch.autograd.grad(found[0], [gain_and_offset], retain_graph=True)
         a, b = by_exposure.tolist()
-        summary = ViewLoss(float(value.detach()), float(of_color.detach()), float(of_depth.detach()), (a, b))
-        return summary, self._gradients(value, pose, parameters)
+        value, of_color, of_depth, surface = (float(mean.detach()) for mean in found)
+        summary = ViewLoss(value, of_color, of_depth, (a, b), surface)
+        return summary, self._gradients(found[0], pose, parameters)
 
     def contributions(self) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
         """Sum of the blending weights [n] of each Gaussian and number of its pixels [n]."""
@@ -449,19 +452,28 @@ def blend(pixels: Any, centres: Any, conics: Any, opacities: Any) -> tuple[Any, 
 
 
 def view_loss(
-    drawn: Painting, color: Any, depth_m: Any, loss: LossWeights, exposure: Any
-) -> tuple[Any, Any, Any]:
-    """The loss of m pixels and its means of colour and depth, as `splat.losses.rgbd_loss` defines them.
+    drawn: Painting, color: Any, depth_m: Any, certainty: Any, loss: LossWeights, exposure: Any
+) -> tuple[Any, Any, Any, Any]:
+    """The loss of m pixels and its means of colour, depth and surface, as `Rasterizer.view_gradients` defines them.
 
-    color [m, 3], depth_m [m]: measured. exposure: a, b [2].
+    color [m, 3], depth_m [m]: measured. certainty [m]: factor of the depth residuals. exposure: a, b [2].
     """
     measured = depth_m > 0
     shown = exposure[0].exp() * drawn.color + exposure[1]
     per_depth = 1.0 / max(int(measured.sum()), 1)
     color_mean = _huber(shown - color, loss.color_huber).sum() / max(color.numel(), 1)
-    depth_mean = _huber((drawn.depth - drawn.alpha * depth_m)[measured], loss.depth_huber_m).sum() * per_depth
+    blended = ((drawn.depth - drawn.alpha * depth_m) * certainty)[measured]
+    depth_mean = _huber(blended, loss.depth_huber_m).sum() * per_depth
     missing = (1 - drawn.alpha)[measured].sum() * per_depth
-    return color_mean + loss.depth_weight * depth_mean + loss.alpha_weight * missing, color_mean, depth_mean
+    of_each = _huber((drawn.depths - depth_m[:, None]) * certainty[:, None], loss.depth_huber_m)
+    surface = (drawn.weights * of_each)[measured].sum() * per_depth
+    value = (
+        color_mean
+        + loss.depth_weight * depth_mean
+        + loss.alpha_weight * missing
+        + loss.surface_weight * surface
+    )
+    return value, color_mean, depth_mean, surface
 
 
 def sigma_of(quats_wxyz: Any, log_scales: Any) -> Any:

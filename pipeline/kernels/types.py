@@ -93,13 +93,15 @@ class LossWeights:
 
     color_huber: colour residual (0..1) where the loss turns from quadratic to linear of slope 1. depth_huber_m: the
     same of depth, metres. depth_weight: of one metre of depth against one unit of colour. alpha_weight: of missing
-    opacity where a depth was measured.
+    opacity where a depth was measured. surface_weight: of one metre between the depth of single Gaussians, by their
+    blending weight, and the measured one.
     """
 
     color_huber: float
     depth_weight: float
     depth_huber_m: float
     alpha_weight: float
+    surface_weight: float = 0.0
 
     def __post_init__(self) -> None:
         for name, least in (
@@ -107,6 +109,7 @@ class LossWeights:
             ("depth_weight", 0.0),
             ("depth_huber_m", SMALLEST_HUBER),
             ("alpha_weight", 0.0),
+            ("surface_weight", 0.0),
         ):
             value = getattr(self, name)
             if not (isinstance(value, Real) and least <= float(value) <= LARGEST_LOSS_WEIGHT):
@@ -117,13 +120,15 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class ViewLoss:
-    """Loss of one view: value, the weighted sum of its terms; color (0..1) and depth (metres), the means of those
-    two terms before their weights; d_exposure, the derivatives of value by the exposure (a, b)."""
+    """Loss of one view: value, the weighted sum of its terms; color (0..1), depth and surface (metres), the means of
+    those terms before their weights; d_exposure, the derivatives of value by the exposure (a, b). The surface term is
+    not measured where its weight is 0, and then 0."""
 
     value: float
     color: float
     depth: float
     d_exposure: tuple[float, float]
+    surface: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -247,19 +247,21 @@ class LogFile:
                 out += [(self._sound_time(time), start, offset) for time, offset in index.records]
         return sorted(out)
 
-    def entries_by_time(self, topic: str) -> dict[int, tuple[int, int, int]]:
+    def entries_by_time(self, topic: str, *others: str) -> dict[int, tuple[int, int, int]]:
         """The entry of every message of a topic by its publish time; of equal times the first.
 
         Only the messages themselves know their publish time, so all their chunks are unpacked; a process does it
-        once per file and topic.
+        once per file and topic. others: topics that will be asked for as well: their chunks are the same.
         """
         status = self.path.stat()
-        key = (str(self.path.resolve()), status.st_size, status.st_mtime_ns, status.st_ino, topic)
-        if key not in _publish_times:
-            entries = self.entries(topic)
-            times = [self._publish_time(entry) for entry in entries]
-            _publish_times[key] = dict(zip(reversed(times), reversed(entries), strict=True))
-        return _publish_times[key]
+        file = str(self.path.resolve()), status.st_size, status.st_mtime_ns, status.st_ino
+        if (*file, topic) not in _publish_times:
+            found = {t: self.entries(t) for t in {topic, *others} if (*file, t) not in _publish_times}
+            by_chunk = sorted((entry for entries in found.values() for entry in entries), key=lambda e: e[1:])
+            times = {entry: self._publish_time(entry) for entry in by_chunk}
+            for t, entries in found.items():
+                _publish_times[(*file, t)] = {times[entry]: entry for entry in reversed(entries)}
+        return _publish_times[(*file, topic)]
 
     def _publish_time(self, entry: tuple[int, int, int]) -> int:
         with parsing(self.path):

@@ -75,7 +75,9 @@ class RgbdLog:
         self.camera = self._read_camera()
         self._source = depth_source(self._log, self.robot, self.camera)
         self.depth_scale = self._source.scale
-        self._color_at = self._log.entries_by_time(self._color_topic)
+        self._mask_topic = topic_table.MASK.of(self.robot)
+        topics = self._color_topic, self._source.topic, self._mask_topic
+        self._color_at = self._log.entries_by_time(*topics)
         self._depth_at = self._log.entries_by_time(self._source.topic)
         self.pairing = pair(self._color_at, self._depth_at)
         if not self.pairing.pairs:
@@ -83,7 +85,6 @@ class RgbdLog:
                 f"{self.path}: {self._color_topic} has {len(self._color_at)} images and {self._source.topic} "
                 f"{len(self._depth_at)}, none of them within {TOLERANCE_NS / 1e6:g} ms of each other, expected pairs"
             )
-        self._mask_topic = topic_table.MASK.of(self.robot)
         self._mask_at = self._read_mask_times()
 
     def _read_camera(self) -> PinholeCamera:

@@ -226,3 +226,51 @@ def reliability(bins: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
     axes.set_ylabel("observed error (mm, root mean square)")
     _legend_above(axes, len(bins) + bool(values))
     return figure
+
+
+@_styled
+def map_sizes(robots: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    """What a larger map brings and costs: four panels against the cap of its Gaussians, on a logarithmic axis.
+
+    Args:
+        robots: per robot a list of "cap", "psnr_db", "depth_l1_m", "depth_l1_layer_m", "keyframe_s", "refinement_s",
+            "peak_memory_mb"; None where there is no such value.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+    panels = (
+        ("PSNR, held out, dB", 1.0, {"psnr_db": ""}),
+        ("depth L1, held out, mm", 1e3, {"depth_l1_m": "blended", "depth_l1_layer_m": "one layer"}),
+        ("processor time, s", 1.0, {"keyframe_s": "a keyframe", "refinement_s": "final refinement"}),
+        ("peak memory, MB", 1.0, {"peak_memory_mb": ""}),
+    )
+    figure = Figure(figsize=(9.6, 6.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    caps = sorted({row["cap"] for rows in robots.values() for row in rows})
+    for axes, (label, scale, kinds) in zip(figure.subplots(2, 2).flat, panels, strict=True):
+        for k, (name, kind) in enumerate(kinds.items()):
+            line = ("-", (0, (4, 2)))[k]
+            for i, (robot, rows) in enumerate(robots.items()):
+                points = [(row["cap"], scale * row[name]) for row in rows if row[name] is not None]
+                axes.plot(
+                    *np.reshape(points, (-1, 2)).T,
+                    color=color_of(i),
+                    linestyle=line,
+                    marker=MARKS[i % len(MARKS)],
+                    markersize=5,
+                    label=None if kind else robot,
+                )
+            if kind:
+                axes.plot([], [], color=INK, linestyle=line, label=kind)
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(FixedLocator(caps))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda cap, _: f"{cap / 1000:g}k"))
+        if label.startswith("processor"):
+            axes.set_yscale("log")
+        axes.set_xlabel("most Gaussians")
+        axes.set_ylabel(label)
+        _legend_above(axes, 4)
+    return figure

@@ -81,9 +81,9 @@ ROBOT = {
 MAPS = {
     "own": "own",
     "own_unrefined": "own, before its final refinement",
-    "own_longer": "own, trained as long as refined",
+    "own_longer": "own, trained longer",
     "fused": "fused",
-    "refined": "refined: the final map",
+    "refined": "refined (final)",
 }  # fmt: skip
 
 VIEW_SETS = {
@@ -109,7 +109,7 @@ RENDERING = {
     "depth_l1_m": ("Depth L1", "mean error against the recorded depth, where both exist"),
     "depth_l1_exact_m": ("Depth L1, exact", "the same against the exact depth"),
     "depth_l1_layer_m": ("Depth L1, one layer", "the same, drawn as the surface that stops a pixel's light"),
-    "depth_l1_common_m": ("Depth L1, common", "over pixels that own, longer trained, fused and refined map all cover"),
+    "depth_l1_common_m": ("Depth L1, common", "over pixels that all maps but the unrefined cover"),
     "depth_completeness": ("Completeness", "share of recorded depth pixels that the map covers"),
 }  # fmt: skip
 
@@ -196,18 +196,20 @@ def comparison_rows(metrics: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def comparison_text(metrics: dict[str, Any]) -> str:
-    """`comparison_rows` as lines of text."""
-    labels = [label for label, _ in COMPARISON.values()]
-    heads = [f"{VIEW_SETS[view_set]}: {labels[0]}" for view_set in COMPARED_SETS]
-    table = [["", ""] + [cell for head in heads for cell in (head, *labels[1:])]]
-    table += [
-        [row["robot"] if row["first"] else "", row["map"], *row["values"]] for row in comparison_rows(metrics)
-    ]
-    widths = [max(len(row[k]) for row in table) for k in range(len(table[0]))]
-    lines = []
-    for row in table:
-        cells = [
-            c.ljust(w) if k < 2 else c.rjust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))
-        ]
-        lines.append("  ".join(cells).rstrip())
+    """The same as lines of text, without units: dB, mm, mm, %; for own, peers' and team's views."""
+    scale = {"psnr_db": (1.0, 2), "depth_completeness": (100.0, 1)}
+    heads = ("PSNR, dB", "depth L1, mm", "one layer, mm", "covered, %")
+    width = 8 * len(COMPARED_SETS)
+    lines = [" " * 24 + "".join(head.rjust(width) for head in heads)]
+    lines.append(" " * 24 + "".join(s.rjust(8) for _ in heads for s in ("own", "peers", "team")))
+    everybody = [("all robots", metrics["rendering"])]
+    for name, found in everybody + [(n, r["rendering"]) for n, r in metrics["robots"].items()]:
+        for kind in COMPARED:
+            line = f"{name if kind == COMPARED[0] else '':<12}{kind:<12}"
+            for column in COMPARISON:
+                factor, digits = scale.get(column, (1e3, 1))
+                for view_set in COMPARED_SETS:
+                    value = found[kind][view_set][column]
+                    line += (NONE if value is None else f"{factor * value:.{digits}f}").rjust(8)
+            lines.append(line)
     return "\n".join(lines)

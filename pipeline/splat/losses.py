@@ -43,6 +43,8 @@ class LossConfig(Config):
     """Depth residual in metres where the loss turns from quadratic to linear; the slope beyond is 1."""
     alpha_weight: float = 0.02
     """Weight of missing opacity (1 - alpha) where a surface was measured."""
+    surface_weight: float = 0.0
+    """Weight of one metre between a Gaussian's own depth and the measured one, by its share in the pixel."""
 
 
 @dataclass(frozen=True)

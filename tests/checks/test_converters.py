@@ -12,7 +12,7 @@ from pipeline import checks
 from tests.converters.test_image_folders import CASES
 from tests.converters.test_ros import Ros, scene
 from tests.converters.test_seven_scenes import make_sequence
-from tests.fuzz.readers import kimera, s3e
+from tests.fuzz.seeds import kimera, s3e
 
 
 def ros_bag(version: int, container: str) -> Callable[[Path], Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ import pytest
 
 import converters
 from converters.logs import clocks
+from converters.logs.describe import describe
+from pipeline.checks import check
 from pipeline.errors import DuagError
 from pipeline.geometry import so3
 from pipeline.recording import format_info, info, open_rgbd, read_log
@@ -190,3 +193,77 @@ def test_truth_that_turns_later_is_found(late_s: float) -> None:
     assert still is None
     other = np.abs(rng.standard_normal(len(times)))
     assert clocks.lag(np.round(times * 1e9).astype(np.int64), other, *clocks.angular_speed(stamps, T)) is None
+
+
+def drifting(r: Ros, seconds: int, ppm: float) -> list[tuple[str, int, Any]]:
+    """The scene again every two seconds; the recorder's clock gains on that of the headers, and delays play."""
+    rows = scene(r)
+    images = [row for row in rows if "image" in row[0]]
+    out = [row for row in rows if "info" in row[0] or row[0] == "/tf_static"]
+    rng = np.random.default_rng(5)
+    for k in range(1, seconds // 2):
+        for topic, _, message in images[2 * (k % FRAMES) : 2 * (k % FRAMES) + 2]:
+            later = moved_headers(r, [(topic, 0, copy.deepcopy(message))], 2 * k * 10**9)[0][2]
+            stamp = later.header.stamp.sec * 10**9 + later.header.stamp.nanosec
+            delay = 0.004 + rng.exponential(0.003) + ppm * 1e-6 * (stamp - START_NS) / 1e9
+            out.append((topic, stamp + round(1e9 * delay), later))
+    return sorted(out, key=lambda x: x[1])
+
+
+def test_a_drift_is_told_and_taken_out_if_asked(tmp_path: Path) -> None:
+    r = Ros(2)
+    bag = r.write(tmp_path / "bag", drifting(r, 120, 400.0), "mcap")
+    converters.convert("ros", bag, tmp_path / "kept")
+    (told,) = [w for w in warnings_of(tmp_path / "kept") if "ppm" in w]
+    assert "the recorder's clock gains 4" in told
+    assert "expected one rate, or --set clocks=estimated" in told
+    assert "ppm" in format_info(info(tmp_path / "kept"))
+    (finding,) = [f for f in check(tmp_path / "kept").findings if f.check == "clock"]
+    assert "ppm" in finding.found
+    assert "clocks=estimated" in finding.expected
+    found = describe(bag)
+    assert found["robots"]["alpha"]["drift_ppm"] == pytest.approx(400, abs=15)
+    assert any("ppm" in w for w in found["robots"]["alpha"]["warnings"])
+    converters.convert("ros", bag, tmp_path / "settled", options=["clocks=estimated"])
+    assert not [f for f in check(tmp_path / "settled").findings if f.check == "clock"]
+    kept, settled = (span(tmp_path / name) for name in ("kept", "settled"))
+    assert kept[0] == settled[0]
+    assert settled[1] - kept[1] == pytest.approx(400e-6 * (kept[1] - kept[0]), rel=0.04)
+
+
+def test_clocks_of_one_rate_are_left_alone(tmp_path: Path) -> None:
+    r = Ros(2)
+    bag = r.write(tmp_path / "bag", drifting(r, 120, 0.0), "mcap")
+    converters.convert("ros", bag, tmp_path / "rec", options=["clocks=estimated"])
+    assert not [w for w in warnings_of(tmp_path / "rec") if "ppm" in w]
+
+
+@pytest.mark.parametrize("ppm", [-80.0, 0.0, 30.0])
+def test_drift_by_the_least_delays(ppm: float) -> None:
+    """An hour at 30 Hz, delays of 5 ms with a long tail; a stall of the recorder changes nothing."""
+    rng = np.random.default_rng(2)
+    stamps = START_NS + np.arange(0, 3600 * 10**9, 33_333_333)
+    delays = 0.002 + rng.exponential(0.005, len(stamps)) + ppm * 1e-6 * (stamps - START_NS) / 1e9
+    delays[40_000:46_000] += 0.5
+    found = clocks.drift(stamps, np.rint(delays * 1e9).astype(np.int64))
+    assert found is not None
+    assert 1e6 * found.rate == pytest.approx(ppm, abs=0.1)
+    assert found.matters == (ppm != 0)
+    assert clocks.drift(stamps[:1500], np.zeros(1500, np.int64)) is None
+    assert clocks.drift(stamps[:0], np.zeros(0, np.int64)) is None
+
+
+def test_a_recorder_that_falls_behind_is_no_drift() -> None:
+    stamps = START_NS + np.arange(0, 600 * 10**9, 33_333_333)
+    found = clocks.drift(stamps, (stamps - START_NS) // 100)
+    assert found is not None
+    assert not found.matters
+
+
+def warnings_of(recording: Path) -> list[str]:
+    return list(json.loads((recording / "recording.json").read_text())["warnings"])
+
+
+def span(recording: Path) -> tuple[int, int]:
+    row = json.loads((recording / "recording.json").read_text())["robots"]["alpha"]
+    return row["start_ns"], row["end_ns"]

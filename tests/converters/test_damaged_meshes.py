@@ -15,7 +15,7 @@ import pytest
 from converters.simulate import meshes
 from pipeline.errors import DuagError
 from tests.converters.test_simulate_meshes import QUADS, folder_of, write_glb, write_ply
-from tests.fuzz.readers import png_bomb
+from tests.fuzz.images import png_bomb
 
 ROOT = Path(__file__).parents[2]
 
@@ -45,6 +45,12 @@ def pipe(folder: Path) -> None:
     folder_of(folder, "obj")
     (folder / "table1.png").unlink()
     os.mkfifo(folder / "table1.png")
+
+
+def named_in_latin(folder: Path) -> None:
+    folder_of(folder, "obj")
+    for file in (folder / "table.mtl", folder / "table.obj"):
+        file.write_bytes(file.read_bytes().replace(b"m1", b"\xb1"))
 
 
 def mesh_pipe(folder: Path) -> None:
@@ -86,6 +92,7 @@ def read(folder: Path, cache: Path) -> meshes.MeshScene:
         (bomb, "table.obj: takes more than .* MB of memory|table.obj: .*20000 x 20000 pixels"),
         (large, "table.obj: has a texture of 20000 x 4000 pixels, expected at most"),
         (pipe, "table.obj: waits for something that does not come"),
+        (named_in_latin, "table.obj: its reader finds a name that is no UTF-8"),
         (mesh_pipe, "room.ply: is no regular file"),
         (torn_inside, "room.glb: its reader says"),
         (triangle("1", "3"), "room.ply: the mesh has triangles of vertices 0 to 3, expected 0 to 2"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 import converters
 import schemas
-from converters.logs import open_log
+from converters.logs import open_log, ros_json
 from converters.logs.foxglove import JsonFields, as_ros
 from pipeline.checks import check
 from pipeline.errors import DuagError
@@ -100,8 +101,24 @@ def as_json(message: Any) -> bytes:
     return json.dumps(times(members, message)).encode()
 
 
+def as_rosbridge(value: Any, old: bool) -> Any:
+    """A message of ROS as rosbridge has it. old: times of ROS 1, bytes as a list."""
+    if isinstance(value, np.ndarray) and value.dtype == np.uint8 and not old:
+        return base64.b64encode(value.tobytes()).decode()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, list):
+        return [as_rosbridge(v, old) for v in value]
+    if not hasattr(value, "__msgtype__"):
+        return value
+    members = {k: as_rosbridge(v, old) for k, v in vars(value).items() if k != "__msgtype__"}
+    if old and value.__msgtype__ == "builtin_interfaces/msg/Time":
+        return {"secs": members["sec"], "nsecs": members["nanosec"]}
+    return members
+
+
 def write(path: Path, rows: list[Row], kind: str, ros: Ros, **settings: Any) -> Path:
-    """Write messages of ROS into an MCAP file as "ros1", "cdr", "protobuf" or "json"."""
+    """Write messages of ROS into an MCAP file as "ros1", "cdr", "protobuf", "json" or, of ROS, "rosbridge"."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=1 << 16, **settings)
@@ -111,7 +128,9 @@ def write(path: Path, rows: list[Row], kind: str, ros: Ros, **settings: Any) -> 
             name, encoding, text, data = encoded(message, kind, ros)
             if topic not in channels:
                 channels[topic] = writer.register_channel(
-                    topic, kind, writer.register_schema(name, encoding, text)
+                    topic,
+                    "json" if kind == "rosbridge" else kind,
+                    writer.register_schema(name, encoding, text),
                 )
             writer.add_message(channels[topic], log_ns, data, log_ns - 1_000_000)
         writer.finish()
@@ -131,6 +150,10 @@ def encoded(message: Any, kind: str, ros: Ros) -> tuple[str, str, bytes, bytes]:
                 bytes(ros.store.serialize_ros1(message, name)),
             )
         return name, "ros2msg", text.encode(), bytes(ros.store.serialize_cdr(message, name))
+    if kind == "rosbridge":
+        name = message.__msgtype__.replace("/msg/", "/") if ros.version == 1 else message.__msgtype__
+        text = json.dumps(as_rosbridge(message, ros.version == 1))
+        return name, "jsonschema", b'{"type": "object"}', text.encode()
     proto = foxglove(message)
     name = proto.DESCRIPTOR.full_name
     if kind == "json":
@@ -163,13 +186,16 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         ("protobuf", {"use_chunking": False}),
         ("json", {"compression": CompressionType.LZ4, "index_types": IndexType.NONE}),
         ("json", {}),
+        ("rosbridge", {}),
+        ("rosbridge1", {"index_types": IndexType.NONE}),
     ],
     ids=lambda v: v if isinstance(v, str) else "-".join(f"{k}={getattr(x, 'name', x)}" for k, x in v.items()),
 )
 def test_every_encoding_gives_the_same_recording(
     tmp_path: Path, expected: dict[str, str], kind: str, settings: dict[str, Any]
 ) -> None:
-    r = Ros(1 if kind == "ros1" else 2)
+    r = Ros(1 if kind.endswith("1") else 2)
+    kind = "rosbridge" if kind == "rosbridge1" else kind
     log = write(tmp_path / "log.mcap", scene(r), kind, r, **settings)
     converters.convert("ros", log, tmp_path / "rec", options=["truth=/odom"])
     assert digests(tmp_path / "rec") == expected
@@ -443,3 +469,71 @@ def test_real_images_in_a_log_are_those_of_the_dataset(tmp_path: Path) -> None:
             both = (ours > 0) & (theirs > 0)
             assert both.mean() > 0.7
             assert np.percentile(np.abs(ours - theirs)[both] / theirs[both], 95) < 0.002
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda m: m.pop("step"), "has no step"),
+        (lambda m: m.update(height="12"), "height is '12', expected a number"),
+        (lambda m: m.update(encoding=5), "encoding is 5, expected text"),
+        (lambda m: m.update(data="###"), "no sensor_msgs/msg/Image in json"),
+        (lambda m: m.update(data=[1, 2, 300]), "data holds a number that is no uint8"),
+        (lambda m: m.update(header=[]), "is list, expected an object"),
+        (lambda m: m.update(data={"a": 1}), "data is dict, expected a list"),
+    ],
+)
+def test_broken_json_of_ros_is_one_line(change: Callable[[dict[str, Any]], Any], words: str) -> None:
+    r = Ros(2)
+    members = as_rosbridge(next(m for t, _, m in scene(r) if t.endswith("color/image_raw")), False)
+    change(members)
+    with pytest.raises(DuagError, match=re.escape(words)) as caught:
+        ros_json.read("sensor_msgs/msg/Image", json.dumps(members).encode(), "log.mcap: /image")
+    assert str(caught.value).startswith("log.mcap: /image")
+    assert "\n" not in str(caught.value)
+
+
+def test_webp_comes_out_as_png(tmp_path: Path) -> None:
+    """Colour as WebP without loss gives the pixels; one that is cut short is left out and told."""
+    r, rows, pixels = Ros(2), [], []
+    for topic, ns, m in scene(r):
+        if topic.endswith("color/image_raw"):
+            image = (
+                np.asarray(m.data).reshape(m.height, m.step)[:, : 3 * m.width].reshape(m.height, m.width, 3)
+            )
+            pixels.append(image)
+            webp = cv2.imencode(".webp", image[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()
+            webp = webp[:-40] if len(pixels) == 2 else webp
+            stamp = m.header.stamp.sec * 10**9 + m.header.stamp.nanosec
+            rows.append((f"{topic}/compressed", ns, r.compressed(stamp, m.header.frame_id, webp, "webp")))
+        else:
+            rows.append((topic, ns, m))
+    log = write(tmp_path / "log.mcap", rows, "cdr", r)
+    converters.convert("ros", log, tmp_path / "rec", options=["undistort=false"])
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as found:
+        kept = [p for k, p in enumerate(pixels) if k != 1]
+        assert len(found) == len(kept)
+        assert all(np.array_equal(f.color, p) for f, p in zip(found.frames(), kept, strict=True))
+    warnings = json.loads((tmp_path / "rec" / "recording.json").read_text())["warnings"]
+    assert any("1 frames have colour or depth that is cut short" in text for text in warnings)
+
+
+@pytest.mark.parametrize("others", [True, False])
+def test_video_is_refused_by_its_name(tmp_path: Path, others: bool) -> None:
+    r = Ros(2)
+    path = tmp_path / "log.mcap"
+    rows = [row for row in scene(r) if others and not row[0].endswith("color/image_raw")]
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("foxglove.CompressedVideo", "protobuf", b"")
+        writer.add_message(writer.register_channel("/cam/video", "protobuf", schema), 1, b"x", 1)
+        for topic, log_ns, message in rows:
+            name, encoding, text, data = encoded(message, "cdr", r)
+            number = writer.register_channel(topic, "cdr", writer.register_schema(name, encoding, text))
+            writer.add_message(number, log_ns, data, log_ns)
+        writer.finish()
+    with pytest.raises(
+        DuagError, match=r"/cam/video \(foxglove.CompressedVideo\) is video, which is not read"
+    ):
+        converters.convert("ros", path, tmp_path / "rec")

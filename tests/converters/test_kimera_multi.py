@@ -242,6 +242,7 @@ def test_robots_and_ground_truth_can_be_chosen(dataset: Path, tmp_path: Path) ->
             ":2: 1,0,0,0,1,0,0, expected integer nanoseconds",
         ),
         ("#timestamp_kf,x,y,z,qw,qx,qy,qz\n1.5,0,0,0,1,0,0,0\n", ":2: "),
+        (f"#timestamp_kf,x,y,z,qw,qx,qy,qz\n{10**30},0,0,0,1,0,0,0\n", ":2: "),
         ("#timestamp_kf,x,y,z,qw,qx,qy,qz\n1,0,0,0,3,0,0,0\n", ":2: "),
     ],
 )

@@ -392,6 +392,10 @@ def test_files_of_positions(tmp_path: Path) -> None:
     assert fixes is not None
     assert fixes.stamps_ns == [1661000000_500000000, 1661000001_500000001]
     np.testing.assert_array_equal(fixes.positions[0], [744073.32, -0.041, -0.296])
+    for broken in ("1e99 2 3 4 5 6 7 8\n", "1 1e999 3 4 5 6 7 8\n"):
+        file.write_text(broken)
+        with pytest.raises(DuagError, match=r"alpha_gt.txt:1: .* expected (a time in seconds|metres)"):
+            read_fixes(file)
     for broken in ("1 2 3\n", "1661000000.5 a b c 0 0 0 1\n", "1 2 3 4 5 6 7 8 9\n"):
         file.write_text(broken)
         with pytest.raises(DuagError, match=r"alpha_gt.txt:1: .* expected eight numbers"):

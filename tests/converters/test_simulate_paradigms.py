@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -212,3 +213,18 @@ def test_arguments_out_of_range_are_refused(tmp_path, bad):
     with pytest.raises(DuagError, match="expected"):
         simulate(tmp_path / "rec", **bad)
     assert not (tmp_path / "rec").exists()
+
+
+def test_where_a_figure_fits_nowhere_is_said(room, monkeypatch):
+    """Of the free floor a patch of half a metre is left."""
+    space = room.free_space()
+    patch = np.zeros_like(space.inside)
+    row, column = np.argwhere(space.inside)[space.inside.sum() // 2]
+    side = int(0.5 / space.cell_m)
+    patch[row : row + side, column : column + side] = True
+    small = replace(space, inside=space.inside & patch)
+    monkeypatch.setattr(room, "free_space", lambda: small)
+    with pytest.raises(
+        DuagError, match=r"no room for crossing paths of 3 robots, .* m\^2 of free floor, expect"
+    ):
+        planned(room, "crossing", 0.6, 3)

@@ -13,6 +13,7 @@ from converters.simulate import simulate
 from pipeline.errors import DuagError
 from pipeline.evaluation import frontend_bench as bench
 from pipeline.frontend.config import FrontendConfig
+from pipeline.report import figures
 
 MAPPING = {"mapping.final_iterations": 2, "mapping.support_views": 2}
 
@@ -81,6 +82,18 @@ def test_tables_hold_every_row(result: dict) -> None:
     agreement = text.split("Agreement of held-out views")[1].split("Mapping")[0]
     assert agreement.count("| bravo |") == 2 + len(bench.ABLATION)  # Open3D has no held-out views
     assert "None" not in text
+
+
+def test_the_curve_over_the_caps_is_drawn_from_the_rows(result: dict) -> None:
+    robots = bench.by_cap(result | {"rows": result["rows"][::-1]})
+    assert [row["cap"] for row in robots["bravo"]] == [400, 3000]
+    assert robots["bravo"][1]["psnr_db"] == result["rows"][1]["refined"]["psnr_db"]
+    drawn = figures.map_sizes(robots)
+    assert drawn == figures.map_sizes(robots)
+    for words in ("3k", "PSNR", "one layer", "peak memory"):
+        assert words in drawn
+    robots["bravo"][0]["depth_l1_m"] = None
+    assert len(figures.map_sizes(robots)) < len(drawn)
 
 
 def test_two_held_out_views_are_too_few_to_agree(result: dict) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.frontend.config import FrontendConfig
 from pipeline.frontend.tracking import Status, TrackedFrame, Tracker
 from pipeline.geometry import se3
 
@@ -154,14 +155,20 @@ class Undisturbed:
             self.frames.append(frame)
             self.poses.append(pose)
 
+    def tracker(self, start: int) -> Tracker:
+        """A tracker as it was before frame `start`."""
+        return _copied(self._before[start])
+
     def disturbed(
         self,
         start: int,
         disturbance: Callable[[Sequence[Shot], np.random.Generator], Iterator[Shot]],
         frames: int = 45,
+        config: FrontendConfig | None = None,
     ) -> list[Row]:
-        """Track on from frame `start` with a disturbance that begins there."""
-        tracker = _copied(self._before[start])
+        """Track on from frame `start` with a disturbance that begins there, maybe with another configuration."""
+        tracker = self.tracker(start)
+        tracker.config = config or tracker.config
         rows = []
         for shot in disturbance(self.shots[start : start + frames], np.random.default_rng(start)):
             frame, pose = track(tracker, shot)

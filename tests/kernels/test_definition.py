@@ -460,6 +460,30 @@ def test_view_gradients_with_certain_depth_are_those_without(plain):
     np.testing.assert_allclose(of_less.means, of_color.means, atol=1e-4 * np.abs(of_color.means).max())
 
 
+@pytest.mark.parametrize("pose_only", [False, True])
+@pytest.mark.parametrize("depth", DEPTH_KINDS)
+def test_view_gradients_of_the_depth_of_single_gaussians_are_those_of_the_reference(plain, depth, pose_only):
+    color, depth_m = measured_images(plain)
+    certainty = np.random.default_rng(5).uniform(0, 1, depth_m.shape).astype(np.float32)
+    arguments = plain.gaussians, plain.camera, plain.T_camera_map, color, depth_m
+    options = {"depth": depth, "pose": True, "depth_certainty": certainty, "mask": checkerboard(plain)}
+    options |= {"parameters": not pose_only}
+    both = dataclasses.replace(LOSS, surface_weight=0.8)
+    loss, gradients = Rasterizer().view_gradients(*arguments, both, **options)
+    wanted, of_reference = ReferenceRasterizer().view_gradients(*arguments, both, **options)
+    assert loss.surface == pytest.approx(wanted.surface, rel=1e-5)
+    assert loss.value == pytest.approx(wanted.value, rel=1e-5)
+    if pose_only:
+        assert gradients.means is None
+        np.testing.assert_allclose(gradients.pose, of_reference.pose, rtol=1e-4, atol=1e-6)
+    else:
+        assert_same_gradients(gradients, of_reference, 1e-4)
+    without, of_less = Rasterizer().view_gradients(*arguments, LOSS, **options)
+    assert without.surface == 0
+    assert loss.value == pytest.approx(without.value + 0.8 * loss.surface, rel=1e-5)
+    assert np.abs(gradients.pose - of_less.pose).max() > 0.01 * np.abs(of_less.pose).max()
+
+
 def test_view_gradients_draw_a_view_that_can_be_asked_further(rasterizer, plain):
     color, depth_m = measured_images(plain)
     arguments = (plain.gaussians, plain.camera, plain.T_camera_map)

@@ -13,6 +13,7 @@ from tests.kernels.scenes import make_scene, random_gaussians
 
 CAMERA = PinholeCamera(203, 117, 90.0, 92.0, 101.2, 57.1)
 LOSS = LossWeights(color_huber=0.1, depth_weight=0.5, depth_huber_m=0.02, alpha_weight=0.02)
+SURFACE = LossWeights(**{**vars(LOSS), "surface_weight": 0.3})
 CALLS = [(isa, threads) for isa in available_isas() for threads in (1, 2, 3, 5)]
 QUICK = [call for call in CALLS if call[0] != "portable" or call[1] in (1, 3)]  # it imitates fma, at length
 
@@ -38,12 +39,16 @@ def digest(rasterizer: Rasterizer) -> str:
         loss, gradients = rasterizer.view_gradients(
             *view, color, depth_m, LOSS, exposure=(0.1, -0.05), mask=mask, depth=depth, pose=True
         )
+        _, of_surface = rasterizer.view_gradients(
+            *view, color, depth_m, SURFACE, mask=mask, depth=depth, depth_certainty=color[..., 0].copy()
+        )
+        arrays += [a for a in vars(of_surface).values() if a is not None]
         statistics = rasterizer.statistics()
         arrays += [a for a in vars(gradients).values() if a is not None]
         arrays += [np.array([loss.value, loss.color, loss.depth, *loss.d_exposure])]
         arrays += [np.array([statistics.visible, statistics.intersections])]
         arrays += [np.array([statistics.evaluated_pairs, statistics.blended_pairs])]
-    assert len(arrays) == 2 * 31
+    assert len(arrays) == 2 * 36
     return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
 
 

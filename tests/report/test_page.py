@@ -1,3 +1,4 @@
+import json
 import re
 
 import numpy as np
@@ -55,6 +56,22 @@ def test_the_page_shows_numbers_with_units_pictures_and_reasons(html):
     assert html.count("data:image/svg+xml") == 7
     assert "None" not in text
     assert "nan" not in text.lower().split()
+
+
+def test_maps_stand_beside_each_other_for_all_and_for_each_robot(fake, html):
+    metrics = json.loads((fake.run / "metrics.json").read_text())
+    rows = words.comparison_rows(metrics)
+    assert [r["robot"] for r in rows if r["first"]] == ["all robots", "alpha", "bravo"]
+    assert len(rows) == 3 * 4
+    assert all(len(r["values"]) == 3 * 4 for r in rows)
+    assert "Which map is better?" in html
+    lines = words.comparison_text(metrics).splitlines()
+    bravo = metrics["robots"]["bravo"]["rendering"]["own"]
+    own = next(line for line in lines if line.startswith("bravo")).split()
+    assert own[:2] == ["bravo", "own"]
+    assert own[2:5] == [f"{bravo[s]['psnr_db']:.2f}" for s in ("held_out", "peers", "team")]
+    assert own[5] == f"{1e3 * bravo['held_out']['depth_l1_common_m']:.1f}"
+    assert own[-1] == f"{100 * bravo['team']['depth_completeness']:.1f}"
 
 
 def test_a_run_without_truth_and_without_agreement_has_a_page(tmp_path):

@@ -2,7 +2,8 @@
 // derivatives are taken, and no image is written or read back.
 //
 // Per pixel, with h the Huber function of slope 1 in its tail: h(e^a colour + b - measured colour), and where a depth z was
-// measured h(depth - alpha z) and 1 - alpha; each term a mean over its pixels (splat.losses.rgbd_loss).
+// measured h(depth - alpha z), 1 - alpha, and the sum over Gaussians of weight h(z_i - z) with z_i the depth of each; every term a
+// mean over its pixels (splat.losses.rgbd_loss, but for the last). Residuals of depth are multiplied by the pixel's certainty.
 #pragma once
 
 #include "parameters.h"
@@ -38,14 +39,14 @@ struct LossScales {
 
 // The measured images in one block.
 struct Measured {
-    alignas(64) float planes[4][LANES];  // red, green, blue, depth
+    alignas(64) float planes[5][LANES];  // red, green, blue, depth, certainty
 };
 
 // Sums of the loss's terms over a tile, in lanes.
 struct LossLanes {
-    Vec color{0.0f}, depth{0.0f}, missing{0.0f}, by_gain{0.0f}, by_offset{0.0f};
+    Vec color{0.0f}, depth{0.0f}, missing{0.0f}, by_gain{0.0f}, by_offset{0.0f}, surface{0.0f};
     void store_sums(double* out) const {
-        const Vec* all[LOSS_SUMS] = {&color, &depth, &missing, &by_gain, &by_offset};
+        const Vec* all[LOSS_SUMS] = {&color, &depth, &missing, &by_gain, &by_offset, &surface};
         for (int k = 0; k < LOSS_SUMS; k++) {
             alignas(64) float lanes[LANES];
             store(lanes, *all[k]);
@@ -70,8 +71,9 @@ inline Cotangents loss_of_block(const OpenBlock& image, const Vec* rgb, const Me
     }
     const Vec z = load(measured.planes[3]), alpha = one - image.T;
     const Mask has_depth = wanted & (zero < z);
-    const Huber h(fnma(alpha, z, image.D), loss.depth_huber_m);
-    const Vec by_depth = select_or_zero(has_depth, h.slope * Vec(loss.depth_weight * scales.per_depth));
+    const Vec certainty = load(measured.planes[4]);
+    const Huber h(fnma(alpha, z, image.D) * certainty, loss.depth_huber_m);
+    const Vec by_depth = select_or_zero(has_depth, h.slope * Vec(loss.depth_weight * scales.per_depth) * certainty);
     sums.depth += select_or_zero(has_depth, h.value);
     sums.missing += select_or_zero(has_depth, image.T);
     store(v.planes[3], by_depth);
@@ -79,12 +81,29 @@ inline Cotangents loss_of_block(const OpenBlock& image, const Vec* rgb, const Me
     return v;
 }
 
+// Huber loss of each Gaussian's own depth, by its weight.
+struct TermOfDepth {
+    static constexpr bool ACTIVE = true;
+    Vec z, certainty, scale, sum{0.0f};  // scale: 0 where no depth was measured; sum: of the loss, before its weight
+    float huber_m;
+    TermOfDepth(const Measured& measured, Mask wanted, const Loss& loss, const LossScales& scales)
+        : z(load(measured.planes[3])), certainty(load(measured.planes[4])),
+          scale(select_or_zero(wanted & (Vec(0.0f) < z), Vec(loss.surface_weight * scales.per_depth))), huber_m(loss.depth_huber_m) {}
+    // Value of the term per weight, and its slope by the depth.
+    ALWAYS_INLINE Vec add(Vec depth, Vec weight, Vec& slope) {
+        const Huber h((depth - z) * certainty, huber_m);
+        slope = scale * certainty * h.slope;
+        sum = fma(weight, h.value, sum);
+        return scale * h.value;
+    }
+};
+
 template <Derivatives D, DepthKind KIND>
 inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScales& scales) {
     Sweep sweep = Sweep::begin<ROW_OF<D, KIND>>(frame, index);
     const View& view = frame.view;
     Measured measured[BLOCKS];
-    bool bad[2] = {};
+    bool bad[3] = {};
     for (int b = 0; b < BLOCKS; b++) {
         const Block block(sweep.tile, b, view);
         if (block.outside(view)) continue;
@@ -95,6 +114,9 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
         bad[1] |= !finite_not_negative(z);
         for (int k = 0; k < 3; k++) store(measured[b].planes[k], rgb[k]);
         store(measured[b].planes[3], z);
+        const Vec certainty = loss.certainty ? read_block(loss.certainty, block, view) : Vec(1.0f);
+        bad[2] |= !finite_not_negative(certainty);
+        store(measured[b].planes[4], certainty);
     }
     const Vec background[3] = {Vec(view.background[0]), Vec(view.background[1]), Vec(view.background[2])};
     const size_t kept = (frame.longest_list + 1) * LANES;  // one more is written before it is known that it was not blended
@@ -112,12 +134,21 @@ inline Status fit_tile(Frame& frame, int index, const Loss& loss, const LossScal
         const Vec rgb[3] = {fma(image.T, background[0], image.R), fma(image.T, background[1], image.G),
                             fma(image.T, background[2], image.B)};
         const Cotangents v = loss_of_block(image, rgb, measured[b], wanted, loss, scales, sums);
-        if (next.counts[b]) gradient_block<D, KIND>(sweep, block, next.counts[b], v, Recall{memory});
+        if (next.counts[b]) {
+            if (loss.surface_weight > 0.0f) {
+                TermOfDepth term(measured[b], wanted, loss, scales);
+                gradient_block<D, KIND>(sweep, block, next.counts[b], v, Recall{memory}, term);
+                sums.surface += select_or_zero(Vec(0.0f) < term.scale, term.sum);
+            } else {
+                NoTermOfDepth none;
+                gradient_block<D, KIND>(sweep, block, next.counts[b], v, Recall{memory}, none);
+            }
+        }
         sweep.items = next;
     }
     frame.evaluated.data()[index] = evaluated;
     sums.store_sums(frame.loss_parts.data() + static_cast<size_t>(index) * LOSS_SUMS);
-    return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : Status::ok;
+    return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;
 }
 
 }  // namespace KERNEL_ISA

@@ -197,12 +197,13 @@ struct FisherArrays {
 // The loss of a view against the measured colour [h, w, 3] and depth [h, w], metres, 0 where there is none.
 struct Loss {
     const float *color, *depth_m;
-    float color_huber, depth_weight, depth_huber_m, alpha_weight;
+    const float* certainty;  // factor of the residuals of depth, per pixel; null: 1
+    float color_huber, depth_weight, depth_huber_m, alpha_weight, surface_weight;
     float gain, offset;  // of the exposure: the image is about gain * rendered + offset
 };
-constexpr int LOSS_SUMS = 5;  // color, depth, missing alpha, derivatives by ln gain and by offset
+constexpr int LOSS_SUMS = 6;  // color, depth, missing alpha, derivatives by ln gain and by offset, surface
 struct LossValues {
-    double color, depth, missing_alpha, by_log_gain, by_offset;  // means over their pixels
+    double color, depth, missing_alpha, by_log_gain, by_offset, surface;  // means over their pixels
 };
 
 // One step of Adam: all parameters of one kind, [count, width] each.

@@ -147,7 +147,7 @@ static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& los
     for (int tile = 0; tile < tiles; tile++)
         for (int k = 0; k < LOSS_SUMS; k++) total[k] += parts[static_cast<size_t>(tile) * LOSS_SUMS + k];
     values = {total[0] * scales.per_color, total[1] * scales.per_depth, total[2] * scales.per_depth,
-              total[3] * scales.per_color * loss.gain, total[4] * scales.per_color};
+              total[3] * scales.per_color * loss.gain, total[4] * scales.per_color, total[5] * scales.per_depth};
     return Status::ok;
 }
 static Status fit(Frame& frame, const GaussianArrays& gaussians, const Loss& loss, LossValues& values, const GradientArrays& out) {

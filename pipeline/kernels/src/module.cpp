@@ -19,6 +19,7 @@
 #include "frame.h"
 
 namespace nb = nanobind;
+using namespace nb::literals;
 
 namespace raster {
 
@@ -183,23 +184,23 @@ public:
         return static_cast<int>(kernels_->forward(frame_, gaussians, color.data(), depth.data(), alpha.data()));
     }
 
-    // Forward, loss and backward; weights: of the loss, then gain and offset. values: as LossValues.
+    // Forward, loss and backward; weights: of the loss, then gain, offset, and the weight of surface. values: as LossValues.
     int fit(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors, const Inputs& logits,
             const Inputs& pose, const Inputs& intrinsics, const Inputs& background, const Bytes& mask, bool ray_plane, int width,
             int height, int threads, const Inputs& color, const Inputs& depth_m, const Inputs& weights, const Array<double>& values, const Floats& g_means,
             const Floats& g_quats, const Floats& g_log_scales, const Floats& g_colors, const Floats& g_logits,
-            const Array<double>& g_pose) {
+            const Array<double>& g_pose, const Inputs& certainty) {
         const Use use(busy_);
         look(pose, intrinsics, background, mask, ray_plane, width, height, threads);
         const float* w = weights.data();
-        const Loss loss = {color.data(), depth_m.data(), w[0], w[1], w[2], w[3], w[4], w[5]};
+        const Loss loss = {color.data(), depth_m.data(), certainty.is_valid() ? data_or_null(certainty) : nullptr, w[0], w[1], w[2], w[3], w[6], w[4], w[5]};
         const GradientArrays out = {data_or_null(g_means),  data_or_null(g_quats), data_or_null(g_log_scales), data_or_null(g_colors),
                                     data_or_null(g_logits), nullptr,               data_or_null(g_pose)};
         const GaussianArrays gaussians = arrays_of(means, quats, log_scales, colors, logits);
         const nb::gil_scoped_release unlocked;
         LossValues found = {};
         const Status status = kernels_->fit(frame_, gaussians, loss, found, out);
-        const double all[LOSS_SUMS] = {found.color, found.depth, found.missing_alpha, found.by_log_gain, found.by_offset};
+        const double all[LOSS_SUMS] = {found.color, found.depth, found.missing_alpha, found.by_log_gain, found.by_offset, found.surface};
         std::copy(all, all + LOSS_SUMS, values.data());
         return static_cast<int>(status);
     }
@@ -310,7 +311,9 @@ NB_MODULE(_raster, m) {
         .def_prop_ro("pairs", &Raster::pairs)
         .def_prop_ro("scratch_bytes", &Raster::scratch_bytes)
         .def("forward", &Raster::forward)
-        .def("fit", &Raster::fit)
+        .def("fit", &Raster::fit, "means"_a, "quats"_a, "log_scales"_a, "colors"_a, "logits"_a, "pose"_a, "intrinsics"_a, "background"_a,
+             "mask"_a, "ray_plane"_a, "width"_a, "height"_a, "threads"_a, "color"_a, "depth_m"_a, "weights"_a, "values"_a, "g_means"_a,
+             "g_quats"_a, "g_log_scales"_a, "g_colors"_a, "g_logits"_a, "g_pose"_a, "certainty"_a.none() = nb::none())
         .def("backward", &Raster::backward)
         .def("fisher", &Raster::fisher)
         .def("full_fisher", &Raster::full_fisher)

@@ -93,9 +93,14 @@ inline void sum_squares(const Lanes& w_of, const Lanes& f_of, const Cotangents& 
     set_parts(sums + INFO_R, half, totals);
 }
 
-// Adds to the rows of a block's items.
-template <Derivatives D, DepthKind KIND, class Pass>
-NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uint32_t count, const Cotangents& v, Pass pass) {
+// A term of the loss that is a function of each Gaussian's own depth at a pixel, times its weight: none.
+struct NoTermOfDepth {
+    static constexpr bool ACTIVE = false;
+};
+
+// Adds to the rows of a block's items. term: see NoTermOfDepth and TermOfDepth.
+template <Derivatives D, DepthKind KIND, class Pass, class Term>
+NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uint32_t count, const Cotangents& v, Pass pass, Term& term) {
     constexpr int ROW = ROW_OF<D, KIND>;
     const Vec r = load(v.planes[0]), g = load(v.planes[1]), b = load(v.planes[2]), z = load(v.planes[3]), a = load(v.planes[4]);
     const Vec pixel_x = block.pixels_x(), pixel_y = block.pixels_y();
@@ -107,12 +112,17 @@ NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uin
     }
     Vec behind = fma(Vec(background[0]), r, fma(Vec(background[1]), g, Vec(background[2]) * b));
     over_batches(sweep, count, [&](const Batch& batch) ALWAYS_INLINE {
-        Lanes f, w;
+        Lanes f, w, d;  // d: cotangent of the Gaussian's depth, where there is a term of it
         Vec sums[ROW];
         unused_sums<D == Derivatives::POSE ? SUM_R : SUMS_OF<D, KIND>, ROW>(sums);
         pass.walk(batch, [&](int k, const Splat& s, Vec alpha, Vec weight) ALWAYS_INLINE {
             const Vec depth = depth_at<KIND>(s, pixel_x, pixel_y);
-            const Vec own = fma(Vec(s.r), r, fma(Vec(s.g), g, fma(Vec(s.b), b, fma(depth, z, a))));
+            Vec own = fma(Vec(s.r), r, fma(Vec(s.g), g, fma(Vec(s.b), b, fma(depth, z, a))));
+            if constexpr (Term::ACTIVE) {
+                Vec slope;
+                own += term.add(depth, weight, slope);
+                d[k] = weight * (z + slope);
+            }
             const Vec gain = gain_over(behind, own, alpha);
             w[k] = if_unclamped(alpha, weight * gain);
             f[k] = weight;
@@ -121,16 +131,24 @@ NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uin
         transpose16(w);
         for (int half = 0; half < PARTS; half++) sum_moments(w, shape, block, half, sums);
         transpose16(f);
+        if constexpr (Term::ACTIVE) transpose16(d);
         for (int half = 0; half < PARTS; half++) {
             constexpr int FIRST = D == Derivatives::POSE ? SUM_Z : SUM_R;  // the pose does not move colours
             Wide totals[SUM_Z + 1 - FIRST];
             sum_products([&](int p) ALWAYS_INLINE { return part(f[p], half); }, v.planes + (FIRST - SUM_R), totals);
             set_parts(sums + FIRST, half, totals);
-            if constexpr (KIND == DepthKind::ray_plane) {
+            if constexpr (KIND == DepthKind::ray_plane || Term::ACTIVE) {
+                const auto depth_of = [&](int p) ALWAYS_INLINE {
+                    if constexpr (Term::ACTIVE) return part(d[p], half);
+                    else return part(f[p], half) * Wide(v.planes[3][p]);
+                };
                 Wide of_depth[monomials(1)];
-                sum_monomials<1>([&](int p) ALWAYS_INLINE { return part(f[p], half) * Wide(v.planes[3][p]); }, shape, block, half, of_depth);
-                set_part(sums[SUM_ZX], half, of_depth[1]);
-                set_part(sums[SUM_ZY], half, of_depth[2]);
+                sum_monomials<1>(depth_of, shape, block, half, of_depth);
+                if constexpr (Term::ACTIVE) set_part(sums[SUM_Z], half, of_depth[0]);
+                if constexpr (KIND == DepthKind::ray_plane) {
+                    set_part(sums[SUM_ZX], half, of_depth[1]);
+                    set_part(sums[SUM_ZY], half, of_depth[2]);
+                }
             }
             if constexpr (D == Derivatives::ALL_AND_SQUARES)
                 sum_squares<KIND>(w, f, v, squared, shape, block, half, sums + GRADIENT_SUMS<KIND>);
@@ -163,7 +181,8 @@ inline Status gradient_tile(Frame& frame, int index, const float* d_color, const
         const uint32_t count = sweep.items.counts[b];
         if (!count) continue;
         const Block block(sweep.tile, b, view);
-        gradient_block<D, KIND>(sweep, block, count, cotangents[b], Replay(block, sweep.items.T + b * LANES));
+        NoTermOfDepth none;
+        gradient_block<D, KIND>(sweep, block, count, cotangents[b], Replay(block, sweep.items.T + b * LANES), none);
         sweep.items.skip(count);
     }
     return bad[0] ? Status::bad_first_image : bad[1] ? Status::bad_second_image : bad[2] ? Status::bad_third_image : Status::ok;

@@ -1,0 +1,151 @@
+"""Views as the mapper keeps them: a keyframe's images in two sizes, and what two views see of each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.splat.losses import depth_certainty, halve
+from pipeline.splat.optimiser import BETA_1, BETA_2
+
+Image = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+
+
+@dataclass
+class View:
+    """A keyframe as the mapper keeps it: colours as bytes, depth in metres, 0 also where a mask forbids the pixel.
+
+    mask, half_mask: pixels that may be used; None = all. certainty, half_certainty: factors of the depth residuals
+    (`splat.losses.depth_certainty`); None = all 1. depth_sigma_m: standard deviation of the depth; None = not told.
+    """
+
+    index: int
+    color: Bytes
+    depth_m: Image
+    half_color: Image
+    half_depth_m: Image
+    T_map_camera: NDArray[np.float64]
+    median_depth_m: float
+    mask: NDArray[np.bool_] | None = None
+    half_mask: NDArray[np.bool_] | None = None
+    depth_sigma_m: Image | None = None
+    certainty: Image | None = None
+    half_certainty: Image | None = None
+    exposure: tuple[float, float] = (0.0, 0.0)
+    exposure_moments: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 2)))
+    exposure_steps: int = 0
+
+    @classmethod
+    def of(
+        cls,
+        index: int,
+        color: Bytes,
+        depth_m: Image,
+        T_map_camera: NDArray[np.float64],
+        mask: NDArray[np.bool_] | None,
+        depth_sigma_m: Image | None,
+        huber_m: float,
+    ) -> View:
+        """A view of images that are kept, not copied, but for depth where a mask forbids pixels.
+
+        huber_m: depth sigmas up to it change nothing.
+        """
+        if color.dtype != np.uint8:
+            raise ValueError(f"color is an array of {color.dtype}, expected uint8")
+        depth_m = np.asarray(depth_m, dtype=np.float32)
+        if mask is not None:
+            depth_m = np.where(mask, depth_m, np.float32(0))
+        near = depth_m[::8, ::8]
+        certainty = None if depth_sigma_m is None else depth_certainty(depth_sigma_m, huber_m)
+        return cls(
+            index=index,
+            color=color,
+            depth_m=depth_m,
+            half_color=halve(_from_bytes(color)),
+            half_depth_m=_halve_depth(depth_m),
+            T_map_camera=np.array(T_map_camera, dtype=np.float64),
+            median_depth_m=float(np.median(near[near > 0])) if near.any() else 0.0,
+            mask=mask,
+            half_mask=None if mask is None else _halve_mask(mask),
+            depth_sigma_m=depth_sigma_m,
+            certainty=certainty,
+            half_certainty=None if certainty is None else halve(certainty),
+        )
+
+    @property
+    def centre_map(self) -> NDArray[np.float64]:
+        """The point [3] that the camera looks at: on its axis, at the median depth."""
+        return self.T_map_camera[:3, 3] + self.median_depth_m * self.T_map_camera[:3, 2]
+
+    def images(self, level: int) -> tuple[Image, Image]:
+        if level == 0:
+            return _from_bytes(self.color), self.depth_m
+        return self.half_color, self.half_depth_m
+
+    def usable(self, level: int) -> NDArray[np.bool_] | None:
+        """The mask of a level; None = all pixels."""
+        return self.mask if level == 0 else self.half_mask
+
+    def step_exposure(self, gradient: tuple[float, float], rate: float) -> None:
+        """One Adam step of (a, b)."""
+        self.exposure_steps += 1
+        g = np.array(gradient)
+        first, second = self.exposure_moments
+        first, second = BETA_1 * first + (1 - BETA_1) * g, BETA_2 * second + (1 - BETA_2) * g * g
+        self.exposure_moments = np.stack([first, second])
+        unbiased = np.sqrt(second / (1 - BETA_2**self.exposure_steps)) + 1e-12
+        a, b = np.array(self.exposure) - rate * first / (1 - BETA_1**self.exposure_steps) / unbiased
+        self.exposure = (float(a), float(b))
+
+
+def overlap(
+    depth_m: Image,
+    T_map_camera: NDArray[np.float64],
+    other_depth_m: Image,
+    T_map_other: NDArray[np.float64],
+    camera: PinholeCamera,
+    stride_px: int = 16,
+) -> float:
+    """Share of one view's measured pixels (every `stride_px`-th) that another view measured too.
+
+    A pixel counts if its point projects into the other image and lies within 10 % of the depth measured there.
+    """
+    first = stride_px // 2
+    z = depth_m[first::stride_px, first::stride_px].astype(np.float64)
+    row, column = np.nonzero(z > 0)
+    if len(row) == 0:
+        return 0.0
+    z = z[row, column]
+    u, v = first + stride_px * column, first + stride_px * row
+    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
+    seen = se3.transform(se3.inverse(T_map_other) @ T_map_camera, points)
+    seen = seen[seen[:, 2] > 0.05]
+    uv = np.rint(camera.project(seen)).astype(np.int64)
+    inside = (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
+    there = other_depth_m[uv[inside, 1], uv[inside, 0]]
+    agree = np.abs(there - seen[inside, 2]) < 0.1 * seen[inside, 2]
+    return float(np.count_nonzero(agree)) / len(points)
+
+
+def _from_bytes(color: Bytes) -> Image:
+    """Colours 0..1."""
+    return color * np.float32(1 / 255)
+
+
+def _halve_depth(depth_m: Image) -> Image:
+    """Means of 2x2 blocks of measured depths on one surface (within 2 %); 0 where a pixel is missing or differs."""
+    h, w = depth_m.shape[0] // 2 * 2, depth_m.shape[1] // 2 * 2
+    quarters = np.stack([depth_m[i:h:2, j:w:2] for i in (0, 1) for j in (0, 1)])
+    nearest, farthest = quarters.min(axis=0), quarters.max(axis=0)
+    return np.where((nearest > 0) & (farthest <= 1.02 * nearest), halve(depth_m), np.float32(0))
+
+
+def _halve_mask(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Blocks of 2x2 pixels that may all be used; a last odd row or column is cut."""
+    h, w = mask.shape[0] // 2 * 2, mask.shape[1] // 2 * 2
+    return mask[0:h:2, :w:2] & mask[0:h:2, 1:w:2] & mask[1:h:2, :w:2] & mask[1:h:2, 1:w:2]
