@@ -78,6 +78,7 @@ ROBOT_NAMES = (
 )
 NANOSECONDS = 1_000_000_000
 MAX_SIDE_PX, MAX_FOCAL_PX = 16_384, 1e6
+FAR_M = 1e9  # from the origin of a world; geocentric coordinates are 6e6
 SIGMA_SCALE_M = 1e-4  # of the images of standard deviations
 UNITS = {"time": "ns", "length": "m", "depth": "depth_scale_m per unit, along z, 0 = none", "angle": "rad"}
 
@@ -195,6 +196,12 @@ class RobotWriter:
         if mask is not None:
             self._log.write(topics.MASK.of(name), messages.pack_mask(stamp_ns, name, mask), stamp_ns)
         if T_world_camera is not None:
+            far_m = float(np.abs(np.asarray(T_world_camera)[:3, 3]).max())
+            if not far_m < FAR_M:
+                raise DuagError(
+                    f"robot {name}: the true pose at {stamp_ns} ns is {far_m:.3g} m away, "
+                    f"expected less than {FAR_M:.0e} m"
+                )
             pose = messages.pack_pose_in_frame(stamp_ns, messages.WORLD_FRAME, T_world_camera)
             self._truth_log().write(topics.GROUNDTRUTH_POSE.of(name), pose, stamp_ns)
             self._positions.append(np.asarray(T_world_camera, dtype=np.float64)[:3, 3].copy())

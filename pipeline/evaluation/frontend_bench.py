@@ -324,7 +324,7 @@ def measure(log: Path, folder: Path, config: FrontendConfig, seed: int, threads:
         whole |= {"keyframe": ("mapping.Mapper", "add_keyframe"), "final": ("mapping.Mapper", "finish")}
         whole |= {"model": ("model.ModelTracker", "refine")}
     with ExitStack() as stack:
-        steps = stack.enter_context(_counted(("tracking.Tracker", "track"), ("align", "_linearise")))
+        steps = stack.enter_context(_counted(("tracking.Tracker", "track"), ("align", "linearise_at")))
         drawn = stack.enter_context(
             _counted(
                 ("mapping.Mapper", "add_keyframe"),

@@ -2,8 +2,8 @@
 
 from pipeline.config import Config
 from pipeline.frontend.mapping_config import MappingConfig
-from pipeline.registration.align import RegistrationConfig
 from pipeline.registration.moving import MovingConfig
+from pipeline.registration.residuals import RegistrationConfig
 
 # Not settings: the files of a run and their readers promise this rule.
 HELD_OUT_PERIOD = 8
@@ -103,6 +103,9 @@ class FailureConfig(Config):
     """The same as a fraction of the depth; the larger limit holds."""
     max_intruders: float = 0.1
     """Largest share of such points in a frame that becomes a keyframe, or by which a lost camera is found again."""
+    max_sigma_obstructed_m: float = 0.01
+    """Largest standard deviation of the position of a frame with more of them than that: what is left beside a hand
+    may tell little, and its errors are several of these."""
     min_told: float = 0.65
     """Share of a frame's points that its keyframe must be able to judge to say that what stood before it is gone."""
     max_speed_m_s: float = 3.0

@@ -8,22 +8,28 @@ the next frame agrees.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from enum import Enum
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.frontend.config import FrontendConfig, is_held_out
-from pipeline.frontend.failure import Reason, StuckImages, has_enough_depth, intruders, saturated_share
+from pipeline.frontend.failure import (
+    Obstruction,
+    Reason,
+    SeenFrom,
+    StuckImages,
+    has_enough_depth,
+    intruders,
+    saturated_share,
+)
 from pipeline.frontend.keyframes import KeyframePair, becomes_keyframe, predicted_overlap
 from pipeline.frontend.relocalisation import features_of, guesses, supports
+from pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.recording import MotionPrior
 from pipeline.registration import (
-    Level,
     Outcome,
     Reference,
     Registration,
@@ -39,60 +45,6 @@ SETTLING_ROUNDS = 3
 USUAL_FRAMES = 50  # whose residuals are the usual ones
 FEATURES_TO_SAY = 3  # times the inliers needed: a keyframe with fewer features cannot say where a view is
 SETTLED_M, SETTLED_RAD = 0.01, 0.01  # a registration that moves less from its own answer has settled
-
-
-class Status(Enum):
-    """Whether a frame's pose may be used; the values stand in the log."""
-
-    OK = "ok"
-    LOST = "lost"
-    RELOCALISED = "relocalised"
-
-
-@dataclass(frozen=True)
-class TrackedFrame:
-    """Where a frame was, relative to a keyframe.
-
-    keyframe_index: the keyframe that it hangs on. T_keyframe_camera: [4, 4]; the last known one if lost.
-    information: [6, 6] of T_keyframe_camera, right tangent (translation m, rotation rad); zero if lost. reason: why
-    it is lost, or why only its colour or only its depth was used.
-    """
-
-    frame_index: int
-    stamp_ns: int
-    keyframe_index: int
-    T_keyframe_camera: Array
-    information: Array
-    status: Status
-    overlap: float
-    rms_depth_m: float
-    rms_gray: float
-    reason: Reason = Reason.NONE
-
-
-@dataclass(frozen=True)
-class TrackedKeyframe:
-    """A keyframe as it was tracked. exposure: (gain, offset) of its grey values relative to keyframe 0.
-
-    features: by which a lost camera is found here. coarsest: the coarsest image of its pyramid.
-    """
-
-    keyframe_index: int
-    frame_index: int
-    stamp_ns: int
-    previous_index: int
-    T_map_keyframe: Array
-    reference: Reference = field(repr=False)
-    features: Features = field(repr=False)
-    coarsest: Level = field(repr=False)
-    exposure: tuple[float, float] = (1.0, 0.0)
-
-    @cached_property
-    def centre_map(self) -> Array:
-        """The middle [3] of what it sees, in the map as tracked."""
-        points = self.reference.levels[-1].points.astype(np.float64)
-        middle = np.median(points, axis=0) if len(points) else np.zeros(3)
-        return se3.transform(self.T_map_keyframe, middle[None])[0]
 
 
 @dataclass(frozen=True)
@@ -138,7 +90,7 @@ class Tracker:
         self._lost = False
         self._unconfirmed: _Unconfirmed | None = None
         self._gray_rms: list[float] = []  # of the last frames that were followed
-        self._obstructed = False  # something stands before the camera
+        self._obstruction = Obstruction(config.tracking.failure)
         self._without_depth = self._without_color = 0  # frames in a row without a usable image
 
     def track(
@@ -233,15 +185,17 @@ class Tracker:
         self._stamp_ns, self._unconfirmed = stamp_ns, None
         if followed and found.without is Reason.NONE:
             self._gray_rms = [*self._gray_rms[1 - USUAL_FRAMES :], result.rms_gray]
+        if found.without is Reason.NONE:
+            self._obstruction.look(pyramid.levels[-1], self._seen_before(found))
         if (
             not is_held_out(frame_index)
             and found.without is Reason.NONE
             and becomes_keyframe(result, pyramid, self.config.keyframes)
             and self._well_exposed(pyramid, result)
-            and self._unobstructed(pyramid, found)
+            and not self._obstruction.standing
         ):
             return self._promote(frame_index, stamp_ns, pyramid, keyframe_index, result, status)
-        return _tracked(frame_index, stamp_ns, keyframe_index, result, status, found.without)
+        return TrackedFrame.by(frame_index, stamp_ns, keyframe_index, result, status, found.without)
 
     def _lose(self, frame_index: int, stamp_ns: int, reason: Reason) -> TrackedFrame:
         """A frame without a pose: it keeps the last known one, and says that it means nothing."""
@@ -292,9 +246,10 @@ class Tracker:
             for guess in starts:
                 information = known if guess is predicted else None
                 result = register(keyframe.reference, pyramid, guess, tracking.registration, information)
-                if result.ok:
-                    return _Found(self._current, result)
-                reason = reason if reason is not Reason.NONE else Reason(result.outcome.value)
+                found = _Found(self._current, result)
+                if result.ok and self._tells_enough(pyramid, found):
+                    return found
+                reason = reason if reason is not Reason.NONE else found.why_not()
         view = features_of(pyramid, tracking.relocalisation) if view is None else view
         for guess in starts:
             found = _Found(self._current, self._settle(keyframe, pyramid, guess, tracking.recovery))
@@ -352,6 +307,16 @@ class Tracker:
             return found
         self._unconfirmed = _Unconfirmed(found, stamp_ns, before.agreed + 1)
         return Reason.UNCONFIRMED
+
+    def _tells_enough(self, pyramid: RgbdPyramid, found: _Found) -> bool:
+        """Whether what something before the camera leaves to be seen still says well where the camera is."""
+        failure = self.config.tracking.failure
+        # along weak directions a prior knows the pose, or the outcome would not be OK
+        covariance = np.linalg.pinv(found.result.information, rcond=1e-12, hermitian=True)
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+        if sigma_m <= failure.max_sigma_obstructed_m:
+            return True
+        return not self._obstruction.intruded(pyramid.levels[-1], self._seen_before(found))[0]
 
     def _believable(self, stamp_ns: int, pyramid: RgbdPyramid, found: _Found, view: Features) -> bool:
         """Whether a pose that was not simply followed can be true.
@@ -419,21 +384,10 @@ class Tracker:
         leaving = min(result.overlap, result.view) < config.relocalisation.min_overlap
         return leaving and saturated_share(pyramid.levels[0]) <= config.max_saturated
 
-    def _unobstructed(self, pyramid: RgbdPyramid, found: _Found) -> bool:
-        """Whether little of a view stands in space that the keyframe saw to be free.
-
-        Once something stands before the camera it is gone only when the keyframe can judge most of the view: what
-        moves with the camera soon stands beside the keyframe's view.
-        """
-        config, coarsest = self.config.tracking.failure, pyramid.levels[-1]
-        keyframe = self.keyframes[found.keyframe_index].coarsest
-        intruding, told = intruders(coarsest, keyframe, found.result.T_reference_target, config)
-        known = int(np.count_nonzero(coarsest.inverse_depth))
-        if intruding > config.max_intruders * told:
-            self._obstructed = True
-        elif told >= config.min_told * known:
-            self._obstructed = False
-        return not self._obstructed
+    def _seen_before(self, found: _Found) -> SeenFrom:
+        """The keyframe that a frame was registered to, as its obstruction is judged by it."""
+        keyframe = self.keyframes[found.keyframe_index]
+        return SeenFrom(keyframe.coarsest, keyframe.T_map_keyframe, found.result.T_reference_target)
 
     # --- keyframes ------------------------------------------------------------------------------------------------
 
@@ -453,16 +407,8 @@ class Tracker:
         self._register_to_neighbours(pyramid, previous, T_map_keyframe, new)
         self._add_keyframe(frame_index, stamp_ns, pyramid, previous, T_map_keyframe, result)
         self._current, self._T_keyframe_camera = new, np.eye(4)
-        return TrackedFrame(
-            frame_index,
-            stamp_ns,
-            new,
-            np.eye(4),
-            result.information,
-            status,
-            result.overlap,
-            result.rms_depth_m,
-            result.rms_gray,
+        return replace(
+            TrackedFrame.by(frame_index, stamp_ns, new, result, status), T_keyframe_camera=np.eye(4)
         )
 
     def _register_to_neighbours(
@@ -519,28 +465,6 @@ class Tracker:
                 (gain, offset),
             )
         )
-
-
-def _tracked(
-    frame_index: int,
-    stamp_ns: int,
-    keyframe_index: int,
-    result: Registration,
-    status: Status,
-    reason: Reason,
-) -> TrackedFrame:
-    return TrackedFrame(
-        frame_index,
-        stamp_ns,
-        keyframe_index,
-        result.T_reference_target,
-        result.information,
-        status,
-        result.overlap,
-        result.rms_depth_m,
-        result.rms_gray,
-        reason,
-    )
 
 
 def _equalising(pyramid: RgbdPyramid, keyframe: TrackedKeyframe, from_gain: float) -> tuple[float, float]:

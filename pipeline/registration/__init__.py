@@ -5,9 +5,10 @@
 robots with the about 2000 samples that a peer sent.
 """
 
-from pipeline.registration.align import Outcome, Registration, RegistrationConfig, linearise, register
+from pipeline.registration.align import Outcome, Registration, linearise, register
 from pipeline.registration.pyramid import Level, RgbdPyramid
 from pipeline.registration.reference import Reference, ReferenceLevel
+from pipeline.registration.residuals import RegistrationConfig
 
 __all__ = [
     "Level",

@@ -323,6 +323,7 @@ BROKEN = [
     ("replica", lambda p: swap(p.parent / "cam_params.json", '"w": ', '"w": Infinity, "f": '), "OverflowError"),
     ("replica", lambda p: swap(p.parent / "cam_params.json", '"scale": ', '"scale": -'), "a positive number"),
     ("replica", lambda p: tear(p / "results" / "depth000001.png"), "that no decoder reads"),
+    ("replica", lambda p: swap(p / "traj.txt", r"^(\S+ \S+ \S+) \S+", r"\1 1e300"), "m away, expected less than"),
     ("replica-multiagent", lambda p: shutil.rmtree(p / "office_0_part2"), "for 2 robots, expected --robots 1"),
     ("aria-multiagent", lambda p: [shutil.rmtree(a) for a in p.iterdir()], "found no folder agent_"),
     ("tum", lambda p: (p / "depth.txt").unlink(), "depth.txt: No such file"),

@@ -43,6 +43,12 @@ def meet(data: list[RobotData], folder: Path, config: ExchangeConfig) -> dict[st
     return results
 
 
+def team(make_robot: Any, robots: int, link: dict[str, Any]) -> list[RobotData]:
+    """Robots side by side, each of which sees a part of what the next one sees; eight in a ring stand all round."""
+    turn = 2 * np.pi / robots if robots == 8 and link.get("topology") == "ring" else 0.6
+    return [make_robot(name, turn * i, keyframes=4)[0] for i, name in enumerate(NAMES[:robots])]
+
+
 def oracle_poses(
     data: list[RobotData], results: dict[str, AgentResult], config: PoseConsensusConfig
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -121,7 +127,7 @@ def gaps(
 def test_the_team_is_at_the_oracle(
     make_robot: Any, tmp_path: Path, robots: int, link: dict[str, Any]
 ) -> None:
-    data = [make_robot(name, 0.6 * i, keyframes=4)[0] for i, name in enumerate(NAMES[:robots])]
+    data = team(make_robot, robots, link)
     config = unrounded(**link)
     results = meet(data, tmp_path, config)
     metres, radians, gap_sigma = gaps(data, results, config)
@@ -152,7 +158,7 @@ def test_on_the_default_wire_the_team_is_near_the_oracle(
     make_robot: Any, tmp_path: Path, robots: int, link: dict[str, Any]
 ) -> None:
     """Rounded evidence, poses in float32, at the tolerance of runs."""
-    data = [make_robot(name, 0.6 * i, keyframes=4)[0] for i, name in enumerate(NAMES[:robots])]
+    data = team(make_robot, robots, link)
     config = ExchangeConfig(link=LinkConfig(**link), max_rounds=20_000)
     results = meet(data, tmp_path, config)
     metres, radians, gap_sigma = gaps(data, results, config)

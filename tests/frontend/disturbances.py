@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.frontend.tracking import Status, TrackedFrame, Tracker
+from pipeline.frontend.config import FrontendConfig
+from pipeline.frontend.tracked import Status, TrackedFrame
+from pipeline.frontend.tracking import Tracker
 from pipeline.geometry import se3
 
 WRONG_M, WRONG_RAD = 0.05, np.deg2rad(3.0)
@@ -154,14 +156,20 @@ class Undisturbed:
             self.frames.append(frame)
             self.poses.append(pose)
 
+    def tracker(self, start: int) -> Tracker:
+        """A tracker as it was before frame `start`."""
+        return _copied(self._before[start])
+
     def disturbed(
         self,
         start: int,
         disturbance: Callable[[Sequence[Shot], np.random.Generator], Iterator[Shot]],
         frames: int = 45,
+        config: FrontendConfig | None = None,
     ) -> list[Row]:
-        """Track on from frame `start` with a disturbance that begins there."""
-        tracker = _copied(self._before[start])
+        """Track on from frame `start` with a disturbance that begins there, maybe with another configuration."""
+        tracker = self.tracker(start)
+        tracker.config = config or tracker.config
         rows = []
         for shot in disturbance(self.shots[start : start + frames], np.random.default_rng(start)):
             frame, pose = track(tracker, shot)
@@ -177,4 +185,5 @@ def _copied(tracker: Tracker) -> Tracker:
         if isinstance(value, list):
             setattr(other, name, list(value))
     other._stuck = copy.copy(tracker._stuck)
+    other._obstruction = copy.copy(tracker._obstruction)
     return other

@@ -5,6 +5,7 @@ a slow test.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,7 +17,8 @@ from converters.simulate.render import Renderer
 from converters.simulate.scenes import build
 from pipeline.frontend.config import FrontendConfig, TrackingConfig
 from pipeline.frontend.failure import Reason, StuckImages, intruders
-from pipeline.frontend.tracking import Status, Tracker
+from pipeline.frontend.tracked import Status
+from pipeline.frontend.tracking import Tracker
 from pipeline.geometry import se3
 from pipeline.recording import open_rgbd
 from pipeline.registration import RgbdPyramid
@@ -88,6 +90,34 @@ def test_a_hand_before_the_lens_does_not_take_the_pose_along(run: Undisturbed, s
     assert not any(row.wrong for row in rows)
     assert sum(row.good for row in during(rows)) >= 8
     assert_found_again(rows, within=4)
+
+
+def test_what_a_hand_leaves_must_tell_the_position(run: Undisturbed) -> None:
+    """With a limit that no image keeps, every frame behind the hand is lost, and no other."""
+    strict = FrontendConfig.model_validate(
+        {"tracking": {"strides": (2, 1, 1, 1), "failure": {"max_sigma_obstructed_m": 1e-7}}}
+    )
+    rows = run.disturbed(STARTS[0], d.hand, config=strict)
+    assert not any(row.good for row in during(rows))
+    assert during(rows)[0].frame.reason is Reason.OBSTRUCTED
+    assert_found_again(rows, within=4)
+    assert all(row.good for row in run.disturbed(STARTS[0], d.dropped, config=strict))
+
+
+def test_a_hand_outside_the_keyframe_s_view_is_noticed(run: Undisturbed) -> None:
+    """Near things are soon beside what an old keyframe saw: the frame before must tell, before they become one."""
+    tracker = run.tracker(STARTS[0])
+    tracker.config = FrontendConfig.model_validate(
+        {"tracking": {"strides": (2, 1, 1, 1)}, "keyframes": {"min_overlap": 1.0}}
+    )
+    *before, current = tracker.keyframes
+    blind = replace(current.coarsest, inverse_depth=np.zeros_like(current.coarsest.inverse_depth))
+    tracker.keyframes = [*before, replace(current, coarsest=blind)]
+    sound, *behind = list(d.hand(run.shots[STARTS[0] : STARTS[0] + 4], np.random.default_rng(0)))
+    frame, _ = d.track(tracker, run.shots[sound.index])
+    assert frame.keyframe_index == len(before) + 1  # every sound frame becomes a keyframe here
+    tracker.keyframes[-1] = replace(tracker.keyframes[-1], coarsest=blind)
+    assert {d.track(tracker, shot)[0].keyframe_index for shot in behind} == {len(before) + 1}
 
 
 @pytest.mark.parametrize("start", STARTS)
@@ -186,12 +216,16 @@ def test_intruders_are_what_stands_in_free_space(run: Undisturbed) -> None:
 
 
 @pytest.mark.slow
-def test_red_kitchen_is_never_silently_wrong(other_room: list[Shot]) -> None:
-    """A real sensor: nine disturbances at four places of the log of the first robot."""
-    if not (RED_KITCHEN / "alpha.mcap").is_file():
+@pytest.mark.parametrize(
+    ("robot", "starts"), [("alpha", (60, 120, 180, 240)), ("bravo", (40, 110, 140, 170, 230))], ids=str
+)
+def test_red_kitchen_is_never_silently_wrong(
+    robot: str, starts: tuple[int, ...], other_room: list[Shot]
+) -> None:
+    """A real sensor: nine disturbances at four or five places of the log of each robot."""
+    if not (RED_KITCHEN / f"{robot}.mcap").is_file():
         pytest.skip("needs recordings/redkitchen")
-    starts = (60, 120, 180, 240)
-    with open_rgbd(RED_KITCHEN / "alpha.mcap") as log:
+    with open_rgbd(RED_KITCHEN / f"{robot}.mcap") as log:
         camera = log.camera
         shots = [Shot(f.index, f.stamp_ns, f.color, f.depth) for f in map(log.frame, range(starts[-1] + 45))]
     run = Undisturbed(Tracker(camera, FrontendConfig()), shots, starts)

@@ -151,7 +151,7 @@ def read_scene(src: Path, out: Path) -> None:
     """A folder of meshes."""
     import open3d  # noqa: F401  in this process: the one that reads is a copy of it
 
-    mesh_process.subprocess.Popen = Forked
+    mesh_process.subprocess.Popen, mesh_process.IDLE_S = Forked, 1
     files = meshes.mesh_files(src / "scene")
     (out / "cache").mkdir()
     meshes.read(src / "scene", meshes.up_axis(files, "auto"), out / "cache")
@@ -236,6 +236,7 @@ CONVERTERS = (
     converter("ros2-lidar", seeds.lidar_bag, "ros", lambda: list(seeds.LIDAR_OPTIONS)),
     converter("ros-toml", seeds.team_file, "ros"),
     converter("mcap-json", seeds.foreign("json"), "ros"),
+    converter("mcap-rosbridge", seeds.foreign("rosbridge"), "ros"),
     converter("mcap-protobuf", seeds.foreign("protobuf"), "ros"),
     converter("kimera-multi", seeds.kimera, "kimera-multi"),
     converter("s3e", seeds.s3e, "s3e"),

@@ -10,9 +10,12 @@ import struct
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from types import CodeType
 
 import cv2
 from rosbags.highlevel import anyreader
+from rosbags.serde import utils as serde_utils
+from rosbags.typesys import store
 
 from converters import bonn, icl_nuim, seven_scenes, tum
 from converters.ros_images import rows_of
@@ -30,6 +33,7 @@ from tests.converters import (
 )
 from tests.converters.ros_bags import Ros, scene
 from tests.converters.test_ros_images import rvl
+from tests.converters.test_simulate_meshes import QUADS
 from tests.evaluation import fake_run
 from tests.recording.logs import write_recording
 
@@ -63,9 +67,14 @@ def shrink() -> None:
     wall = fake_run.wall
     fake_run.wall = lambda seed=0: wall(seed).select(slice(None, None, 50))
     test_simulate_meshes.TEXEL_M = 0.1
-    test_simulate_meshes.QUADS = 4 * test_simulate_meshes.QUADS[9:]  # sides of the table
-    # most of the time to open a bag goes into texts that every bag holds
+    # most of the time to read a bag goes into texts that every bag holds, and into code that is made of them
     anyreader.get_types_from_msg = cache(anyreader.get_types_from_msg)
+    store.exec = serde_utils.exec = lambda text, *where: exec(_compiled(text), *where)
+
+
+@cache
+def _compiled(text: str) -> CodeType:
+    return compile(text, "made by rosbags", "exec")
 
 
 def image_options(dataset: str) -> list[str]:
@@ -184,21 +193,23 @@ def seven_options() -> list[str]:
 
 
 def make_recording(seed: Path) -> None:
-    write_recording(seed / "rec", robots=2, frames=4)
+    write_recording(seed / "rec", robots=2, frames=3)
 
 
 def make_scene(kind: str) -> Callable[[Path], None]:
     def make(seed: Path) -> None:
-        test_simulate_meshes.folder_of(seed / "scene", kind)
+        (seed / "scene").mkdir()
+        for name, sides in (("walls", QUADS[9:11]), ("table", QUADS[11:])):
+            test_simulate_meshes.WRITERS[kind](seed / "scene" / f"{name}.{kind}", sides)
 
     return make
 
 
 def make_gltf(seed: Path) -> None:
     """A glTF file with its arrays in another file, and its images in files of their own."""
-    test_simulate_meshes.folder_of(seed / "scene", "glb")
-    (seed / "scene" / "walls.glb").unlink()
-    glb = seed / "scene" / "table.glb"
+    make_scene("glb")(seed)
+    (seed / "scene" / "table.glb").unlink()
+    glb = seed / "scene" / "walls.glb"
     data = glb.read_bytes()
     glb.unlink()
     (size,) = struct.unpack_from("<I", data, 12)

@@ -1,0 +1,292 @@
+"""The residuals of a registration at one pose: point-to-plane distances and grey differences with their weights.
+
+For a sample p (reference frame) with normal n and intensity I, seen by the target at q = T_reference_target^-1 p,
+
+    depth residual   r_d = m . (x z(u) - q),             m = R^T n, u = project(q), x the ray and z the depth there
+    grey residual    r_g = gray(u) - (gain I + offset)   gain, offset: affine brightness between the views
+
+are each divided by their noise and weighted by Huber's function at a scale from the median absolute deviation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config import Config
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.registration.pyramid import Level, RgbdPyramid
+from pipeline.registration.reference import Reference
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.floating]
+
+MAD_TO_SIGMA = 1.4826  # of a normal distribution
+MAD_STRIDE = 4  # residuals between those that estimate a scale, where there are thousands
+GATE_SIGMAS = 3  # of depth whose noise is told: the gate is no narrower
+
+
+class RegistrationConfig(Config):
+    """Joint point-to-plane and photometric registration."""
+
+    residuals: Literal["joint", "depth", "gray"] = "joint"
+    """Which residuals count: both, point-to-plane only, or grey values only (for comparisons)."""
+    iterations: tuple[int, ...] = (4, 5, 6)
+    """Gauss-Newton steps per pyramid level, finest first."""
+    depth_gate_m: float = 0.1
+    """Smallest limit of the distance between a sample and the surface it falls on; farther ones do not count."""
+    depth_gate_relative: float = 0.05
+    """The same as a fraction of the depth; the larger limit holds."""
+    normal_gate_rad: float = 0.0
+    """Largest angle between the normals of a sample and of the surface it falls on; 0 = no test, the default, because
+    normals of a structured-light camera scatter by more than any useful limit."""
+    huber_sigmas: float = 1.5
+    """Residuals beyond this many sigmas count linearly."""
+    depth_sigma_base_m: float = 0.0012
+    """Depth noise sigma(z) = base + slope * (z - 0.4)^2, where the log does not tell it pixel by pixel; only its shape
+    counts, its scale is estimated."""
+    depth_sigma_slope_per_m: float = 0.0019
+    """See depth_sigma_base_m (Nguyen, Izadi and Lovell 2012)."""
+    depth_sigma_floor: float = 0.05
+    """Smallest estimated scale of the depth noise at the finest level, as a multiple of sigma(z). Four times more at
+    each coarser one, where edges are blurred: without noise the depth would else outweigh the grey values so far
+    that the way to the minimum becomes a narrow valley, which takes hundreds of steps."""
+    gray_sigma_floor: float = 0.002
+    """Smallest estimated noise of grey values (about half a step of 8 bits)."""
+    gray_sigma_of_depth: float = 0.03
+    """Smallest estimated noise of grey values as a multiple of the scale of the depth noise. A camera with poor depth
+    also has depth registered to colour only to a pixel, and texture turns that pixel into a grey error that is the
+    same in all frames; without this the many sharp grey values overrule the depth (RedKitchen: 2.7 cm, with it 2.3)."""
+    min_gradient: float = 0.0
+    """Grey gradient (1/px) below which a sample's grey value is not used."""
+    min_samples: int = 100
+    """Fewer agreeing samples are LOW_OVERLAP."""
+    min_overlap: float = 0.3
+    """Smaller overlap is LOW_OVERLAP."""
+    max_conflict: float = 0.3
+    """Largest fraction of seen samples that lie in space which the target saw to be free."""
+    max_depth_scale: float = 8.0
+    """Largest estimated scale of the depth noise, as a multiple of sigma(z); more is RESIDUAL."""
+    max_gray_rms: float = 0.15
+    """Largest weighted grey residual; more is RESIDUAL."""
+    max_gain: float = 2.0
+    """The gain must lie between 1 / max_gain and max_gain; else RESIDUAL (covered lens, other scene)."""
+    max_sigma_m: float = 0.03
+    """Directions with a larger standard deviation at the median depth are weak: they stay at the guess, or where the
+    prior pulls them, and carry no information. The outcome is ILL_CONDITIONED unless the prior knows them better."""
+    max_translation_m: float = 0.3
+    """Largest correction of the guess; more is JUMP."""
+    max_rotation_rad: float = 0.35
+    """Largest correction of the guess; more is JUMP."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Weighted residuals of one kind; J float32 [n, 8] by (translation, rotation, gain, offset), r = value / noise."""
+
+    jacobian: Floats
+    residual: Floats
+    weight: Floats
+    scale: float
+    pixels: tuple[Floats, Floats]
+
+    def normal_equations(self) -> tuple[Array, Array]:
+        """H [8, 8] and gradient [8], summed in double precision in the order of the samples."""
+        J = self.jacobian.astype(np.float64)
+        Jw = J * self.weight[:, None]
+        return Jw.T @ J, Jw.T @ self.residual.astype(np.float64)
+
+    def nothing(self) -> Residuals:
+        """The same kind and scale without any residual."""
+        u, v = self.pixels
+        return Residuals(self.jacobian[:0], self.residual[:0], self.weight[:0], self.scale, (u[:0], v[:0]))
+
+    def rms(self) -> float:
+        """Root of the weighted mean square of the residuals, Huber's weight only, in units of the noise given."""
+        if not len(self.residual):
+            return 0.0
+        w = self.weight.astype(np.float64)
+        return float(np.sqrt(np.sum(w * self.residual.astype(np.float64) ** 2) / np.sum(w)))
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Residuals at one pose and level, and what was seen of the samples."""
+
+    depth: Residuals
+    gray: Residuals
+    overlap: float
+    view: float
+    conflict: float
+    agreeing: int
+    median_depth_m: float
+    sigma_mean_m: float
+
+    def normal_equations(self) -> tuple[Array, Array]:
+        H_depth, g_depth = self.depth.normal_equations()
+        H_gray, g_gray = self.gray.normal_equations()
+        return H_depth + H_gray, g_depth + g_gray
+
+
+def linearise_at(
+    reference: Reference,
+    pyramid: RgbdPyramid,
+    index: int,
+    T_reference_target: Array,
+    exposure: Array,
+    config: RegistrationConfig,
+) -> Linearisation:
+    """Residuals of all samples of level `index` at one pose. Samples without a partner have none."""
+    samples, level = reference.levels[index], pyramid.levels[index]
+    camera = level.camera
+    T_target_reference = se3.inverse(T_reference_target).astype(np.float32)
+    q = T_target_reference[:3, :3] @ samples.points.T + T_target_reference[:3, 3:]
+    front = np.maximum(q[2], np.float32(0.05))
+    u = np.float32(camera.fx) * q[0] / front + np.float32(camera.cx)
+    v = np.float32(camera.fy) * q[1] / front + np.float32(camera.cy)
+    inside = (q[2] > 0.05) & (u >= 1) & (u < camera.width - 2) & (v >= 1) & (v < camera.height - 2)
+    seen = np.flatnonzero(inside)
+    q, u, v = q[:, seen], u[seen], v[seen]
+
+    gray, gu, gv, inverse_depth, *told = _interpolate(level, u, v)
+    with np.errstate(invalid="ignore"):
+        # without a depth image every sample may be what is seen there
+        z = 1 / inverse_depth if level.has_depth else q[2]
+        gate = np.maximum(np.float32(config.depth_gate_m), np.float32(config.depth_gate_relative) * q[2])
+        if told:
+            gate = np.maximum(gate, np.float32(GATE_SIGMAS) * told[0])
+        off = z - q[2]
+        agree = np.abs(off) < gate
+        # beyond the gate in front of the surface: that space was seen to be free; behind it: hidden
+        free = off >= gate
+    m = T_target_reference[:3, :3] @ samples.normals[seen].T
+    if config.normal_gate_rad > 0:
+        agree &= _normals_agree(level, u, v, m, config.normal_gate_rad)
+    agreeing = np.flatnonzero(agree)
+    conflicts, judged = int(free.sum()), int(np.isfinite(z).sum())
+    total = len(samples) - (len(seen) - judged)
+
+    q, m, u, v, z = q[:, agreeing], m[:, agreeing], u[agreeing], v[agreeing], z[agreeing]
+    gray, gu, gv = gray[agreeing], gu[agreeing], gv[agreeing]
+    intensities = samples.intensities[seen[agreeing]]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy]).astype(np.float32)
+    surface = np.stack([rays[0] * z, rays[1] * z, z])
+    sigma = _depth_sigma(z, config) if not told else told[0][agreeing]
+    if (
+        told and samples.depth_sigmas is not None
+    ):  # of two views alike it stays the same, as that of the model
+        sigma = np.sqrt(np.float32(0.5) * (sigma**2 + samples.depth_sigmas[seen[agreeing]] ** 2))
+    floor = config.depth_sigma_floor * 4.0**index
+    depth = _depth_residuals(surface, q, m, sigma, floor, (u, v), config)
+    if not level.has_depth:
+        depth = depth.nothing()
+    floor = max(config.gray_sigma_floor, config.gray_sigma_of_depth * depth.scale)
+    images = gray, gu, gv
+    photometric = _gray_residuals(camera, images, intensities, q, exposure, floor, (u, v), config)
+    return Linearisation(
+        depth.nothing() if config.residuals == "gray" else depth,
+        photometric.nothing() if config.residuals == "depth" else photometric,
+        overlap=len(agreeing) / max(total, 1),
+        view=len(seen) / max(len(samples), 1),
+        conflict=conflicts / max(judged, 1),
+        agreeing=len(agreeing),
+        median_depth_m=float(np.median(z)) if len(z) else 0.0,
+        sigma_mean_m=float(sigma.mean(dtype=np.float64)) if len(z) else 0.0,
+    )
+
+
+def _interpolate(level: Level, u: Floats, v: Floats) -> tuple[Floats, ...]:
+    """Grey value, its two derivatives, inverse depth (NaN where unknown) and sigma if known, at pixels inside."""
+    width = level.camera.width
+    u0, v0 = u.astype(np.int32), v.astype(np.int32)
+    a, b = (u - u0)[:, None], (v - v0)[:, None]
+    corner, channels = v0 * width + u0, level.channels
+    top = channels.take(corner, axis=0)
+    top += a * (channels.take(corner + 1, axis=0) - top)
+    bottom = channels.take(corner + width, axis=0)
+    bottom += a * (channels.take(corner + width + 1, axis=0) - bottom)
+    top += b * (bottom - top)
+    return tuple(np.ascontiguousarray(top.T))
+
+
+def _normals_agree(
+    level: Level, u: Floats, v: Floats, normals: Floats, limit_rad: float
+) -> NDArray[np.bool_]:
+    """Whether normals [3, n] are within the limit of the target's at the nearest pixels; unknown ones do not agree."""
+    nearest = (v + np.float32(0.5)).astype(np.int32) * level.camera.width + (u + np.float32(0.5)).astype(
+        np.int32
+    )
+    target = level.normals.reshape(-1, 3).take(nearest, axis=0)
+    cosine = target[:, 0] * normals[0] + target[:, 1] * normals[1] + target[:, 2] * normals[2]
+    return cosine > np.float32(np.cos(limit_rad))
+
+
+def _depth_sigma(z: Floats, config: RegistrationConfig) -> Floats:
+    """Noise of a depth z, metres, up to the scale that is estimated."""
+    base, slope = np.float32(config.depth_sigma_base_m), np.float32(config.depth_sigma_slope_per_m)
+    return base + slope * (z - np.float32(0.4)) ** 2
+
+
+def _depth_residuals(
+    surface: Floats,
+    q: Floats,
+    m: Floats,
+    sigma: Floats,
+    floor: float,
+    pixels: tuple[Floats, Floats],
+    config: RegistrationConfig,
+) -> Residuals:
+    """Point-to-plane distance over sigma(z); derivative by the target's motion: m by v, surface x m by w."""
+    J = np.zeros((len(sigma), 8), dtype=np.float32)
+    J[:, 0], J[:, 1], J[:, 2] = m / sigma
+    J[:, 3], J[:, 4], J[:, 5] = _cross(surface, m) / sigma
+    residual = np.sum(m * (surface - q), axis=0) / sigma
+    return _weighted(J, residual, floor, config.huber_sigmas, pixels)
+
+
+def _gray_residuals(
+    camera: PinholeCamera,
+    images: tuple[Floats, Floats, Floats],
+    intensities: Floats,
+    q: Floats,
+    exposure: Array,
+    floor: float,
+    pixels: tuple[Floats, Floats],
+    config: RegistrationConfig,
+) -> Residuals:
+    """Grey difference; dq = -v - w x q, so the derivative is -d by v and -(q x d) by w with d = d gray / d q."""
+    gray, gu, gv = images
+    if config.min_gradient > 0:
+        keep = np.flatnonzero(gu * gu + gv * gv >= np.float32(config.min_gradient) ** 2)
+        gray, gu, gv, intensities, q = gray[keep], gu[keep], gv[keep], intensities[keep], q[:, keep]
+        pixels = (pixels[0][keep], pixels[1][keep])
+    dx, dy = gu * np.float32(camera.fx) / q[2], gv * np.float32(camera.fy) / q[2]
+    d = np.stack([dx, dy, -(dx * q[0] + dy * q[1]) / q[2]])
+    J = np.empty((len(gray), 8), dtype=np.float32)
+    J[:, 0], J[:, 1], J[:, 2] = -d
+    J[:, 3], J[:, 4], J[:, 5] = -_cross(q, d)
+    J[:, 6], J[:, 7] = -intensities, -1
+    residual = gray - (np.float32(exposure[0]) * intensities + np.float32(exposure[1]))
+    return _weighted(J, residual, floor, config.huber_sigmas, pixels)
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    """Cross products of vectors [3, n]."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _weighted(
+    J: Floats, residual: Floats, floor: float, huber_sigmas: float, pixels: tuple[Floats, Floats]
+) -> Residuals:
+    """Scale by the median absolute deviation, weights by Huber: w = 1 / (scale^2 max(1, |r| / (k scale)))."""
+    magnitude = np.abs(residual)
+    part = magnitude[::MAD_STRIDE] if len(magnitude) > 1000 * MAD_STRIDE else magnitude
+    scale = max(MAD_TO_SIGMA * float(np.median(part)), floor) if len(residual) else floor
+    weight = 1 / (
+        np.maximum(np.float32(1), magnitude / np.float32(huber_sigmas * scale)) * np.float32(scale**2)
+    )
+    return Residuals(J, residual, weight, scale, pixels)
