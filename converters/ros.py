@@ -147,7 +147,8 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
         rows["without_depth"] = empty / max(
             1, (len(pairs) - cut) * source.camera.width * source.camera.height
         )
-    return {**rows, **check.result(log, max_ratio), **_truth_lag(source)}
+    drift = {} if source.drift is None else {"clock_drift_ppm": 1e6 * source.drift.rate}
+    return {**rows, **check.result(log, max_ratio), **_truth_lag(source), **drift}
 
 
 def _measured(source: RobotLog, stamp_ns: int, color: Any, depth: Any) -> tuple[Picture, int]:

@@ -59,6 +59,7 @@ def _check_robot(
     with LogFile(log.path) as file:
         if recording is not None:
             add(_check_digest(recording, robot, file))
+            add(_check_clock(recording, robot))
         topics = images.read_repeats(file, robot)
     for topic, repeats in topics.items():
         add(stamps.check_stamps(robot, topic, repeats.stamps_ns))
@@ -98,6 +99,17 @@ def _check_digest(recording: Recording, robot: str, file: LogFile) -> Iterator[F
             f"{told[:12]} as in recording.json",
             "the log is not the one that was converted",
         )
+
+
+def _check_clock(recording: Recording, robot: str) -> Iterator[Finding]:
+    """What the converter said about a clock that runs at another rate than the recorder's, and left as it was."""
+    for text in recording.description["warnings"]:
+        if str(text).startswith(f"{robot}: ") and " ppm on that of the headers" in str(text):
+            found, _, expected = str(text).removeprefix(f"{robot}: ").partition("; expected ")
+            if expected:
+                yield Finding(
+                    Severity.WARNING, "clock", robot, found, expected, "convert it again with that option"
+                )
 
 
 def _check_scales(recording: Recording | None, log: RgbdLog, moved: list[geometry.Move]) -> Iterator[Finding]:

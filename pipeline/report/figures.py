@@ -250,16 +250,20 @@ def map_sizes(robots: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
     FigureCanvasAgg(figure)
     caps = sorted({row["cap"] for rows in robots.values() for row in rows})
     for axes, (label, scale, kinds) in zip(figure.subplots(2, 2).flat, panels, strict=True):
-        for i, (robot, rows) in enumerate(robots.items()):
-            for k, (name, kind) in enumerate(kinds.items()):
+        for k, (name, kind) in enumerate(kinds.items()):
+            line = ("-", (0, (4, 2)))[k]
+            for i, (robot, rows) in enumerate(robots.items()):
                 points = [(row["cap"], scale * row[name]) for row in rows if row[name] is not None]
-                style = {"linestyle": ("-", (0, (4, 2)))[k], "marker": MARKS[i % len(MARKS)], "markersize": 5}
                 axes.plot(
                     *np.reshape(points, (-1, 2)).T,
                     color=color_of(i),
-                    label=f"{robot} {kind}".strip(),
-                    **style,
+                    linestyle=line,
+                    marker=MARKS[i % len(MARKS)],
+                    markersize=5,
+                    label=None if kind else robot,
                 )
+            if kind:
+                axes.plot([], [], color=INK, linestyle=line, label=kind)
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(FixedLocator(caps))
         axes.xaxis.set_minor_locator(NullLocator())
@@ -268,5 +272,5 @@ def map_sizes(robots: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
             axes.set_yscale("log")
         axes.set_xlabel("most Gaussians")
         axes.set_ylabel(label)
-        _legend_above(axes, len(robots) * len(kinds))
+        _legend_above(axes, 4)
     return figure

@@ -13,6 +13,7 @@ import pytest
 import converters
 from converters.logs import clocks
 from converters.logs.describe import describe
+from pipeline.checks import check
 from pipeline.errors import DuagError
 from pipeline.geometry import so3
 from pipeline.recording import format_info, info, open_rgbd, read_log
@@ -217,10 +218,14 @@ def test_a_drift_is_told_and_taken_out_if_asked(tmp_path: Path) -> None:
     assert "the recorder's clock gains 4" in told
     assert "expected one rate, or --set clocks=estimated" in told
     assert "ppm" in format_info(info(tmp_path / "kept"))
+    (finding,) = [f for f in check(tmp_path / "kept").findings if f.check == "clock"]
+    assert "ppm" in finding.found
+    assert "clocks=estimated" in finding.expected
     found = describe(bag)
     assert found["robots"]["alpha"]["drift_ppm"] == pytest.approx(400, abs=15)
     assert any("ppm" in w for w in found["robots"]["alpha"]["warnings"])
     converters.convert("ros", bag, tmp_path / "settled", options=["clocks=estimated"])
+    assert not [f for f in check(tmp_path / "settled").findings if f.check == "clock"]
     kept, settled = (span(tmp_path / name) for name in ("kept", "settled"))
     assert kept[0] == settled[0]
     assert settled[1] - kept[1] == pytest.approx(400e-6 * (kept[1] - kept[0]), rel=0.04)

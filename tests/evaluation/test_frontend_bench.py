@@ -90,7 +90,7 @@ def test_the_curve_over_the_caps_is_drawn_from_the_rows(result: dict) -> None:
     assert robots["bravo"][1]["psnr_db"] == result["rows"][1]["refined"]["psnr_db"]
     drawn = figures.map_sizes(robots)
     assert drawn == figures.map_sizes(robots)
-    for words in ("3k", "PSNR", "bravo one layer", "peak memory"):
+    for words in ("3k", "PSNR", "one layer", "peak memory"):
         assert words in drawn
     robots["bravo"][0]["depth_l1_m"] = None
     assert len(figures.map_sizes(robots)) < len(drawn)

@@ -17,7 +17,8 @@ from converters.simulate.render import Renderer
 from converters.simulate.scenes import build
 from pipeline.frontend.config import FrontendConfig, TrackingConfig
 from pipeline.frontend.failure import Reason, StuckImages, intruders
-from pipeline.frontend.tracking import Status, Tracker
+from pipeline.frontend.tracked import Status
+from pipeline.frontend.tracking import Tracker
 from pipeline.geometry import se3
 from pipeline.recording import open_rgbd
 from pipeline.registration import RgbdPyramid

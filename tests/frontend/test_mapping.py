@@ -12,7 +12,7 @@ from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels import Rasterizer
 from pipeline.splat.gaussians import DepthKind, Gaussians
-from pipeline.splat.losses import depth_error, psnr
+from pipeline.splat.losses import LossConfig, depth_error, psnr
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 PLANES = (
@@ -223,6 +223,20 @@ def test_both_depths_of_a_gaussian_make_a_map(depth: DepthKind) -> None:
     render = Rasterizer().forward(mapper.gaussians, CAMERA, se3.inverse(POSES[1]), depth=depth)
     assert psnr(render.color, color / 255) > 28.0
     assert depth_error(render, z)[0] < 0.02
+
+
+def test_loss_on_single_gaussians_brings_each_to_its_surface() -> None:
+    def layer_error_m(loss: LossConfig) -> float:
+        mapper, _ = build(QUICK.model_copy(update={"depth": "ray_plane", "loss": loss}))
+        mapper.finish()
+        rasterizer, depth_m = Rasterizer(), shot(POSES[1])[1]
+        rasterizer.forward(mapper.gaussians, CAMERA, se3.inverse(POSES[1]), depth="ray_plane")
+        layer_m = rasterizer.layer_depth()
+        assert (layer_m > 0).mean() > 0.97
+        return float(np.abs(layer_m - depth_m)[layer_m > 0].mean())
+
+    single = LossConfig(surface_weight=1.0, depth_weight=0.0, depth_huber_m=0.005)
+    assert layer_error_m(single) < 0.5 * layer_error_m(LossConfig())
 
 
 def test_exposure_is_found() -> None:
