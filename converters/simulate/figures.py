@@ -29,6 +29,7 @@ LEAST_CLEARANCE_M = MIN_CLEARANCE_M - 0.04
 APART_M = 0.4  # between robots on the floor at the same time
 LINES_APART_M = 0.45
 CROSSING_GAP_M = (0.45, 0.6)  # by which a robot is behind the one before, on its way through the middle
+CROSSING_ONE_POINT = 4  # so many robots at most go through one point, one after the other
 CROSSING_RAD = np.deg2rad((20.0, 80.0))
 CIRCLE_TURN_RAD = 0.8 * MAX_TURN_RAD  # per frame; a robot on a small circle goes more slowly
 FARTHEST_BEHIND_M = 5.0, 15.0  # a follower, and the last one behind the first
@@ -65,8 +66,17 @@ def circle(figure: Figure, robots: int, spreads: Sequence[float]) -> tuple[Array
 
 
 def crossing(figure: Figure, robots: int, spreads: Sequence[float]) -> tuple[Array, float]:
-    """A straight way through the middle, later than the one before, and in another direction."""
-    k, (least, more) = len(spreads) - 1, CROSSING_RAD
+    """A straight way through the middle, later than the one before, and in another direction.
+
+    Many robots go at the same time, in evenly spread directions, and leave the middle to their left, as at a
+    roundabout; the spread says how many directions on from the robot before.
+    """
+    k = len(spreads) - 1
+    if robots > CROSSING_ONE_POINT:
+        between = 2 * np.pi / robots
+        aside = -1.1 * APART_M / (2 * np.sin(between / 2))
+        return _line(figure, between * (k + sum(round(2 * s) for s in spreads)), aside, 0.0), figure.length_m
+    least, more = CROSSING_RAD
     gap = float(np.clip(figure.length_m / max(robots - 1, 1), *CROSSING_GAP_M))
     turn = k * least + sum(spreads) * (more - least)
     return _line(figure, turn, 0.0, ((robots - 1) / 2 - k) * gap), figure.length_m

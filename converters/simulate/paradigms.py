@@ -43,7 +43,7 @@ FIRST_SPREADS = (0.4, 0.6, 0.2, 0.8, 0.0, 1.0)  # to see whether there is room
 GAZE_STEP_RAD, GAZES = np.deg2rad(40.0), (0, 1, -1, 2, -2)  # aside of the way, to the left
 CLOSE, NEAR_ENOUGH = 0.015, 0.03  # to the overlap asked for: of two robots, to search no more; of every two
 SHOWN = 12  # paths near enough of which the one with most to see is taken: robots times figures
-EFFORT = 200  # per size and robot: a way counts one, a path that is looked along LOOK_EFFORT
+EFFORT = 250  # per size and robot: a way counts one, a path that is looked along LOOK_EFFORT
 LOOK_EFFORT = 5
 SKETCH = (28, 21)  # pixels of the views that a planner looks at
 

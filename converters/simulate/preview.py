@@ -86,8 +86,9 @@ class Preview:
         for k, way in enumerate(self.ways):
             color = COLORS[k % len(COLORS)]
             line = np.array([pixel(p) for p in way[:, :2, 3]], dtype=np.int32)[:, None]
-            cv2.polylines(image, [line], False, (255, 255, 255), 5, cv2.LINE_AA)
-            cv2.polylines(image, [line], False, color, 3, cv2.LINE_AA)
+            wide = 3 + round(6 * (len(self.ways) - 1 - k) / len(self.ways))  # who goes over others hides none
+            cv2.polylines(image, [line], False, (255, 255, 255), wide + 2, cv2.LINE_AA)
+            cv2.polylines(image, [line], False, color, wide, cv2.LINE_AA)
             for index in self.shown:
                 at = way[index, :2, 3]
                 for side in (-0.5, 0.5):  # half the opening angle of a camera, about

@@ -274,7 +274,9 @@ def bench_paths(
             raise typer.BadParameter(
                 f"{name!r} is not one of {', '.join(PARADIGMS[1:])}", param_hint="--paradigms"
             )
-    counts = [round(n) for n in _numbers("--robots", robots, 1, MAX_ROBOTS)]
+    counts = _counts("--robots", robots)
+    if max(counts) > MAX_ROBOTS:
+        raise typer.BadParameter(f"{max(counts)} is more than {MAX_ROBOTS}", param_hint="--robots")
     asked = _numbers("--overlap", overlap, 0, 1)
     rows = paths.survey(scenes.split(","), paradigms.split(","), counts, asked, frames, seed, up)
     print(json.dumps(rows, indent=2) if as_json else paths.format_table(rows))

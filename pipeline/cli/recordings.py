@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import EXIT_FAILED, Force, Json, Out, Workers, app, say
+from pipeline.cli.common import EXIT_FAILED, Force, Json, Out, app, say
 from pipeline.errors import DuagError
 
 
@@ -48,7 +48,7 @@ def simulate(
         Path | None,
         typer.Option(metavar="PNG", help="Contact sheet to write: paths from above, views over time."),
     ] = None,
-    workers: Workers = 2,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that render; changes no result.")] = 2,
     force: Force = False,
 ) -> None:
     """Render a recording of a robot team, in a procedural scene or among textured meshes, with exact ground truth.
