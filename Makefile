@@ -18,7 +18,7 @@ help:
 	@echo "make lint        ruff and mypy"
 	@echo "make bench       speed of the kernels, side by side with plain torch"
 	@echo "make check-full  the slow checks as well, and the kernels under sanitizers (minutes)"
-	@echo "make fuzz        5000 damaged files for every reader (hours)"
+	@echo "make fuzz        5000 damaged files for every reader (an hour of one core)"
 
 setup: $(STAMP)
 

@@ -257,7 +257,7 @@ class _RosJson:
         return ros_json.read(self.kind, data, where)
 
     def header_ns(self, data: bytes, where: str) -> int:
-        return stamp_ns(self.read(data, where))
+        return ros_json.header_ns(self.kind, data, where)
 
     def tells_time(self, head: bytes) -> bool:
         return False

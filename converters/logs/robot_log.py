@@ -82,7 +82,7 @@ class RobotLog:
         if not chooser.images:
             where = f" below {self.namespace}" if self.namespace else ""
             video = video_words(self.log, self.namespace)
-            raise DuagError(f"{self.name}: found no topic of images{where}{video}; expected colour and depth")
+            raise DuagError(f"{self.name}: found no topic of images{where}, expected colour and depth{video}")
         self.depth = chooser.depth().required(self.log, "depth")
         self.color = chooser.color().required(self.log, "color")
         self.color_camera = self._camera(self.color, "color_info", chooser)

@@ -9,11 +9,13 @@ from __future__ import annotations
 import base64
 import binascii
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
 
+from converters.logs.files import stamp_ns
 from converters.logs.foxglove import Base64, json_members
 from converters.logs.rosbag_file import READ_TYPES, reason
 from pipeline.errors import DuagError
@@ -42,6 +44,19 @@ def read(kind: str, data: bytes, where: str) -> Any:
     try:
         return _built(kind, json_members(data))
     except Exception as error:  # broken JSON, and whatever values provoke that should be others
+        raise DuagError(
+            f"{where} holds {len(data)} bytes that are no {kind} in json ({reason(error)})"
+        ) from error
+
+
+def header_ns(kind: str, data: bytes, where: str) -> int:
+    """The time in the header of a message, without its data; 0 where it has no header. Raises DuagError as `read`."""
+    try:
+        members = json_members(data)
+        if not isinstance(members, dict) or "header" not in members:
+            return 0
+        return stamp_ns(SimpleNamespace(header=_built("std_msgs/msg/Header", members["header"])))
+    except Exception as error:
         raise DuagError(
             f"{where} holds {len(data)} bytes that are no {kind} in json ({reason(error)})"
         ) from error

@@ -51,8 +51,9 @@ class RosBag:
         self._encoding = "cdr" if self._reader.is2 else "ros1"
         self.topics: dict[str, Topic] = {}
         for c in self._reader.connections:
-            if not isinstance(c.msgcount, int):  # it stands in the metadata of a bag of ROS 2
-                raise DuagError(f"{path}: {c.topic} has {c.msgcount!r} messages, expected a number")
+            told = c.topic, c.msgtype, c.msgcount  # of a bag of ROS 2 they stand in its metadata
+            if not all(map(isinstance, told, (str, str, int))):
+                raise DuagError(f"{path}: found {told}, expected a topic, its type and number of messages")
             count = c.msgcount + (self.topics[c.topic].count if c.topic in self.topics else 0)
             kind = foxglove.ROS_TYPES.get(foxglove.plain_name(c.msgtype), c.msgtype)
             self.topics[c.topic] = Topic(c.topic, kind, c.msgtype, self._encoding, count)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.checks.findings import Finding, Severity
+from pipeline.messages import unpack_stamp
 from pipeline.progress import track
 from pipeline.recording import Record, RgbdFrame
 from pipeline.recording.read import LogFile
@@ -46,7 +47,7 @@ class Repeats:
         self.repeated += same
         self.longest, self._last = max(self.longest, self._run), digest
         self.stamps_ns.append(record.publish_time_ns)
-        self.other_stamps += image.timestamp.ToNanoseconds() != record.publish_time_ns
+        self.other_stamps += unpack_stamp(image) != record.publish_time_ns
 
 
 def read_repeats(log: LogFile, robot: str) -> dict[str, Repeats]:

@@ -88,8 +88,7 @@ class Link:
     adapting_from: float = 0.0  # received_total when the robust weights became final after their schedule
     newest: NDArray[np.int64] = field(init=False)  # [s] sequence last used
     newest_header: int = 0
-    change: Array = field(init=False)  # [s] last change by an arrival (m, rad)
-    recent: Array = field(init=False)  # [s, REMEMBERED] the same of the last arrivals, newest last
+    changes: Array = field(init=False)  # [s, REMEMBERED] by the last arrivals (m, rad), the newest last
     reference: tuple[Array, Array] | None = None  # force and poses when the curvature window began
     peer_curvature: Array | None = None
     peer_converged: bool = False
@@ -97,8 +96,7 @@ class Link:
     def __post_init__(self) -> None:
         self.offset = np.zeros((len(self.keyframes), 6))
         self.newest = np.zeros(len(self.keyframes), np.int64)
-        self.change = np.full(len(self.keyframes), np.inf)
-        self.recent = np.full((len(self.keyframes), REMEMBERED), np.inf)
+        self.changes = np.full((len(self.keyframes), REMEMBERED), np.inf)
 
     @property
     def holds(self) -> bool:
@@ -115,12 +113,11 @@ class Link:
 
     def moved(self, at: NDArray[np.int64], change: Array) -> None:
         """Note by how much an arrival moved the edge variables `at` (m, rad)."""
-        self.change[at] = change
-        self.recent[at] = np.concatenate([self.recent[at, 1:], change[:, None]], axis=1)
+        self.changes[at] = np.concatenate([self.changes[at, 1:], change[:, None]], axis=1)
 
     def largest_change(self) -> float:
         """Largest change of an edge variable by the last arrivals (m, rad); infinite before the first."""
-        return float(self.change.max())
+        return float(self.changes[:, -1].max())
 
     def largest_recent_change(self) -> float:
         """The same over the last arrivals; infinite before there were so many.
@@ -128,7 +125,7 @@ class Link:
         A neighbour that has not heard since says nearly the same again: the less arrives, the less a single small
         change means.
         """
-        return float(self.recent.max())
+        return float(self.changes.max())
 
 
 def link_metric(

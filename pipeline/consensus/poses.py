@@ -388,13 +388,14 @@ class PoseAgent:
 
     @property
     def largest_change(self) -> float:
-        """Largest change of a pose in the last step or of an edge variable by recent arrivals (m, rad)."""
-        return max([self.step_change, *(link.largest_recent_change() for link in self.links.values())])
+        """Largest change of a pose or an edge variable in the last round (m, rad)."""
+        return max([self.step_change, *(link.largest_change() for link in self.links.values())])
 
     @property
     def settled(self) -> bool:
-        """This end changes less than the tolerance, and its weights are final."""
-        return self.robust_done and self.largest_change < self.config.tolerance
+        """This end changes less than the tolerance, by the last arrivals too, and its weights are final."""
+        recent = [link.largest_recent_change() for link in self.links.values()]
+        return self.robust_done and max([self.step_change, *recent]) < self.config.tolerance
 
     @property
     def agreed(self) -> bool:

@@ -104,6 +104,10 @@ def _robot(robot: RobotRun, recording: Recording) -> Robot:
     true = groundtruth.trajectory(recording, robot.robot)
     if isinstance(true, Absent):
         raise DuagError(f"{recording.path}: {robot.robot} has no ground truth, expected a trajectory")
+    if not groundtruth.knows_rotations(recording, robot.robot):
+        raise DuagError(
+            f"{recording.path}: the ground truth of {robot.robot} has positions only, expected poses"
+        )
     pairs = trajectory_errors.pair(true, robot.trajectory)
     frame_of = {f.stamp_ns: f for f in robot.frames if f.status != "lost"}
     row_of = {stamp: row for row, stamp in enumerate(pairs.stamps_ns.tolist())}

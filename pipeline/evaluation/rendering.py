@@ -146,17 +146,17 @@ def own_longer(run: RunFolder, robot: RobotRun, source: Recording, threads: int)
     with open_rgbd(log) as camera_log:
         camera = camera_log.camera
     views = training_views(files, frames, poses, config, section_of(run, MovingConfig, "frontend", "moving"))
+    steps = sum(steps_of(config, len(views), 1))
     return refine(
         own.gaussians,
         np.ones(len(own.gaussians), bool),
         views,
         camera,
-        config,
+        config.model_copy(update={"steps_per_view": steps, "steps_max": steps}),
         section_of(run, MatchingConfig, "exchange", "matching").thickness_floor_m,
         own.depth,
         run.config.get("seed", 0),
         threads,
-        steps=(sum(steps_of(config, len(views), 1)), 0),
     )
 
 

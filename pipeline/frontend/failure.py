@@ -7,6 +7,7 @@ but whether they can be true: of a rigid world, seen by two sensors that both go
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -125,3 +126,46 @@ def intruders(
     z_keyframe, z_seen = 1 / nearest[told].astype(np.float64), points[inside, 2][told]
     gate_m = np.maximum(config.intruder_gate_m, config.intruder_gate_relative * z_keyframe)
     return int(np.count_nonzero(z_seen < z_keyframe - gate_m)), len(z_seen)
+
+
+@dataclass(frozen=True)
+class SeenFrom:
+    """A keyframe, coarse, and a view beside it: T_map_keyframe, T_keyframe_camera, [4, 4] each."""
+
+    keyframe: Level
+    T_map_keyframe: Array
+    T_keyframe_camera: Array
+
+
+class Obstruction:
+    """Something before the camera: noticed when much of a view stands in space that was seen to be free.
+
+    Every view is held against its keyframe and against the last clear view. That one was taken nearby: what appears
+    from one frame to the next is inside it, where the keyframe, from elsewhere, cannot judge what is near the lens. The
+    keyframe is older: it also knows what came in slowly.
+    """
+
+    def __init__(self, config: FailureConfig) -> None:
+        self.config = config
+        self.standing = False
+        self._clear: tuple[Level, Array] | None = None  # the last view without, coarse, and its T_map_camera
+
+    def look(self, view: Level, seen: SeenFrom) -> None:
+        """Look at the next view that was tracked. What stands there is gone only when most of a view can be judged."""
+        intruded, told = self.intruded(view, seen)
+        if intruded:
+            self.standing = True
+        elif told >= self.config.min_told * int(np.count_nonzero(view.inverse_depth)):
+            self.standing = False
+        if not self.standing:
+            self._clear = view, seen.T_map_keyframe @ seen.T_keyframe_camera
+
+    def intruded(self, view: Level, seen: SeenFrom) -> tuple[bool, int]:
+        """Whether too much of a view stands in free space; second, how many of its pixels could be judged."""
+        judged = [intruders(view, seen.keyframe, seen.T_keyframe_camera, self.config)]
+        if self._clear is not None:
+            clear, T_map_clear = self._clear
+            T_clear_camera = se3.inverse(T_map_clear) @ seen.T_map_keyframe @ seen.T_keyframe_camera
+            judged.append(intruders(view, clear, T_clear_camera, self.config))
+        intruded = any(intruding > self.config.max_intruders * told for intruding, told in judged)
+        return intruded, max(told for _, told in judged)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.frontend.config import ModelConfig
-from pipeline.frontend.tracking import TrackedFrame
+from pipeline.frontend.tracked import TrackedFrame
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels import Rasterizer

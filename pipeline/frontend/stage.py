@@ -21,7 +21,8 @@ from pipeline.frontend import bundle, loops
 from pipeline.frontend.config import FrontendConfig, is_held_out
 from pipeline.frontend.failure import Reason
 from pipeline.frontend.keyframes import KeyframePair, Refined, refine
-from pipeline.frontend.tracking import Status, TrackedFrame, TrackedKeyframe, Tracker
+from pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
+from pipeline.frontend.tracking import Tracker
 from pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
 from pipeline.recording import LogWriter, RgbdLog, open_rgbd
 from pipeline.registration import RgbdPyramid

@@ -8,22 +8,28 @@ the next frame agrees.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from enum import Enum
-from functools import cached_property
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.frontend.config import FrontendConfig, is_held_out
-from pipeline.frontend.failure import Reason, StuckImages, has_enough_depth, intruders, saturated_share
+from pipeline.frontend.failure import (
+    Obstruction,
+    Reason,
+    SeenFrom,
+    StuckImages,
+    has_enough_depth,
+    intruders,
+    saturated_share,
+)
 from pipeline.frontend.keyframes import KeyframePair, becomes_keyframe, predicted_overlap
 from pipeline.frontend.relocalisation import features_of, guesses, supports
+from pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.recording import MotionPrior
 from pipeline.registration import (
-    Level,
     Outcome,
     Reference,
     Registration,
@@ -39,60 +45,6 @@ SETTLING_ROUNDS = 3
 USUAL_FRAMES = 50  # whose residuals are the usual ones
 FEATURES_TO_SAY = 3  # times the inliers needed: a keyframe with fewer features cannot say where a view is
 SETTLED_M, SETTLED_RAD = 0.01, 0.01  # a registration that moves less from its own answer has settled
-
-
-class Status(Enum):
-    """Whether a frame's pose may be used; the values stand in the log."""
-
-    OK = "ok"
-    LOST = "lost"
-    RELOCALISED = "relocalised"
-
-
-@dataclass(frozen=True)
-class TrackedFrame:
-    """Where a frame was, relative to a keyframe.
-
-    keyframe_index: the keyframe that it hangs on. T_keyframe_camera: [4, 4]; the last known one if lost.
-    information: [6, 6] of T_keyframe_camera, right tangent (translation m, rotation rad); zero if lost. reason: why
-    it is lost, or why only its colour or only its depth was used.
-    """
-
-    frame_index: int
-    stamp_ns: int
-    keyframe_index: int
-    T_keyframe_camera: Array
-    information: Array
-    status: Status
-    overlap: float
-    rms_depth_m: float
-    rms_gray: float
-    reason: Reason = Reason.NONE
-
-
-@dataclass(frozen=True)
-class TrackedKeyframe:
-    """A keyframe as it was tracked. exposure: (gain, offset) of its grey values relative to keyframe 0.
-
-    features: by which a lost camera is found here. coarsest: the coarsest image of its pyramid.
-    """
-
-    keyframe_index: int
-    frame_index: int
-    stamp_ns: int
-    previous_index: int
-    T_map_keyframe: Array
-    reference: Reference = field(repr=False)
-    features: Features = field(repr=False)
-    coarsest: Level = field(repr=False)
-    exposure: tuple[float, float] = (1.0, 0.0)
-
-    @cached_property
-    def centre_map(self) -> Array:
-        """The middle [3] of what it sees, in the map as tracked."""
-        points = self.reference.levels[-1].points.astype(np.float64)
-        middle = np.median(points, axis=0) if len(points) else np.zeros(3)
-        return se3.transform(self.T_map_keyframe, middle[None])[0]
 
 
 @dataclass(frozen=True)
@@ -138,8 +90,7 @@ class Tracker:
         self._lost = False
         self._unconfirmed: _Unconfirmed | None = None
         self._gray_rms: list[float] = []  # of the last frames that were followed
-        self._obstructed = False  # something stands before the camera
-        self._clear: tuple[Level, Array] | None = None  # the last view without, coarse, and its T_map_camera
+        self._obstruction = Obstruction(config.tracking.failure)
         self._without_depth = self._without_color = 0  # frames in a row without a usable image
 
     def track(
@@ -235,16 +186,16 @@ class Tracker:
         if followed and found.without is Reason.NONE:
             self._gray_rms = [*self._gray_rms[1 - USUAL_FRAMES :], result.rms_gray]
         if found.without is Reason.NONE:
-            self._look_for_obstructions(pyramid, found)
+            self._obstruction.look(pyramid.levels[-1], self._seen_before(found))
         if (
             not is_held_out(frame_index)
             and found.without is Reason.NONE
             and becomes_keyframe(result, pyramid, self.config.keyframes)
             and self._well_exposed(pyramid, result)
-            and not self._obstructed
+            and not self._obstruction.standing
         ):
             return self._promote(frame_index, stamp_ns, pyramid, keyframe_index, result, status)
-        return _tracked(frame_index, stamp_ns, keyframe_index, result, status, found.without)
+        return TrackedFrame.by(frame_index, stamp_ns, keyframe_index, result, status, found.without)
 
     def _lose(self, frame_index: int, stamp_ns: int, reason: Reason) -> TrackedFrame:
         """A frame without a pose: it keeps the last known one, and says that it means nothing."""
@@ -363,7 +314,9 @@ class Tracker:
         # along weak directions a prior knows the pose, or the outcome would not be OK
         covariance = np.linalg.pinv(found.result.information, rcond=1e-12, hermitian=True)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-        return sigma_m <= failure.max_sigma_obstructed_m or not self._intruded(pyramid, found)[0]
+        if sigma_m <= failure.max_sigma_obstructed_m:
+            return True
+        return not self._obstruction.intruded(pyramid.levels[-1], self._seen_before(found))[0]
 
     def _believable(self, stamp_ns: int, pyramid: RgbdPyramid, found: _Found, view: Features) -> bool:
         """Whether a pose that was not simply followed can be true.
@@ -431,38 +384,10 @@ class Tracker:
         leaving = min(result.overlap, result.view) < config.relocalisation.min_overlap
         return leaving and saturated_share(pyramid.levels[0]) <= config.max_saturated
 
-    def _look_for_obstructions(self, pyramid: RgbdPyramid, found: _Found) -> None:
-        """Notice what stands before the camera, and when it is gone.
-
-        It is gone only when most of the view can be judged: what moves with the camera soon stands beside the
-        keyframe's view.
-        """
-        coarsest = pyramid.levels[-1]
-        intruded, told = self._intruded(pyramid, found)
-        if intruded:
-            self._obstructed = True
-        elif told >= self.config.tracking.failure.min_told * int(np.count_nonzero(coarsest.inverse_depth)):
-            self._obstructed = False
-        if not self._obstructed:
-            keyframe = self.keyframes[found.keyframe_index]
-            self._clear = coarsest, keyframe.T_map_keyframe @ found.result.T_reference_target
-
-    def _intruded(self, pyramid: RgbdPyramid, found: _Found) -> tuple[bool, int]:
-        """Whether much of a view stands in space that its keyframe, or the last clear view, saw to be free.
-
-        The last clear view was taken nearby: what appears from one frame to the next is inside it. The keyframe is
-        older: it also knows what came in slowly. Second, how many pixels of the view the better of them could judge.
-        """
-        config, keyframe = self.config.tracking.failure, self.keyframes[found.keyframe_index]
-        T_keyframe_camera = found.result.T_reference_target
-        earlier = [(keyframe.coarsest, T_keyframe_camera)]
-        if self._clear is not None:
-            clear, T_map_clear = self._clear
-            T_clear_camera = se3.inverse(T_map_clear) @ keyframe.T_map_keyframe @ T_keyframe_camera
-            earlier.append((clear, T_clear_camera))
-        judged = [intruders(pyramid.levels[-1], level, T, config) for level, T in earlier]
-        intruded = any(intruding > config.max_intruders * told for intruding, told in judged)
-        return intruded, max(told for _, told in judged)
+    def _seen_before(self, found: _Found) -> SeenFrom:
+        """The keyframe that a frame was registered to, as its obstruction is judged by it."""
+        keyframe = self.keyframes[found.keyframe_index]
+        return SeenFrom(keyframe.coarsest, keyframe.T_map_keyframe, found.result.T_reference_target)
 
     # --- keyframes ------------------------------------------------------------------------------------------------
 
@@ -482,16 +407,8 @@ class Tracker:
         self._register_to_neighbours(pyramid, previous, T_map_keyframe, new)
         self._add_keyframe(frame_index, stamp_ns, pyramid, previous, T_map_keyframe, result)
         self._current, self._T_keyframe_camera = new, np.eye(4)
-        return TrackedFrame(
-            frame_index,
-            stamp_ns,
-            new,
-            np.eye(4),
-            result.information,
-            status,
-            result.overlap,
-            result.rms_depth_m,
-            result.rms_gray,
+        return replace(
+            TrackedFrame.by(frame_index, stamp_ns, new, result, status), T_keyframe_camera=np.eye(4)
         )
 
     def _register_to_neighbours(
@@ -548,28 +465,6 @@ class Tracker:
                 (gain, offset),
             )
         )
-
-
-def _tracked(
-    frame_index: int,
-    stamp_ns: int,
-    keyframe_index: int,
-    result: Registration,
-    status: Status,
-    reason: Reason,
-) -> TrackedFrame:
-    return TrackedFrame(
-        frame_index,
-        stamp_ns,
-        keyframe_index,
-        result.T_reference_target,
-        result.information,
-        status,
-        result.overlap,
-        result.rms_depth_m,
-        result.rms_gray,
-        reason,
-    )
 
 
 def _equalising(pyramid: RgbdPyramid, keyframe: TrackedKeyframe, from_gain: float) -> tuple[float, float]:

@@ -64,7 +64,6 @@ def refine(
     threads: int = 1,
     *,
     peer_views: Sequence[View] = (),
-    steps: tuple[int, int] | None = None,
 ) -> Gaussians:
     """The map after some steps, each on one view: own ones in random order, each once before any comes again, and
     neighbours' likewise, evenly spread among the first.
@@ -74,11 +73,10 @@ def refine(
         views: own images. peer_views: as neighbours' maps show them.
         thickness_floor_m: none becomes thinner than this, or than it was.
         depth: as the map was made. threads: changes no bit.
-        steps: on own views and on neighbours'; `steps_of` if None.
     Returns:
         As many Gaussians, in the same order, with the same ids and anchors.
     """
-    own_steps, peer_steps = steps_of(config, len(views), len(peer_views)) if steps is None else steps
+    own_steps, peer_steps = steps_of(config, len(views), len(peer_views))
     if not own_steps or not len(gaussians):
         return gaussians
     total = own_steps + peer_steps

@@ -127,6 +127,14 @@ def twice(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
         yield record, message, stamps[7] if again else publish_ns
 
 
+def no_clock(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
+    """Images with times that protobuf itself refuses."""
+    for record, message, publish_ns in nothing(records):
+        if record.topic == COLOR:
+            message.timestamp.nanos = -1
+        yield record, message, publish_ns
+
+
 def gap(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
     """A second without images, in the times alone."""
     middle = records[len(records) // 2].log_time_ns
@@ -163,6 +171,7 @@ FAULTS: dict[str, tuple[Change, dict[str, Any], str, str]] = {
     "size for focal length": (swapped(fx="height"), {}, "warning", "intrinsics"),
     "stuck": (stuck, {}, "warning", "repeats"),
     "times twice": (twice, {}, "warning", "times"),
+    "times of no clock": (no_clock, {}, "warning", "times"),
     "gap": (gap, {}, "warning", "gaps"),
     "no depth": (no_depth, {}, "error", "depth"),
     "half the depth": (half_depth, {}, "warning", "pairs"),

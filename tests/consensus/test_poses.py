@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.consensus.closures import Closure, ClosureConfig
 from pipeline.consensus.factors import Factors
-from pipeline.consensus.links import SharedKeyframes
+from pipeline.consensus.links import REMEMBERED, SharedKeyframes
 from pipeline.consensus.poses import PoseAgent, PoseConsensusConfig
 from pipeline.consensus.robust import graduated_weights
 from pipeline.geometry import se3
@@ -50,6 +50,23 @@ def test_float32_packets_stay_within_their_rounding():
     assert_same_poses(
         team_poses(agents), best.poses, atol=2e-5
     )  # stopping tolerance 1e-5, float32 of 10 m: 1e-6
+
+
+def test_a_neighbour_that_hears_nothing_does_not_make_an_end_hold_still():
+    """It says nearly the same again and again; a few such arrivals change little, and mean nothing."""
+    agents = make_team(1, robots=2).agents(PLAIN)
+    deaf, other = agents["alpha"], agents["bravo"]
+    deaf.step()
+    quiet, settled = [], []
+    for _ in range(20):
+        other.receive("alpha", deaf.outgoing("bravo"))
+        other.step()
+        quiet.append(other.largest_change < other.config.tolerance)
+        settled.append(other.settled)
+    first = quiet.index(True)
+    assert first < 10
+    assert all(quiet[first:])
+    assert not any(settled[: first + REMEMBERED - 2])
 
 
 def test_duplicates_reordering_and_halves_change_nothing_in_the_end():

@@ -269,12 +269,9 @@ def test_what_is_missing_is_named(tmp_path: Path, change: Callable[[Any], Any], 
     [
         (lambda bag: edit_rows(bag, "update messages set data = 'text' where id = 4"), "holds 4 bytes that are no"),
         (lambda bag: edit_rows(bag, "update messages set data = 7"), "cannot open value of type integer"),
-        (
-            lambda bag: (bag / "metadata.yaml").write_text(
-                re.sub("message_count: [0-9]+", "message_count: many", (bag / "metadata.yaml").read_text())
-            ),
-            "'many'",
-        ),
+        (lambda bag: edit_metadata(bag, "message_count: [0-9]+", "message_count: many"), "'many'"),
+        (lambda bag: edit_metadata(bag, "type: .*", "type: null"), "None"),
+        (lambda bag: edit_metadata(bag, "name: .*", "name: 7"), "7"),
     ],
 )  # fmt: skip
 def test_a_database_with_anything_in_it_is_refused(
@@ -285,6 +282,11 @@ def test_a_database_with_anything_in_it_is_refused(
     change(bag)
     with pytest.raises(DuagError, match=message):
         converters.convert("ros", bag, tmp_path / "rec")
+
+
+def edit_metadata(bag: Path, pattern: str, new: str) -> None:
+    file = bag / "metadata.yaml"
+    file.write_text(re.sub(pattern, new, file.read_text()))
 
 
 def edit_rows(bag: Path, statement: str) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.frontend.config import FrontendConfig
-from pipeline.frontend.tracking import Status, TrackedFrame, Tracker
+from pipeline.frontend.tracked import Status, TrackedFrame
+from pipeline.frontend.tracking import Tracker
 from pipeline.geometry import se3
 
 WRONG_M, WRONG_RAD = 0.05, np.deg2rad(3.0)
@@ -184,4 +185,5 @@ def _copied(tracker: Tracker) -> Tracker:
         if isinstance(value, list):
             setattr(other, name, list(value))
     other._stuck = copy.copy(tracker._stuck)
+    other._obstruction = copy.copy(tracker._obstruction)
     return other

@@ -8,7 +8,7 @@ from pipeline.frontend.failure import Reason
 from pipeline.frontend.mapping import Mapper
 from pipeline.frontend.mapping_config import MappingConfig
 from pipeline.frontend.model import ModelTracker
-from pipeline.frontend.tracking import Status, TrackedFrame
+from pipeline.frontend.tracked import Status, TrackedFrame
 from pipeline.geometry import se3
 from pipeline.recording import RgbdFrame
 from pipeline.registration import RegistrationConfig

@@ -12,7 +12,7 @@ from pipeline.frontend.config import FrontendConfig, KeyframeConfig, TrackingCon
 from pipeline.frontend.keyframes import KeyframePair, refine
 from pipeline.frontend.mapping_config import MappingConfig
 from pipeline.frontend.stage import LATENCY_NS, _support, run_frontend
-from pipeline.frontend.tracking import Status, TrackedFrame
+from pipeline.frontend.tracked import Status, TrackedFrame
 from pipeline.geometry import se3
 from pipeline.geometry.trajectory import ate_rmse_m
 from pipeline.recording import content_digest, read_log

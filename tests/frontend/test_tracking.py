@@ -7,7 +7,8 @@ import pytest
 
 from pipeline.frontend.config import FrontendConfig, KeyframeConfig, TrackingConfig, is_held_out
 from pipeline.frontend.keyframes import KeyframePair, refine
-from pipeline.frontend.tracking import Status, TrackedFrame, Tracker
+from pipeline.frontend.tracked import Status, TrackedFrame
+from pipeline.frontend.tracking import Tracker
 from pipeline.geometry import se3
 from pipeline.geometry.trajectory import ate_rmse_m
 from pipeline.recording import Motion

@@ -1,5 +1,7 @@
 """Training of a fused map: better on the own images, elsewhere as it was, and the same each time."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -165,3 +167,11 @@ def test_steps_are_shared_out() -> None:
     assert steps_of(config, 4, 7) == (20, 5)
     assert steps_of(config, 40, 7) == (100, 25)
     assert steps_of(config, 40, 0) == (100, 0)
+
+
+def test_made_up_colours_of_a_neighbour_do_little_to_own_views(spoilt: tuple[Gaussians, list[View]]) -> None:
+    """Robust loss, a fifth of the steps, and own images last."""
+    gaussians, views = spoilt
+    own, hostile = views[::2], [replace(v, color=255 - v.color) for v in views[1::2]]
+    fooled = refine(gaussians, ALL, own, CAMERA, RefineConfig(), 1e-3, "blended", seed=0, peer_views=hostile)
+    assert score(fooled, own) > score(gaussians, own) + 1

@@ -236,6 +236,7 @@ CONVERTERS = (
     converter("ros2-lidar", seeds.lidar_bag, "ros", lambda: list(seeds.LIDAR_OPTIONS)),
     converter("ros-toml", seeds.team_file, "ros"),
     converter("mcap-json", seeds.foreign("json"), "ros"),
+    converter("mcap-rosbridge", seeds.foreign("rosbridge"), "ros"),
     converter("mcap-protobuf", seeds.foreign("protobuf"), "ros"),
     converter("kimera-multi", seeds.kimera, "kimera-multi"),
     converter("s3e", seeds.s3e, "s3e"),

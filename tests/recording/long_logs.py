@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from mcap.writer import CompressionType, Writer
 from rosbags.rosbag1 import Writer as BagWriter
@@ -30,6 +31,7 @@ from schemas import topics
 from tests.converters.ros_bags import Ros
 
 KINDS = ("bag", "db3", "cdr", "protobuf", "json")
+PACKED = "bag-png"  # a bag with depth as compressedDepth
 COLOR, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"
 INFOS = ("/camera/color/camera_info", "/camera/aligned_depth_to_color/camera_info")
 IMU, STATIC = "/camera/imu", "/tf_static"
@@ -70,8 +72,8 @@ def patched(data: bytes) -> Message:
     return lambda at: data[:4] + struct.pack("<II", at // 10**9, at % 10**9) + data[12:]
 
 
-def ros_messages(seed: Seed, ros: Ros) -> dict[str, tuple[str, list[Message]]]:
-    """By topic: type and the messages that are repeated."""
+def ros_messages(seed: Seed, ros: Ros, packed: bool) -> dict[str, tuple[str, list[Message]]]:
+    """By topic: type and the messages that are repeated. packed: depth as compressedDepth."""
     serialise: Any = ros.store.serialize_ros1 if ros.version == 1 else ros.store.serialize_cdr
     text = "jpeg" if seed.colors[0].startswith(b"\xff\xd8") else "png"
     still = ros.make("geometry_msgs/msg/Vector3", x=0.01, y=0.02, z=9.81)
@@ -92,6 +94,16 @@ def ros_messages(seed: Seed, ros: Ros) -> dict[str, tuple[str, list[Message]]]:
         f"{COLOR}/compressed": [ros.compressed(START_NS, FRAME, c, text) for c in seed.colors],
         DEPTH: [ros.image(START_NS, FRAME, d, "16UC1") for d in seed.depths],
     }
+    if packed:
+        found[DEPTH] = [
+            ros.compressed(
+                START_NS,
+                FRAME,
+                bytes(12) + cv2.imencode(".png", d)[1].tobytes(),
+                "16UC1; compressedDepth png",
+            )
+            for d in seed.depths
+        ]
     out: dict[str, tuple[str, list[Message]]] = {}
     for topic, rows in found.items():
         encoded = [bytes(serialise(m, m.__msgtype__)) for m in rows]
@@ -171,11 +183,14 @@ def mcap(path: Path, kind: str, types: dict[str, str]) -> Iterator[Callable[[str
 
 def write(seed: Seed, path: Path, kind: str, most_bytes: float) -> int:
     """Write a log of about so many bytes of messages. Returns the number of frames."""
-    ros = Ros(1 if kind == "bag" else 2)
-    found = foxglove_messages(seed, kind) if kind in ("protobuf", "json") else ros_messages(seed, ros)
+    ros = Ros(1 if kind in ("bag", PACKED) else 2)
+    if kind in ("protobuf", "json"):
+        found = foxglove_messages(seed, kind)
+    else:
+        found = ros_messages(seed, ros, kind == PACKED)
     types = {topic: name for topic, (name, _) in found.items()}
     opened: AbstractContextManager[Callable[[str, int, bytes], None]]
-    opened = rosbag(path, ros, types) if kind in ("bag", "db3") else mcap(path, kind, types)
+    opened = rosbag(path, ros, types) if kind in ("bag", PACKED, "db3") else mcap(path, kind, types)
     order = [*range(len(seed.colors)), *range(len(seed.colors) - 2, 0, -1)]
     frames = written = readings = 0
     with opened as put:
@@ -199,7 +214,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("recording", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--kind", choices=KINDS, default="bag")
+    parser.add_argument("--kind", choices=(*KINDS, PACKED), default="bag")
     parser.add_argument("--gigabytes", type=float, default=2.0)
     parser.add_argument("--frames", type=int, default=60, help="of the recording that are repeated")
     said = parser.parse_args()
