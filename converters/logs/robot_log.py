@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
@@ -24,12 +25,12 @@ from converters.tum_layout import Listed, associate
 from pipeline.errors import DuagError
 from pipeline.geometry import se3
 from pipeline.progress import track
+from pipeline.recording.register_depth import MOST_SAMPLES, sample_steps
 
 Array = NDArray[np.float64]
 HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
 RECTIFIED = ("image_rect", "image_rect_color", "rect")
 SAME_CAMERA_PX = 1.0  # up to which a camera has not changed
-FINEST = 64  # pixels of colour between two of depth, which are filled when depth is moved
 OUT_SCALE = 0.0005  # metres per unit of depth that was registered or came as floats
 
 
@@ -95,11 +96,14 @@ class RobotLog:
         self.camera = self.color_camera.camera
         self.depth_camera = self._camera(self.depth, "depth_info", chooser)
         self.T_color_depth = self._extrinsics()
-        finer = self.camera.fx / self.depth_camera.camera.fx
-        if self.T_color_depth is not None and finer > FINEST:
+        sensor = self.depth_camera.camera
+        steps = sample_steps(sensor, self.camera)
+        if self.T_color_depth is not None and steps**2 * sensor.width * sensor.height > MOST_SAMPLES:
+            finer = max(self.camera.fx / sensor.fx, self.camera.fy / sensor.fy)
+            most = math.isqrt(MOST_SAMPLES // (sensor.width * sensor.height)) / 1.5
             raise DuagError(
                 f"{self.name}: pixels of {self.color} are {finer:.0f} times as fine as those of {self.depth}, expected "
-                f"at most {FINEST} times"
+                f"at most {most:.0f} times"
             )
         self.keeps_depth = is_integer_depth(chooser.images[self.depth]) and self.T_color_depth is None
         self.depth_scale = s.depth_scale if self.keeps_depth else OUT_SCALE

@@ -49,14 +49,29 @@ class RosBag:
                 if isinstance(reader, Reader1):
                     _bound_chunks(reader)
         self._encoding = "cdr" if self._reader.is2 else "ros1"
-        self.topics: dict[str, Topic] = {}
+        try:
+            self.topics = self._topics()
+        except BaseException:
+            self.close()
+            raise
+
+    def _topics(self) -> dict[str, Topic]:
+        topics: dict[str, Topic] = {}
         for c in self._reader.connections:
             told = c.topic, c.msgtype, c.msgcount  # of a bag of ROS 2 they stand in its metadata
             if not all(map(isinstance, told, (str, str, int))):
-                raise DuagError(f"{path}: found {told}, expected a topic, its type and number of messages")
-            count = c.msgcount + (self.topics[c.topic].count if c.topic in self.topics else 0)
+                raise DuagError(
+                    f"{self.path}: found {told}, expected a topic, its type and number of messages"
+                )
+            before = topics.get(c.topic)
+            if before is not None and before.schema != c.msgtype:
+                raise DuagError(
+                    f"{self.path}: {c.topic} holds {before.schema} and {c.msgtype}, expected one type"
+                )
+            count = c.msgcount + (before.count if before is not None else 0)
             kind = foxglove.ROS_TYPES.get(foxglove.plain_name(c.msgtype), c.msgtype)
-            self.topics[c.topic] = Topic(c.topic, kind, c.msgtype, self._encoding, count)
+            topics[c.topic] = Topic(c.topic, kind, c.msgtype, self._encoding, count)
+        return topics
 
     def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
         heads = [t for t in heads if foxglove.plain_name(self.topics[t].schema) not in foxglove.ROS_TYPES]

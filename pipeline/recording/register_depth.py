@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +15,13 @@ Image = NDArray[np.float32]
 SAME_SURFACE = 0.03  # relative step of depth up to which neighbours are one surface
 ONE_LAYER = 0.01  # relative depth behind the nearest sample of a pixel up to which samples are averaged
 NEAREST_M = 0.05
+MOST_SAMPLES = 64_000_000  # of a depth image that is registered; each takes twelve bytes
+
+
+def sample_steps(depth_camera: PinholeCamera, camera: PinholeCamera) -> int:
+    """Samples per pixel of the depth camera, along either axis, that leave no gaps in the other camera."""
+    growth = max(camera.fx / depth_camera.fx, camera.fy / depth_camera.fy)
+    return max(1, int(np.ceil(1.5 * growth)))
 
 
 def register_depth(
@@ -31,9 +40,8 @@ def register_depth(
     """
     known = depth_m > 0
     inverse = np.where(known, 1 / np.where(known, depth_m, 1), 0).astype(np.float64)
-    growth = max(camera.fx / depth_camera.fx, camera.fy / depth_camera.fy)
-    steps = max(1, int(np.ceil(1.5 * growth)))
-    points = []
+    steps = sample_steps(depth_camera, camera)
+    drawn = []
     for b in range(steps):
         for a in range(steps):
             rho = inverse if a == b == 0 else _between(inverse, a / steps, b / steps)
@@ -41,8 +49,8 @@ def register_depth(
             z = 1 / rho[v, u]
             x = (u + a / steps - depth_camera.cx) / depth_camera.fx * z
             y = (v + b / steps - depth_camera.cy) / depth_camera.fy * z
-            points.append(np.stack([x, y, z], axis=-1))
-    return draw_points(se3.transform(T_camera_depth, np.concatenate(points)), camera)
+            drawn.append(_pixels(se3.transform(T_camera_depth, np.stack([x, y, z], axis=-1)), camera))
+    return _nearest(drawn, camera)
 
 
 def _between(inverse: Array, a: float, b: float) -> Array:
@@ -56,21 +64,24 @@ def _between(inverse: Array, a: float, b: float) -> Array:
     return out
 
 
-def draw_points(points_camera: Array, camera: PinholeCamera) -> Image:
-    """Points [n, 3] of the camera frame as a depth image: the nearest of every pixel, 0 where there is none.
-
-    The samples of the nearest surface in a pixel are averaged in inverse depth.
-    """
+def _pixels(points_camera: Array, camera: PinholeCamera) -> tuple[NDArray[np.int32], Array]:
+    """Pixel (row by row) and depth of the points that fall into the image."""
     points = points_camera[points_camera[:, 2] > NEAREST_M]
     u, v = np.rint(camera.project(points)).T
     inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    pixel = (v[inside] * camera.width + u[inside]).astype(np.int64)
-    z = points[inside, 2]
+    return (v[inside] * camera.width + u[inside]).astype(np.int32), points[inside, 2]
+
+
+def _nearest(drawn: Sequence[tuple[NDArray[np.int32], Array]], camera: PinholeCamera) -> Image:
+    """The nearest surface in every pixel, of samples in several lots; its samples are averaged in inverse depth."""
     size = camera.width * camera.height
     nearest = np.full(size, np.inf)
-    np.minimum.at(nearest, pixel, z)
-    front = z <= (1 + ONE_LAYER) * nearest[pixel]
-    count = np.bincount(pixel[front], minlength=size)
-    total = np.bincount(pixel[front], 1 / z[front], size)
+    for pixel, z in drawn:
+        np.minimum.at(nearest, pixel, z)
+    count, total = np.zeros(size), np.zeros(size)
+    for pixel, z in drawn:
+        front = z <= (1 + ONE_LAYER) * nearest[pixel]
+        np.add.at(count, pixel[front], 1)
+        np.add.at(total, pixel[front], 1 / z[front])
     depth = np.where(count > 0, count / np.where(count > 0, total, 1), 0)
     return depth.reshape(camera.height, camera.width).astype(np.float32)

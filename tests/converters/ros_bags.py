@@ -119,12 +119,12 @@ class Ros:
         return out
 
     def _fill(self, bag: Any, rows: list[tuple[str, int, Any]], serialise: Callable[..., Any]) -> None:
-        connections: dict[str, Any] = {}
+        connections: dict[tuple[str, str], Any] = {}
         for topic, log_ns, message in rows:
             kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = bag.add_connection(topic, kind, typestore=self.store)
-            bag.write(connections[topic], log_ns, serialise(message, kind))
+            if (topic, kind) not in connections:
+                connections[topic, kind] = bag.add_connection(topic, kind, typestore=self.store)
+            bag.write(connections[topic, kind], log_ns, serialise(message, kind))
 
 
 def scene(

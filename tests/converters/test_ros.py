@@ -6,6 +6,7 @@ import json
 import re
 import sqlite3
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,27 @@ def test_every_container_gives_the_same_recording(tmp_path: Path, version: int, 
             assert np.median(np.abs(frame.color[inner].astype(int) - color[inner])) <= 2
     check = json.loads((tmp_path / "rec" / "recording.json").read_text())["checks"]["alpha"]
     assert check["reprojection_median_m"] < 0.05
+
+
+def test_a_topic_of_two_types_is_refused(tmp_path: Path) -> None:
+    r = Ros(1)
+    rows = [*scene(r), ("/tf_static", START_NS, r.info(START_NS, "color", COLOR))]
+    with pytest.raises(DuagError, match=r"/tf_static holds .*TFMessage and .*CameraInfo, expected one type"):
+        converters.convert("ros", r.write(tmp_path / "bag", rows, "plain"), tmp_path / "rec")
+
+
+def test_colour_that_is_too_fine_for_the_depth_is_refused(tmp_path: Path) -> None:
+    """Depth is drawn in steps of the other camera's pixels: a wrong CameraInfo would ask for all memory."""
+    r = Ros(1)
+    wrong = {
+        "/camera/color/camera_info": r.info(START_NS, "_color", replace(COLOR, fy=15 * COLOR.fy)),
+        "/camera/depth/camera_info": r.info(START_NS, "_depth", replace(DEPTH, fy=DEPTH.fy / 6)),
+    }
+    rows = [(name, at, wrong.get(name, message)) for name, at, message in scene(r)]
+    with pytest.raises(
+        DuagError, match=r"color/image_raw are \d+ times as fine as those of .*, expected at most"
+    ):
+        converters.convert("ros", r.write(tmp_path / "bag", rows, "plain"), tmp_path / "rec")
 
 
 def test_depth_that_is_not_moved_is_wrong(tmp_path: Path) -> None:
