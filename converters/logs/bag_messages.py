@@ -33,7 +33,12 @@ def messages(reader: Any, topics: Collection[str], heads: Collection[str]) -> It
     elif not reader.is2 and all(_is_plain(chunk) for chunk in inner.chunks.values()):
         yield from _of_bag(inner, connections, heads)
     else:
-        yield from reader.messages(connections=connections)
+        for message in reader.messages(connections=connections):
+            if message[0] not in connections:
+                raise ValueError(
+                    f"the index leads to a message of {message[0].topic}, not of {sorted(topics)}"
+                )
+            yield message
 
 
 def _is_plain(chunk: Any) -> bool:

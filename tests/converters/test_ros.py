@@ -75,6 +75,20 @@ def test_a_topic_of_two_types_is_refused(tmp_path: Path) -> None:
         converters.convert("ros", r.write(tmp_path / "bag", rows, "plain"), tmp_path / "rec")
 
 
+@pytest.mark.parametrize("container", ["plain", "lz4"])
+def test_an_index_that_leads_to_another_topic_is_refused(tmp_path: Path, container: str) -> None:
+    r = Ros(1)
+    bag = r.write(tmp_path / "bag", scene(r), container)
+    data = bytearray(bag.read_bytes())
+    entries = [m.start() for m in re.finditer(rb"op=\x04", data)]  # one for every topic
+    for at in entries:
+        conn = data.index(b"conn=", at - 40) + 5
+        data[conn] = (data[conn] + 1) % len(entries)
+    bag.write_bytes(data)
+    with pytest.raises(DuagError, match=r"bag\.bag: .*, expected a sound bag of ROS 1 or ROS 2"):
+        converters.convert("ros", bag, tmp_path / "rec")
+
+
 def test_colour_that_is_too_fine_for_the_depth_is_refused(tmp_path: Path) -> None:
     """Depth is drawn in steps of the other camera's pixels: a wrong CameraInfo would ask for all memory."""
     r = Ros(1)
