@@ -23,7 +23,6 @@ from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.summary import Summary
-from mcap.writer import CompressionType, IndexType, Writer
 
 from pipeline.errors import DuagError
 from pipeline.files import check_file, read_bytes
@@ -32,7 +31,7 @@ from pipeline.progress import track
 from pipeline.recording import RECORDING_FILE, RECORDING_FORMAT, RECORDING_SCHEMA, open_rgbd
 from pipeline.recording.identity import ContentDigest, channel_identity, framed
 from pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, MAGIC, ROBOT_KEY
-from pipeline.recording.write import CHUNK_BYTES
+from pipeline.recording.write import mcap_writer
 
 _RECORD = struct.Struct("<BQ")  # opcode, length
 _CHUNK = struct.Struct("<QQQII")  # first and last time, size, checksum, length of the compression's name
@@ -315,14 +314,7 @@ class _Copy:
     """Writes records into a new log, as `LogWriter` writes it: the digest of a log that lost nothing is the same."""
 
     def __init__(self, target: IO[bytes], salvage: Salvage) -> None:
-        self._writer = Writer(
-            target,
-            chunk_size=CHUNK_BYTES,
-            compression=CompressionType.ZSTD,
-            index_types=IndexType.ALL,
-            enable_crcs=True,
-            enable_data_crcs=True,
-        )
+        self._writer = mcap_writer(target)
         self._writer.start(profile="", library=LIBRARY)
         self._salvage = salvage
         self._schemas: dict[int, Schema] = {}

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -23,7 +22,8 @@ from converters.logs.files import open_log
 from converters.logs.robot_log import RobotLog
 from converters.logs.sources import sources_of
 from pipeline.errors import DuagError
-from pipeline.recording.write import CHUNK_BYTES
+from pipeline.recording.write import mcap_writer
+from pipeline.workers import peak_memory_bytes
 
 TASKS = ("copy", "convert")
 
@@ -115,17 +115,8 @@ def format_table(found: dict[str, Any]) -> str:
 
 
 def _copy(src: Path, out: Path, topics: Sequence[str]) -> None:
-    from mcap.writer import CompressionType, IndexType, Writer
-
     with out.open("wb") as stream:
-        writer = Writer(
-            stream,
-            chunk_size=CHUNK_BYTES,
-            compression=CompressionType.ZSTD,
-            index_types=IndexType.ALL,
-            enable_crcs=True,
-            enable_data_crcs=True,
-        )
+        writer = mcap_writer(stream)
         writer.start()
         channels = {topic: writer.register_channel(topic, "", 0) for topic in topics}
         for topic, time_ns, data in _messages(src, topics):
@@ -156,9 +147,8 @@ def _main(said: str) -> None:
         _copy(Path(src), Path(target), topics)
     else:
         converters.convert("ros", Path(src), Path(target), options=options)
-    peak = re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
     spent = os.times()
-    print(json.dumps({"cpu_s": spent.user + spent.system, "peak_bytes": int(peak[1]) * 1024 if peak else 0}))
+    print(json.dumps({"cpu_s": spent.user + spent.system, "peak_bytes": peak_memory_bytes()}))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ from __future__ import annotations
 import functools
 import inspect
 import os
-import resource
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -33,7 +32,7 @@ from pipeline.geometry.trajectory import Trajectory
 from pipeline.progress import track
 from pipeline.recording import Recording, open_rgbd
 from pipeline.run_folder import RobotRun
-from pipeline.workers import worker_pool
+from pipeline.workers import peak_memory_bytes, worker_pool
 
 SCHEMA = 1
 OPEN3D = {"Open3D, hybrid": "Hybrid", "Open3D, point-to-plane": "PointToPlane"}
@@ -302,16 +301,6 @@ def _parts(whole: Calls, parts: Mapping[str, Calls]) -> dict[str, float]:
     return shares | {"other": 1000 * sum(whole.cpu_s) / len(whole.cpu_s) - sum(shares.values())}
 
 
-def peak_memory_mb() -> float:
-    """Most memory that this process has held. `getrusage` would count the parent that it was started from."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) / 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
 # --- one run -----------------------------------------------------------------------------------------------------
 
 
@@ -348,7 +337,12 @@ def measure(log: Path, folder: Path, config: FrontendConfig, seed: int, threads:
         if outer.calls["model"].cpu_s:
             times["model"] = summary(outer.calls["model"])
         times["final_refinement_cpu_s"] = sum(outer.calls["final"].cpu_s)
-    return {"times": times, "laps_wall_s": laps, "cpu_s": cpu_s, "peak_memory_mb": peak_memory_mb()}
+    return {
+        "times": times,
+        "laps_wall_s": laps,
+        "cpu_s": cpu_s,
+        "peak_memory_mb": peak_memory_bytes() / 2**20,
+    }
 
 
 class _Inner:
@@ -427,7 +421,7 @@ def measure_open3d(log: Path, method: str) -> dict[str, Any]:
             stamps.append(frame.stamp_ns)
     return {
         "times": {"frame": summary(calls)},
-        "peak_memory_mb": peak_memory_mb(),
+        "peak_memory_mb": peak_memory_bytes() / 2**20,
         "stamps_ns": np.array(stamps, dtype=np.int64),
         "poses": np.array(poses),
         "failed": failed,

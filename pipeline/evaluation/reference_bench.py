@@ -95,7 +95,8 @@ def run(run_folder: RunFolder, recording: Recording, config: FrontendConfig) -> 
         for robot in robots:
             robot.log.close()
     rows = [{"poses": name, **_errors(robots, poses)} for name, poses in answers.items()]
-    rows.append({"poses": "the truth", "team_ate_rmse_m": 0.0, "own_ate_rmse_m": 0.0, "cut_ate_rmse_m": {}})
+    cuts = dict.fromkeys(rows[0]["cut_ate_rmse_m"], 0.0)
+    rows.append({"poses": "the truth", "team_ate_rmse_m": 0.0, "own_ate_rmse_m": 0.0, "cut_ate_rmse_m": cuts})
     return {"views": pairs, "rows": [row | {"agreement_m": agreement[row["poses"]]} for row in rows]}
 
 
@@ -237,7 +238,7 @@ def format_table(result: dict[str, Any]) -> str:
         numbers = [
             row["team_ate_rmse_m"],
             row["own_ate_rmse_m"],
-            *(row["cut_ate_rmse_m"].get(n, 0.0) for n in cuts),
+            *(row["cut_ate_rmse_m"][n] for n in cuts),
         ]
         numbers += [row["agreement_m"][kind] for kind, pairs in result["views"].items() if pairs]
         cells = ["-" if value is None else f"{1e3 * value:.2f}" for value in numbers]

@@ -155,7 +155,7 @@ def own_longer(run: RunFolder, robot: RobotRun, source: Recording, threads: int)
         config.model_copy(update={"steps_per_view": steps, "steps_max": steps}),
         section_of(run, MatchingConfig, "exchange", "matching").thickness_floor_m,
         own.depth,
-        run.config.get("seed", 0),
+        run.config["seed"],
         threads,
     )
 

@@ -20,6 +20,18 @@ from schemas import topics as topic_table
 CHUNK_BYTES = 1 << 20
 
 
+def mcap_writer(stream: IO[bytes]) -> Writer:
+    """A writer with the settings of our logs, not yet started."""
+    return Writer(
+        stream,
+        chunk_size=CHUNK_BYTES,
+        compression=CompressionType.ZSTD,
+        index_types=IndexType.ALL,
+        enable_crcs=True,
+        enable_data_crcs=True,
+    )
+
+
 class LogWriter:
     """Writes one log; use it as a context manager.
 
@@ -48,14 +60,7 @@ class LogWriter:
             self._stream = self._part.open("wb")
         except OSError as error:
             raise DuagError(f"{self._part}: {error.strerror or error}, expected to write a log") from error
-        self._writer = Writer(
-            self._stream,
-            chunk_size=CHUNK_BYTES,
-            compression=CompressionType.ZSTD,
-            index_types=IndexType.ALL,
-            enable_crcs=True,
-            enable_data_crcs=True,
-        )
+        self._writer = mcap_writer(self._stream)
         self._writer.start(profile="", library=LIBRARY)
         self._writer.add_metadata(LOG_RECORD, dict(sorted(self._metadata.items())))
         return self

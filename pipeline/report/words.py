@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -171,27 +172,29 @@ def rows(
     ]
 
 
+def _compared(metrics: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Of all robots together and of each: name, map, its scores by set of views."""
+    yield from (("all robots", kind, metrics["rendering"][kind]) for kind in COMPARED)
+    for name, robot in metrics["robots"].items():
+        yield from ((name, kind, robot["rendering"][kind]) for kind in COMPARED)
+
+
 def comparison_rows(metrics: dict[str, Any]) -> list[dict[str, Any]]:
     """A robot's maps beside each other, for all robots and for each: own views, peers' views, both.
 
     Returns:
         Rows of "robot", "map", "first" (of its robot) and "values": the columns of COMPARISON for each set of views.
     """
-    everybody = [("all robots", metrics["rendering"])]
-    each = [(name, robot["rendering"]) for name, robot in metrics["robots"].items()]
     return [
         {
             "robot": name,
             "map": MAPS[kind],
             "first": kind == COMPARED[0],
             "values": [
-                text(column, found[kind][view_set][column])
-                for view_set in COMPARED_SETS
-                for column in COMPARISON
+                text(column, found[view_set][column]) for view_set in COMPARED_SETS for column in COMPARISON
             ],
         }
-        for name, found in everybody + each
-        for kind in COMPARED
+        for name, kind, found in _compared(metrics)
     ]
 
 
@@ -202,14 +205,12 @@ def comparison_text(metrics: dict[str, Any]) -> str:
     width = 8 * len(COMPARED_SETS)
     lines = [" " * 24 + "".join(head.rjust(width) for head in heads)]
     lines.append(" " * 24 + "".join(s.rjust(8) for _ in heads for s in ("own", "peers", "team")))
-    everybody = [("all robots", metrics["rendering"])]
-    for name, found in everybody + [(n, r["rendering"]) for n, r in metrics["robots"].items()]:
-        for kind in COMPARED:
-            line = f"{name if kind == COMPARED[0] else '':<12}{kind:<12}"
-            for column in COMPARISON:
-                factor, digits = scale.get(column, (1e3, 1))
-                for view_set in COMPARED_SETS:
-                    value = found[kind][view_set][column]
-                    line += (NONE if value is None else f"{factor * value:.{digits}f}").rjust(8)
-            lines.append(line)
+    for name, kind, found in _compared(metrics):
+        line = f"{name if kind == COMPARED[0] else '':<12}{kind:<12}"
+        for column in COMPARISON:
+            factor, digits = scale.get(column, (1e3, 1))
+            for view_set in COMPARED_SETS:
+                value = found[view_set][column]
+                line += (NONE if value is None else f"{factor * value:.{digits}f}").rjust(8)
+        lines.append(line)
     return "\n".join(lines)
