@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from converters.base import RobotWriter
-from converters.logs.files import Entry
+from converters.logs.entries import Entry
 from converters.ros_images import color_bytes
 from converters.ros_points import as_of, points_of
 from converters.stereo import RowCheck, StereoRig

@@ -36,7 +36,8 @@ from converters.derived_depth import (
 )
 from converters.image_files import options_of
 from converters.logs import open_log
-from converters.logs.files import Entry, Log
+from converters.logs.entries import Entry
+from converters.logs.files import Log
 from converters.logs.gather import gathered, nearest
 from converters.stereo import RawCamera, StereoOptions, StereoRig
 from converters.tum_layout import nanoseconds

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.files import NANOSECONDS, Log
+from converters.logs.entries import NANOSECONDS
+from converters.logs.files import Log
 from pipeline.geometry import so3
 
 Array = NDArray[np.float64]

@@ -14,7 +14,8 @@ import numpy as np
 
 from converters.logs.choice import POINTS_TYPE, Chooser
 from converters.logs.clocks import compare, overlap_warnings
-from converters.logs.files import NANOSECONDS, SUFFIXES, Entry, Log, open_log
+from converters.logs.entries import NANOSECONDS, Entry
+from converters.logs.files import SUFFIXES, Log, open_log
 from converters.logs.motion import IMU_TYPE, POSE_TYPES
 from converters.logs.robot_log import RobotLog
 from converters.logs.sources import Source, is_log, robot_of, sources_of

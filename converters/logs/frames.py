@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.files import Entry, Log, stamp_ns
+from converters.logs.entries import Entry, stamp_ns
+from converters.logs.files import Log
 from pipeline.errors import DuagError
 from pipeline.geometry import se3
 

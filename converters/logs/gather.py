@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.files import Entry, Log
+from converters.logs.entries import Entry
+from converters.logs.files import Log
 from pipeline.errors import DuagError
 
 MOST_KEPT_BYTES = 512 << 20

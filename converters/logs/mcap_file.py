@@ -14,7 +14,7 @@ from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from converters.logs import foxglove, ros_json
-from converters.logs.files import Entry, Topic, ros_type, sound_time, stamp_ns
+from converters.logs.entries import Entry, Topic, ros_type, sound_time, stamp_ns
 from converters.logs.mcap_chunks import Chunks
 from converters.logs.rosbag_file import (
     LARGEST_CHUNK,

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.files import NANOSECONDS, Entry, Log, sound_time
+from converters.logs.entries import NANOSECONDS, Entry, sound_time
+from converters.logs.files import Log
 from converters.logs.frames import TF_TYPES, Transforms, frame_name, pose_matrix, transforms_in
 from converters.logs.options import LogOptions
 from converters.tum_layout import Poses

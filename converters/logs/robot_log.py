@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from converters.logs.choice import REGISTERED, Chooser, video_words
 from converters.logs.clocks import Drift, RobotClock, drift
 from converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
-from converters.logs.files import NANOSECONDS, Entry, Log, sound_time
+from converters.logs.entries import NANOSECONDS, Entry, sound_time
+from converters.logs.files import Log
 from converters.logs.frames import Transforms, pose_matrix
 from converters.logs.gather import gathered
 from converters.logs.motion import CameraPoses, Imu, MotionReader, extrinsics_of

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from converters.logs.files import stamp_ns
+from converters.logs.entries import stamp_ns
 from converters.logs.foxglove import Base64, json_members
 from converters.logs.rosbag_file import READ_TYPES, reason
 from pipeline.errors import DuagError

@@ -11,7 +11,7 @@ from typing import Any
 
 from converters.logs import foxglove
 from converters.logs.bag_messages import messages
-from converters.logs.files import NANOSECONDS, Entry, Topic, sound_time, stamp_ns
+from converters.logs.entries import NANOSECONDS, Entry, Topic, sound_time, stamp_ns
 from pipeline.errors import DuagError
 from pipeline.files import check_file
 

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import converters
 from converters.logs import bench, foxglove, open_log
-from converters.logs.files import Entry
+from converters.logs.entries import Entry
 from pipeline.errors import DuagError
 from pipeline.geometry.camera import PinholeCamera
 from tests.recording.long_logs import COLOR, DEPTH, FRAME, IMU, KINDS, Seed, write

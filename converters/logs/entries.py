@@ -1,0 +1,61 @@
+"""Topics and messages of a log, whatever the container, and their times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.errors import DuagError
+
+NANOSECONDS = 1_000_000_000
+LAST_NS = 1 << 62
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a log. type: ROS's name of it ("sensor_msgs/msg/Image"), or the schema's own if it has none.
+
+    schema, encoding: as the file names them. count: messages.
+    """
+
+    name: str
+    type: str
+    schema: str
+    encoding: str
+    count: int
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One message. log_ns: when it was recorded; publish_ns: when it was sent, where the container tells.
+
+    data: as it stands in the container. read: the message, with ROS's fields. header_ns: the time in its header, 0
+    where it has none.
+    """
+
+    topic: str
+    log_ns: int
+    publish_ns: int | None
+    data: bytes
+    read: Callable[[], Any]
+    header_ns: Callable[[], int]
+
+
+def sound_time(time_ns: int, where: str) -> int:
+    """A time that can be computed with. Raises DuagError for one before 1970 or after 2115."""
+    if not 0 <= time_ns < LAST_NS:
+        raise DuagError(f"{where}: time {time_ns} ns, expected one between the years 1970 and 2116")
+    return time_ns
+
+
+def ros_type(schema: str) -> str:
+    """A type of ROS by the name that ROS 2 has for it: "sensor_msgs/Image" is "sensor_msgs/msg/Image"."""
+    parts = schema.split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else schema
+
+
+def stamp_ns(message: Any) -> int:
+    """The time in the header of a message, 0 where it has none."""
+    header = getattr(message, "header", None)
+    return int(header.stamp.sec) * NANOSECONDS + int(header.stamp.nanosec) if header else 0
