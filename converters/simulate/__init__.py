@@ -81,9 +81,9 @@ def simulate(
     from converters.simulate.preview import Preview
     from converters.simulate.stages import MeshStage, set_up
 
-    camera = _camera(size)
+    camera = camera_of(size)
     names = robot_names(robots)
-    source, parameters = _about(scene, up)
+    source, parameters = scene_of(scene, up)
     scene_name = parameters["scene"]
     parameters |= {"robots": robots, "frames": frames, "size": list(size)}
     parameters |= {"noise": noise, "seed": seed, "overlap": overlap}
@@ -170,7 +170,7 @@ def simulate(
             sheet.write(preview, points[0], points[2])
 
 
-def _about(scene: str, up: str) -> tuple[dict[str, Any], dict[str, Any]]:
+def scene_of(scene: str, up: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """What `recording.json` says about a scene: source and parameters, no path of this machine."""
     if scene in SCENES:
         return {"kind": "simulation"}, {"scene": scene}
@@ -218,7 +218,7 @@ def _check(
         )
 
 
-def _camera(size: tuple[int, int]) -> PinholeCamera:
+def camera_of(size: tuple[int, int]) -> PinholeCamera:
     """The camera of all robots."""
     width, height = size
     focal = FOCAL_OF_WIDTH * width

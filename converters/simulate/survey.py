@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from converters.simulate import FRAME_RATE_HZ, _about, _camera, paradigms, paths
+from converters.simulate import FRAME_RATE_HZ, camera_of, paradigms, paths, scene_of
 from converters.simulate.stages import set_up
 from pipeline.errors import DuagError
 from pipeline.geometry import se3
@@ -35,9 +35,9 @@ def survey(
         robots_apart_m; and cpu_s.
     """
     rows = []
-    camera = _camera((480, 360))
+    camera = camera_of((480, 360))
     for scene in scenes:
-        about = _about(scene, up)[1]
+        about = scene_of(scene, up)[1]
         with tempfile.TemporaryDirectory(prefix="duagc-scene-") as cache:
             stage = set_up(scene, about.get("up", ""), seed, Path(cache), as_meshes=False)
             small = stage.eye(camera.scaled(*paths.OVERLAP_IMAGE))

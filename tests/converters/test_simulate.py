@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from converters.simulate import _camera, bake, noise, paths, simulate, write_points
+from converters.simulate import bake, camera_of, noise, paths, simulate, write_points
 from converters.simulate.render import Renderer
 from converters.simulate.scene import Scene
 from converters.simulate.scenes import build
@@ -35,7 +35,7 @@ def atlas(room: Scene) -> bake.Atlas:
 
 @pytest.fixture(scope="module")
 def camera() -> PinholeCamera:
-    return _camera(SIZE)
+    return camera_of(SIZE)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_depth_ends_on_a_surface_and_passes_through_none(room, renderer, ways):
 @pytest.mark.parametrize(("i", "j"), [(0, 1), (0, 25), (70, 110)])
 def test_views_agree_on_depth_and_colour(room, atlas, ways, i, j):
     """A point seen in view i is, in view j, at the depth and of the colour that view j has there."""
-    camera, T_i, T_j = _camera((480, 360)), ways[0][i], ways[0][j]
+    camera, T_i, T_j = camera_of((480, 360)), ways[0][i], ways[0][j]
     renderer = Renderer(room, atlas, camera)
     one, other = renderer.render(T_i), renderer.render(T_j)
     points = se3.transform(se3.inverse(T_j) @ T_i, camera.back_project(one.depth).reshape(-1, 3))
@@ -219,7 +219,7 @@ def check_noisy_recording(folder: Path) -> None:
     """The log holds what was measured, the ground truth what was there."""
     recording = Recording(folder)
     assert recording.robots == ["alpha", "bravo"]
-    scene, camera = build("room", 7), _camera(SIZE)
+    scene, camera = build("room", 7), camera_of(SIZE)
     exact = Renderer(scene, None, camera)
     for robot in recording.robots:
         truth = recording.groundtruth(robot)

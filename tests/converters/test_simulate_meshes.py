@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from converters.simulate import _camera, meshes, simulate, walks
+from converters.simulate import camera_of, meshes, simulate, walks
 from converters.simulate.paths import look_at, shared_view
 from converters.simulate.raycast import Caster, MeshRenderer
 from converters.simulate.stages import MeshStage
@@ -228,7 +228,7 @@ def true_view(origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, n
 
 
 def test_depth_and_colour_are_those_of_the_room(stage):
-    camera = _camera((240, 180))
+    camera = camera_of((240, 180))
     eye = MeshRenderer(stage.caster, camera)
     for T in some_poses():
         view = eye.render(T)
@@ -245,7 +245,7 @@ def test_depth_and_colour_are_those_of_the_room(stage):
 
 def test_colour_is_the_mean_over_the_pixel(stage):
     """The same view at five times the size, averaged in blocks, is the view."""
-    camera = _camera((160, 120))
+    camera = camera_of((160, 120))
     T = some_poses()[1]
     view = MeshRenderer(stage.caster, camera).render(T)
     large = MeshRenderer(stage.caster, camera.scaled(800, 600)).render(T)
@@ -272,7 +272,7 @@ def test_points_lie_on_the_surfaces_and_have_their_colours(stage):
 
 @pytest.mark.parametrize("stage", ["obj"], indirect=True)
 def test_walks_are_smooth_clear_and_overlap(stage):
-    camera = _camera((160, 120))
+    camera = camera_of((160, 120))
     ways = stage.wander(2, 40, 0.6, camera)
     for way in ways:
         step, turn = se3.distance(way[:-1], way[1:])
@@ -330,7 +330,7 @@ def test_a_hole_has_no_depth_and_is_black(tmp_path):
     write_glb(tmp_path / "floor.glb", QUADS[4:5])
     scene = meshes.read(tmp_path, "y", tmp_path / "cache")
     T = look_at(np.array([[2.5, 1.0, 1.0]]), np.array([[2.5, 3.0, 1.0]]))[0]
-    view = MeshRenderer(Caster(scene), _camera((64, 48))).render(T)
+    view = MeshRenderer(Caster(scene), camera_of((64, 48))).render(T)
     up = slice(0, 20)  # above the horizon there is nothing
     assert (view.depth[up] == 0).all()
     assert (view.surface[up] == -1).all()
@@ -360,7 +360,7 @@ def test_a_far_texture_is_blurred_to_its_mean(tmp_path):
     board = ((np.indices((512, 512)).sum(axis=0) % 2) * 200).astype(np.uint8)
     scene = one_quad(tmp_path, np.repeat(board[..., None], 3, axis=2))
     T = look_at(np.array([[3.0, 2.0, 1.3]]), np.array([[0.0, 2.0, 1.3]]))[0]
-    color = MeshRenderer(Caster(scene), _camera((48, 36))).render(T).color
+    color = MeshRenderer(Caster(scene), camera_of((48, 36))).render(T).color
     assert np.abs(color[16:20, 22:26].astype(int) - 100).max() <= 2
 
 
@@ -468,6 +468,6 @@ def test_a_chunk_of_a_real_scan(tmp_path):
     caster = Caster(scene)
     assert walks.floor_height(caster) == pytest.approx(0.02, abs=0.05)
     T = look_at(np.array([[9.4, -7.0, 1.4]]), np.array([[10.6, -8.2, 0.9]]))[0]
-    view = MeshRenderer(caster, _camera((160, 120))).render(T)
+    view = MeshRenderer(caster, camera_of((160, 120))).render(T)
     assert np.mean(view.depth > 0) > 0.95
     assert view.color[view.depth > 0].std() > 20

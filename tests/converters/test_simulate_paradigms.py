@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from converters.simulate import PARADIGMS, _camera, figures, paradigms, simulate, survey, walks
+from converters.simulate import PARADIGMS, camera_of, figures, paradigms, simulate, survey, walks
 from converters.simulate.paths import OVERLAP_IMAGE, shared_view
 from converters.simulate.stages import MeshStage, RoomStage, set_up
 from pipeline import messages
@@ -23,7 +23,7 @@ from tests.converters.test_simulate_meshes import HOUSE, folder_of
 
 FRAMES = 80
 FIGURES = PARADIGMS[1:]
-CAMERA = _camera((160, 120))
+CAMERA = camera_of((160, 120))
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_a_survey_says_what_was_reached(room, monkeypatch):
     rows = survey.survey(["room"], ["crossing"], [2], [0.3], FRAMES, 0, "auto")
     ways = ways_of(room, "crossing", 0.3, 2)
     assert rows[0]["robots_apart_m"] == paradigms.least_apart(ways)
-    eye = room.eye(_camera((480, 360)).scaled(*OVERLAP_IMAGE))
+    eye = room.eye(camera_of((480, 360)).scaled(*OVERLAP_IMAGE))
     assert rows[0]["shared"] == shared_view(eye, *ways)
     rows.append({"scene": "room", "paradigm": "parallel", "robots": 8, "cpu_s": 1.0, "refused": "too many"})
     table = survey.format_table(rows)

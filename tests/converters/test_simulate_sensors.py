@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.simulate import Rig, _camera, _twists, simulate
+from converters.simulate import Rig, _twists, camera_of, simulate
 from converters.simulate.movers import Mover, walk
 from converters.simulate.sensors import RANGE_SIGMA_M, T_CAMERA_LIDAR, MovingCamera, with_gain
 from converters.simulate.stages import MeshStage, set_up
@@ -17,7 +17,7 @@ from pipeline.recording import Recording, open_rgbd
 from tests.converters.test_simulate_meshes import ROOM, folder_of, some_poses
 from tests.converters.test_simulate_paradigms import true_poses
 
-CAMERA = _camera((80, 60))
+CAMERA = camera_of((80, 60))
 TWIST = np.array([0.5, -0.2, 0.3, 0.4, 0.6, -0.3])
 
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from converters.simulate import _camera, bake, paths
+from converters.simulate import bake, camera_of, paths
 from converters.simulate.render import Renderer
 from converters.simulate.scenes import build
 from pipeline.frontend.config import FrontendConfig, TrackingConfig
@@ -27,7 +27,7 @@ from tests.frontend.disturbances import Row, Shot, Undisturbed
 
 FRAME_NS = 33_333_333
 CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)))
-CAMERA = _camera((240, 180))
+CAMERA = camera_of((240, 180))
 STARTS = (17, 34, 50)
 FRAMES = 95
 RED_KITCHEN = Path(__file__).parents[2] / "recordings" / "redkitchen"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from converters.base import RecordingWriter
-from converters.simulate import _camera, bake, paths
+from converters.simulate import bake, camera_of, paths
 from converters.simulate.render import Renderer
 from converters.simulate.scenes import build
 from converters.stereo import StereoRig
@@ -23,7 +23,7 @@ from pipeline.kernels import Rasterizer
 from pipeline.recording import RgbdLog, read_log
 from pipeline.splat.losses import depth_error
 
-CAMERA = _camera((240, 180))
+CAMERA = camera_of((240, 180))
 FRAMES = 20
 BASELINE_M = 0.12
 RANGE_SIGMA_M = 0.02
