@@ -34,10 +34,8 @@ Array = NDArray[np.float64]
 PARADIGMS = ("wander", *SHAPES)
 SIZES = (1.0, 0.8, 0.64, 0.5, 0.4, 0.3, 0.2, 0.14, 0.1)  # of the way that frames and step would make
 LEAST_LENGTH_M = 1.0  # ways become no shorter than that by going more slowly
-DRAWS, PLACES = (
-    160,
-    4,
-)  # figures drawn per size, and those with room for all that are looked at from the cameras
+DRAWS = 160  # figures per size
+PLACES = 4  # figures with room for all that are looked at from the cameras
 SPREADS, HALVINGS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0), 4
 FIRST_SPREADS = (0.4, 0.6, 0.2, 0.8, 0.0, 1.0)  # to see whether there is room
 GAZE_STEP_RAD, GAZES = np.deg2rad(40.0), (0, 1, -1, 2, -2)  # aside of the way, to the left
@@ -111,10 +109,8 @@ class _Search:
         self.ground = Ground(terrain, frames, seed)
         self.paradigm, self.shape, self.overlap = paradigm, SHAPES[paradigm], overlap
         self.sky, self.full_m = terrain.sky, (frames - 1) * terrain.step_m
-        self.sketch, self.eye = (
-            terrain.sketch(camera.scaled(*SKETCH)),
-            terrain.eye(camera.scaled(*VIEW_IMAGE)),
-        )
+        self.sketch = terrain.sketch(camera.scaled(*SKETCH))
+        self.eye = terrain.eye(camera.scaled(*VIEW_IMAGE))
         self.looks = 0  # along paths, so far
 
     def best(self, robots: int) -> list[Array] | None:
