@@ -177,6 +177,13 @@ NEIGHBOUR_DOUBT = Topic(
     Scope.ROBOT,
     "what own images say against a neighbour's map, and whether it is used",
 )
+PEER_COLORS = Topic(
+    "/<robot>/peer_colors",
+    "duagc.v1.PeerColors",
+    "fusion",
+    Scope.ROBOT,
+    "how every neighbour's camera sees colours beside its own",
+)
 PEER_MESSAGE = Topic(
     "/<robot>/peer/message",
     "duagc.v1.PeerMessage",
@@ -243,6 +250,7 @@ TOPICS: tuple[Topic, ...] = (
     REFINED_MAP,
     CORRECTED_KEYFRAMES,
     NEIGHBOUR_DOUBT,
+    PEER_COLORS,
     PEER_MESSAGE,
     PEER_PACKET,
     EXCHANGE_SUMMARY,

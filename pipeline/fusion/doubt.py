@@ -6,9 +6,10 @@ than alone. So every neighbour's map is drawn where the robot's own keyframes st
     e_p = |colour drawn - colour seen|^2,    blame of a Gaussian = (sum of its weights times e) / (sum of its weights),
 
 over pixels at which the neighbour's surface lies in front of the measured one or on it; what lies behind is hidden and
-says nothing. A Gaussian is contradicted if its pixels are drawn worse than by one grey for everything: blame above the
-variance of the own images. So is a neighbour as a whole if that holds for all of its map. No colour is told from
-another by a chosen threshold; honest maps stay far below. What no own keyframe saw cannot be judged.
+says nothing. Colours are those that the own camera would show (`consensus.colors`, by the matches of this pair alone).
+A Gaussian is contradicted if its pixels are drawn worse than by one grey for everything: blame above the variance of
+the own images. So is a neighbour as a whole if its map does not explain half of that variance; honest ones explain five
+sixths and more. What no own keyframe saw cannot be judged.
 
 Matches are checked, too, because the lower-named robot of a pair speaks for it: two Gaussians that are not where each
 other are, or differ more than neighbours in the own map do, are none.
@@ -22,6 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.consensus.colors import team_colors
 from pipeline.consensus.config import MatchingConfig, WeightKind
 from pipeline.consensus.evidence import LOG_COVARIANCE, MEAN, Evidence, rows_by_id
 from pipeline.consensus.matching import Pairs, gaussian_distance, threshold
@@ -35,7 +37,10 @@ from pipeline.kernels import Rasterizer
 from pipeline.splat.gaussians import DepthKind, Gaussians
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+NOTHING: Index = np.zeros((0, 2), np.int64)
 COVERED = 0.5  # opacity from which on a pixel shows a neighbour's surface
+EXPLAINED = 0.5  # of the variance of own images, that a map must explain to be used at all
 LEAST_PX = 4.0  # weight, in pixels, from which on a Gaussian is judged
 LEAST_SHARE = 0.01  # of the own pixels, from which on a neighbour is judged as a whole
 PASSES = 2  # what hid behind a contradicted Gaussian is judged in the second
@@ -69,7 +74,7 @@ class Doubt:
     @property
     def trusted(self) -> bool:
         """Whether its map shows what the own images show, as far as anybody can tell."""
-        return self.judged_px < LEAST_SHARE * self.own_px or self.error <= self.grey
+        return self.judged_px < LEAST_SHARE * self.own_px or self.error <= (1 - EXPLAINED) * self.grey
 
     @property
     def reason(self) -> str:
@@ -92,7 +97,7 @@ class Believed:
 
     evidence: dict[str, Evidence]
     contradicted: dict[str, NDArray[np.bool_]]
-    pairs: dict[tuple[str, str], NDArray[np.int64]]
+    pairs: dict[tuple[str, str], Index]
     doubts: tuple[Doubt, ...]
 
 
@@ -129,7 +134,8 @@ def believed(
         possible = _sizes_m(there) <= largest
         told, there = told.select(possible), there.select(possible)
         judge = _Judge(views, camera, config, depth, threads)
-        against = judge.contradicted(there, grey)
+        pair = _near(world[own.owner], there, _between(pairs, own.owner, name), matching)
+        against = judge.contradicted(_in_colors_of(world[own.owner], there, pair, matching), grey)
         doubt = Doubt(
             name,
             len(possible),
@@ -155,26 +161,43 @@ def _sizes_m(evidence: Evidence) -> Array:
     return np.asarray(np.exp(0.5 * values.max(axis=1, initial=-np.inf)))
 
 
+def _between(pairs: Pairs, own: str, other: str) -> Index:
+    """Matches [m, 2] of two robots, the own id first."""
+    found = pairs.get((min(own, other), max(own, other)), NOTHING)
+    return found if own < other else np.flip(found, axis=1)
+
+
+def _near(a: Evidence, b: Evidence, pairs: Index, matching: MatchingConfig) -> Index:
+    """The pairs [m, 2] whose Gaussians are there and near each other."""
+    i, j = rows_by_id(pairs[:, 0], a.ids), rows_by_id(pairs[:, 1], b.ids)
+    known = np.flatnonzero((i >= 0) & (j >= 0))
+    apart_m = np.linalg.norm(a.theta[i[known], MEAN] - b.theta[j[known], MEAN], axis=1)
+    return pairs[known[apart_m <= RADIUS_SLACK * matching.radius_m]]
+
+
+def _in_colors_of(a: Evidence, b: Evidence, pairs: Index, matching: MatchingConfig) -> Evidence:
+    """Evidence of b as the camera of a would show it, by their matches [m, 2] alone."""
+    cameras = team_colors({a.owner: a, b.owner: b}, {(a.owner, b.owner): pairs}, matching.colors)
+    return cameras.between(b.owner, a.owner).of(b)
+
+
 def _true_pairs(
     world: Mapping[str, Evidence], pairs: Pairs, largest: float, matching: MatchingConfig
-) -> dict[tuple[str, str], NDArray[np.int64]]:
+) -> dict[tuple[str, str], Index]:
     """The pairs whose Gaussians are there, near each other and alike: d_G at most `largest`."""
     true = {}
     for a, b in sorted(p for p in pairs if p[0] in world and p[1] in world):
-        i, j = (rows_by_id(pairs[a, b][:, k], world[name].ids) for k, name in enumerate((a, b)))
-        known = np.flatnonzero((i >= 0) & (j >= 0))
-        i, j = i[known], j[known]
-        apart_m = np.linalg.norm(world[a].theta[i, MEAN] - world[b].theta[j, MEAN], axis=1)
-        alike = gaussian_distance(world[a], i, world[b], j, matching) <= largest
-        true[a, b] = pairs[a, b][known[alike & (apart_m <= RADIUS_SLACK * matching.radius_m)]]
+        near = _near(world[a], world[b], pairs[a, b], matching)
+        i, j = rows_by_id(near[:, 0], world[a].ids), rows_by_id(near[:, 1], world[b].ids)
+        other = _in_colors_of(world[a], world[b], near, matching)
+        true[a, b] = near[gaussian_distance(world[a], i, other, j, matching) <= largest]
     return true
 
 
 def _with_pairs(doubt: Doubt, own: str, pairs: Pairs, true: Pairs) -> Doubt:
     """How many matches of the neighbour with this robot there are, and how many of them are none."""
-    pair = (min(own, doubt.neighbour), max(own, doubt.neighbour))
-    count = len(pairs.get(pair, ()))
-    return replace(doubt, pairs=count, refused=count - len(true.get(pair, ())))
+    count = len(_between(pairs, own, doubt.neighbour))
+    return replace(doubt, pairs=count, refused=count - len(_between(true, own, doubt.neighbour)))
 
 
 class _Judge:

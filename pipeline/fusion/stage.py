@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import schemas
+from pipeline.consensus.colors import ColorMap
 from pipeline.consensus.config import MatchingConfig, WeightKind
 from pipeline.consensus.evidence import unpack_symmetric
 from pipeline.consensus.weighting import own_stiffness
@@ -123,6 +124,7 @@ def run_fusion(
                 own.depth,
                 weights,
                 threads,
+                colors=fused.colors,
             )
             owned = fused.source == fused.robots.index(own.robot)
             refined = refine(
@@ -219,8 +221,32 @@ def _write_log(
         if refined is not None:
             refined_map = GaussianMap(stamp_ns, robot, WORLD_FRAME, refined, None, depth)
             log.write(topics.REFINED_MAP.of(robot), refined_map, stamp_ns, stamp_ns)
+        for peer, colors in sorted(fused.colors.items()):
+            message = schemas.new(
+                "PeerColors",
+                robot=robot,
+                peer=peer,
+                gain=colors.gain,
+                offset=colors.offset,
+                gain_sigma=colors.sigma_gain,
+                offset_sigma=colors.sigma_offset,
+                matches=colors.matches,
+            )
+            pack_stamp(message, stamp_ns)
+            log.write(topics.PEER_COLORS.of(robot), message, stamp_ns, stamp_ns)
         for doubt in doubts:
             log.write(topics.NEIGHBOUR_DOUBT.of(robot), _doubt(robot, doubt, stamp_ns), stamp_ns, stamp_ns)
+
+
+def peer_colors(path: Path, robot: str) -> dict[str, ColorMap]:
+    """From every neighbour's colours to the robot's, by name, of its fused.mcap; empty if that holds none."""
+    found = [record.message() for record in read_log(path, (topics.PEER_COLORS.of(robot),))]
+    return {
+        m.peer: ColorMap(
+            np.array(m.gain), np.array(m.offset), np.array(m.gain_sigma), np.array(m.offset_sigma), m.matches
+        )
+        for m in found
+    }
 
 
 def _doubt(robot: str, doubt: Doubt, stamp_ns: int) -> Any:
