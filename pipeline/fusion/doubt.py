@@ -172,7 +172,8 @@ def _near(a: Evidence, b: Evidence, pairs: Index, matching: MatchingConfig) -> I
     i, j = rows_by_id(pairs[:, 0], a.ids), rows_by_id(pairs[:, 1], b.ids)
     known = np.flatnonzero((i >= 0) & (j >= 0))
     apart_m = np.linalg.norm(a.theta[i[known], MEAN] - b.theta[j[known], MEAN], axis=1)
-    return pairs[known[apart_m <= RADIUS_SLACK * matching.radius_m]]
+    near: Index = pairs[known[apart_m <= RADIUS_SLACK * matching.radius_m]]
+    return near
 
 
 def _in_colors_of(a: Evidence, b: Evidence, pairs: Index, matching: MatchingConfig) -> Evidence:
