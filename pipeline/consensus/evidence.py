@@ -123,9 +123,9 @@ class Evidence:
         """What a robot can tell others of its own map, each Gaussian in the frame of its anchor.
 
         The sums of the images hold everything but one Gaussian fixed; what others want to know is where the surface is.
-        The depth images say that it lies within the measured deviation of the mean, across the disc, however little the
-        sums know of one splat among many; and nobody knows it better: the square of the deviation is added to the mean's
-        covariance. Nobody knows a shape better than `SHAPE_FLOOR`. No information stays none.
+        The depth images say that it lies within the measured deviation of the mean, across the disc, however little
+        the sums know of one splat among many; and nobody knows it better: the deviation's square is added to the
+        mean's covariance. Nobody knows a shape better than `SHAPE_FLOOR`. No information stays none.
 
         Args:
             owner: the robot.

@@ -109,7 +109,9 @@ def test_what_is_told_is_never_surer_than_the_deviation_and_nothing_stays_nothin
 def test_depth_images_say_how_far_a_surface_is_where_the_sums_know_nothing_of_a_splat():
     gaussians, sums, _ = random_map(9)
     sums.geometry *= 1e-12
-    position = Evidence.from_map("alpha", gaussians, sums, np.tile(np.eye(4), (4, 1, 1))).position_information()
+    position = Evidence.from_map(
+        "alpha", gaussians, sums, np.tile(np.eye(4), (4, 1, 1))
+    ).position_information()
     values = np.linalg.eigvalsh(position)
     np.testing.assert_allclose(values[:, 2], 0.5 / sums.deviation_m**2, rtol=1e-3)  # across the disc
     assert np.all(values[:, :2] < 1e-6)  # along it, nothing

@@ -118,7 +118,7 @@ def test_two_runs_write_the_same_log(sensor_log: Path, frontend_log: Path) -> No
 
 def test_map_is_grown_at_the_refined_keyframes(sensor_log: Path) -> None:
     out = sensor_log.with_name("mapped.mcap")
-    small = MappingConfig(max_gaussians=300, iterations=2, final_iterations=1, depth="ray_plane")
+    small = MappingConfig(max_gaussians=300, iterations=2, final_iterations=1)
     run_frontend(sensor_log, out, TRACKING.model_copy(update={"mapping_enabled": True, "mapping": small}))
     final = messages(out, topics.MAP)
     updates = messages(out, topics.MAP_UPDATE)
@@ -132,7 +132,7 @@ def test_map_is_grown_at_the_refined_keyframes(sensor_log: Path) -> None:
     )
     assert updates[-1].total == len(final[0].gaussians)
     (unrefined,) = messages(out, topics.UNREFINED_MAP)
-    assert final[0].depth == unrefined.depth == "ray_plane"
+    assert final[0].depth == unrefined.depth == "ray_plane"  # the log's depth is exact
     assert len(unrefined.gaussians) == updates[-2].total
     common = np.intersect1d(unrefined.gaussians.ids, final[0].gaussians.ids)
     assert len(common) > 50  # the refinement replaces some and moves the others
