@@ -48,11 +48,19 @@ class LossConfig(Config):
     """Weight of one metre between a Gaussian's own depth and the measured one, by its share in the pixel."""
 
 
+class SurfaceLossConfig(LossConfig):
+    """The same where depth is exact: every single Gaussian belongs on the surface."""
+
+    depth_weight: float = 0.25
+    depth_huber_m: float = 0.01
+    surface_weight: float = 0.5
+
+
 class MapLossConfig(Config):
     """The loss of a map, by the depth that its Gaussians are drawn with."""
 
     blended: LossConfig = LossConfig()
-    ray_plane: LossConfig = LossConfig(depth_weight=0.5, depth_huber_m=0.01, surface_weight=0.5)
+    ray_plane: SurfaceLossConfig = SurfaceLossConfig()
 
     def of(self, depth: DepthKind) -> LossConfig:
         """The loss of maps of a kind."""

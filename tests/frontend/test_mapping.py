@@ -12,7 +12,7 @@ from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels import Rasterizer
 from pipeline.splat.gaussians import DepthKind, Gaussians
-from pipeline.splat.losses import LossConfig, MapLossConfig, depth_error, psnr
+from pipeline.splat.losses import MapLossConfig, SurfaceLossConfig, depth_error, psnr
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 PLANES = (
@@ -226,7 +226,7 @@ def test_both_depths_of_a_gaussian_make_a_map(depth: DepthKind) -> None:
 
 
 def test_loss_on_single_gaussians_brings_each_to_its_surface() -> None:
-    def layer_error_m(loss: LossConfig) -> float:
+    def layer_error_m(loss: SurfaceLossConfig) -> float:
         mapper, _ = build(
             QUICK.model_copy(update={"depth": "ray_plane", "loss": MapLossConfig(ray_plane=loss)})
         )
@@ -237,8 +237,9 @@ def test_loss_on_single_gaussians_brings_each_to_its_surface() -> None:
         assert (layer_m > 0).mean() > 0.97
         return float(np.abs(layer_m - depth_m)[layer_m > 0].mean())
 
-    single = LossConfig(surface_weight=1.0, depth_weight=0.0, depth_huber_m=0.005)
-    assert layer_error_m(single) < 0.5 * layer_error_m(LossConfig())
+    single = SurfaceLossConfig(surface_weight=1.0, depth_weight=0.0, depth_huber_m=0.005)
+    together = SurfaceLossConfig(surface_weight=0.0, depth_weight=1.0, depth_huber_m=0.02)
+    assert layer_error_m(single) < 0.5 * layer_error_m(together)
 
 
 def test_how_depth_is_drawn_follows_from_its_noise() -> None:
