@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 
 from converters.base import NANOSECONDS, RecordingWriter, RobotWriter, robot_names
+from converters.calibrated import ColorLens, correct, numbers, resampled
 from converters.image_files import options_of, read_color, read_depth, rigid
 from converters.self_check import ReprojectionCheck
 from pipeline import numeric
@@ -41,6 +42,9 @@ CONNECTED_RATIO = (
     0.03  # neighbouring depths that differ by less than this share of the nearer are one surface
 )
 
+LENGTHS = {"color_distortion": (4, 5), "color_rotation_rad": (3,), "depth_correction_per_m": (6,)}
+"""How many numbers options hold that are lists of numbers."""
+
 
 class Options(Config):
     """Cameras and time; the defaults are those of the Kinect that recorded 7-Scenes."""
@@ -59,6 +63,16 @@ class Options(Config):
     """Principal point of the colour camera; fitted on RedKitchen: depth edges fall on colour edges."""
     baseline_m: float = 0.025
     """The colour camera sits this far to the right (+x) of the depth camera; a point shifts by -f b / z pixels."""
+    color_focal_y_px: float = Field(0.0, ge=0)
+    """Focal length of the colour camera along y; 0: that along x."""
+    color_distortion: str = ""
+    """Lens of the colour camera: k1 k2 p1 p2 [k3] as OpenCV has them; empty: none. With this option, the one before or
+    the one after, colour is resampled as a pinhole camera sees it that is turned as the depth camera is."""
+    color_rotation_rad: str = ""
+    """Rotation vector x y z that takes directions of the depth camera to those of the colour camera; empty: none."""
+    depth_correction_per_m: str = ""
+    """Smooth error of the depth camera, c0 .. c5: 1/z + c0 (1 - 2 m / z) + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2 is
+    the true 1/z at the ray (x, y, 1); empty: none."""
     rate_hz: int = Field(30, gt=0)
     """Frames per second; the dataset has no time stamps."""
     sequences: str = Field("", coerce_numbers_to_str=True)
@@ -69,10 +83,27 @@ class Options(Config):
         f = self.depth_focal_px
         return PinholeCamera(WIDTH, HEIGHT, f, f, self.depth_cx_px, self.depth_cy_px)
 
-    def color_camera(self) -> PinholeCamera:
+    @field_validator(*LENGTHS)
+    @classmethod
+    def _are_numbers(cls, text: str, info: ValidationInfo) -> str:
+        assert info.field_name is not None
+        numbers(text, LENGTHS[info.field_name])
+        return text
+
+    def lens(self) -> ColorLens:
         """The camera that the colour images were taken with."""
-        f = self.color_focal_px
-        return PinholeCamera(WIDTH, HEIGHT, f, f, self.color_cx_px, self.color_cy_px)
+        f, fy = self.color_focal_px, self.color_focal_y_px or self.color_focal_px
+        source = PinholeCamera(WIDTH, HEIGHT, f, fy, self.color_cx_px, self.color_cy_px)
+        rotation = numbers(self.color_rotation_rad, LENGTHS["color_rotation_rad"])
+        return ColorLens(source, numbers(self.color_distortion, LENGTHS["color_distortion"]), rotation)
+
+    def color_camera(self) -> PinholeCamera:
+        """The camera of the colour images in the recording."""
+        return self.lens().camera
+
+    def depth_correction(self) -> tuple[float, ...]:
+        """c0 .. c5, or nothing."""
+        return numbers(self.depth_correction_per_m, LENGTHS["depth_correction_per_m"])
 
 
 @dataclass(frozen=True)
@@ -209,10 +240,14 @@ def _write_robot(
     T_depth_color = se3.from_rotation_translation(np.eye(3), [options.baseline_m, 0.0, 0.0])
     register = Registration(options.depth_camera(), options.color_camera(), options.baseline_m)
     check = ReprojectionCheck(options.color_camera(), len(frames))
+    lens, correction = options.lens(), options.depth_correction()
+    maps = None if lens.is_pinhole else lens.maps()
     holes = invalid = 0
     for index, files in enumerate(track(frames, f"convert {robot.name}")):
-        depth = register(_depth_m(files.depth))
+        depth = register(correct(_depth_m(files.depth), options.depth_camera(), correction))
         color, color_format = read_color(files.color, (WIDTH, HEIGHT))
+        if maps is not None:
+            color, color_format = resampled(color, maps), "png"
         T_world_camera = None
         if files.pose is not None:
             T_world_camera = _read_pose(files.pose) @ T_depth_color

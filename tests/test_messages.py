@@ -103,7 +103,7 @@ def test_messages_read_back_bit_for_bit(seed: int, n: int) -> None:
 
 
 def test_every_dataclass_is_read_by_the_name_of_its_schema() -> None:
-    assert {c.schema for c in (type(x) for x in all_messages(0, 1))} == set(m._UNPACK)
+    assert {c.schema for c in (type(x) for x in all_messages(0, 1))} == set(m.estimates._UNPACK)
 
 
 def test_a_message_without_dataclass_stays_as_it_is() -> None:
@@ -129,7 +129,7 @@ def test_a_message_without_dataclass_stays_as_it_is() -> None:
 def test_broken_messages_say_what_is_wrong(schema: str, fields: dict[str, Any], words: str) -> None:
     message = schemas.new(schema, **fields)
     with pytest.raises(DuagError, match=words):
-        m.unpack_gaussians(message) if schema == "GaussianArrays" else m.unpack(message)
+        m.estimates.unpack_gaussians(message) if schema == "GaussianArrays" else m.unpack(message)
 
 
 def test_wrong_shapes_are_bugs() -> None:

@@ -210,7 +210,7 @@ def bench_frontend(
 
     from converters.simulate import simulate as simulate_recording
     from pipeline.config import load
-    from pipeline.evaluation import frontend_bench
+    from pipeline.evaluation import frontend_bench, frontend_tables
     from pipeline.runner import RunConfig
 
     settings = load(RunConfig, config, overrides or [])
@@ -241,7 +241,7 @@ def bench_frontend(
         partial = plot.with_name(plot.name + ".part")
         partial.write_text(figures.map_sizes(frontend_bench.by_cap(result)), encoding="utf-8")
         partial.replace(plot)
-    print(json.dumps(result, indent=2) if as_json else frontend_bench.format_tables(result))
+    print(json.dumps(result, indent=2) if as_json else frontend_tables.format_tables(result))
 
 
 @bench_app.command("paths")

@@ -99,13 +99,20 @@ def replay(
 def evaluate(
     run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.", show_default=False)],
     recording: Annotated[Path | None, typer.Option(help="Where the recording is now.")] = None,
+    own_longer: Annotated[
+        bool,
+        typer.Option(
+            "--own-longer",
+            help="Also train each own map as long as the final one, without the team, and score it.",
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Measure a run against ground truth, where there is any, and write metrics.json.
 
-    Prints how each robot's maps compare: own, own trained as long, fused, refined.
+    Prints how each robot's maps compare: own, fused, refined.
 
-    Example: `duagc evaluate outputs/demo/run --json`
+    Example: `duagc evaluate outputs/demo/run --own-longer`
     """
     from pipeline.evaluation import evaluate as evaluate_run
     from pipeline.report.words import comparison_text
@@ -113,7 +120,10 @@ def evaluate(
     from pipeline.runner import threads_per_worker
 
     metrics = evaluate_run(
-        run_folder, recording or RunFolder(run_folder).recording, threads=threads_per_worker(1)
+        run_folder,
+        recording or RunFolder(run_folder).recording,
+        threads=threads_per_worker(1),
+        own_longer=own_longer,
     )
     if as_json:
         print(json.dumps(metrics, indent=2))

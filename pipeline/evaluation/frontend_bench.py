@@ -9,13 +9,12 @@ threads together; it suffers less from other load on the machine than wall time 
 from __future__ import annotations
 
 import functools
-import inspect
 import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -26,6 +25,7 @@ from pipeline.errors import DuagError
 from pipeline.evaluation import agreement, groundtruth, trajectory_errors, views
 from pipeline.evaluation.rendering import PosedMap, RenderTask
 from pipeline.evaluation.results import Absent, split_reasons
+from pipeline.evaluation.stopwatch import Calls, Stopwatch, counted, replaced, shares, summary
 from pipeline.evaluation.trajectory_errors import Paired
 from pipeline.frontend.config import FrontendConfig
 from pipeline.geometry.trajectory import Trajectory
@@ -56,6 +56,12 @@ ABLATION: dict[str, dict[str, Any]] = {
 }
 FRAME_PARTS = {"pyramid": ("tracking.RgbdPyramid", "build"), "registration": ("tracking", "register")}
 KEYFRAME_PARTS = {"seeding": ("mapping.Mapper", "_seed"), "optimisation": ("mapping.Mapper", "_optimise")}
+COUNTED = {
+    "frame": ("tracking.Tracker", "track"),
+    "step": ("align", "linearise_at"),
+    "keyframe": ("mapping.Mapper", "add_keyframe"),
+    "draw": ("mapping.Mapper", "_optimise"),
+}
 
 
 @dataclass(frozen=True)
@@ -151,65 +157,6 @@ def changed(config: FrontendConfig, values: Mapping[str, Any]) -> FrontendConfig
     return FrontendConfig.model_validate(content)
 
 
-# --- times -------------------------------------------------------------------------------------------------------
-
-
-@dataclass
-class Calls:
-    """Processor and wall time of every call of a function, seconds."""
-
-    cpu_s: list[float] = field(default_factory=list)
-    wall_s: list[float] = field(default_factory=list)
-
-
-class Stopwatch:
-    """Times every call of named functions for as long as it is open; a function that is not there is an error."""
-
-    def __init__(self, functions: Mapping[str, tuple[Any, str]]) -> None:
-        """functions: label to (module or class, name of the function in it)."""
-        self.calls = {label: Calls() for label in functions}
-        self._functions = dict(functions)
-        self._open = ExitStack()
-
-    def __enter__(self) -> Stopwatch:
-        with ExitStack() as stack:
-            for label, (owner, name) in self._functions.items():
-                stack.enter_context(_replaced(owner, name, functools.partial(_timed, self.calls[label])))
-            self._open = stack.pop_all()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._open.close()
-
-
-@contextmanager
-def _replaced(
-    owner: Any, name: str, change: Callable[[Callable[..., Any]], Callable[..., Any]]
-) -> Iterator[None]:
-    original = inspect.getattr_static(owner, name)
-    if isinstance(original, staticmethod | classmethod):
-        setattr(owner, name, type(original)(change(original.__func__)))
-    else:
-        setattr(owner, name, change(original))
-    try:
-        yield
-    finally:
-        setattr(owner, name, original)
-
-
-def _timed(calls: Calls, function: Callable[..., Any]) -> Callable[..., Any]:
-    @functools.wraps(function)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        wall, cpu = time.perf_counter(), time.process_time()
-        try:
-            return function(*args, **kwargs)
-        finally:
-            calls.cpu_s.append(time.process_time() - cpu)
-            calls.wall_s.append(time.perf_counter() - wall)
-
-    return call
-
-
 def _functions(parts: Mapping[str, tuple[str, str]]) -> dict[str, tuple[Any, str]]:
     from pipeline.frontend import mapping, model, stage, tracking
     from pipeline.registration import align
@@ -228,79 +175,6 @@ def _functions(parts: Mapping[str, tuple[str, str]]) -> dict[str, tuple[Any, str
     return found
 
 
-def summary(calls: Calls) -> dict[str, float]:
-    """Milliseconds of a call: mean, median, 95th percentile and the means of the first and the last quarter.
-
-    Means are those of processor time; `wall_ms` is the mean of wall time.
-    """
-    ms = 1000 * np.array(calls.cpu_s)
-    quarter = max(1, len(ms) // 4)
-    return {
-        "calls": len(ms),
-        "cpu_ms": float(ms.mean()),
-        "cpu_ms_median": float(np.median(ms)),
-        "cpu_ms_p95": float(np.quantile(ms, 0.95)),
-        "cpu_ms_first_quarter": float(ms[:quarter].mean()),
-        "cpu_ms_last_quarter": float(ms[-quarter:].mean()),
-        "wall_ms": float(1000 * np.mean(calls.wall_s)),
-    }
-
-
-@dataclass
-class Work:
-    """What is counted beside time: it is the same on every machine. Totals after each call of the whole."""
-
-    total: int = 0
-    after: list[int] = field(default_factory=list)
-
-    def summary(self, name: str) -> dict[str, float]:
-        """Mean per call, in the first and in the last quarter of the calls."""
-        counts = np.diff(np.array([0, *self.after]))
-        quarter = max(1, len(counts) // 4)
-        return {
-            name: float(counts.mean()),
-            f"{name}_first_quarter": float(counts[:quarter].mean()),
-            f"{name}_last_quarter": float(counts[-quarter:].mean()),
-        }
-
-
-@contextmanager
-def _counted(
-    whole: tuple[str, str], part: tuple[str, str], amount: Callable[..., int] = lambda *_: 1
-) -> Iterator[Work]:
-    """Add up `amount` of the arguments of the calls of a part while the whole runs; noted at the end of its calls."""
-    work = Work()
-
-    def counting(function: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(function)
-        def call(*args: Any, **kwargs: Any) -> Any:
-            result = function(*args, **kwargs)
-            work.total += amount(*args)
-            return result
-
-        return call
-
-    def noting(function: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(function)
-        def call(*args: Any, **kwargs: Any) -> Any:
-            work.total = work.after[-1] if work.after else 0  # what happens between the calls is not counted
-            result = function(*args, **kwargs)
-            work.after.append(work.total)
-            return result
-
-        return call
-
-    found = _functions({"whole": whole, "part": part})
-    with _replaced(*found["part"], counting), _replaced(*found["whole"], noting):
-        yield work
-
-
-def _parts(whole: Calls, parts: Mapping[str, Calls]) -> dict[str, float]:
-    """Milliseconds of processor time that parts of a call take of it on average, and what is left."""
-    shares = {label: 1000 * sum(calls.cpu_s) / len(whole.cpu_s) for label, calls in parts.items()}
-    return shares | {"other": 1000 * sum(whole.cpu_s) / len(whole.cpu_s) - sum(shares.values())}
-
-
 # --- one run -----------------------------------------------------------------------------------------------------
 
 
@@ -312,14 +186,11 @@ def measure(log: Path, folder: Path, config: FrontendConfig, seed: int, threads:
     if config.mapping_enabled:
         whole |= {"keyframe": ("mapping.Mapper", "add_keyframe"), "final": ("mapping.Mapper", "finish")}
         whole |= {"model": ("model.ModelTracker", "refine")}
+    counts = _functions(COUNTED)
     with ExitStack() as stack:
-        steps = stack.enter_context(_counted(("tracking.Tracker", "track"), ("align", "linearise_at")))
+        steps = stack.enter_context(counted(counts["frame"], counts["step"]))
         drawn = stack.enter_context(
-            _counted(
-                ("mapping.Mapper", "add_keyframe"),
-                ("mapping.Mapper", "_optimise"),
-                lambda mapper, *_: mapper.rasterizer.visible,
-            )
+            counted(counts["keyframe"], counts["draw"], lambda mapper, *_: mapper.rasterizer.visible)
         )
         outer = stack.enter_context(Stopwatch(_functions(whole)))
         inner = stack.enter_context(_in_turn(config))
@@ -327,12 +198,12 @@ def measure(log: Path, folder: Path, config: FrontendConfig, seed: int, threads:
         laps = run_frontend(log, folder / "frontend.mcap", config, seed=seed, threads=threads)
         cpu_s = time.process_time() - start
     frame = outer.calls["frame"]
-    times: dict[str, Any] = {"frame": summary(frame) | {"parts_cpu_ms": _parts(frame, inner.of("frame"))}}
+    times: dict[str, Any] = {"frame": summary(frame) | {"parts_cpu_ms": shares(frame, inner.of("frame"))}}
     times["frame"] |= steps.summary("steps")
     times["pose_optimisation_cpu_s"] = sum(outer.calls["poses"].cpu_s)
     if config.mapping_enabled:
         keyframe = outer.calls["keyframe"]
-        times["keyframe"] = summary(keyframe) | {"parts_cpu_ms": _parts(keyframe, inner.of("keyframe"))}
+        times["keyframe"] = summary(keyframe) | {"parts_cpu_ms": shares(keyframe, inner.of("keyframe"))}
         times["keyframe"] |= drawn.summary("gaussians_drawn")
         if outer.calls["model"].cpu_s:
             times["model"] = summary(outer.calls["model"])
@@ -365,7 +236,7 @@ def _in_turn(config: FrontendConfig) -> Iterator[_Inner]:
         wholes["keyframe"] = ("mapping.Mapper", "add_keyframe")
     with ExitStack() as stack:
         for label, (owner, name) in _functions(wholes).items():
-            stack.enter_context(_replaced(owner, name, functools.partial(_within, watches[label])))
+            stack.enter_context(replaced(owner, name, functools.partial(_within, watches[label])))
         yield _Inner(watches)
 
 
@@ -517,120 +388,3 @@ def by_cap(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
                 }
             )
     return robots
-
-
-# --- words -------------------------------------------------------------------------------------------------------
-
-
-def format_tables(result: dict[str, Any]) -> str:
-    """The rows as Markdown tables: tracking, mapping by cap, parts."""
-    machine, rows = result["machine"], result["rows"]
-    about = [
-        result["recording"],
-        machine["cpu"],
-        f"{machine['cores']} cores",
-        f"{machine['threads']} threads",
-    ]
-    about += [f"load {machine['load_average']:.1f}", "processor time"]
-    head = ["robot", "", "frames", "lost", "keyframes", "ATE mm", "RPE mm", "RPE mrad"]
-    head += ["ms/frame", "p95", "first, last quarter", "steps", "model ms", "poses s", "peak MB"]
-    lines = [", ".join(about), "", "Tracking"]
-    lines += _table(head, [_tracking_cells(row) for row in rows])
-    head = ["robot", "", "depth mm", "of ground truth", "features px", "of ground truth"]
-    judged = [_agreement_cells(row) for row in rows if "depth_agreement_m" in row]
-    lines += ["", "Agreement of held-out views", *_table(head, judged)]
-    mapped = [row for row in rows if row["name"] == "map"]
-    if mapped:
-        head = [
-            "robot",
-            "cap",
-            "Gaussians",
-            "PSNR dB",
-            "before refinement",
-            "depth L1 mm",
-            "exact mm",
-            "layer mm",
-        ]
-        head += ["ms/keyframe", "p95", "first, last quarter", "k drawn", "refinement s", "all s", "peak MB"]
-        lines += ["", "Mapping; scores of held-out views", *_table(head, [_map_cells(row) for row in mapped])]
-    parts = [
-        [row["robot"], row.get("max_gaussians", row["name"]), whole, _parts_text(row["times"][whole])]
-        for row in rows
-        for whole in ("frame", "keyframe")
-        if whole in row["times"] and row["name"] in ("map", WITHOUT_MAP)
-    ]
-    lines += ["", "Parts, ms", *_table(["robot", "cap", "of a", "parts"], parts)]
-    return "\n".join(lines)
-
-
-def _tracking_cells(row: dict[str, Any]) -> list[Any]:
-    frame = row["times"]["frame"]
-    return [
-        *(
-            row["robot"],
-            f"all, map of {row['max_gaussians']}" if row["name"] == "map" else row["name"],
-            row["frames"],
-            row.get("lost", row.get("failed")),
-            row.get("keyframes", "-"),
-        ),
-        *(
-            _number(row["ate_rmse_m"], 1e3, 3),
-            _number(row["rpe_trans_m"], 1e3, 3),
-            _number(row["rpe_rot_rad"], 1e3, 3),
-        ),
-        *(f"{frame['cpu_ms']:.1f}", f"{frame['cpu_ms_p95']:.1f}", _quarters(frame)),
-        *(_work(frame, "steps", 1.0), _model(row["times"].get("model"))),
-        *(_number(row["times"].get("pose_optimisation_cpu_s"), 1, 1), f"{row['peak_memory_mb']:.0f}"),
-    ]
-
-
-def _agreement_cells(row: dict[str, Any]) -> list[Any]:
-    return [
-        *(row["robot"], row["name"]),
-        *(_number(row[f"depth_agreement_m{of}"], 1e3, 2) for of in ("", agreement.OF_TRUTH)),
-        *(_number(row[f"feature_agreement_px{of}"], 1, 2) for of in ("", agreement.OF_TRUTH)),
-    ]
-
-
-def _map_cells(row: dict[str, Any]) -> list[Any]:
-    keyframe, refined, unrefined = row["times"]["keyframe"], row["refined"], row["unrefined"] or {}
-    return [
-        *(row["robot"], row["max_gaussians"], row["gaussians"], _number(refined["psnr_db"], 1, 2)),
-        _number(unrefined.get("psnr_db"), 1, 2),
-        *(_number(refined["depth_l1_m"], 1e3, 2), _number(refined["depth_l1_exact_m"], 1e3, 2)),
-        _number(refined["depth_l1_layer_m"], 1e3, 2),
-        *(f"{keyframe['cpu_ms']:.0f}", f"{keyframe['cpu_ms_p95']:.0f}", _quarters(keyframe)),
-        _work(keyframe, "gaussians_drawn", 1e-3),
-        *(
-            f"{row['times']['final_refinement_cpu_s']:.1f}",
-            f"{row['cpu_s']:.1f}",
-            f"{row['peak_memory_mb']:.0f}",
-        ),
-    ]
-
-
-def _quarters(times: dict[str, float]) -> str:
-    return f"{times['cpu_ms_first_quarter']:.1f}, {times['cpu_ms_last_quarter']:.1f}"
-
-
-def _work(times: dict[str, float], name: str, scale: float) -> str:
-    if name not in times:
-        return "-"
-    return f"{scale * times[f'{name}_first_quarter']:.1f}, {scale * times[f'{name}_last_quarter']:.1f}"
-
-
-def _model(times: dict[str, float] | None) -> str:
-    return "-" if times is None else f"{times['calls']} x {times['cpu_ms']:.1f}"
-
-
-def _parts_text(times: dict[str, Any]) -> str:
-    return ", ".join(f"{label} {value:.1f}" for label, value in times["parts_cpu_ms"].items())
-
-
-def _number(value: float | None, scale: float, digits: int) -> str:
-    return "-" if value is None else f"{scale * value:.{digits}f}"
-
-
-def _table(head: list[str], rows: list[list[Any]]) -> list[str]:
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
-    return lines + ["| " + " | ".join(str(cell) for cell in row) + " |" for row in rows]

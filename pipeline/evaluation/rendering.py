@@ -1,4 +1,4 @@
-"""What the maps show where cameras stood: own, own trained longer, fused and refined, on the same pixels.
+"""What the maps show where cameras stood: own, fused, refined, and if asked own trained longer, on the same pixels.
 
 Every robot's maps are drawn at its own held-out views, at those of the robots that share its world (`peers`), and both
 together are the views of the team (`team`).
@@ -29,8 +29,10 @@ from pipeline.run_folder import RobotRun, RunFolder
 from pipeline.splat.gaussians import DepthKind, Gaussians
 
 COMPARED = ("own", "own_longer", "fused", "refined")
+IN_EVERY_RUN = ("own", "fused", "refined")
 COMPARED_SETS = ("held_out", "peers", "team")
 NOBODY_MET = "no robot met another"
+NOT_ASKED = "not asked for: duagc evaluate --own-longer"
 REASONS = {
     "held_out": "there is no such view",
     "training": "there is no such view",
@@ -53,6 +55,7 @@ class _Found:
     """Scores by robot, map and set of views; and the rows of the long table."""
 
     rows: list[Row]
+    longer: bool
     scores: dict[tuple[str, str, str], Scores] = field(default_factory=dict)
 
     def add(self, robot: str, kind: str, view_set: str, index: int, score: views.ViewScore | Absent) -> None:
@@ -67,24 +70,27 @@ class _Found:
         return self.scores.get((robot, kind, view_set), [])
 
     def summary(self, robots: list[str], kind: str, view_set: str) -> dict[str, Any]:
-        lone = kind in ("own_longer", "refined")
-        reason = (
-            "the front end wrote no map before its refinement"
-            if kind == "own_unrefined"
-            else NOBODY_MET
-            if lone
-            else REASONS[view_set]
-        )
+        if kind == "own_unrefined":
+            reason = "the front end wrote no map before its refinement"
+        elif kind == "own_longer" and not self.longer:
+            reason = NOT_ASKED
+        else:
+            reason = NOBODY_MET if kind in ("own_longer", "refined") else REASONS[view_set]
         return views.summary([s for r in robots for s in self.of(r, kind, view_set)], reason)
 
 
 def rendering_sections(
-    run: RunFolder, source: Recording, threads: int, progress: bool, rows: list[Row]
+    run: RunFolder, source: Recording, threads: int, progress: bool, longer: bool, rows: list[Row]
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Scores of all maps over all sets of views: of all robots together, and of each; one row per view and score."""
-    found = _Found(rows)
+    """Scores of all maps over all sets of views: of all robots together, and of each; one row per view and score.
+
+    `longer`: train the own maps as long as the refined ones, and score them too.
+    """
+    found = _Found(rows, longer)
     for name, robot in run.robots.items():
-        maps = _maps(run, robot, source, threads)
+        maps = _maps(robot)
+        if longer and robot.refined_map is not None:
+            maps["own_longer"] = own_longer(run, robot, source, threads)
         own = {kind: PosedMap(g, _own_trajectory(robot, kind)) for kind, g in maps.items()}
         task = RenderTask(own, robot, "held_out", robot.own_map.depth)
         for index, scores in task.scores(source, threads, f"render maps of {name}" if progress else None):
@@ -121,14 +127,13 @@ def mates(run: RunFolder, robot: RobotRun) -> list[RobotRun]:
     return [other for other in others if other.component == robot.component]
 
 
-def _maps(run: RunFolder, robot: RobotRun, source: Recording, threads: int) -> dict[str, Gaussians]:
+def _maps(robot: RobotRun) -> dict[str, Gaussians]:
     """The own maps in the robot's map frame, the others in the world; those that exist."""
     maps = {"own": robot.own_map.gaussians, "fused": robot.fused_map.gaussians}
     if robot.unrefined_map is not None:
         maps["own_unrefined"] = robot.unrefined_map.gaussians
     if robot.refined_map is not None:
         maps["refined"] = robot.refined_map.gaussians
-        maps["own_longer"] = own_longer(run, robot, source, threads)
     return maps
 
 
@@ -194,7 +199,7 @@ class RenderTask:
             exact = groundtruth.exact_depths(source, name, stamps)
             frames = _views(log, sorted(chosen), exact, groundtruth.recorded_depth_is_exact(source, name))
             maps = {kind: (m.gaussians, poses_by_stamp(m.trajectory)) for kind, m in self.maps.items()}
-            found = views.score_maps(maps, log.camera, frames, threads, self.depth, COMPARED)
+            found = views.score_maps(maps, log.camera, frames, threads, self.depth, IN_EVERY_RUN)
             yield from track(found, title, total=len(chosen)) if title else found
 
 

@@ -48,7 +48,7 @@ PROTOCOL = {
     "held_out": "index % 8 == 4",
     "training": "keyframes",
     "team": "held-out and peers' views together, of robots that have peers",
-    "common": "pixels that own, own_longer, fused and refined all cover; else what a map does not cover is no part of "
+    "common": "pixels that own, fused and refined all cover; else what a map does not cover is no part of "
     "its depth error and lowers its completeness",
     "peers": "held-out views of the other robots of the component, at their own poses; own map moved into the world",
     "poses": "own: odometry.tum in the robot's map frame; fused: trajectory.tum in the world frame",
@@ -61,19 +61,22 @@ PROTOCOL = {
     "depth": "blended depth / alpha where alpha >= 0.5, of a Gaussian as its map says: that of its centre or of its "
     "plane; mean over pixels with both depths, then over views",
     "own_unrefined": "the own map before its final refinement, seen as the own map",
-    "own_longer": "the own map trained again with the same settings and as many steps, alone; seen as the own map",
+    "own_longer": "if asked for, the own map trained again as the refined one was, alone; seen as the own map",
     "refined": "the final map: the fused one trained again on own images and peers' maps, seen as the fused map",
     "calibration": "distance of fused Gaussians from the true surface against sigma along its normal; mean of robots",
 }
 
 
-def evaluate(run_dir: Path, recording: Path, threads: int = 2, progress: bool = True) -> dict[str, Any]:
+def evaluate(
+    run_dir: Path, recording: Path, threads: int = 2, progress: bool = True, own_longer: bool = False
+) -> dict[str, Any]:
     """Measure a run against its recording and write metrics.json and metrics.parquet into its folder.
 
     Args:
         run_dir: folder of the run. recording: folder of its recording; its ground truth is optional.
         threads: views rendered at the same time; changes no bit of the result.
         progress: say on standard error how far it is.
+        own_longer: also score the own maps trained as long as the final ones; takes as long as that training.
     Returns:
         The content of metrics.json.
     Raises:
@@ -85,7 +88,7 @@ def evaluate(run_dir: Path, recording: Path, threads: int = 2, progress: bool = 
         raise DuagError(f"{recording}: has no robot {strangers[0]}, expected the robots of {run_dir}")
     truth, session = TruePaths.of(run, source), Session(run)
     rows: list[Row] = []
-    rendering, rendering_of = rendering_sections(run, source, threads, progress, rows)
+    rendering, rendering_of = rendering_sections(run, source, threads, progress, own_longer, rows)
     tree = {
         "schema": SCHEMA,
         "robots": {

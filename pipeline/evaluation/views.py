@@ -164,7 +164,7 @@ def score_maps(
                 frame.depth,
                 view.exact_depth_m,
                 layer_m,
-                common if name in compared else None,
+                common,
             )
         return frame.index, scores
 

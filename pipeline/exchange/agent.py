@@ -33,7 +33,6 @@ from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.frames import Frames
 from pipeline.exchange.meeting import HigherEnd, LowerEnd, Meeting, OwnPlaces, Send
 from pipeline.exchange.neighbour import Neighbour
-from pipeline.exchange.outcome import result_of
 from pipeline.exchange.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError, Packet, parse
 from pipeline.exchange.sharing import Sharing
 from pipeline.exchange.signatures import Identity
@@ -41,7 +40,7 @@ from pipeline.exchange.solvers import AdmmSolver, EliminationSolver, LinkStart, 
 from pipeline.exchange.transport import Arrival, Message, Outgoing, Transport
 from pipeline.exchange.wire import Anchors, PairFrames, State, pair_bit
 from pipeline.geometry import se3
-from pipeline.robot import AgentResult, RobotData
+from pipeline.robot import RobotData
 
 Array = NDArray[np.float64]
 EVERYWHERE = 255  # a hop count that has reached the whole component, for good
@@ -461,10 +460,6 @@ class Agent:
     @staticmethod
     def _supplied(n: Neighbour, everyone: list[int]) -> bool:
         return n.state is not None and all(n.state.sources[m] == wire.COMPLETE for m in everyone)
-
-    def result(self) -> AgentResult:
-        """What the robot takes home."""
-        return result_of(self)
 
 
 def _pair(a: int, b: int) -> tuple[int, int]:

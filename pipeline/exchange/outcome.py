@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.consensus.closures import Closure
 from pipeline.consensus.robust import COUNTS
+from pipeline.exchange.agent import Agent
 from pipeline.exchange.evidence import to_evidence
 from pipeline.exchange.neighbour import Neighbour
 from pipeline.exchange.verification import Verdict
 from pipeline.exchange.wire import PairList
 from pipeline.geometry import se3
 from pipeline.robot import AgentResult, ClosureRecord
-
-if TYPE_CHECKING:
-    from pipeline.exchange.agent import Agent
 
 Array = NDArray[np.float64]
 

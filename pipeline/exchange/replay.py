@@ -10,6 +10,7 @@ from pipeline import numeric
 from pipeline.exchange import links
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.config import ExchangeConfig
+from pipeline.exchange.outcome import result_of
 from pipeline.exchange.record import read_session
 from pipeline.exchange.session import Delivery, due
 from pipeline.robot import AgentInput, AgentResult, RobotData, load
@@ -61,4 +62,4 @@ def replay_agent_of(
         now_ns = round_index * config.period_ns
         for out in agent.tick(round_index, now_ns, due(waiting, now_ns)):
             recomputed.update(out.packet)
-    return agent.result(), SentPackets(recorded.hexdigest(), recomputed.hexdigest())
+    return result_of(agent), SentPackets(recorded.hexdigest(), recomputed.hexdigest())

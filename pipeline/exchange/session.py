@@ -11,6 +11,7 @@ from pipeline.exchange import links
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.config import ExchangeConfig
 from pipeline.exchange.links import LinkModel
+from pipeline.exchange.outcome import result_of
 from pipeline.exchange.record import ConsensusRecorder, ExchangeRecorder, RawAlternative
 from pipeline.exchange.wire import MAX_TEAM
 from pipeline.progress import track
@@ -82,7 +83,7 @@ def run_session_of(
                     )
             if all(agent.done for agent in agents.values()):
                 break
-        results = {robot: agent.result() for robot, agent in agents.items()}
+        results = {robot: result_of(agent) for robot, agent in agents.items()}
         for result in results.values():
             rounds.result(result, now_ns)
         packets.summary(

@@ -96,7 +96,7 @@ VIEW_SETS = {
 
 COMPARISON = {
     "psnr_db": ("PSNR", "likeness of colours; what a map does not cover is black and counts"),
-    "depth_l1_common_m": ("Depth L1", "mean error against the recorded depth, over pixels that all four maps cover"),
+    "depth_l1_common_m": ("Depth L1", "mean depth error over pixels that own, fused and refined map cover"),
     "depth_l1_layer_m": ("one layer", "the same over what the map itself covers, drawn as one surface"),
     "depth_completeness": ("Covered", "share of recorded depth pixels that the map covers"),
 }  # fmt: skip
@@ -174,9 +174,10 @@ def rows(
 
 def _compared(metrics: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Of all robots together and of each: name, map, its scores by set of views."""
-    yield from (("all robots", kind, metrics["rendering"][kind]) for kind in COMPARED)
+    kinds = [k for k in COMPARED if k != "own_longer" or metrics["rendering"][k]["held_out"]["views"]]
+    yield from (("all robots", kind, metrics["rendering"][kind]) for kind in kinds)
     for name, robot in metrics["robots"].items():
-        yield from ((name, kind, robot["rendering"][kind]) for kind in COMPARED)
+        yield from ((name, kind, robot["rendering"][kind]) for kind in kinds)
 
 
 def comparison_rows(metrics: dict[str, Any]) -> list[dict[str, Any]]:

@@ -29,7 +29,12 @@ T_DEPTH_COLOR = se3.from_rotation_translation(np.eye(3), [Options().baseline_m, 
 
 def render(camera: PinholeCamera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Colour uint8 [H, W, 3] and exact z-depth [H, W] of a box in a room, seen from inside the room."""
-    rays = camera.rays().reshape(-1, 3) @ T_world_camera[:3, :3].T
+    return render_rays(camera.rays(), T_world_camera)
+
+
+def render_rays(rays_camera: np.ndarray, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`render` along rays [H, W, 3] with z = 1."""
+    rays = rays_camera.reshape(-1, 3) @ T_world_camera[:3, :3].T
     origin = T_world_camera[:3, 3]
     with np.errstate(divide="ignore"):
         to_walls = np.where(rays > 0, (ROOM_HALF_M - origin) / rays, (-ROOM_HALF_M - origin) / rays).min(
@@ -39,9 +44,9 @@ def render(camera: PinholeCamera, T_world_camera: np.ndarray) -> tuple[np.ndarra
     enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
     z = np.where((enter < leave) & (enter > 0), enter, to_walls)
     points = origin + z[:, None] * rays
-    shade = (np.floor(points * 5).sum(axis=1) % 2) * 90 + 80
+    shade = (np.floor(points * 5 + 0.3).sum(axis=1) % 2) * 90 + 80
     color = np.stack([shade, shade * 0.8, shade * 0.6], axis=-1).astype(np.uint8)
-    return color.reshape(camera.height, camera.width, 3), z.reshape(camera.height, camera.width)
+    return color.reshape(rays_camera.shape), z.reshape(rays_camera.shape[:2])
 
 
 def depth_pose(index: int) -> np.ndarray:
@@ -345,6 +350,92 @@ def test_no_depth_stays_none() -> None:
     depth = slanted(options.depth_camera(), 0.5)
     depth[100:110, 50:300] = 0
     np.testing.assert_allclose(same(depth), depth, rtol=1e-12)  # the identity keeps every hole
+
+
+# --- a calibrated rig -------------------------------------------------------------------------------------------------
+
+RIG: dict[str, Any] = {
+    "color_focal_px": 515.0,
+    "color_focal_y_px": 519.0,
+    "color_cx_px": 327.0,
+    "color_cy_px": 246.0,
+    "color_distortion": "0.08 -0.37 0.001 -0.002 0.41",
+    "color_rotation_rad": "0.012, -0.008, 0.02",
+    "depth_correction_per_m": "0.015 -0.012 -0.005 -0.017 -0.004 0.001",
+}
+
+
+def make_rig_sequence(folder: Path) -> Path:
+    """A sequence as cameras see it that are as `RIG` says, made without the code of the converter."""
+    folder.mkdir(parents=True)
+    v, u = np.mgrid[:480, :640].astype(np.float64)
+    K = np.array([[515.0, 0, 327], [0, 519, 246], [0, 0, 1]])
+    lens, steps = np.array([0.08, -0.37, 0.001, -0.002, 0.41]), (cv2.TERM_CRITERIA_COUNT, 50, 0)
+    xy = cv2.undistortPoints(np.stack([u, v], axis=-1).reshape(-1, 1, 2), K, lens, criteria=steps)
+    turned = np.concatenate([xy[:, 0], np.ones((len(xy), 1))], axis=1) @ so3.exp(
+        np.array([0.012, -0.008, 0.02])
+    )
+    rays = (turned / turned[:, 2:]).reshape(
+        480, 640, 3
+    )  # of the colour pixels, as the depth camera is turned
+    x, y = (u - 320) / 585, (v - 240) / 585
+    for index in range(3):
+        pose = depth_pose(index)
+        color, _ = render_rays(rays, pose @ T_DEPTH_COLOR)
+        _, depth = render(Options().depth_camera(), pose)
+        error = 0.015 - 0.012 * x - 0.005 * y - 0.017 * x * x - 0.004 * x * y + 0.001 * y * y
+        wrong = (1 - 2 * 0.015) / (1 / depth - error)
+        stem = folder / f"frame-{index:06d}"
+        cv2.imwrite(f"{stem}.color.png", color)
+        cv2.imwrite(f"{stem}.depth.png", np.rint(wrong * 1000).astype(np.uint16))
+        np.savetxt(f"{stem}.pose.txt", pose, delimiter="\t")
+    return folder
+
+
+def errors_of(recording: Path, camera: PinholeCamera) -> tuple[float, float]:
+    """Share of pixels of another colour than the room's, and median error of depth in metres, all frames."""
+    colors, depths = [], []
+    for frame in open_rgbd(Recording(recording).log("alpha")).frames():
+        color, depth = render(camera, depth_pose(frame.index) @ T_DEPTH_COLOR)
+        inside = np.s_[30:-30, 30:-30]  # what the colour camera did not see is at the border
+        off = np.abs(frame.color[inside].astype(float) - color[inside][..., ::-1]).max(axis=-1)
+        colors.append(np.mean(off > 20))
+        depths.append(np.abs(frame.depth - depth)[frame.depth > 0])
+    return float(np.mean(colors)), float(np.median(np.concatenate(depths)))
+
+
+def test_lens_rotation_and_depth_error_are_undone(tmp_path: Path) -> None:
+    source = make_rig_sequence(tmp_path / "seq-01")
+    convert(source, tmp_path / "rec", **RIG)
+    convert(source, tmp_path / "again", **RIG)
+    convert(source, tmp_path / "as_if_ideal", color_focal_px=515.0)
+    assert content_digest(tmp_path / "rec" / "alpha.mcap") == content_digest(
+        tmp_path / "again" / "alpha.mcap"
+    )
+    camera = Options(**RIG).color_camera()
+    assert open_rgbd(Recording(tmp_path / "rec").log("alpha")).camera == camera
+    assert camera.fx == camera.fy == 515
+    colors, depths = errors_of(tmp_path / "rec", camera)
+    assert colors < 0.04, "edges of the pattern, blurred by half a pixel"
+    assert depths < 0.0005, "the millimetre of the source, rounded twice"
+    colors, depths = errors_of(tmp_path / "as_if_ideal", camera)
+    assert colors > 0.1
+    assert depths > 0.005
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("color_distortion", "0.1 0.2"),
+        ("color_distortion", "0.1 0.2 0 nan"),
+        ("color_rotation_rad", "1 2 three"),
+        ("depth_correction_per_m", "0 0 0 0 0"),
+    ],
+)
+def test_lists_of_numbers_are_checked(sequence: Path, tmp_path: Path, name: str, value: str) -> None:
+    with pytest.raises(DuagError, match=f"7scenes: {name} = '{value}'"):
+        convert(sequence, tmp_path / "rec", 1, False, **{name: value})
+    assert not (tmp_path / "rec").exists()
 
 
 # --- the table of converters ------------------------------------------------------------------------------------------

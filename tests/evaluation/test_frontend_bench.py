@@ -12,6 +12,7 @@ import pytest
 from converters.simulate import simulate
 from pipeline.errors import DuagError
 from pipeline.evaluation import frontend_bench as bench
+from pipeline.evaluation import frontend_tables, stopwatch
 from pipeline.frontend.config import FrontendConfig
 from pipeline.report import figures
 
@@ -75,7 +76,7 @@ def test_tracking_is_the_same_with_and_without_maps(result: dict) -> None:
 
 
 def test_tables_hold_every_row(result: dict) -> None:
-    text = bench.format_tables(result)
+    text = frontend_tables.format_tables(result)
     for name in (*bench.ABLATION, *bench.OPEN3D):
         assert text.count(f"| bravo | {name} |") >= 1
     assert "| bravo | 400 |" in text
@@ -114,7 +115,7 @@ def test_without_ground_truth_errors_are_absent(recording: Path, tmp_path: Path)
     (row,) = result["rows"]
     assert row["ate_rmse_m"] is None
     assert "no ground truth" in result["reasons"]["rows.0.ate_rmse_m"]
-    assert "-" in bench.format_tables(result)
+    assert "-" in frontend_tables.format_tables(result)
 
 
 def test_the_command_prints_json(recording: Path) -> None:
@@ -156,7 +157,7 @@ class Worker:
 
 def test_a_stopwatch_times_calls_and_leaves_no_trace() -> None:
     before = dict(vars(Worker))
-    with bench.Stopwatch({"own": (Worker, "own"), "fixed": (Worker, "fixed")}) as watch:
+    with stopwatch.Stopwatch({"own": (Worker, "own"), "fixed": (Worker, "fixed")}) as watch:
         assert Worker().own(0.02) == 0.04
         assert Worker.fixed(0.01) == 0.01
     assert dict(vars(Worker)) == before
@@ -164,14 +165,14 @@ def test_a_stopwatch_times_calls_and_leaves_no_trace() -> None:
     assert np.round(watch.calls["own"].cpu_s, 2) == pytest.approx([0.02], abs=0.011)
     assert np.round(watch.calls["fixed"].cpu_s, 2) == pytest.approx([0.02, 0.01], abs=0.011)
     assert (np.array(watch.calls["own"].wall_s) >= 0.019).all()
-    with pytest.raises(AttributeError), bench.Stopwatch({"x": (Worker, "fixed"), "y": (Worker, "gone")}):
+    with pytest.raises(AttributeError), stopwatch.Stopwatch({"x": (Worker, "fixed"), "y": (Worker, "gone")}):
         pass
     assert dict(vars(Worker)) == before
 
 
 def test_quarters_are_those_of_the_run() -> None:
-    calls = bench.Calls([0.001] * 4 + [0.002] * 8 + [0.003] * 4, [0.01] * 16)
-    found = bench.summary(calls)
+    calls = stopwatch.Calls([0.001] * 4 + [0.002] * 8 + [0.003] * 4, [0.01] * 16)
+    found = stopwatch.summary(calls)
     assert found["cpu_ms_first_quarter"] == pytest.approx(1)
     assert found["cpu_ms_last_quarter"] == pytest.approx(3)
     assert found["cpu_ms"] == found["cpu_ms_median"] == pytest.approx(2)

@@ -212,6 +212,17 @@ def test_threads_change_no_bit(fake, metrics, tmp_path):
     assert {name: (fake.run / name).read_bytes() for name in before} == before
 
 
+def test_own_maps_are_trained_longer_only_if_asked(metrics, tmp_path):
+    fake = make(tmp_path)
+    asked = evaluate(fake.run, fake.recording, progress=False, own_longer=True)
+    check_against_schema(asked)
+    assert asked["rendering"]["own_longer"]["held_out"]["views"] > 0
+    assert metrics["rendering"]["own_longer"]["held_out"]["views"] == 0
+    assert "--own-longer" in metrics["reasons"]["rendering.own_longer.held_out.psnr_db"]
+    others = ("own", "own_unrefined", "fused", "refined")
+    assert {k: asked["rendering"][k] for k in others} == {k: metrics["rendering"][k] for k in others}
+
+
 def test_without_ground_truth_there_are_reasons_not_numbers(tmp_path):
     fake = make(tmp_path, truth=False)
     metrics = evaluate(fake.run, fake.recording, progress=False)

@@ -11,6 +11,7 @@ import pytest
 
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.config import ExchangeConfig, TransportConfig
+from pipeline.exchange.outcome import result_of
 from pipeline.exchange.packets import (
     HEADER_BYTES,
     Kind,
@@ -60,7 +61,7 @@ def meet(
                     invented += 1
         if all(agent.done for agent in agents.values()):
             break
-    return {name: agent.result() for name, agent in agents.items()}, agents, invented
+    return {name: result_of(agent) for name, agent in agents.items()}, agents, invented
 
 
 def moved(results: dict[str, AgentResult], others: dict[str, AgentResult]) -> list[str]:

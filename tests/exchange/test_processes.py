@@ -12,6 +12,7 @@ from pipeline.exchange import links
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.config import ExchangeConfig, LinkConfig
 from pipeline.exchange.links import LinkModel
+from pipeline.exchange.outcome import result_of
 from pipeline.exchange.session import Delivery, due, run_session_of
 from tests.exchange.conftest import robot
 from tests.exchange.test_session import same
@@ -29,7 +30,7 @@ def live(pipe: Connection, place: int) -> None:
         round_index, now_ns, packets = heard
         sent = [(out.receiver, out.packet) for out in agent.tick(round_index, now_ns, packets)]
         pipe.send((sent, agent.done))
-    pipe.send(agent.result())
+    pipe.send(result_of(agent))
     pipe.close()
 
 

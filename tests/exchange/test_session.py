@@ -15,6 +15,7 @@ from pipeline.consensus.config import PoseConsensusConfig
 from pipeline.exchange.agent import Agent
 from pipeline.exchange.config import ExchangeConfig, InjectionConfig, LinkConfig, TransportConfig
 from pipeline.exchange.evidence import best_first, own_records, paper_priority
+from pipeline.exchange.outcome import result_of
 from pipeline.exchange.packets import Kind, Packet, chunk_bytes, parse, serialise
 from pipeline.exchange.record import read_session
 from pipeline.exchange.replay import replay_agent_of
@@ -404,7 +405,7 @@ def test_a_neighbour_that_falls_silent_ends_the_session(team: Any) -> None:
         sent = {n: agent.tick(round_index, round_index, air[n]) for n, agent in agents.items()}
         air = {n: [o.packet for s in sent.values() for o in s if o.receiver == n] for n in NAMES[:2]}
     assert agents["alpha"].done
-    result = agents["alpha"].result()
+    result = result_of(agents["alpha"])
     assert not result.converged
     assert not result.agreed
     assert np.isfinite(result.T_world_keyframe).all()
@@ -440,7 +441,7 @@ def test_hostile_packets_change_nothing(team: Any) -> None:
             assert parse(out.packet).sender == 0
     assert sum(agent.refused.values()) > 200
     assert not agent.neighbours[1].decided
-    assert agent.result().component == ("alpha",)
+    assert result_of(agent).component == ("alpha",)
 
 
 FORBIDDEN = ("truth", "evaluation", "converters", "fusion", "viewer", "report")

@@ -62,7 +62,7 @@ def test_maps_stand_beside_each_other_for_all_and_for_each_robot(fake, html):
     metrics = json.loads((fake.run / "metrics.json").read_text())
     rows = words.comparison_rows(metrics)
     assert [r["robot"] for r in rows if r["first"]] == ["all robots", "alpha", "bravo"]
-    assert len(rows) == 3 * 4
+    assert len(rows) == 3 * 3
     assert all(len(r["values"]) == 3 * 4 for r in rows)
     assert "Which map is better?" in html
     lines = words.comparison_text(metrics).splitlines()

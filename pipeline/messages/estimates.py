@@ -1,96 +1,33 @@
-"""Messages of our logs as dataclasses of arrays, and back: `message.pack()`, `Message.unpack(proto)`.
-
-Poses, information and arrays read back bit for bit. Times are integer nanoseconds. Frames, units and shapes stand
-at the fields; their place in the log in `schemas/*.proto`, their topics in `schemas/topics.py`.
-"""
+"""Messages of what a robot estimates: poses, keyframes, maps and their information."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 import schemas
 from pipeline.errors import DuagError
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
+from pipeline.messages.parts import (
+    WORLD_FRAME,
+    Array,
+    map_frame,
+    numbers,
+    pack_array,
+    pack_information,
+    pack_pose,
+    pack_stamp,
+    unpack_array,
+    unpack_pose,
+    unpack_stamp,
+)
 from pipeline.splat.gaussians import DEPTH_KINDS, DepthKind, Gaussians
-
-Array = NDArray[np.float64]
-NANOSECONDS = 1_000_000_000
 
 _STATUS = {"ok": 1, "lost": 2, "relocalised": 3}
 _STATUS_NAME = {number: name for name, number in _STATUS.items()}
-
-
-def pack_stamp(message: Any, stamp_ns: int) -> None:
-    """Set the field `timestamp` of any message to integer nanoseconds."""
-    message.timestamp.seconds, message.timestamp.nanos = divmod(int(stamp_ns), NANOSECONDS)
-
-
-def unpack_stamp(message: Any) -> int:
-    """Integer nanoseconds of the field `timestamp` of any message."""
-    return message.timestamp.seconds * NANOSECONDS + message.timestamp.nanos
-
-
-def pack_array(array: ArrayLike, dtype: str) -> bytes:
-    """Little-endian bytes in C order; `dtype` as numpy names it, for example "float32"."""
-    return np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()
-
-
-def unpack_array(data: bytes, dtype: str, shape: tuple[int, ...], field: str) -> NDArray[Any]:
-    """Array of a shape from little-endian bytes; a writable copy.
-
-    Raises:
-        DuagError: the bytes do not have the length that the shape asks for.
-    """
-    expected = math.prod(shape) * np.dtype(dtype).itemsize
-    if len(data) != expected:
-        raise DuagError(f"{field} has {len(data)} bytes, expected {expected} for {dtype} {list(shape)}")
-    return np.frombuffer(data, np.dtype(dtype).newbyteorder("<")).reshape(shape).astype(dtype)
-
-
-def _numbers(values: Any, shape: tuple[int, ...], field: str) -> Array:
-    array = np.array(values, dtype=np.float64)
-    if array.size != math.prod(shape):
-        raise DuagError(f"{field} has {array.size} numbers, expected {math.prod(shape)}")
-    return array.reshape(shape)
-
-
-def pack_pose(T: ArrayLike) -> Any:
-    """duagc.v1.Pose of a motion [4, 4]."""
-    T = np.asarray(T, dtype=np.float64)
-    if T.shape != (4, 4):
-        raise ValueError(f"a pose is [4, 4], not {T.shape}")
-    x, y, z = T[:3, 3].tolist()
-    return schemas.new("Pose", translation={"x": x, "y": y, "z": z}, rotation=T[:3, :3].ravel().tolist())
-
-
-def unpack_pose(pose: Any, field: str = "pose") -> Array:
-    """Motion [4, 4] of a duagc.v1.Pose."""
-    T = np.eye(4)
-    T[:3, :3] = _numbers(pose.rotation, (3, 3), f"{field}.rotation")
-    T[:3, 3] = pose.translation.x, pose.translation.y, pose.translation.z
-    return T
-
-
-def _pack_information(information: ArrayLike) -> list[float]:
-    array = np.asarray(information, dtype=np.float64)
-    if array.shape != (6, 6):
-        raise ValueError(f"the information of a pose is [6, 6], not {array.shape}")
-    return array.ravel().tolist()
-
-
-def map_frame(robot: str) -> str:
-    """Name of the frame of a robot's own map: that of its first camera pose."""
-    return f"{robot}/map"
-
-
-WORLD_FRAME = "world"
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +69,7 @@ class Odometry:
             keyframe_index=int(self.keyframe_index),
             pose_map_camera=pack_pose(self.T_map_camera),
             pose_keyframe_camera=pack_pose(self.T_keyframe_camera),
-            information=_pack_information(self.information),
+            information=pack_information(self.information),
             status=_STATUS[self.status],
             overlap=float(self.overlap),
             rms_depth_m=float(self.rms_depth_m),
@@ -155,7 +92,7 @@ class Odometry:
             keyframe_index=m.keyframe_index,
             T_map_camera=unpack_pose(m.pose_map_camera, "Odometry.pose_map_camera"),
             T_keyframe_camera=unpack_pose(m.pose_keyframe_camera, "Odometry.pose_keyframe_camera"),
-            information=_numbers(m.information, (6, 6), "Odometry.information"),
+            information=numbers(m.information, (6, 6), "Odometry.information"),
             status=_STATUS_NAME[m.status],
             overlap=m.overlap,
             rms_depth_m=m.rms_depth_m,
@@ -197,7 +134,7 @@ class Keyframe:
             pose_map_camera=pack_pose(self.T_map_camera),
             previous_index=int(self.previous_index),
             pose_previous_keyframe=pack_pose(self.T_previous_keyframe),
-            information=_pack_information(self.information),
+            information=pack_information(self.information),
             exposure_a=float(self.exposure[0]),
             exposure_b=float(self.exposure[1]),
         )
@@ -215,7 +152,7 @@ class Keyframe:
             T_map_camera=unpack_pose(m.pose_map_camera, "Keyframe.pose_map_camera"),
             previous_index=m.previous_index,
             T_previous_keyframe=unpack_pose(m.pose_previous_keyframe, "Keyframe.pose_previous_keyframe"),
-            information=_numbers(m.information, (6, 6), "Keyframe.information"),
+            information=numbers(m.information, (6, 6), "Keyframe.information"),
             exposure=(m.exposure_a, m.exposure_b),
         )
 
@@ -248,7 +185,7 @@ class KeyframeFactor:
             first_index=int(self.first_index),
             second_index=int(self.second_index),
             pose_first_second=pack_pose(self.T_first_second),
-            information=_pack_information(self.information),
+            information=pack_information(self.information),
             weight=float(self.weight),
         )
         pack_stamp(message, self.stamp_ns)
@@ -263,7 +200,7 @@ class KeyframeFactor:
             first_index=m.first_index,
             second_index=m.second_index,
             T_first_second=unpack_pose(m.pose_first_second, "KeyframeFactor.pose_first_second"),
-            information=_numbers(m.information, (6, 6), "KeyframeFactor.information"),
+            information=numbers(m.information, (6, 6), "KeyframeFactor.information"),
             weight=m.weight,
         )
 
@@ -555,209 +492,3 @@ def unpack(message: Any) -> Any:
     """The dataclass of a protobuf message that has one here; any other message as it is."""
     function = _UNPACK.get(message.DESCRIPTOR.full_name)
     return message if function is None else function(message)
-
-
-# --- foxglove schemas of the sensors --------------------------------------------------------------------------------
-
-
-def _foxglove(name: str, stamp_ns: int, frame_id: str, **fields: Any) -> Any:
-    message: Any = schemas.message_class(f"foxglove.{name}")(frame_id=frame_id, **fields)
-    pack_stamp(message, stamp_ns)
-    return message
-
-
-def camera_frame(robot: str) -> str:
-    """Name of the frame of a robot's colour camera: x right, y down, z forward."""
-    return f"{robot}/camera"
-
-
-def pack_color(stamp_ns: int, robot: str, data: bytes, image_format: str) -> Any:
-    """foxglove.CompressedImage of encoded bytes; `image_format` is "jpeg" or "png"."""
-    return _foxglove("CompressedImage", stamp_ns, camera_frame(robot), data=data, format=image_format)
-
-
-def pack_depth(stamp_ns: int, robot: str, depth: NDArray[np.uint16]) -> Any:
-    """foxglove.RawImage, 16UC1 little-endian, of depth in units of the channel's depth_scale, uint16 [H, W]."""
-    if depth.dtype != np.uint16 or depth.ndim != 2:
-        raise ValueError(f"depth is {depth.dtype} {depth.shape}, expected uint16 [H, W]")
-    height, width = depth.shape
-    data = pack_array(depth, "uint16")
-    fields = {"width": width, "height": height, "encoding": "16UC1", "step": 2 * width, "data": data}
-    return _foxglove("RawImage", stamp_ns, camera_frame(robot), **fields)
-
-
-def unpack_depth(m: Any, where: str) -> NDArray[np.uint16]:
-    """uint16 [H, W] of a foxglove.RawImage; `where` begins the line of an error."""
-    if m.encoding != "16UC1":
-        raise DuagError(f"{where} is {m.encoding or 'without encoding'}, expected 16UC1")
-    if m.step < 2 * m.width or m.step % 2 or m.height * m.width == 0:
-        raise DuagError(
-            f"{where} has rows of {m.step} bytes for {m.width}x{m.height} pixels, expected two per pixel"
-        )
-    return unpack_array(m.data, "uint16", (m.height, m.step // 2), where)[:, : m.width]
-
-
-def pack_mask(stamp_ns: int, robot: str, usable: NDArray[np.bool_]) -> Any:
-    """foxglove.RawImage, 8UC1, of the pixels that may be used, bool [H, W]: 255 = yes, 0 = no."""
-    if usable.dtype != np.bool_ or usable.ndim != 2:
-        raise ValueError(f"mask is {usable.dtype} {usable.shape}, expected bool [H, W]")
-    height, width = usable.shape
-    data = np.where(usable, np.uint8(255), np.uint8(0)).tobytes()
-    fields = {"width": width, "height": height, "encoding": "8UC1", "step": width, "data": data}
-    return _foxglove("RawImage", stamp_ns, camera_frame(robot), **fields)
-
-
-def unpack_mask(m: Any, where: str) -> NDArray[np.bool_]:
-    """bool [H, W], True = usable, of a foxglove.RawImage; `where` begins the line of an error."""
-    if m.encoding != "8UC1":
-        raise DuagError(f"{where} is {m.encoding or 'without encoding'}, expected 8UC1")
-    if m.step < m.width or m.height * m.width == 0:
-        raise DuagError(
-            f"{where} has rows of {m.step} bytes for {m.width}x{m.height} pixels, expected one per pixel"
-        )
-    values = unpack_array(m.data, "uint8", (m.height, m.step), where)[:, : m.width]
-    odd = values[(values != 0) & (values != 255)]
-    if len(odd):
-        raise DuagError(f"{where} has the value {odd[0]}, expected 0 (ignore) and 255 (usable) only")
-    return values == 255
-
-
-def pack_calibration(stamp_ns: int, robot: str, camera: PinholeCamera) -> Any:
-    """foxglove.CameraCalibration of an undistorted camera."""
-    K = camera.matrix()
-    return _foxglove(
-        "CameraCalibration",
-        stamp_ns,
-        camera_frame(robot),
-        width=camera.width,
-        height=camera.height,
-        K=K.ravel().tolist(),
-        R=np.eye(3).ravel().tolist(),
-        P=np.hstack([K, np.zeros((3, 1))]).ravel().tolist(),
-    )
-
-
-def unpack_calibration(m: Any) -> PinholeCamera:
-    """Camera of a foxglove.CameraCalibration.
-
-    Raises:
-        DuagError: lens distortion, numbers that are not finite, or no image size.
-    """
-    K = _numbers(m.K, (3, 3), "K")
-    if any(d != 0 for d in m.D):
-        raise DuagError(
-            f"found lens distortion {m.distortion_model!r} {list(m.D)}, expected undistorted images"
-        )
-    if not np.all(np.isfinite(K)) or K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise DuagError(f"K is {K.ravel().tolist()}, expected finite numbers and positive focal lengths")
-    if K[0, 1] != 0 or not np.array_equal(np.delete(K.ravel(), [0, 1, 2, 4, 5]), [0, 0, 0, 1]):
-        raise DuagError(f"K is {K.ravel().tolist()}, expected a camera without skew")
-    if m.width == 0 or m.height == 0:
-        raise DuagError(f"image size is {m.width}x{m.height}, expected at least one pixel")
-    return PinholeCamera(m.width, m.height, *(float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))))
-
-
-def pack_transform(stamp_ns: int, parent: str, child: str, T_parent_child: ArrayLike) -> Any:
-    """foxglove.FrameTransform of a motion [4, 4] that takes coordinates of frame `child` to frame `parent`."""
-    T = np.asarray(T_parent_child, dtype=np.float64)
-    w, x, y, z = so3.to_quat_wxyz(T[:3, :3]).tolist()
-    tx, ty, tz = T[:3, 3].tolist()
-    message: Any = schemas.message_class("foxglove.FrameTransform")(
-        parent_frame_id=parent,
-        child_frame_id=child,
-        translation={"x": tx, "y": ty, "z": tz},
-        rotation={"x": x, "y": y, "z": z, "w": w},
-    )
-    pack_stamp(message, stamp_ns)
-    return message
-
-
-def unpack_transform(m: Any) -> Array:
-    """Motion T_parent_child [4, 4] of a foxglove.FrameTransform.
-
-    Raises:
-        DuagError: numbers that are not finite, or a quaternion of no length.
-    """
-    return _rigid(m.translation, m.rotation, "transform")
-
-
-_NUMBER_TYPES = {7: "float32", 8: "float64"}  # foxglove.PackedElementField.NumericType
-
-
-def pack_points(stamp_ns: int, frame_id: str, points_m: ArrayLike) -> Any:
-    """foxglove.PointCloud of points [n, 3], float32 metres."""
-    fields = [{"name": name, "offset": 4 * k, "type": 7} for k, name in enumerate("xyz")]
-    data = pack_array(points_m, "float32")
-    pose = {"orientation": {"w": 1.0}}
-    return _foxglove("PointCloud", stamp_ns, frame_id, pose=pose, point_stride=12, fields=fields, data=data)
-
-
-def unpack_points(m: Any, where: str) -> Array:
-    """Points [n, 3] in metres, in the frame of the message, of a foxglove.PointCloud; not finite ones are left out.
-
-    `where` begins the line of an error.
-    """
-    fields = {field.name: field for field in m.fields}
-    missing = [name for name in "xyz" if name not in fields or fields[name].type not in _NUMBER_TYPES]
-    if missing or m.point_stride == 0 or len(m.data) % m.point_stride:
-        raise DuagError(
-            f"{where} has fields {sorted(fields)} and {len(m.data)} bytes at {m.point_stride} per point, "
-            "expected x, y, z as float32 or float64"
-        )
-    columns = []
-    rows = np.frombuffer(m.data, np.uint8).reshape(-1, m.point_stride)
-    for name in "xyz":
-        dtype = np.dtype(_NUMBER_TYPES[fields[name].type]).newbyteorder("<")
-        offset = fields[name].offset
-        if offset + dtype.itemsize > m.point_stride:
-            raise DuagError(f"{where}: field {name} ends beyond the {m.point_stride} bytes of a point")
-        column = np.ascontiguousarray(rows[:, offset : offset + dtype.itemsize]).view(dtype).ravel()
-        columns.append(column.astype(np.float64))
-    points = np.stack(columns, axis=-1)
-    points = points[np.isfinite(points).all(axis=1)]
-    if not m.HasField("pose"):
-        return points
-    return se3.transform(_rigid(m.pose.position, m.pose.orientation, where), points)
-
-
-def _rigid(p: Any, q: Any, what: str) -> Array:
-    """T [4, 4] of a translation and a quaternion message."""
-    quat = np.array([q.w, q.x, q.y, q.z])
-    if not np.all(np.isfinite([p.x, p.y, p.z, *quat])) or not 0.9 < np.linalg.norm(quat) < 1.1:
-        raise DuagError(
-            f"{what} is {(p.x, p.y, p.z)}, wxyz {tuple(quat.tolist())}, expected a finite rigid motion"
-        )
-    return se3.from_quat_translation(quat, [p.x, p.y, p.z])
-
-
-def pack_imu(stamp_ns: int, robot: str, rates_rad_s: ArrayLike, accelerations_m_s2: ArrayLike) -> Any:
-    """duagc.v1.Imu of angular velocity [3] and linear acceleration [3] in the frame of the unit."""
-    message = schemas.new(
-        "Imu",
-        frame_id=f"{robot}/imu",
-        robot=robot,
-        angular_velocity=dict(zip("xyz", np.asarray(rates_rad_s, np.float64).tolist(), strict=True)),
-        linear_acceleration=dict(
-            zip("xyz", np.asarray(accelerations_m_s2, np.float64).tolist(), strict=True)
-        ),
-    )
-    pack_stamp(message, stamp_ns)
-    return message
-
-
-def pack_pose_in_frame(stamp_ns: int, frame_id: str, T_frame_body: ArrayLike) -> Any:
-    """foxglove.PoseInFrame of a motion [4, 4]; its rotation is kept as a unit quaternion."""
-    T = np.asarray(T_frame_body, dtype=np.float64)
-    w, x, y, z = so3.to_quat_wxyz(T[:3, :3]).tolist()
-    tx, ty, tz = T[:3, 3].tolist()
-    pose = {"position": {"x": tx, "y": ty, "z": tz}, "orientation": {"x": x, "y": y, "z": z, "w": w}}
-    return _foxglove("PoseInFrame", stamp_ns, frame_id, pose=pose)
-
-
-def unpack_pose_in_frame(m: Any) -> Array:
-    """Motion T_frame_body [4, 4] of a foxglove.PoseInFrame.
-
-    Raises:
-        DuagError: numbers that are not finite, or a quaternion of no length.
-    """
-    return _rigid(m.pose.position, m.pose.orientation, "pose")

@@ -1,0 +1,90 @@
+"""Pieces that messages share: times, arrays, poses, and the names of frames."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import schemas
+from pipeline.errors import DuagError
+
+Array = NDArray[np.float64]
+NANOSECONDS = 1_000_000_000
+WORLD_FRAME = "world"
+
+
+def map_frame(robot: str) -> str:
+    """Name of the frame of a robot's own map: that of its first camera pose."""
+    return f"{robot}/map"
+
+
+def camera_frame(robot: str) -> str:
+    """Name of the frame of a robot's colour camera: x right, y down, z forward."""
+    return f"{robot}/camera"
+
+
+def pack_stamp(message: Any, stamp_ns: int) -> None:
+    """Set the field `timestamp` of any message to integer nanoseconds."""
+    message.timestamp.seconds, message.timestamp.nanos = divmod(int(stamp_ns), NANOSECONDS)
+
+
+def unpack_stamp(message: Any) -> int:
+    """Integer nanoseconds of the field `timestamp` of any message."""
+    return message.timestamp.seconds * NANOSECONDS + message.timestamp.nanos
+
+
+def pack_array(array: ArrayLike, dtype: str) -> bytes:
+    """Little-endian bytes in C order; `dtype` as numpy names it, for example "float32"."""
+    return np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()
+
+
+def unpack_array(data: bytes, dtype: str, shape: tuple[int, ...], field: str) -> NDArray[Any]:
+    """Array of a shape from little-endian bytes; a writable copy.
+
+    Raises:
+        DuagError: the bytes do not have the length that the shape asks for.
+    """
+    expected = math.prod(shape) * np.dtype(dtype).itemsize
+    if len(data) != expected:
+        raise DuagError(f"{field} has {len(data)} bytes, expected {expected} for {dtype} {list(shape)}")
+    return np.frombuffer(data, np.dtype(dtype).newbyteorder("<")).reshape(shape).astype(dtype)
+
+
+def numbers(values: Any, shape: tuple[int, ...], field: str) -> Array:
+    """float64 array of a shape from a repeated field.
+
+    Raises:
+        DuagError: another number of values than the shape asks for.
+    """
+    array = np.array(values, dtype=np.float64)
+    if array.size != math.prod(shape):
+        raise DuagError(f"{field} has {array.size} numbers, expected {math.prod(shape)}")
+    return array.reshape(shape)
+
+
+def pack_pose(T: ArrayLike) -> Any:
+    """duagc.v1.Pose of a motion [4, 4]."""
+    T = np.asarray(T, dtype=np.float64)
+    if T.shape != (4, 4):
+        raise ValueError(f"a pose is [4, 4], not {T.shape}")
+    x, y, z = T[:3, 3].tolist()
+    return schemas.new("Pose", translation={"x": x, "y": y, "z": z}, rotation=T[:3, :3].ravel().tolist())
+
+
+def unpack_pose(pose: Any, field: str = "pose") -> Array:
+    """Motion [4, 4] of a duagc.v1.Pose."""
+    T = np.eye(4)
+    T[:3, :3] = numbers(pose.rotation, (3, 3), f"{field}.rotation")
+    T[:3, 3] = pose.translation.x, pose.translation.y, pose.translation.z
+    return T
+
+
+def pack_information(information: ArrayLike) -> list[float]:
+    """The 36 numbers of the information [6, 6] of a pose."""
+    array = np.asarray(information, dtype=np.float64)
+    if array.shape != (6, 6):
+        raise ValueError(f"the information of a pose is [6, 6], not {array.shape}")
+    return array.ravel().tolist()

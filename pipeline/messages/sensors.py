@@ -1,0 +1,212 @@
+"""Messages of sensors, in Foxglove's schemas where it has one: images, masks, cameras, transforms, points, inertia."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import schemas
+from pipeline.errors import DuagError
+from pipeline.geometry import se3, so3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.messages.parts import Array, camera_frame, numbers, pack_array, pack_stamp, unpack_array
+
+
+def _foxglove(name: str, stamp_ns: int, frame_id: str, **fields: Any) -> Any:
+    message: Any = schemas.message_class(f"foxglove.{name}")(frame_id=frame_id, **fields)
+    pack_stamp(message, stamp_ns)
+    return message
+
+
+def pack_color(stamp_ns: int, robot: str, data: bytes, image_format: str) -> Any:
+    """foxglove.CompressedImage of encoded bytes; `image_format` is "jpeg" or "png"."""
+    return _foxglove("CompressedImage", stamp_ns, camera_frame(robot), data=data, format=image_format)
+
+
+def pack_depth(stamp_ns: int, robot: str, depth: NDArray[np.uint16]) -> Any:
+    """foxglove.RawImage, 16UC1 little-endian, of depth in units of the channel's depth_scale, uint16 [H, W]."""
+    if depth.dtype != np.uint16 or depth.ndim != 2:
+        raise ValueError(f"depth is {depth.dtype} {depth.shape}, expected uint16 [H, W]")
+    height, width = depth.shape
+    data = pack_array(depth, "uint16")
+    fields = {"width": width, "height": height, "encoding": "16UC1", "step": 2 * width, "data": data}
+    return _foxglove("RawImage", stamp_ns, camera_frame(robot), **fields)
+
+
+def unpack_depth(m: Any, where: str) -> NDArray[np.uint16]:
+    """uint16 [H, W] of a foxglove.RawImage; `where` begins the line of an error."""
+    if m.encoding != "16UC1":
+        raise DuagError(f"{where} is {m.encoding or 'without encoding'}, expected 16UC1")
+    if m.step < 2 * m.width or m.step % 2 or m.height * m.width == 0:
+        raise DuagError(
+            f"{where} has rows of {m.step} bytes for {m.width}x{m.height} pixels, expected two per pixel"
+        )
+    return unpack_array(m.data, "uint16", (m.height, m.step // 2), where)[:, : m.width]
+
+
+def pack_mask(stamp_ns: int, robot: str, usable: NDArray[np.bool_]) -> Any:
+    """foxglove.RawImage, 8UC1, of the pixels that may be used, bool [H, W]: 255 = yes, 0 = no."""
+    if usable.dtype != np.bool_ or usable.ndim != 2:
+        raise ValueError(f"mask is {usable.dtype} {usable.shape}, expected bool [H, W]")
+    height, width = usable.shape
+    data = np.where(usable, np.uint8(255), np.uint8(0)).tobytes()
+    fields = {"width": width, "height": height, "encoding": "8UC1", "step": width, "data": data}
+    return _foxglove("RawImage", stamp_ns, camera_frame(robot), **fields)
+
+
+def unpack_mask(m: Any, where: str) -> NDArray[np.bool_]:
+    """bool [H, W], True = usable, of a foxglove.RawImage; `where` begins the line of an error."""
+    if m.encoding != "8UC1":
+        raise DuagError(f"{where} is {m.encoding or 'without encoding'}, expected 8UC1")
+    if m.step < m.width or m.height * m.width == 0:
+        raise DuagError(
+            f"{where} has rows of {m.step} bytes for {m.width}x{m.height} pixels, expected one per pixel"
+        )
+    values = unpack_array(m.data, "uint8", (m.height, m.step), where)[:, : m.width]
+    odd = values[(values != 0) & (values != 255)]
+    if len(odd):
+        raise DuagError(f"{where} has the value {odd[0]}, expected 0 (ignore) and 255 (usable) only")
+    return values == 255
+
+
+def pack_calibration(stamp_ns: int, robot: str, camera: PinholeCamera) -> Any:
+    """foxglove.CameraCalibration of an undistorted camera."""
+    K = camera.matrix()
+    return _foxglove(
+        "CameraCalibration",
+        stamp_ns,
+        camera_frame(robot),
+        width=camera.width,
+        height=camera.height,
+        K=K.ravel().tolist(),
+        R=np.eye(3).ravel().tolist(),
+        P=np.hstack([K, np.zeros((3, 1))]).ravel().tolist(),
+    )
+
+
+def unpack_calibration(m: Any) -> PinholeCamera:
+    """Camera of a foxglove.CameraCalibration.
+
+    Raises:
+        DuagError: lens distortion, numbers that are not finite, or no image size.
+    """
+    K = numbers(m.K, (3, 3), "K")
+    if any(d != 0 for d in m.D):
+        raise DuagError(
+            f"found lens distortion {m.distortion_model!r} {list(m.D)}, expected undistorted images"
+        )
+    if not np.all(np.isfinite(K)) or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise DuagError(f"K is {K.ravel().tolist()}, expected finite numbers and positive focal lengths")
+    if K[0, 1] != 0 or not np.array_equal(np.delete(K.ravel(), [0, 1, 2, 4, 5]), [0, 0, 0, 1]):
+        raise DuagError(f"K is {K.ravel().tolist()}, expected a camera without skew")
+    if m.width == 0 or m.height == 0:
+        raise DuagError(f"image size is {m.width}x{m.height}, expected at least one pixel")
+    return PinholeCamera(m.width, m.height, *(float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))))
+
+
+def pack_transform(stamp_ns: int, parent: str, child: str, T_parent_child: ArrayLike) -> Any:
+    """foxglove.FrameTransform of a motion [4, 4] that takes coordinates of frame `child` to frame `parent`."""
+    T = np.asarray(T_parent_child, dtype=np.float64)
+    w, x, y, z = so3.to_quat_wxyz(T[:3, :3]).tolist()
+    tx, ty, tz = T[:3, 3].tolist()
+    message: Any = schemas.message_class("foxglove.FrameTransform")(
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation={"x": tx, "y": ty, "z": tz},
+        rotation={"x": x, "y": y, "z": z, "w": w},
+    )
+    pack_stamp(message, stamp_ns)
+    return message
+
+
+def unpack_transform(m: Any) -> Array:
+    """Motion T_parent_child [4, 4] of a foxglove.FrameTransform.
+
+    Raises:
+        DuagError: numbers that are not finite, or a quaternion of no length.
+    """
+    return _rigid(m.translation, m.rotation, "transform")
+
+
+_NUMBER_TYPES = {7: "float32", 8: "float64"}  # foxglove.PackedElementField.NumericType
+
+
+def pack_points(stamp_ns: int, frame_id: str, points_m: ArrayLike) -> Any:
+    """foxglove.PointCloud of points [n, 3], float32 metres."""
+    fields = [{"name": name, "offset": 4 * k, "type": 7} for k, name in enumerate("xyz")]
+    data = pack_array(points_m, "float32")
+    pose = {"orientation": {"w": 1.0}}
+    return _foxglove("PointCloud", stamp_ns, frame_id, pose=pose, point_stride=12, fields=fields, data=data)
+
+
+def unpack_points(m: Any, where: str) -> Array:
+    """Points [n, 3] in metres, in the frame of the message, of a foxglove.PointCloud; not finite ones are left out.
+
+    `where` begins the line of an error.
+    """
+    fields = {field.name: field for field in m.fields}
+    missing = [name for name in "xyz" if name not in fields or fields[name].type not in _NUMBER_TYPES]
+    if missing or m.point_stride == 0 or len(m.data) % m.point_stride:
+        raise DuagError(
+            f"{where} has fields {sorted(fields)} and {len(m.data)} bytes at {m.point_stride} per point, "
+            "expected x, y, z as float32 or float64"
+        )
+    columns = []
+    rows = np.frombuffer(m.data, np.uint8).reshape(-1, m.point_stride)
+    for name in "xyz":
+        dtype = np.dtype(_NUMBER_TYPES[fields[name].type]).newbyteorder("<")
+        offset = fields[name].offset
+        if offset + dtype.itemsize > m.point_stride:
+            raise DuagError(f"{where}: field {name} ends beyond the {m.point_stride} bytes of a point")
+        column = np.ascontiguousarray(rows[:, offset : offset + dtype.itemsize]).view(dtype).ravel()
+        columns.append(column.astype(np.float64))
+    points = np.stack(columns, axis=-1)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not m.HasField("pose"):
+        return points
+    return se3.transform(_rigid(m.pose.position, m.pose.orientation, where), points)
+
+
+def _rigid(p: Any, q: Any, what: str) -> Array:
+    """T [4, 4] of a translation and a quaternion message."""
+    quat = np.array([q.w, q.x, q.y, q.z])
+    if not np.all(np.isfinite([p.x, p.y, p.z, *quat])) or not 0.9 < np.linalg.norm(quat) < 1.1:
+        raise DuagError(
+            f"{what} is {(p.x, p.y, p.z)}, wxyz {tuple(quat.tolist())}, expected a finite rigid motion"
+        )
+    return se3.from_quat_translation(quat, [p.x, p.y, p.z])
+
+
+def pack_imu(stamp_ns: int, robot: str, rates_rad_s: ArrayLike, accelerations_m_s2: ArrayLike) -> Any:
+    """duagc.v1.Imu of angular velocity [3] and linear acceleration [3] in the frame of the unit."""
+    message = schemas.new(
+        "Imu",
+        frame_id=f"{robot}/imu",
+        robot=robot,
+        angular_velocity=dict(zip("xyz", np.asarray(rates_rad_s, np.float64).tolist(), strict=True)),
+        linear_acceleration=dict(
+            zip("xyz", np.asarray(accelerations_m_s2, np.float64).tolist(), strict=True)
+        ),
+    )
+    pack_stamp(message, stamp_ns)
+    return message
+
+
+def pack_pose_in_frame(stamp_ns: int, frame_id: str, T_frame_body: ArrayLike) -> Any:
+    """foxglove.PoseInFrame of a motion [4, 4]; its rotation is kept as a unit quaternion."""
+    T = np.asarray(T_frame_body, dtype=np.float64)
+    w, x, y, z = so3.to_quat_wxyz(T[:3, :3]).tolist()
+    tx, ty, tz = T[:3, 3].tolist()
+    pose = {"position": {"x": tx, "y": ty, "z": tz}, "orientation": {"x": x, "y": y, "z": z, "w": w}}
+    return _foxglove("PoseInFrame", stamp_ns, frame_id, pose=pose)
+
+
+def unpack_pose_in_frame(m: Any) -> Array:
+    """Motion T_frame_body [4, 4] of a foxglove.PoseInFrame.
+
+    Raises:
+        DuagError: numbers that are not finite, or a quaternion of no length.
+    """
+    return _rigid(m.pose.position, m.pose.orientation, "pose")
