@@ -25,6 +25,8 @@ MEAN, LOG_COVARIANCE, COLOR, OPACITY = slice(0, 3), slice(3, 9), slice(9, 12), 1
 """Places in theta."""
 SHAPE_FLOOR = 0.1
 """Least standard deviation of a coordinate of vec log Sigma: 5 % of a scale."""
+LEAST_DEVIATION_M = 1e-4
+"""Deviation of a mean from the measured surface below which nobody claims to know that surface."""
 _POSITION, _SHAPE, _COLOR, _OPACITY = slice(0, 6), slice(6, 27), slice(27, 30), 30
 
 
@@ -212,7 +214,10 @@ def _across_surface(gaussians: Gaussians, deviation_m: Array) -> Array:
     """Information [n, 3, 3], 1/m^2, of surfaces within the deviation [n] of means, along the discs' normals."""
     rows = np.arange(len(gaussians))
     axes = so3.from_quat_wxyz(gaussians.quats_wxyz.astype(np.float64))
-    normal = axes[rows, :, np.argmin(gaussians.log_scales, axis=1)] / np.maximum(deviation_m, 1e-6)[:, None]
+    normal = (
+        axes[rows, :, np.argmin(gaussians.log_scales, axis=1)]
+        / np.maximum(deviation_m, LEAST_DEVIATION_M)[:, None]
+    )
     return np.asarray(normal[:, :, None] * normal[:, None, :], dtype=np.float64)
 
 
