@@ -205,7 +205,7 @@ def _map(
             stats.loss_after,
         )
 
-    mapper = Mapper(log.camera, config.mapping, seed, threads, _depth_noise_m(frames))
+    mapper = Mapper(log.camera, config.mapping, seed, threads, depth_noise_m(frames))
     free = FreeSpace(log.camera, config.moving)
     for keyframe in keyframes:
         free.add(log.frame(keyframe.frame_index).usable_depth, keyframe.T_map_camera)
@@ -241,7 +241,7 @@ def _map(
     return updates, _Maps(mapper.gaussians, unrefined, mapper.depth), frames
 
 
-def _depth_noise_m(frames: Sequence[TrackedFrame]) -> float | None:
+def depth_noise_m(frames: Sequence[TrackedFrame]) -> float | None:
     """Noise of the depth images, metres: the median over the frames of what is left between two registered ones."""
     rms_m = [
         frame.rms_depth_m
