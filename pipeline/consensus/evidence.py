@@ -141,10 +141,9 @@ class Evidence:
             deviation_m = np.zeros(len(gaussians))
             deviation_m[rows >= 0] = information.deviation_m[rows[rows >= 0]]
             sums = unpack_symmetric(packed[:, _POSITION], 3)
-            position = inflated(
-                sums + _across_surface(gaussians, deviation_m) * sums.any(axis=(1, 2))[:, None, None],
-                deviation_m[:, None, None] ** 2 * np.eye(3),
-            )
+            known = (sums != 0).any(axis=(1, 2), keepdims=True)
+            across = known * _across_surface(gaussians, deviation_m)
+            position = inflated(sums + across, deviation_m[:, None, None] ** 2 * np.eye(3))
             shape = inflated(unpack_symmetric(packed[:, _SHAPE], 6), SHAPE_FLOOR**2 * np.eye(6))
             packed[:, _POSITION], packed[:, _SHAPE] = pack_symmetric(position), pack_symmetric(shape)
         in_map = Evidence(owner, gaussians.ids, gaussians.anchors, theta_of(gaussians), packed)
