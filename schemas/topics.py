@@ -170,6 +170,13 @@ CORRECTED_KEYFRAMES = Topic(
     Scope.ROBOT,
     "keyframe poses after consensus",
 )
+PEER_COLORS = Topic(
+    "/<robot>/peer_colors",
+    "duagc.v1.PeerColors",
+    "fusion",
+    Scope.ROBOT,
+    "how every neighbour's camera sees colours beside its own",
+)
 PEER_MESSAGE = Topic(
     "/<robot>/peer/message",
     "duagc.v1.PeerMessage",
@@ -235,6 +242,7 @@ TOPICS: tuple[Topic, ...] = (
     FUSED_MAP,
     REFINED_MAP,
     CORRECTED_KEYFRAMES,
+    PEER_COLORS,
     PEER_MESSAGE,
     PEER_PACKET,
     EXCHANGE_SUMMARY,

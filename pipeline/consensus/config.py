@@ -80,8 +80,29 @@ class PoseConsensusConfig(Config):
     """Trust in closures."""
 
 
+class ColorConfig(Config):
+    """How differently the cameras of a team see colours."""
+
+    enabled: bool = True
+    """Find gain and offset of each channel between robots and read neighbours' colours by them; if not, all cameras
+    count as alike."""
+    min_matches: int = Field(default=100, ge=3)
+    """Two robots with fewer matched Gaussians say nothing of each other's colours."""
+    splats_per_sample: float = Field(default=30.0, ge=1.0)
+    """Matched Gaussians that say together what one would say alone: those that share a pixel make up for each other."""
+    sigma_floor: float = Field(default=0.003, gt=0.0)
+    """Least standard deviation of what two robots find: of the log of the gain, and of colours."""
+    prior_gain: float = Field(default=0.5, gt=0.0)
+    """Standard deviation of a camera's gain (its log) before anything was compared."""
+    prior_offset: float = Field(default=0.2, gt=0.0)
+    """The same of its offset; colours are 0..1."""
+
+
 class MatchingConfig(Config):
     """Matching of Gaussians between two robots."""
+
+    colors: ColorConfig = ColorConfig()
+    """Of cameras that differ."""
 
     radius_m: float = Field(default=0.05, gt=0.0)
     """Delta of (6): matches are searched within this distance."""

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+import schemas
+from pipeline.consensus.colors import ColorMap
 from pipeline.consensus.config import MatchingConfig, WeightKind
 from pipeline.consensus.evidence import unpack_symmetric
 from pipeline.consensus.weighting import own_stiffness
@@ -19,7 +21,14 @@ from pipeline.fusion.own_pixels import weigh_by_own_pixels
 from pipeline.fusion.peer_views import peer_views
 from pipeline.fusion.refine import View, refine
 from pipeline.geometry.trajectory import Trajectory, write_tum
-from pipeline.messages import WORLD_FRAME, CorrectedKeyframes, GaussianInformation, GaussianMap, Odometry
+from pipeline.messages import (
+    WORLD_FRAME,
+    CorrectedKeyframes,
+    GaussianInformation,
+    GaussianMap,
+    Odometry,
+    pack_stamp,
+)
 from pipeline.recording import LogWriter, open_rgbd, read_log
 from pipeline.registration.moving import FreeSpace, MovingConfig
 from pipeline.robot import AgentInput, AgentResult, RobotData, load
@@ -98,6 +107,7 @@ def run_fusion(
                 own.depth,
                 weights,
                 threads,
+                colors=fused.colors,
             )
             owned = fused.source == fused.robots.index(own.robot)
             refined = refine(
@@ -193,6 +203,30 @@ def _write_log(
         if refined is not None:
             refined_map = GaussianMap(stamp_ns, robot, WORLD_FRAME, refined, None, depth)
             log.write(topics.REFINED_MAP.of(robot), refined_map, stamp_ns, stamp_ns)
+        for peer, colors in sorted(fused.colors.items()):
+            message = schemas.new(
+                "PeerColors",
+                robot=robot,
+                peer=peer,
+                gain=colors.gain,
+                offset=colors.offset,
+                gain_sigma=colors.sigma_gain,
+                offset_sigma=colors.sigma_offset,
+                matches=colors.matches,
+            )
+            pack_stamp(message, stamp_ns)
+            log.write(topics.PEER_COLORS.of(robot), message, stamp_ns, stamp_ns)
+
+
+def peer_colors(path: Path, robot: str) -> dict[str, ColorMap]:
+    """From every neighbour's colours to the robot's, by name, of its fused.mcap; empty if that holds none."""
+    found = [record.message() for record in read_log(path, (topics.PEER_COLORS.of(robot),))]
+    return {
+        m.peer: ColorMap(
+            np.array(m.gain), np.array(m.offset), np.array(m.gain_sigma), np.array(m.offset_sigma), m.matches
+        )
+        for m in found
+    }
 
 
 def _information(robot: str, fused: FusedMap, stamp_ns: int) -> GaussianInformation:

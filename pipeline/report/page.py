@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from pipeline.errors import DuagError
 from pipeline.evaluation.network import Session
 from pipeline.evaluation.paths import Path3, paths, top_view_axes
-from pipeline.evaluation.rendering import COMPARED_SETS, in_world, mates, poses_by_stamp
+from pipeline.evaluation.rendering import COMPARED_SETS, in_colors_of, in_world, mates, poses_by_stamp
 from pipeline.evaluation.results import Absent
 from pipeline.evaluation.views import score_view, surface_depth
+from pipeline.fusion.stage import peer_colors
 from pipeline.geometry import se3
 from pipeline.messages import GaussianMap
 from pipeline.recording import Recording, open_rgbd
@@ -263,12 +264,18 @@ def _pictures(run: RunFolder, source: Recording) -> tuple[list[dict[str, Any]], 
                 shown.append(head | _view(maps, log, frame, rasterizer))
             if run.robots[name].fused_map.information is not None and frames:
                 colored.append(head | _information_view(robot, log, frames, rasterizer))
+        colors = peer_colors(robot.folder / "fused.mcap", name)
         for peer in mates(run, robot)[:1]:
-            moved = replace(robot.own_map, gaussians=in_world(robot, "own", robot.own_map.gaussians))
+            alike = colors.get(peer.robot)
+            moved = replace(
+                robot.own_map,
+                gaussians=in_colors_of(alike, in_world(robot, "own", robot.own_map.gaussians)),
+            )
+            last = replace(final[1], gaussians=in_colors_of(alike, final[1].gaussians))
             with open_rgbd(source.log(peer.robot)) as log:
                 for frame in [log.frame(index) for index in _chosen_frames(peer, len(log))[:1]]:
                     T = poses_by_stamp(peer.trajectory)[frame.stamp_ns]
-                    maps = {"own": (moved, T), final[0]: (final[1], T)}
+                    maps = {"own": (moved, T), final[0]: (last, T)}
                     where = {"where": f" of {peer.robot}"}
                     shown.append(head | where | _view(maps, log, frame, rasterizer))
     return shown, colored
