@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.calibration.rig import NAMES, Rig
-from pipeline.calibration.views import Views, look_up
+from pipeline.calibration.views import Views, look_up, normals_at
 from pipeline.geometry import se3, so3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.registration.residuals import MAD_TO_SIGMA
 
 Array = NDArray[np.float64]
 
-ROUNDS, SETTLED = 12, 1e-4  # m, rad
+ROUNDS, SETTLED = 25, 1e-4  # m, rad
 CAUCHY, HUBER = 2.5, 1.5  # scales
 SAME_ERROR = 50.0  # neighbours err alike, and no model is exact: so many residuals count as one
 PRIOR = dict(zip(NAMES, (15, 15, 15, 15, 0.3, 0.5, 0.5, 0.01, 0.01, 0.01, 0.02, *[0.02] * 6), strict=True))
@@ -54,7 +54,7 @@ class Adjusted:
 
 def adjust(parts: Sequence[Views], rig: Rig, calibrate: bool) -> Adjusted:
     """Adjust poses and landmarks (in place), and the cameras too if asked, until no pose moves."""
-    start, pairs = rig, [overlapping(part) for part in parts]
+    start, pairs = Rig.of(rig.camera), [overlapping(part) for part in parts]
     ends = np.cumsum([0] + [6 * len(part.T_map_camera) for part in parts])
     size = len(NAMES) if calibrate else 0
     scale = rig.camera.width / 640
@@ -143,7 +143,7 @@ def _planes(views: Views, pairs: NDArray[np.int64], rig: Rig) -> _Planes:
     at = first[:, None], row, column
     rays = _rays(c, column, row)
     z, z_by = rig.depth(views.inverse_depth[at].astype(np.float64), rays)
-    p, normals = rays * z[..., None], views.normals[at].astype(np.float64)
+    p, normals = rays * z[..., None], normals_at(views, *at)
     M = se3.inverse(views.T_map_camera[second]) @ views.T_map_camera[first]
     q = se3.transform(M, p)
     m = normals @ np.swapaxes(M[:, :3, :3], 1, 2)
@@ -194,7 +194,7 @@ def _features(views: Views, rig: Rig) -> _Features:
     rays = _rays(c, uv[:, 0], uv[:, 1])
     z, z_by = rig.depth(np.where(seen, inverse, 1.0), rays)
     at = np.rint(np.where(seen[:, None], uv, 0)).astype(np.int64)
-    n = views.normals[view, at[:, 1], at[:, 0]].astype(np.float64)
+    n = normals_at(views, view, at[:, 1], at[:, 0])
     used = seen & (np.abs(z - q[:, 2]) < FEATURE_GATE_M) & (np.abs(n).sum(axis=-1) > 0)
     n = np.where(used[:, None], n, 0.0)
     sigma = _sigma(z)[:, None]
@@ -269,7 +269,7 @@ def _linearised(views: Views, pairs: NDArray[np.int64], rig: Rig, calibrate: boo
     V = np.zeros((landmarks, 3, 3))
     weighted = f.by_point * root
     np.add.at(V, views.landmark, np.swapaxes(weighted, 1, 2) @ weighted)
-    V += (1e-4 * np.trace(V, axis1=1, axis2=2)[:, None, None] + 1e-6) * np.eye(3)
+    V += (1e-8 * np.trace(V, axis1=1, axis2=2)[:, None, None] + 1e-6) * np.eye(3)
     V_inverse = np.asarray(np.linalg.inv(V), dtype=np.float64)
     W = (A.T @ B).tocsr()
     blocks = sparse.bsr_matrix((V_inverse, np.arange(landmarks), np.arange(landmarks + 1)))

@@ -38,7 +38,7 @@ def plain(found: Calibration) -> dict[str, Any]:
 
 def options(found: Calibration) -> dict[str, Any] | None:
     """Options of `duagc convert 7scenes` that take it, for a recording made by that without them; else None."""
-    converter, used = found.recording["converter"]["name"], found.recording.get("parameters", {})
+    converter, used = found.recording["converter"]["name"], found.recording["parameters"]
     resampled = any(used.get(name) for name in ("color_focal_y_px", "color_distortion", "color_rotation_rad"))
     if converter != "7scenes" or resampled or used.get("depth_correction_per_m"):
         return None

@@ -29,6 +29,9 @@ RATIO = 0.75
 LINE_PX, POINT_PX = 8.0, 25.0  # of 640 px: how far a match may be from where the tracked poses put it
 MIN_MATCHES = 10
 MIN_TRACK = 3  # views
+NORMALS_LEVEL = (
+    1  # images of half the size: noisy normals feign information along a surface, and steps get short
+)
 SAMPLES = 150  # of the depth of a view
 FARTHEST_SAMPLE_M = 4.0
 MAX_TURN, MAX_WAY_M = 0.6, 2.0  # cosine between the axes of views that are compared, way between them
@@ -39,8 +42,9 @@ class Views:
     """Views of one part of a recording; poses and points are changed by the adjustment.
 
     T_map_camera: [n, 4, 4]. velocity: [n, 6] of the camera, right tangent per second. inverse_depth: [n, h, w], NaN
-    where unknown. normals: [n, h, w, 3], zero where unknown. samples: [n, SAMPLES, 2], columns and rows with a normal.
-    view, landmark, pixel: of every observation of a feature, [k], [k], [k, 2]. points_map: of the landmarks [m, 3].
+    where unknown. normals: [n, h', w', 3] of smaller images, zero where unknown. samples: [n, SAMPLES, 2], columns and
+    rows with a normal. view, landmark, pixel: of every observation of a feature, [k], [k], [k, 2]. points_map: of the
+    landmarks [m, 3].
     """
 
     name: str
@@ -106,15 +110,16 @@ def load_views(tracked: Tracked, first: int, last: int, most: int) -> Views:
             keypoints, found = sift.detectAndCompute(gray, None)
             pixel = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
             row, column = np.rint(pixel[:, 1]).astype(int), np.rint(pixel[:, 0]).astype(int)
-            level = RgbdPyramid.build(np.zeros(depth.shape, np.float32), depth, camera, 1).levels[0]
+            pyramid = RgbdPyramid.build(np.zeros(depth.shape, np.float32), depth, camera, NORMALS_LEVEL + 1)
             pixels.append(pixel)
             descriptors.append(
                 root_sift(np.asarray(found, dtype=np.float32)) if len(pixel) else np.zeros((0, 128), np.uint8)
             )
             depths.append(depth[row, column].astype(np.float64))
-            inverse.append(np.where(level.inverse_depth > 0, level.inverse_depth, np.float32(np.nan)))
-            normals.append(level.normals)
-            samples.append(_samples(level.normals, depth, tracked.robot, int(index), tracked.path))
+            w = pyramid.levels[0].inverse_depth
+            inverse.append(np.where(w > 0, w, np.float32(np.nan)))
+            normals.append(pyramid.levels[NORMALS_LEVEL].normals)
+            samples.append(_samples(normals[-1], depth, tracked.robot, int(index), tracked.path))
     T = tracked.T_map_camera[chosen]
     view, landmark, pixel, points = _landmarks(pixels, descriptors, depths, camera, T)
     return Views(
@@ -132,6 +137,19 @@ def load_views(tracked: Tracked, first: int, last: int, most: int) -> Views:
     )
 
 
+def coarse(index: NDArray[np.int64], size: int) -> NDArray[np.int64]:
+    """Rows or columns of the images of normals, which have `size` of them, for those of full images."""
+    return np.minimum(index >> NORMALS_LEVEL, size - 1)
+
+
+def normals_at(
+    views: Views, view: NDArray[np.int64], row: NDArray[np.int64], column: NDArray[np.int64]
+) -> Array:
+    """Normals [..., 3] at pixels of views."""
+    height, width = views.normals.shape[1:3]
+    return views.normals[view, coarse(row, height), coarse(column, width)].astype(np.float64)
+
+
 def _velocities(tracked: Tracked, chosen: NDArray[np.int64]) -> Array:
     before, after = np.maximum(chosen - 1, 0), np.minimum(chosen + 1, len(tracked.ok) - 1)
     T = tracked.T_map_camera
@@ -143,7 +161,9 @@ def _velocities(tracked: Tracked, chosen: NDArray[np.int64]) -> Array:
 def _samples(
     normals: NDArray[np.float32], depth: NDArray[np.float32], robot: str, index: int, path: Path
 ) -> NDArray[np.int64]:
-    row, column = np.nonzero((np.abs(normals).sum(axis=-1) > 0) & (depth < FARTHEST_SAMPLE_M))
+    row, column = np.nonzero((depth > 0) & (depth < FARTHEST_SAMPLE_M))
+    sound = np.abs(normals[coarse(row, normals.shape[0]), coarse(column, normals.shape[1])]).sum(axis=-1) > 0
+    row, column = row[sound], column[sound]
     if len(row) < SAMPLES:
         raise DuagError(
             f"{path}: depth of frame {index} shows a surface at {len(row)} pixels, expected {SAMPLES}"

@@ -13,7 +13,7 @@ from converters.base import RecordingWriter
 from pipeline.calibration import Calibration, calibrate, report
 from pipeline.calibration.adjustment import Quality, _features, _planes, adjust, overlapping
 from pipeline.calibration.rig import NAMES, Rig
-from pipeline.calibration.views import Views
+from pipeline.calibration.views import NORMALS_LEVEL, Views
 from pipeline.errors import DuagError
 from pipeline.frontend.config import FrontendConfig
 from pipeline.geometry import se3, so3
@@ -60,14 +60,13 @@ def make_views(seed: int) -> Views:
         depths.append(depth)
         measured = (1 / depth - error) / (1 - 2 * TRUE.depth_error[0])
         measured = 1 / (1 / measured + rng.normal(size=depth.shape) * 0.001)
-        level = RgbdPyramid.build(
-            np.zeros(depth.shape, np.float32), (1 / measured).astype(np.float32), CAMERA, 1
-        )
-        inverse.append(level.levels[0].inverse_depth)
-        normals.append(level.levels[0].normals)
+        noisy = (1 / measured).astype(np.float32)
+        pyramid = RgbdPyramid.build(np.zeros(depth.shape, np.float32), noisy, CAMERA, NORMALS_LEVEL + 1)
+        inverse.append(pyramid.levels[0].inverse_depth)
+        normals.append(pyramid.levels[NORMALS_LEVEL].normals)
         v, u = np.nonzero(np.abs(normals[-1]).sum(axis=-1) > 0)
         picked = rng.choice(len(v), 150, replace=False)
-        samples.append(np.stack([u[picked], v[picked]], axis=-1))
+        samples.append(np.stack([u[picked], v[picked]], axis=-1) << NORMALS_LEVEL)
     points, seen_by, landmarks, pixels = [], [], [], []
     for m in range(LANDMARKS):
         k, u, v = rng.integers(VIEWS), rng.integers(5, 315), rng.integers(5, 235)
