@@ -170,6 +170,20 @@ CORRECTED_KEYFRAMES = Topic(
     Scope.ROBOT,
     "keyframe poses after consensus",
 )
+NEIGHBOUR_DOUBT = Topic(
+    "/<robot>/neighbour_doubt",
+    "duagc.v1.NeighbourDoubt",
+    "fusion",
+    Scope.ROBOT,
+    "what own images say against a neighbour's map, and whether it is used",
+)
+PEER_COLORS = Topic(
+    "/<robot>/peer_colors",
+    "duagc.v1.PeerColors",
+    "fusion",
+    Scope.ROBOT,
+    "how every neighbour's camera sees colours beside its own",
+)
 PEER_MESSAGE = Topic(
     "/<robot>/peer/message",
     "duagc.v1.PeerMessage",
@@ -235,6 +249,8 @@ TOPICS: tuple[Topic, ...] = (
     FUSED_MAP,
     REFINED_MAP,
     CORRECTED_KEYFRAMES,
+    NEIGHBOUR_DOUBT,
+    PEER_COLORS,
     PEER_MESSAGE,
     PEER_PACKET,
     EXCHANGE_SUMMARY,

@@ -143,6 +143,10 @@ def simulate(
             recording.checks["exposure_gain"] = {
                 name: [rig.gain(seed, name, i / FRAME_RATE_HZ) for i in range(frames)] for name in names
             }
+        if rig.camera_stops > 0:
+            tints = {name: rig.tint(seed, name) for name in names}
+            recording.checks["camera_gain"] = {name: gain.tolist() for name, (gain, _) in tints.items()}
+            recording.checks["camera_black"] = {name: black.tolist() for name, (_, black) in tints.items()}
         sensors = _told(rig, noise)
         with _Studio(stage, camera, noise, seed, workers, rig, walkers) as studio:
             images = track(studio.images(jobs), "simulate", len(jobs))
@@ -279,8 +283,9 @@ class _Artist:
             assert self.moving is not None
             rng = streams.generator(self.seed, "simulate.lidar", robot=job.robot, frame=job.index)
             depth, points = None, self.moving.sweep(job.pose, job.index, rng)
-        if self.rig.gain_stops > 0:
-            color = with_gain(color, self.rig.gain(self.seed, job.robot, job.index / FRAME_RATE_HZ))
+        if self.rig.gain_stops > 0 or self.rig.camera_stops > 0:
+            gain = self.rig.gain(self.seed, job.robot, job.index / FRAME_RATE_HZ)
+            color = with_gain(color, gain, self.rig.tint(self.seed, job.robot))
         return _Images(
             _png(color),
             depth,
@@ -345,6 +350,7 @@ def _check_rig(rig: Rig, movers: int, noise: str) -> None:
         ("readout", rig.readout_s, 1 / FRAME_RATE_HZ),
         ("exposure", rig.exposure_s, 1 / FRAME_RATE_HZ),
         ("gain", rig.gain_stops, 3.0),
+        ("difference of cameras", rig.camera_stops, 2.0),
         ("clock offset", rig.clock_s, 0.9),  # logs begin at 1 s, and no time is negative
         ("movers", movers, 8),
     ):

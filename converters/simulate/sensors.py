@@ -29,6 +29,7 @@ T_CAMERA_LIDAR = np.array(
 )  # 10 cm above the camera, x ahead, z up
 GAMMA = 2.2
 GAIN_PERIODS_S = (2.0, 5.0)
+BLACK_OF_STOP = 0.04  # of full scale
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class Rig:
 
     sensor: one of SENSORS. readout_s: from the first to the last row of an image. exposure_s: how long the shutter is
     open. gain_stops: largest change of the exposure, factors of two. clock_s: largest offset of a robot's clock.
+    camera_stops: how much the cameras of two robots differ: each channel of each takes up to so many factors of two of
+    light more or less, and has a black level of up to so many times BLACK_OF_STOP.
     """
 
     sensor: str = "rgbd"
@@ -44,6 +47,7 @@ class Rig:
     exposure_s: float = 0.0
     gain_stops: float = 0.0
     clock_s: float = 0.0
+    camera_stops: float = 0.0
 
     @property
     def plain(self) -> bool:
@@ -62,10 +66,21 @@ class Rig:
         periods, phases = rng.uniform(*GAIN_PERIODS_S, 2), rng.uniform(0, 2 * np.pi, 2)
         return float(2 ** (self.gain_stops * np.sin(2 * np.pi * time_s / periods + phases).mean()))
 
+    def tint(self, seed: int, robot: str) -> tuple[Array, Array]:
+        """How a robot's camera sees colours: gain [3] (of image values) and black level [3] (0..1) by channel."""
+        if self.camera_stops == 0:
+            return np.ones(3), np.zeros(3)
+        rng = streams.generator(seed, "simulate.tint", robot=robot)
+        stops, black = self.camera_stops * rng.uniform(-1, 1, (2, 3))
+        return 2 ** (stops / GAMMA), BLACK_OF_STOP * black
 
-def with_gain(color: NDArray[np.uint8], gain: float) -> NDArray[np.uint8]:
-    """An image [h, w, 3] with another exposure; what is too bright is white."""
-    return np.clip(np.rint(color * gain ** (1 / GAMMA)), 0, 255).astype(np.uint8)
+
+def with_gain(
+    color: NDArray[np.uint8], gain: float, tint: tuple[Array, Array] = (np.ones(3), np.zeros(3))
+) -> NDArray[np.uint8]:
+    """An image [h, w, 3] with another exposure, seen by a camera of this tint; what is too bright is white."""
+    scale, black = tint
+    return np.clip(np.rint(color * (gain ** (1 / GAMMA) * scale) + 255 * black), 0, 255).astype(np.uint8)
 
 
 class MovingCamera:

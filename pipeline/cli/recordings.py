@@ -42,6 +42,9 @@ def simulate(
     readout_ms: Annotated[float, typer.Option(help="Rolling shutter: from the first row to the last.")] = 0,
     exposure_ms: Annotated[float, typer.Option(help="Motion blur: how long the shutter is open.")] = 0,
     gain_stops: Annotated[float, typer.Option(help="Largest change of the exposure over time.")] = 0,
+    camera_stops: Annotated[
+        float, typer.Option(help="Difference of the robots' cameras, by channel: factors of two of light.")
+    ] = 0,
     clock_ms: Annotated[float, typer.Option(help="Largest offset of a robot's clock.")] = 0,
     movers: Annotated[int, typer.Option(min=0, max=8, help="Figures that walk about, with masks.")] = 0,
     preview: Annotated[
@@ -69,7 +72,7 @@ def simulate(
         up=up,
         paradigm=paradigm,
         preview=preview,
-        rig=Rig(sensor, readout_ms / 1000, exposure_ms / 1000, gain_stops, clock_ms / 1000),
+        rig=Rig(sensor, readout_ms / 1000, exposure_ms / 1000, gain_stops, clock_ms / 1000, camera_stops),
         movers=movers,
         size=(width, height),
         overlap=overlap,

@@ -51,10 +51,11 @@ class PoseConsensusConfig(Config):
     """The factorisation is kept until rotations moved this much in sum."""
     step_limit_rad: float = Field(default=0.3, gt=0.0)
     """A step that turns some keyframe more than this is shortened; nonlinearity makes longer ones worthless."""
-    tolerance: float = Field(default=1e-5, gt=0.0)
+    tolerance: float = Field(default=2e-6, gt=0.0)
     """An end is settled when its steps and edge variables change less than this (m, rad)."""
-    wire: Literal["float32", "float64"] = "float32"
-    """Precision of poses in a packet."""
+    wire: Literal["fixed", "float32", "float64"] = "fixed"
+    """Poses in a packet: rotations in float32 and translations in steps of 7.5 nm, wherever the world has its origin;
+    all in float32, which is 15 um a kilometre from there; or not rounded at all."""
     robust: bool = True
     """Weigh closures by graduated non-convexity, truncated least squares; if not, `keep` decides alone."""
     truncation: float = Field(default=7.5, gt=0.0)
@@ -80,8 +81,29 @@ class PoseConsensusConfig(Config):
     """Trust in closures."""
 
 
+class ColorConfig(Config):
+    """How differently the cameras of a team see colours."""
+
+    enabled: bool = True
+    """Find gain and offset of each channel between robots and read neighbours' colours by them; if not, all cameras
+    count as alike."""
+    min_matches: int = Field(default=100, ge=3)
+    """Two robots with fewer matched Gaussians say nothing of each other's colours."""
+    splats_per_sample: float = Field(default=30.0, ge=1.0)
+    """Matched Gaussians that say together what one would say alone: those that share a pixel make up for each other."""
+    sigma_floor: float = Field(default=0.003, gt=0.0)
+    """Least standard deviation of what two robots find: of the log of the gain, and of colours."""
+    prior_gain: float = Field(default=0.5, gt=0.0)
+    """Standard deviation of a camera's gain (its log) before anything was compared."""
+    prior_offset: float = Field(default=0.2, gt=0.0)
+    """The same of its offset; colours are 0..1."""
+
+
 class MatchingConfig(Config):
     """Matching of Gaussians between two robots."""
+
+    colors: ColorConfig = ColorConfig()
+    """Of cameras that differ."""
 
     radius_m: float = Field(default=0.05, gt=0.0)
     """Delta of (6): matches are searched within this distance."""

@@ -8,6 +8,9 @@ with colours as degree-0 spherical-harmonic coefficients and l = delta, the sear
 squares without a unit, which would make the position count for nothing within 5 cm (l = 1 m gives (6) as printed).
 How thin a Gaussian is says nothing where it is as thin as the mapper lets it be: against one that is thicker, that
 component of log Sigma, e e' with e the axis, is left out; two at the floor are equally thin. Tilts stay in.
+
+Two cameras may see colours differently. So the Gaussians are first matched without their colours, which is enough to
+tell gain and offset (`consensus.colors`), and the other robot's colours are compared as the own camera would show them.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
+from pipeline.consensus.colors import team_colors
 from pipeline.consensus.config import MatchingConfig
 from pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Evidence
 from pipeline.geometry import spd
@@ -108,12 +112,21 @@ def match(own: Evidence, peer: Evidence, config: MatchingConfig) -> Index:
 
     Args:
         own: all evidence of the computing robot, in the world frame; tau_G is taken over it.
-        peer: evidence of the other robot, in the world frame.
+        peer: evidence of the other robot, in the world frame, in its own camera's colours.
     Returns:
         int64 [m, 2], ids of (own, peer), ascending; each id at most once.
     """
     if not len(own) or not len(peer):
         return np.zeros((0, 2), np.int64)
+    if config.colors.enabled and config.beta_color > 0:
+        blind = _match(own, peer, config.model_copy(update={"beta_color": 0.0}))
+        a, b = "own", "peer"
+        peer = team_colors({a: own, b: peer}, {(a, b): blind}, config.colors).between(b, a).of(peer)
+    return _match(own, peer, config)
+
+
+def _match(own: Evidence, peer: Evidence, config: MatchingConfig) -> Index:
+    """`match` of evidence in the same colours, not empty."""
     i, j = _candidates(own.theta[:, MEAN], peer.theta[:, MEAN], config)
     d = _distances(_Chart.of(own.theta, config), i, _Chart.of(peer.theta, config), j, config)
     close = d < threshold(own, config)

@@ -1,7 +1,8 @@
 """What the maps show where cameras stood: own, fused, refined, and if asked own trained longer, on the same pixels.
 
 Every robot's maps are drawn at its own held-out views, at those of the robots that share its world (`peers`), and both
-together are the views of the team (`team`).
+together are the views of the team (`team`). A map has the colours of its own robot's camera; at peers' views it is
+drawn in the colours of the camera that took the view.
 """
 
 from __future__ import annotations
@@ -13,13 +14,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.consensus.colors import ColorMap
 from pipeline.consensus.config import MatchingConfig
 from pipeline.evaluation import groundtruth, views
 from pipeline.evaluation.oracle import section_of
 from pipeline.evaluation.results import Absent, Row
 from pipeline.fusion.config import RefineConfig
 from pipeline.fusion.refine import refine, steps_of
-from pipeline.fusion.stage import training_views
+from pipeline.fusion.stage import peer_colors, training_views
 from pipeline.geometry.trajectory import Trajectory
 from pipeline.progress import track
 from pipeline.recording import Recording, RgbdLog, open_rgbd
@@ -103,8 +105,10 @@ def rendering_sections(
             for kind, score in scores.items():
                 found.add(name, kind, "training", index, score)
         world = {kind: in_world(robot, kind, g) for kind, g in maps.items() if kind in COMPARED}
+        colors = peer_colors(robot.folder / "fused.mcap", name)
         for peer in mates(run, robot):
-            there = {kind: PosedMap(g, peer.trajectory) for kind, g in world.items()}
+            seen = {kind: in_colors_of(colors.get(peer.robot), g) for kind, g in world.items()}
+            there = {kind: PosedMap(g, peer.trajectory) for kind, g in seen.items()}
             task = RenderTask(there, peer, "held_out", robot.own_map.depth)
             title = f"render maps of {name} from {peer.robot}" if progress else None
             for index, scores in task.scores(source, threads, title):
@@ -176,6 +180,13 @@ def in_world(robot: RobotRun, kind: str, gaussians: Gaussians) -> Gaussians:
         return gaussians
     T_map_keyframe = np.array([k.T_map_camera for k in robot.keyframes])
     return gaussians.moved(T_map_keyframe, robot.corrected.T_world_keyframe)
+
+
+def in_colors_of(colors: ColorMap | None, gaussians: Gaussians) -> Gaussians:
+    """A map of a robot in a peer's colours, by how those look to the robot; None: as if both cameras were alike."""
+    if colors is None or colors.is_identity:
+        return gaussians
+    return gaussians.replace(colors=colors.from_other(gaussians.colors).astype(np.float32))
 
 
 @dataclass(frozen=True)

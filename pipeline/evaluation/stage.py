@@ -15,6 +15,7 @@ from pipeline.errors import DuagError
 from pipeline.evaluation import (
     agreement,
     calibration,
+    cameras,
     groundtruth,
     map_errors,
     trajectory_errors,
@@ -53,6 +54,8 @@ PROTOCOL = {
     "peers": "held-out views of the other robots of the component, at their own poses; own map moved into the world",
     "poses": "own: odometry.tum in the robot's map frame; fused: trajectory.tum in the world frame",
     "exposure": "none fitted",
+    "colors": "those of the camera that took the view; at peers' views the map's, which are its own camera's, are put "
+    "into them by the robot's own estimate from matched Gaussians (/<robot>/peer_colors); nothing is fitted to a view",
     "background": "black",
     "psnr": "render clamped to 0..1, mean over views, at most 100 dB",
     "ssim": "one scale, 11x11 Gaussian window of sigma 1.5, windows inside the image",
@@ -94,7 +97,7 @@ def evaluate(
         "robots": {
             name: _robot_section(robot, truth)
             | _agreement_section(robot, source, truth)
-            | {"rendering": rendering_of[name]}
+            | {"camera": cameras.section(robot), "rendering": rendering_of[name]}
             for name, robot in run.robots.items()
         },
         "team": _team_section(run, truth) | session.closure_counts(),

@@ -84,7 +84,12 @@ class FailureConfig(Config):
     max_frames_without_depth: int = 15
     """Frames in a row that are tracked by colour alone, because their depth is missing or stuck."""
     min_view_without_depth: float = 0.6
-    """Share of the keyframe's samples that must be inside such a frame: colour alone is poor where little is shared."""
+    """Share of the last such frame's samples that must be seen: colour alone is poor where little is shared."""
+    max_way_without_depth_m: float = 0.12
+    """Distance from the last frame with depth up to which colour alone is followed: it errs by up to a quarter
+    of it."""
+    sigma_of_way_without_depth: float = 0.07
+    """Standard deviation of that error per axis, as a share of the distance; counted in the information."""
     max_frames_without_color: int = 3
     """Frames in a row that are tracked by depth alone, because their colour is stuck; walls do not hold it long."""
     stuck_share: float = 0.99
@@ -155,6 +160,8 @@ class RelocalisationConfig(Config):
     """The same as a share of the matches; the larger number holds."""
     min_overlap: float = 0.5
     """Overlap by which a place must be seen to be believed."""
+    max_contradiction_m: float = 0.03
+    """Largest distance between a place that was found and where a later keyframe, not believed itself, has it."""
     max_conflict: float = 0.1
     """Largest fraction of a keyframe's seen samples in space that the frame saw to be free, to be believed."""
     max_gray_rms: float = 0.03

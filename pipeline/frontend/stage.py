@@ -190,7 +190,7 @@ def _map(
     """
     if not config.mapping_enabled:
         clock.lap("mapping_s")
-        return [], _Maps(Gaussians.empty(), None, config.mapping.depth), frames
+        return [], _Maps(Gaussians.empty(), None, config.mapping.depth_kind(None)), frames
     from pipeline.frontend.mapping import Mapper, MappingStats
 
     def update(keyframe: Keyframe, stats: MappingStats) -> MapUpdate:
@@ -205,7 +205,7 @@ def _map(
             stats.loss_after,
         )
 
-    mapper = Mapper(log.camera, config.mapping, seed, threads=threads)
+    mapper = Mapper(log.camera, config.mapping, seed, threads, depth_noise_m(frames))
     free = FreeSpace(log.camera, config.moving)
     for keyframe in keyframes:
         free.add(log.frame(keyframe.frame_index).usable_depth, keyframe.T_map_camera)
@@ -224,7 +224,7 @@ def _map(
         updates.append(update(keyframe, stats))
     unrefined = mapper.gaussians
     clock.lap("mapping_s")
-    frames = _refine_to_model(log, unrefined, keyframes, frames, config, threads, progress)
+    frames = _refine_to_model(log, unrefined, mapper.depth, keyframes, frames, config, threads, progress)
     clock.lap("model_s")
     for supporting in _support(frames, keyframes, config):
         frame = log.frame(supporting.frame_index)
@@ -238,12 +238,23 @@ def _map(
             depth_sigma_m=frame.depth_sigma,
         )
     updates.append(update(keyframes[-1], mapper.finish()))
-    return updates, _Maps(mapper.gaussians, unrefined, config.mapping.depth), frames
+    return updates, _Maps(mapper.gaussians, unrefined, mapper.depth), frames
+
+
+def depth_noise_m(frames: Sequence[TrackedFrame]) -> float | None:
+    """Noise of the depth images, metres: the median over the frames of what is left between two registered ones."""
+    rms_m = [
+        frame.rms_depth_m
+        for frame in frames
+        if frame.status is Status.OK and frame.reason is Reason.NONE and frame.rms_depth_m > 0
+    ]
+    return float(np.median(rms_m)) if rms_m else None
 
 
 def _refine_to_model(
     log: RgbdLog,
     gaussians: Gaussians,
+    depth: DepthKind,
     keyframes: Sequence[Keyframe],
     frames: Sequence[TrackedFrame],
     config: FrontendConfig,
@@ -253,9 +264,7 @@ def _refine_to_model(
     """The frames with those between keyframes registered to the map, where that pays."""
     from pipeline.frontend.model import ModelTracker
 
-    model = ModelTracker(
-        gaussians, config.mapping.depth, log.camera, config.model, config.tracking.registration, threads
-    )
+    model = ModelTracker(gaussians, depth, log.camera, config.model, config.tracking.registration, threads)
     taken = {keyframe.frame_index for keyframe in keyframes}
     refined = []
     for frame in progress_bar.track(frames, f"model {log.robot}") if progress else frames:

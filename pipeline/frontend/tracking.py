@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.frontend.by_color import SoundFrame
 from pipeline.frontend.config import FrontendConfig, is_held_out
 from pipeline.frontend.failure import (
     Obstruction,
@@ -25,15 +26,14 @@ from pipeline.frontend.failure import (
 )
 from pipeline.frontend.keyframes import KeyframePair, becomes_keyframe, predicted_overlap
 from pipeline.frontend.relocalisation import features_of, guesses, supports
+from pipeline.frontend.settling import settle
 from pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.recording import MotionPrior
 from pipeline.registration import (
-    Outcome,
     Reference,
     Registration,
-    RegistrationConfig,
     RgbdPyramid,
     register,
 )
@@ -41,10 +41,8 @@ from pipeline.registration.features import Features
 
 Array = NDArray[np.float64]
 Image = NDArray[np.floating]
-SETTLING_ROUNDS = 3
 USUAL_FRAMES = 50  # whose residuals are the usual ones
 FEATURES_TO_SAY = 3  # times the inliers needed: a keyframe with fewer features cannot say where a view is
-SETTLED_M, SETTLED_RAD = 0.01, 0.01  # a registration that moves less from its own answer has settled
 
 
 @dataclass(frozen=True)
@@ -92,6 +90,7 @@ class Tracker:
         self._gray_rms: list[float] = []  # of the last frames that were followed
         self._obstruction = Obstruction(config.tracking.failure)
         self._without_depth = self._without_color = 0  # frames in a row without a usable image
+        self._sound: SoundFrame | None = None  # the last frame with both, nothing before it
 
     def track(
         self,
@@ -124,7 +123,6 @@ class Tracker:
 
     def _examine(self, frame_index: int, stamp_ns: int, pyramid: RgbdPyramid) -> _Found | Reason | None:
         """Where a frame is, or why that is not known; None if it may become the first keyframe."""
-        failure = self.config.tracking.failure
         stuck = self._stuck.look(pyramid)
         if stuck is Reason.STUCK_COLOR:
             return self._follow_by_depth(stamp_ns, pyramid)
@@ -135,13 +133,18 @@ class Tracker:
             self._without_depth = 0
             return self._find(frame_index, stamp_ns, pyramid) if self.keyframes else None
         self._without_depth += 1
-        enough = self._without_depth > failure.max_frames_without_depth
-        if enough or not self.keyframes or self._long_lost(stamp_ns):
+        return self._follow_by_color(stamp_ns, pyramid, without)
+
+    def _follow_by_color(self, stamp_ns: int, pyramid: RgbdPyramid, without: Reason) -> _Found | Reason:
+        """Follow a frame without depth by its colour alone, for a while, if it looks as frames did before."""
+        tracking = self.config.tracking
+        enough = self._without_depth > tracking.failure.max_frames_without_depth
+        if enough or self._lost or self._sound is None:
             return without
-        found = self._find_near(stamp_ns, pyramid.without_depth())
-        if isinstance(found, Reason) or found.result.view < failure.min_view_without_depth:
-            return without
-        return replace(found, without=without)
+        predicted, known = self._predicted(stamp_ns)
+        result = self._sound.follow(pyramid, predicted, tracking.registration, tracking.failure, known)
+        found = _Found(self._current, result, without)
+        return found if result.ok and self._looks_as_usual(result) else without
 
     def _follow_by_depth(self, stamp_ns: int, pyramid: RgbdPyramid) -> _Found | Reason:
         """Follow a frame whose colour is stuck by its depth alone, for a few frames: walls do not hold it long."""
@@ -170,6 +173,7 @@ class Tracker:
             return self._lose(frame_index, stamp_ns, Reason.NO_DEPTH)
         self._add_keyframe(frame_index, stamp_ns, pyramid, -1, np.eye(4), None)
         self._stamp_ns, self._lost = stamp_ns, False
+        self._sound = SoundFrame(pyramid, self.config.tracking.strides, np.eye(4), None)
         nothing = np.zeros((6, 6))
         return TrackedFrame(frame_index, stamp_ns, 0, np.eye(4), nothing, Status.OK, 1.0, 0.0, 0.0)
 
@@ -187,6 +191,7 @@ class Tracker:
             self._gray_rms = [*self._gray_rms[1 - USUAL_FRAMES :], result.rms_gray]
         if found.without is Reason.NONE:
             self._obstruction.look(pyramid.levels[-1], self._seen_before(found))
+            self._sound = self._sound_frame(pyramid, result.T_reference_target, result.information)
         if (
             not is_held_out(frame_index)
             and found.without is Reason.NONE
@@ -196,6 +201,14 @@ class Tracker:
         ):
             return self._promote(frame_index, stamp_ns, pyramid, keyframe_index, result, status)
         return TrackedFrame.by(frame_index, stamp_ns, keyframe_index, result, status, found.without)
+
+    def _sound_frame(
+        self, pyramid: RgbdPyramid, T_keyframe_camera: Array, information: Array | None
+    ) -> SoundFrame | None:
+        """A frame that colour alone may be registered to; None if something stands before the camera."""
+        if self._obstruction.standing:
+            return None
+        return SoundFrame(pyramid, self.config.tracking.strides, T_keyframe_camera, information)
 
     def _lose(self, frame_index: int, stamp_ns: int, reason: Reason) -> TrackedFrame:
         """A frame without a pose: it keeps the last known one, and says that it means nothing."""
@@ -247,38 +260,16 @@ class Tracker:
                 information = known if guess is predicted else None
                 result = register(keyframe.reference, pyramid, guess, tracking.registration, information)
                 found = _Found(self._current, result)
-                if result.ok and self._tells_enough(pyramid, found):
+                if result.ok and self._tells_enough(pyramid, found) and self._followed(predicted, result):
                     return found
                 reason = reason if reason is not Reason.NONE else found.why_not()
         view = features_of(pyramid, tracking.relocalisation) if view is None else view
         for guess in starts:
-            found = _Found(self._current, self._settle(keyframe, pyramid, guess, tracking.recovery))
+            found = _Found(self._current, settle(keyframe, pyramid, guess, tracking, tracking.recovery))
             if found.result.ok and self._believable(stamp_ns, pyramid, found, view):
                 return found
             reason = reason if reason is not Reason.NONE else found.why_not()
         return reason
-
-    def _settle(
-        self, keyframe: TrackedKeyframe, pyramid: RgbdPyramid, guess: Array, config: RegistrationConfig
-    ) -> Registration:
-        """Register from a poor guess; OK only if the usual registration, started from the answer, stays there.
-
-        Wide gates let wrong surfaces in, and a start too far away ends on the way. The brightness is brought to that
-        of the keyframe first.
-        """
-        gain, offset = _equalising(pyramid, keyframe, self.config.tracking.equalise_from_gain)
-        if gain != 1:
-            pyramid = pyramid.with_exposure(gain, offset)
-        result = register(keyframe.reference, pyramid, guess, config)
-        for _ in range(SETTLING_ROUNDS):
-            if not result.ok:
-                break
-            before = result.T_reference_target
-            result = register(keyframe.reference, pyramid, before, self.config.tracking.registration)
-            moved_m, turned_rad = se3.distance(before, result.T_reference_target)
-            if moved_m < SETTLED_M and turned_rad < SETTLED_RAD:
-                return _with_exposure(result, gain, offset)
-        return replace(result, outcome=Outcome.JUMP) if result.ok else result
 
     def _find_place(
         self, frame_index: int, stamp_ns: int, pyramid: RgbdPyramid, view: Features
@@ -287,17 +278,43 @@ class Tracker:
         config = self.config.tracking
         features = [keyframe.features for keyframe in self.keyframes]
         for index, guess in guesses(view, features, frame_index, config.relocalisation):
-            found = _Found(index, self._settle(self.keyframes[index], pyramid, guess, config.registration))
+            found = _Found(index, settle(self.keyframes[index], pyramid, guess, config, config.registration))
             if found.result.ok and self._believable(stamp_ns, pyramid, found, view):
-                return found
+                return self._by_latest(stamp_ns, pyramid, view, found)
         return None
+
+    def _by_latest(self, stamp_ns: int, pyramid: RgbdPyramid, view: Features, found: _Found) -> _Found | None:
+        """A place that was found, by the latest keyframe that shows enough of it; None if one contradicts.
+
+        Between keyframes long apart lies what tracking erred on the way from one to the other. The way goes on from
+        its end: by an early keyframe the camera would jump by all of that (5 cm in RedKitchen). A later keyframe that
+        is not believed, but has the camera elsewhere, leaves it open where the camera is.
+        """
+        config, limits = self.config.tracking, self.config.tracking.relocalisation
+        T_map_camera = self.keyframes[found.keyframe_index].T_map_keyframe @ found.result.T_reference_target
+        tried = 0
+        for keyframe in reversed(self.keyframes[found.keyframe_index + 1 :]):
+            guess = se3.inverse(keyframe.T_map_keyframe) @ T_map_camera
+            if predicted_overlap(keyframe.reference, pyramid, guess) < limits.min_overlap:
+                continue
+            result = settle(keyframe, pyramid, guess, config, config.registration)
+            later = _Found(keyframe.keyframe_index, result)
+            if result.ok and self._believable(stamp_ns, pyramid, later, view):
+                return later
+            if result.ok and se3.distance(guess, result.T_reference_target)[0] > limits.max_contradiction_m:
+                return None
+            tried += 1
+            if tried == limits.candidates:
+                break
+        return found
 
     def _confirm(self, stamp_ns: int, pyramid: RgbdPyramid, view: Features) -> _Found | Reason | None:
         """Track on from a place that was found; None if the frame does not agree with it."""
         assert self._unconfirmed is not None
         before, self._unconfirmed = self._unconfirmed, None
         index, last = before.found.keyframe_index, before.found.result.T_reference_target
-        result = self._settle(self.keyframes[index], pyramid, last, self.config.tracking.registration)
+        tracking = self.config.tracking
+        result = settle(self.keyframes[index], pyramid, last, tracking, tracking.registration)
         found = _Found(index, result)
         moved_m, _ = se3.distance(last, result.T_reference_target)
         reach_m = self.config.tracking.failure.max_speed_m_s * (stamp_ns - before.stamp_ns) * 1e-9
@@ -307,6 +324,20 @@ class Tracker:
             return found
         self._unconfirmed = _Unconfirmed(found, stamp_ns, before.agreed + 1)
         return Reason.UNCONFIRMED
+
+    def _followed(self, predicted: Array, result: Registration) -> bool:
+        """Whether a frame that looks unlike its keyframe is at least where it was expected and contradicts no depth.
+
+        Exposure that jumps makes frames look unlike, and a hand; another place that looks somewhat alike is also
+        elsewhere: in RedKitchen a mirrored room would be followed 11 cm and 14 degrees beside the way.
+        """
+        tracking = self.config.tracking
+        moved_m, turned_rad = se3.distance(predicted, result.T_reference_target)
+        return result.rms_gray <= self._largest_gray_rms() or bool(
+            moved_m <= tracking.failure.slack_m
+            and turned_rad <= tracking.failure.slack_rad
+            and result.conflict <= tracking.relocalisation.max_conflict
+        )
 
     def _tells_enough(self, pyramid: RgbdPyramid, found: _Found) -> bool:
         """Whether what something before the camera leaves to be seen still says well where the camera is."""
@@ -377,12 +408,16 @@ class Tracker:
 
         Where the exposure jumps, too dark and too bright images pass. They make poor keyframes.
         """
-        config = self.config.tracking
-        alike = 1 / config.max_keyframe_gain < result.exposure[0] < config.max_keyframe_gain
-        if alike and result.rms_gray <= self._largest_gray_rms():
+        if self._looks_as_usual(result):
             return True
+        config = self.config.tracking
         leaving = min(result.overlap, result.view) < config.relocalisation.min_overlap
         return leaving and saturated_share(pyramid.levels[0]) <= config.max_saturated
+
+    def _looks_as_usual(self, result: Registration) -> bool:
+        """Whether a frame is exposed as what it was registered to, and its grey values fit as usual."""
+        largest = self.config.tracking.max_keyframe_gain
+        return 1 / largest < result.exposure[0] < largest and result.rms_gray <= self._largest_gray_rms()
 
     def _seen_before(self, found: _Found) -> SeenFrom:
         """The keyframe that a frame was registered to, as its obstruction is judged by it."""
@@ -407,6 +442,7 @@ class Tracker:
         self._register_to_neighbours(pyramid, previous, T_map_keyframe, new)
         self._add_keyframe(frame_index, stamp_ns, pyramid, previous, T_map_keyframe, result)
         self._current, self._T_keyframe_camera = new, np.eye(4)
+        self._sound = self._sound_frame(pyramid, np.eye(4), None)
         return replace(
             TrackedFrame.by(frame_index, stamp_ns, new, result, status), T_keyframe_camera=np.eye(4)
         )
@@ -465,23 +501,3 @@ class Tracker:
                 (gain, offset),
             )
         )
-
-
-def _equalising(pyramid: RgbdPyramid, keyframe: TrackedKeyframe, from_gain: float) -> tuple[float, float]:
-    """Gain and offset that give a view the mean and spread of grey values of a keyframe; (1, 0) if nearly so.
-
-    No more than fivefold: a black image does not become one that shows something.
-    """
-    there, here = keyframe.coarsest.gray, pyramid.levels[-1].gray
-    gain = float(there.std()) / max(float(here.std()), 1e-3)
-    if 1 / from_gain < gain < from_gain or not 0.2 < gain < 5:
-        return 1.0, 0.0
-    return gain, float(there.mean()) - gain * float(here.mean())
-
-
-def _with_exposure(result: Registration, gain: float, offset: float) -> Registration:
-    """A registration of an equalised view, gain * grey + offset, with the exposure of the view as it was."""
-    if gain == 1:
-        return result
-    a, b = result.exposure
-    return replace(result, exposure=(a / gain, (b - offset) / gain))

@@ -10,7 +10,8 @@ robots were measured to differ by across it, in shape, colour and opacity. `asso
 default the neighbours', and the own splat counts with its stiffness among its own (`Evidence.of_splats`), because what
 makes a picture is not where one splat is but what they are together. A thickness that the mapper holds at its floor is
 held here too. Every robot's evidence counts once, however often it arrived and through whom. Where no member of a track
-knows anything, the own value stays. The result is a continuous function of the evidence.
+knows anything, the own value stays. The result is a continuous function of the evidence. Everything is fused in colours
+common to the team (`consensus.colors`), and each robot's map has those of its own camera.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.consensus.colors import ColorMap, team_colors
 from pipeline.consensus.config import MatchingConfig, WeightKind
 from pipeline.consensus.evidence import (
     COLOR,
@@ -45,6 +47,7 @@ MAD_TO_SIGMA = 1.4826
 # Information of the own mean (1/m^2) and shape, which decides where nobody knows more. Matches are within centimetres,
 # so that of `neighbours` is no claim; where all robots shall end with the same Gaussian it is next to nothing.
 PRIOR = {"neighbours": (100.0, 0.1), "members": (1e-2, 1e-4)}
+_COLOR_INFORMATION = slice(27, 30)
 _NEAR_M = 0.05  # points closer to a camera than this are not judged by it
 
 
@@ -57,6 +60,7 @@ class FusedMap:
     `consensus.evidence`, world frame, the sum over members.
     robots: names. source: int32 [n], index into robots: whose Gaussian it was. source_ids: int64 [n], its id there.
     members: int32 [n], robots whose evidence is in it. matched: own Gaussians fused with others. added: taken over.
+    colors: from every other robot's colours to the receiver's, which are those of the map.
     """
 
     gaussians: Gaussians
@@ -68,6 +72,7 @@ class FusedMap:
     members: NDArray[np.int32]
     matched: int
     added: int
+    colors: dict[str, ColorMap]
 
 
 @dataclass(frozen=True)
@@ -284,6 +289,8 @@ def fuse(
     matching: MatchingConfig,
     depth: DepthKind = "blended",
     weights: WeightKind = "block",
+    *,
+    contradicted: Mapping[str, NDArray[np.bool_]] | None = None,
 ) -> FusedMap:
     """Fuse what a robot knows into one map in the world frame.
 
@@ -298,13 +305,18 @@ def fuse(
         pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians.
         depth_images: (own keyframe index, depth [H, W] in metres, 0 invalid), read once; for `coverage = all`.
         camera: of these depth images.
-        matching: as the pairs were found; for splitting tracks that hold two Gaussians of one robot.
+        matching: as the pairs were found; for splitting tracks that hold two Gaussians of one robot, and for what the
+            pairs tell of the robots' cameras.
         depth: of a Gaussian at a pixel, as the own map was made.
         weights: kind of the information in `evidence` and `own_splats`.
+        contradicted: by robot, [n] of its evidence: what is not taken over, whatever space it is in.
     """
     own, own_splats = (_in_order_of(gaussians.ids, e) for e in (evidence[robot], own_splats))
     names = tuple(sorted(evidence))
     world = {n: in_world(own if n == robot else evidence[n], T_world_keyframe[n], weights) for n in names}
+    cameras = team_colors(world, pairs, matching.colors)
+    common = cameras.to_common(robot)
+    world = {n: cameras.to_common(n).of(e) for n, e in world.items()}
     start = np.concatenate([[0], np.cumsum([len(world[n]) for n in names])]).astype(np.int64)
     rows = _Rows.of([world[n] for n in names])
     owner = np.repeat(np.arange(len(names)), np.diff(start))
@@ -324,7 +336,7 @@ def fuse(
     if len(first):
         taking_part, mine = rows.take(member), np.flatnonzero(found.robot == me)
         if config.association == "neighbours":
-            splats = in_world(own_splats.select(found.row[mine]), T_world_keyframe[robot], weights)
+            splats = in_world(common.of(own_splats.select(found.row[mine])), T_world_keyframe[robot], weights)
             taking_part = taking_part.with_rows(mine, _Rows.of([splats]))
         move[representative] = _moves(taking_part, reference, first, config, matching.thickness_floor_m)
         members[representative] = np.diff(np.append(first, len(member)))
@@ -334,6 +346,8 @@ def fuse(
     absorbed = np.zeros(len(rows.theta), dtype=bool)
     absorbed[member] = True
     absorbed[representative] = False
+    for name, against in (contradicted or {}).items():
+        absorbed[start[names.index(name)] + np.flatnonzero(against)] = True
     foreign = np.flatnonzero((owner != me) & ~absorbed)
     same_frame = np.array_equal(T_map_keyframe, T_world_keyframe[robot])
     moved = gaussians if same_frame else gaussians.moved(T_map_keyframe, T_world_keyframe[robot])
@@ -342,15 +356,18 @@ def fuse(
         surfaces = _surfaces(moved, T_world_keyframe[robot], depth_images, camera, config, depth)
         added = _to_add(foreign, rows, sums, T_world_keyframe[robot], surfaces, camera, config)
 
+    theta, move[:, COLOR] = rows.theta + move, move[:, COLOR] / common.gain
+    theta[:, COLOR] = common.from_other(theta[:, COLOR])
+    sums[:, _COLOR_INFORMATION] *= common.gain**2
     kept = _applied(moved, move[own_rows], rows.theta[own_rows, LOG_COVARIANCE])
     ids = np.concatenate([world[n].ids for n in names])
     anchors = np.concatenate([world[n].anchors for n in names])
     next_id = int(gaussians.ids.max()) + 1 if len(gaussians) else 0
-    taken = gaussians_of(next_id + np.arange(len(added)), anchors[added], rows.theta[added] + move[added])
+    taken = gaussians_of(next_id + np.arange(len(added)), anchors[added], theta[added])
     order = np.concatenate([own_rows, added])
     return FusedMap(
         gaussians=Gaussians.concatenate([kept, taken]),
-        theta=rows.theta[order] + move[order],
+        theta=theta[order],
         information=sums[order],
         robots=names,
         source=owner[order].astype(np.int32),
@@ -358,6 +375,7 @@ def fuse(
         members=members[order],
         matched=int(np.sum(members[own_rows] > 1)),
         added=len(added),
+        colors={n: cameras.between(n, robot) for n in names if n != robot},
     )
 
 

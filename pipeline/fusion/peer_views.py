@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.consensus.colors import ColorMap
 from pipeline.consensus.config import WeightKind
 from pipeline.consensus.evidence import Evidence
 from pipeline.consensus.weighting import in_world
@@ -35,23 +36,27 @@ def peer_views(
     depth: DepthKind,
     weights: WeightKind = "block",
     threads: int = 1,
+    *,
+    colors: Mapping[str, ColorMap],
 ) -> list[View]:
-    """Colour and depth of every neighbour's map at its keyframes and half way between them.
+    """Colour and depth of every neighbour's map at its keyframes and half way between them, as the own camera sees.
 
     Args:
         evidence: of the neighbours, by name, in anchor frames. T_world_keyframe: by name, [k, 4, 4] by anchor.
         camera: the robot's own; what the neighbour's map does not cover counts as not seen.
         most: so many views in all, evenly spread.
         depth: as the maps were made. threads: changes no bit.
+        colors: from every neighbour's colours to the own.
     """
     rasterizer = Rasterizer(threads=threads)
-    poses = [(name, T) for name in sorted(evidence) for T in _with_middles(T_world_keyframe[name])]
+    shown = [name for name in sorted(evidence) if len(evidence[name])]
+    poses = [(name, T) for name in shown for T in _with_middles(T_world_keyframe[name])]
     count = min(most, len(poses))
     chosen = [poses[(2 * k + 1) * len(poses) // (2 * count)] for k in range(count)]
     views, drawn = [], ""
     for name, T_world_camera in chosen:
         if name != drawn:
-            there = in_world(evidence[name], T_world_keyframe[name], weights)
+            there = in_world(colors[name].of(evidence[name]), T_world_keyframe[name], weights)
             gaussians, drawn = gaussians_of(there.ids, there.anchors, there.theta), name
         render = rasterizer.forward(gaussians, camera, se3.inverse(T_world_camera), depth=depth)
         seen = render.alpha >= COVERED

@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import DuagError
+from pipeline.evaluation.cameras import CHANNELS
 from pipeline.evaluation.network import Session
 from pipeline.evaluation.paths import Path3, paths, top_view_axes
-from pipeline.evaluation.rendering import COMPARED_SETS, in_world, mates, poses_by_stamp
+from pipeline.evaluation.rendering import COMPARED_SETS, in_colors_of, in_world, mates, poses_by_stamp
 from pipeline.evaluation.results import Absent
 from pipeline.evaluation.views import score_view, surface_depth
+from pipeline.fusion.stage import peer_colors
 from pipeline.geometry import se3
 from pipeline.messages import GaussianMap
 from pipeline.recording import Recording, open_rgbd
@@ -98,7 +100,7 @@ def content(run: RunFolder, source: Recording) -> dict[str, Any]:
         "comparison": words.comparison_rows(metrics),
         "rendering_columns": list(words.RENDERING.values()),
         "rendering": _rendering_rows(metrics),
-        "exposure_note": "No exposure is fitted to a view.",
+        "exposure_note": " ".join(["No exposure is fitted to a view.", *_cameras(metrics)]),
         "views": shown_views,
         **_agreement_content(session, metrics, reasons),
         "exchange_charts": _exchange_charts(session),
@@ -113,6 +115,23 @@ def content(run: RunFolder, source: Recording) -> dict[str, Any]:
         "config": run.config_text or "The run has no config.toml.",
         "recording": json.dumps(source.description, indent=2),
     }
+
+
+def _cameras(metrics: dict[str, Any]) -> list[str]:
+    """How the robots' cameras differ, a sentence for each that was compared with the first of its component."""
+    said = []
+    for name, robot in metrics["robots"].items():
+        camera = robot.get("camera", {})  # runs of earlier versions have none
+        if camera.get("gain_red") is not None:
+            gains = ", ".join(
+                f"{camera[f'gain_{channel}']:.3f} ± {camera[f'sigma_gain_{channel}']:.3f}"
+                for channel in CHANNELS
+            )
+            said.append(
+                f"By the robots' own estimate {name}'s camera has {gains} times the red, green and blue of the first "
+                "robot's; peers' views are compared in the colours of the camera that took them."
+            )
+    return said
 
 
 def _count(number: int, noun: str) -> str:
@@ -263,12 +282,18 @@ def _pictures(run: RunFolder, source: Recording) -> tuple[list[dict[str, Any]], 
                 shown.append(head | _view(maps, log, frame, rasterizer))
             if run.robots[name].fused_map.information is not None and frames:
                 colored.append(head | _information_view(robot, log, frames, rasterizer))
+        colors = peer_colors(robot.folder / "fused.mcap", name)
         for peer in mates(run, robot)[:1]:
-            moved = replace(robot.own_map, gaussians=in_world(robot, "own", robot.own_map.gaussians))
+            alike = colors.get(peer.robot)
+            moved = replace(
+                robot.own_map,
+                gaussians=in_colors_of(alike, in_world(robot, "own", robot.own_map.gaussians)),
+            )
+            last = replace(final[1], gaussians=in_colors_of(alike, final[1].gaussians))
             with open_rgbd(source.log(peer.robot)) as log:
                 for frame in [log.frame(index) for index in _chosen_frames(peer, len(log))[:1]]:
                     T = poses_by_stamp(peer.trajectory)[frame.stamp_ns]
-                    maps = {"own": (moved, T), final[0]: (final[1], T)}
+                    maps = {"own": (moved, T), final[0]: (last, T)}
                     where = {"where": f" of {peer.robot}"}
                     shown.append(head | where | _view(maps, log, frame, rasterizer))
     return shown, colored

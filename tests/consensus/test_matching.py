@@ -1,8 +1,11 @@
 """Matching of Gaussians: mutual, symmetric under renaming, blind to what carries no meaning; tracks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from pipeline.consensus.config import ColorConfig
 from pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, Evidence
 from pipeline.consensus.matching import MatchingConfig, gaussian_distance, match, threshold, tracks
 from pipeline.geometry import so3, spd
@@ -54,6 +57,19 @@ def test_matches_do_not_depend_on_the_order_of_rows_or_on_the_world():
     np.testing.assert_array_equal(shuffled, pairs)
     T = random_poses(rng, 1)
     np.testing.assert_array_equal(match(a.in_world(T), b.in_world(T), CONFIG), pairs)
+
+
+def test_matches_do_not_depend_on_how_a_camera_sees_colours():
+    """As a bravo whose every channel is darker and whose black is not black; compared as if alike, half is lost."""
+    a, b = (
+        replace(e, information=np.ones((len(e), 31))) for e in (surface("alpha", 9), surface("bravo", 10))
+    )
+    theta = b.theta.copy()
+    theta[:, COLOR] = [0.7, 0.8, 0.6] * theta[:, COLOR] + [0.05, -0.03, 0.02]
+    expected, tinted = match(a, b, CONFIG), replace(b, theta=theta)
+    assert len(np.intersect1d(match(a, tinted, CONFIG), expected)) > 0.97 * len(np.unique(expected))
+    alike = CONFIG.model_copy(update={"colors": ColorConfig(enabled=False)})
+    assert len(match(a, tinted, alike)) < 0.5 * len(expected)
 
 
 def test_matches_are_mutual_bests_of_all_candidates():

@@ -117,6 +117,26 @@ def test_gain_changes_the_light():
     assert with_gain(grey, 2.0).mean() == pytest.approx(60 * 2 ** (1 / 2.2), abs=1)
 
 
+def test_cameras_differ_by_channel(tmp_path):
+    kind = {"frames": 2, "size": (64, 48), "workers": 1}
+    simulate(tmp_path / "alike", **kind)
+    simulate(tmp_path / "differ", rig=Rig(camera_stops=1.0), **kind)
+    checks = json.loads((tmp_path / "differ" / "recording.json").read_text())["checks"]
+    gains = np.array([checks["camera_gain"][robot] for robot in ("alpha", "bravo")])
+    assert len(np.unique(gains)) == 6
+    assert (np.abs(np.log2(gains)) <= 1 / 2.2).all()
+    for robot in ("alpha", "bravo"):
+        gain, black = (np.array(checks[name][robot]) for name in ("camera_gain", "camera_black"))
+        with (
+            open_rgbd(Recording(tmp_path / "alike").log(robot)) as alike,
+            open_rgbd(Recording(tmp_path / "differ").log(robot)) as differ,
+        ):
+            for before, after in zip(alike.frames(), differ.frames(), strict=True):
+                expected = np.clip(before.color * gain + 255 * black, 0, 255)
+                assert np.abs(after.color - expected).max() <= 0.5
+                assert np.array_equal(after.depth, before.depth)
+
+
 def test_stereo_depth_is_as_good_as_its_sigma_says(folder, tmp_path):
     simulate(
         tmp_path / "rec", scene=str(folder), robots=1, frames=2, size=(320, 240), workers=1, rig=Rig("stereo")
@@ -166,6 +186,7 @@ def test_twists_lead_to_the_next_pose():
         {"rig": Rig("lidar"), "noise": "kinect"},
         {"rig": Rig(readout_s=0.1)},
         {"rig": Rig(clock_s=2.0)},
+        {"rig": Rig(camera_stops=3.0)},
         {"movers": 20},
     ],
 )

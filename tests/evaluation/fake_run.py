@@ -7,6 +7,7 @@ rendered from, the corrected ways are the true ones, so that the ideal values of
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -122,13 +123,16 @@ def make(
     truth: bool = True,
     joined: bool = True,
     depth_noise: str = "none",
+    gain: float = 1.0,
 ) -> FakeRun:
     """Write the recording and the run.
 
     truth: with ground truth. joined: whether the robots share a world and talked; otherwise each is alone.
+    gain: of the last robot's camera; if not 1, the robots know it.
     """
     recording, run = folder / "recording", folder / "run"
-    _write_recording(recording, robots, truth, depth_noise)
+    gains = dict.fromkeys(robots, 1.0) | {robots[-1]: gain}
+    _write_recording(recording, robots, truth, depth_noise, gains)
     run.mkdir()
     (run / "config.toml").write_text(
         "seed = 0\n\n[exchange.consensus]\ntolerance = 1e-5\n\n[fusion.refine]\nsteps_per_view = 1\n"
@@ -139,20 +143,35 @@ def make(
         '"peak_rss_mb": 180.0}}}'
     )
     for i, robot in enumerate(robots):
-        _write_robot(run / "robots" / robot, robot, i, list(robots) if joined else [robot], joined)
+        _write_robot(run / "robots" / robot, robot, i, list(robots) if joined else [robot], joined, gains)
     _write_exchange(run / "exchange.mcap", robots if joined else [], list(robots))
     _write_consensus(run / "consensus.mcap", list(robots), joined)
     return FakeRun(run, recording)
 
 
-def _write_recording(folder: Path, robots: Sequence[str], truth: bool, depth_noise: str) -> None:
+def _peer_colors(robot: str, peer: str, gain: float) -> Any:
+    return schemas.new(
+        "PeerColors",
+        robot=robot,
+        peer=peer,
+        gain=[gain] * 3,
+        offset=[0.0] * 3,
+        gain_sigma=[0.01] * 3,
+        offset_sigma=[0.002] * 3,
+        matches=500,
+    )
+
+
+def _write_recording(
+    folder: Path, robots: Sequence[str], truth: bool, depth_noise: str, gains: dict[str, float]
+) -> None:
     rasterizer = Rasterizer()
     with RecordingWriter(folder, "wall", {"made": "by the tests"}, "tests") as recording:
         for i, robot in enumerate(robots):
             with recording.robot(robot, CAMERA, 0.001, {"depth_noise": depth_noise}) as log:
                 for k, T_world_camera in enumerate(way(i)):
                     render = rasterizer.forward(wall(), CAMERA, se3.inverse(T_world_camera))
-                    rgb = np.rint(np.clip(render.color, 0, 1) * 255).astype(np.uint8)
+                    rgb = np.rint(np.clip(gains[robot] * render.color, 0, 1) * 255).astype(np.uint8)
                     _, png = cv2.imencode(".png", rgb[:, :, ::-1])
                     depth = np.rint(1000 * render.depth / render.alpha).astype(np.uint16)
                     depth[:4] = 0  # a strip without measurement
@@ -175,7 +194,9 @@ def _write_wall(path: Path) -> None:
     write_points(path, points, normals, np.zeros((len(x), 3), np.uint8))
 
 
-def _write_robot(folder: Path, robot: str, index: int, component: list[str], joined: bool) -> None:
+def _write_robot(
+    folder: Path, robot: str, index: int, component: list[str], joined: bool, gains: dict[str, float]
+) -> None:
     folder.mkdir(parents=True)
     stamps = np.arange(FRAMES, dtype=np.int64) * INTERVAL_NS
     true = way(index)
@@ -185,7 +206,8 @@ def _write_robot(folder: Path, robot: str, index: int, component: list[str], joi
     after = true if joined else T_map_world @ true
     write_tum(folder / "odometry.tum", Trajectory(stamps, odometry))
     write_tum(folder / "trajectory.tum", Trajectory(stamps, after))
-    own, fused = wall().transformed(T_map_world), wall() if joined else wall().transformed(T_map_world)
+    seen = wall().replace(colors=np.float32(gains[robot]) * wall().colors)
+    own, fused = seen.transformed(T_map_world), seen if joined else seen.transformed(T_map_world)
     end = int(stamps[-1])
     with LogWriter(folder / "frontend.mcap", robot) as log:
         for k in range(FRAMES):
@@ -212,6 +234,10 @@ def _write_robot(folder: Path, robot: str, index: int, component: list[str], joi
         indices = np.arange(len(KEYFRAMES), dtype=np.int32)
         corrected = CorrectedKeyframes(end, robot, component, indices, after[list(KEYFRAMES)])
         log.write(topics.CORRECTED_KEYFRAMES.of(robot), corrected, end)
+        for peer in component if set(gains.values()) != {1.0} else ():
+            if peer != robot:
+                colors = _peer_colors(robot, peer, gains[robot] / gains[peer])
+                log.write(topics.PEER_COLORS.of(robot), colors, end)
 
 
 def _odometry(robot: str, k: int, T_map_camera: np.ndarray, status: str) -> Odometry:

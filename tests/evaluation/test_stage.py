@@ -9,6 +9,8 @@ import pytest
 
 from pipeline.errors import DuagError
 from pipeline.evaluation import evaluate
+from pipeline.recording import LogWriter, read_log
+from schemas import topics
 from tests.evaluation.fake_run import DRIFT_M, FRAMES, KEYFRAMES, FakeRun, make
 
 NUMBER = (int, float)
@@ -30,9 +32,14 @@ COMPARED = {
     kind: {"held_out": VIEWS, "peers": VIEWS, "team": VIEWS}
     for kind in ("own", "own_longer", "fused", "refined")
 }
+CAMERA = {
+    f"{value}_{channel}": NUMBER
+    for value in ("gain", "offset", "sigma_gain", "sigma_offset")
+    for channel in ("red", "green", "blue")
+}
 SCHEMA = {
     "schema": int,
-    "robots": dict.fromkeys(("alpha", "bravo"), ROBOT | {"rendering": COMPARED}),
+    "robots": dict.fromkeys(("alpha", "bravo"), ROBOT | {"camera": CAMERA | {"matches": int}, "rendering": COMPARED}),
     "team": {
         "robots": int, "robots_in_largest_component": int, "ate_rmse_m": NUMBER, "ate_rmse_m_mean_of_robots": NUMBER,
         "inter_robot_closures": int, "inter_robot_closures_rejected": int,
@@ -59,7 +66,7 @@ SCHEMA = {
     "protocol": dict.fromkeys(
         ("alignment", "ate", "team_ate", "rpe", "depth_agreement", "feature_agreement",
          "initial_relative_poses", "held_out", "peers", "training", "poses",
-         "exposure", "own_unrefined", "own_longer", "refined", "team", "common", "background", "psnr", "ssim",
+         "exposure", "colors", "own_unrefined", "own_longer", "refined", "team", "common", "background", "psnr", "ssim",
          "ms_ssim", "depth", "calibration", "oracle"),
         str,
     ),
@@ -95,6 +102,30 @@ def fake(tmp_path_factory) -> FakeRun:
 @pytest.fixture(scope="module")
 def metrics(fake) -> dict:
     return evaluate(fake.run, fake.recording, progress=False)
+
+
+def test_peers_views_are_compared_in_the_colours_of_their_camera(metrics, tmp_path):
+    dark = make(tmp_path, gain=0.6)
+    seen = evaluate(dark.run, dark.recording, progress=False)
+    for kind in ("own", "fused", "refined"):
+        for views in ("held_out", "peers"):
+            expected = metrics["rendering"][kind][views]["psnr_db"]
+            assert seen["rendering"][kind][views]["psnr_db"] == pytest.approx(expected, abs=3)
+    assert seen["robots"]["bravo"]["camera"]["gain_green"] == pytest.approx(0.6)
+    assert seen["robots"]["bravo"]["camera"]["matches"] == 500
+    assert seen["robots"]["alpha"]["camera"]["gain_green"] is None
+    assert "held against" in seen["reasons"]["robots.alpha.camera.gain_green"]
+    for robot in ("alpha", "bravo"):  # as if nobody had found out
+        log = dark.run / "robots" / robot / "fused.mcap"
+        records = [(r.topic, r.message(), r.log_time_ns) for r in read_log(log)]
+        with LogWriter(log, robot) as again:
+            for topic, message, time_ns in records:
+                if topic != topics.PEER_COLORS.of(robot):
+                    again.write(topic, message, time_ns)
+    blind = evaluate(dark.run, dark.recording, progress=False)
+    assert (
+        blind["rendering"]["fused"]["peers"]["psnr_db"] < seen["rendering"]["fused"]["peers"]["psnr_db"] - 10
+    )
 
 
 def test_metrics_json_keeps_its_contract(fake, metrics):

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.consensus.evidence import LOG_COVARIANCE, MEAN, Evidence, pack_information
+from pipeline.consensus.config import ColorConfig
+from pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, Evidence, pack_information
 from pipeline.consensus.gaussians import Weights
 from pipeline.consensus.matching import MatchingConfig
 from pipeline.fusion.fuse import FusionConfig, association_covariance, explained, fuse, weighted_move
@@ -80,7 +81,7 @@ class World:
             depth_images,
             CAMERA,
             config,
-            MATCHING,
+            given.get("matching", MATCHING),
         )
 
     def without_information(self, name):
@@ -147,6 +148,51 @@ def test_all_robots_arrive_at_the_same_gaussians():
         ]
         np.testing.assert_allclose(*shapes, atol=5e-5)
         np.testing.assert_array_equal(other.information, results[0].information)
+
+
+def tinted(world, **cameras):
+    """The same robots with other cameras: gain and offset [3] by name."""
+    maps, evidence = dict(world.maps), dict(world.evidence)
+    for name, (gain, offset) in cameras.items():
+        e, m = evidence[name], maps[name]
+        theta, sums = e.theta.copy(), e.information.copy()
+        theta[:, COLOR] = gain * theta[:, COLOR] + offset
+        sums[:, 27:30] /= np.square(gain)
+        colors = gain * m.colors + offset
+        maps[name], evidence[name] = (
+            m.replace(colors=colors.astype(np.float32)),
+            Evidence(name, e.ids, e.anchors, theta, sums),
+        )
+    return maps, evidence
+
+
+def test_every_robot_keeps_its_own_colours_and_the_maps_agree():
+    """Against the same team with equal cameras: all else is fused alike, and colours, put into one camera's, too."""
+    world = World(20)
+    rng = np.random.default_rng(20)
+    shared = rng.uniform(size=(N, 3))
+    for k, name in enumerate(world.names):  # splats of one place have nearly one colour
+        world.evidence[name].theta[:, COLOR] = shared + 0.01 * np.random.default_rng(k).normal(size=(N, 3))
+        colors = world.evidence[name].theta[:, COLOR].astype(np.float32)
+        world.maps[name] = world.maps[name].replace(colors=colors)
+    gain, offset = np.array([0.7, 0.8, 1.3]), np.array([0.02, -0.03, 0.01])
+    compared = MatchingConfig(colors=ColorConfig(min_matches=N, splats_per_sample=1))
+    alike = {name: world.fuse(name, ALIKE, matching=compared) for name in world.names}
+    world.maps, evidence = tinted(world, bravo=(gain, offset))
+    differ = {name: world.fuse(name, ALIKE, evidence=evidence, matching=compared) for name in world.names}
+    for name in world.names:
+        np.testing.assert_allclose(differ[name].gaussians.means, alike[name].gaussians.means, atol=1e-6)
+        expected = alike[name].gaussians.colors
+        if name == "bravo":
+            expected = gain * expected + offset
+        np.testing.assert_allclose(differ[name].gaussians.colors, expected, atol=0.01)
+        there = differ[name].colors["charlie" if name == "bravo" else "bravo"]
+        true = (1 / gain) if name != "bravo" else gain
+        np.testing.assert_allclose(there.gain, true, rtol=0.03)
+    in_alphas = differ["alpha"].colors["bravo"].to_other(differ["bravo"].gaussians.colors)
+    np.testing.assert_allclose(in_alphas, differ["alpha"].gaussians.colors, atol=1e-6)
+    told = differ["alpha"].information[:, 27:30] * differ["alpha"].colors["bravo"].gain ** 2
+    np.testing.assert_allclose(told, differ["bravo"].information[:, 27:30], rtol=1e-6)
 
 
 def test_order_of_arrival_does_not_change_a_bit():

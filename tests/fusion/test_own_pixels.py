@@ -43,7 +43,7 @@ def with_taken_over(information: float) -> FusedMap:
     sums[:, OPACITY_INFORMATION] = information
     source = np.where(np.arange(n) < len(own), 0, 1).astype(np.int32)
     return FusedMap(
-        gaussians, theta_of(gaussians), sums, ("alpha", "bravo"), source, gaussians.ids, np.ones(n, np.int32), 0, 3
+        gaussians, theta_of(gaussians), sums, ("alpha", "bravo"), source, gaussians.ids, np.ones(n, np.int32), 0, 3, {}
     )  # fmt: skip
 
 

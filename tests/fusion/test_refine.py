@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.consensus.colors import ColorMap
 from pipeline.consensus.evidence import Evidence
 from pipeline.fusion.config import RefineConfig
 from pipeline.fusion.peer_views import peer_views
@@ -17,6 +18,7 @@ from pipeline.splat.losses import psnr
 
 CAMERA = PinholeCamera(64, 48, 55.0, 55.0, 31.5, 23.5)
 ALL = np.ones(400, bool)
+ALIKE = {"zulu": ColorMap(np.ones(3), np.zeros(3), np.zeros(3), np.zeros(3), 0)}
 POSES = [se3.exp(np.array([0.05 * k, 0.02 * k, 0, 0, -0.02 * k, 0])) for k in range(6)]
 
 
@@ -125,7 +127,7 @@ def test_a_neighbours_map_shows_what_it_would_from_where_the_neighbour_stood() -
     hung = true.replace(anchors=anchors.astype(np.int32))
     evidence = Evidence.from_map("zulu", hung, None, poses)
     there = T_world_map @ poses
-    all_of_them = peer_views({"zulu": evidence}, {"zulu": there}, CAMERA, 40, "blended")
+    all_of_them = peer_views({"zulu": evidence}, {"zulu": there}, CAMERA, 40, "blended", colors=ALIKE)
     assert len(all_of_them) == 5  # three keyframes and the two places between them
     for k, view in enumerate(all_of_them[::2]):
         np.testing.assert_allclose(view.T_world_camera, there[k], atol=1e-12)
@@ -139,12 +141,12 @@ def test_a_neighbours_map_shows_what_it_would_from_where_the_neighbour_stood() -
         share = render.alpha[sure]
         np.testing.assert_allclose(view.depth_m[sure], render.depth[sure] / share, atol=1e-3)
         np.testing.assert_allclose(view.color[sure], 255 * render.color[sure] / share[:, None], atol=1)
-    some = peer_views({"zulu": evidence}, {"zulu": there}, CAMERA, 2, "blended", threads=2)
+    some = peer_views({"zulu": evidence}, {"zulu": there}, CAMERA, 2, "blended", threads=2, colors=ALIKE)
     assert [v.T_world_camera.tolist() for v in some] == [
         all_of_them[k].T_world_camera.tolist() for k in (1, 3)
     ]
     assert np.array_equal(some[0].color, all_of_them[1].color)
-    assert peer_views({}, {}, CAMERA, 40, "blended") == []
+    assert peer_views({}, {}, CAMERA, 40, "blended", colors=ALIKE) == []
 
 
 def test_neighbours_views_teach_what_own_ones_do_not_see(spoilt: tuple[Gaussians, list[View]]) -> None:

@@ -1,0 +1,216 @@
+"""How the cameras of a team see the same colours, from matched Gaussians alone.
+
+Every robot keeps the colours of its own camera; there is no right one. Per channel, a camera shows the colour s of a
+surface as c = (s - b) / a: gain (exposure, white balance) and offset. Of every pair of robots their matched Gaussians
+tell the ratio of the gains and the colours that correspond; over the team these make one linear problem. Everybody who
+holds the same evidence and pair lists solves the same problem, so nothing more is sent, and what a robot reads from a
+neighbour it puts into its own colours (`ColorMap`).
+
+Two robots' splats of one place differ in colour by noise in both, so a regression of one on the other would find a gain
+below one between equal cameras. The gain here is the ratio of the spreads (reduced major axis), which is the same
+whoever is asked; exact if noise grows with the gain. It lies between the two regressions, ratio * r and ratio / r with
+r the correlation, and counts as spread evenly between them (Frisch 1934): that is most of its standard deviation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.consensus.config import ColorConfig
+from pipeline.consensus.evidence import COLOR, Evidence, rows_by_id
+
+Array = NDArray[np.float64]
+Pairs = Mapping[tuple[str, str], NDArray[np.int64]]
+MAD_TO_SIGMA = 1.4826
+_ROUNDS = 20  # of reweighting
+_TUNING = 3.0  # standard deviations at which a pair counts a quarter
+_LEAST_SPREAD = 1e-3  # of colours; below it there is no contrast to compare
+_LEAST_CORRELATION = 0.05
+_COLOR_INFORMATION = slice(27, 30)
+
+
+@dataclass(frozen=True)
+class ColorMap:
+    """How one camera's colours c look to another: gain * c + offset, by channel [3]; their standard deviations.
+
+    sigma_gain: relative. sigma_offset: of the other camera's colour in the middle of the colours that were compared.
+    matches: pairs of Gaussians behind it, of these two robots. Where nothing was compared it is the identity.
+    """
+
+    gain: Array
+    offset: Array
+    sigma_gain: Array
+    sigma_offset: Array
+    matches: int
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether it changes nothing."""
+        return bool(np.all(self.gain == 1) and np.all(self.offset == 0))
+
+    def to_other(self, colors: NDArray[np.floating]) -> Array:
+        """Colours [n, 3] as the other camera shows them."""
+        return np.asarray(self.gain * colors + self.offset, dtype=np.float64)
+
+    def from_other(self, colors: NDArray[np.floating]) -> Array:
+        """The way back: colours [n, 3] of the other camera as this one shows them."""
+        return np.asarray((colors - self.offset) / self.gain, dtype=np.float64)
+
+    def of(self, evidence: Evidence) -> Evidence:
+        """Evidence in the other camera's colours; every bit is kept by the identity."""
+        if self.is_identity:
+            return evidence
+        theta, information = evidence.theta.copy(), evidence.information.copy()
+        theta[:, COLOR] = self.to_other(theta[:, COLOR])
+        information[:, _COLOR_INFORMATION] /= self.gain**2
+        return replace(evidence, theta=theta, information=information)
+
+
+@dataclass(frozen=True)
+class TeamColors:
+    """Every robot's way from its own colours c to common ones, scale * c + shift, by name, [3] each.
+
+    The common colours have no meaning but that everybody computes the same: those in which nobody's gain and offset
+    is far from one and zero. Covariances [r, r, 3] between robots, in order of name, of log scale and of shift.
+    """
+
+    robots: tuple[str, ...]
+    scale: dict[str, Array]
+    shift: dict[str, Array]
+    covariance_scale: Array
+    covariance_shift: Array
+    matches: dict[tuple[str, str], int]
+
+    def to_common(self, robot: str) -> ColorMap:
+        """From a robot's colours to the common ones."""
+        i = self.robots.index(robot)
+        return ColorMap(
+            self.scale[robot],
+            self.shift[robot],
+            np.sqrt(self.covariance_scale[i, i]),
+            np.sqrt(self.covariance_shift[i, i]),
+            sum(n for pair, n in self.matches.items() if robot in pair),
+        )
+
+    def between(self, robot: str, other: str) -> ColorMap:
+        """From a robot's colours to another's."""
+        i, j = self.robots.index(robot), self.robots.index(other)
+        scale = self.scale[other]
+        return ColorMap(
+            self.scale[robot] / scale,
+            (self.shift[robot] - self.shift[other]) / scale,
+            _sigma_of_difference(self.covariance_scale, i, j),
+            _sigma_of_difference(self.covariance_shift, i, j) / scale,
+            sum(n for pair, n in self.matches.items() if set(pair) == {robot, other}),
+        )
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """Two robots' colours of the same places, by channel [3]: log of the ratio of spreads, other over own, and its
+    variance; the middle of either's colours, and the variance of their difference in units of the geometric mean."""
+
+    log_ratio: Array
+    variance: Array
+    middle_own: Array
+    middle_other: Array
+    variance_middle: Array
+
+
+def team_colors(evidence: Mapping[str, Evidence], pairs: Pairs, config: ColorConfig) -> TeamColors:
+    """How the cameras of a team differ.
+
+    Args:
+        evidence: of every robot. pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians; those that
+            `evidence` lacks, or whose colours one of the two knows nothing of, are left out.
+    """
+    robots = tuple(sorted(evidence))
+    matches: dict[tuple[str, str], int] = {}
+    found: list[tuple[int, int, _Compared]] = []
+    for a, b in sorted(p for p in pairs if p[0] in evidence and p[1] in evidence):
+        own, other = _colors_of(evidence[a], evidence[b], pairs[a, b])
+        if config.enabled and len(own) >= config.min_matches:
+            matches[a, b] = len(own)
+            found.append((robots.index(a), robots.index(b), _compare(own, other, config)))
+    scale, shift = np.ones((len(robots), 3)), np.zeros((len(robots), 3))
+    of_scale, of_shift = (
+        np.zeros((len(robots), len(robots), 3)) + s**2 * np.eye(len(robots))[..., None]
+        for s in (config.prior_gain, config.prior_offset)
+    )
+    for k in range(3 if found else 0):
+        rows = [(i, j, c.log_ratio[k], c.variance[k]) for i, j, c in found]
+        log_gain, of_scale[..., k] = _differences(len(robots), rows, config.prior_gain)
+        scale[:, k] = np.exp(-log_gain)
+        rows = []
+        for i, j, c in found:
+            apart = scale[i, k] * c.middle_own[k] - scale[j, k] * c.middle_other[k]
+            rows.append((i, j, apart, scale[i, k] * scale[j, k] * c.variance_middle[k]))
+        shift[:, k], of_shift[..., k] = _differences(len(robots), rows, config.prior_offset)
+    return TeamColors(
+        robots,
+        dict(zip(robots, scale, strict=True)),
+        dict(zip(robots, shift, strict=True)),
+        of_scale,
+        of_shift,
+        matches,
+    )
+
+
+def _colors_of(own: Evidence, other: Evidence, ids: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Colours [m, 3] of matched Gaussians of which both robots know something."""
+    i, j = rows_by_id(ids[:, 0], own.ids), rows_by_id(ids[:, 1], other.ids)
+    here = (i >= 0) & (j >= 0)
+    i, j = i[here], j[here]
+    known = np.all(own.color_information()[i] > 0, axis=1) & np.all(other.color_information()[j] > 0, axis=1)
+    return own.theta[i[known], COLOR], other.theta[j[known], COLOR]
+
+
+def _compare(own: Array, other: Array, config: ColorConfig) -> _Compared:
+    """Compare matched colours [m, 3]; continuous in them, and the same with the two exchanged."""
+    middle = [np.median(x, axis=0) for x in (own, other)]
+    spread = [
+        MAD_TO_SIGMA * np.median(np.abs(x - m), axis=0) for x, m in zip((own, other), middle, strict=True)
+    ]
+    squares = [s**2 + _LEAST_SPREAD**2 for s in spread]
+    weight = np.ones_like(own)
+    for _ in range(_ROUNDS):
+        ratio = np.sqrt(squares[1] / squares[0])
+        x, y = own - middle[0], other - middle[1]
+        apart = (y - ratio * x) / np.sqrt(ratio)
+        sigma = MAD_TO_SIGMA * np.median(np.abs(apart), axis=0) + _LEAST_SPREAD
+        weight = 1 / (1 + (apart / (_TUNING * sigma)) ** 2) ** 2
+        total = weight.sum(axis=0)
+        middle = [(weight * c).sum(axis=0) / total for c in (own, other)]
+        x, y = own - middle[0], other - middle[1]
+        squares = [(weight * d**2).sum(axis=0) / total + _LEAST_SPREAD**2 for d in (x, y)]
+    correlation = (weight * x * y).sum(axis=0) / total / np.sqrt(squares[0] * squares[1])
+    correlation = np.clip(correlation, _LEAST_CORRELATION, 1.0)
+    samples = total / config.splats_per_sample
+    return _Compared(
+        0.5 * np.log(squares[1] / squares[0]),
+        (1 - correlation**2) / samples + np.log(correlation) ** 2 / 3 + config.sigma_floor**2,
+        middle[0],
+        middle[1],
+        sigma**2 / samples + config.sigma_floor**2,
+    )
+
+
+def _differences(robots: int, rows: list[tuple[int, int, float, float]], prior: float) -> tuple[Array, Array]:
+    """Values [r] of least squares of their differences x_j - x_i with variances, each (i, j, x_j - x_i, variance),
+    and of their own being zero within the prior; their covariance [r, r]."""
+    matrix, right = np.eye(robots) / prior**2, np.zeros(robots)
+    for i, j, difference, variance in rows:
+        matrix[[i, j], [i, j]] += 1 / variance
+        matrix[[i, j], [j, i]] -= 1 / variance
+        right[i] -= difference / variance
+        right[j] += difference / variance
+    covariance = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    return covariance @ right, covariance
+
+
+def _sigma_of_difference(covariance: Array, i: int, j: int) -> Array:
+    return np.sqrt(np.maximum(covariance[i, i] + covariance[j, j] - 2 * covariance[i, j], 0.0))

@@ -1,0 +1,29 @@
+"""How the robots' cameras see the same colours, as the robots found out (docs/consensus.md, "Colours")."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pipeline.evaluation.results import Absent
+from pipeline.fusion.stage import peer_colors
+from pipeline.run_folder import RobotRun
+
+CHANNELS = ("red", "green", "blue")
+VALUES = ("gain", "offset", "sigma_gain", "sigma_offset")
+
+
+def section(robot: RobotRun) -> dict[str, Any]:
+    """What this robot's camera makes of a colour c of the first robot of its component: gain * c + offset."""
+    first = robot.component[0]
+    names = [f"{value}_{channel}" for value in VALUES for channel in CHANNELS]
+    told = peer_colors(robot.folder / "fused.mcap", robot.robot).get(first)
+    if len(robot.component) < 2:
+        reason = Absent("this robot met nobody")
+    elif first == robot.robot:
+        reason = Absent("the others' cameras are held against this one")
+    else:
+        reason = Absent("the run has not recorded how cameras differ")
+    if told is None:
+        return dict.fromkeys(names, reason) | {"matches": reason}
+    values = [float(x) for value in VALUES for x in getattr(told, value)]
+    return dict(zip(names, values, strict=True)) | {"matches": told.matches}
