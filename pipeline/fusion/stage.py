@@ -53,7 +53,7 @@ def run_fusion(
     *,
     seed: int = 0,
     threads: int = 1,
-) -> FusedMap:
+) -> tuple[Doubt, ...]:
     """Write fused.mcap, fused.ply, refined.ply, trajectory.tum and odometry.tum of one robot.
 
     Args:
@@ -64,7 +64,7 @@ def run_fusion(
         moving: as the front end looked for what moves.
         seed: of the run. threads: of the rasterizer; changes no bit.
     Returns:
-        The fused map, in the world frame.
+        What own images say against every neighbour's map.
     """
     own = load(source)
     frames = _frames(source)
@@ -146,7 +146,7 @@ def run_fusion(
     before = np.array([f.T_map_camera for f in frames])
     write_tum(folder / "odometry.tum", Trajectory(stamps, before))
     write_tum(folder / "trajectory.tum", Trajectory(stamps, hung))
-    return fused
+    return trust.doubts
 
 
 def training_views(
