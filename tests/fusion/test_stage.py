@@ -190,6 +190,23 @@ def test_what_only_a_neighbour_saw_is_taken_over(robot, tmp_path):
     np.testing.assert_allclose(fused.gaussians.means[-1], [0, 0, -3.0])
 
 
+def test_a_neighbour_that_contradicts_own_images_is_left_out(robot, tmp_path):
+    """A white wall where bravo saw a dark one, and one more Gaussian where bravo never looked."""
+    x, y = np.meshgrid(np.arange(-1.4, 1.4, 0.05), np.arange(-1.1, 1.1, 0.05))
+    theta = np.zeros((x.size + 1, 13))
+    theta[:-1, :3] = np.stack([x, y, np.full_like(x, 2.0)], axis=-1).reshape(-1, 3)
+    theta[-1, :3] = [0, 0, -3.0]
+    theta[:, 3:6], theta[:, 9:12], theta[:, 12] = 2 * np.log(0.03), 1.0, 4.0
+    ids = np.arange(len(theta))
+    other = Evidence("alpha", ids, np.zeros(len(ids)), theta, np.ones((len(ids), 31)))
+    fused = fuse_files(robot, result_of(robot, robot.T_map_keyframe, alpha=other), tmp_path)[GaussianMap]
+    assert len(fused.gaussians) == N
+    (record,) = read_log(tmp_path / "fused.mcap", topics=[topics.NEIGHBOUR_DOUBT.of("bravo")])
+    said = record.message()
+    assert (said.neighbour, said.gaussians, said.used) == ("alpha", len(ids), False)
+    assert "contradicts own images" in said.reason
+
+
 def test_information_of_another_map_is_refused(robot, tmp_path):
     other = robot.sums.ids + 1
     with LogWriter(tmp_path / "information.mcap", "bravo") as log:
