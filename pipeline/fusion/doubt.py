@@ -124,9 +124,9 @@ def believed(
         views: own keyframes at their corrected poses. camera: of the views.
         matching: as the pairs were found. depth: as the maps were made. threads: changes no bit.
     """
-    images = [v.color if v.mask is None else v.color[v.mask] for v in views]
-    seen = np.concatenate([np.zeros((0, 3)), *(image.reshape(-1, 3) for image in images)]) / 255.0
-    grey = max(float(np.mean(np.var(seen, axis=0))) if len(seen) else 0.0, LEAST_GREY)
+    own_colors = _Spread()
+    for view in views:
+        own_colors.add(view.color[... if view.mask is None else view.mask])
     world = {own.owner: in_world(own, T_world_keyframe[own.owner], weights)}
     largest = LARGEST * _sizes_m(world[own.owner]).max(initial=0.0)
     kept, contradicted, doubts = {}, {}, []
@@ -137,7 +137,9 @@ def believed(
         told, there = told.select(possible), there.select(possible)
         judge = _Judge(views, camera, config, depth, threads)
         pair = _near(world[own.owner], there, _between(pairs, own.owner, name), matching)
-        against = judge.contradicted(_in_colors_of(world[own.owner], there, pair, matching), grey)
+        against = judge.contradicted(
+            _in_colors_of(world[own.owner], there, pair, matching), own_colors.variance
+        )
         doubt = Doubt(
             name,
             len(possible),
@@ -145,10 +147,10 @@ def believed(
             int(np.sum(against)),
             0,
             0,
-            judge.judged_px,
-            len(seen),
+            judge.own.pixels,
+            own_colors.pixels,
             judge.error,
-            judge.variance,
+            judge.own.variance,
         )
         used = slice(None) if doubt.trusted else slice(0, 0)
         kept[name], contradicted[name], world[name] = told.select(used), against[used], there.select(used)
@@ -203,8 +205,29 @@ def _with_pairs(doubt: Doubt, own: str, pairs: Pairs, true: Pairs) -> Doubt:
     return replace(doubt, pairs=count, refused=count - len(_between(true, own, doubt.neighbour)))
 
 
+class _Spread:
+    """How much colours 0..255 differ, summed as they come."""
+
+    def __init__(self) -> None:
+        self.pixels, self._sum, self._squares = 0, np.zeros(3), np.zeros(3)
+
+    def add(self, colors: NDArray[np.uint8]) -> None:
+        """Colours [..., 3]."""
+        c = colors.reshape(-1, 3).astype(np.float32) * np.float32(1 / 255)
+        self.pixels += len(c)
+        self._sum += c.sum(axis=0, dtype=np.float64)
+        self._squares += (c**2).sum(axis=0, dtype=np.float64)
+
+    @property
+    def variance(self) -> float:
+        """Mean over the channels, of colours 0..1; at least LEAST_GREY."""
+        n = max(self.pixels, 1)
+        return max(float(np.mean(self._squares / n - (self._sum / n) ** 2)), LEAST_GREY)
+
+
 class _Judge:
-    """Draws a map at own keyframes. judged_px, error, variance: as in `Doubt`, of the first drawing."""
+    """Draws a map at own keyframes. own, error: own colours at the judged pixels, mean squared error there, of the
+    first drawing."""
 
     def __init__(
         self,
@@ -216,7 +239,7 @@ class _Judge:
     ) -> None:
         self.views, self.camera, self.config, self.depth = views, camera, config, depth
         self.rasterizer = Rasterizer(threads=threads)
-        self.judged_px, self.error, self.variance = 0, 0.0, LEAST_GREY
+        self.own, self.error = _Spread(), 0.0
 
     def contradicted(self, world: Evidence, grey: float) -> NDArray[np.bool_]:
         """Which Gaussians [n] own images contradict."""
@@ -231,7 +254,7 @@ class _Judge:
     def _blame(self, gaussians: Gaussians, first: bool) -> Array:
         """Mean squared error of what each Gaussian draws [n], zero of too little."""
         errors, weights = np.zeros(len(gaussians)), np.zeros(len(gaussians))
-        total, seen, squares, judged_px = 0.0, np.zeros(3), np.zeros(3), 0
+        total = 0.0
         for view in self.views:
             T_camera_world = se3.inverse(view.T_world_camera)
             render = self.rasterizer.forward(
@@ -240,21 +263,15 @@ class _Judge:
             alpha = np.maximum(render.alpha, np.float32(COVERED))
             reach = view.depth_m * (1 + self.config.explained_relative) + self.config.explained_m
             judged = (render.alpha >= COVERED) & (view.depth_m > 0) & (render.depth / alpha <= reach)
-            own = view.color * np.float32(1 / 255)
-            off = render.color / alpha[..., None] - own
+            off = render.color / alpha[..., None] - view.color * np.float32(1 / 255)
             images = np.zeros_like(render.color)
             images[..., 0] = np.where(judged, np.mean(np.clip(off, -1, 1) ** 2, axis=2), 0)
             images[..., 1] = judged
-            sums = self.rasterizer.backward(
-                images
-            ).colors  # by colour: sums over pixels of weight times image
+            sums = self.rasterizer.backward(images).colors  # of weight times image, over the pixels
             errors, weights = errors + sums[:, 0], weights + sums[:, 1]
             total += float(images[..., 0].sum(dtype=np.float64))
-            judged_px += int(judged.sum())
-            seen += own[judged].sum(axis=0, dtype=np.float64)
-            squares += (own[judged] ** 2).sum(axis=0, dtype=np.float64)
+            if first:
+                self.own.add(view.color[judged])
         if first:
-            n = max(judged_px, 1)
-            self.judged_px, self.error = judged_px, total / n
-            self.variance = max(float(np.mean(squares / n - (seen / n) ** 2)), LEAST_GREY)
+            self.error = total / max(self.own.pixels, 1)
         return np.where(weights >= LEAST_PX, errors / np.maximum(weights, LEAST_PX), 0.0)
