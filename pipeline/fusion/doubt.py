@@ -8,8 +8,9 @@ than alone. So every neighbour's map is drawn where the robot's own keyframes st
 over pixels at which the neighbour's surface lies in front of the measured one or on it; what lies behind is hidden and
 says nothing. Colours are those that the own camera would show (`consensus.colors`, by the matches of this pair alone).
 A Gaussian is contradicted if its pixels are drawn worse than by one grey for everything: blame above the variance of
-the own images. So is a neighbour as a whole if its map does not explain half of that variance; honest ones explain five
-sixths and more. What no own keyframe saw cannot be judged.
+the own images. So is a neighbour as a whole if its map does not explain some of the variance of the pixels that it was
+judged on; honest ones explain two thirds and more, one colour for everything nothing. What no own keyframe saw cannot
+be judged.
 
 Matches are checked, too, because the lower-named robot of a pair speaks for it: two Gaussians that are not where each
 other are, or differ more than neighbours in the own map do, are none.
@@ -40,7 +41,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 NOTHING: Index = np.zeros((0, 2), np.int64)
 COVERED = 0.5  # opacity from which on a pixel shows a neighbour's surface
-EXPLAINED = 0.5  # of the variance of own images, that a map must explain to be used at all
+EXPLAINED = 0.3  # of the variance of own pixels, that a map must explain to be used at all
+LEAST_GREY = 0.01  # of images that show next to nothing, where errors of maps and poses count for more
 LEAST_PX = 4.0  # weight, in pixels, from which on a Gaussian is judged
 LEAST_SHARE = 0.01  # of the own pixels, from which on a neighbour is judged as a whole
 PASSES = 2  # what hid behind a contradicted Gaussian is judged in the second
@@ -57,7 +59,7 @@ class Doubt:
 
     gaussians: how many it sent. too_large, contradicted: how many of them are not used, by reason. pairs, refused: its
     matches with this robot, and how many of them are none. judged_px, own_px: own pixels on which its map was judged,
-    of how many. error: mean squared error of its colours there. grey: variance of the own images.
+    of how many. error: mean squared error of its colours there. variance: of the own ones, at least LEAST_GREY.
     """
 
     neighbour: str
@@ -69,12 +71,12 @@ class Doubt:
     judged_px: int
     own_px: int
     error: float
-    grey: float
+    variance: float
 
     @property
     def trusted(self) -> bool:
         """Whether its map shows what the own images show, as far as anybody can tell."""
-        return self.judged_px < LEAST_SHARE * self.own_px or self.error <= (1 - EXPLAINED) * self.grey
+        return self.judged_px < LEAST_SHARE * self.own_px or self.error <= (1 - EXPLAINED) * self.variance
 
     @property
     def reason(self) -> str:
@@ -82,8 +84,8 @@ class Doubt:
         if self.trusted:
             return ""
         return (
-            f"its map contradicts own images: squared error {self.error:.4f} on {self.judged_px} common pixels, "
-            f"one grey for everything has {self.grey:.4f}"
+            f"it contradicts own images: squared error {self.error:.4f} on {self.judged_px} common pixels, "
+            f"whose variance is {self.variance:.4f}"
         )
 
 
@@ -122,9 +124,9 @@ def believed(
         views: own keyframes at their corrected poses. camera: of the views.
         matching: as the pairs were found. depth: as the maps were made. threads: changes no bit.
     """
-    images = [v.color if v.mask is None else v.color[v.mask] for v in views]
-    seen = np.concatenate([np.zeros((0, 3)), *(image.reshape(-1, 3) for image in images)]) / 255.0
-    grey = float(np.mean(np.var(seen, axis=0))) if len(seen) else 0.0
+    own_colors = _Spread()
+    for view in views:
+        own_colors.add(view.color[... if view.mask is None else view.mask])
     world = {own.owner: in_world(own, T_world_keyframe[own.owner], weights)}
     largest = LARGEST * _sizes_m(world[own.owner]).max(initial=0.0)
     kept, contradicted, doubts = {}, {}, []
@@ -135,7 +137,9 @@ def believed(
         told, there = told.select(possible), there.select(possible)
         judge = _Judge(views, camera, config, depth, threads)
         pair = _near(world[own.owner], there, _between(pairs, own.owner, name), matching)
-        against = judge.contradicted(_in_colors_of(world[own.owner], there, pair, matching), grey)
+        against = judge.contradicted(
+            _in_colors_of(world[own.owner], there, pair, matching), own_colors.variance
+        )
         doubt = Doubt(
             name,
             len(possible),
@@ -143,10 +147,10 @@ def believed(
             int(np.sum(against)),
             0,
             0,
-            judge.judged_px,
-            len(seen),
+            judge.own.pixels,
+            own_colors.pixels,
             judge.error,
-            grey,
+            judge.own.variance,
         )
         used = slice(None) if doubt.trusted else slice(0, 0)
         kept[name], contradicted[name], world[name] = told.select(used), against[used], there.select(used)
@@ -201,8 +205,29 @@ def _with_pairs(doubt: Doubt, own: str, pairs: Pairs, true: Pairs) -> Doubt:
     return replace(doubt, pairs=count, refused=count - len(_between(true, own, doubt.neighbour)))
 
 
+class _Spread:
+    """How much colours 0..255 differ, summed as they come."""
+
+    def __init__(self) -> None:
+        self.pixels, self._sum, self._squares = 0, np.zeros(3), np.zeros(3)
+
+    def add(self, colors: NDArray[np.uint8]) -> None:
+        """Colours [..., 3]."""
+        c = colors.reshape(-1, 3).astype(np.float32) * np.float32(1 / 255)
+        self.pixels += len(c)
+        self._sum += c.sum(axis=0, dtype=np.float64)
+        self._squares += (c**2).sum(axis=0, dtype=np.float64)
+
+    @property
+    def variance(self) -> float:
+        """Mean over the channels, of colours 0..1; at least LEAST_GREY."""
+        n = max(self.pixels, 1)
+        return max(float(np.mean(self._squares / n - (self._sum / n) ** 2)), LEAST_GREY)
+
+
 class _Judge:
-    """Draws a map at own keyframes. judged_px, error: pixels and mean squared error of the first drawing."""
+    """Draws a map at own keyframes. own, error: own colours at the judged pixels, mean squared error there, of the
+    first drawing."""
 
     def __init__(
         self,
@@ -214,7 +239,7 @@ class _Judge:
     ) -> None:
         self.views, self.camera, self.config, self.depth = views, camera, config, depth
         self.rasterizer = Rasterizer(threads=threads)
-        self.judged_px, self.error = 0, 0.0
+        self.own, self.error = _Spread(), 0.0
 
     def contradicted(self, world: Evidence, grey: float) -> NDArray[np.bool_]:
         """Which Gaussians [n] own images contradict."""
@@ -222,16 +247,14 @@ class _Judge:
         against = np.zeros(len(world), bool)
         for turn in range(PASSES):
             rows = np.flatnonzero(~against)
-            blame, judged_px, error = self._blame(gaussians.select(rows))
+            blame = self._blame(gaussians.select(rows), first=turn == 0)
             against[rows[blame > grey]] = True
-            if turn == 0:
-                self.judged_px, self.error = judged_px, error
         return against
 
-    def _blame(self, gaussians: Gaussians) -> tuple[Array, int, float]:
-        """Mean squared error of what each Gaussian draws [n], zero of too little; judged pixels; their mean error."""
+    def _blame(self, gaussians: Gaussians, first: bool) -> Array:
+        """Mean squared error of what each Gaussian draws [n], zero of too little."""
         errors, weights = np.zeros(len(gaussians)), np.zeros(len(gaussians))
-        total, judged_px = 0.0, 0
+        total = 0.0
         for view in self.views:
             T_camera_world = se3.inverse(view.T_world_camera)
             render = self.rasterizer.forward(
@@ -244,13 +267,11 @@ class _Judge:
             images = np.zeros_like(render.color)
             images[..., 0] = np.where(judged, np.mean(np.clip(off, -1, 1) ** 2, axis=2), 0)
             images[..., 1] = judged
-            sums = self.rasterizer.backward(
-                images
-            ).colors  # by colour: sums over pixels of weight times image
+            sums = self.rasterizer.backward(images).colors  # of weight times image, over the pixels
             errors, weights = errors + sums[:, 0], weights + sums[:, 1]
-            total, judged_px = (
-                total + float(images[..., 0].sum(dtype=np.float64)),
-                judged_px + int(judged.sum()),
-            )
-        blame = np.where(weights >= LEAST_PX, errors / np.maximum(weights, LEAST_PX), 0.0)
-        return blame, judged_px, total / max(judged_px, 1)
+            total += float(images[..., 0].sum(dtype=np.float64))
+            if first:
+                self.own.add(view.color[judged])
+        if first:
+            self.error = total / max(self.own.pixels, 1)
+        return np.where(weights >= LEAST_PX, errors / np.maximum(weights, LEAST_PX), 0.0)

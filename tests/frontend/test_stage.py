@@ -16,7 +16,7 @@ from pipeline.frontend.stage import LATENCY_NS, _support, depth_noise_m, run_fro
 from pipeline.frontend.tracked import Status, TrackedFrame
 from pipeline.geometry import se3
 from pipeline.geometry.trajectory import ate_rmse_m
-from pipeline.recording import content_digest, read_log
+from pipeline.recording import content_digest, log_metadata, read_log
 from pipeline.registration.moving import MovingConfig
 from schemas import topics
 from tests.registration.room import CAMERA, pose, render
@@ -134,6 +134,7 @@ def test_map_is_grown_at_the_refined_keyframes(sensor_log: Path) -> None:
     assert updates[-1].total == len(final[0].gaussians)
     (unrefined,) = messages(out, topics.UNREFINED_MAP)
     assert final[0].depth == unrefined.depth == "ray_plane"  # the log's depth is exact
+    assert 0.0 < float(log_metadata(out)["depth_noise_m"]) < 0.001
     assert len(unrefined.gaussians) == updates[-2].total
     common = np.intersect1d(unrefined.gaussians.ids, final[0].gaussians.ids)
     assert len(common) > 50  # the refinement replaces some and moves the others

@@ -70,7 +70,7 @@ def test_an_honest_neighbour_is_believed(views):
     assert doubt.trusted
     assert doubt.reason == ""
     assert (doubt.too_large, doubt.contradicted, doubt.refused) == (0, 0, 0)
-    assert doubt.error < 0.1 * doubt.grey
+    assert doubt.error < 0.1 * doubt.variance
     assert doubt.judged_px > 0.5 * doubt.own_px
     assert len(trust.evidence["bravo"]) == len(trust.pairs["alpha", "bravo"]) == doubt.pairs == N
 
