@@ -106,6 +106,11 @@ def test_what_looks_unlike_is_followed_only_where_it_was_expected(run: Undisturb
     beyond = replace(beyond, index=here.index, stamp_ns=here.stamp_ns)
     found = [d.track(run.tracker(START), shot)[0] for shot in (here, beyond, unlike(here), unlike(beyond))]
     assert [frame.status for frame in found] == [Status.OK, Status.OK, Status.OK, Status.LOST]
+    all_of_it = {"tracking": {"strides": (2, 1, 1, 1), "failure": {"min_overlap_unlike": 1.0}}}
+    for shot, status in ((here, Status.OK), (unlike(here), Status.LOST)):
+        tracker = run.tracker(START)
+        tracker.config = FrontendConfig.model_validate(all_of_it)
+        assert d.track(tracker, shot)[0].status is status
 
 
 def _drifted(run: Undisturbed) -> Tracker:

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -235,27 +234,7 @@ def test_red_kitchen_is_never_silently_wrong(
     run = Undisturbed(Tracker(camera, FrontendConfig()), shots, starts)
     lost = [frame.frame_index for frame in run.frames if frame.status is Status.LOST]
     assert not lost
-    size = (camera.width, camera.height)
-    there = [
-        Shot(
-            s.index,
-            s.stamp_ns,
-            cv2.resize(s.color, size),
-            cv2.resize(s.depth, size, interpolation=cv2.INTER_NEAREST),
-        )
-        for s in other_room
-    ]
-    every = (
-        d.covered,
-        d.hand,
-        d.foreign(there),
-        d.mirrored,
-        d.dropped,
-        d.frozen,
-        d.frozen_color,
-        d.flipped,
-        d.depthless,
-    )
+    every = d.every(d.resized(other_room, camera))
     wrong, found = [], 0
     for start in starts:
         for disturbance in every:
