@@ -171,7 +171,9 @@ def run(
         for robot, result in results.items():
             say(f"fusion: {robot}")
             with timing.stage("fusion", robot):
-                fuse_robot(robot, logs[robot], robots[robot], result, config)
+                left_out = fuse_robot(robot, logs[robot], robots[robot], result, config)
+            for neighbour, reason in left_out.items():
+                say(f"warning: {robot} uses nothing of {neighbour}'s map: {reason}")
         _write_json(folder / "manifest.json", _manifest(recording, folder, config))
         _write_json(folder / "timing.json", {"stages": timing.stages})
         say("evaluation")
@@ -202,11 +204,15 @@ def agent_input(robot: str, log: Path, folder: Path) -> AgentInput:
     return AgentInput(robot, log, folder / "frontend.mcap", folder / "information.mcap")
 
 
-def fuse_robot(robot: str, log: Path, folder: Path, result: AgentResult, config: RunConfig) -> None:
-    """Fused map and corrected trajectory of one robot, into the folder of its own results; one robot at a time."""
+def fuse_robot(robot: str, log: Path, folder: Path, result: AgentResult, config: RunConfig) -> dict[str, str]:
+    """Fused map and corrected trajectory of one robot, into the folder of its own results; one robot at a time.
+
+    Returns:
+        Neighbours of whose maps nothing is used, and why.
+    """
     from pipeline.fusion.stage import run_fusion
 
-    run_fusion(
+    doubts = run_fusion(
         agent_input(robot, log, folder),
         result,
         folder,
@@ -217,6 +223,7 @@ def fuse_robot(robot: str, log: Path, folder: Path, result: AgentResult, config:
         seed=config.seed,
         threads=threads_per_worker(1),
     )
+    return {doubt.neighbour: doubt.reason for doubt in doubts if not doubt.trusted}
 
 
 def _evaluate(folder: Path, recording: Path, timing: Timing) -> None:

@@ -170,6 +170,13 @@ CORRECTED_KEYFRAMES = Topic(
     Scope.ROBOT,
     "keyframe poses after consensus",
 )
+NEIGHBOUR_DOUBT = Topic(
+    "/<robot>/neighbour_doubt",
+    "duagc.v1.NeighbourDoubt",
+    "fusion",
+    Scope.ROBOT,
+    "what own images say against a neighbour's map, and whether it is used",
+)
 PEER_COLORS = Topic(
     "/<robot>/peer_colors",
     "duagc.v1.PeerColors",
@@ -242,6 +249,7 @@ TOPICS: tuple[Topic, ...] = (
     FUSED_MAP,
     REFINED_MAP,
     CORRECTED_KEYFRAMES,
+    NEIGHBOUR_DOUBT,
     PEER_COLORS,
     PEER_MESSAGE,
     PEER_PACKET,

@@ -64,13 +64,3 @@ def test_broken_file_is_named(tmp_path: Path) -> None:
         load(Whole, path)
     with pytest.raises(DuagError, match=r"absent\.toml"):
         load(Whole, tmp_path / "absent.toml")
-
-
-def test_the_settings_for_exact_depth_are_settings_of_a_run() -> None:
-    """The file that docs/mapping.md tells users to pass."""
-    from pipeline.runner import RunConfig
-
-    config = load(RunConfig, Path(__file__).parents[1] / "docs" / "exact-depth.toml")
-    assert config.frontend.mapping.depth == "ray_plane"
-    assert config.fusion.refine.loss == config.frontend.mapping.loss
-    assert config.frontend.mapping.loss.surface_weight > 0

@@ -77,8 +77,8 @@ def bench_consensus(
 ) -> None:
     """What it costs a team to agree on matched Gaussians, mode by mode, against the central optimum.
 
-    Lists are separated by commas; every combination is a row. The defaults take some minutes. With --run,
-    robots, contrast, unknown and tracks are those of the run.
+    Lists are separated by commas; every combination is a row, of two robots in full topology only. The defaults
+    take some minutes. With --run, robots, contrast, unknown and tracks are those of the run.
 
     Examples: `duagc bench consensus --robots 4 --topology chain --loss 0,0.9 --contrast 47`,
     `duagc bench consensus --run outputs/redkitchen --topology full --loss 0 --mode evidence,admm,paper`
@@ -104,6 +104,10 @@ def bench_consensus(
         seed=seed,
     )
     if of_run is None:
+        if min(plan.robots) < 2 or not plan.cases():
+            raise typer.BadParameter(
+                "a team takes two robots, a ring, chain or star three", param_hint="--robots"
+            )
         result = bench.run(plan)
     else:
         from pipeline.evaluation.modes import team_of_run

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import EXIT_FAILED, Force, Json, Out, app, say
+from pipeline.cli.common import EXIT_FAILED, ConfigFile, Force, Json, Out, Overrides, app, say
 from pipeline.errors import DuagError
 
 
@@ -193,6 +193,38 @@ def check(
     print(json.dumps(report.plain(), indent=2) if as_json else checks.format_report(report))
     if not report.sound:
         raise typer.Exit(EXIT_FAILED)
+
+
+@app.command()
+def calibrate(
+    path: Annotated[Path, typer.Argument(metavar="RECORDING", show_default=False)],
+    robots: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--robot", help="Only this robot; repeatable. All, if none: they have one kind of camera."
+        ),
+    ] = None,
+    views: Annotated[int, typer.Option(min=12, help="Most views of each half of the recording.")] = 56,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    as_json: Json = False,
+) -> None:
+    """Estimate lens, rotation between the cameras and depth error of an RGB-D recording from its own images.
+
+    Prints every number with its standard deviation, a check of each half by the other, and options for the converter.
+    Ground truth is not looked at. An error if the images do not determine the cameras.
+
+    Example: `duagc calibrate recordings/redkitchen`
+    """
+    from pipeline import numeric
+    from pipeline.calibration import calibrate as calibrate_recording
+    from pipeline.calibration import report
+    from pipeline.config import load
+    from pipeline.runner import RunConfig
+
+    numeric.settle_opencv()
+    found = calibrate_recording(path, load(RunConfig, config, overrides or []).frontend, robots or [], views)
+    print(json.dumps(report.plain(found), indent=2) if as_json else report.format_calibration(found))
 
 
 @app.command()

@@ -176,7 +176,6 @@ def _compare(own: Array, other: Array, config: ColorConfig) -> _Compared:
         MAD_TO_SIGMA * np.median(np.abs(x - m), axis=0) for x, m in zip((own, other), middle, strict=True)
     ]
     squares = [s**2 + _LEAST_SPREAD**2 for s in spread]
-    weight = np.ones_like(own)
     for _ in range(_ROUNDS):
         ratio = np.sqrt(squares[1] / squares[0])
         x, y = own - middle[0], other - middle[1]

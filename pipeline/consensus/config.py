@@ -51,10 +51,11 @@ class PoseConsensusConfig(Config):
     """The factorisation is kept until rotations moved this much in sum."""
     step_limit_rad: float = Field(default=0.3, gt=0.0)
     """A step that turns some keyframe more than this is shortened; nonlinearity makes longer ones worthless."""
-    tolerance: float = Field(default=1e-5, gt=0.0)
+    tolerance: float = Field(default=2e-6, gt=0.0)
     """An end is settled when its steps and edge variables change less than this (m, rad)."""
-    wire: Literal["float32", "float64"] = "float32"
-    """Precision of poses in a packet."""
+    wire: Literal["fixed", "float32", "float64"] = "fixed"
+    """Poses in a packet: rotations in float32 and translations in steps of 7.5 nm, wherever the world has its origin;
+    all in float32, which is 15 um a kilometre from there; or not rounded at all."""
     robust: bool = True
     """Weigh closures by graduated non-convexity, truncated least squares; if not, `keep` decides alone."""
     truncation: float = Field(default=7.5, gt=0.0)

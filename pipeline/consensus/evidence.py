@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.consensus.factors import inflated
-from pipeline.geometry import se3, spd
+from pipeline.geometry import se3, so3, spd
 from pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]
@@ -25,6 +25,8 @@ MEAN, LOG_COVARIANCE, COLOR, OPACITY = slice(0, 3), slice(3, 9), slice(9, 12), 1
 """Places in theta."""
 SHAPE_FLOOR = 0.1
 """Least standard deviation of a coordinate of vec log Sigma: 5 % of a scale."""
+LEAST_DEVIATION_M = 1e-4
+"""Deviation of a mean from the measured surface below which nobody claims to know that surface."""
 _POSITION, _SHAPE, _COLOR, _OPACITY = slice(0, 6), slice(6, 27), slice(27, 30), 30
 
 
@@ -123,8 +125,9 @@ class Evidence:
         """What a robot can tell others of its own map, each Gaussian in the frame of its anchor.
 
         The sums of the images hold everything but one Gaussian fixed; what others want to know is where the surface is.
-        So the mean's deviation from the measured surface is added to its covariance, and nobody knows a shape better
-        than `SHAPE_FLOOR`. No information stays none.
+        The depth images say that it lies within the measured deviation of the mean, across the disc, however little
+        the sums know of one splat among many; and nobody knows it better: the deviation's square is added to the
+        mean's covariance. Nobody knows a shape better than `SHAPE_FLOOR`. No information stays none.
 
         Args:
             owner: the robot.
@@ -137,9 +140,10 @@ class Evidence:
         if information is not None and len(rows):
             deviation_m = np.zeros(len(gaussians))
             deviation_m[rows >= 0] = information.deviation_m[rows[rows >= 0]]
-            position = inflated(
-                unpack_symmetric(packed[:, _POSITION], 3), deviation_m[:, None, None] ** 2 * np.eye(3)
-            )
+            sums = unpack_symmetric(packed[:, _POSITION], 3)
+            known = (sums != 0).any(axis=(1, 2), keepdims=True)
+            across = known * _across_surface(gaussians, deviation_m)
+            position = inflated(sums + across, deviation_m[:, None, None] ** 2 * np.eye(3))
             shape = inflated(unpack_symmetric(packed[:, _SHAPE], 6), SHAPE_FLOOR**2 * np.eye(6))
             packed[:, _POSITION], packed[:, _SHAPE] = pack_symmetric(position), pack_symmetric(shape)
         in_map = Evidence(owner, gaussians.ids, gaussians.anchors, theta_of(gaussians), packed)
@@ -203,6 +207,17 @@ class Evidence:
     def opacity_information(self) -> Array:
         """[n], over the logit."""
         return self.information[:, _OPACITY]
+
+
+def _across_surface(gaussians: Gaussians, deviation_m: Array) -> Array:
+    """Information [n, 3, 3], 1/m^2, of surfaces within the deviation [n] of means, along the discs' normals."""
+    rows = np.arange(len(gaussians))
+    axes = so3.from_quat_wxyz(gaussians.quats_wxyz.astype(np.float64))
+    normal = (
+        axes[rows, :, np.argmin(gaussians.log_scales, axis=1)]
+        / np.maximum(deviation_m, LEAST_DEVIATION_M)[:, None]
+    )
+    return np.asarray(normal[:, :, None] * normal[:, None, :], dtype=np.float64)
 
 
 def _sums_of(gaussians: Gaussians, information: FisherSums | None) -> tuple[Array, NDArray[np.int64]]:

@@ -15,6 +15,8 @@ from pipeline.consensus.factors import Factors
 from pipeline.consensus.robust import RobustWeights
 
 Array = NDArray[np.float64]
+STEP_M = 2.0**-27
+"""Steps of translations on the wire `fixed`: 7.5 nm."""
 BLOCK = [0, 0, 0, 1, 1, 1]
 """Translation, rotation -> the six rows of a tangent."""
 REMEMBERED = 8
@@ -39,7 +41,8 @@ class PosePacket:
     """One direction of one link in one round. It may be cut by keyframe; every part is useful alone.
 
     sequence: counts the sender's packets on this link. version: of the penalties. keyframes: int32 [s], indices of
-    the non-holder's keyframes. quats_wxyz [s, 4], translations [s, 3] (m): 2 x - y in the sender's world frame.
+    the non-holder's keyframes. quats_wxyz [s, 4], translations [s, 3] (m): 2 x - y in the sender's world frame; both
+    float32, both float64, or translations alone float64: multiples of STEP_M.
     penalties: float32 [2] (translation, rotation) of this version. curvature: float32 [2] or None, the stiffness that
     the sender met in this version. converged: the sender is settled.
     """
@@ -126,6 +129,13 @@ class Link:
         change means.
         """
         return float(self.changes.max())
+
+
+def rounded_translations(translations: Array, wire: str) -> NDArray[Any]:
+    """Translations [s, 3] as they stand in a packet: float64 (rounded to STEP_M for `fixed`) or float32."""
+    if wire == "fixed":
+        return np.asarray(np.rint(translations / STEP_M) * STEP_M)
+    return translations.astype(wire)
 
 
 def link_metric(

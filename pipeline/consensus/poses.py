@@ -42,7 +42,14 @@ from pipeline.consensus import factors as pose_factors
 from pipeline.consensus.closures import Closure, closure_factors
 from pipeline.consensus.config import PoseConsensusConfig
 from pipeline.consensus.factors import Factors, difference, inflated, retract
-from pipeline.consensus.links import BLOCK, Link, PosePacket, SharedKeyframes, link_metric
+from pipeline.consensus.links import (
+    BLOCK,
+    Link,
+    PosePacket,
+    SharedKeyframes,
+    link_metric,
+    rounded_translations,
+)
 from pipeline.consensus.robust import COUNTS, RobustWeights
 from pipeline.geometry import se3, so3
 
@@ -250,8 +257,10 @@ class PoseAgent:
             sequence=link.sent,
             version=link.version,
             keyframes=link.keyframes,
-            quats_wxyz=so3.to_quat_wxyz(m[:, :3, :3]).astype(self.config.wire),
-            translations=m[:, :3, 3].astype(self.config.wire),
+            quats_wxyz=so3.to_quat_wxyz(m[:, :3, :3]).astype(
+                "float64" if self.config.wire == "float64" else "float32"
+            ),
+            translations=rounded_translations(m[:, :3, 3], self.config.wire),
             penalties=link.penalties.astype(np.float32),
             curvature=None if curvature is None else curvature.astype(np.float32),
             converged=self.settled,

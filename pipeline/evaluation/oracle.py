@@ -162,7 +162,8 @@ def _gaussian_gaps(
     matched = best.members[: len(own)] > 1
     theta = theta_of(run.robots[robot].fused_map.gaussians.select(slice(0, len(own))))
     information = Evidence("", own.ids, own.anchors, theta, best.information[: len(own)])
-    roots = np.sqrt(Weights.of(information).diagonal())
+    # where nobody knows a coordinate, rounding may leave a little less than nothing
+    roots = np.sqrt(np.maximum(Weights.of(information).diagonal(), 0.0))
     gaps = np.abs(theta - theta_of(best.gaussians)[: len(own)]) * roots
     return np.asarray(gaps[matched].max(axis=1, initial=0.0))
 

@@ -123,6 +123,14 @@ class PlacesConfig(Config):
     """Least information about the two robots that a sample must promise, in nats; 0: all that the budget allows."""
 
 
+class PeerRegistrationConfig(RegistrationConfig):
+    """Registration of two robots' views, whose cameras may differ."""
+
+    max_gain: float = 4.0
+    """The gain must lie between 1 / max_gain and max_gain. A covered lens, which less would find out, has no features
+    that agree on a motion."""
+
+
 class VerificationConfig(Config):
     """From a candidate to a closure: RANSAC over 3-D matches, then registration."""
 
@@ -138,7 +146,7 @@ class VerificationConfig(Config):
     """Points with normal and intensity of the neighbour's keyframe used by the registration."""
     max_refinement_m: float = Field(default=0.15, gt=0.0)
     """Largest translation by which the registration may change what RANSAC found."""
-    registration: RegistrationConfig = RegistrationConfig()
+    registration: PeerRegistrationConfig = PeerRegistrationConfig()
     """The registration itself."""
     max_refinement_rad: float = Field(default=0.10, gt=0.0)
     """Largest rotation by which the registration may change what RANSAC found."""

@@ -39,15 +39,24 @@ class MappingStats:
 class Mapper:
     """Grow and refine the Gaussian map of one robot."""
 
-    def __init__(self, camera: PinholeCamera, config: MappingConfig, seed: int, threads: int = 1) -> None:
+    def __init__(
+        self,
+        camera: PinholeCamera,
+        config: MappingConfig,
+        seed: int,
+        threads: int = 1,
+        depth_noise_m: float | None = None,
+    ) -> None:
         """Args:
         seed: of the run; the window's lots and the order of the refinement are drawn from it.
+        depth_noise_m: standard deviation of the depth images, metres, for `config.depth` = auto; None: nobody knows.
         threads: of the rasterizer; changes no bit of the map.
         """
         self.config, self.seed = config, seed
         self.cameras = (camera, camera.halved())
         self.rasterizer = Rasterizer(threads=threads)
-        self._loss_weights = LossWeights(**config.loss.model_dump())
+        self.depth = config.depth_kind(depth_noise_m)
+        self._loss_weights = LossWeights(**config.loss.of(self.depth).model_dump())
         self._gaussians = Gaussians.empty()
         self._adam = CompiledAdam(threads=threads)
         self._views: list[View] = []
@@ -86,7 +95,7 @@ class Mapper:
         """
         if keyframe_index != len(self._views):
             raise ValueError(f"keyframe {keyframe_index} added after {len(self._views)} keyframes")
-        huber_m = self.config.loss.depth_huber_m
+        huber_m = self._loss_weights.depth_huber_m
         view = View.of(keyframe_index, color, depth_m, T_map_camera, mask, depth_sigma_m, huber_m)
         self._views.append(view)
         self._adam.freeze_after(self.config.stable_steps or None)
@@ -136,7 +145,7 @@ class Mapper:
         It seeds no Gaussians. Never give a frame that is held out for evaluation.
         """
         T_map_camera = self._views[keyframe_index].T_map_camera @ T_keyframe_camera
-        huber_m = self.config.loss.depth_huber_m
+        huber_m = self._loss_weights.depth_huber_m
         view = View.of(keyframe_index, color, depth_m, T_map_camera, mask, depth_sigma_m, huber_m)
         self._support.append((view, T_keyframe_camera))
 
@@ -181,7 +190,7 @@ class Mapper:
             self.cameras[level],
             se3.inverse(view.T_map_camera),
             mask=mask,
-            depth=self.config.depth,
+            depth=self.depth,
         )
 
     def _loss(self, view: View, level: int) -> float:
@@ -198,7 +207,7 @@ class Mapper:
             self._loss_weights,
             exposure=view.exposure,
             mask=view.usable(level),
-            depth=self.config.depth,
+            depth=self.depth,
             depth_certainty=view.certainty if level == 0 else view.half_certainty,
         )
 

@@ -1,8 +1,12 @@
 """Configuration of the mapping."""
 
+from typing import Literal
+
+from pydantic import Field
+
 from pipeline.config import Config
 from pipeline.splat.gaussians import DepthKind
-from pipeline.splat.losses import LossConfig
+from pipeline.splat.losses import MapLossConfig
 from pipeline.splat.optimiser import LearningRates
 from pipeline.splat.seeding import SeedingConfig
 
@@ -40,9 +44,12 @@ class MappingConfig(Config):
     """The final refinement's learning rates fall exponentially to this share."""
     stable_steps: int = 0
     """Steps after which a Gaussian is stable: frozen until the final refinement; 0: never."""
-    depth: DepthKind = "blended"
-    """Depth of a Gaussian at a pixel: that of its centre (`blended`), or of its disc along the ray (`ray_plane`)."""
-    loss: LossConfig = LossConfig()
+    depth: DepthKind | Literal["auto"] = "auto"
+    """Depth of a Gaussian at a pixel: that of its centre (`blended`), or of its disc along the ray (`ray_plane`).
+    `auto`: `ray_plane` where the measured noise of the depth images is below `exact_depth_m`."""
+    exact_depth_m: float = Field(default=0.002, ge=0.0)
+    """Depth that agrees this well from frame to frame tells the surface of every single Gaussian."""
+    loss: MapLossConfig = MapLossConfig()
     seeding: SeedingConfig = SeedingConfig()
     min_opacity: float = 0.03
     """Gaussians below are pruned."""
@@ -59,3 +66,9 @@ class MappingConfig(Config):
     exposure: bool = False
     """Fit a gain and an offset per view; the map ends in the mean exposure of its keyframes."""
     exposure_rate: float = 2e-3
+
+    def depth_kind(self, depth_noise_m: float | None) -> DepthKind:
+        """How the Gaussians' depth is drawn; depth_noise_m: of the depth images, None: nobody knows."""
+        if self.depth != "auto":
+            return self.depth
+        return "ray_plane" if depth_noise_m is not None and depth_noise_m < self.exact_depth_m else "blended"

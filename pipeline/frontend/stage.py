@@ -67,19 +67,21 @@ def run_frontend(
             raise DuagError(
                 f"{log_path}: found no frame to begin a map with ({', '.join(reasons)}), expected one with depth"
             )
+        noise_m = depth_noise_m(frames)
         clock.lap("tracking_s")
         refined, pairs = _refine(log, tracker, config, seed)
         keyframes = _keyframe_messages(log.robot, tracker.keyframes, refined)
         factors = _factor_messages(log.robot, tracker.keyframes, pairs, refined)
         clock.lap("refinement_s")
-        updates, maps, frames = _map(log, keyframes, frames, config, seed, threads, progress, clock)
+        updates, maps, frames = _map(log, keyframes, frames, noise_m, config, seed, threads, progress, clock)
         clock.lap("final_refinement_s")
-        alone = {
+        notes = {
             "color_without_depth": str(len(log.pairing.color_alone)),
             "depth_without_color": str(len(log.pairing.depth_alone)),
+            "depth_noise_m": "unknown" if noise_m is None else f"{noise_m:.6f}",
         }
     odometry = [_odometry(log.robot, frame, refined.T_map_keyframe) for frame in frames]
-    _write(out_path, log.robot, odometry, keyframes, factors, updates, maps, alone)
+    _write(out_path, log.robot, odometry, keyframes, factors, updates, maps, notes)
     clock.lap("writing_s")
     return clock.laps
 
@@ -178,6 +180,7 @@ def _map(
     log: RgbdLog,
     keyframes: Sequence[Keyframe],
     frames: list[TrackedFrame],
+    noise_m: float | None,
     config: FrontendConfig,
     seed: int,
     threads: int,
@@ -190,7 +193,7 @@ def _map(
     """
     if not config.mapping_enabled:
         clock.lap("mapping_s")
-        return [], _Maps(Gaussians.empty(), None, config.mapping.depth), frames
+        return [], _Maps(Gaussians.empty(), None, config.mapping.depth_kind(noise_m)), frames
     from pipeline.frontend.mapping import Mapper, MappingStats
 
     def update(keyframe: Keyframe, stats: MappingStats) -> MapUpdate:
@@ -205,7 +208,7 @@ def _map(
             stats.loss_after,
         )
 
-    mapper = Mapper(log.camera, config.mapping, seed, threads=threads)
+    mapper = Mapper(log.camera, config.mapping, seed, threads, noise_m)
     free = FreeSpace(log.camera, config.moving)
     for keyframe in keyframes:
         free.add(log.frame(keyframe.frame_index).usable_depth, keyframe.T_map_camera)
@@ -224,7 +227,7 @@ def _map(
         updates.append(update(keyframe, stats))
     unrefined = mapper.gaussians
     clock.lap("mapping_s")
-    frames = _refine_to_model(log, unrefined, keyframes, frames, config, threads, progress)
+    frames = _refine_to_model(log, unrefined, mapper.depth, keyframes, frames, config, threads, progress)
     clock.lap("model_s")
     for supporting in _support(frames, keyframes, config):
         frame = log.frame(supporting.frame_index)
@@ -238,12 +241,23 @@ def _map(
             depth_sigma_m=frame.depth_sigma,
         )
     updates.append(update(keyframes[-1], mapper.finish()))
-    return updates, _Maps(mapper.gaussians, unrefined, config.mapping.depth), frames
+    return updates, _Maps(mapper.gaussians, unrefined, mapper.depth), frames
+
+
+def depth_noise_m(frames: Sequence[TrackedFrame]) -> float | None:
+    """Noise of the depth images, metres: the median over the frames of what is left between two registered ones."""
+    rms_m = [
+        frame.rms_depth_m
+        for frame in frames
+        if frame.status is Status.OK and frame.reason is Reason.NONE and frame.rms_depth_m > 0
+    ]
+    return float(np.median(rms_m)) if rms_m else None
 
 
 def _refine_to_model(
     log: RgbdLog,
     gaussians: Gaussians,
+    depth: DepthKind,
     keyframes: Sequence[Keyframe],
     frames: Sequence[TrackedFrame],
     config: FrontendConfig,
@@ -253,9 +267,7 @@ def _refine_to_model(
     """The frames with those between keyframes registered to the map, where that pays."""
     from pipeline.frontend.model import ModelTracker
 
-    model = ModelTracker(
-        gaussians, config.mapping.depth, log.camera, config.model, config.tracking.registration, threads
-    )
+    model = ModelTracker(gaussians, depth, log.camera, config.model, config.tracking.registration, threads)
     taken = {keyframe.frame_index for keyframe in keyframes}
     refined = []
     for frame in progress_bar.track(frames, f"model {log.robot}") if progress else frames:
@@ -320,7 +332,7 @@ def _write(
     factors: Sequence[KeyframeFactor],
     updates: Sequence[MapUpdate],
     maps: _Maps,
-    alone: Mapping[str, str],
+    notes: Mapping[str, str],
 ) -> None:
     """One message per frame, then what its keyframe did, in the order of time; the maps at the end."""
     keyframe_of = {keyframe.frame_index: keyframe for keyframe in keyframes}
@@ -332,7 +344,7 @@ def _write(
         updates_of.setdefault(update.keyframe_index, []).append(update)
     tracked = sum(message.status != Status.LOST.value for message in odometry)
     with LogWriter(
-        out_path, robot=robot, metadata={"frames": str(len(odometry)), "tracked": str(tracked), **alone}
+        out_path, robot=robot, metadata={"frames": str(len(odometry)), "tracked": str(tracked), **notes}
     ) as log:
         for message in odometry:
             time_ns = message.stamp_ns + LATENCY_NS

@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from pipeline.config import Config
-from pipeline.splat.losses import LossConfig
+from pipeline.splat.losses import MapLossConfig
 from pipeline.splat.optimiser import LearningRates
 
 
@@ -27,7 +27,7 @@ class RefineConfig(Config):
     rate_decay: float = Field(default=0.1, gt=0.0, le=1.0)
     """They fall exponentially to this share."""
     rates: LearningRates = LearningRates()
-    loss: LossConfig = LossConfig()
+    loss: MapLossConfig = MapLossConfig()
 
 
 class FusionConfig(Config):

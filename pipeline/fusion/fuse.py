@@ -289,6 +289,8 @@ def fuse(
     matching: MatchingConfig,
     depth: DepthKind = "blended",
     weights: WeightKind = "block",
+    *,
+    contradicted: Mapping[str, NDArray[np.bool_]] | None = None,
 ) -> FusedMap:
     """Fuse what a robot knows into one map in the world frame.
 
@@ -307,6 +309,7 @@ def fuse(
             pairs tell of the robots' cameras.
         depth: of a Gaussian at a pixel, as the own map was made.
         weights: kind of the information in `evidence` and `own_splats`.
+        contradicted: by robot, [n] of its evidence: what is not taken over, whatever space it is in.
     """
     own, own_splats = (_in_order_of(gaussians.ids, e) for e in (evidence[robot], own_splats))
     names = tuple(sorted(evidence))
@@ -343,6 +346,8 @@ def fuse(
     absorbed = np.zeros(len(rows.theta), dtype=bool)
     absorbed[member] = True
     absorbed[representative] = False
+    for name, against in (contradicted or {}).items():
+        absorbed[start[names.index(name)] + np.flatnonzero(against)] = True
     foreign = np.flatnonzero((owner != me) & ~absorbed)
     same_frame = np.array_equal(T_map_keyframe, T_world_keyframe[robot])
     moved = gaussians if same_frame else gaussians.moved(T_map_keyframe, T_world_keyframe[robot])

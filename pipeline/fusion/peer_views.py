@@ -49,7 +49,8 @@ def peer_views(
         colors: from every neighbour's colours to the own.
     """
     rasterizer = Rasterizer(threads=threads)
-    poses = [(name, T) for name in sorted(evidence) for T in _with_middles(T_world_keyframe[name])]
+    shown = [name for name in sorted(evidence) if len(evidence[name])]
+    poses = [(name, T) for name in shown for T in _with_middles(T_world_keyframe[name])]
     count = min(most, len(poses))
     chosen = [poses[(2 * k + 1) * len(poses) // (2 * count)] for k in range(count)]
     views, drawn = [], ""

@@ -82,7 +82,7 @@ def refine(
     total = own_steps + peer_steps
     head = max(peer_steps, round(PEERS_UNTIL * total))
     rasterizer, adam = Rasterizer(threads=threads), CompiledAdam(len(gaussians), threads=threads)
-    weights = LossWeights(**config.loss.model_dump())
+    weights = LossWeights(**config.loss.of(depth).model_dump())
     floor = np.minimum(
         gaussians.log_scales, np.float32(np.log(thickness_floor_m))
     )  # thinner ones stay as they are
@@ -92,7 +92,7 @@ def refine(
         view = next(peer if of_peer else own)
         certainty = None
         if view.depth_sigma_m is not None:
-            certainty = depth_certainty(view.depth_sigma_m, config.loss.depth_huber_m)
+            certainty = depth_certainty(view.depth_sigma_m, weights.depth_huber_m)
         _, gradients = rasterizer.view_gradients(
             gaussians,
             camera,

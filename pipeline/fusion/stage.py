@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from pipeline.consensus.evidence import unpack_symmetric
 from pipeline.consensus.weighting import own_stiffness
 from pipeline.errors import DuagError
 from pipeline.fusion.config import FusionConfig, RefineConfig
+from pipeline.fusion.doubt import Doubt, believed
 from pipeline.fusion.fuse import FusedMap, fuse
 from pipeline.fusion.own_pixels import weigh_by_own_pixels
 from pipeline.fusion.peer_views import peer_views
@@ -51,7 +53,7 @@ def run_fusion(
     *,
     seed: int = 0,
     threads: int = 1,
-) -> FusedMap:
+) -> tuple[Doubt, ...]:
     """Write fused.mcap, fused.ply, refined.ply, trajectory.tum and odometry.tum of one robot.
 
     Args:
@@ -62,30 +64,45 @@ def run_fusion(
         moving: as the front end looked for what moves.
         seed: of the run. threads: of the rasterizer; changes no bit.
     Returns:
-        The fused map, in the world frame.
+        What own images say against every neighbour's map.
     """
     own = load(source)
+    frames = _frames(source)
+    hung = np.array([result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera for f in frames])
+    stamp_ns = frames[-1].stamp_ns
+    met = len(result.component) > 1
+    views = training_views(source, frames, hung, config.refine, moving) if met else []
+    trust = believed(
+        result.own_evidence,
+        result.evidence,
+        result.T_world_keyframe_of,
+        result.pairs,
+        views[: own.keyframes],
+        own.camera,
+        config,
+        matching,
+        own.depth,
+        weights,
+        threads,
+    )
     fused = fuse(
         own.robot,
         own.gaussians,
         own.T_map_keyframe,
-        {own.robot: result.own_evidence, **result.evidence},
+        {own.robot: result.own_evidence, **trust.evidence},
         own_stiffness(own.robot, own.gaussians, own.information, own.T_map_keyframe, weights),
         result.T_world_keyframe_of,
-        result.pairs,
+        trust.pairs,
         _depth_images(own),
         own.camera,
         config,
         matching,
         own.depth,
         weights,
+        contradicted=trust.contradicted,
     )
-    frames = _frames(source)
-    hung = np.array([result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera for f in frames])
-    stamp_ns = frames[-1].stamp_ns
     refined = None
-    if len(result.component) > 1:
-        views = training_views(source, frames, hung, config.refine, moving)
+    if met:
         info = own.information
         fused = weigh_by_own_pixels(
             fused,
@@ -100,7 +117,7 @@ def run_fusion(
         )
         if config.refine.steps_per_view:
             shown = peer_views(
-                result.evidence,
+                {name: e.select(~trust.contradicted[name]) for name, e in trust.evidence.items()},
                 result.T_world_keyframe_of,
                 own.camera,
                 config.refine.peer_views if config.refine.peer_share else 0,
@@ -124,12 +141,12 @@ def run_fusion(
             )
     write_ply(folder / "fused.ply", fused.gaussians)
     write_ply(folder / "refined.ply", fused.gaussians if refined is None else refined)
-    _write_log(folder / "fused.mcap", result, fused, refined, stamp_ns, own.depth)
+    _write_log(folder / "fused.mcap", result, fused, refined, trust.doubts, stamp_ns, own.depth)
     stamps = np.array([f.stamp_ns for f in frames], dtype=np.int64)
     before = np.array([f.T_map_camera for f in frames])
     write_tum(folder / "odometry.tum", Trajectory(stamps, before))
     write_tum(folder / "trajectory.tum", Trajectory(stamps, hung))
-    return fused
+    return trust.doubts
 
 
 def training_views(
@@ -183,6 +200,7 @@ def _write_log(
     result: AgentResult,
     fused: FusedMap,
     refined: Gaussians | None,
+    doubts: Sequence[Doubt],
     stamp_ns: int,
     depth: DepthKind,
 ) -> None:
@@ -216,6 +234,8 @@ def _write_log(
             )
             pack_stamp(message, stamp_ns)
             log.write(topics.PEER_COLORS.of(robot), message, stamp_ns, stamp_ns)
+        for doubt in doubts:
+            log.write(topics.NEIGHBOUR_DOUBT.of(robot), _doubt(robot, doubt, stamp_ns), stamp_ns, stamp_ns)
 
 
 def peer_colors(path: Path, robot: str) -> dict[str, ColorMap]:
@@ -227,6 +247,15 @@ def peer_colors(path: Path, robot: str) -> dict[str, ColorMap]:
         )
         for m in found
     }
+
+
+def _doubt(robot: str, doubt: Doubt, stamp_ns: int) -> Any:
+    """duagc.v1.NeighbourDoubt."""
+    message = schemas.new(
+        "NeighbourDoubt", robot=robot, used=doubt.trusted, reason=doubt.reason, **vars(doubt)
+    )
+    pack_stamp(message, stamp_ns)
+    return message
 
 
 def _information(robot: str, fused: FusedMap, stamp_ns: int) -> GaussianInformation:

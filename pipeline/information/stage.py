@@ -325,26 +325,35 @@ def surface_deviation(
     """How far every Gaussian's mean is from the surface that the depth images show, metres [n].
 
     Splats that overlap make up for each other's places: where a sum of them is drawn to a millimetre, each may be a
-    centimetre off, and no pixel tells. What tells is the depth image itself: root mean square, over the views that
-    measured a surface within the gate, of the mean's distance from the tangent plane at its pixel (of the depth's
-    median over 5 x 5 px, or the sensor's noise would pass for the map's deviation). The median over all
-    Gaussians counts as half a view more, and stands alone where a Gaussian was never measured; without any, the gate.
+    centimetre off, and no pixel tells. What tells is the depth image itself: the median, over the views that measured a
+    surface within the gate, of the mean's distance from the tangent plane at its pixel (of the depth's median over
+    5 x 5 px, or the sensor's noise would pass for the map's deviation). Not the root mean square: at an edge some views
+    look past a Gaussian at another surface. The median over all Gaussians counts as half a view more; a Gaussian that
+    no view measured has the gate.
     """
     import cv2
 
     means, n = gaussians.means.astype(np.float64), len(gaussians)
-    squares, count = np.zeros(n), np.zeros(n)
+    all_rows, all_distances = [np.zeros(0, np.int64)], [np.zeros(0)]
     for view in views:
         usable = view.depth_m if view.mask is None else np.where(view.mask, view.depth_m, np.float32(0))
         smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(usable), MEDIAN_PX), dtype=np.float32)
         points = se3.transform(se3.inverse(view.T_map_camera), means)
         rows, distance_m = _from_tangent_planes(points, smooth, camera)
         near = np.abs(distance_m) < gate_m
-        squares[rows[near]] += distance_m[near] ** 2
-        count[rows[near]] += 1
+        all_rows.append(rows[near])
+        all_distances.append(np.abs(distance_m[near]))
+    rows, distance_m = np.concatenate(all_rows), np.concatenate(all_distances)
+    distance_m = distance_m[np.lexsort((distance_m, rows))]
+    count = np.bincount(rows, minlength=n)
     measured = count > 0
-    typical = float(np.median(squares[measured] / count[measured])) if measured.any() else gate_m**2
-    return np.sqrt((squares + 0.5 * typical) / (count + 0.5))
+    deviation_m = np.full(n, gate_m)
+    if measured.any():
+        views_of, first = count[measured], (np.cumsum(count) - count)[measured]
+        median = distance_m[first + (views_of - 1) // 2]
+        typical = np.median(median)
+        deviation_m[measured] = np.sqrt((views_of * median**2 + 0.5 * typical**2) / (views_of + 0.5))
+    return deviation_m
 
 
 def _from_tangent_planes(

@@ -29,6 +29,8 @@ class PoseGraphConfig(Config):
     max_rounds: int = Field(default=5000, ge=1)
     """A round is one burst of every robot to every neighbour; the run ends here whatever has been agreed."""
     consensus: PoseConsensusConfig = PoseConsensusConfig(
+        tolerance=1e-5,
+        wire="float32",
         odometry_floor_m=0,
         odometry_floor_rad=0,
         closures=_AS_GIVEN,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import DuagError
+from pipeline.evaluation.cameras import CHANNELS
 from pipeline.evaluation.network import Session
 from pipeline.evaluation.paths import Path3, paths, top_view_axes
 from pipeline.evaluation.rendering import COMPARED_SETS, in_colors_of, in_world, mates, poses_by_stamp
@@ -99,7 +100,7 @@ def content(run: RunFolder, source: Recording) -> dict[str, Any]:
         "comparison": words.comparison_rows(metrics),
         "rendering_columns": list(words.RENDERING.values()),
         "rendering": _rendering_rows(metrics),
-        "exposure_note": "No exposure is fitted to a view.",
+        "exposure_note": " ".join(["No exposure is fitted to a view.", *_cameras(metrics)]),
         "views": shown_views,
         **_agreement_content(session, metrics, reasons),
         "exchange_charts": _exchange_charts(session),
@@ -114,6 +115,23 @@ def content(run: RunFolder, source: Recording) -> dict[str, Any]:
         "config": run.config_text or "The run has no config.toml.",
         "recording": json.dumps(source.description, indent=2),
     }
+
+
+def _cameras(metrics: dict[str, Any]) -> list[str]:
+    """How the robots' cameras differ, a sentence for each that was compared with the first of its component."""
+    said = []
+    for name, robot in metrics["robots"].items():
+        camera = robot.get("camera", {})  # runs of earlier versions have none
+        if camera.get("gain_red") is not None:
+            gains = ", ".join(
+                f"{camera[f'gain_{channel}']:.3f} ± {camera[f'sigma_gain_{channel}']:.3f}"
+                for channel in CHANNELS
+            )
+            said.append(
+                f"By the robots' own estimate {name}'s camera has {gains} times the red, green and blue of the first "
+                "robot's; peers' views are compared in the colours of the camera that took them."
+            )
+    return said
 
 
 def _count(number: int, noun: str) -> str:

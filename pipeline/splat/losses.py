@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config import Config
+from pipeline.splat.gaussians import DepthKind
 
 Image = NDArray[np.float32]
 
@@ -45,6 +46,25 @@ class LossConfig(Config):
     """Weight of missing opacity (1 - alpha) where a surface was measured."""
     surface_weight: float = 0.0
     """Weight of one metre between a Gaussian's own depth and the measured one, by its share in the pixel."""
+
+
+class SurfaceLossConfig(LossConfig):
+    """The same where depth is exact: every single Gaussian belongs on the surface."""
+
+    depth_weight: float = 0.25
+    depth_huber_m: float = 0.01
+    surface_weight: float = 0.5
+
+
+class MapLossConfig(Config):
+    """The loss of a map, by the depth that its Gaussians are drawn with."""
+
+    blended: LossConfig = LossConfig()
+    ray_plane: SurfaceLossConfig = SurfaceLossConfig()
+
+    def of(self, depth: DepthKind) -> LossConfig:
+        """The loss of maps of a kind."""
+        return self.ray_plane if depth == "ray_plane" else self.blended
 
 
 @dataclass(frozen=True)

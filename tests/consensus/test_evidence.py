@@ -17,7 +17,7 @@ from pipeline.consensus.evidence import (
     pack_symmetric,
     unpack_symmetric,
 )
-from pipeline.geometry import se3, spd
+from pipeline.geometry import se3, so3, spd
 from pipeline.splat.gaussians import Gaussians
 from tests.consensus.worlds import random_poses
 
@@ -76,7 +76,10 @@ def test_anchored_and_back_in_the_map_is_what_the_map_said():
     np.testing.assert_array_equal(back.theta[:, OPACITY], gaussians.opacity_logits)
     geometry = unpack_symmetric(sums.geometry, 9)
     off = sums.deviation_m[:, None, None] ** 2 * np.eye(3)
-    told = np.linalg.inv(np.linalg.inv(geometry[:, :3, :3]) + off)
+    axes = so3.from_quat_wxyz(gaussians.quats_wxyz.astype(np.float64))
+    normal = np.take_along_axis(axes, gaussians.log_scales.argmin(axis=1)[:, None, None], axis=2)
+    measured = normal @ normal.swapaxes(1, 2) / sums.deviation_m[:, None, None] ** 2
+    told = np.linalg.inv(np.linalg.inv(geometry[:, :3, :3] + measured) + off)
     np.testing.assert_allclose(back.position_information(), told, atol=1e-9)
     told = np.linalg.inv(np.linalg.inv(geometry[:, 3:, 3:]) + SHAPE_FLOOR**2 * np.eye(6))
     np.testing.assert_allclose(back.shape_information(), told, atol=1e-9)
@@ -101,6 +104,17 @@ def test_what_is_told_is_never_surer_than_the_deviation_and_nothing_stays_nothin
     assert np.all(sigma_m >= sums.deviation_m * (1 - 1e-9))
     np.testing.assert_allclose(sigma_m[::2], sums.deviation_m[::2], rtol=1e-3)
     assert not told.information[1::4, :27].any()
+
+
+def test_depth_images_say_how_far_a_surface_is_where_the_sums_know_nothing_of_a_splat():
+    gaussians, sums, _ = random_map(9)
+    sums.geometry *= 1e-12
+    position = Evidence.from_map(
+        "alpha", gaussians, sums, np.tile(np.eye(4), (4, 1, 1))
+    ).position_information()
+    values = np.linalg.eigvalsh(position)
+    np.testing.assert_allclose(values[:, 2], 0.5 / sums.deviation_m**2, rtol=1e-3)  # across the disc
+    assert np.all(values[:, :2] < 1e-6)  # along it, nothing
 
 
 def test_a_motion_of_the_world_leaves_every_mahalanobis_distance():

@@ -42,14 +42,27 @@ def test_agents_reach_the_central_optimum_whatever_is_lost(loss, limit):
     assert_same_poses(team_poses(agents), best.poses, atol=1e-7)
 
 
-def test_float32_packets_stay_within_their_rounding():
+@pytest.mark.parametrize(("wire", "atol"), [("fixed", 5e-6), ("float32", 2e-5)])
+def test_rounded_packets_stay_within_their_rounding(wire, atol):
+    """And within some times the tolerance at which robots hold still; float32 of 10 m is 1e-6."""
     world = make_team(1, robots=2)
-    agents = world.agents(PLAIN)
+    agents = world.agents(PLAIN.model_copy(update={"wire": wire, "tolerance": 0.2 * atol}))
     _, best = world.optimum(agents)
     assert talk(agents, 200) < 200
-    assert_same_poses(
-        team_poses(agents), best.poses, atol=2e-5
-    )  # stopping tolerance 1e-5, float32 of 10 m: 1e-6
+    assert_same_poses(team_poses(agents), best.poses, atol=atol)
+
+
+def test_a_team_agrees_however_far_away_its_world_has_its_origin():
+    """In float32 a position 30 km away has steps of 2 mm, and nobody would ever hold still."""
+    world = make_team(1, robots=2)
+    _, best = world.optimum(world.agents(PLAIN))
+    agents = world.agents(PLAIN)
+    for agent in agents.values():
+        far = agent.T_world_map.copy()
+        far[:3, 3] += [30_000.0, -20_000.0, 100.0]
+        agent.set_frame(far)
+    assert talk(agents, 200) < 200
+    assert_same_poses(team_poses(agents), best.poses, atol=5e-6)
 
 
 def test_a_neighbour_that_hears_nothing_does_not_make_an_end_hold_still():

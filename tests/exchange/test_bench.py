@@ -13,7 +13,9 @@ from pipeline.exchange.bench import MODES, Plan, format_table, run
 def rows() -> dict[tuple[str, float], dict]:
     plan = Plan((3,), ("chain",), (0.0, 0.5), (47.0,), (0.1,), MODES, tracks=20, max_rounds=1500)
     result = run(plan)
-    assert len(format_table(result).splitlines()) == 2 + len(result["rows"])
+    lines = [line for line in format_table(result).splitlines() if line.startswith("|")]
+    assert len(lines) == 2 + len(result["rows"])
+    assert len({len(line) for line in lines}) == 1
     return {(row["mode"], row["loss"]): row for row in result["rows"]}
 
 

@@ -1,5 +1,6 @@
 """Recognising places and verifying closures on rendered views of a known room."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,12 +9,18 @@ import pytest
 from pipeline import streams
 from pipeline.consensus.config import ClosureConfig
 from pipeline.exchange import places, places_wire
-from pipeline.exchange.config import ExchangeConfig, PlacesConfig, VerificationConfig
+from pipeline.exchange.config import (
+    ExchangeConfig,
+    PeerRegistrationConfig,
+    PlacesConfig,
+    VerificationConfig,
+)
 from pipeline.exchange.meeting import OwnPlaces
 from pipeline.exchange.places import Candidate, Planner
 from pipeline.exchange.verification import Verdict, inverse_information, verify
 from pipeline.geometry import se3
 from pipeline.registration import features
+from pipeline.robot import Images
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +73,25 @@ def test_a_closure_is_as_good_as_its_information_says(robots: dict) -> None:
     assert moved_m < 0.003
     assert moved_rad < 0.002
     assert np.linalg.eigvalsh(result.closure.information)[0] > 1e4  # better than 1 cm and 10 mrad everywhere
+
+
+def test_a_darker_camera_finds_the_same_place(robots: dict) -> None:
+    (alpha, truth_a), (bravo, truth_b) = robots["alpha"], robots["bravo"]
+
+    def dark(keyframe: int) -> Images:
+        color, *depth = alpha.data.images(keyframe)
+        return Images(np.rint(0.45 * color + 8).astype(np.uint8), *depth)
+
+    darker = OwnPlaces(replace(alpha.data, images=dark), ExchangeConfig())
+    sample = places_wire.read_sample(places_wire.write_sample(bravo.sample(0)), 3)
+    given = darker.features[2], darker.pyramid(2), sample.features, sample.reference, 0.8
+    result = verify(2, 0, *given, VerificationConfig(), streams.generator(0, "test"))
+    assert result.closure is not None
+    moved_m, moved_rad = se3.distance(result.closure.T_own_peer, se3.inverse(truth_a[2]) @ truth_b[0])
+    assert moved_m < 0.003
+    assert moved_rad < 0.002
+    alike = VerificationConfig(registration=PeerRegistrationConfig(max_gain=2.0))  # as within one robot
+    assert verify(2, 0, *given, alike, streams.generator(0, "test")).verdict is Verdict.NOT_REGISTERED
 
 
 def test_different_places_are_refused(robots: dict, make_robot: Any) -> None:

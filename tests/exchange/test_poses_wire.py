@@ -1,11 +1,13 @@
 """Poses of a round: what is written is read, whichever component of a quaternion is left out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from pipeline.consensus.links import PosePacket
+from pipeline.consensus.links import STEP_M, PosePacket, rounded_translations
 from pipeline.exchange.packets import MalformedError
-from pipeline.exchange.poses_wire import poses_per_packet, read_poses, write_poses, write_poses_in_parts
+from pipeline.exchange.poses_wire import read_poses, write_poses, write_poses_in_parts
 from pipeline.geometry import se3, so3
 
 
@@ -13,24 +15,24 @@ def poses(rng, n):
     return se3.from_quat_translation(rng.normal(size=(n, 4)), 10 * rng.normal(size=(n, 3)))
 
 
-def pose_packet(rng, n, dtype="float32", curvature=None):
+def pose_packet(rng, n, wire="fixed", curvature=None):
     T = poses(rng, n)
     return PosePacket(
         sequence=7,
         version=3,
         keyframes=(2 * np.arange(n)).astype(np.int32),
-        quats_wxyz=so3.to_quat_wxyz(T[:, :3, :3]).astype(dtype),
-        translations=T[:, :3, 3].astype(dtype),
+        quats_wxyz=so3.to_quat_wxyz(T[:, :3, :3]).astype("float64" if wire == "float64" else "float32"),
+        translations=rounded_translations(T[:, :3, 3], wire),
         penalties=np.array([0.5, 0.25], np.float32),
         curvature=curvature,
         converged=True,
     )
 
 
-@pytest.mark.parametrize(("dtype", "atol"), [("float32", 3e-7), ("float64", 1e-15)])
-def test_poses_come_back_whichever_component_was_left_out(dtype, atol):
+@pytest.mark.parametrize(("wire", "atol"), [("fixed", 3e-7), ("float32", 3e-7), ("float64", 1e-15)])
+def test_poses_come_back_whichever_component_was_left_out(wire, atol):
     rng = np.random.default_rng(0)
-    packet = pose_packet(rng, 41, dtype)
+    packet = pose_packet(rng, 41, wire)
     assert len(set(np.argmax(np.abs(packet.quats_wxyz), axis=1).tolist())) == 4
     data = write_poses(packet, 3, 30, decides=True)
     read = read_poses(data, packet.keyframes, from_decider=True)
@@ -47,9 +49,8 @@ def test_poses_come_back_whichever_component_was_left_out(dtype, atol):
 
 
 def test_a_full_packet_of_poses_fits():
-    for dtype in ("float32", "float64"):
-        n = poses_per_packet(1166, dtype == "float64")
-        packet = pose_packet(np.random.default_rng(1), n, dtype)
+    for wire, n in (("fixed", 37), ("float32", 47), ("float64", 23)):
+        packet = pose_packet(np.random.default_rng(1), n, wire)
         assert 1166 - 60 < len(write_poses(packet, 0, n, decides=False)) <= 1166
 
 
@@ -75,3 +76,29 @@ def test_keyframes_that_are_not_shared_are_refused():
     packet = pose_packet(np.random.default_rng(4), 6)
     with pytest.raises(MalformedError, match="shared"):
         read_poses(write_poses(packet, 0, 6, True), packet.keyframes[:5], True)
+
+
+def test_fixed_translations_are_as_fine_a_thousand_kilometres_away():
+    far = np.array([[999_999.123456789, -999_999.0, 0.0], [-STEP_M, STEP_M, 3 * STEP_M]])
+    packet = replace(
+        pose_packet(np.random.default_rng(5), 2), translations=rounded_translations(far, "fixed")
+    )
+    read = read_poses(write_poses(packet, 0, 2, True), packet.keyframes, True).translations
+    np.testing.assert_array_equal(read, packet.translations)
+    assert np.abs(read - far).max() <= STEP_M / 2
+
+
+def test_poses_beyond_all_places_are_refused():
+    for far in (1.1e6, -1e30):
+        packet = replace(pose_packet(np.random.default_rng(6), 2), translations=np.full((2, 3), far))
+        with pytest.raises(MalformedError, match="rigid"):
+            read_poses(write_poses(packet, 0, 2, True), packet.keyframes, True)
+
+
+@pytest.mark.parametrize("flags", [8 + 16, 32])
+def test_unknown_precisions_are_refused(flags):
+    packet = pose_packet(np.random.default_rng(7), 3)
+    data = bytearray(write_poses(packet, 0, 3, True))
+    data[8] |= flags
+    with pytest.raises(MalformedError, match="flags"):
+        read_poses(bytes(data), packet.keyframes, True)

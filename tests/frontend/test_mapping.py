@@ -12,7 +12,7 @@ from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels import Rasterizer
 from pipeline.splat.gaussians import DepthKind, Gaussians
-from pipeline.splat.losses import LossConfig, depth_error, psnr
+from pipeline.splat.losses import MapLossConfig, SurfaceLossConfig, depth_error, psnr
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 PLANES = (
@@ -226,8 +226,10 @@ def test_both_depths_of_a_gaussian_make_a_map(depth: DepthKind) -> None:
 
 
 def test_loss_on_single_gaussians_brings_each_to_its_surface() -> None:
-    def layer_error_m(loss: LossConfig) -> float:
-        mapper, _ = build(QUICK.model_copy(update={"depth": "ray_plane", "loss": loss}))
+    def layer_error_m(loss: SurfaceLossConfig) -> float:
+        mapper, _ = build(
+            QUICK.model_copy(update={"depth": "ray_plane", "loss": MapLossConfig(ray_plane=loss)})
+        )
         mapper.finish()
         rasterizer, depth_m = Rasterizer(), shot(POSES[1])[1]
         rasterizer.forward(mapper.gaussians, CAMERA, se3.inverse(POSES[1]), depth="ray_plane")
@@ -235,8 +237,20 @@ def test_loss_on_single_gaussians_brings_each_to_its_surface() -> None:
         assert (layer_m > 0).mean() > 0.97
         return float(np.abs(layer_m - depth_m)[layer_m > 0].mean())
 
-    single = LossConfig(surface_weight=1.0, depth_weight=0.0, depth_huber_m=0.005)
-    assert layer_error_m(single) < 0.5 * layer_error_m(LossConfig())
+    single = SurfaceLossConfig(surface_weight=1.0, depth_weight=0.0, depth_huber_m=0.005)
+    together = SurfaceLossConfig(surface_weight=0.0, depth_weight=1.0, depth_huber_m=0.02)
+    assert layer_error_m(single) < 0.5 * layer_error_m(together)
+
+
+def test_how_depth_is_drawn_follows_from_its_noise() -> None:
+    def mapper(noise_m: float | None, config: MappingConfig = QUICK) -> Mapper:
+        return Mapper(CAMERA, config, seed=0, depth_noise_m=noise_m)
+
+    assert [mapper(noise_m).depth for noise_m in (0.0005, 0.002, 0.007, None)] == [
+        "ray_plane", "blended", "blended", "blended",
+    ]  # fmt: skip
+    asked = QUICK.model_copy(update={"depth": "blended"})
+    assert mapper(0.0005, asked).depth == "blended"
 
 
 def test_exposure_is_found() -> None:

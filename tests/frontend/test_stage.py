@@ -9,13 +9,14 @@ import pytest
 from converters.base import RecordingWriter
 from pipeline.errors import DuagError
 from pipeline.frontend.config import FrontendConfig, KeyframeConfig, TrackingConfig
+from pipeline.frontend.failure import Reason
 from pipeline.frontend.keyframes import KeyframePair, refine
 from pipeline.frontend.mapping_config import MappingConfig
-from pipeline.frontend.stage import LATENCY_NS, _support, run_frontend
+from pipeline.frontend.stage import LATENCY_NS, _support, depth_noise_m, run_frontend
 from pipeline.frontend.tracked import Status, TrackedFrame
 from pipeline.geometry import se3
 from pipeline.geometry.trajectory import ate_rmse_m
-from pipeline.recording import content_digest, read_log
+from pipeline.recording import content_digest, log_metadata, read_log
 from pipeline.registration.moving import MovingConfig
 from schemas import topics
 from tests.registration.room import CAMERA, pose, render
@@ -118,7 +119,7 @@ def test_two_runs_write_the_same_log(sensor_log: Path, frontend_log: Path) -> No
 
 def test_map_is_grown_at_the_refined_keyframes(sensor_log: Path) -> None:
     out = sensor_log.with_name("mapped.mcap")
-    small = MappingConfig(max_gaussians=300, iterations=2, final_iterations=1, depth="ray_plane")
+    small = MappingConfig(max_gaussians=300, iterations=2, final_iterations=1)
     run_frontend(sensor_log, out, TRACKING.model_copy(update={"mapping_enabled": True, "mapping": small}))
     final = messages(out, topics.MAP)
     updates = messages(out, topics.MAP_UPDATE)
@@ -132,7 +133,8 @@ def test_map_is_grown_at_the_refined_keyframes(sensor_log: Path) -> None:
     )
     assert updates[-1].total == len(final[0].gaussians)
     (unrefined,) = messages(out, topics.UNREFINED_MAP)
-    assert final[0].depth == unrefined.depth == "ray_plane"
+    assert final[0].depth == unrefined.depth == "ray_plane"  # the log's depth is exact
+    assert 0.0 < float(log_metadata(out)["depth_noise_m"]) < 0.001
     assert len(unrefined.gaussians) == updates[-2].total
     common = np.intersect1d(unrefined.gaussians.ids, final[0].gaussians.ids)
     assert len(common) > 50  # the refinement replaces some and moves the others
@@ -190,3 +192,13 @@ def test_what_moves_is_not_mapped(tmp_path: Path) -> None:
         left[enabled] = int(np.count_nonzero(away < 1.1 * RADIUS_M))
     assert left[False] > 100
     assert left[True] < 0.05 * left[False]
+
+
+def test_noise_of_depth_is_that_of_frames_which_were_registered_by_it() -> None:
+    def frame(rms_m: float, status: Status = Status.OK, reason: Reason = Reason.NONE) -> TrackedFrame:
+        return TrackedFrame(0, 0, 0, np.eye(4), np.zeros((6, 6)), status, 1.0, rms_m, 0.0, reason)
+
+    first, lost = frame(0.0), frame(0.5, Status.LOST)
+    by_color = frame(0.5, reason=Reason.STUCK_DEPTH)
+    assert depth_noise_m([first, frame(0.006), lost, by_color, frame(0.008), frame(0.007)]) == 0.007
+    assert depth_noise_m([first, lost]) is None

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from converters.base import RecordingWriter
-from pipeline.consensus.config import MatchingConfig
+from pipeline.consensus.config import ColorConfig, MatchingConfig
 from pipeline.consensus.evidence import Evidence
 from pipeline.errors import DuagError
 from pipeline.fusion.config import FusionConfig
-from pipeline.fusion.stage import run_fusion
+from pipeline.fusion.stage import peer_colors, run_fusion
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.geometry.trajectory import read_tum
@@ -152,6 +152,7 @@ def test_alone_everything_stays(robot, tmp_path):
     np.testing.assert_allclose(geometry[:, [0, 9, 17]], told[:, [0, 3, 5]], rtol=1e-5)  # diagonals
     np.testing.assert_allclose(geometry[:, [24, 44]], told[:, [6, 26]], rtol=1e-5)
     assert said[CorrectedKeyframes].component == ["bravo"]
+    assert peer_colors(tmp_path / "fused.mcap", "bravo") == {}
 
 
 def test_frames_and_gaussians_move_with_their_keyframes(robot, tmp_path):
@@ -188,6 +189,29 @@ def test_what_only_a_neighbour_saw_is_taken_over(robot, tmp_path):
     fused = fuse_files(robot, result, tmp_path)[GaussianMap]
     assert len(fused.gaussians) == len(fused.information.ids) == N + 1
     np.testing.assert_allclose(fused.gaussians.means[-1], [0, 0, -3.0])
+    told = peer_colors(tmp_path / "fused.mcap", "bravo")[
+        "alpha"
+    ]  # nothing matched: as if alike, and nobody knows
+    assert told.is_identity
+    assert told.matches == 0
+    np.testing.assert_allclose(told.sigma_gain, np.sqrt(2) * ColorConfig().prior_gain)
+
+
+def test_a_neighbour_that_contradicts_own_images_is_left_out(robot, tmp_path):
+    """A white wall where bravo saw a dark one, and one more Gaussian where bravo never looked."""
+    x, y = np.meshgrid(np.arange(-1.4, 1.4, 0.05), np.arange(-1.1, 1.1, 0.05))
+    theta = np.zeros((x.size + 1, 13))
+    theta[:-1, :3] = np.stack([x, y, np.full_like(x, 2.0)], axis=-1).reshape(-1, 3)
+    theta[-1, :3] = [0, 0, -3.0]
+    theta[:, 3:6], theta[:, 9:12], theta[:, 12] = 2 * np.log(0.03), 1.0, 4.0
+    ids = np.arange(len(theta))
+    other = Evidence("alpha", ids, np.zeros(len(ids)), theta, np.ones((len(ids), 31)))
+    fused = fuse_files(robot, result_of(robot, robot.T_map_keyframe, alpha=other), tmp_path)[GaussianMap]
+    assert len(fused.gaussians) == N
+    (record,) = read_log(tmp_path / "fused.mcap", topics=[topics.NEIGHBOUR_DOUBT.of("bravo")])
+    said = record.message()
+    assert (said.neighbour, said.gaussians, said.used) == ("alpha", len(ids), False)
+    assert "contradicts own images" in said.reason
 
 
 def test_information_of_another_map_is_refused(robot, tmp_path):

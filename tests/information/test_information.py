@@ -167,9 +167,12 @@ def test_the_deviation_is_the_distance_from_the_measured_surface() -> None:
     view = View(np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8), depth, np.eye(4))
     found = surface_deviation(gaussians, CAMERA, [view] * 1000, 0.1)
     np.testing.assert_allclose(found[:3], np.abs(off_m[:3]), atol=1e-3)
-    np.testing.assert_allclose(found[3:], 0.02, atol=1e-3)  # not measured: the median of the others
+    np.testing.assert_array_equal(found[3:], 0.1)  # not measured within the gate
     half = surface_deviation(gaussians, CAMERA, [view], 0.1)  # and it counts as half a view
     np.testing.assert_allclose(half[1:3] ** 2, (off_m[1:3] ** 2 + 0.5 * 0.02**2) / 1.5, rtol=0.05)
+    other = View(view.color, (depth + 0.04).astype(np.float32), np.eye(4))  # two of five look past it
+    past = surface_deviation(gaussians, CAMERA, [*[view] * 300, *[other] * 200], 0.1)
+    np.testing.assert_allclose(past[:3], np.abs(off_m[:3]), atol=1e-3)
     blind = View(view.color, view.depth_m, view.T_map_camera, np.zeros(depth.shape, bool))
     np.testing.assert_array_equal(surface_deviation(gaussians, CAMERA, [blind], 0.1), 0.1)
 

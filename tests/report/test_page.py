@@ -1,5 +1,6 @@
 import json
 import re
+from html import unescape
 
 import numpy as np
 import pytest
@@ -72,6 +73,14 @@ def test_maps_stand_beside_each_other_for_all_and_for_each_robot(fake, html):
     assert own[2:5] == [f"{bravo[s]['psnr_db']:.2f}" for s in ("held_out", "peers", "team")]
     assert own[5] == f"{1e3 * bravo['held_out']['depth_l1_common_m']:.1f}"
     assert own[-1] == f"{100 * bravo['team']['depth_completeness']:.1f}"
+
+
+def test_the_page_says_how_cameras_differ(html, tmp_path):
+    dark = make(tmp_path, gain=0.6)
+    evaluate(dark.run, dark.recording, progress=False)
+    page = write_report(dark.run, dark.recording).read_text()
+    assert "bravo's camera has 0.600 ± 0.010, 0.600 ± 0.010, 0.600 ± 0.010 times" in unescape(page)
+    assert "'s camera has" not in unescape(html)
 
 
 def test_a_run_without_truth_and_without_agreement_has_a_page(tmp_path):

@@ -1,0 +1,206 @@
+"""Cameras that are known, estimated from what they see; and recordings that do not say enough."""
+
+import json
+from copy import copy
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from converters import seven_scenes
+from converters.base import RecordingWriter
+from pipeline.calibration import Calibration, calibrate, report
+from pipeline.calibration.adjustment import Quality, _features, _planes, adjust, overlapping
+from pipeline.calibration.rig import NAMES, Rig
+from pipeline.calibration.views import NORMALS_LEVEL, Views
+from pipeline.errors import DuagError
+from pipeline.frontend.config import FrontendConfig
+from pipeline.geometry import se3, so3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.registration.pyramid import RgbdPyramid
+
+CAMERA = PinholeCamera(320, 240, 262.0, 262.0, 160.0, 118.0)
+TRUE = Rig(
+    CAMERA,
+    np.array([266.0, 265.0, 163.0, 121.0, 0.08, -0.30, 0.25]),
+    so3.exp(np.array([0.006, -0.008, 0.01])),
+    0.004,
+    np.array([0.012, -0.015, 0.006, -0.018, 0.005, 0.008]),
+)
+ROOM_HALF_M = np.array([2.4, 1.6, 2.0])
+VIEWS, LANDMARKS = 14, 500
+
+
+def distance(origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Along rays [n, 3] from inside the room, with a pillar in it."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        walls = np.where(rays > 0, (ROOM_HALF_M - origin) / rays, (-ROOM_HALF_M - origin) / rays).min(axis=1)
+        a, b = ((np.array([0.3, 0.4, 0.5]) + s * np.array([0.3, 1.2, 0.25]) - origin) / rays for s in (-1, 1))
+    enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+    return np.where((enter < leave) & (enter > 0), enter, walls)
+
+
+def pose(k: int) -> np.ndarray:
+    turn = np.array([0.25 * np.sin(1.3 * k), -0.5 + 0.08 * k, 0.15 * np.cos(k)])
+    return se3.from_rotation_translation(so3.exp(turn), [0.8 - 0.1 * k, 0.3 * np.sin(k), -1.5 + 0.05 * k])
+
+
+def make_views(seed: int) -> Views:
+    """Views of the room as the true cameras see it, with noise, at poses that are a little wrong."""
+    rng = np.random.default_rng(seed)
+    T = np.array([pose(k) for k in range(VIEWS)])
+    velocity = rng.normal(size=(VIEWS, 6)) * 0.4
+    rays = CAMERA.rays()
+    x, y = rays[..., 0], rays[..., 1]
+    error = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1) @ TRUE.depth_error
+    inverse, normals, samples, depths = [], [], [], []
+    for k in range(VIEWS):
+        depth = distance(T[k, :3, 3], rays.reshape(-1, 3) @ T[k, :3, :3].T).reshape(rays.shape[:2])
+        depths.append(depth)
+        measured = (1 / depth - error) / (1 - 2 * TRUE.depth_error[0])
+        measured = 1 / (1 / measured + rng.normal(size=depth.shape) * 0.001)
+        noisy = (1 / measured).astype(np.float32)
+        pyramid = RgbdPyramid.build(np.zeros(depth.shape, np.float32), noisy, CAMERA, NORMALS_LEVEL + 1)
+        inverse.append(pyramid.levels[0].inverse_depth)
+        normals.append(pyramid.levels[NORMALS_LEVEL].normals)
+        v, u = np.nonzero(np.abs(normals[-1]).sum(axis=-1) > 0)
+        picked = rng.choice(len(v), 150, replace=False)
+        samples.append(np.stack([u[picked], v[picked]], axis=-1) << NORMALS_LEVEL)
+    points, seen_by, landmarks, pixels = [], [], [], []
+    for m in range(LANDMARKS):
+        k, u, v = rng.integers(VIEWS), rng.integers(5, 315), rng.integers(5, 235)
+        points.append(se3.transform(T[k], (rays[v, u] * depths[k][v, u])[None])[0])
+        for i in range(VIEWS):
+            q = se3.transform(se3.inverse(T[i]), points[m][None])
+            if q[0, 2] < 0.1:
+                continue
+            p = se3.transform(se3.exp(-TRUE.delay_s * velocity[i]), q) @ TRUE.R_color_depth.T
+            pixel = TRUE.project(p)[0][0]
+            if not (0 <= pixel[0] < 320 and 0 <= pixel[1] < 240 and np.hypot(*(p[0, :2] / p[0, 2])) < 0.75):
+                continue
+            ray = (points[m] - T[i, :3, 3])[None]
+            if distance(T[i, :3, 3], ray)[0] > 0.999:
+                seen_by.append(i)
+                landmarks.append(m)
+                pixels.append(pixel + rng.normal(size=2) * 0.1)
+    wrong = T @ se3.exp(rng.normal(size=(VIEWS, 6)) * 0.003)
+    return Views(
+        f"room {seed}",
+        CAMERA,
+        wrong,
+        velocity,
+        np.array(inverse),
+        np.array(normals),
+        np.array(samples),
+        np.array(seen_by),
+        np.array(landmarks),
+        np.array(pixels),
+        np.array(points) + rng.normal(size=(LANDMARKS, 3)) * 0.01,
+    )
+
+
+@pytest.fixture(scope="module")
+def views() -> Views:
+    return make_views(0)
+
+
+def test_derivatives_are_those_of_the_residuals(views: Views) -> None:
+    """By differences; those of depth roughly, for sigma(z), which divides it, is held."""
+    step = 1e-6
+    features = _features(views, TRUE)
+    for k in range(len(NAMES)):
+        e = np.zeros(len(NAMES))
+        e[k] = step
+        ahead, behind = (_features(views, TRUE.moved(s * e)) for s in (1, -1))
+        by_image = (ahead.off_px - behind.off_px) / (2 * step)
+        by_depth = np.where(features.used, (ahead.distance - behind.distance) / (2 * step), 0)
+        np.testing.assert_allclose(features.by_rig[:, :2, k], by_image, rtol=2e-3, atol=1e-3)
+        np.testing.assert_allclose(
+            np.where(features.used, features.by_rig[:, 2, k], 0), by_depth, rtol=0.2, atol=5
+        )
+    for k in range(6):
+        e = np.zeros(6)
+        e[k] = step
+        ahead, behind = copy(views), copy(views)
+        ahead.T_map_camera = views.T_map_camera @ se3.exp(e)
+        behind.T_map_camera = views.T_map_camera @ se3.exp(-e)
+        by_image = (_features(ahead, TRUE).off_px - _features(behind, TRUE).off_px) / (2 * step)
+        np.testing.assert_allclose(features.by_view[:, :2, k], by_image, rtol=1e-3, atol=1e-2)
+    pairs = overlapping(views)
+    planes = _planes(views, pairs, TRUE)
+    assert planes.used.mean() > 0.3
+    for k in range(6):
+        e = np.zeros(len(NAMES))
+        e[11 + k] = step
+        ahead, behind = (_planes(views, pairs, TRUE.moved(s * e)) for s in (1, -1))
+        by_depth = (ahead.distance - behind.distance) / (2 * step)
+        both = planes.used & ahead.used & behind.used
+        off = np.abs(planes.by_depth[..., k] - by_depth)[both]
+        assert np.median(off) < 0.15 * np.median(np.abs(by_depth[both]))  # points move to other pixels
+
+
+def test_known_cameras_are_found(views: Views) -> None:
+    """From one walk through the room within what their standard deviations say; and they hold on another walk."""
+    found = adjust([make_views(1)], Rig.of(CAMERA), True)
+    assert found.covariance is not None
+    sigma = np.sqrt(np.diag(found.covariance))
+    off = np.abs(found.rig.values() - TRUE.values())
+    for name, value, limit in zip(NAMES, off, np.maximum(4 * sigma, 1e-3), strict=True):
+        assert value < limit, name
+    # what the numbers say together is known much better than each
+    p = np.column_stack([np.random.default_rng(0).uniform(-0.45, 0.45, (200, 2)), np.ones(200)])
+    true = TRUE.project(p @ TRUE.R_color_depth.T)[0]
+    moved = found.rig.project(p @ found.rig.R_color_depth.T)[0] - true
+    before = Rig.of(CAMERA).project(p)[0] - true
+    assert np.median(np.linalg.norm(moved, axis=-1)) < 0.15 * np.median(np.linalg.norm(before, axis=-1))
+    as_recorded = adjust([copy(views)], Rig.of(CAMERA), False).quality[0]
+    held_out = adjust([copy(views)], found.rig, False).quality[0]
+    assert held_out.features_px < 0.5 * as_recorded.features_px
+    assert held_out.depth < as_recorded.depth
+
+
+def still_recording(folder: Path) -> Path:
+    """A camera that does not move, before a wall with a pattern."""
+    rng = np.random.default_rng(0)
+    pattern = cv2.GaussianBlur(rng.uniform(0, 255, (240, 320)), (0, 0), 2)
+    pattern = cv2.normalize(pattern, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    png = cv2.imencode(".png", np.repeat(pattern[..., None], 3, axis=2))[1].tobytes()
+    depth = np.full((240, 320), 1500, np.uint16) + (np.arange(320) // 4).astype(np.uint16)
+    with RecordingWriter(folder) as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
+        for k in range(16):
+            robot.add_frame(k * 33_000_000, png, "png", depth, None)
+    return folder
+
+
+def test_a_camera_that_does_not_move_is_refused(tmp_path: Path) -> None:
+    folder = still_recording(tmp_path / "still")
+    with pytest.raises(DuagError, match=r"still: its images do not determine .*rx, ry.*expected more motion"):
+        calibrate(folder, FrontendConfig(), [])
+    with pytest.raises(DuagError, match="has no robot bravo, expected one of alpha"):
+        calibrate(folder, FrontendConfig(), ["bravo"])
+
+
+def found_by(converter: str, **parameters: object) -> Calibration:
+    quality = [Quality(0.8, 0.9, 1.2), Quality(0.6, 0.7, 1.1)]
+    description = {"converter": {"name": converter}, "parameters": parameters}
+    sigma = dict.fromkeys(NAMES, 0.001)
+    halves = ["alpha, frames 0 to 9", "bravo, frames 0 to 9"]
+    return Calibration(TRUE, sigma, [TRUE, TRUE], quality, quality, halves, 20, 900, description)
+
+
+def test_the_options_are_those_of_the_converter() -> None:
+    options = report.options(found_by("7scenes", color_distortion=""))
+    assert options is not None
+    read = seven_scenes.Options(**options)
+    assert read.color_focal_y_px == 265
+    assert read.lens().distortion == (0.08, -0.3, 0.0, 0.0, 0.25)
+    assert read.depth_correction() == tuple(TRUE.depth_error)
+    np.testing.assert_allclose(read.lens().rotation_rad, [0.006, -0.008, 0.01], atol=1e-5)
+    assert report.options(found_by("7scenes", color_distortion="0.1 0 0 0")) is None
+    assert report.options(found_by("tum")) is None
+    text = report.format_calibration(found_by("7scenes"))
+    assert "--set color_distortion='0.08000 -0.30000 0.00000 0.00000 0.25000'" in text
+    assert "features 0.80 -> 0.80 px" in text
+    assert "takes no calibration" in report.format_calibration(found_by("tum"))
+    assert json.loads(json.dumps(report.plain(found_by("tum"))))["values"]["fx"]["value"] == 266
