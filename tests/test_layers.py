@@ -22,6 +22,7 @@ ALLOWED = {
     "recording": FOUNDATION | {"messages"},
     "digest": FOUNDATION | LOGS,
     "frontend": MATHEMATICS | LOGS,
+    "calibration": MATHEMATICS | LOGS | {"frontend", "run_folder"},
     "information": MATHEMATICS | LOGS,
     "consensus": MATHEMATICS,
     "robot": MATHEMATICS | LOGS | {"consensus"},
