@@ -183,7 +183,9 @@ def test_a_camera_that_does_not_move_is_refused(tmp_path: Path) -> None:
 
 def test_a_wall_without_texture_is_refused(tmp_path: Path) -> None:
     folder = still_recording(tmp_path / "bare", contrast=0)
-    with pytest.raises(DuagError, match=r"bare.* tracked frames in alpha, frames 0 to 7, expected at least 8"):
+    with pytest.raises(
+        DuagError, match=r"bare.* tracked frames in alpha, frames 0 to 7, expected at least 8"
+    ):
         calibrate(folder, FrontendConfig(), [])
     pixels, descriptors = [np.zeros((0, 2))] * 2, [np.zeros((0, 128), np.uint8)] * 2
     found = _landmarks(pixels, descriptors, [np.zeros(0)] * 2, CAMERA, np.array([np.eye(4)] * 2))
