@@ -73,7 +73,7 @@ def adjust(parts: Sequence[Views], rig: Rig, calibrate: bool) -> Adjusted:
         if calibrate:
             H[range(ends[-1], total), range(ends[-1], total)] += SAME_ERROR / prior**2
             g[ends[-1] :] += SAME_ERROR * (rig.values() - start.values()) / prior**2
-        d = np.sqrt(np.diag(H))
+        d = np.sqrt(np.maximum(np.diag(H), 1e-12))  # nothing moves a view that shows nothing
         scaled = H / d[:, None] / d
         x = -np.linalg.solve(scaled + 1e-9 * np.eye(total), g / d) / d
         for part, step, a, b in zip(parts, steps, ends[:-1], ends[1:], strict=True):

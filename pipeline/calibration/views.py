@@ -189,7 +189,10 @@ def _landmarks(
         np.stack([offsets[a] + found[:, 0], offsets[b] + found[:, 1]], axis=-1)
         for a, b, found in _matched(pixels, descriptors, depths, camera, T)
     ]
-    ends = np.concatenate([np.zeros((0, 2), dtype=np.int64), *edges])
+    if not edges:
+        none = np.zeros(0, dtype=np.int64)
+        return none, none, np.zeros((0, 2)), np.zeros((0, 3))
+    ends = np.concatenate(edges)
     graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(offsets[-1], offsets[-1]))
     _, label = connected_components(graph, directed=False)
     view = np.repeat(np.arange(len(pixels)), np.diff(offsets))

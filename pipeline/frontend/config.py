@@ -113,6 +113,8 @@ class FailureConfig(Config):
     may tell little, and its errors are several of these."""
     min_told: float = 0.65
     """Share of a frame's points that its keyframe must be able to judge to say that what stood before it is gone."""
+    min_overlap_unlike: float = 0.7
+    """Least overlap by which a frame is followed that looks unlike its keyframe, as where the exposure jumps."""
     max_speed_m_s: float = 3.0
     """Greatest speed of the camera: a lost one is not found farther away than it can have come."""
     slack_m: float = 0.1

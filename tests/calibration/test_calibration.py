@@ -13,7 +13,7 @@ from converters.base import RecordingWriter
 from pipeline.calibration import Calibration, calibrate, report
 from pipeline.calibration.adjustment import Quality, _features, _planes, adjust, overlapping
 from pipeline.calibration.rig import NAMES, Rig
-from pipeline.calibration.views import NORMALS_LEVEL, Views
+from pipeline.calibration.views import NORMALS_LEVEL, Views, _landmarks
 from pipeline.errors import DuagError
 from pipeline.frontend.config import FrontendConfig
 from pipeline.geometry import se3, so3
@@ -160,11 +160,11 @@ def test_known_cameras_are_found(views: Views) -> None:
     assert held_out.depth < as_recorded.depth
 
 
-def still_recording(folder: Path) -> Path:
+def still_recording(folder: Path, contrast: int = 255) -> Path:
     """A camera that does not move, before a wall with a pattern."""
     rng = np.random.default_rng(0)
     pattern = cv2.GaussianBlur(rng.uniform(0, 255, (240, 320)), (0, 0), 2)
-    pattern = cv2.normalize(pattern, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    pattern = cv2.normalize(pattern, None, 0, contrast, cv2.NORM_MINMAX).astype(np.uint8)
     png = cv2.imencode(".png", np.repeat(pattern[..., None], 3, axis=2))[1].tobytes()
     depth = np.full((240, 320), 1500, np.uint16) + (np.arange(320) // 4).astype(np.uint16)
     with RecordingWriter(folder) as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
@@ -179,6 +179,17 @@ def test_a_camera_that_does_not_move_is_refused(tmp_path: Path) -> None:
         calibrate(folder, FrontendConfig(), [])
     with pytest.raises(DuagError, match="has no robot bravo, expected one of alpha"):
         calibrate(folder, FrontendConfig(), ["bravo"])
+
+
+def test_a_wall_without_texture_is_refused(tmp_path: Path) -> None:
+    folder = still_recording(tmp_path / "bare", contrast=0)
+    with pytest.raises(
+        DuagError, match=r"bare.* tracked frames in alpha, frames 0 to 7, expected at least 8"
+    ):
+        calibrate(folder, FrontendConfig(), [])
+    pixels, descriptors = [np.zeros((0, 2))] * 2, [np.zeros((0, 128), np.uint8)] * 2
+    found = _landmarks(pixels, descriptors, [np.zeros(0)] * 2, CAMERA, np.array([np.eye(4)] * 2))
+    assert [len(part) for part in found] == [0, 0, 0, 0]
 
 
 def found_by(converter: str, **parameters: object) -> Calibration:

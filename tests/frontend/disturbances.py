@@ -6,6 +6,7 @@ import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +14,7 @@ from pipeline.frontend.config import FrontendConfig
 from pipeline.frontend.tracked import Status, TrackedFrame
 from pipeline.frontend.tracking import Tracker
 from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
 
 WRONG_M, WRONG_RAD = 0.05, np.deg2rad(3.0)
 """A pose called good that is farther than this from that of the undisturbed run is wrong."""
@@ -56,7 +58,7 @@ def hand(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
 def foreign(other: Sequence[Shot]) -> Callable[[Sequence[Shot], np.random.Generator], Iterator[Shot]]:
     """For 30 frames the images come from another room, in which a camera moves as well."""
 
-    def swapped(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+    def foreign_room(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
         for k, shot in enumerate(shots):
             if k >= 30:
                 yield shot
@@ -64,7 +66,7 @@ def foreign(other: Sequence[Shot]) -> Callable[[Sequence[Shot], np.random.Genera
             there = other[k % len(other)]
             yield replace(shot, color=there.color, depth=there.depth, disturbed=True, foreign=True)
 
-    return swapped
+    return foreign_room
 
 
 def mirrored(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
@@ -109,6 +111,37 @@ def depthless(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]
     """For 20 frames the depth camera delivers nothing."""
     for k, shot in enumerate(shots):
         yield replace(shot, depth=np.zeros_like(shot.depth), disturbed=True) if k < 20 else shot
+
+
+Disturbance = Callable[[Sequence[Shot], np.random.Generator], Iterator[Shot]]
+
+
+def every(other: Sequence[Shot]) -> list[Disturbance]:
+    """All of them; other: frames of a foreign room."""
+    return [
+        covered,
+        hand,
+        foreign(other),
+        mirrored,
+        dropped,
+        frozen,
+        frozen_color,
+        flipped,
+        depthless,
+    ]
+
+
+def resized(shots: Sequence[Shot], camera: PinholeCamera) -> list[Shot]:
+    """Frames in the image size of another camera."""
+    size = (camera.width, camera.height)
+    return [
+        replace(
+            shot,
+            color=cv2.resize(shot.color, size),
+            depth=cv2.resize(shot.depth, size, interpolation=cv2.INTER_NEAREST),
+        )
+        for shot in shots
+    ]
 
 
 @dataclass(frozen=True)
@@ -163,7 +196,7 @@ class Undisturbed:
     def disturbed(
         self,
         start: int,
-        disturbance: Callable[[Sequence[Shot], np.random.Generator], Iterator[Shot]],
+        disturbance: Disturbance,
         frames: int = 45,
         config: FrontendConfig | None = None,
     ) -> list[Row]:

@@ -63,7 +63,7 @@ def test_colour_alone_is_followed_for_a_short_way(run: Undisturbed) -> None:
 
 
 def test_colour_alone_says_how_little_it_knows(run: Undisturbed) -> None:
-    """Its standard deviation holds the share of the way, and the uncertainty of the frame that it went on from."""
+    """Its standard deviation holds a share of the way."""
     rows = [row for row in run.disturbed(START, d.depthless, frames=5) if row.good]
     T_sound = run.poses[START - 1]
     share = CONFIG.tracking.failure.sigma_of_way_without_depth
@@ -71,6 +71,15 @@ def test_colour_alone_says_how_little_it_knows(run: Undisturbed) -> None:
         way_m = float(np.linalg.norm((se3.inverse(T_sound) @ run.poses[row.shot.index])[:3, 3]))
         covariance = np.linalg.inv(row.frame.information)
         assert np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[0]) > 0.99 * share * way_m
+
+
+def test_colour_alone_knows_no_more_than_the_frame_it_went_on_from(run: Undisturbed) -> None:
+    tracker, shot = run.tracker(START), run.shots[START]
+    assert tracker._sound is not None
+    tracker._sound = replace(tracker._sound, information=1e2 * np.eye(6))  # 10 cm, 0.1 rad
+    frame, _ = d.track(tracker, replace(shot, depth=np.zeros_like(shot.depth)))
+    covariance = np.linalg.inv(frame.information)
+    assert np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[0]) > 0.099
 
 
 def test_colour_alone_must_look_as_before(run: Undisturbed) -> None:
@@ -97,6 +106,11 @@ def test_what_looks_unlike_is_followed_only_where_it_was_expected(run: Undisturb
     beyond = replace(beyond, index=here.index, stamp_ns=here.stamp_ns)
     found = [d.track(run.tracker(START), shot)[0] for shot in (here, beyond, unlike(here), unlike(beyond))]
     assert [frame.status for frame in found] == [Status.OK, Status.OK, Status.OK, Status.LOST]
+    all_of_it = {"tracking": {"strides": (2, 1, 1, 1), "failure": {"min_overlap_unlike": 1.0}}}
+    for shot, status in ((here, Status.OK), (unlike(here), Status.LOST)):
+        tracker = run.tracker(START)
+        tracker.config = FrontendConfig.model_validate(all_of_it)
+        assert d.track(tracker, shot)[0].status is status
 
 
 def _drifted(run: Undisturbed) -> Tracker:

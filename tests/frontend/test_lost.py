@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -217,12 +216,16 @@ def test_intruders_are_what_stands_in_free_space(run: Undisturbed) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("robot", "starts"), [("alpha", (60, 120, 180, 240)), ("bravo", (40, 110, 170, 230))], ids=str
+    ("robot", "starts"), [("alpha", (60, 120, 180, 240)), ("bravo", (20, 60, 110, 140, 170, 230))], ids=str
 )
 def test_red_kitchen_is_never_silently_wrong(
     robot: str, starts: tuple[int, ...], other_room: list[Shot]
 ) -> None:
-    """A real sensor: nine disturbances at four places of the log of each robot."""
+    """A real sensor: nine disturbances, bravo's from the hardest places.
+
+    At 20 the depth sticks while the image is burnt out, from 60 the mirrored room could pass for a fast motion, from
+    140 depth and colour do not fit together by 5 cm, and tracking has erred by as much since the first keyframe.
+    """
     if not (RED_KITCHEN / f"{robot}.mcap").is_file():
         pytest.skip("needs recordings/redkitchen")
     with open_rgbd(RED_KITCHEN / f"{robot}.mcap") as log:
@@ -231,27 +234,7 @@ def test_red_kitchen_is_never_silently_wrong(
     run = Undisturbed(Tracker(camera, FrontendConfig()), shots, starts)
     lost = [frame.frame_index for frame in run.frames if frame.status is Status.LOST]
     assert not lost
-    size = (camera.width, camera.height)
-    there = [
-        Shot(
-            s.index,
-            s.stamp_ns,
-            cv2.resize(s.color, size),
-            cv2.resize(s.depth, size, interpolation=cv2.INTER_NEAREST),
-        )
-        for s in other_room
-    ]
-    every = (
-        d.covered,
-        d.hand,
-        d.foreign(there),
-        d.mirrored,
-        d.dropped,
-        d.frozen,
-        d.frozen_color,
-        d.flipped,
-        d.depthless,
-    )
+    every = d.every(d.resized(other_room, camera))
     wrong, found = [], 0
     for start in starts:
         for disturbance in every:
@@ -260,15 +243,3 @@ def test_red_kitchen_is_never_silently_wrong(
             found += rows[-1].good
     assert not wrong
     assert found >= 0.9 * len(starts) * len(every)
-
-
-@pytest.mark.slow
-def test_red_kitchen_no_hand_becomes_a_keyframe() -> None:
-    """Here the hand lies outside the view of the latest keyframe from the second frame on."""
-    if not (RED_KITCHEN / "bravo.mcap").is_file():
-        pytest.skip("needs recordings/redkitchen")
-    with open_rgbd(RED_KITCHEN / "bravo.mcap") as log:
-        camera = log.camera
-        shots = [Shot(f.index, f.stamp_ns, f.color, f.depth) for f in map(log.frame, range(185))]
-    run = Undisturbed(Tracker(camera, FrontendConfig()), shots, (140,))
-    assert not any(row.wrong for row in run.disturbed(140, d.hand))
