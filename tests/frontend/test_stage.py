@@ -165,7 +165,7 @@ def test_a_missing_log_is_named(tmp_path: Path) -> None:
 
 
 def test_what_moves_is_not_mapped(tmp_path: Path) -> None:
-    """A ball crosses the room, never twice at one place: by depth alone it is kept out, without that it leaves a trail."""
+    """A ball crosses the room, never twice at one place: depth alone keeps it out, without that it leaves a trail."""
     centres = [np.array([-0.5 + 0.15 * k, -0.3, 0.5]) for k in range(FRAMES)]
     with RecordingWriter(tmp_path / "room") as recording, recording.robot("alpha", CAMERA, 0.0005) as robot:
         for k in range(FRAMES):
