@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.consensus.config import ColorConfig
-from pipeline.consensus.evidence import COLOR, Evidence, rows_by_id
+from pipeline.consensus.evidence import COLOR, COLOR_INFORMATION, Evidence, rows_by_id
 
 Array = NDArray[np.float64]
 Pairs = Mapping[tuple[str, str], NDArray[np.int64]]
@@ -30,7 +30,6 @@ _ROUNDS = 20  # of reweighting
 _TUNING = 3.0  # standard deviations at which a pair counts a quarter
 _LEAST_SPREAD = 1e-3  # of colours; below it there is no contrast to compare
 _LEAST_CORRELATION = 0.05
-_COLOR_INFORMATION = slice(27, 30)
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class ColorMap:
             return evidence
         theta, information = evidence.theta.copy(), evidence.information.copy()
         theta[:, COLOR] = self.to_other(theta[:, COLOR])
-        information[:, _COLOR_INFORMATION] /= self.gain**2
+        information[:, COLOR_INFORMATION] /= self.gain**2
         return replace(evidence, theta=theta, information=information)
 
 

@@ -23,11 +23,13 @@ from pipeline.splat.gaussians import Gaussians
 Array = NDArray[np.float64]
 MEAN, LOG_COVARIANCE, COLOR, OPACITY = slice(0, 3), slice(3, 9), slice(9, 12), 12
 """Places in theta."""
+COLOR_INFORMATION = slice(27, 30)
+"""Places of the colour in the packed information."""
 SHAPE_FLOOR = 0.1
 """Least standard deviation of a coordinate of vec log Sigma: 5 % of a scale."""
 LEAST_DEVIATION_M = 1e-4
 """Deviation of a mean from the measured surface below which nobody claims to know that surface."""
-_POSITION, _SHAPE, _COLOR, _OPACITY = slice(0, 6), slice(6, 27), slice(27, 30), 30
+_POSITION, _SHAPE, _OPACITY = slice(0, 6), slice(6, 27), 30
 
 
 class FisherSums(Protocol):
@@ -202,7 +204,7 @@ class Evidence:
 
     def color_information(self) -> Array:
         """[n, 3]."""
-        return self.information[:, _COLOR]
+        return self.information[:, COLOR_INFORMATION]
 
     def opacity_information(self) -> Array:
         """[n], over the logit."""
@@ -230,7 +232,7 @@ def _sums_of(gaussians: Gaussians, information: FisherSums | None) -> tuple[Arra
     geometry = unpack_symmetric(information.geometry[row], 9)
     packed[found, _POSITION] = pack_symmetric(geometry[:, :3, :3])
     packed[found, _SHAPE] = pack_symmetric(geometry[:, 3:, 3:])
-    packed[found, _COLOR] = information.color[row]
+    packed[found, COLOR_INFORMATION] = information.color[row]
     packed[found, _OPACITY] = information.opacity[row]
     return packed, rows
 

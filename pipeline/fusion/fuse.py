@@ -26,6 +26,7 @@ from pipeline.consensus.colors import ColorMap, team_colors
 from pipeline.consensus.config import MatchingConfig, WeightKind
 from pipeline.consensus.evidence import (
     COLOR,
+    COLOR_INFORMATION,
     LOG_COVARIANCE,
     MEAN,
     OPACITY,
@@ -47,7 +48,6 @@ MAD_TO_SIGMA = 1.4826
 # Information of the own mean (1/m^2) and shape, which decides where nobody knows more. Matches are within centimetres,
 # so that of `neighbours` is no claim; where all robots shall end with the same Gaussian it is next to nothing.
 PRIOR = {"neighbours": (100.0, 0.1), "members": (1e-2, 1e-4)}
-_COLOR_INFORMATION = slice(27, 30)
 _NEAR_M = 0.05  # points closer to a camera than this are not judged by it
 
 
@@ -358,7 +358,7 @@ def fuse(
 
     theta, move[:, COLOR] = rows.theta + move, move[:, COLOR] / common.gain
     theta[:, COLOR] = common.from_other(theta[:, COLOR])
-    sums[:, _COLOR_INFORMATION] *= common.gain**2
+    sums[:, COLOR_INFORMATION] *= common.gain**2
     kept = _applied(moved, move[own_rows], rows.theta[own_rows, LOG_COVARIANCE])
     ids = np.concatenate([world[n].ids for n in names])
     anchors = np.concatenate([world[n].anchors for n in names])
