@@ -117,8 +117,8 @@ def _calibrate(
     for name, before, after in zip(found.names, found.before, found.after, strict=True):
         if after.features_px > before.features_px:
             raise DuagError(
-                f"{folder}: calibrated by the other half, features of {name} meet within {after.features_px:.2f} px, "
-                f"expected less than the {before.features_px:.2f} px of the recording's own calibration"
+                f"{folder}: found no better calibration than its own: by that of the other half, features of {name} "
+                f"meet within {after.features_px:.3f} px, expected less than {before.features_px:.3f} px as recorded"
             )
     return found
 
