@@ -100,6 +100,7 @@ def content(run: RunFolder, source: Recording) -> dict[str, Any]:
         "comparison": words.comparison_rows(metrics),
         "rendering_columns": list(words.RENDERING.values()),
         "rendering": _rendering_rows(metrics),
+        "own_longer": words.is_scored(metrics, "own_longer"),
         "exposure_note": " ".join(["No exposure is fitted to a view.", *_cameras(metrics)]),
         "views": shown_views,
         **_agreement_content(session, metrics, reasons),
@@ -258,7 +259,7 @@ def _rendering_rows(metrics: dict[str, Any]) -> list[dict[str, Any]]:
         }
         for kind, word in words.MAPS.items()
         for view_set in words.VIEW_SETS
-        if view_set in metrics["rendering"][kind]
+        if view_set in metrics["rendering"][kind] and words.is_scored(metrics, kind)
     ]
 
 

@@ -172,9 +172,14 @@ def rows(
     ]
 
 
+def is_scored(metrics: dict[str, Any], kind: str) -> bool:
+    """Whether a map was evaluated; `own_longer` is only if asked for."""
+    return kind != "own_longer" or bool(metrics["rendering"][kind]["held_out"]["views"])
+
+
 def _compared(metrics: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Of all robots together and of each: name, map, its scores by set of views."""
-    kinds = [k for k in COMPARED if k != "own_longer" or metrics["rendering"][k]["held_out"]["views"]]
+    kinds = [kind for kind in COMPARED if is_scored(metrics, kind)]
     yield from (("all robots", kind, metrics["rendering"][kind]) for kind in kinds)
     for name, robot in metrics["robots"].items():
         yield from ((name, kind, robot["rendering"][kind]) for kind in kinds)

@@ -66,6 +66,7 @@ def test_maps_stand_beside_each_other_for_all_and_for_each_robot(fake, html):
     assert len(rows) == 3 * 3
     assert all(len(r["values"]) == 3 * 4 for r in rows)
     assert "Which map is better?" in html
+    assert "own, trained longer" not in html  # it was not asked for
     lines = words.comparison_text(metrics).splitlines()
     bravo = metrics["robots"]["bravo"]["rendering"]["own"]
     own = next(line for line in lines if line.startswith("bravo")).split()
