@@ -12,14 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.files import decode_image
-from pipeline.geometry import so3
+from pipeline.geometry import depth_error, so3
 from pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
-
-NO_ERROR_M = 2.0  # where c0 changes nothing: a common factor of all depths is no error that images could show
-FARTHEST_M = 100.0  # depth that a correction would put farther away, or behind the camera, is none
 
 
 def numbers(text: str, counts: tuple[int, ...]) -> Numbers:
@@ -88,9 +85,7 @@ def resampled(data: bytes, maps: tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 def correct(depth_m: Array, camera: PinholeCamera, coefficients: Numbers) -> Array:
-    """Depth without its smooth error: 1/z + c0 (1 - 2 m / z) + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2 is the true 1/z.
-
-    A structured-light camera measures disparity, which is affine in 1/z; lens and projector warp it.
+    """Depth without its smooth error (`pipeline.geometry.depth_error`); what that puts too far away is unknown.
 
     Args:
         depth_m: [h, w] of `camera`, 0 = none. coefficients: c0 .. c5, 1/m; empty: nothing is changed.
@@ -100,8 +95,8 @@ def correct(depth_m: Array, camera: PinholeCamera, coefficients: Numbers) -> Arr
     x, y = camera.rays()[..., 0], camera.rays()[..., 1]
     known = depth_m > 0
     w = 1 / np.where(known, depth_m, 1)
-    terms = (1 - NO_ERROR_M * w, x, y, x * x, x * y, y * y)
-    for coefficient, term in zip(coefficients, terms, strict=True):
-        w = w + coefficient * term
-    near = w > 1 / FARTHEST_M
+    terms = depth_error.terms(w, x, y)
+    for k, coefficient in enumerate(coefficients):
+        w = w + coefficient * terms[..., k]
+    near = w > 1 / depth_error.FARTHEST_M
     return np.where(known & near, 1 / np.where(near, w, 1), 0.0)

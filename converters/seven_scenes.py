@@ -25,7 +25,7 @@ from pipeline import numeric
 from pipeline.config import Config
 from pipeline.errors import DuagError
 from pipeline.files import read_text
-from pipeline.geometry import se3
+from pipeline.geometry import depth_error, se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.progress import track
 
@@ -42,7 +42,11 @@ CONNECTED_RATIO = (
     0.03  # neighbouring depths that differ by less than this share of the nearer are one surface
 )
 
-LENGTHS = {"color_distortion": (4, 5), "color_rotation_rad": (3,), "depth_correction_per_m": (6,)}
+LENGTHS = {
+    "color_distortion": (4, 5),
+    "color_rotation_rad": (3,),
+    "depth_correction_per_m": (depth_error.COEFFICIENTS,),
+}
 """How many numbers options hold that are lists of numbers."""
 
 

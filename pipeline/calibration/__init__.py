@@ -6,7 +6,7 @@ to each half, and what a half says is tried on the other: a calibration is only 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,9 +70,9 @@ def calibrate(folder: Path, config: FrontendConfig, robots: Sequence[str], views
     if len(cameras) > 1:
         raise DuagError(f"{folder}: its robots have {len(cameras)} different cameras, expected --robot NAME")
     for half in halves:
-        if sum(len(part.points_map) for part in half) < MIN_LANDMARKS:
+        found = sum(len(part.points_map) for part in half)
+        if found < MIN_LANDMARKS:
             names = " and ".join(part.name for part in half)
-            found = sum(len(part.points_map) for part in half)
             raise DuagError(f"{folder}: {found} features were followed in {names}, expected {MIN_LANDMARKS}")
     return _calibrate(folder, halves, Rig.of(cameras.pop()), source.description)
 
@@ -80,18 +80,8 @@ def calibrate(folder: Path, config: FrontendConfig, robots: Sequence[str], views
 def _calibrate(
     folder: Path, halves: list[list[Views]], start: Rig, description: dict[str, Any]
 ) -> Calibration:
-    jobs: list[tuple[list[list[Views]], Rig, bool]] = [([half], start, False) for half in halves]
-    jobs += [([half], start, True) for half in halves]
-    done: list[Adjusted] = []
-    for k in track(range(7), "adjust"):
-        if k < 4:
-            chosen, rig, free = jobs[k]
-        elif k < 6:
-            chosen, rig, free = [halves[k - 4]], done[7 - k].rig, False  # calibrated by the other half
-        else:
-            chosen, rig, free = halves, start, True
-        done.append(adjust([copy(part) for half in chosen for part in half], rig, free))
-    both = done[6]
+    done = list(track(_adjustments(halves, start), "adjust", total=7))
+    recorded, alone, by_other, both = done[:2], done[2:4], done[4:6], done[6]
     assert both.covariance is not None
     sigma = dict(zip(NAMES, np.sqrt(np.diag(both.covariance)).tolist(), strict=True))
     scale = start.camera.width / 640
@@ -106,9 +96,9 @@ def _calibrate(
     found = Calibration(
         both.rig,
         sigma,
-        [done[2].rig, done[3].rig],
-        [_mean(done[0].quality), _mean(done[1].quality)],
-        [_mean(done[4].quality), _mean(done[5].quality)],
+        [half.rig for half in alone],
+        [_mean(half.quality) for half in recorded],
+        [_mean(half.quality) for half in by_other],
         [" and ".join(part.name for part in half) for half in halves],
         sum(len(part.T_map_camera) for half in halves for part in half),
         sum(len(part.points_map) for half in halves for part in half),
@@ -121,6 +111,23 @@ def _calibrate(
                 f"meet within {after.features_px:.3f} px, expected less than {before.features_px:.3f} px as recorded"
             )
     return found
+
+
+def _adjustments(halves: list[list[Views]], start: Rig) -> Iterator[Adjusted]:
+    """Each half as recorded, each calibrated by itself, each as the other calibrates it, and all of it calibrated."""
+
+    def adjusted(parts: Sequence[Views], rig: Rig, calibrate: bool) -> Adjusted:
+        return adjust([copy(part) for part in parts], rig, calibrate)
+
+    for half in halves:
+        yield adjusted(half, start, False)
+    alone = []
+    for half in halves:
+        alone.append(adjusted(half, start, True))
+        yield alone[-1]
+    for half, other in zip(halves, reversed(alone), strict=True):
+        yield adjusted(half, other.rig, False)
+    yield adjusted([part for half in halves for part in half], start, True)
 
 
 def _mean(quality: Sequence[Quality]) -> Quality:

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from pipeline.calibration.rig import NAMES, Rig
 from pipeline.calibration.views import Views, look_up, normals_at
 from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.registration.residuals import MAD_TO_SIGMA
+from pipeline.registration.residuals import MAD_TO_SIGMA, RegistrationConfig
 
 Array = NDArray[np.float64]
 
@@ -29,6 +28,7 @@ PRIOR = dict(zip(NAMES, (15, 15, 15, 15, 0.3, 0.5, 0.5, 0.01, 0.01, 0.01, 0.02, 
 NEIGHBOURS, MIN_OVERLAP = 4, 0.3  # views that the depth of a view is compared with
 GATE_M, GATE_RELATIVE = 0.08, 0.05
 FEATURE_GATE_M = 0.15
+NOISE = RegistrationConfig()  # of depth: its shape
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def _planes(views: Views, pairs: NDArray[np.int64], rig: Rig) -> _Planes:
     first, second = pairs.T
     column, row = np.moveaxis(views.samples[first], -1, 0)
     at = first[:, None], row, column
-    rays = _rays(c, column, row)
+    rays = c.rays_at(column, row)
     z, z_by = rig.depth(views.inverse_depth[at].astype(np.float64), rays)
     p, normals = rays * z[..., None], normals_at(views, *at)
     M = se3.inverse(views.T_map_camera[second]) @ views.T_map_camera[first]
@@ -151,7 +151,7 @@ def _planes(views: Views, pairs: NDArray[np.int64], rig: Rig) -> _Planes:
     uv = c.project(np.where(front[..., None], q, 1.0))
     inverse = look_up(views, np.broadcast_to(second[:, None], front.shape), uv[..., 0], uv[..., 1])
     seen = front & np.isfinite(inverse)
-    rays_there = _rays(c, uv[..., 0], uv[..., 1])
+    rays_there = c.rays_at(uv[..., 0], uv[..., 1])
     z_there, z_there_by = rig.depth(np.where(seen, inverse, 1.0), rays_there)
     used = seen & (np.abs(z_there - q[..., 2]) < np.maximum(GATE_M, GATE_RELATIVE * q[..., 2]))
     surface = rays_there * z_there[..., None]
@@ -191,7 +191,7 @@ def _features(views: Views, rig: Rig) -> _Features:
     uv = c.project(q)
     inverse = look_up(views, view, uv[:, 0], uv[:, 1])
     seen = np.isfinite(inverse)
-    rays = _rays(c, uv[:, 0], uv[:, 1])
+    rays = c.rays_at(uv[:, 0], uv[:, 1])
     z, z_by = rig.depth(np.where(seen, inverse, 1.0), rays)
     at = np.rint(np.where(seen[:, None], uv, 0)).astype(np.int64)
     n = normals_at(views, view, at[:, 1], at[:, 0])
@@ -210,14 +210,9 @@ def _features(views: Views, rig: Rig) -> _Features:
     return _Features(pixel - views.pixel, distance, used, by_q @ by_motion, by_q @ T[:, :3, :3], by_rig)
 
 
-def _rays(camera: PinholeCamera, u: Array | NDArray[np.int64], v: Array | NDArray[np.int64]) -> Array:
-    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    return np.stack([x, y, np.ones_like(x)], axis=-1)
-
-
 def _sigma(z: Array) -> Array:
-    """Shape of the noise of depth, metres (as `RegistrationConfig.depth_sigma_base_m` has it)."""
-    return np.asarray(0.0012 + 0.0019 * (z - 0.4) ** 2)
+    """Shape of the noise of depth, metres, as the registration has it."""
+    return np.asarray(NOISE.depth_sigma_base_m + NOISE.depth_sigma_slope_per_m * (z - 0.4) ** 2)
 
 
 def _scale(residual: Array, least: float) -> float:
@@ -278,10 +273,18 @@ def _linearised(views: Views, pairs: NDArray[np.int64], rig: Rig, calibrate: boo
     H = (A.T @ A - WV @ W.T).toarray()
     g = np.asarray(A.T @ r - WV @ force, dtype=np.float64)
 
+    H_planes, g_planes = _of_planes(views, pairs, rig, cameras)
+    return _Step(H + H_planes, g + g_planes, V_inverse, force.reshape(-1, 3), W.T.tocsr())
+
+
+def _of_planes(views: Views, pairs: NDArray[np.int64], rig: Rig, cameras: int) -> tuple[Array, Array]:
+    """What the depth images say of poses and the last `cameras` numbers: H [n, n] and g [n]."""
+    count = 6 * len(views.T_map_camera)
+    H, g = np.zeros((count + cameras, count + cameras)), np.zeros(count + cameras)
     s = _planes(views, pairs, rig)
     weight = np.where(s.used, _huber(s.distance, _scale(s.distance[s.used], 0.1)), 0.0)
     J = [s.by_first, s.by_second]
-    if calibrate:
+    if cameras:
         J.append(np.zeros((*weight.shape, cameras)))
         J[-1][..., 11:] = s.by_depth
     J_all = np.concatenate(J, axis=-1)
@@ -291,7 +294,7 @@ def _linearised(views: Views, pairs: NDArray[np.int64], rig: Rig, calibrate: boo
         at = np.r_[6 * a : 6 * a + 6, 6 * b : 6 * b + 6, count : count + cameras]
         H[np.ix_(at, at)] += H_pair
         g[at] += g_pair
-    return _Step(H, g, V_inverse, force.reshape(-1, 3), W.T.tocsr())
+    return H, g
 
 
 def _huber(residual: Array, scale: float) -> Array:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry import so3
+from pipeline.geometry import depth_error, so3
 from pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
@@ -20,8 +20,6 @@ LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3")
 ROTATION = ("rx", "ry", "rz")
 DEPTH = ("c0", "c1", "c2", "c3", "c4", "c5")
 NAMES = (*LENS, *ROTATION, "delay_s", *DEPTH)
-NO_ERROR_M = 2.0  # where c0 changes nothing: no image shows a common factor of all lengths
-FARTHEST_M = 100.0
 
 
 @dataclass(frozen=True)
@@ -30,8 +28,7 @@ class Rig:
 
     camera: of the recording, to which depth is registered. lens: [7], focal lengths and principal point in pixels,
     radial distortion k1 k2 k3 as OpenCV defines it. R_color_depth: [3, 3]. delay_s: colour was taken so much later.
-    depth_error: [6], 1/m: 1/z + c0 (1 - 2 m / z) + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2 is the true 1/z at the ray
-    (x, y, 1).
+    depth_error: [6], 1/m, see `geometry.depth_error`.
     """
 
     camera: PinholeCamera
@@ -89,7 +86,6 @@ class Rig:
 
     def depth(self, inverse: Array, rays: Array) -> tuple[Array, Array]:
         """True depth [...] of a measured inverse depth at rays [..., 3], and its derivative by the error [..., 6]."""
-        x, y = rays[..., 0], rays[..., 1]
-        terms = np.stack([1 - NO_ERROR_M * inverse, x, y, x * x, x * y, y * y], axis=-1)
-        z = 1 / np.maximum(inverse + terms @ self.depth_error, 1 / FARTHEST_M)
+        terms = depth_error.terms(inverse, rays[..., 0], rays[..., 1])
+        z = 1 / np.maximum(inverse + terms @ self.depth_error, 1 / depth_error.FARTHEST_M)
         return z, -(z**2)[..., None] * terms

@@ -18,7 +18,7 @@ from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.progress import track
 from pipeline.recording import open_rgbd
-from pipeline.registration.features import matches, root_sift
+from pipeline.registration.features import DIMENSIONS, matches, root_sift
 from pipeline.registration.pyramid import SAME_SURFACE, RgbdPyramid
 from pipeline.run_folder import RobotRun
 
@@ -29,9 +29,7 @@ RATIO = 0.75
 LINE_PX, POINT_PX = 8.0, 25.0  # of 640 px: how far a match may be from where the tracked poses put it
 MIN_MATCHES = 10
 MIN_TRACK = 3  # views
-NORMALS_LEVEL = (
-    1  # images of half the size: noisy normals feign information along a surface, and steps get short
-)
+NORMALS_LEVEL = 1  # half size: noisy normals feign information along a surface, and steps get short
 SAMPLES = 150  # of the depth of a view
 FARTHEST_SAMPLE_M = 4.0
 MAX_TURN, MAX_WAY_M = 0.6, 2.0  # cosine between the axes of views that are compared, way between them
@@ -113,7 +111,9 @@ def load_views(tracked: Tracked, first: int, last: int, most: int) -> Views:
             pyramid = RgbdPyramid.build(np.zeros(depth.shape, np.float32), depth, camera, NORMALS_LEVEL + 1)
             pixels.append(pixel)
             descriptors.append(
-                root_sift(np.asarray(found, dtype=np.float32)) if len(pixel) else np.zeros((0, 128), np.uint8)
+                root_sift(np.asarray(found, dtype=np.float32))
+                if len(pixel)
+                else np.zeros((0, DIMENSIONS), np.uint8)
             )
             depths.append(depth[row, column].astype(np.float64))
             w = pyramid.levels[0].inverse_depth
@@ -207,13 +207,7 @@ def _landmarks(
     count = int(landmark.max()) + 1 if len(kept) else 0
     points, seen = np.zeros((count, 3)), np.zeros(count)
     known = depth[kept] > 0
-    rays = np.column_stack(
-        [
-            (pixel[kept, 0] - camera.cx) / camera.fx,
-            (pixel[kept, 1] - camera.cy) / camera.fy,
-            np.ones(len(kept)),
-        ]
-    )
+    rays = camera.rays_at(*pixel[kept].T)
     there = se3.transform(T[view[kept]], (rays * depth[kept, None])[:, None])[:, 0]
     np.add.at(points, landmark[known], there[known])
     np.add.at(seen, landmark[known], 1)
@@ -228,10 +222,7 @@ def _matched(
     T: Array,
 ) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
     """Pairs of views, and their matches that are roughly where the poses put them."""
-    rays = [
-        np.column_stack([(p - (camera.cx, camera.cy)) / (camera.fx, camera.fy), np.ones(len(p))])
-        for p in pixels
-    ]
+    rays = [camera.rays_at(*p.T) for p in pixels]
     scale = camera.width / 640
     axes, centres = T[:, :3, 2], T[:, :3, 3]
     for a in range(len(T)):

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from pipeline.consensus.config import ColorConfig
 from pipeline.consensus.evidence import COLOR, COLOR_INFORMATION, Evidence, rows_by_id
+from pipeline.registration.residuals import MAD_TO_SIGMA
 
 Array = NDArray[np.float64]
 Pairs = Mapping[tuple[str, str], NDArray[np.int64]]
-MAD_TO_SIGMA = 1.4826
 _ROUNDS = 20  # of reweighting
 _TUNING = 3.0  # standard deviations at which a pair counts a quarter
 _LEAST_SPREAD = 1e-3  # of colours; below it there is no contrast to compare

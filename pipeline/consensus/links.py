@@ -13,6 +13,7 @@ from pipeline.consensus.closures import Closure, closure_factors
 from pipeline.consensus.config import ClosureConfig
 from pipeline.consensus.factors import Factors
 from pipeline.consensus.robust import RobustWeights
+from pipeline.geometry import so3
 
 Array = NDArray[np.float64]
 STEP_M = 2.0**-27
@@ -131,11 +132,12 @@ class Link:
         return float(self.changes.max())
 
 
-def rounded_translations(translations: Array, wire: str) -> NDArray[Any]:
-    """Translations [s, 3] as they stand in a packet: float64 (rounded to STEP_M for `fixed`) or float32."""
+def rounded(T: Array, wire: str) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Poses [s, 4, 4] as they stand in a packet: quats_wxyz [s, 4] and translations [s, 3], see `PosePacket`."""
+    quats_wxyz, translations = so3.to_quat_wxyz(T[:, :3, :3]), T[:, :3, 3]
     if wire == "fixed":
-        return np.asarray(np.rint(translations / STEP_M) * STEP_M)
-    return translations.astype(wire)
+        return quats_wxyz.astype(np.float32), np.asarray(np.rint(translations / STEP_M) * STEP_M)
+    return quats_wxyz.astype(wire), translations.astype(wire)
 
 
 def link_metric(

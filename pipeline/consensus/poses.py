@@ -42,16 +42,9 @@ from pipeline.consensus import factors as pose_factors
 from pipeline.consensus.closures import Closure, closure_factors
 from pipeline.consensus.config import PoseConsensusConfig
 from pipeline.consensus.factors import Factors, difference, inflated, retract
-from pipeline.consensus.links import (
-    BLOCK,
-    Link,
-    PosePacket,
-    SharedKeyframes,
-    link_metric,
-    rounded_translations,
-)
+from pipeline.consensus.links import BLOCK, Link, PosePacket, SharedKeyframes, link_metric, rounded
 from pipeline.consensus.robust import COUNTS, RobustWeights
-from pipeline.geometry import se3, so3
+from pipeline.geometry import se3
 
 Array = NDArray[np.float64]
 _STEADY = 1e-3  # m, rad: a link that moves less has left its start behind
@@ -251,16 +244,14 @@ class PoseAgent:
             self._start()
         link = self.links[peer]
         link.sent += 1
-        m = retract(self._x[link.slots], link.offset)
+        quats_wxyz, translations = rounded(retract(self._x[link.slots], link.offset), self.config.wire)
         curvature = None if link.decides else self._curvature(link)
         return PosePacket(
             sequence=link.sent,
             version=link.version,
             keyframes=link.keyframes,
-            quats_wxyz=so3.to_quat_wxyz(m[:, :3, :3]).astype(
-                "float64" if self.config.wire == "float64" else "float32"
-            ),
-            translations=rounded_translations(m[:, :3, 3], self.config.wire),
+            quats_wxyz=quats_wxyz,
+            translations=translations,
             penalties=link.penalties.astype(np.float32),
             curvature=None if curvature is None else curvature.astype(np.float32),
             converged=self.settled,

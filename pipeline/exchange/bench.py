@@ -325,6 +325,10 @@ def _records(team: Team, name: str, kind: Kind) -> NDArray[Any]:
     return out
 
 
+HEAD = (
+    "topology | robots | contrast | unknown | loss | mode | to 0.05 sigma | to 1e-6 | end, rounds | "
+    "gap, sigma | at 99 % | kB | kB as the paper counts | CPU s"
+)
 LEGEND = """
 Unknown: share of its tracks that a robot knows nothing of. Rounds: until the worst coordinate of any robot is that
 near the optimum, and until the session ended (there, or nothing moved any more, or --max-rounds); "-": not reached.
@@ -334,20 +338,7 @@ of its weights. kB: of all robots, headers and lost packets too; as the paper co
 
 def format_table(result: dict[str, Any]) -> str:
     """The rows as a Markdown table that can be read as it stands, and what its columns mean."""
-    rows = [
-        [
-            "topology",
-            "robots",
-            "contrast",
-            "unknown",
-            "loss",
-            "mode",
-            "to 0.05 sigma",
-            "to 1e-6",
-            "end, rounds",
-        ]
-    ]
-    rows[0] += ["gap, sigma", "at 99 %", "kB", "kB as the paper counts", "CPU s"]
+    rows = [HEAD.split(" | ")]
     for r in result["rows"]:
         paper = r["bytes_paper_accounting"]
         rows.append(

@@ -47,10 +47,8 @@ LEAST_PX = 4.0  # weight, in pixels, from which on a Gaussian is judged
 LEAST_SHARE = 0.01  # of the own pixels, from which on a neighbour is judged as a whole
 PASSES = 2  # what hid behind a contradicted Gaussian is judged in the second
 LARGEST = 2.0  # times the largest Gaussian of the own map: no mapper makes a larger one
-RADIUS_SLACK, DISTANCE_SLACK = (
-    2.0,
-    1.5,
-)  # on what makes a match; far enough that rounding tips none of an honest robot
+# on what makes a match; far enough that rounding tips none of an honest robot
+RADIUS_SLACK, DISTANCE_SLACK = 2.0, 1.5
 
 
 @dataclass(frozen=True)

@@ -40,11 +40,11 @@ from pipeline.consensus.weighting import in_world
 from pipeline.fusion.config import FusionConfig
 from pipeline.geometry import se3, spd
 from pipeline.geometry.camera import PinholeCamera
+from pipeline.registration.residuals import MAD_TO_SIGMA
 from pipeline.splat.gaussians import DepthKind, Gaussians
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-MAD_TO_SIGMA = 1.4826
 # Information of the own mean (1/m^2) and shape, which decides where nobody knows more. Matches are within centimetres,
 # so that of `neighbours` is no claim; where all robots shall end with the same Gaussian it is next to nothing.
 PRIOR = {"neighbours": (100.0, 0.1), "members": (1e-2, 1e-4)}

@@ -46,8 +46,12 @@ class PinholeCamera:
 
     def rays(self) -> NDArray[np.float64]:
         """Ray of every pixel with z = 1, camera frame, [height, width, 3]."""
-        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
-        return np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)], axis=-1)
+        return self.rays_at(*np.meshgrid(np.arange(self.width), np.arange(self.height)))
+
+    def rays_at(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
+        """Rays [..., 3] with z = 1, camera frame, of pixels: columns u [...] and rows v [...], between centres, too."""
+        x, y = (np.asarray(u) - self.cx) / self.fx, (np.asarray(v) - self.cy) / self.fy
+        return np.stack([x, y, np.ones(np.shape(x))], axis=-1)
 
     def project(self, points_camera: ArrayLike) -> NDArray[np.float64]:
         """Pixels [..., 2] of points [..., 3] with z > 0 in the camera frame."""

@@ -21,10 +21,10 @@ from pipeline.kernels import FisherSums, Rasterizer
 from pipeline.messages import GaussianInformation, GaussianMap, Keyframe, Odometry
 from pipeline.recording import LogWriter, open_rgbd, read_log
 from pipeline.registration.moving import FreeSpace, MovingConfig
+from pipeline.registration.residuals import MAD_TO_SIGMA
 from pipeline.splat.gaussians import DepthKind, Gaussians
 from schemas import topics
 
-MAD_TO_SIGMA = 1.4826
 CORRELATION_VIEWS = 8
 MEDIAN_PX = 5
 NEAR_M = 0.05  # points closer to a camera than this are not judged by it

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.consensus.links import STEP_M, PosePacket, rounded_translations
+from pipeline.consensus.links import STEP_M, PosePacket, rounded
 from pipeline.exchange.packets import MalformedError
 from pipeline.exchange.poses_wire import read_poses, write_poses, write_poses_in_parts
 from pipeline.geometry import se3, so3
@@ -16,13 +16,13 @@ def poses(rng, n):
 
 
 def pose_packet(rng, n, wire="fixed", curvature=None):
-    T = poses(rng, n)
+    quats_wxyz, translations = rounded(poses(rng, n), wire)
     return PosePacket(
         sequence=7,
         version=3,
         keyframes=(2 * np.arange(n)).astype(np.int32),
-        quats_wxyz=so3.to_quat_wxyz(T[:, :3, :3]).astype("float64" if wire == "float64" else "float32"),
-        translations=rounded_translations(T[:, :3, 3], wire),
+        quats_wxyz=quats_wxyz,
+        translations=translations,
         penalties=np.array([0.5, 0.25], np.float32),
         curvature=curvature,
         converged=True,
@@ -80,9 +80,9 @@ def test_keyframes_that_are_not_shared_are_refused():
 
 def test_fixed_translations_are_as_fine_a_thousand_kilometres_away():
     far = np.array([[999_999.123456789, -999_999.0, 0.0], [-STEP_M, STEP_M, 3 * STEP_M]])
-    packet = replace(
-        pose_packet(np.random.default_rng(5), 2), translations=rounded_translations(far, "fixed")
-    )
+    T = poses(np.random.default_rng(5), 2)
+    T[:, :3, 3] = far
+    packet = replace(pose_packet(np.random.default_rng(5), 2), translations=rounded(T, "fixed")[1])
     read = read_poses(write_poses(packet, 0, 2, True), packet.keyframes, True).translations
     np.testing.assert_array_equal(read, packet.translations)
     assert np.abs(read - far).max() <= STEP_M / 2
