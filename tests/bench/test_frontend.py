@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from converters.simulate import simulate
+from pipeline.bench import frontend as bench
+from pipeline.bench import frontend_tables, stopwatch
 from pipeline.errors import DuagError
-from pipeline.evaluation import frontend_bench as bench
-from pipeline.evaluation import frontend_tables, stopwatch
 from pipeline.frontend.config import FrontendConfig
 from pipeline.report import figures
 
