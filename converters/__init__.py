@@ -1,7 +1,8 @@
 """From files as they are distributed to recordings: one module per dataset, named in one table."""
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -61,6 +62,7 @@ def convert(
     robots: int | None = None,
     force: bool = False,
     options: Sequence[str] = (),
+    options_file: Path | None = None,
 ) -> None:
     """Convert a dataset into a recording.
 
@@ -70,10 +72,44 @@ def convert(
         robots: how many robots to make of it; None: one, or as many as the dataset has.
         force: replace a recording that is there.
         options: `name=value` of the converter, values in TOML notation.
+        options_file: TOML file of options; those of `options` win. `recording.json` keeps its text.
+    Raises:
+        DuagError: names the file, what was found and what was expected.
     """
     module = _module(dataset)
     count = {} if robots is None else {"robots": robots}
-    module.convert(Path(src), Path(out), force=force, **count, **parse_options(options))
+    said = parse_options(options)
+    with _options_of_file(options_file, module, dataset) as filed:
+        for name in ("src", "out", "robots", "force"):
+            if name in filed or name in said:
+                raise DuagError(
+                    f"{dataset}: {name} is no option of a converter, expected it among the arguments"
+                )
+        module.convert(Path(src), Path(out), force=force, **count, **{**filed, **said})
+
+
+@contextmanager
+def _options_of_file(path: Path | None, module: ModuleType, dataset: str) -> Iterator[dict[str, Any]]:
+    """Options by name, sound by themselves; recordings that are written meanwhile keep the text."""
+    if path is None:
+        yield {}
+        return
+    from converters.base import OPTIONS_FILE
+    from converters.image_files import options_of
+    from pipeline.files import read_text
+
+    text = read_text(path, "options of a converter in TOML")
+    try:
+        values = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise DuagError(f"{path}: {error}, expected options of a converter in TOML") from error
+    if hasattr(module, "Options"):
+        options_of(module.Options, values, f"{path}, for {dataset}")
+    token = OPTIONS_FILE.set({"name": path.name, "text": text})
+    try:
+        yield values
+    finally:
+        OPTIONS_FILE.reset(token)
 
 
 def parse_options(options: Sequence[str]) -> dict[str, Any]:

@@ -25,6 +25,7 @@ import re
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from contextvars import ContextVar
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -45,6 +46,9 @@ from pipeline.recording import (
     LogWriter,
 )
 from schemas import topics
+
+OPTIONS_FILE: ContextVar[dict[str, str] | None] = ContextVar("options_file", default=None)
+"""Name and text of the file that the converter's options came from; recordings keep it."""
 
 ROBOT_NAMES = (
     *(
@@ -433,6 +437,7 @@ class RecordingWriter:
             "source": self._source,
             "converter": {"name": self._converter, "version": __version__},
             "parameters": self.parameters,
+            "options_file": OPTIONS_FILE.get(),
             "units": UNITS,
             "geometry": self._geometry,
             "robots": {robot: self._robots[robot] for robot in sorted(self._robots)},

@@ -111,6 +111,14 @@ def convert(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Option of the converter; repeatable."),
     ] = None,
+    options_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--options",
+            metavar="TOML",
+            help="File of options, such as `duagc calibrate --out` writes; --set wins over it.",
+        ),
+    ] = None,
     time_source: Annotated[
         str | None,
         typer.Option(
@@ -124,7 +132,8 @@ def convert(
 ) -> None:
     """Convert a dataset, as it is distributed, into one log per robot.
 
-    Example: `duagc convert 7scenes ~/data/redkitchen --robots 2 --out recordings/redkitchen`
+    Examples: `duagc convert 7scenes ~/data/redkitchen --robots 2 --out recordings/redkitchen`,
+    `duagc convert 7scenes ~/data/redkitchen --robots 2 --options cameras.toml --out recordings/calibrated`
     """
     import converters
 
@@ -134,7 +143,9 @@ def convert(
     if dataset is None or source is None or out is None:
         raise typer.BadParameter("expected DATASET SRC --out REC, or --list")
     said = [*(options or []), *([f"time_source={time_source}"] if time_source else [])]
-    converters.convert(dataset, source, out, robots=robots, force=force, options=said)
+    converters.convert(
+        dataset, source, out, robots=robots, force=force, options=said, options_file=options_file
+    )
     _say_warnings(out)
     print(out)
 
@@ -205,25 +216,36 @@ def calibrate(
         ),
     ] = None,
     views: Annotated[int, typer.Option(min=12, help="Most views of each half of the recording.")] = 56,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="TOML", help="File to write: options for `duagc convert`."),
+    ] = None,
+    force: Force = False,
     config: ConfigFile = None,
     overrides: Overrides = None,
     as_json: Json = False,
 ) -> None:
     """Estimate lens, rotation between the cameras and depth error of an RGB-D recording from its own images.
 
-    Prints every number with its standard deviation, a check of each half by the other, and options for the converter.
-    Ground truth is not looked at. An error if the images do not determine the cameras.
+    Prints every number with its standard deviation, and a check of each half by the other. Ground truth is not looked
+    at. An error if the images do not determine the cameras.
 
-    Example: `duagc calibrate recordings/redkitchen`
+    Example: `duagc calibrate recordings/redkitchen --out cameras.toml`, then
+    `duagc convert 7scenes ~/data/redkitchen --robots 2 --options cameras.toml --out recordings/calibrated`
     """
     from pipeline import numeric
     from pipeline.calibration import calibrate as calibrate_recording
     from pipeline.calibration import report
     from pipeline.config import load
+    from pipeline.recording import Recording
     from pipeline.runner import RunConfig
 
     numeric.settle_opencv()
+    if out is not None:
+        report.check_out(out, force, Recording(path).description, path)
     found = calibrate_recording(path, load(RunConfig, config, overrides or []).frontend, robots or [], views)
+    if out is not None:
+        report.write(found, out)
     print(json.dumps(report.plain(found), indent=2) if as_json else report.format_calibration(found))
 
 

@@ -1,12 +1,14 @@
 """Cameras that are known, estimated from what they see; and recordings that do not say enough."""
 
 import json
+import tomllib
 from copy import copy
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from converters import seven_scenes
 from converters.base import RecordingWriter
@@ -14,6 +16,7 @@ from pipeline.calibration import Calibration, calibrate, report
 from pipeline.calibration.adjustment import Quality, _features, _planes, adjust, overlapping
 from pipeline.calibration.rig import NAMES, Rig
 from pipeline.calibration.views import NORMALS_LEVEL, Views, _landmarks
+from pipeline.cli import app
 from pipeline.errors import DuagError
 from pipeline.frontend.config import FrontendConfig
 from pipeline.geometry import se3, so3
@@ -194,24 +197,65 @@ def test_a_wall_without_texture_is_refused(tmp_path: Path) -> None:
 
 def found_by(converter: str, **parameters: object) -> Calibration:
     quality = [Quality(0.8, 0.9, 1.2), Quality(0.6, 0.7, 1.1)]
-    description = {"converter": {"name": converter}, "parameters": parameters}
+    description = {"name": "kitchen", "converter": {"name": converter}, "parameters": parameters}
     sigma = dict.fromkeys(NAMES, 0.001)
     halves = ["alpha, frames 0 to 9", "bravo, frames 0 to 9"]
     return Calibration(TRUE, sigma, [TRUE, TRUE], quality, quality, halves, 20, 900, description)
 
 
-def test_the_options_are_those_of_the_converter() -> None:
-    options = report.options(found_by("7scenes", color_distortion=""))
-    assert options is not None
-    read = seven_scenes.Options(**options)
-    assert read.color_focal_y_px == 265
+def test_the_file_of_options_is_one_of_the_converter(tmp_path: Path) -> None:
+    """What was found, and what that is relative to, with standard deviations in comments."""
+    found = found_by("7scenes", color_distortion="", color_focal_px=520.0, baseline_m=0.03, rate_hz=30)
+    report.write(found, tmp_path / "cameras.toml")
+    assert [path.name for path in tmp_path.iterdir()] == ["cameras.toml"]
+    text = (tmp_path / "cameras.toml").read_text()
+    read = seven_scenes.Options(**tomllib.loads(text))
+    assert tomllib.loads(text) == report.options(found)
+    assert (read.color_focal_px, read.color_focal_y_px, read.baseline_m) == (266, 265, 0.03)
+    assert (read.color_cx_px, read.color_cy_px) == (163, 121)
     assert read.lens().distortion == (0.08, -0.3, 0.0, 0.0, 0.25)
     assert read.depth_correction() == tuple(TRUE.depth_error)
     np.testing.assert_allclose(read.lens().rotation_rad, [0.006, -0.008, 0.01], atol=1e-5)
-    assert report.options(found_by("7scenes", color_distortion="0.1 0 0 0")) is None
-    assert report.options(found_by("tum")) is None
-    text = report.format_calibration(found_by("7scenes"))
-    assert "--set color_distortion='0.08000 -0.30000 0.00000 0.00000 0.25000'" in text
+    for name in NAMES:
+        assert f"# {name} = " in text
+    assert "# k1 = 0.08000 +- 0.00100 (halves 0.08000, 0.08000)" in text
     assert "features 0.80 -> 0.80 px" in text
-    assert "takes no calibration" in report.format_calibration(found_by("tum"))
+    text = report.format_calibration(found)
+    assert "features 0.80 -> 0.80 px" in text
+    assert "--out FILE.toml" in text
+
+
+def test_recordings_that_take_no_calibration() -> None:
+    for other, why in (
+        (found_by("tum"), "was made by tum, which takes no calibration"),
+        (found_by("7scenes", color_distortion="0.1 0 0 0"), "was converted with color_distortion, expected"),
+        (found_by("7scenes", depth_correction_per_m="0.1"), "was converted with depth_correction_per_m"),
+    ):
+        assert report.options(other) is None
+        assert why in report.format_calibration(other)
+        with pytest.raises(ValueError, match=why):
+            report.toml(other)
     assert json.loads(json.dumps(report.plain(found_by("tum"))))["values"]["fx"]["value"] == 266
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_anything_is_measured(tmp_path: Path) -> None:
+    folder = still_recording(tmp_path / "still")  # which cannot be calibrated: nothing below gets there
+    recorded = folder / "recording.json"
+
+    def refused(out: Path, message: str, *more: str) -> None:
+        arguments = ["calibrate", str(folder), "--out", str(out), *more]
+        with pytest.raises(DuagError, match=message) as caught:
+            CliRunner().invoke(app, arguments, catch_exceptions=False)
+        assert "\n" not in str(caught.value)
+
+    refused(tmp_path / "a.toml", "still: was made by , which takes no calibration, expected one by 7scenes")
+    recorded.write_text(recorded.read_text().replace('"name": ""', '"name": "7scenes"', 1))
+    refused(tmp_path / "a.json", "a.json: .* expected NAME.toml in a folder that exists")
+    refused(tmp_path / "none" / "a.toml", "a.toml: .* expected NAME.toml in a folder that exists")
+    (tmp_path / "a.toml").write_text("mine")
+    refused(tmp_path / "a.toml", "a.toml: exists already; choose another --out or give --force")
+    (tmp_path / "b.toml").mkdir()
+    refused(tmp_path / "b.toml", "b.toml: exists already", "--force")
+    refused(tmp_path / "a.toml", "still: its images do not determine", "--force")
+    assert (tmp_path / "a.toml").read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.toml", "b.toml", "still"]

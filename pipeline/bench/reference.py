@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.bench.tables import markdown
 from pipeline.errors import DuagError
 from pipeline.evaluation import depth_agreement, groundtruth, trajectory_errors
 from pipeline.evaluation.network import Session, counts
@@ -234,7 +235,7 @@ def format_table(result: dict[str, Any]) -> str:
     cuts = list(result["rows"][0]["cut_ate_rmse_m"])
     head = ["poses", "one alignment", "own alignments", *(f"cut in {n}" for n in cuts)]
     head += [f"depth images {kind} ({pairs} pairs)" for kind, pairs in result["views"].items() if pairs]
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    rows = []
     for row in result["rows"]:
         numbers = [
             row["team_ate_rmse_m"],
@@ -242,6 +243,5 @@ def format_table(result: dict[str, Any]) -> str:
             *(row["cut_ate_rmse_m"][n] for n in cuts),
         ]
         numbers += [row["agreement_m"][kind] for kind, pairs in result["views"].items() if pairs]
-        cells = ["-" if value is None else f"{1e3 * value:.2f}" for value in numbers]
-        lines.append("| " + " | ".join([row["poses"], *cells]) + " |")
-    return "\n".join(lines)
+        rows.append([row["poses"], *(None if value is None else f"{1e3 * value:.2f}" for value in numbers)])
+    return "\n".join(markdown(head, rows))
