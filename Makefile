@@ -71,4 +71,4 @@ format: setup
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf build $(STAMP)
+	rm -rf build pipeline/kernels/*.so $(STAMP)

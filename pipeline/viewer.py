@@ -29,7 +29,7 @@ from pipeline.messages import camera_frame
 from pipeline.recording import RECORDING_FILE, Recording, open_rgbd
 from pipeline.report import words
 from pipeline.report.figures import color_of
-from pipeline.report.page import position_sigma_m, sigma_colors
+from pipeline.report.renders import position_sigma_m, sigma_colors
 from pipeline.run_folder import RobotRun, RunFolder
 from pipeline.splat.gaussians import Gaussians
 from schemas import topics

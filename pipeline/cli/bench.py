@@ -33,7 +33,8 @@ def bench_raster(
 
     Lists are separated by commas. Takes about two minutes on an idle machine; a busy one gives other times.
     """
-    from pipeline.kernels import available_isas, bench
+    from pipeline.bench import raster, raster_tables
+    from pipeline.kernels import available_isas
 
     isas = available_isas() if isa is None else isa.split(",")
     for name in isas:
@@ -41,7 +42,7 @@ def bench_raster(
             raise typer.BadParameter(
                 f"{name!r} is not one of {', '.join(available_isas())}", param_hint="--isa"
             )
-    plan = bench.Plan(
+    plan = raster.Plan(
         sizes=tuple(_sizes(sizes)),
         gaussians=tuple(_counts("--gaussians", "60k,300k,1M" if full else gaussians)),
         threads=tuple(_counts("--threads", threads)),
@@ -50,8 +51,8 @@ def bench_raster(
         isas=tuple(isas),
         portable_everywhere=isa is not None,
     )
-    result = bench.run(plan)
-    print(json.dumps(result, indent=2) if as_json else bench.format_tables(result))
+    result = raster.run(plan)
+    print(json.dumps(result, indent=2) if as_json else raster_tables.format_tables(result))
 
 
 @bench_app.command("consensus")
@@ -83,16 +84,16 @@ def bench_consensus(
     Examples: `duagc bench consensus --robots 4 --topology chain --loss 0,0.9 --contrast 47`,
     `duagc bench consensus --run outputs/redkitchen --topology full --loss 0 --mode evidence,admm,paper`
     """
-    from pipeline.exchange import bench
+    from pipeline.bench import consensus
 
     for option, words, known in (
         ("--topology", topology.split(","), ("full", "ring", "chain", "star")),
-        ("--mode", mode.split(","), bench.MODES),
+        ("--mode", mode.split(","), consensus.MODES),
     ):
         for word in words:
             if word not in known:
                 raise typer.BadParameter(f"{word!r} is not one of {', '.join(known)}", param_hint=option)
-    plan = bench.Plan(
+    plan = consensus.Plan(
         robots=tuple(_counts("--robots", robots)),
         topologies=tuple(topology.split(",")),
         losses=tuple(_numbers("--loss", loss, 0.0, 0.99)),
@@ -108,14 +109,14 @@ def bench_consensus(
             raise typer.BadParameter(
                 "a team takes two robots, a ring, chain or star three", param_hint="--robots"
             )
-        result = bench.run(plan)
+        result = consensus.run(plan)
     else:
-        from pipeline.evaluation.modes import team_of_run
+        from pipeline.bench.team_of_run import team_of_run
         from pipeline.run_folder import RunFolder
 
-        parts = [bench.run_on(team_of_run(RunFolder(of_run), t), t, plan) for t in plan.topologies]
+        parts = [consensus.run_on(team_of_run(RunFolder(of_run), t), t, plan) for t in plan.topologies]
         result = {"plan": parts[0]["plan"], "rows": [row for part in parts for row in part["rows"]]}
-    print(json.dumps(result, indent=2) if as_json else bench.format_table(result))
+    print(json.dumps(result, indent=2) if as_json else consensus.format_table(result))
 
 
 @bench_app.command("team")
@@ -138,23 +139,23 @@ def bench_team(
 
     Example: `duagc bench team outputs/redkitchen --checks frames --seeds 100`
     """
+    from pipeline.bench import team
     from pipeline.config import load
-    from pipeline.evaluation import team_bench
     from pipeline.recording import Recording
     from pipeline.run_folder import RunFolder
     from pipeline.runner import RunConfig
 
     chosen = checks.split(",")
     for name in chosen:
-        if name not in team_bench.CHECKS:
+        if name not in team.CHECKS:
             raise typer.BadParameter(
-                f"{name!r} is not one of {', '.join(team_bench.CHECKS)}", param_hint="--checks"
+                f"{name!r} is not one of {', '.join(team.CHECKS)}", param_hint="--checks"
             )
     run = RunFolder(run_folder)
     settings = load(RunConfig, run.config_file, overrides or [])
     source = Recording(run.recording if recording is None else recording)
-    result = team_bench.run(run, source, settings.exchange, settings.seed, chosen, seeds)
-    print(json.dumps(result, indent=2) if as_json else team_bench.format_table(result))
+    result = team.run(run, source, settings.exchange, settings.seed, chosen, seeds)
+    print(json.dumps(result, indent=2) if as_json else team.format_table(result))
 
 
 @bench_app.command("reference")
@@ -172,8 +173,8 @@ def bench_reference(
     Example: `duagc bench reference outputs/redkitchen`
     """
     from pipeline import numeric
+    from pipeline.bench import reference
     from pipeline.config import load
-    from pipeline.evaluation import reference_bench
     from pipeline.recording import Recording
     from pipeline.run_folder import RunFolder
     from pipeline.runner import RunConfig
@@ -181,8 +182,8 @@ def bench_reference(
     numeric.settle_opencv()
     run = RunFolder(run_folder)
     source = Recording(run.recording if recording is None else recording)
-    result = reference_bench.run(run, source, load(RunConfig, run.config_file, []).frontend)
-    print(json.dumps(result, indent=2) if as_json else reference_bench.format_table(result))
+    result = reference.run(run, source, load(RunConfig, run.config_file, []).frontend)
+    print(json.dumps(result, indent=2) if as_json else reference.format_table(result))
 
 
 @bench_app.command("frontend")
@@ -213,8 +214,8 @@ def bench_frontend(
     import tempfile
 
     from converters.simulate import simulate as simulate_recording
+    from pipeline.bench import frontend, frontend_tables
     from pipeline.config import load
-    from pipeline.evaluation import frontend_bench, frontend_tables
     from pipeline.runner import RunConfig
 
     settings = load(RunConfig, config, overrides or [])
@@ -228,7 +229,7 @@ def bench_frontend(
         if recording is None:
             recording = Path(folder) / "room"
             simulate_recording(recording, robots=1, frames=60, seed=settings.seed)
-        plan = frontend_bench.Plan(
+        plan = frontend.Plan(
             recording,
             settings.frontend,
             chosen,
@@ -238,12 +239,12 @@ def bench_frontend(
             settings.seed,
             (robot,) if robot else (),
         )
-        result = frontend_bench.run(plan)
+        result = frontend.run(plan)
     if plot is not None:
         from pipeline.report import figures
 
         partial = plot.with_name(plot.name + ".part")
-        partial.write_text(figures.map_sizes(frontend_bench.by_cap(result)), encoding="utf-8")
+        partial.write_text(figures.map_sizes(frontend.by_cap(result)), encoding="utf-8")
         partial.replace(plot)
     print(json.dumps(result, indent=2) if as_json else frontend_tables.format_tables(result))
 
@@ -271,7 +272,7 @@ def bench_paths(
     Example: `duagc bench paths --scenes scans/house --robots 3`
     """
     from converters.simulate import MAX_ROBOTS, PARADIGMS
-    from converters.simulate import survey as paths
+    from pipeline.bench import paths
 
     for name in paradigms.split(","):
         if name not in PARADIGMS[1:]:
@@ -282,7 +283,7 @@ def bench_paths(
     if max(counts) > MAX_ROBOTS:
         raise typer.BadParameter(f"{max(counts)} is more than {MAX_ROBOTS}", param_hint="--robots")
     asked = _numbers("--overlap", overlap, 0, 1)
-    rows = paths.survey(scenes.split(","), paradigms.split(","), counts, asked, frames, seed, up)
+    rows = paths.run(scenes.split(","), paradigms.split(","), counts, asked, frames, seed, up)
     print(json.dumps(rows, indent=2) if as_json else paths.format_table(rows))
 
 
@@ -304,10 +305,10 @@ def bench_convert(
 
     Example: `duagc bench convert ~/logs/kitchen.bag --set imu=/imu/data`
     """
-    from converters.logs import bench
+    from pipeline.bench import convert
 
-    result = bench.run(log, options or [], out)
-    print(json.dumps(result, indent=2) if as_json else bench.format_table(result))
+    result = convert.run(log, options or [], out)
+    print(json.dumps(result, indent=2) if as_json else convert.format_table(result))
 
 
 def _numbers(option: str, text: str, low: float, high: float) -> list[float]:

@@ -15,8 +15,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 import converters
-from converters.logs import bench, foxglove, open_log
+from converters.logs import foxglove, open_log
 from converters.logs.entries import Entry
+from pipeline.bench import convert
 from pipeline.errors import DuagError
 from pipeline.geometry.camera import PinholeCamera
 from tests.recording.long_logs import COLOR, DEPTH, FRAME, IMU, KINDS, Seed, write
@@ -156,11 +157,11 @@ def test_a_second_timestamp_or_none_is_left_to_the_whole_message() -> None:
 
 
 def test_the_bench_compares_the_same_messages(logs: dict[str, Path], tmp_path: Path) -> None:
-    found = bench.run(logs["bag"], [f"imu={IMU}"], tmp_path / "bench")
+    found = convert.run(logs["bag"], [f"imu={IMU}"], tmp_path / "bench")
     assert found["topics"] == sorted([*IMAGES, IMU])
     assert not (tmp_path / "bench").exists()
-    assert all(found[task]["cpu_s"] > 0 and found[task]["peak_bytes"] > 1e6 for task in bench.TASKS)
+    assert all(found[task]["cpu_s"] > 0 and found[task]["peak_bytes"] > 1e6 for task in convert.TASKS)
     assert 0.5 < found["copy"]["bytes"] / found["convert"]["bytes"] < 2
-    assert "processor time" in bench.format_table(found)
+    assert "processor time" in convert.format_table(found)
     with pytest.raises(DuagError, match="imu topic /none not found"):
-        bench.run(logs["bag"], ["imu=/none"], tmp_path / "bench")
+        convert.run(logs["bag"], ["imu=/none"], tmp_path / "bench")

@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from converters.simulate import PARADIGMS, camera_of, figures, paradigms, simulate, survey, walks
+from converters.simulate import PARADIGMS, camera_of, figures, paradigms, simulate, walks
 from converters.simulate.paths import OVERLAP_IMAGE, shared_view
 from converters.simulate.stages import MeshStage, RoomStage, set_up
 from pipeline import messages
+from pipeline.bench import paths
 from pipeline.errors import DuagError
 from pipeline.geometry import se3
 from pipeline.recording import Recording, open_rgbd, read_log
@@ -90,14 +91,14 @@ def test_an_overlap_that_cannot_be_is_the_nearest_one_and_said(tmp_path):
 
 
 def test_a_survey_says_what_was_reached(room, monkeypatch):
-    monkeypatch.setattr(survey, "set_up", lambda *_, **__: room)
-    rows = survey.survey(["room"], ["crossing"], [2], [0.3], FRAMES, 0, "auto")
+    monkeypatch.setattr(paths, "set_up", lambda *_, **__: room)
+    rows = paths.run(["room"], ["crossing"], [2], [0.3], FRAMES, 0, "auto")
     ways = ways_of(room, "crossing", 0.3, 2)
     assert rows[0]["robots_apart_m"] == paradigms.least_apart(ways)
     eye = room.eye(camera_of((480, 360)).scaled(*OVERLAP_IMAGE))
     assert rows[0]["shared"] == shared_view(eye, *ways)
     rows.append({"scene": "room", "paradigm": "parallel", "robots": 8, "cpu_s": 1.0, "refused": "too many"})
-    table = survey.format_table(rows)
+    table = " ".join(paths.format_table(rows).split())
     assert "| room | crossing | 0.3: 0." in table
     assert "| no room |" in table
     assert table.endswith("too many")

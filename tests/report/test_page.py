@@ -8,7 +8,7 @@ import pytest
 from pipeline.errors import DuagError
 from pipeline.evaluation import evaluate
 from pipeline.report import figures, pictures, words, write_report
-from pipeline.report.page import sigma_colors
+from pipeline.report.renders import sigma_colors
 from tests.evaluation.fake_run import make
 
 

@@ -8,21 +8,22 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline import cli
+from pipeline.bench import raster, raster_tables, torch_tiles
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import Rasterizer, _raster, available_isas, bench
+from pipeline.kernels import Rasterizer, _raster, available_isas
 
-TINY = bench.Plan(sizes=((40, 30), (20, 16)), gaussians=(500,), threads=(1, 2), rounds=1)
+TINY = raster.Plan(sizes=((40, 30), (20, 16)), gaussians=(500,), threads=(1, 2), rounds=1)
 
 
 @pytest.fixture(scope="module")
 def result():
-    return json.loads(json.dumps(bench.run(TINY)))
+    return json.loads(json.dumps(raster.run(TINY)))
 
 
 def test_the_torch_rasterizer_draws_the_same_room():
-    room, camera = bench.make_room(2000), PinholeCamera(50, 40, 25.0, 25.0, 24.5, 19.5)
-    render = Rasterizer().forward(room, camera, bench.view_of_room())
-    image = bench.torch_tiles(bench._torch_parameters(room), camera, bench.view_of_room()).detach().numpy()
+    room, camera = raster.make_room(2000), PinholeCamera(50, 40, 25.0, 25.0, 24.5, 19.5)
+    render = Rasterizer().forward(room, camera, raster.view_of_room())
+    image = torch_tiles.draw(torch_tiles.tensors_of(room), camera, raster.view_of_room()).detach().numpy()
     assert render.alpha.mean() > 0.9  # the room fills the view
     # float32 on both sides: a pair at a threshold may be drawn by one of them only
     assert np.abs(image[..., :3] - render.color).mean() < 1e-5
@@ -36,7 +37,7 @@ def test_a_row_per_scene_and_candidate(result):
     }
     assert {(row["width"], row["isa"], row["threads"]) for row in result["rows"]} == wanted
     for row in result["rows"]:
-        times = [row[f"{name}_ms"] for name in bench.TITLES] + [
+        times = [row[f"{name}_ms"] for name in raster.TITLES] + [
             row["torch_forward_ms"],
             row["torch_backward_ms"],
         ]
@@ -52,25 +53,25 @@ def test_work_is_the_same_for_every_candidate(result):
 
 
 def test_drawn_pairs_are_the_pixels_that_gaussians_count():
-    view = bench.View((40, 30), 500)
+    view = raster.View((40, 30), 500)
     rasterizer = Rasterizer()
     rasterizer.forward(view.room, view.camera, view.T_camera_map)
-    assert bench.Work("auto", view).seen.blended_pairs == rasterizer.contributions()[1].sum()
+    assert raster.Work("auto", view).seen.blended_pairs == rasterizer.contributions()[1].sum()
 
 
 def test_fraction_of_peak_is_work_over_time_over_rate(result):
     for row in result["rows"]:
         rate = 1e9 * result["machine"]["fma_gflops"][row["isa"]][str(row["threads"])]
-        flops = bench.FLOPS["backward"] * row["contributing_pairs"]
+        flops = raster.FLOPS["backward"] * row["contributing_pairs"]
         assert row["backward_fraction_of_peak"] == pytest.approx(flops / (1e-3 * row["backward_ms"]) / rate)
 
 
 def test_tables_show_every_row(result):
-    text = bench.format_tables(result)
+    text = raster_tables.format_tables(result)
     assert result["machine"]["cpu"] in text
     for isa in available_isas():
         assert f" {isa} |" in text
-    for title in bench.TITLES.values():
+    for title in raster.TITLES.values():
         assert f" {title} |" in text
     blocks = text.split("\n\n")
     times = blocks[2].splitlines()
@@ -96,7 +97,7 @@ def test_machine_has_a_bandwidth(threads):
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_room_is_flat_along_its_walls(axis):
-    room = bench.make_room(3000)
+    room = raster.make_room(3000)
     on_wall = room.log_scales.argmin(axis=1) == axis
     assert on_wall.mean() > 0.1
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.bench.consensus import Team
 from pipeline.consensus.config import MatchingConfig
 from pipeline.consensus.evidence import LOG_COVARIANCE, Evidence, pack_information
 from pipeline.consensus.factors import inflated
@@ -13,7 +14,6 @@ from pipeline.consensus.weighting import told
 from pipeline.errors import DuagError
 from pipeline.evaluation.network import Session
 from pipeline.evaluation.oracle import section_of
-from pipeline.exchange.bench import Team
 from pipeline.exchange.config import LinkConfig
 from pipeline.exchange.links import neighbours
 from pipeline.fusion.config import FusionConfig

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from pipeline import streams
+from pipeline.bench.tables import markdown
 from pipeline.errors import DuagError
 from pipeline.evaluation import groundtruth, trajectory_errors
 from pipeline.evaluation.results import Absent
@@ -226,21 +227,22 @@ def _input(run: RunFolder, recording: Recording, robot: str) -> AgentInput:
 def format_table(result: dict[str, Any]) -> str:
     """One line per session, then the worst of every case."""
     head = ["case", "seed", "together", "team ATE, mm", "rounds", "MB", "closures", "false kept", "alone"]
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    rows = []
     for row in [result["base"], *result["rows"]]:
         ate = row["team_ate_rmse_m"]
         cells = [
             row["case"],
             row["seed"],
             row["robots_together"],
-            "-" if ate is None else f"{1e3 * ate:.6f}",
-            row["rounds_to_agreement"] or "-",
+            None if ate is None else f"{1e3 * ate:.6f}",
+            row["rounds_to_agreement"],
             f"{row['bytes'] / 1e6:.2f}",
             f"{row['closures_kept']} of {row['closures_measured']}",
             row["false_closures_kept"],
             "yes" if row["as_if_alone"] else "no",
         ]
-        lines.append("| " + " | ".join(str(cell) for cell in cells) + " |")
+        rows.append(cells)
+    lines = markdown(head, rows)
     for case, entry in result["worst"].items():
         lines.append(
             f"{case}: {entry['sessions']} sessions, {entry['apart']} not together; team ATE differs by "

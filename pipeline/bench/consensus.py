@@ -1,6 +1,6 @@
 """How much it costs a team to agree on matched Gaussians: rounds, bytes and time of every mode, against one optimum.
 
-Teams are made, or those of a finished run (`evaluation.modes`). In made ones every robot has evidence on every track,
+Teams are made, or those of a finished run (`team_of_run`). In made ones every robot has evidence on every track,
 with information spread over a contrast and a share of it missing. `evidence` travels as in an exchange, over the real
 transport with acknowledgements, compact, in float32 or in float64; `admm` and `paper` send float64 values in every
 round. Loss is drawn by the link model. The optimum is computed with everybody's evidence at hand, which no robot has;
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import progress, streams
+from pipeline.bench.tables import markdown
 from pipeline.consensus.evidence import Evidence, pack_information
 from pipeline.consensus.gaussians import (
     COORDINATES,
@@ -338,32 +339,25 @@ of its weights. kB: of all robots, headers and lost packets too; as the paper co
 
 def format_table(result: dict[str, Any]) -> str:
     """The rows as a Markdown table that can be read as it stands, and what its columns mean."""
-    rows = [HEAD.split(" | ")]
+    rows: list[list[object]] = []
     for r in result["rows"]:
         paper = r["bytes_paper_accounting"]
         rows.append(
             [
                 r["topology"],
-                str(r["robots"]),
+                r["robots"],
                 f"{r['contrast']:g}",
                 f"{100 * r['unknown']:g} %",
                 f"{100 * r['loss']:g} %",
                 r["mode"],
-                _or_dash(r["rounds_to_0.05_sigma"]),
-                _or_dash(r["rounds_to_1e-6_sigma"]),
-                str(r["rounds"]),
+                r["rounds_to_0.05_sigma"],
+                r["rounds_to_1e-6_sigma"],
+                r["rounds"],
                 f"{r['gap_sigma']:.1e}",
                 f"{r['gap_sigma_p99']:.1e}",
                 f"{r['bytes'] / 1000:.0f}",
-                "-" if paper is None else f"{paper / 1000:.0f}",
+                None if paper is None else f"{paper / 1000:.0f}",
                 f"{r['cpu_s']:.2f}",
             ]
         )
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    rows.insert(1, ["-" * width for width in widths])
-    lines = ["| " + " | ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) + " |" for row in rows]
-    return "\n".join([*lines, LEGEND])
-
-
-def _or_dash(value: int | None) -> str:
-    return "-" if value is None else str(value)
+    return "\n".join([*markdown(HEAD.split(" | "), rows), LEGEND])

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from pipeline.bench.frontend import WITHOUT_MAP
+from pipeline.bench.tables import markdown
 from pipeline.evaluation import agreement
-from pipeline.evaluation.frontend_bench import WITHOUT_MAP
 
 
 def format_tables(result: dict[str, Any]) -> str:
@@ -21,10 +22,10 @@ def format_tables(result: dict[str, Any]) -> str:
     head = ["robot", "", "frames", "lost", "keyframes", "ATE mm", "RPE mm", "RPE mrad"]
     head += ["ms/frame", "p95", "first, last quarter", "steps", "model ms", "poses s", "peak MB"]
     lines = [", ".join(about), "", "Tracking"]
-    lines += _table(head, [_tracking_cells(row) for row in rows])
+    lines += markdown(head, [_tracking_cells(row) for row in rows])
     head = ["robot", "", "depth mm", "of ground truth", "features px", "of ground truth"]
     judged = [_agreement_cells(row) for row in rows if "depth_agreement_m" in row]
-    lines += ["", "Agreement of held-out views", *_table(head, judged)]
+    lines += ["", "Agreement of held-out views", *markdown(head, judged)]
     mapped = [row for row in rows if row["name"] == "map"]
     if mapped:
         head = [
@@ -38,14 +39,18 @@ def format_tables(result: dict[str, Any]) -> str:
             "layer mm",
         ]
         head += ["ms/keyframe", "p95", "first, last quarter", "k drawn", "refinement s", "all s", "peak MB"]
-        lines += ["", "Mapping; scores of held-out views", *_table(head, [_map_cells(row) for row in mapped])]
+        lines += [
+            "",
+            "Mapping; scores of held-out views",
+            *markdown(head, [_map_cells(row) for row in mapped]),
+        ]
     parts = [
         [row["robot"], row.get("max_gaussians", row["name"]), whole, _parts_text(row["times"][whole])]
         for row in rows
         for whole in ("frame", "keyframe")
         if whole in row["times"] and row["name"] in ("map", WITHOUT_MAP)
     ]
-    lines += ["", "Parts, ms", *_table(["robot", "cap", "of a", "parts"], parts)]
+    lines += ["", "Parts, ms", *markdown(["robot", "cap", "of a", "parts"], parts)]
     return "\n".join(lines)
 
 
@@ -115,8 +120,3 @@ def _parts_text(times: dict[str, Any]) -> str:
 
 def _number(value: float | None, scale: float, digits: int) -> str:
     return "-" if value is None else f"{scale * value:.{digits}f}"
-
-
-def _table(head: list[str], rows: list[list[Any]]) -> list[str]:
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
-    return lines + ["| " + " | ".join(str(cell) for cell in row) + " |" for row in rows]

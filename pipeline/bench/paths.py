@@ -11,6 +11,7 @@ import numpy as np
 
 from converters.simulate import FRAME_RATE_HZ, camera_of, paradigms, paths, scene_of
 from converters.simulate.stages import set_up
+from pipeline.bench.tables import markdown
 from pipeline.errors import DuagError
 from pipeline.geometry import se3
 from pipeline.progress import track
@@ -18,7 +19,7 @@ from pipeline.progress import track
 Row = dict[str, Any]
 
 
-def survey(
+def run(
     scenes: Iterable[str],
     figures: Iterable[str],
     robots: Iterable[int],
@@ -70,18 +71,13 @@ def survey(
 def format_table(rows: list[Row]) -> str:
     """A row per scene and paradigm, a column per number of robots: worst overlap, slowest and fastest robot."""
     numbers = sorted({row["robots"] for row in rows})
-    lines = [
-        "| scene | paradigm | " + " | ".join(f"{n} robots" for n in numbers) + " |",
-        "|---" * (2 + len(numbers)) + "|",
-    ]
-    for scene, figure in dict.fromkeys((row["scene"], row["paradigm"]) for row in rows):
-        cells = []
-        for n in numbers:
-            same = [
-                row for row in rows if (row["scene"], row["paradigm"], row["robots"]) == (scene, figure, n)
-            ]
-            cells.append(_cell(same))
-        lines.append(f"| {scene} | {figure} | " + " | ".join(cells) + " |")
+    by_figure: dict[tuple[str, str], dict[int, list[Row]]] = {}
+    for row in rows:
+        by_figure.setdefault((row["scene"], row["paradigm"]), {}).setdefault(row["robots"], []).append(row)
+    lines = markdown(
+        ["scene", "paradigm", *(f"{n} robots" for n in numbers)],
+        [[*key, *(_cell(found.get(n, [])) for n in numbers)] for key, found in by_figure.items()],
+    )
     planned = [row for row in rows if "refused" not in row]
     if planned:
         lines += [

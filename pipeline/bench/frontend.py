@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.bench.stopwatch import Calls, Stopwatch, counted, replaced, shares, summary
 from pipeline.errors import DuagError
 from pipeline.evaluation import agreement, groundtruth, trajectory_errors, views
 from pipeline.evaluation.rendering import PosedMap, RenderTask
 from pipeline.evaluation.results import Absent, split_reasons
-from pipeline.evaluation.stopwatch import Calls, Stopwatch, counted, replaced, shares, summary
 from pipeline.evaluation.trajectory_errors import Paired
 from pipeline.frontend.config import FrontendConfig
 from pipeline.geometry.trajectory import Trajectory
@@ -89,7 +89,7 @@ def run(plan: Plan) -> dict[str, Any]:
     Raises:
         DuagError: the recording is broken, or has no such robot.
     """
-    from pipeline.kernels.bench import cpu_name
+    from pipeline.bench.raster import cpu_name
 
     source = Recording(plan.recording)
     robots = list(plan.robots) or source.robots

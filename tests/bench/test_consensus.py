@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from pipeline.exchange.bench import MODES, Plan, format_table, run
+from pipeline.bench.consensus import MODES, Plan, format_table, run
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from pipeline.bench.consensus import Plan, run_on
+from pipeline.bench.team_of_run import team_of_run
 from pipeline.errors import DuagError
-from pipeline.evaluation.modes import team_of_run
-from pipeline.exchange.bench import Plan, run_on
 from pipeline.run_folder import RunFolder
 from tests.evaluation.fake_run import make
 

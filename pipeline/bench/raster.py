@@ -25,9 +25,10 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.bench import torch_tiles
 from pipeline.geometry import so3
 from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import _raster, reference
+from pipeline.kernels import _raster
 from pipeline.kernels.rasterizer import Rasterizer, available_isas
 from pipeline.kernels.types import FisherSums, Gradients, LossWeights, Statistics
 from pipeline.progress import track
@@ -42,7 +43,6 @@ THREADS = (1, 2)
 ROUNDS = 7
 ROOM_M = np.array([6.0, 3.0, 5.0])  # x, y down, z
 SPACING_PER_SCALE, FLATNESS = 0.62, 0.13
-TORCH_TILE_PX = 16
 TORCH_ROUNDS = 3
 TORCH_LARGEST = 640 * 480 * 60_000  # pixels times Gaussians: seconds and gigabytes beyond
 PEAK_S = 0.1  # per instruction set, number of threads and scene; the best counts
@@ -347,6 +347,19 @@ def _typical(milliseconds: list[float], threads: int) -> float:
     return float(np.percentile(milliseconds, 25)) if threads > 1 else statistics.median(milliseconds)
 
 
+def _time_torch(view: View, threads: int) -> dict[str, float]:
+    """Milliseconds of one forward and one backward."""
+    import torch
+
+    threads_before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    parameters, wall = torch_tiles.tensors_of(view.room), threads > 1
+    forward_ms, image = _timed(lambda: torch_tiles.draw(parameters, view.camera, view.T_camera_map), wall)
+    backward_ms, _ = _timed(image.sum().backward, wall)
+    torch.set_num_threads(threads_before)
+    return {"forward": forward_ms, "backward": backward_ms}
+
+
 # ---------------------------------------------------------------- the room
 
 
@@ -383,159 +396,3 @@ def view_of_room() -> np.ndarray:
     T = np.eye(4)
     T[:3, :3] = np.stack([x, np.cross(z, x), z])
     return T
-
-
-# ---------------------------------------------------------------- tables
-
-WHO = ["size", "Gaussians", "threads", "isa"]
-
-
-def format_tables(result: dict[str, Any]) -> str:
-    """The result of `run` as Markdown."""
-    rows: list[dict[str, Any]] = result["rows"]
-    first_of_scene = {(row["width"], row["height"], row["gaussians"]): row for row in reversed(rows)}
-    counted = [TITLES[name] for name in FLOPS]
-    with_torch = [row for row in rows if row["torch_forward_ms"] is not None]
-    parts = [
-        _machine_lines(result["machine"]),
-        "Milliseconds; one thread: CPU time, median; more: wall time, lower quartile.",
-        _table([*WHO, *TITLES.values()], [[*_who(row), *_cells(row, "{}_ms", 1)] for row in rows]),
-        "Work of one view; pairs of pixel and Gaussian whose alpha is evaluated, and that are drawn.",
-        _table(
-            ["size", "Gaussians", "visible", "tile entries", "evaluated, M", "drawn, M", "scratch, MB"],
-            [
-                [
-                    *_who(row)[:2],
-                    str(row["visible"]),
-                    str(row["intersections"]),
-                    f"{1e-6 * row['evaluated_pairs']:.1f}",
-                    f"{1e-6 * row['contributing_pairs']:.1f}",
-                    f"{row['scratch_mb']:.0f}",
-                ]
-                for row in reversed(first_of_scene.values())
-            ],
-        ),
-        "Drawn pairs per second, in 10^9.",
-        _table([*WHO, *counted], [[*_who(row), *_cells(row, "{}_pairs_per_s", 2, 1e-9)] for row in rows]),
-        "Percent of the peak rate of multiply-adds / of the bandwidth; flops and bytes are counted by hand.",
-        _table(
-            [*WHO, *counted],
-            [
-                [
-                    *_who(row),
-                    *(
-                        f"{a} / {b}"
-                        for a, b in zip(
-                            _cells(row, "{}_fraction_of_peak", 0, 100),
-                            _cells(row, "{}_fraction_of_bandwidth", 0, 100),
-                            strict=True,
-                        )
-                    ),
-                ]
-                for row in rows
-            ],
-        ),
-    ]
-    if with_torch:
-        parts += [
-            "Plain torch, milliseconds, and how many times as long it takes.",
-            _table(
-                [*WHO, "torch forward", "torch backward", "forward, times", "backward, times"],
-                [
-                    [
-                        *_who(row),
-                        f"{row['torch_forward_ms']:.0f}",
-                        f"{row['torch_backward_ms']:.0f}",
-                        f"{row['torch_forward_ms'] / row['forward_ms']:.0f}",
-                        f"{row['torch_backward_ms'] / row['backward_ms']:.0f}",
-                    ]
-                    for row in with_torch
-                ],
-            ),
-        ]
-    return "\n\n".join(parts)
-
-
-def _machine_lines(machine: dict[str, Any]) -> str:
-    lines = [f"{machine['cpu']}, {machine['cores']} cores, load average {machine['load_average']:.1f} before"]
-    for isa, rates in machine["fma_gflops"].items():
-        lines.append(
-            f"{isa}: " + ", ".join(f"{rate:.0f} GFLOP/s with {n}" for n, rate in rates.items()) + " threads"
-        )
-    for n, read in machine["read_gb_per_s"].items():
-        lines.append(
-            f"memory, {n} threads: read {read:.0f} GB/s, copy {machine['copy_gb_per_s'][n]:.0f} GB/s"
-        )
-    return "\n".join(f"- {line}" for line in lines)
-
-
-def _who(row: dict[str, Any]) -> list[str]:
-    return [f"{row['width']}x{row['height']}", str(row["gaussians"]), str(row["threads"]), row["isa"]]
-
-
-def _cells(row: dict[str, Any], key: str, digits: int, factor: float = 1.0) -> list[str]:
-    return [f"{factor * row[key.format(name)]:.{digits}f}" for name in TITLES if key.format(name) in row]
-
-
-def _table(titles: list[str], rows: list[list[str]]) -> str:
-    widths = [max(len(line[i]) for line in (titles, *rows)) for i in range(len(titles))]
-    lines = [titles, ["-" * (width - 1) + ":" for width in widths], *rows]
-    return "\n".join(
-        "| " + " | ".join(c.rjust(w) for c, w in zip(line, widths, strict=True)) + " |" for line in lines
-    )
-
-
-# ---------------------------------------------------------------- plain torch, for comparison
-
-
-def _time_torch(view: View, threads: int) -> dict[str, float]:
-    """Milliseconds of one forward and one backward."""
-    import torch
-
-    threads_before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    parameters, wall = _torch_parameters(view.room), threads > 1
-    forward_ms, image = _timed(lambda: torch_tiles(parameters, view.camera, view.T_camera_map), wall)
-    backward_ms, _ = _timed(image.sum().backward, wall)
-    torch.set_num_threads(threads_before)
-    return {"forward": forward_ms, "backward": backward_ms}
-
-
-def _torch_parameters(room: Gaussians) -> dict[str, Any]:
-    import torch
-
-    names = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
-    return {name: torch.tensor(getattr(room, name), requires_grad=True) for name in names}
-
-
-def torch_tiles(parameters: dict[str, Any], camera: PinholeCamera, T_camera_map: np.ndarray) -> Any:
-    """Colour and depth [H, W, 4] by the reference's formulas, tile by tile, in float32; differentiable."""
-    import torch
-
-    T = torch.tensor(T_camera_map, dtype=torch.float32)
-    sigma = reference.sigma_of(parameters["quats_wxyz"], parameters["log_scales"])
-    order, z, centres, conics = reference.project(parameters["means"], sigma, T[:3, :3], T[:3, 3], camera)
-    opacities = torch.sigmoid(parameters["opacity_logits"][order])
-    values = torch.cat([parameters["colors"][order], z[:, None]], dim=1)
-    with torch.no_grad():
-        reach = 2 * torch.log(255 * opacities).clamp(min=0)
-        extent = torch.sqrt(reach[:, None] * torch.linalg.inv(conics).diagonal(dim1=1, dim2=2))
-        low, high = centres - extent, centres + extent
-        size = torch.tensor([camera.width, camera.height])
-        seen = torch.nonzero(((low < size) & (high >= 0)).all(dim=1) & (reach > 0))[:, 0]
-    tiles = []
-    for y in range(0, camera.height, TORCH_TILE_PX):
-        height = min(TORCH_TILE_PX, camera.height - y)
-        in_strip = seen[(low[seen, 1] <= y + height - 1) & (high[seen, 1] >= y)]
-        for x in range(0, camera.width, TORCH_TILE_PX):
-            width = min(TORCH_TILE_PX, camera.width - x)
-            i = in_strip[(low[in_strip, 0] <= x + width - 1) & (high[in_strip, 0] >= x)]
-            rows, columns = torch.meshgrid(
-                torch.arange(y, y + height), torch.arange(x, x + width), indexing="ij"
-            )
-            pixels = torch.stack([columns, rows], -1).reshape(-1, 2).to(torch.float32)
-            weights, _ = reference.blend(pixels, centres[i], conics[i], opacities[i])
-            tiles.append((weights @ values[i]).reshape(height, width, 4))
-    across = -(-camera.width // TORCH_TILE_PX)
-    strips = [torch.cat(tiles[i : i + across], dim=1) for i in range(0, len(tiles), across)]
-    return torch.cat(strips, dim=0)

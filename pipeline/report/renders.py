@@ -1,0 +1,209 @@
+"""The pictures of a report: maps rendered beside the images of some views, and coloured by their uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.evaluation.rendering import in_colors_of, in_world, mates, poses_by_stamp
+from pipeline.evaluation.results import Absent
+from pipeline.evaluation.views import score_view, surface_depth
+from pipeline.fusion.stage import peer_colors
+from pipeline.geometry import se3
+from pipeline.messages import GaussianMap
+from pipeline.recording import Recording, open_rgbd
+from pipeline.report import figures, pictures, words
+from pipeline.run_folder import RobotRun, RunFolder, position_information
+
+if TYPE_CHECKING:
+    from pipeline.kernels import Rasterizer, Render
+    from pipeline.recording import RgbdFrame, RgbdLog
+
+Array = NDArray[np.float64]
+PICTURE_WIDTH_PX = 400
+VIEWS_PER_ROBOT = 2
+COLOR_ERROR_END = 0.3
+DEPTH_ERROR_END_M = 0.05
+NO_EXACT = Absent("not needed for a picture")
+UNDETERMINED_GREY = 0.75
+
+
+def rendered_views(run: RunFolder, source: Recording) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Renders beside images, and the fused map coloured by its uncertainty, for a few held-out views per robot, and
+    beside the image of a peer."""
+    from pipeline.kernels import Rasterizer
+
+    rasterizer = Rasterizer(threads=1)
+    shown, colored = [], []
+    for i, (name, robot) in enumerate(run.robots.items()):
+        head = {"robot": name, "color": figures.color_of(i), "where": ""}
+        with open_rgbd(source.log(name)) as log:
+            frames = [log.frame(index) for index in _chosen_frames(robot, len(log))]
+            shown += [head | view for view in _own_views(robot, log, frames, rasterizer)]
+            if robot.fused_map.information is not None and frames:
+                colored.append(head | _information_view(robot, log, frames, rasterizer))
+        for peer in mates(run, robot)[:1]:
+            with open_rgbd(source.log(peer.robot)) as log:
+                views = _peer_views(robot, peer, log, rasterizer)
+                shown += [head | {"where": f" of {peer.robot}"} | view for view in views]
+    return shown, colored
+
+
+def _own_views(
+    robot: RobotRun, log: RgbdLog, frames: Iterable[RgbdFrame], rasterizer: Rasterizer
+) -> Iterator[dict[str, Any]]:
+    """The robot's maps, each at its own pose of the robot's frames."""
+    before, after = poses_by_stamp(robot.odometry), poses_by_stamp(robot.trajectory)
+    kind, final = _final(robot)
+    for frame in frames:
+        maps = {"own": (robot.own_map, before[frame.stamp_ns]), kind: (final, after[frame.stamp_ns])}
+        yield _view(maps, log, frame, rasterizer)
+
+
+def _peer_views(
+    robot: RobotRun, peer: RobotRun, log: RgbdLog, rasterizer: Rasterizer
+) -> Iterator[dict[str, Any]]:
+    """The robot's maps at a frame of a peer, in the colours of the peer's camera."""
+    alike = peer_colors(robot.folder / "fused.mcap", robot.robot).get(peer.robot)
+    poses = poses_by_stamp(peer.trajectory)
+    kind, final = _final(robot)
+    own = in_world(robot, "own", robot.own_map.gaussians)
+    moved = replace(robot.own_map, gaussians=in_colors_of(alike, own))
+    last = replace(final, gaussians=in_colors_of(alike, final.gaussians))
+    for index in _chosen_frames(peer, len(log))[:1]:
+        frame = log.frame(index)
+        T = poses[frame.stamp_ns]
+        yield _view({"own": (moved, T), kind: (last, T)}, log, frame, rasterizer)
+
+
+def _final(robot: RobotRun) -> tuple[str, GaussianMap]:
+    """The map that a robot has in the end, and what it is called."""
+    return ("fused", robot.fused_map) if robot.refined_map is None else ("refined", robot.refined_map)
+
+
+def _chosen_frames(robot: RobotRun, frames: int) -> list[int]:
+    """A few held-out frames with poses before and after consensus, evenly over the log."""
+    before, after = poses_by_stamp(robot.odometry), poses_by_stamp(robot.trajectory)
+    able = [
+        f.frame_index
+        for f in robot.frames
+        if f.held_out and f.frame_index < frames and f.stamp_ns in before and f.stamp_ns in after
+    ]
+    places = [(2 * i + 1) * len(able) // (2 * VIEWS_PER_ROBOT) for i in range(VIEWS_PER_ROBOT)]
+    return sorted({able[place] for place in places}) if able else []
+
+
+def _view(
+    maps: Mapping[str, tuple[GaussianMap, Array]], log: RgbdLog, frame: RgbdFrame, rasterizer: Rasterizer
+) -> dict[str, Any]:
+    """Image and renders of maps at poses, their depths, their errors."""
+    renders = {
+        kind: rasterizer.forward(shown.gaussians, log.camera, se3.inverse(T), depth=shown.depth)
+        for kind, (shown, T) in maps.items()
+    }
+    measured = frame.depth > 0
+    low, high = _range_m(frame.depth[measured])
+    depths = {kind: surface_depth(render) for kind, render in renders.items()}
+
+    def depth_picture(depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
+        return pictures.colored(depth_m, low, high, depth_m > 0)
+
+    def depth_error_picture(depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
+        return pictures.colored(
+            np.abs(depth_m - frame.depth), 0.0, DEPTH_ERROR_END_M, measured & (depth_m > 0), "magma"
+        )
+
+    def color_error_picture(render: Render) -> NDArray[np.uint8]:
+        error = np.abs(np.clip(render.color, 0, 1) - frame.color / np.float32(255)).mean(axis=2)
+        return pictures.colored(error, 0.0, COLOR_ERROR_END, np.ones(error.shape, dtype=bool), "magma")
+
+    kinds = tuple(renders)
+    columns = [
+        ("image", frame.color),
+        *((f"{kind} map", pictures.to_uint8(renders[kind].color)) for kind in kinds),
+        ("recorded depth", depth_picture(frame.depth)),
+        *((f"depth, {kind} map", depth_picture(depths[kind])) for kind in kinds),
+        (f"colour error, {kinds[-1]} map", color_error_picture(renders[kinds[-1]])),
+        *((f"depth error, {kind} map", depth_error_picture(depths[kind])) for kind in kinds),
+    ]
+    return {
+        "frame_index": frame.index,
+        "numbers": " · ".join(f"{kind}: {_view_numbers(render, frame)}" for kind, render in renders.items()),
+        "pictures": [{"caption": caption, "uri": _uri(picture)} for caption, picture in columns],
+        "scales": [
+            _scale("viridis", f"{low:.2f} m", f"{high:.2f} m", "depth"),
+            _scale("magma", "0", f"{1e3 * DEPTH_ERROR_END_M:.0f} mm and more", "depth error"),
+            _scale("magma", "0", f"{COLOR_ERROR_END:g} of white and more", "colour error"),
+        ],
+    }
+
+
+def _view_numbers(render: Render, frame: RgbdFrame) -> str:
+    score = score_view(render, frame.color, frame.depth, NO_EXACT)
+    depth = words.NONE if isinstance(score.depth_l1_m, Absent) else words.metres_text(score.depth_l1_m)
+    return f"{score.psnr_db:.1f} dB, depth {depth}"
+
+
+def _range_m(depths_m: NDArray[np.float32]) -> tuple[float, float]:
+    """Near and far end of a depth scale: the middle 98 % of the values."""
+    if not len(depths_m):
+        return 0.0, 1.0
+    low, high = np.percentile(depths_m, [1, 99])
+    return float(low), float(max(high, low + 1e-3))
+
+
+def _information_view(
+    robot: RobotRun, log: RgbdLog, frames: Iterable[RgbdFrame], rasterizer: Rasterizer
+) -> dict[str, Any]:
+    information = robot.fused_map.information
+    assert information is not None
+    colors, low_m, high_m = sigma_colors(position_sigma_m(information.geometry))
+    gaussians = robot.fused_map.gaussians.replace(colors=colors)
+    poses = poses_by_stamp(robot.trajectory)
+    shown = []
+    for frame in frames:
+        render = rasterizer.forward(
+            gaussians, log.camera, se3.inverse(poses[frame.stamp_ns]), background=(1.0, 1.0, 1.0)
+        )
+        shown.append({"caption": f"image, frame {frame.index}", "uri": _uri(frame.color)})
+        shown.append({"caption": "uncertainty", "uri": _uri(pictures.to_uint8(render.color))})
+    scale = _scale(
+        "plasma",
+        words.metres_text(low_m),
+        words.metres_text(high_m),
+        "standard deviation of a centre, log scale",
+    )
+    return {"pictures": shown, "scales": [scale]}
+
+
+def position_sigma_m(geometry: NDArray[np.float32]) -> Array:
+    """Standard deviation of every centre, metres [n]: sqrt trace F^-1; infinite where a direction is not determined."""
+    F = position_information(geometry)
+    values = np.linalg.eigvalsh(F) if len(F) else np.zeros((0, 3))
+    determined = (values[:, 0] > 0) & (values[:, 2] < 1e12 * values[:, 0])
+    sigma = np.full(len(F), np.inf)
+    sigma[determined] = np.sqrt(np.sum(1.0 / values[determined], axis=1))
+    return sigma
+
+
+def sigma_colors(sigma_m: Array) -> tuple[NDArray[np.float32], float, float]:
+    """Colours [n, 3] on a logarithmic scale over the middle 90 %, grey where infinite, and the ends of the scale."""
+    known = np.isfinite(sigma_m)
+    colors = np.full((len(sigma_m), 3), UNDETERMINED_GREY, dtype=np.float32)
+    if not known.any():
+        return colors, 1.0, 1.0
+    low, high = np.percentile(np.log10(sigma_m[known]), [5, 95])
+    colors[known] = pictures.color_by(np.log10(sigma_m[known]), low, high, "plasma")
+    return colors, float(10.0**low), float(10.0**high)
+
+
+def _uri(picture: NDArray[np.uint8]) -> str:
+    return pictures.jpeg_uri(picture, min(PICTURE_WIDTH_PX, picture.shape[1]))
+
+
+def _scale(palette: str, low: str, high: str, what: str) -> dict[str, str]:
+    return {"uri": pictures.scale_uri(palette), "low": low, "high": high, "what": what}
