@@ -71,6 +71,16 @@ class SoundFrame:
             information=self._information(result, limits.sigma_of_way_without_depth * way_m),
         )
 
+    def agrees(self, T_keyframe_camera: Array, by_color: Array, limits: FailureConfig) -> bool:
+        """Whether colour alone puts a frame where colour and depth together do: both T_keyframe_camera, [4, 4].
+
+        If the two images are of different times, or something moves before the camera, the answers differ by as
+        much as the camera moves. Those of a sound camera differ by a share of it.
+        """
+        apart_m = float(se3.distance(T_keyframe_camera, by_color)[0])
+        way_m = max(float(se3.distance(self.T_keyframe_camera, T)[0]) for T in (T_keyframe_camera, by_color))
+        return apart_m <= max(limits.max_contradiction_m, limits.max_contradiction_of_way * way_m)
+
     def _information(self, result: Registration, sigma_m: float) -> Array:
         """Of the pose in the keyframe: what the registration, this frame's pose and the way leave of it."""
         depth_m = max(float(np.median(self._reference.levels[-1].points[:, 2])), 0.1)
