@@ -154,10 +154,20 @@ def test_an_output_that_appeared_meanwhile_is_kept(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.rglob("*")] == ["out", "keep"]
 
 
+def _listen_to_interrupts() -> None:
+    """What a shell starts in the background, tests among it, is deaf to them."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_an_interrupted_command_is_one_line(tmp_path: Path) -> None:
     command = [sys.executable, "-c", "from pipeline.cli import main; main()", "simulate", "--out"]
     process = subprocess.Popen(
-        [*command, str(tmp_path / "out")], stderr=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True
+        [*command, str(tmp_path / "out")],
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        start_new_session=True,
+        preexec_fn=_listen_to_interrupts,
     )
     deadline = time.monotonic() + 60
     while not list(tmp_path.iterdir()) and time.monotonic() < deadline:
