@@ -11,6 +11,7 @@ import pytest
 
 from pipeline import cli
 from pipeline.errors import DuagError
+from pipeline.files import new_file
 from pipeline.new_folder import new_folder
 
 ROOT = Path(__file__).parents[1]
@@ -92,6 +93,38 @@ def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
         assert_one_line(duagc(*command, "--out", tmp_path / "file", "--force"), "file")
         assert_one_line(duagc(*command, "--out", tmp_path / "file" / "out"), "Not a directory")
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_full_disk_is_one_line() -> None:
+    command = "lambda: open('/dev/full', 'wb', buffering=0).write(b'a log')"
+    code = f"from pipeline import cli; cli.app = {command}; cli.main()"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False
+    )
+    assert_one_line(result, "No space left on device", "expected room for the output")
+
+
+def test_a_file_appears_only_when_it_is_finished(tmp_path: Path) -> None:
+    path = tmp_path / "out.txt"
+    path.write_text("before")
+
+    def fail_half_way() -> None:
+        with new_file(path) as part:
+            part.write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail_half_way()
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["before"]
+    with new_file(path) as part:
+        part.write_text("after")
+        assert path.read_text() == "before"
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["after"]
+    with (
+        pytest.raises(DuagError, match=r"out.txt/in.txt: Not a directory"),
+        new_file(path / "in.txt") as part,
+    ):
+        part.write_text("nowhere")
 
 
 def test_two_processes_do_not_write_one_output(tmp_path: Path) -> None:

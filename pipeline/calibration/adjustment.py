@@ -20,7 +20,8 @@ from pipeline.registration.residuals import MAD_TO_SIGMA, RegistrationConfig
 
 Array = NDArray[np.float64]
 
-ROUNDS, SETTLED = 25, 1e-4  # m, rad
+ROUNDS = 30
+SETTLED, SETTLED_OF_PRIOR = 2e-4, 0.01  # steps of poses (m, rad), of the cameras' numbers as a share of their priors
 CAUCHY, HUBER = 2.5, 1.5  # scales
 SAME_ERROR = 50.0  # neighbours err alike, and no model is exact: so many residuals count as one
 PRIOR = dict(zip(NAMES, (15, 15, 15, 15, 0.3, 0.5, 0.5, 0.01, 0.01, 0.01, 0.02, *[0.02] * 6), strict=True))
@@ -53,7 +54,7 @@ class Adjusted:
 
 
 def adjust(parts: Sequence[Views], rig: Rig, calibrate: bool) -> Adjusted:
-    """Adjust poses and landmarks (in place), and the cameras too if asked, until no pose moves."""
+    """Adjust poses and landmarks (in place), and the cameras too if asked, until nothing moves."""
     start, pairs = Rig.of(rig.camera), [overlapping(part) for part in parts]
     ends = np.cumsum([0] + [6 * len(part.T_map_camera) for part in parts])
     size = len(NAMES) if calibrate else 0
@@ -81,7 +82,8 @@ def adjust(parts: Sequence[Views], rig: Rig, calibrate: bool) -> Adjusted:
             part.T_map_camera = part.T_map_camera @ se3.exp(x[a:b].reshape(-1, 6))
         if calibrate:
             rig = rig.moved(x[ends[-1] :])
-        if np.abs(x[: ends[-1]]).max() < SETTLED:
+        settled = not calibrate or np.abs(x[ends[-1] :] / prior).max() < SETTLED_OF_PRIOR
+        if settled and np.abs(x[: ends[-1]]).max() < SETTLED:
             break
     covariance = None
     if calibrate:

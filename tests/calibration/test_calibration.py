@@ -144,7 +144,7 @@ def test_derivatives_are_those_of_the_residuals(views: Views) -> None:
 
 def test_noise_of_depth_pushes_no_coefficient() -> None:
     """At the true poses and cameras only chance pulls at the error of depth, though depth is in its derivative."""
-    noisy = make_views(0, noise_per_m=0.006, count=4000)
+    noisy = make_views(0, noise_per_m=0.006, count=2500)
     noisy.T_map_camera = np.array([pose(k) for k in range(VIEWS)])
     H, g = _of_planes(noisy, overlapping(noisy), TRUE, len(NAMES))
     pull = g[-6:] / np.sqrt(np.diag(H)[-6:])
