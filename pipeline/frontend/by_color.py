@@ -71,6 +71,10 @@ class SoundFrame:
             information=self._information(result, limits.sigma_of_way_without_depth * way_m),
         )
 
+    def way_m(self, T_keyframe_camera: Array) -> float:
+        """Distance from this frame to a pose in its keyframe."""
+        return float(se3.distance(self.T_keyframe_camera, T_keyframe_camera)[0])
+
     def agrees(self, T_keyframe_camera: Array, by_color: Array, limits: FailureConfig) -> bool:
         """Whether colour alone puts a frame where colour and depth together do: both T_keyframe_camera, [4, 4].
 
@@ -78,7 +82,7 @@ class SoundFrame:
         much as the camera moves. Those of a sound camera differ by a share of it.
         """
         apart_m = float(se3.distance(T_keyframe_camera, by_color)[0])
-        way_m = max(float(se3.distance(self.T_keyframe_camera, T)[0]) for T in (T_keyframe_camera, by_color))
+        way_m = max(self.way_m(T_keyframe_camera), self.way_m(by_color))
         return apart_m <= max(limits.max_contradiction_m, limits.max_contradiction_of_way * way_m)
 
     def _information(self, result: Registration, sigma_m: float) -> Array:

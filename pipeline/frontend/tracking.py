@@ -96,6 +96,9 @@ class Tracker:
         self._unconfirmed: _Unconfirmed | None = None
         self._gray_rms: list[float] = []  # of the last frames that were followed
         self._obstruction = Obstruction(config.tracking.failure)
+        self._contradiction = (
+            False  # depth and colour contradicted each other, and nothing has cleared that up
+        )
         self._without_depth = self._without_color = 0  # frames in a row without a usable image
         self._sound: SoundFrame | None = None  # the last frame with both, nothing before it
 
@@ -203,6 +206,7 @@ class Tracker:
         if followed and found.without is Reason.NONE:
             self._gray_rms = [*self._gray_rms[1 - USUAL_FRAMES :], result.rms_gray]
         if found.without is Reason.NONE:
+            self._contradiction = False
             self._obstruction.look(pyramid.levels[-1], self._seen_before(found))
             if not (found.doubted or self._obstruction.standing):
                 T, strides = result.T_reference_target, self.config.tracking.strides
@@ -279,22 +283,26 @@ class Tracker:
                 why_not = found.why_not()
                 if result.ok and self._tells_enough(pyramid, found) and self._followed(predicted, result):
                     undisputed = self._undisputed(stamp_ns, pyramid, found)
-                    if undisputed is not None:
+                    if isinstance(undisputed, _Found):
                         return undisputed
-                    why_not = Reason.CONTRADICTION
+                    why_not = undisputed
                 reason = reason if reason is not Reason.NONE else why_not
         view = features_of(pyramid, tracking.relocalisation) if view is None else view
         for guess in starts:
             found = _Found(self._current, settle(keyframe, pyramid, guess, tracking, tracking.recovery))
             if found.result.ok and self._believable(stamp_ns, pyramid, found, view):
                 undisputed = self._undisputed(stamp_ns, pyramid, found)
-                if undisputed is not None:
+                if isinstance(undisputed, _Found):
                     return undisputed
             reason = reason if reason is not Reason.NONE else found.why_not()
         return reason
 
-    def _undisputed(self, stamp_ns: int, pyramid: RgbdPyramid, found: _Found) -> _Found | None:
-        """The same, if it looks as usual or colour alone, where that can tell, puts the camera there too."""
+    def _undisputed(self, stamp_ns: int, pyramid: RgbdPyramid, found: _Found) -> _Found | Reason:
+        """The same, if it looks as usual or colour alone, where that can tell, puts the camera there too.
+
+        If the two contradict each other, depth of another time holds the camera back: then colour alone is believed,
+        unless it says that the camera moved less, or something stands before it.
+        """
         tracking = self.config.tracking
         largest = tracking.failure.doubtful_gray_of_usual * self._usual_gray_rms()
         if self._sound is None or not self._gray_rms or found.result.rms_gray <= largest:
@@ -302,9 +310,19 @@ class Tracker:
         predicted, known = self._predicted(stamp_ns)
         by_color = self._sound.follow(pyramid, predicted, tracking.registration, tracking.failure, known)
         if not by_color.ok or by_color.rms_gray > largest:
-            return found
+            return Reason.CONTRADICTION if self._contradiction else found
         T, T_by_color = found.result.T_reference_target, by_color.T_reference_target
-        return replace(found, doubted=True) if self._sound.agrees(T, T_by_color, tracking.failure) else None
+        if self._sound.agrees(T, T_by_color, tracking.failure):
+            return replace(found, doubted=True)
+        self._contradiction = True
+        obstructed = (
+            self._obstruction.standing
+            or (self._obstruction.intruded(pyramid.levels[-1], self._seen_before(found))[0])
+        )
+        held_back = self._sound.way_m(T) < self._sound.way_m(T_by_color)
+        if self._lost or obstructed or not held_back or not self._looks_as_usual(by_color):
+            return Reason.CONTRADICTION
+        return _Found(self._current, by_color, Reason.CONTRADICTION)
 
     def _find_place(
         self, frame_index: int, stamp_ns: int, pyramid: RgbdPyramid, view: Features
@@ -415,7 +433,9 @@ class Tracker:
 
     def _largest_gray_rms(self) -> float:
         config = self.config.tracking.relocalisation
-        return config.max_gray_rms + config.max_gray_rms_of_usual * self._usual_gray_rms()
+        # depth of another time looks 2.5 times as bad as usual where it is 4 cm off: then nothing is added
+        added = 0.0 if self._contradiction else config.max_gray_rms
+        return added + config.max_gray_rms_of_usual * self._usual_gray_rms()
 
     def _usual_gray_rms(self) -> float:
         return float(np.median(self._gray_rms)) if self._gray_rms else 0.0
