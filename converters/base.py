@@ -20,9 +20,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
-import shutil
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from contextvars import ContextVar
@@ -37,6 +35,7 @@ from numpy.typing import NDArray
 from pipeline import __version__, messages
 from pipeline.errors import DuagError
 from pipeline.geometry.camera import PinholeCamera
+from pipeline.new_folder import RECORDING, new_folder
 from pipeline.recording import (
     DEPTH_SCALE_KEY,
     RANGE_SIGMA_KEY,
@@ -357,8 +356,6 @@ class RecordingWriter:
         parameters: the settings it was made with.
         """
         self.out = Path(out)
-        if not self.out.name:
-            raise DuagError(f"{self.out}: found a path without a name, expected the name of a new folder")
         self.name = name or self.out.resolve().name
         self.warnings: list[str] = []
         self.parameters = dict(parameters or {})
@@ -370,30 +367,11 @@ class RecordingWriter:
         self._robots: dict[str, dict[str, Any]] = {}
         self._open: list[RobotWriter] = []
         self._geometry: str | None = None
-        self.folder = self.out.with_name(f".{self.out.name}.{os.getpid()}.part")
+        self._place = ExitStack()
 
     def __enter__(self) -> RecordingWriter:
-        self._check_out()
-        try:
-            if self.folder.exists():  # left by a process of the same number that was killed
-                shutil.rmtree(self.folder)
-            self.folder.mkdir(parents=True)
-        except OSError as error:
-            raise DuagError(
-                f"{self.out}: {error.strerror or error}, expected to write a recording"
-            ) from error
+        self.folder = self._place.enter_context(new_folder(self.out, self._force, RECORDING))
         return self
-
-    def _check_out(self) -> None:
-        if not self.out.exists():
-            return
-        if not self._force:
-            raise DuagError(f"{self.out}: exists already; choose another --out or give --force")
-        replaceable = self.out.is_dir() and (
-            (self.out / RECORDING_FILE).is_file() or not any(self.out.iterdir())
-        )
-        if not replaceable:
-            raise DuagError(f"{self.out}: is not a recording, expected one; --force replaces nothing else")
 
     def robot(
         self, name: str, camera: PinholeCamera, depth_scale: float, sensors: Mapping[str, str] | None = None
@@ -419,13 +397,13 @@ class RecordingWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
-            if kind is None:
-                for writer in self._open:
-                    self.add(writer.summary)
-                self._finish()
-        finally:
-            shutil.rmtree(self.folder, ignore_errors=True)
+        if kind is not None:
+            self._place.__exit__(kind, error, trace)
+            return
+        with self._place:
+            for writer in self._open:
+                self.add(writer.summary)
+            self._finish()
 
     def _finish(self) -> None:
         if not self._robots:
@@ -447,7 +425,3 @@ class RecordingWriter:
         }
         text = json.dumps(description, indent=2, allow_nan=False) + "\n"
         (self.folder / RECORDING_FILE).write_text(text)
-        self._check_out()
-        if self.out.exists():
-            shutil.rmtree(self.out)
-        self.folder.rename(self.out)

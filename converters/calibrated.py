@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.files import decode_image
-from pipeline.geometry import depth_error, so3
+from pipeline.geometry import depth_error, se3, so3
 from pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
@@ -61,6 +61,11 @@ class ColorLens:
             return s
         x, y, z = so3.exp(np.array(self.rotation_rad or (0.0, 0.0, 0.0)))[:, 2].tolist()
         return PinholeCamera(s.width, s.height, s.fx, s.fx, s.cx + s.fx * x / z, s.cy + s.fy * y / z)
+
+    def turned(self) -> Array:
+        """T_color_camera [4, 4], from `camera` to the colour camera as it is: they are at one place."""
+        R = so3.exp(np.array(self.rotation_rad or (0.0, 0.0, 0.0)))
+        return se3.from_rotation_translation(R, np.zeros(3))
 
     def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Where in the camera's images every pixel of `camera` lies, columns and rows [h, w]."""

@@ -36,7 +36,6 @@ from pipeline.files import read_text
 from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
-ROBOTS = ("acl_jackal", "acl_jackal2", "sparkal1", "sparkal2", "hathor", "thoth", "apis", "sobek")
 COLOR, DEPTH = "forward/color/image_raw/compressed", "forward/depth/image_rect_raw"
 COLOR_INFO, DEPTH_INFO = "forward/color/camera_info", "forward/depth/camera_info"
 IMU = "forward/imu"

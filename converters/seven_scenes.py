@@ -2,7 +2,8 @@
 
 A sequence is a folder of `frame-NNNNNN.color.png` (or .jpg), `.depth.png` (16 bit, millimetres, 0 and 65535 invalid)
 and `.pose.txt` (4x4, depth camera to world, x right, y down, z forward). There are no time stamps: they are made at
-30 Hz from the frame number. The depth is not registered to colour: it is here, with the constants below.
+30 Hz from the frame number. The depth is not registered to colour: it is here, with the constants below. True poses
+may be those of others (`reference_poses`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationInfo, field_validator
 
+from converters import reference_poses
 from converters.base import NANOSECONDS, RecordingWriter, RobotWriter, robot_names
 from converters.calibrated import ColorLens, correct, numbers, resampled
 from converters.image_files import options_of, read_color, read_depth, rigid
@@ -29,7 +31,9 @@ from pipeline.geometry import depth_error, se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.progress import track
 
+Array = NDArray[np.float64]
 Depth = NDArray[np.float64]
+Reference = dict[int, Array]  # T_world_color [4, 4] by frame number
 
 WIDTH, HEIGHT = 640, 480
 DEPTH_SCALE = 0.001
@@ -79,6 +83,11 @@ class Options(Config):
     the true 1/z at the ray (x, y, 1); empty: none."""
     rate_hz: int = Field(30, gt=0)
     """Frames per second; the dataset has no time stamps."""
+    reference_poses: str = ""
+    """File of true poses to take instead of the dataset's, by structure from motion: a line per image, in the format of
+    `pgt/sfm/7scenes/redkitchen_train.txt` of Brachmann et al. (ICCV 2021). Frames it lacks have no ground truth."""
+    reference_sequence: str = ""
+    """Which sequence of that file a folder holds that is not called seq-NN, for example "seq-01"."""
     sequences: str = Field("", coerce_numbers_to_str=True)
     """Numbers of the sequences to take, for example "1,3"; all if empty. Several make one robot each."""
 
@@ -142,22 +151,30 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         "folder": Path(src).resolve().name,
         "sequences": sorted({p[0] for p in parts if p[0]}),
     }
+    references = [_reference(Path(src), sequence, frames, settings) for sequence, frames in parts]
     parameters = {"robots": robots, **settings.model_dump()}
+    parameters["reference_poses"] = Path(settings.reference_poses).name
     with RecordingWriter(out, "", source, "7scenes", parameters, force) as recording:
         recording.warnings += skipped
         recording.warnings.append(
             f"no time stamps in the dataset: made from frame numbers at {settings.rate_hz} Hz"
         )
-        for name, (sequence, frames) in zip(robot_names(len(parts)), parts, strict=True):
+        for name, (sequence, frames), reference in zip(
+            robot_names(len(parts)), parts, references, strict=True
+        ):
             sensors = {"depth": "Kinect v1, registered to colour by the converter", "sequence": sequence}
             with recording.robot(name, settings.color_camera(), DEPTH_SCALE, sensors) as robot:
-                check = _write_robot(robot, frames, settings, str(src))
+                check = _write_robot(robot, frames, reference, settings, str(src))
             recording.checks[name] = {
                 "first_frame": frames[0].number,
                 "last_frame": frames[-1].number,
                 **check,
             }
-            if frames[0].pose is None:
+            if reference is not None:
+                known = sum(files.number in reference for files in frames)
+                if known < len(frames):
+                    recording.warnings.append(f"{name}: reference poses of {known} of {len(frames)} frames")
+            elif frames[0].pose is None:
                 recording.warnings.append(f"{name}: the sequence has no poses: no ground truth")
 
 
@@ -234,14 +251,28 @@ def list_frames(folder: Path) -> tuple[list[FrameFiles], list[int]]:
     ], missing
 
 
+def _reference(src: Path, sequence: str, frames: list[FrameFiles], options: Options) -> Reference | None:
+    """T_world_color by frame number where other poses than the dataset's are asked for."""
+    if not options.reference_poses:
+        if options.reference_sequence:
+            raise DuagError("7scenes: found reference_sequence alone, expected reference_poses with it")
+        return None
+    path = Path(options.reference_poses)
+    name = sequence or (src.name if SEQUENCE_FOLDER.fullmatch(src.name) else options.reference_sequence)
+    reference = reference_poses.read(path, name)
+    first, last = frames[0].number, frames[-1].number
+    if not any(files.number in reference for files in frames):
+        raise DuagError(f"{path}: found none of frames {first} to {last}, expected poses of some of them")
+    return reference
+
+
 # --- one robot ------------------------------------------------------------------------------------------------------
 
 
 def _write_robot(
-    robot: RobotWriter, frames: list[FrameFiles], options: Options, label: str
+    robot: RobotWriter, frames: list[FrameFiles], reference: Reference | None, options: Options, label: str
 ) -> dict[str, Any]:
     """Write all frames of a robot; returns what the self-check measured."""
-    T_depth_color = se3.from_rotation_translation(np.eye(3), [options.baseline_m, 0.0, 0.0])
     register = Registration(options.depth_camera(), options.color_camera(), options.baseline_m)
     check = ReprojectionCheck(options.color_camera(), len(frames))
     lens, correction = options.lens(), options.depth_correction()
@@ -252,10 +283,8 @@ def _write_robot(
         color, color_format = read_color(files.color, (WIDTH, HEIGHT))
         if maps is not None:
             color, color_format = resampled(color, maps), "png"
-        T_world_camera = None
-        if files.pose is not None:
-            T_world_camera = _read_pose(files.pose) @ T_depth_color
-            check.add(index, depth, T_world_camera)
+        T_world_camera = _true_pose(files, reference, options)
+        check.add(index, depth, T_world_camera)
         stamp_ns = (files.number - frames[0].number) * NANOSECONDS // options.rate_hz
         raw = np.rint(depth / DEPTH_SCALE).astype(np.uint16)
         robot.add_frame(stamp_ns, color, color_format, raw, T_world_camera)
@@ -264,6 +293,17 @@ def _write_robot(
     pixels = len(frames) * WIDTH * HEIGHT
     rates = {"registered_without_depth": invalid / pixels, "registered_holes": holes / pixels}
     return {**rates, **check.result(label)}
+
+
+def _true_pose(files: FrameFiles, reference: Reference | None, options: Options) -> Array | None:
+    """T_world_camera [4, 4] of the recording's camera, None where it is not known."""
+    if reference is not None:
+        T_world_color = reference.get(files.number)
+        return None if T_world_color is None else T_world_color @ options.lens().turned()
+    if files.pose is None:
+        return None
+    T_depth_camera = se3.from_rotation_translation(np.eye(3), [options.baseline_m, 0.0, 0.0])
+    return _read_pose(files.pose) @ T_depth_camera
 
 
 def _count_holes(depth: NDArray[np.uint16]) -> int:
@@ -281,7 +321,7 @@ def _depth_m(path: Path) -> Depth:
     return np.where(np.isin(raw, NO_DEPTH), 0, raw) * DEPTH_SCALE
 
 
-def _read_pose(path: Path) -> NDArray[np.float64]:
+def _read_pose(path: Path) -> Array:
     """T_world_depth [4, 4], its rotation made exactly orthonormal."""
     try:
         T = np.array(read_text(path, "4x4 numbers").split(), dtype=np.float64).reshape(4, 4)

@@ -1,7 +1,9 @@
-"""Reading whole files from outside: regular ones of bounded size, or one line that says why not."""
+"""Whole files: reading regular ones of bounded size from outside, writing ones that appear when they are finished."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +52,24 @@ def read_text(path: Path, expected: str) -> str:
         return read_bytes(path, expected).decode()
     except UnicodeDecodeError as error:
         raise DuagError(f"{path}: is not text, expected {expected}") from error
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """A name beside `path` to write to: it becomes `path` when the block ends well, else it is removed.
+
+    Raises:
+        DuagError: it cannot be written there.
+    """
+    part = path.with_name(path.name + ".part")
+    try:
+        yield part
+        part.replace(path)
+    except OSError as error:
+        raise DuagError(f"{path}: {error.strerror or error}, expected to write a file") from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def decode_image(data: bytes, flags: int) -> NDArray[Any] | None:

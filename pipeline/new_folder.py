@@ -9,18 +9,22 @@ from pathlib import Path
 
 from pipeline.errors import DuagError
 
-OURS = ("manifest.json", "run/manifest.json")  # a run, a demo
+RUN = "a run", ("manifest.json", "run/manifest.json")  # the latter of a demo
+RECORDING = "a recording", ("recording.json",)
 
 
 @contextmanager
-def new_folder(out: Path, force: bool) -> Iterator[Path]:
-    """A folder beside `out` that takes its name when the block ends well, and is removed when it does not."""
-    _check_out(out, force)
+def new_folder(out: Path, force: bool, kind: tuple[str, tuple[str, ...]] = RUN) -> Iterator[Path]:
+    """A folder beside `out` that takes its name when the block ends well, and is removed when it does not.
+
+    force: replace what is there, if it is empty or of this kind: its name, and the files that tell.
+    """
+    _check_out(out, force, kind)
     partial = out.with_name(out.name + ".part")
     with _locked(partial):
         try:
             yield partial
-            _check_out(out, force)  # it may have appeared meanwhile
+            _check_out(out, force, kind)  # it may have appeared meanwhile
             if out.exists():
                 shutil.rmtree(out)
             partial.rename(out)
@@ -56,13 +60,14 @@ def _take(lock: int, folder: Path) -> None:
         raise DuagError(f"{folder}: another process is writing it; wait, or choose another --out") from error
 
 
-def _check_out(out: Path, force: bool) -> None:
-    """Refuse to replace what is there, unless `force` and only a run would be lost."""
+def _check_out(out: Path, force: bool, kind: tuple[str, tuple[str, ...]]) -> None:
+    """Refuse to replace what is there, unless `force` and nothing of another kind would be lost."""
     if not out.name:
         raise DuagError(f"{out}: found a path without a name, expected the name of a new folder")
     if not out.exists():
         return
     if not force:
         raise DuagError(f"{out}: exists already; choose another --out or give --force")
-    if not out.is_dir() or (any(out.iterdir()) and not any((out / mark).is_file() for mark in OURS)):
-        raise DuagError(f"{out}: is not a run; --force replaces only what an earlier run has written")
+    name, marks = kind
+    if not out.is_dir() or (any(out.iterdir()) and not any((out / mark).is_file() for mark in marks)):
+        raise DuagError(f"{out}: is not {name}, expected one; --force replaces nothing else")

@@ -12,6 +12,7 @@ from pathlib import Path
 from pipeline.config import load
 from pipeline.digest import ROBOT_RESULTS, digest_file
 from pipeline.errors import DuagError
+from pipeline.files import check_file
 from pipeline.run_folder import RunFolder
 from pipeline.runner import RunConfig, agent_input, fuse_robot, prepare_robot, threads_per_worker
 
@@ -48,12 +49,15 @@ def replay(
 
     config = load(RunConfig, RunFolder(run).config_file)
     logs = Recording(recording)
+    known = RunFolder(run).robots
+    check_file(run / "exchange.mcap", "the log of the exchange")
+    for robot in robots:  # before hours of work
+        if robot not in known:
+            raise DuagError(f"{run}: robot {robot} not found, expected one of {', '.join(known)}")
+        for name in ROBOT_RESULTS:
+            check_file(known[robot].folder / name, "a result of a finished run")
     out = []
     for robot in robots:
-        if robot not in RunFolder(run).robots:
-            raise DuagError(
-                f"{run}: robot {robot} not found, expected one of {', '.join(RunFolder(run).robots)}"
-            )
         folder = Path(tempfile.mkdtemp(prefix=f"duagc-replay-{robot}-"))
         try:
             out += _replay_one(run, logs.log(robot), robot, folder, config, say)

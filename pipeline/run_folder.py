@@ -21,11 +21,12 @@ from pipeline.messages import (
     GaussianInformation,
     GaussianMap,
     Keyframe,
-    MapUpdate,
     Odometry,
 )
 from pipeline.recording import read_log
 from schemas import topics
+
+SCHEMA = 1  # of manifest.json and metrics.json
 
 
 @dataclass(frozen=True)
@@ -61,11 +62,6 @@ class RobotRun:
     def keyframes(self) -> list[Keyframe]:
         """Every keyframe, in order of its index."""
         return self._all("frontend.mcap", topics.KEYFRAME)
-
-    @cached_property
-    def map_updates(self) -> list[MapUpdate]:
-        """What the mapping of every keyframe did, in order."""
-        return self._all("frontend.mcap", topics.MAP_UPDATE)
 
     @cached_property
     def own_map(self) -> GaussianMap:
@@ -142,6 +138,11 @@ class RunFolder:
         names = sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
         if not names:
             raise DuagError(f"{self.path}: found no folder robots/<robot>, expected a run")
+        for name in self._json("manifest.json").get("inputs", {}):
+            if name not in names:
+                raise DuagError(
+                    f"{folder / name}: no such folder, expected the results that manifest.json names"
+                )
         return {name: RobotRun(name, folder / name, self._digests(name)) for name in names}
 
     @cached_property
@@ -164,6 +165,8 @@ class RunFolder:
             DuagError: this is not a finished run, or the recording is no longer there.
         """
         path = self.path / "manifest.json"
+        if not path.is_file():
+            raise DuagError(f"{path}: no such file, expected the manifest of a finished run")
         named = self._json(path.name).get("recording")
         if named is None:
             raise DuagError(f"{path}: names no recording, expected the manifest of a finished run")
@@ -224,6 +227,8 @@ class RunFolder:
             raise DuagError(f"{path}: not valid JSON: {error}") from error
         if not isinstance(content, dict):
             raise DuagError(f"{path}: found a {type(content).__name__}, expected a JSON object")
+        if content.get("schema", SCHEMA) != SCHEMA:
+            raise DuagError(f"{path}: schema is {content['schema']}, expected {SCHEMA}")
         return content
 
 

@@ -26,6 +26,7 @@ from pipeline.fusion.config import FusionConfig
 from pipeline.information.config import InformationConfig
 from pipeline.new_folder import new_folder
 from pipeline.robot import AgentInput, AgentResult
+from pipeline.run_folder import SCHEMA
 from pipeline.workers import worker_pool
 
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
@@ -250,7 +251,7 @@ def _manifest(recording: Any, folder: Path, config: RunConfig) -> dict[str, Any]
     from importlib.metadata import version
 
     return {
-        "schema": 1,
+        "schema": SCHEMA,
         "duagc": __version__,
         "libraries": {name: version(name) for name in LIBRARIES},
         "recording": os.path.relpath(recording.path, folder),

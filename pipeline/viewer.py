@@ -24,6 +24,7 @@ from pipeline.evaluation.network import Session
 from pipeline.evaluation.paths import Path3, paths
 from pipeline.evaluation.rendering import poses_by_stamp
 from pipeline.evaluation.results import Absent
+from pipeline.files import new_file
 from pipeline.geometry import so3
 from pipeline.messages import camera_frame
 from pipeline.recording import RECORDING_FILE, Recording, open_rgbd
@@ -60,7 +61,8 @@ def view(path: Path, save: Path | None = None, screenshot: Path | None = None) -
     with tempfile.TemporaryDirectory(prefix="duagc-view-") as folder:
         rrd = _as_rrd(Path(path), Path(folder))
         if save is not None:
-            _copy(rrd, save)
+            with new_file(save) as part:
+                shutil.copyfile(rrd, part)
         if screenshot is not None:
             take_screenshot(rrd, screenshot)
         if save is None and screenshot is None:
@@ -86,12 +88,6 @@ def _as_rrd(path: Path, folder: Path) -> Path:
     )
 
 
-def _copy(rrd: Path, save: Path) -> None:
-    partial = save.with_name(save.name + ".part")
-    shutil.copyfile(rrd, partial)
-    partial.replace(save)
-
-
 # --- a run -------------------------------------------------------------------------------------------------------
 
 
@@ -107,13 +103,12 @@ def write_rrd(run_dir: Path, recording: Path, out: Path, max_gaussians: int = 30
     import rerun as rr
 
     run, source = RunFolder(run_dir), Recording(recording)
-    partial = out.with_name(out.name + ".part")
     stream = rr.RecordingStream(APPLICATION, recording_id=f"run-{source.name}")
-    stream.save(partial, default_blueprint=_blueprint(run))
-    _log_run(stream, run, source, max_gaussians)
-    stream.flush()
-    stream.disconnect()
-    partial.replace(out)
+    with new_file(out) as part:
+        stream.save(part, default_blueprint=_blueprint(run))
+        _log_run(stream, run, source, max_gaussians)
+        stream.flush()
+        stream.disconnect()
     return out
 
 
@@ -374,13 +369,12 @@ def recording_to_rrd(logs: Sequence[Path], out: Path) -> Path:
             rest,
             LazyChunkStream.from_iter([meter]),
         ]
-    partial = out.with_name(out.name + ".part")
     recording = rr.RecordingStream(APPLICATION, recording_id=f"recording-{out.stem}")
-    recording.save(partial, default_blueprint=_recording_blueprint(robots))
-    recording.send_chunks(LazyChunkStream.merge(*streams))
-    recording.flush()
-    recording.disconnect()
-    partial.replace(out)
+    with new_file(out) as part:
+        recording.save(part, default_blueprint=_recording_blueprint(robots))
+        recording.send_chunks(LazyChunkStream.merge(*streams))
+        recording.flush()
+        recording.disconnect()
     return out
 
 
@@ -452,9 +446,10 @@ def take_screenshot(rrd: Path, png: Path, timeout_s: float = 60.0) -> None:
     """
     from rerun.experimental import ViewerClient
 
+    executable = _executable()
     try:
         with ViewerClient.spawn(
-            headless=True, port=_free_port(), memory_limit=VIEWER_MEMORY, executable_path=_executable()
+            headless=True, port=_free_port(), memory_limit=VIEWER_MEMORY, executable_path=executable
         ) as viewer:
             viewer.open(str(rrd))
             data = _settled_picture(viewer, timeout_s)
@@ -464,9 +459,8 @@ def take_screenshot(rrd: Path, png: Path, timeout_s: float = 60.0) -> None:
             f"{png}: the viewer drew no picture ({first}); it needs a graphics driver, "
             "for example the package mesa-vulkan-drivers"
         ) from error
-    partial = png.with_name(png.name + ".part")
-    partial.write_bytes(data)
-    partial.replace(png)
+    with new_file(png) as part:
+        part.write_bytes(data)
 
 
 def _settled_picture(viewer: Any, timeout_s: float) -> bytes:

@@ -11,6 +11,7 @@ import pytest
 
 from pipeline import cli
 from pipeline.errors import DuagError
+from pipeline.files import new_file
 from pipeline.new_folder import new_folder
 
 ROOT = Path(__file__).parents[1]
@@ -94,6 +95,38 @@ def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
     assert (tmp_path / "file").read_text() == "mine"
 
 
+def test_a_full_disk_is_one_line() -> None:
+    command = "lambda: open('/dev/full', 'wb', buffering=0).write(b'a log')"
+    code = f"from pipeline import cli; cli.app = {command}; cli.main()"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False
+    )
+    assert_one_line(result, "No space left on device", "expected room for the output")
+
+
+def test_a_file_appears_only_when_it_is_finished(tmp_path: Path) -> None:
+    path = tmp_path / "out.txt"
+    path.write_text("before")
+
+    def fail_half_way() -> None:
+        with new_file(path) as part:
+            part.write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail_half_way()
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["before"]
+    with new_file(path) as part:
+        part.write_text("after")
+        assert path.read_text() == "before"
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["after"]
+    with (
+        pytest.raises(DuagError, match=r"out.txt/in.txt: Not a directory"),
+        new_file(path / "in.txt") as part,
+    ):
+        part.write_text("nowhere")
+
+
 def test_two_processes_do_not_write_one_output(tmp_path: Path) -> None:
     with new_folder(tmp_path / "out", force=False) as folder:
         (folder / "mine").write_text("")
@@ -121,10 +154,20 @@ def test_an_output_that_appeared_meanwhile_is_kept(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.rglob("*")] == ["out", "keep"]
 
 
+def _listen_to_interrupts() -> None:
+    """What a shell starts in the background, tests among it, is deaf to them."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_an_interrupted_command_is_one_line(tmp_path: Path) -> None:
     command = [sys.executable, "-c", "from pipeline.cli import main; main()", "simulate", "--out"]
     process = subprocess.Popen(
-        [*command, str(tmp_path / "out")], stderr=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True
+        [*command, str(tmp_path / "out")],
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        start_new_session=True,
+        preexec_fn=_listen_to_interrupts,
     )
     deadline = time.monotonic() + 60
     while not list(tmp_path.iterdir()) and time.monotonic() < deadline:

@@ -226,7 +226,9 @@ def test_the_exchange_of_a_run_can_be_repeated_under_faults(finished: Path, reco
 def test_what_the_images_allow_is_told_beside_the_error_of_the_team(finished: Path, recording: Path) -> None:
     config = load(RunConfig, finished / "config.toml", []).frontend
     result = reference.run(RunFolder(finished), Recording(recording), config)
-    told = json.loads((finished / "metrics.json").read_text())["team"]["ate_rmse_m"]
+    metrics = json.loads((finished / "metrics.json").read_text())
+    told = metrics["team"]["ate_rmse_m"]
+    assert result["closures"] == metrics["team"]["inter_robot_closures"] > 0
     rows = {row["poses"]: row for row in result["rows"]}
     assert rows["the run"]["team_ate_rmse_m"] == pytest.approx(told, abs=1e-9)
     assert rows["the run"]["own_ate_rmse_m"] <= told

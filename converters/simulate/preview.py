@@ -1,11 +1,12 @@
 """A contact sheet of a simulated recording: the paths from above, and what every robot saw over time."""
 
-import os
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.files import new_file
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -50,9 +51,8 @@ class Preview:
         sheet = [_line(self.title, width)]
         sheet += [_padded(row, width) for row in rows]
         _, png = cv2.imencode(".png", np.ascontiguousarray(np.concatenate(sheet)[..., ::-1]))
-        part = path.with_name(f".{path.name}.{os.getpid()}.part")
-        part.write_bytes(png.tobytes())
-        part.rename(path)
+        with new_file(path) as part:
+            part.write_bytes(png.tobytes())
 
     def _row(self, k: int) -> Image:
         """The frames of one robot."""

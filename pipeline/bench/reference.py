@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 from pipeline.bench.tables import markdown
 from pipeline.errors import DuagError
 from pipeline.evaluation import depth_agreement, groundtruth, trajectory_errors
+from pipeline.evaluation.network import Session, counts
 from pipeline.evaluation.results import Absent
 from pipeline.evaluation.trajectory_errors import Paired
 from pipeline.frontend import bundle
 from pipeline.frontend.config import FrontendConfig
 from pipeline.frontend.keyframes import KeyframePair
 from pipeline.geometry import se3
-from pipeline.recording import Recording, RgbdLog, open_rgbd, read_log
+from pipeline.recording import Recording, RgbdLog, open_rgbd
 from pipeline.registration import Level, Reference, RgbdPyramid
 from pipeline.registration.features import Features
 from pipeline.run_folder import RobotRun, RunFolder
-from schemas import topics
 
 Array = NDArray[np.float64]
 Poses = dict[str, Array]  # T_world_camera [n, 4, 4] of a robot's frames that have a true pose
@@ -71,7 +71,8 @@ def run(run_folder: RunFolder, recording: Recording, config: FrontendConfig) -> 
     Returns:
         "rows", one per trajectory: team_ate_rmse_m under one alignment, own_ate_rmse_m, the mean of those under an own
         alignment of each robot, cut_ate_rmse_m, the same of one robot's path cut in 2, 3, 4, and agreement_m of depth
-        images, within robots and across them. "views": pairs of held-out views, within and across.
+        images, within robots and across them. "closures": of the run that tie the robots' keyframes from the start.
+        "views": pairs of held-out views, within and across.
     Raises:
         DuagError: a robot has no ground truth, or the robots do not share one world.
     """
@@ -98,7 +99,8 @@ def run(run_folder: RunFolder, recording: Recording, config: FrontendConfig) -> 
     rows = [{"poses": name, **_errors(robots, poses)} for name, poses in answers.items()]
     cuts = dict.fromkeys(rows[0]["cut_ate_rmse_m"], 0.0)
     rows.append({"poses": "the truth", "team_ate_rmse_m": 0.0, "own_ate_rmse_m": 0.0, "cut_ate_rmse_m": cuts})
-    return {"views": pairs, "rows": [row | {"agreement_m": agreement[row["poses"]]} for row in rows]}
+    rows = [row | {"agreement_m": agreement[row["poses"]]} for row in rows]
+    return {"closures": team.closures, "views": pairs, "rows": rows}
 
 
 def _robot(robot: RobotRun, recording: Recording) -> Robot:
@@ -151,12 +153,11 @@ class _Team:
             for k in robot.run.keyframes
             if k.previous_index >= 0
         }
-        consensus = run_folder.path / "consensus.mcap"
-        for record in read_log(consensus, topics=[topics.CLOSURE_DECISION.pattern]):
-            c = record.message()
-            if c.weight > 0:
-                a, b = first[c.robot] + c.own_keyframe, first[c.peer] + c.peer_keyframe
-                self.ends.add((min(a, b), max(a, b)))
+        closures = [c for c in Session(run_folder).closures if counts(c)]
+        for c in closures:
+            a, b = first[c.robot] + c.own_keyframe, first[c.peer] + c.peer_keyframe
+            self.ends.add((min(a, b), max(a, b)))
+        self.closures = len(closures)
 
     def images(self, keyframe: int, levels: int) -> RgbdPyramid:
         robot, row = self.where[keyframe]

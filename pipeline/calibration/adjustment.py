@@ -20,7 +20,8 @@ from pipeline.registration.residuals import MAD_TO_SIGMA, RegistrationConfig
 
 Array = NDArray[np.float64]
 
-ROUNDS, SETTLED = 25, 1e-4  # m, rad
+ROUNDS = 30
+SETTLED, SETTLED_OF_PRIOR = 2e-4, 0.01  # steps of poses (m, rad), of the cameras' numbers as a share of their priors
 CAUCHY, HUBER = 2.5, 1.5  # scales
 SAME_ERROR = 50.0  # neighbours err alike, and no model is exact: so many residuals count as one
 PRIOR = dict(zip(NAMES, (15, 15, 15, 15, 0.3, 0.5, 0.5, 0.01, 0.01, 0.01, 0.02, *[0.02] * 6), strict=True))
@@ -53,7 +54,7 @@ class Adjusted:
 
 
 def adjust(parts: Sequence[Views], rig: Rig, calibrate: bool) -> Adjusted:
-    """Adjust poses and landmarks (in place), and the cameras too if asked, until no pose moves."""
+    """Adjust poses and landmarks (in place), and the cameras too if asked, until nothing moves."""
     start, pairs = Rig.of(rig.camera), [overlapping(part) for part in parts]
     ends = np.cumsum([0] + [6 * len(part.T_map_camera) for part in parts])
     size = len(NAMES) if calibrate else 0
@@ -81,7 +82,8 @@ def adjust(parts: Sequence[Views], rig: Rig, calibrate: bool) -> Adjusted:
             part.T_map_camera = part.T_map_camera @ se3.exp(x[a:b].reshape(-1, 6))
         if calibrate:
             rig = rig.moved(x[ends[-1] :])
-        if np.abs(x[: ends[-1]]).max() < SETTLED:
+        settled = not calibrate or np.abs(x[ends[-1] :] / prior).max() < SETTLED_OF_PRIOR
+        if settled and np.abs(x[: ends[-1]]).max() < SETTLED:
             break
     covariance = None
     if calibrate:
@@ -142,7 +144,7 @@ def _planes(views: Views, pairs: NDArray[np.int64], rig: Rig) -> _Planes:
     column, row = np.moveaxis(views.samples[first], -1, 0)
     at = first[:, None], row, column
     rays = c.rays_at(column, row)
-    z, z_by = rig.depth(views.inverse_depth[at].astype(np.float64), rays)
+    z = rig.depth(views.inverse_depth[at].astype(np.float64), rays)
     p, normals = rays * z[..., None], normals_at(views, *at)
     M = se3.inverse(views.T_map_camera[second]) @ views.T_map_camera[first]
     q = se3.transform(M, p)
@@ -152,11 +154,14 @@ def _planes(views: Views, pairs: NDArray[np.int64], rig: Rig) -> _Planes:
     inverse = look_up(views, np.broadcast_to(second[:, None], front.shape), uv[..., 0], uv[..., 1])
     seen = front & np.isfinite(inverse)
     rays_there = c.rays_at(uv[..., 0], uv[..., 1])
-    z_there, z_there_by = rig.depth(np.where(seen, inverse, 1.0), rays_there)
+    z_there = rig.depth(np.where(seen, inverse, 1.0), rays_there)
     used = seen & (np.abs(z_there - q[..., 2]) < np.maximum(GATE_M, GATE_RELATIVE * q[..., 2]))
     surface = rays_there * z_there[..., None]
     sigma = _sigma(z_there)[..., None]
     towards = (m * rays_there).sum(axis=-1)[..., None]
+    # derivatives at the mean of both views' depths, with which the residual, their difference, does not vary
+    between = np.sqrt(np.where(used, z_there / q[..., 2], 1.0))
+    z_there_by, z_by = rig.depth_by(z_there / between, rays_there), rig.depth_by(z * between, rays)
     return _Planes(
         (m * (surface - q)).sum(axis=-1) / sigma[..., 0],
         used,
@@ -192,7 +197,7 @@ def _features(views: Views, rig: Rig) -> _Features:
     inverse = look_up(views, view, uv[:, 0], uv[:, 1])
     seen = np.isfinite(inverse)
     rays = c.rays_at(uv[:, 0], uv[:, 1])
-    z, z_by = rig.depth(np.where(seen, inverse, 1.0), rays)
+    z, z_by = rig.depth(np.where(seen, inverse, 1.0), rays), rig.depth_by(q[:, 2], rays)
     at = np.rint(np.where(seen[:, None], uv, 0)).astype(np.int64)
     n = normals_at(views, view, at[:, 1], at[:, 0])
     used = seen & (np.abs(z - q[:, 2]) < FEATURE_GATE_M) & (np.abs(n).sum(axis=-1) > 0)

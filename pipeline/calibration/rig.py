@@ -84,8 +84,16 @@ class Rig:
         by_lens = np.stack([np.stack(u_by, axis=-1), np.stack(v_by, axis=-1)], axis=1)
         return np.stack([fx * x * g + cx, fy * y * g + cy], axis=-1), by_ray @ ray_by_point, by_lens
 
-    def depth(self, inverse: Array, rays: Array) -> tuple[Array, Array]:
-        """True depth [...] of a measured inverse depth at rays [..., 3], and its derivative by the error [..., 6]."""
+    def depth(self, inverse: Array, rays: Array) -> Array:
+        """True depth [...], metres, of a measured inverse depth at rays [..., 3]."""
         terms = depth_error.terms(inverse, rays[..., 0], rays[..., 1])
-        z = 1 / np.maximum(inverse + terms @ self.depth_error, 1 / depth_error.FARTHEST_M)
-        return z, -(z**2)[..., None] * terms
+        return np.asarray(1 / np.maximum(inverse + terms @ self.depth_error, 1 / depth_error.FARTHEST_M))
+
+    def depth_by(self, depth_m: Array, rays: Array) -> Array:
+        """Derivative [..., 6] of a depth [...] at rays [..., 3] by the coefficients of the error, to their first order.
+
+        Give it a depth whose noise is not the residual's: it grows with depth squared, and were that the measured one,
+        noise would push all coefficients one way, the farther the less they are determined.
+        """
+        terms = depth_error.terms(1 / depth_m, rays[..., 0], rays[..., 1])
+        return np.asarray(-(depth_m**2)[..., None] * terms)

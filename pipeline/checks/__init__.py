@@ -33,23 +33,23 @@ def check(path: Path) -> Report:
     recording = None if path.is_file() else Recording(path)
     sights: dict[str, images.Sight] = {}
     for robot in recording.robots if recording else [""]:
+        log = None
         try:
             log = recording.log(robot) if recording else path
             with open_rgbd(log) as rgbd:
                 _check_robot(report, recording, rgbd, sights)
         except DuagError as error:
-            report.findings.append(_unreadable(robot, error))
+            advice = "duagc recover may save it" if log else ""
+            report.findings.append(_unreadable(robot, error, advice))
     report.findings += images.check_colors(sights)
     report.estimate = estimate.estimate(report.robots)
     report.findings += estimate.check_disk(path.parent, report.estimate["bytes"])
     return report
 
 
-def _unreadable(robot: str, error: DuagError) -> Finding:
+def _unreadable(robot: str, error: DuagError, advice: str) -> Finding:
     found, _, expected = str(error).partition(", expected ")
-    return Finding(
-        Severity.ERROR, "log", robot, found, expected or "a sound log", "duagc recover may save it"
-    )
+    return Finding(Severity.ERROR, "log", robot, found, expected or "a sound log", advice)
 
 
 def _check_robot(

@@ -1,5 +1,6 @@
 """The command `duagc`. Every command imports what it needs when it runs, so that `--help` is quick."""
 
+import errno
 import sys
 
 from pipeline import numeric
@@ -19,6 +20,7 @@ from pipeline.cli import bench
 __all__ = ["app", "bench", "looking", "main", "posegraph", "recordings", "runs", "settings"]
 
 TYPER_INTERRUPTED = 130  # what typer makes of Ctrl-C, without a word
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's share of it, a limit on files
 
 
 def main() -> None:
@@ -28,6 +30,12 @@ def main() -> None:
         app()
     except DuagError as error:
         print(f"duagc: {error}", file=sys.stderr)
+        sys.exit(EXIT_FAILED)
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"duagc: {where}{error.strerror}, expected room for the output", file=sys.stderr)
         sys.exit(EXIT_FAILED)
     except SystemExit as stop:
         if stop.code != TYPER_INTERRUPTED:

@@ -241,11 +241,11 @@ def bench_frontend(
         )
         result = frontend.run(plan)
     if plot is not None:
+        from pipeline.files import new_file
         from pipeline.report import figures
 
-        partial = plot.with_name(plot.name + ".part")
-        partial.write_text(figures.map_sizes(frontend.by_cap(result)), encoding="utf-8")
-        partial.replace(plot)
+        with new_file(plot) as part:
+            part.write_text(figures.map_sizes(frontend.by_cap(result)), encoding="utf-8")
     print(json.dumps(result, indent=2) if as_json else frontend_tables.format_tables(result))
 
 

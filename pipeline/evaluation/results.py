@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.files import new_file
+
 
 @dataclass(frozen=True)
 class Absent:
@@ -84,9 +86,8 @@ class Row:
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write a document of finite numbers; the name appears only when the file is complete."""
     text = json.dumps(document, indent=2, allow_nan=False) + "\n"
-    partial = path.with_name(path.name + ".part")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
+    with new_file(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def write_parquet(path: Path, rows: list[Row]) -> None:
@@ -110,6 +111,5 @@ def write_parquet(path: Path, rows: list[Row]) -> None:
             "reason": pa.array(reasons, pa.string()),
         }
     )
-    partial = path.with_name(path.name + ".part")
-    pq.write_table(table, partial, compression="zstd")
-    partial.replace(path)
+    with new_file(path) as part:
+        pq.write_table(table, part, compression="zstd")

@@ -34,9 +34,7 @@ from pipeline.evaluation.results import (
 from pipeline.evaluation.trajectory_errors import Paired, TeamError
 from pipeline.geometry.trajectory import Trajectory
 from pipeline.recording import Recording
-from pipeline.run_folder import RobotRun, RunFolder
-
-SCHEMA = 1
+from pipeline.run_folder import SCHEMA, RobotRun, RunFolder
 
 PROTOCOL = {
     "alignment": "se3",

@@ -63,9 +63,11 @@ def run_frontend(
             raise DuagError(f"{log_path}: has no image, expected at least one")
         tracker, frames = _track(log, config, progress)
         if not tracker.keyframes:
-            reasons = sorted({frame.reason.value for frame in frames})
+            reasons = ", ".join(sorted({frame.reason.value for frame in frames}))
+            size = f"{log.camera.width} x {log.camera.height}"
             raise DuagError(
-                f"{log_path}: found no frame to begin a map with ({', '.join(reasons)}), expected one with depth"
+                f"{log_path}: found no frame of {size} pixels to begin a map with ({reasons}), "
+                "expected one with depth in enough of them"
             )
         noise_m = depth_noise_m(frames)
         clock.lap("tracking_s")

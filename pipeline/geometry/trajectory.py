@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import DuagError
-from pipeline.files import read_text
+from pipeline.files import new_file, read_text
 from pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
@@ -39,9 +39,8 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
     for stamp, t, q in zip(trajectory.stamps_ns.tolist(), trajectory.positions, quats, strict=True):
         values = " ".join(f"{v:.17g}" for v in (*t, q[1], q[2], q[3], q[0]))
         lines.append(f"{stamp // 10**9}.{stamp % 10**9:09d} {values}")
-    partial = path.with_name(path.name + ".part")
-    partial.write_text("\n".join(lines) + "\n")
-    partial.replace(path)
+    with new_file(path) as part:
+        part.write_text("\n".join(lines) + "\n")
 
 
 def read_tum(path: Path) -> Trajectory:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import DuagError
+from pipeline.files import new_file
 from pipeline.recording.rgbd import RgbdFrame, RgbdLog, open_rgbd
 
 SHOWN = 6  # frames of a robot
@@ -50,13 +50,8 @@ def write_preview(logs: Sequence[Path], out: Path) -> None:
             rows += _rows_of(log)
     width = max(row.shape[1] for row in rows)
     sheet = np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows])
-    part = out.with_name(out.name + ".part")
-    try:
+    with new_file(out) as part:
         part.write_bytes(cv2.imencode(".png", sheet[:, :, ::-1])[1].tobytes())
-        os.replace(part, out)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise DuagError(f"{out}: {error.strerror or error}, expected to write a picture") from error
 
 
 def _rows_of(log: RgbdLog) -> list[Picture]:

@@ -15,6 +15,7 @@ from pipeline.evaluation.network import Session
 from pipeline.evaluation.paths import Path3, paths, top_view_axes
 from pipeline.evaluation.rendering import COMPARED_SETS
 from pipeline.evaluation.results import Absent
+from pipeline.files import new_file
 from pipeline.recording import Recording
 from pipeline.report import figures, pictures, words
 from pipeline.report.renders import rendered_views
@@ -61,9 +62,8 @@ def write_report(run_dir: Path, recording: Path) -> Path:
     html = environment.get_template(TEMPLATE).render(**content(run, source))
     path = run_dir / "report" / "index.html"
     path.parent.mkdir(exist_ok=True)
-    partial = path.with_name(path.name + ".part")
-    partial.write_text(html, encoding="utf-8")
-    partial.replace(path)
+    with new_file(path) as part:
+        part.write_text(html, encoding="utf-8")
     return path
 
 
@@ -329,8 +329,12 @@ def _reliability_chart(run: RunFolder) -> str:
         return ""
     import pyarrow.parquet as pq
 
+    try:
+        rows = pq.read_table(path, filters=[("scope", "==", "reliability")]).to_pylist()
+    except (ValueError, OSError) as error:  # pyarrow's errors are kinds of these
+        raise DuagError(f"{path}: is no Parquet file that can be read, expected that of the run") from error
     bins: dict[str, dict[str, dict[str, float]]] = {}
-    for row in pq.read_table(path, filters=[("scope", "==", "reliability")]).to_pylist():
+    for row in rows:
         bins.setdefault(row["robot"], {}).setdefault(row["view_set"], {})[row["name"]] = row["value"]
     if not bins:
         return ""

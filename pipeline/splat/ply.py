@@ -8,14 +8,13 @@ frame of the Gaussians that were given. ids and anchors are not part of the form
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import DuagError
-from pipeline.files import read_bytes
+from pipeline.files import new_file, read_bytes
 from pipeline.splat.gaussians import Gaussians
 
 SH_DEGREE_0 = 0.28209479177387814
@@ -53,16 +52,12 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
             "end_header\n",
         ]
     )
-    part = path.with_name(path.name + ".part")
-    try:
+    with new_file(path) as part:
         with part.open("wb") as file:
             file.write(header.encode("ascii"))
             file.write(table.tobytes())
         if not np.array_equal(_read_table(part), table):
             raise DuagError(f"{path.name}: what was written reads back differently; is the disk full?")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def read_ply(path: str | Path) -> Gaussians:
