@@ -91,13 +91,6 @@ def test_made_up_colours_leave_a_neighbour_out(views, color):
     assert len(trust.evidence["bravo"]) == len(trust.pairs["alpha", "bravo"]) == 0
 
 
-@pytest.mark.parametrize(("sigma", "used"), [(0.1, True), (0.45, False)])
-def test_noise_on_every_colour_leaves_a_neighbour_out_once_it_hides_half_of_the_picture(views, sigma, used):
-    noise = np.random.default_rng(5).normal(0, sigma, (N, 3))
-    (doubt,) = told(views, map_of("bravo", repaint(lambda c: c + noise))).doubts
-    assert doubt.trusted == used
-
-
 def test_another_camera_is_no_lie(views):
     assert told(views, map_of("bravo", repaint(lambda c: 0.6 * c + 0.05))).doubts[0].trusted
 
