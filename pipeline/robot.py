@@ -106,7 +106,8 @@ class AgentResult:
     T_world_keyframe: [n, 4, 4], own keyframes in the map frame of component[0]; exactly those of its own map if it is
     alone. T_world_keyframe_of: the same of every member, itself included, as far as their agreed poses arrived.
     own_evidence: as it was sent, sorted by id. evidence: of the other members with agreed poses, by name, as far as
-    it arrived. pairs: ids of matched Gaussians, int64 [n, 2], by (lower, higher) name.
+    it arrived. depth_of: of a Gaussian at a pixel, as their maps were made, by name.
+    pairs: ids of matched Gaussians, int64 [n, 2], by (lower, higher) name.
     closures: every candidate that this robot decided on. agreed: its poses are final. converged: it also has
     everything it should have; a robot that is alone has. rounds: ticks it took part in. rounds_to_agreement: None if
     its poses were not agreed. refused: reasons of packets that could not be used, and how many.
@@ -118,6 +119,7 @@ class AgentResult:
     T_world_keyframe_of: dict[str, Array]
     own_evidence: Evidence
     evidence: dict[str, Evidence]
+    depth_of: dict[str, DepthKind]
     pairs: dict[tuple[str, str], NDArray[np.int64]]
     closures: tuple[ClosureRecord, ...]
     agreed: bool

@@ -250,10 +250,21 @@ def surface_points(scene: Scene, atlas: Atlas, count: int) -> tuple[Array, Array
         elif isinstance(surface, Ball):
             keep = rng.random(n) < np.sin(t / surface.radius)
         p, normal = surface.points(s, t)
-        keep &= scene.clearance(p + 0.002 * normal) > 0.001
+        keep &= _free(scene, p + 0.002 * normal, 0.001)
         xy = atlas.origin[k] + np.stack([s, t], axis=1) / atlas.texel_m
         x, y = np.ascontiguousarray(xy.T.astype(np.float32))
         points.append(p[keep])
         normals.append(normal[keep])
         colors.append(atlas.sample(0, x, y)[keep])
     return np.concatenate(points), np.concatenate(normals), np.concatenate(colors)
+
+
+def _free(scene: Scene, points: Array, margin_m: float) -> NDArray[np.bool_]:
+    """Whether points [n, 3] keep more than a margin from everything: `clearance`, of the solids near them only."""
+    low, high = points.min(axis=0) - 2 * margin_m, points.max(axis=0) + 2 * margin_m
+    free = np.minimum(points, scene.size - points).min(axis=1) > margin_m
+    for solid in scene.solids:
+        center, half = _bounds(solid)
+        if (low < center + half).all() and (high > center - half).all():
+            free &= solid.distance(points) > margin_m
+    return free

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.simulate import drawn
 from converters.simulate import furniture as fur
 from converters.simulate import textures as tex
 from converters.simulate.furniture import Place
@@ -116,10 +117,10 @@ def _windows(rng: np.random.Generator, width: float, height: float) -> tex.Mater
     patches: list[tuple[tex.Material, float, float, float, float]] = []
     at = float(rng.uniform(0.5, 1.0))
     while at < width - 1.7:
-        patches.append((tex.window, at, 0.45, 1.4, 1.2))
+        patches.append((drawn.window, at, 0.45, 1.4, 1.2))
         kind = fur.PICTURES[int(rng.integers(0, 4))]
         if at + 2.4 < width:
-            patches.append((tex.picture(kind), at + 1.65, 0.5, 0.6, 0.75))
+            patches.append((drawn.picture(kind), at + 1.65, 0.5, 0.6, 0.75))
         at += 2.6
     patches.append((tex.skirting, 0.0, height - 0.08, width, 0.08))
     return tex.paint_onto(tex.plaster(PAINTS[int(rng.integers(0, len(PAINTS)))]), patches)
@@ -134,7 +135,7 @@ def _with_doors(rng: np.random.Generator, width: float, height: float) -> tex.Ma
         patches.append((tex.front(tone, 1, 2), at, height - 2.08, 0.95, 2.08))
         kind = fur.PICTURES[int(rng.integers(0, 4))]
         if at + 2.3 < width:
-            patches.append((tex.picture(kind), at + 1.25, height - 2.1, float(rng.uniform(0.6, 1.0)), 0.8))
+            patches.append((drawn.picture(kind), at + 1.25, height - 2.1, float(rng.uniform(0.6, 1.0)), 0.8))
         at += float(rng.uniform(2.5, 2.9))
     return tex.paint_onto(tex.plaster(PAINTS[int(rng.integers(0, len(PAINTS)))]), patches)
 
@@ -205,7 +206,7 @@ def _meeting(scene: Scene, rng: np.random.Generator, room: Rect) -> None:
     fur.meeting_table(Place(scene, "meeting/table", (x0 + x1) / 2, (y0 + y1) / 2 + 0.25), rng)
     screen = Place(scene, "meeting/screen", x0, (y0 + y1) / 2 + 0.25, WEST)
     screen.box(
-        "display", (-0.8, -0.06, 0.95), (1.6, 0.06, 0.95), tex.plaster((38, 38, 42), 0.1), front=tex.screen
+        "display", (-0.8, -0.06, 0.95), (1.6, 0.06, 0.95), tex.plaster((38, 38, 42), 0.1), front=drawn.screen
     )
     fur.cabinet(Place(scene, "meeting/cabinet", x1, (y0 + y1) / 2 + 0.4, EAST), rng, 1.5)
     fur.plant(Place(scene, "meeting/plant", x0 + 0.4, y1 - 0.4), rng, 1.1)
@@ -218,7 +219,7 @@ def _lounge(scene: Scene, rng: np.random.Generator, room: Rect) -> None:
     table = Place(scene, "lounge/table", (x0 + x1) / 2 + 0.3, y1 - 1.6, 0.15)
     table.box("top", (-0.5, -0.3, 0.38), (1.0, 0.6, 0.05), tex.wood((136, 90, 56)))
     table.legs("leg", (-0.47, -0.27, 0), (0.94, 0.54, 0.38), 0.06, tex.wood((100, 66, 44)))
-    table.box("paper", (-0.2, -0.1, 0.43), (0.3, 0.22, 0.02), tex.picture("landscape"), yaw_rad=0.4)
+    table.box("paper", (-0.2, -0.1, 0.43), (0.3, 0.22, 0.02), drawn.picture("landscape"), yaw_rad=0.4)
     rug_at = Place(scene, "lounge/rug", (x0 + x1) / 2 + 0.3, y1 - 1.6)
     rug_at.box("rug", (-1.1, -0.75, 0.0), (2.2, 1.5, 0.012), tex.plaster((120, 90, 70)), top=tex.rug)
     fur.copier(Place(scene, "lounge/copier", x0, y1 - 1.2, WEST), rng)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from converters.simulate import drawn
 from converters.simulate import textures as tex
 from converters.simulate.scene import Scene
 
@@ -88,12 +89,12 @@ def desk(at: Place, rng: np.random.Generator) -> None:
     )
     left = float(rng.uniform(-0.55, -0.25))
     black = tex.plaster((38, 38, 42), 0.1)
-    at.box("monitor", (left, -0.28, 0.86), (0.62, 0.05, 0.4), black, front=tex.screen)
+    at.box("monitor", (left, -0.28, 0.86), (0.62, 0.05, 0.4), black, front=drawn.screen)
     at.box("monitor/foot", (left + 0.2, -0.3, 0.75), (0.22, 0.16, 0.11), black)
     cover = tex.marbled((92, 70, 60), (124, 92, 74))
-    at.box("books", (0.35, -0.24, 0.75), (0.34, 0.2, 0.26), cover, front=tex.spines)
+    at.box("books", (0.35, -0.24, 0.75), (0.34, 0.2, 0.26), cover, front=drawn.spines)
     at.box(
-        "paper", (0.05, -0.6, 0.75), (0.3, 0.22, 0.012), tex.picture("page"), yaw_rad=rng.uniform(-0.4, 0.4)
+        "paper", (0.05, -0.6, 0.75), (0.3, 0.22, 0.012), drawn.picture("page"), yaw_rad=rng.uniform(-0.4, 0.4)
     )
     mug = tex.marbled((176, 66, 48), (226, 212, 186), 0.05)
     at.cylinder("mug", (-0.6, -0.5, 0.75), 0.045, 0.1, mug)
@@ -129,9 +130,9 @@ def shelf(at: Place, rng: np.random.Generator, width: float, height: float = 2.0
             tall = (step - board) * float(rng.uniform(0.55, 0.92))
             low = (x, -depth + float(rng.uniform(0.01, 0.06)), k * step + board)
             if rng.random() < 0.78:
-                at.box(f"books{k}.{x:.2f}", low, (length, 0.2, tall), cover, front=tex.spines, top=paper)
+                at.box(f"books{k}.{x:.2f}", low, (length, 0.2, tall), cover, front=drawn.spines, top=paper)
             else:
-                at.box(f"box{k}.{x:.2f}", low, (length, 0.2, 0.6 * tall), tex.carton)
+                at.box(f"box{k}.{x:.2f}", low, (length, 0.2, 0.6 * tall), drawn.carton)
             x += length + float(rng.uniform(0.0, 0.1))
 
 
@@ -147,7 +148,7 @@ def cabinet(at: Place, rng: np.random.Generator, width: float = 1.2, height: flo
         front=tex.front(tone, columns, 3),
     )
     cover = tex.marbled((92, 70, 60), (124, 92, 74))
-    at.box("books", (-width / 2 + 0.08, -0.3, height), (0.36, 0.18, 0.25), cover, front=tex.spines)
+    at.box("books", (-width / 2 + 0.08, -0.3, height), (0.36, 0.18, 0.25), cover, front=drawn.spines)
     glaze = tex.marbled(tex.vivid(rng), (226, 206, 176), 0.08)
     at.cylinder("jar", (0.1 * width, -0.22, height), 0.09, float(rng.uniform(0.16, 0.3)), glaze)
     at.sphere(
@@ -166,8 +167,8 @@ def plant(at: Place, rng: np.random.Generator, high: float = 1.0) -> None:
 
 def cartons(at: Place, rng: np.random.Generator) -> None:
     """Two boxes, one on the other, at the wall."""
-    at.box("low", (-0.28, -0.58, 0), (0.55, 0.55, 0.42), tex.carton)
-    at.box("high", (-0.2, -0.5, 0.42), (0.38, 0.4, 0.3), tex.carton, yaw_rad=float(rng.uniform(-0.5, 0.5)))
+    at.box("low", (-0.28, -0.58, 0), (0.55, 0.55, 0.42), drawn.carton)
+    at.box("high", (-0.2, -0.5, 0.42), (0.38, 0.4, 0.3), drawn.carton, yaw_rad=float(rng.uniform(-0.5, 0.5)))
 
 
 def sofa(at: Place, rng: np.random.Generator, width: float = 1.7) -> None:
@@ -190,7 +191,9 @@ def meeting_table(at: Place, rng: np.random.Generator, length: float = 2.4) -> N
     for k in range(4):
         low = (-length / 2 + 0.2 + k * (length - 0.4) / 4, float(rng.uniform(-0.35, 0.1)), 0.75)
         kind = PICTURES[int(rng.integers(0, 4))]
-        at.box(f"paper{k}", low, (0.3, 0.22, 0.015), tex.picture(kind), yaw_rad=float(rng.uniform(-0.6, 0.6)))
+        at.box(
+            f"paper{k}", low, (0.3, 0.22, 0.015), drawn.picture(kind), yaw_rad=float(rng.uniform(-0.6, 0.6))
+        )
     for side, turn in ((-1, 0.0), (1, np.pi)):
         for k in range(3):
             x, y, _ = at.world((-length / 3 + k * length / 3, side * 0.78, 0))
@@ -212,8 +215,8 @@ def copier(at: Place, rng: np.random.Generator) -> None:
         front=tex.front((186, 188, 190), 1, 4, (70, 72, 76)),
     )
     at.box("lid", (-0.35, -0.62, 0.87), (0.7, 0.6, 0.12), tex.plaster((84, 88, 96), 0.1))
-    at.box("panel", (-0.3, -0.72, 0.9), (0.4, 0.1, 0.05), tex.screen)
-    at.box("paper", (-0.2, -0.5, 0.99), (0.3, 0.22, 0.05), tex.picture("page"), yaw_rad=0.2)
+    at.box("panel", (-0.3, -0.72, 0.9), (0.4, 0.1, 0.05), drawn.screen)
+    at.box("paper", (-0.2, -0.5, 0.99), (0.3, 0.22, 0.05), drawn.picture("page"), yaw_rad=0.2)
 
 
 def lockers(at: Place, rng: np.random.Generator, count: int = 4) -> None:
@@ -221,7 +224,7 @@ def lockers(at: Place, rng: np.random.Generator, count: int = 4) -> None:
     width = 0.4 * count
     tone = tex.shaded(rng, (96, 122, 140), 0.15)
     at.box("body", (-width / 2, -0.45, 0), (width, 0.45, 1.85), STEEL, front=tex.front(tone, count, 2))
-    at.box("top", (-width / 2 + 0.1, -0.4, 1.85), (0.5, 0.35, 0.26), tex.carton, yaw_rad=0.1)
+    at.box("top", (-width / 2 + 0.1, -0.4, 1.85), (0.5, 0.35, 0.26), drawn.carton, yaw_rad=0.1)
 
 
 def bench(at: Place, rng: np.random.Generator, length: float = 1.6) -> None:
@@ -238,7 +241,7 @@ def cooler(at: Place, rng: np.random.Generator) -> None:
     """A water cooler at the wall."""
     at.box("body", (-0.17, -0.36, 0), (0.34, 0.34, 1.0), tex.plaster((216, 216, 210), 0.05))
     at.cylinder("water", (0, -0.19, 1.0), 0.14, 0.38, tex.marbled((96, 150, 190), (150, 196, 220), 0.15))
-    at.box("tap", (-0.12, -0.39, 0.62), (0.24, 0.03, 0.16), tex.screen)
+    at.box("tap", (-0.12, -0.39, 0.62), (0.24, 0.03, 0.16), drawn.screen)
 
 
 def decorated(
@@ -256,6 +259,6 @@ def decorated(
         w = min(w, width - 0.15 - x)
         if x + w < free[0] or x > free[1]:
             top = height - float(rng.uniform(1.9, 2.1))
-            patches.append((tex.picture(PICTURES[int(rng.integers(0, 4))]), x, max(0.05, top), w, h))
+            patches.append((drawn.picture(PICTURES[int(rng.integers(0, 4))]), x, max(0.05, top), w, h))
         x += w + float(rng.uniform(0.35, 1.1))
     return tex.paint_onto(base, patches)

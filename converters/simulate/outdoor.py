@@ -5,6 +5,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from converters.simulate import drawn
 from converters.simulate import furniture as fur
 from converters.simulate import textures as tex
 from converters.simulate.furniture import Place
@@ -88,7 +89,7 @@ def _house(scene: Scene, rng: np.random.Generator) -> None:
     scene.box("house/awning", (x0 - 1.1, y0 + 1.2, 2.35), (1.1, 3.0, 0.12), awning)
     for k, y in enumerate((y0 + 1.5, y0 + 3.4)):
         Place(scene, f"house/crate{k}", x0 - 0.4, y).box(
-            "crate", (-0.3, -0.3, 0), (0.6, 0.6, 0.5), tex.carton
+            "crate", (-0.3, -0.3, 0), (0.6, 0.6, 0.5), drawn.carton
         )
 
 
@@ -108,7 +109,7 @@ def _square(scene: Scene, rng: np.random.Generator) -> None:
         fur.bench(Place(scene, f"bench{k}", x, y, yaw), rng, 1.8)
     posters = tex.paint_onto(
         tex.plaster((196, 186, 160), 0.08),
-        [(tex.picture(kind), 0.15 + 0.85 * k, 0.4, 0.7, 1.1) for k, kind in enumerate(fur.PICTURES)],
+        [(drawn.picture(kind), 0.15 + 0.85 * k, 0.4, 0.7, 1.1) for k, kind in enumerate(fur.PICTURES)],
     )
     scene.cylinder("posters", (4.4, 12.6, 0), 0.6, 2.6, posters)
     for k, (x, y) in enumerate(((18.6, 10.0), (18.6, 16.0), (18.6, 22.0))):
@@ -116,7 +117,7 @@ def _square(scene: Scene, rng: np.random.Generator) -> None:
         box.box("trough", (-0.3, -1.1, 0), (0.6, 2.2, 0.5), tex.wood((150, 112, 76)), top=tex.foliage)
         box.sphere("bush", (0.0, float(rng.uniform(-0.6, 0.6)), 0.7), 0.36, tex.foliage)
     kiosk = Place(scene, "kiosk", 13.0, 27.5, 0.3)
-    kiosk.box("body", (-1.2, -0.9, 0), (2.4, 1.8, 2.4), tex.plaster((66, 104, 92), 0.1), front=tex.spines)
+    kiosk.box("body", (-1.2, -0.9, 0), (2.4, 1.8, 2.4), tex.plaster((66, 104, 92), 0.1), front=drawn.spines)
     kiosk.box("roof", (-1.5, -1.2, 2.4), (3.0, 2.4, 0.15), tex.plaster((96, 60, 50), 0.1))
 
 
@@ -159,7 +160,7 @@ def _car(at: Place, rng: np.random.Generator) -> None:
     coat = tex.plaster(paint, 0.06)
     at.box("body", (-2.05, -0.85, 0.28), (4.1, 1.7, 0.62), coat, front=body, back=body)
     at.box("cabin", (-1.2, -0.76, 0.9), (2.2, 1.52, 0.52), glass, top=coat)
-    plate = tex.picture("page")
+    plate = drawn.picture("page")
     for end, x in (("rear", -2.07), ("nose", 2.05)):
         at.box(end, (x, -0.3, 0.45), (0.02, 0.6, 0.18), plate)
     for k, (x, y) in enumerate(((-1.3, -0.86), (1.3, -0.86), (-1.3, 0.66), (1.3, 0.66))):
@@ -239,7 +240,7 @@ def facade(color: tex.Color) -> tex.Material:
                 patches.append((sill, max(0.0, x - 0.08), top + high, wide + 0.16, 0.1))
                 if floor == 0 and rng.random() < 0.4:
                     kind = fur.PICTURES[int(rng.integers(0, 4))]
-                    patches.append((tex.picture(kind), x + 0.1, top + high + 0.2, wide - 0.2, 0.5))
+                    patches.append((drawn.picture(kind), x + 0.1, top + high + 0.2, wide - 0.2, 0.5))
         return tex.paint_onto(wall, patches)(rng, width_m, height_m, texel_m)
 
     return paint

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from converters.simulate import drawn
 from converters.simulate import textures as tex
 from converters.simulate.scene import Flat, Lamp, Scene
 from pipeline import streams
@@ -30,28 +31,28 @@ def _shell(scene: Scene) -> None:
     north = tex.paint_onto(
         tex.plaster((198, 190, 168)),
         [
-            (tex.picture("map"), 2.75, 0.4, 0.8, 0.6),
-            (tex.picture("abstract"), 3.85, 0.32, 0.55, 0.75),
-            (tex.picture("landscape"), 5.1, 0.5, 0.85, 0.55),
+            (drawn.picture("map"), 2.75, 0.4, 0.8, 0.6),
+            (drawn.picture("abstract"), 3.85, 0.32, 0.55, 0.75),
+            (drawn.picture("landscape"), 5.1, 0.5, 0.85, 0.55),
             (tex.skirting, 0.0, h - 0.08, w, 0.08),
         ],
     )
     east = tex.paint_onto(
         tex.bricks(),
         [
-            (tex.window, 2.55, 0.45, 1.5, 1.25),
-            (tex.picture("abstract"), 0.5, 0.55, 0.7, 0.9),
-            (tex.picture("page"), 4.45, 0.6, 0.7, 0.55),
+            (drawn.window, 2.55, 0.45, 1.5, 1.25),
+            (drawn.picture("abstract"), 0.5, 0.55, 0.7, 0.9),
+            (drawn.picture("page"), 4.45, 0.6, 0.7, 0.55),
             (tex.skirting, 0.0, h - 0.08, d, 0.08),
         ],
     )
     south = tex.paint_onto(
         tex.wallpaper(),
         [
-            (tex.picture("page"), 1.0, 0.6, 0.6, 0.75),
-            (tex.picture("map"), 2.3, 0.4, 1.35, 0.85),
-            (tex.picture("abstract"), 4.05, 0.6, 0.5, 0.7),
-            (tex.picture("landscape"), 5.2, 0.55, 0.6, 0.8),
+            (drawn.picture("page"), 1.0, 0.6, 0.6, 0.75),
+            (drawn.picture("map"), 2.3, 0.4, 1.35, 0.85),
+            (drawn.picture("abstract"), 4.05, 0.6, 0.5, 0.7),
+            (drawn.picture("landscape"), 5.2, 0.55, 0.6, 0.8),
             (tex.skirting, 0.0, h - 0.08, w, 0.08),
         ],
     )
@@ -59,9 +60,9 @@ def _shell(scene: Scene) -> None:
         tex.plaster((146, 162, 178), 0.06),
         [
             (tex.front((146, 108, 74), 1, 2), 1.0, 0.6, 0.9, 2.1),
-            (tex.picture("landscape"), 2.2, 0.55, 0.55, 0.75),
-            (tex.picture("abstract"), 3.05, 0.35, 1.0, 0.65),
-            (tex.picture("page"), 4.45, 0.55, 0.6, 0.75),
+            (drawn.picture("landscape"), 2.2, 0.55, 0.55, 0.75),
+            (drawn.picture("abstract"), 3.05, 0.35, 1.0, 0.65),
+            (drawn.picture("page"), 4.45, 0.55, 0.6, 0.75),
             (tex.skirting, 0.0, h - 0.08, 1.0, 0.08),
             (tex.skirting, 1.9, h - 0.08, d - 1.9, 0.08),
         ],
@@ -130,10 +131,12 @@ def _books(
             size = (length, 0.2, tall)
             corner = (low[0] + at, low[1] + set_back, low[2])
             cover = tex.marbled((92, 70, 60), (124, 92, 74))
-            scene.box(f"{name}.{k}", corner, size, cover, shades=False, front=tex.spines, top=paper)
+            scene.box(f"{name}.{k}", corner, size, cover, shades=False, front=drawn.spines, top=paper)
         elif rng.random() < 0.5:
             size = (length, 0.2, 0.55 * tall)
-            scene.box(f"{name}.{k}", (low[0] + at, low[1] + set_back, low[2]), size, tex.carton, shades=False)
+            scene.box(
+                f"{name}.{k}", (low[0] + at, low[1] + set_back, low[2]), size, drawn.carton, shades=False
+            )
         at += length + rng.uniform(0.0, 0.09)
         k += 1
 
@@ -149,7 +152,7 @@ def _sideboard(scene: Scene, rng: np.random.Generator) -> None:
     )
     scene.legs("sideboard", (3.1, 5.2, 0.0), (2.0, 0.35, 0.08), 0.06, tex.wood((80, 58, 42)))
     scene.box(
-        "display", (3.5, 5.3, 0.68), (1.1, 0.06, 0.64), tex.plaster((38, 38, 42), 0.1), front=tex.screen
+        "display", (3.5, 5.3, 0.68), (1.1, 0.06, 0.64), tex.plaster((38, 38, 42), 0.1), front=drawn.screen
     )
     scene.box(
         "display/foot", (3.85, 5.25, 0.6), (0.4, 0.2, 0.08), tex.plaster((44, 44, 48), 0.1), shades=False
@@ -159,7 +162,7 @@ def _sideboard(scene: Scene, rng: np.random.Generator) -> None:
         (3.12, 5.27, 0.6),
         (0.26, 0.17, 0.24),
         tex.marbled((92, 70, 60), (124, 92, 74)),
-        front=tex.spines,
+        front=drawn.spines,
     )
     scene.cylinder("vase", (4.88, 5.38, 0.6), 0.085, 0.3, tex.marbled((60, 92, 120), (210, 204, 190), 0.1))
     scene.sphere("vase/leaves", (4.88, 5.38, 1.04), 0.17, tex.foliage)
@@ -179,7 +182,7 @@ def _desk(scene: Scene) -> None:
         left=tex.front((170, 126, 82), 1, 3),
     )
     scene.box(
-        "monitor", (6.1, 1.85, 0.86), (0.05, 0.78, 0.46), tex.plaster((38, 38, 42), 0.1), left=tex.screen
+        "monitor", (6.1, 1.85, 0.86), (0.05, 0.78, 0.46), tex.plaster((38, 38, 42), 0.1), left=drawn.screen
     )
     scene.box(
         "monitor/foot", (6.08, 2.12, 0.75), (0.14, 0.24, 0.11), tex.plaster((52, 52, 58), 0.1), shades=False
@@ -189,9 +192,9 @@ def _desk(scene: Scene) -> None:
         (6.02, 1.3, 0.75),
         (0.2, 0.34, 0.26),
         tex.marbled((92, 70, 60), (124, 92, 74)),
-        left=tex.spines,
+        left=drawn.spines,
     )
-    scene.box("desk/paper", (5.76, 2.25, 0.75), (0.3, 0.22, 0.012), tex.picture("page"), shades=False)
+    scene.box("desk/paper", (5.76, 2.25, 0.75), (0.3, 0.22, 0.012), drawn.picture("page"), shades=False)
     scene.cylinder(
         "desk/mug", (5.85, 1.75, 0.75), 0.045, 0.1, tex.marbled((176, 66, 48), (226, 212, 186), 0.05)
     )
@@ -205,8 +208,8 @@ def _desk(scene: Scene) -> None:
     for k, y in enumerate((1.95, 2.31)):
         scene.box(f"chair/post{k}", (5.135, y, 0.48), (0.04, 0.04, 0.08), dark, shades=False, **turn)
     scene.cylinder("bin", (6.1, 3.25, 0.0), 0.16, 0.36, tex.marbled((66, 84, 92), (140, 150, 150), 0.1))
-    scene.box("cartons/low", (5.7, 4.55, 0.0), (0.55, 0.6, 0.42), tex.carton)
-    scene.box("cartons/high", (5.82, 4.65, 0.42), (0.38, 0.42, 0.3), tex.carton, yaw_rad=-0.3)
+    scene.box("cartons/low", (5.7, 4.55, 0.0), (0.55, 0.6, 0.42), drawn.carton)
+    scene.box("cartons/high", (5.82, 4.65, 0.42), (0.38, 0.42, 0.3), drawn.carton, yaw_rad=-0.3)
 
 
 def _sofa(scene: Scene) -> None:
@@ -248,7 +251,7 @@ def _low_table(scene: Scene) -> None:
         (0.3, 0.22, 0.04),
         pages,
         yaw_rad=0.4,
-        top=tex.picture("landscape"),
+        top=drawn.picture("landscape"),
         shades=False,
     )
     scene.box(
@@ -257,7 +260,7 @@ def _low_table(scene: Scene) -> None:
         (0.24, 0.18, 0.02),
         pages,
         yaw_rad=-0.5,
-        top=tex.picture("abstract"),
+        top=drawn.picture("abstract"),
         shades=False,
     )
     scene.cylinder(
@@ -279,7 +282,7 @@ def _west_side(scene: Scene) -> None:
         (0.1, 3.2, 0.88),
         (0.18, 0.4, 0.25),
         tex.marbled((92, 70, 60), (124, 92, 74)),
-        right=tex.spines,
+        right=drawn.spines,
     )
     scene.cylinder(
         "dresser/jar", (0.24, 3.85, 0.88), 0.09, 0.24, tex.marbled((150, 60, 56), (226, 206, 176), 0.08)
@@ -289,5 +292,10 @@ def _west_side(scene: Scene) -> None:
     scene.cylinder("plant/stem", (0.45, 2.4, 0.4), 0.03, 0.3, tex.wood((96, 74, 50)))
     scene.sphere("plant/leaves", (0.45, 2.4, 0.98), 0.32, tex.foliage)
     scene.box(
-        "crate", (0.12, 0.3, 0.0), (0.6, 0.45, 0.38), tex.wood((160, 124, 84)), yaw_rad=0.25, back=tex.carton
+        "crate",
+        (0.12, 0.3, 0.0),
+        (0.6, 0.45, 0.38),
+        tex.wood((160, 124, 84)),
+        yaw_rad=0.25,
+        back=drawn.carton,
     )

@@ -237,7 +237,7 @@ def _evidence(team: Team, model: LinkModel, case: dict[str, Any], plan: Plan) ->
     children = {owner: _tree(owner, team.linked) for owner in team.names}
     payloads = {
         n: evidence_wire.write_evidence(
-            kind, index[n], 1, evidence_wire.to_body(kind, _records(team, n, kind))
+            kind, index[n], "blended", evidence_wire.to_body(kind, _records(team, n, kind))
         )
         for n in team.names
     }

@@ -21,7 +21,7 @@ from pipeline.registration.residuals import MAD_TO_SIGMA, RegistrationConfig
 Array = NDArray[np.float64]
 
 ROUNDS = 30
-SETTLED, SETTLED_OF_PRIOR = 2e-4, 0.01  # steps of poses (m, rad), of the cameras' numbers as a share of their priors
+SETTLED, SETTLED_OF_PRIOR = 2e-4, 0.01  # steps: of poses (m, rad), of the cameras' numbers in their priors
 CAUCHY, HUBER = 2.5, 1.5  # scales
 SAME_ERROR = 50.0  # neighbours err alike, and no model is exact: so many residuals count as one
 PRIOR = dict(zip(NAMES, (15, 15, 15, 15, 0.3, 0.5, 0.5, 0.01, 0.01, 0.01, 0.02, *[0.02] * 6), strict=True))

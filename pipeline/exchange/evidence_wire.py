@@ -22,6 +22,7 @@ from pipeline.exchange.packets import (
     records_per_chunk,
 )
 from pipeline.exchange.wire import MAX_COORDINATE, Reader
+from pipeline.splat.gaussians import DEPTH_KINDS, DepthKind
 
 Array = NDArray[np.float64]
 
@@ -31,7 +32,9 @@ MAX_LOG_COVARIANCE = 60.0  # beyond it exponentials overflow in float32
 
 RECORD = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f4", 13), ("information", "<f4", 31)])
 RECORD_DOUBLE = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f8", 13), ("information", "<f8", 31)])
-_EVIDENCE = struct.Struct("<HHI")  # owner, version, records of the whole message
+_EVIDENCE = struct.Struct(
+    "<HHI"
+)  # owner, 1 + index of the depth its map was made with, records of the whole message
 assert RECORD.itemsize == EVIDENCE_EXACT_BYTES
 assert RECORD_DOUBLE.itemsize == EVIDENCE_DOUBLE_BYTES
 assert COMPACT.itemsize == EVIDENCE_BYTES
@@ -53,10 +56,13 @@ def from_body(kind: Kind, body: NDArray[Any]) -> NDArray[Any]:
     return decode(body, RECORD) if kind is Kind.EVIDENCE else body
 
 
-def write_evidence(kind: Kind, owner: int, version: int, body: NDArray[Any]) -> bytes:
-    """Bytes of evidence of any kind: chunks of whole records, each with its own head, as they are cut."""
+def write_evidence(kind: Kind, owner: int, depth: DepthKind, body: NDArray[Any]) -> bytes:
+    """Bytes of evidence of any kind: chunks of whole records, each with its own head, as they are cut.
+
+    depth: of a Gaussian at a pixel, as the owner's map was made.
+    """
     n, per, size = len(body), records_per_chunk(kind), body.itemsize
-    head = _EVIDENCE.pack(owner, version, n)
+    head = _EVIDENCE.pack(owner, 1 + DEPTH_KINDS.index(depth), n)
     chunks = max(1, -(-n // per))
     rows = np.zeros((chunks, chunk_bytes(kind)), np.uint8)
     rows[:, :EVIDENCE_HEAD_BYTES] = np.frombuffer(head, np.uint8)
@@ -66,12 +72,14 @@ def write_evidence(kind: Kind, owner: int, version: int, body: NDArray[Any]) -> 
     return rows.tobytes()[: chunks * EVIDENCE_HEAD_BYTES + n * size]
 
 
-def read_evidence_head(kind: Kind, chunk: bytes, team: int) -> tuple[int, int]:
-    """Owner of a chunk of evidence and the number of records of the whole message."""
-    owner, _, n = Reader(chunk[:EVIDENCE_HEAD_BYTES], "evidence").fields(_EVIDENCE)
+def read_evidence_head(kind: Kind, chunk: bytes, team: int) -> tuple[int, DepthKind, int]:
+    """Owner of a chunk of evidence, the depth its map was made with, and the number of records of the whole message."""
+    owner, depth, n = Reader(chunk[:EVIDENCE_HEAD_BYTES], "evidence").fields(_EVIDENCE)
     if owner >= team or (len(chunk) - EVIDENCE_HEAD_BYTES) % EVIDENCE_KINDS[kind]:
         raise MalformedError("evidence: names a robot outside the team, or holds a part of a record")
-    return owner, n
+    if not 1 <= depth <= len(DEPTH_KINDS):
+        raise MalformedError("evidence: of a map with an unknown kind of depth")
+    return owner, DEPTH_KINDS[depth - 1], n
 
 
 def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any], NDArray[Any]]:
@@ -79,7 +87,7 @@ def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any]
 
     A complete message has the announced number of records; parts of one have fewer.
     """
-    owner, announced = read_evidence_head(kind, data[:EVIDENCE_HEAD_BYTES], team)
+    owner, _, announced = read_evidence_head(kind, data[:EVIDENCE_HEAD_BYTES], team)
     step = chunk_bytes(kind)
     chunks = -(-len(data) // step)
     padded = np.zeros(chunks * step, np.uint8)

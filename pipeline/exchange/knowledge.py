@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.exchange import evidence_wire, wire
-from pipeline.exchange.packets import Kind, MalformedError
+from pipeline.exchange.packets import EVIDENCE_HEAD_BYTES, Kind, MalformedError
 from pipeline.exchange.wire import Anchors, PairList
+from pipeline.splat.gaussians import DepthKind
 
 Records = NDArray[Any]
 
@@ -45,7 +46,7 @@ class Knowledge:
     def take_evidence(self, provider: int, message: int, payload: bytes, complete: bool) -> int | None:
         """Take a chunk, or the complete message. Returns the owner if its evidence is here completely."""
         if not complete:
-            owner, _ = evidence_wire.read_evidence_head(self.kind, payload, self.team)
+            owner, _, _ = evidence_wire.read_evidence_head(self.kind, payload, self.team)
             if owner not in self.evidence:
                 entry = self.incoming.setdefault((provider, message), Incoming(owner, provider))
                 if entry.owner != owner:
@@ -120,6 +121,15 @@ class Knowledge:
             records = np.concatenate(parts) if parts else np.zeros(0, evidence_wire.record_dtype(self.kind))
         _, first = np.unique(records["id"], return_index=True)
         return records[first]
+
+    def depth(self, owner: int) -> DepthKind | None:
+        """Of a Gaussian at a pixel, as the owner's map was made; None if nothing of its evidence is here."""
+        chunks = [self.evidence_bytes[owner]] if owner in self.evidence_bytes else []
+        for key in sorted(k for k, entry in self.incoming.items() if entry.owner == owner):
+            chunks += self.incoming[key].chunks
+        if not chunks:
+            return None
+        return evidence_wire.read_evidence_head(self.kind, chunks[0][:EVIDENCE_HEAD_BYTES], self.team)[1]
 
     def sound_records(self, owner: int) -> Records:
         """`records` whose anchor is among the owner's agreed poses; none without agreed poses."""

@@ -40,6 +40,7 @@ def result_of(agent: Agent) -> AgentResult:
     }
     own = agent.sharing.own_records()
     evidence = {team[i]: knowledge.sound_records(i) for i in others if i in knowledge.anchors}
+    depths = {team[i]: knowledge.depth(i) for i in others}
     return AgentResult(
         robot=robot,
         component=tuple(sorted(names)),
@@ -47,6 +48,7 @@ def result_of(agent: Agent) -> AgentResult:
         T_world_keyframe_of=T_world,
         own_evidence=to_evidence(robot, own[np.argsort(own["id"])]),
         evidence={name: to_evidence(name, records) for name, records in evidence.items()},
+        depth_of={name: depths[name] or agent.data.depth for name in evidence},
         pairs=pairs,
         closures=tuple(_closures(agent)),
         agreed=agent.agreed or not others,

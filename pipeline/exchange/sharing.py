@@ -64,7 +64,9 @@ class Sharing:
     def _own_evidence(self) -> bytes:
         k = self.knowledge
         if self.own not in k.evidence_bytes:
-            k.evidence_bytes[self.own] = evidence_wire.write_evidence(self.kind, self.own, 1, self.own_body())
+            k.evidence_bytes[self.own] = evidence_wire.write_evidence(
+                self.kind, self.own, self.data.depth, self.own_body()
+            )
         return k.evidence_bytes[self.own]
 
     # --- telling others
@@ -116,15 +118,16 @@ class Sharing:
         if n.voxels is None or T_world_map is None:
             return None
         if owner == self.own:
-            records, body = self.own_records(), self.own_body()
+            records, body, depth = self.own_records(), self.own_body(), self.data.depth
             T_common = T_world_map @ self.data.T_map_keyframe
-        elif owner in k.anchors:
-            records, body, T_common = k.evidence[owner], k.bodies[owner], k.anchors[owner].T_common_keyframe
+        elif owner in k.anchors and (told := k.depth(owner)) is not None:
+            records, body, depth = k.evidence[owner], k.bodies[owner], told
+            T_common = k.anchors[owner].T_common_keyframe
         else:
             return None
         known = records["anchor"] < len(T_common)
         keep = within(records[known], T_common, n.voxels, self.config.overlap_voxel_m)
-        return evidence_wire.write_evidence(self.kind, owner, 1, body[known][keep])
+        return evidence_wire.write_evidence(self.kind, owner, depth, body[known][keep])
 
     # --- matching
 

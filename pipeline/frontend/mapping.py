@@ -21,7 +21,7 @@ from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels import CompiledAdam, FisherSums, Gradients, LossWeights, Rasterizer, Render, ViewLoss
 from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.optimiser import LearningRates
+from pipeline.splat.optimiser import LearningRates, falling
 from pipeline.splat.seeding import seed_discs, unexplained, worst_drawn
 
 
@@ -175,7 +175,7 @@ class Mapper:
                 inserted, pruned = inserted + came, pruned + went
             elif step == steps // 2:
                 pruned += self._keep(self._contributions(self._views)[0] >= config.min_contribution)
-            rates = config.rates.times(config.final_rate_decay ** (step / max(steps - 1, 1)))
+            rates = config.rates.times(falling(step, steps, config.final_rate_decay))
             self._optimise(views[order[position]], 0, rates)
         pruned += self._prune_degenerate()
         if config.exposure and self._views:

@@ -40,8 +40,8 @@ class MappingConfig(Config):
     """Times, in the first half of the final refinement, that Gaussians that contribute nothing are pruned and the
     room below the cap is seeded where the keyframes are drawn worst; 0: never. The last round fills the cap."""
     rates: LearningRates = LearningRates()
-    final_rate_decay: float = 0.05
-    """The final refinement's learning rates fall exponentially to this share."""
+    final_rate_decay: float = 0.03
+    """The final refinement's learning rates fall to this share: slowly, fast, slowly."""
     stable_steps: int = 0
     """Steps after which a Gaussian is stable: frozen until the final refinement; 0: never."""
     depth: DepthKind | Literal["auto"] = "auto"

@@ -22,10 +22,10 @@ class RefineConfig(Config):
     """Most views of neighbours' maps."""
     support_views: int = Field(default=40, ge=0)
     """Most tracked frames between keyframes that take part."""
-    rate: float = Field(default=0.1, gt=0.0)
+    rate: float = Field(default=0.15, gt=0.0)
     """First learning rates as a share of the mapper's."""
     rate_decay: float = Field(default=0.1, gt=0.0, le=1.0)
-    """They fall exponentially to this share."""
+    """They fall to this share: slowly, fast, slowly."""
     rates: LearningRates = LearningRates()
     loss: MapLossConfig = MapLossConfig()
 

@@ -110,7 +110,7 @@ def believed(
     camera: PinholeCamera,
     config: FusionConfig,
     matching: MatchingConfig,
-    depth: DepthKind,
+    depth_of: Mapping[str, DepthKind],
     weights: WeightKind = "block",
     threads: int = 1,
 ) -> Believed:
@@ -120,7 +120,8 @@ def believed(
         own: the robot's own evidence. evidence: of the neighbours, by name. Both in anchor frames.
         T_world_keyframe: by name, [k, 4, 4] by anchor. pairs: as they came, (robot a, robot b) -> ids [m, 2].
         views: own keyframes at their corrected poses. camera: of the views.
-        matching: as the pairs were found. depth: as the maps were made. threads: changes no bit.
+        matching: as the pairs were found. depth_of: as the neighbours' maps were made, by name. threads: changes no
+            bit.
     """
     own_colors = _Spread()
     for view in views:
@@ -133,7 +134,7 @@ def believed(
         there = in_world(told, T_world_keyframe[name], weights)
         possible = _sizes_m(there) <= largest
         told, there = told.select(possible), there.select(possible)
-        judge = _Judge(views, camera, config, depth, threads)
+        judge = _Judge(views, camera, config, depth_of[name], threads)
         pair = _near(world[own.owner], there, _between(pairs, own.owner, name), matching)
         against = judge.contradicted(
             _in_colors_of(world[own.owner], there, pair, matching), own_colors.variance

@@ -33,7 +33,7 @@ def peer_views(
     T_world_keyframe: Mapping[str, Array],
     camera: PinholeCamera,
     most: int,
-    depth: DepthKind,
+    depth_of: Mapping[str, DepthKind],
     weights: WeightKind = "block",
     threads: int = 1,
     *,
@@ -45,7 +45,7 @@ def peer_views(
         evidence: of the neighbours, by name, in anchor frames. T_world_keyframe: by name, [k, 4, 4] by anchor.
         camera: the robot's own; what the neighbour's map does not cover counts as not seen.
         most: so many views in all, evenly spread.
-        depth: as the maps were made. threads: changes no bit.
+        depth_of: as the maps were made, by name. threads: changes no bit.
         colors: from every neighbour's colours to the own.
     """
     rasterizer = Rasterizer(threads=threads)
@@ -58,7 +58,7 @@ def peer_views(
         if name != drawn:
             there = in_world(colors[name].of(evidence[name]), T_world_keyframe[name], weights)
             gaussians, drawn = gaussians_of(there.ids, there.anchors, there.theta), name
-        render = rasterizer.forward(gaussians, camera, se3.inverse(T_world_camera), depth=depth)
+        render = rasterizer.forward(gaussians, camera, se3.inverse(T_world_camera), depth=depth_of[name])
         seen = render.alpha >= COVERED
         share = np.where(seen, render.alpha, np.float32(1))
         color = np.rint(np.clip(render.color / share[..., None], 0, 1) * 255).astype(np.uint8)

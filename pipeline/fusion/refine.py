@@ -25,6 +25,7 @@ from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
 from pipeline.splat.gaussians import DepthKind, Gaussians
 from pipeline.splat.losses import depth_certainty
+from pipeline.splat.optimiser import falling
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ def refine(
             depth=depth,
             depth_certainty=certainty,
         )
-        share = config.rate * config.rate_decay ** (step / max(total - 1, 1))
+        share = config.rate * falling(step, total, config.rate_decay)
         stepped = adam.step(gaussians, gradients, config.rates.times(share))
         stepped = stepped.replace(
             log_scales=np.maximum(stepped.log_scales, floor),

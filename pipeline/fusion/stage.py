@@ -81,7 +81,7 @@ def run_fusion(
         own.camera,
         config,
         matching,
-        own.depth,
+        result.depth_of,
         weights,
         threads,
     )
@@ -121,7 +121,7 @@ def run_fusion(
                 result.T_world_keyframe_of,
                 own.camera,
                 config.refine.peer_views if config.refine.peer_share else 0,
-                own.depth,
+                result.depth_of,
                 weights,
                 threads,
                 colors=fused.colors,

@@ -40,7 +40,7 @@ from pipeline.kernels.types import (
 from pipeline.splat.gaussians import Gaussians
 
 NEAR_M = 0.01
-BLUR_PX2 = 0.3
+BLUR_PX2 = 1 / 12
 FIELD_MARGIN = 1.3
 LARGEST_PX2 = 1e12
 ALPHA_MIN = 1.0 / 255.0

@@ -42,7 +42,7 @@ class LossConfig(Config):
     """Weight of one metre of depth error against one unit of colour."""
     depth_huber_m: float = 0.02
     """Depth residual in metres where the loss turns from quadratic to linear; the slope beyond is 1."""
-    alpha_weight: float = 0.02
+    alpha_weight: float = 0.04
     """Weight of missing opacity (1 - alpha) where a surface was measured."""
     surface_weight: float = 0.0
     """Weight of one metre between a Gaussian's own depth and the measured one, by its share in the pixel."""
@@ -53,6 +53,7 @@ class SurfaceLossConfig(LossConfig):
 
     depth_weight: float = 0.25
     depth_huber_m: float = 0.01
+    alpha_weight: float = 0.02
     surface_weight: float = 0.5
 
 

@@ -47,11 +47,17 @@ class LearningRates(Config):
     log_scales: float = 0.08
     colors: float = 2e-2
     """RGB in 0..1."""
-    opacity_logits: float = 3e-2
+    opacity_logits: float = 6e-2
 
     def times(self, factor: float) -> LearningRates:
         """All rates scaled."""
         return LearningRates(**{name: rate * factor for name, rate in self.model_dump().items()})
+
+
+def falling(step: int, steps: int, last: float) -> float:
+    """Share of the learning rates at a step of `steps`: from 1 to `last`, level at both ends."""
+    done = step / max(steps - 1, 1)
+    return last + (1.0 - last) * (1.0 - done * done * (3.0 - 2.0 * done))
 
 
 class Adam:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import itertools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,10 @@ NAMES = ("alpha", "bravo", "charlie")
 
 @pytest.fixture(scope="module")
 def team(make_robot: Any) -> dict[str, tuple[RobotData, np.ndarray]]:
-    return {name: make_robot(name, 0.6 * i, keyframes=4) for i, name in enumerate(NAMES)}
+    """Three robots; the map of the last was made with another depth."""
+    robots = {name: make_robot(name, 0.6 * i, keyframes=4) for i, name in enumerate(NAMES)}
+    data, T_true = robots["charlie"]
+    return robots | {"charlie": (replace(data, depth="ray_plane"), T_true)}
 
 
 def meet(
@@ -54,6 +58,15 @@ def lossy_chain(
     folder = tmp_path_factory.mktemp("chain")
     config = ExchangeConfig(link=LinkConfig(topology="chain", loss_probability=0.3), solver=request.param)
     return meet(team, 3, folder, link=config.link, solver=config.solver), folder, config
+
+
+def test_robots_know_how_the_maps_of_others_were_made(
+    lossy_chain: tuple[dict[str, AgentResult], Path, ExchangeConfig],
+) -> None:
+    """Of alpha's and charlie's, who are not linked, by what bravo hands on."""
+    kinds = {"alpha": "blended", "bravo": "blended", "charlie": "ray_plane"}
+    for name, result in lossy_chain[0].items():
+        assert result.depth_of == {other: kind for other, kind in kinds.items() if other != name}
 
 
 def error_m(result: AgentResult, team: dict[str, tuple[RobotData, np.ndarray]]) -> float:

@@ -18,6 +18,7 @@ from pipeline.exchange.poses_wire import read_poses, write_poses
 from pipeline.geometry import se3
 from pipeline.registration import Reference, ReferenceLevel
 from pipeline.registration.features import Features
+from pipeline.splat.gaussians import DEPTH_KINDS
 
 RNG = np.random.default_rng(5)
 TEAM = 4
@@ -121,11 +122,13 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
         lambda d: wire.read_pairs(d, TEAM),
     ),
     "evidence": (
-        evidence_wire.write_evidence(Kind.EVIDENCE, 1, 1, evidence_wire.to_body(Kind.EVIDENCE, records(15))),
+        evidence_wire.write_evidence(
+            Kind.EVIDENCE, 1, "blended", evidence_wire.to_body(Kind.EVIDENCE, records(15))
+        ),
         lambda d: evidence_wire.read_evidence(Kind.EVIDENCE, d, TEAM),
     ),
     "exact evidence": (
-        evidence_wire.write_evidence(Kind.EVIDENCE_EXACT, 1, 1, records(15)),
+        evidence_wire.write_evidence(Kind.EVIDENCE_EXACT, 1, "blended", records(15)),
         lambda d: evidence_wire.read_evidence(Kind.EVIDENCE_EXACT, d, TEAM),
     ),
 }
@@ -180,16 +183,28 @@ def test_a_sample_comes_back_within_its_quantisation() -> None:
 @settings(max_examples=20, deadline=None)
 def test_evidence_comes_back_and_every_chunk_is_useful_alone(kind: Kind, n: int) -> None:
     sent = records_of(kind, n)
-    data = evidence_wire.write_evidence(kind, 1, 1, evidence_wire.to_body(kind, sent))
+    data = evidence_wire.write_evidence(kind, 1, "ray_plane", evidence_wire.to_body(kind, sent))
     owner, body, back = evidence_wire.read_evidence(kind, data, TEAM)
     assert owner == 1
     assert np.array_equal(back, as_sent(kind, sent))
-    assert evidence_wire.write_evidence(kind, 1, 1, body) == data  # handed on unchanged
+    assert evidence_wire.write_evidence(kind, 1, "ray_plane", body) == data  # handed on unchanged
     step = chunk_bytes(kind)
     parts = [
         evidence_wire.read_evidence(kind, data[i : i + step], TEAM)[2] for i in range(0, len(data), step)
     ]
     assert np.array_equal(np.concatenate(parts), back)
+    for depth in DEPTH_KINDS:
+        data = evidence_wire.write_evidence(kind, 1, depth, body)
+        for i in range(0, len(data), step):
+            assert evidence_wire.read_evidence_head(kind, data[i : i + step], TEAM) == (1, depth, n)
+
+
+@pytest.mark.parametrize("depth", [0, 1 + len(DEPTH_KINDS), 0xFFFF])
+def test_evidence_of_an_unknown_kind_of_depth_is_refused(depth: int) -> None:
+    data = bytearray(evidence_wire.write_evidence(Kind.EVIDENCE_EXACT, 1, "blended", records(3)))
+    data[2:4] = depth.to_bytes(2, "little")
+    with pytest.raises(MalformedError, match="unknown kind of depth"):
+        evidence_wire.read_evidence(Kind.EVIDENCE_EXACT, bytes(data), TEAM)
 
 
 def test_exact_evidence_is_exact() -> None:
@@ -206,7 +221,7 @@ def test_exact_evidence_is_exact() -> None:
 def test_impossible_information_is_refused(field: int, value: float, reason: str) -> None:
     sent = records(20)
     sent["information"][7, field] = value
-    data = evidence_wire.write_evidence(Kind.EVIDENCE_EXACT, 1, 1, sent)
+    data = evidence_wire.write_evidence(Kind.EVIDENCE_EXACT, 1, "blended", sent)
     with pytest.raises(MalformedError, match=reason):
         evidence_wire.read_evidence(Kind.EVIDENCE_EXACT, data, TEAM)
 

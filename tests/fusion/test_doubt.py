@@ -59,8 +59,8 @@ def told(views: list[View], bravo: Evidence, pairs=None, threads: int = 1) -> Be
     ids = 10 + np.arange(N)
     pairs = {("alpha", "bravo"): np.stack([ids, ids], axis=1)} if pairs is None else pairs
     return believed(
-        map_of("alpha"), {"bravo": bravo}, HERE, pairs, views, CAMERA, FusionConfig(), MatchingConfig(), "blended",
-        threads=threads,
+        map_of("alpha"), {"bravo": bravo}, HERE, pairs, views, CAMERA, FusionConfig(), MatchingConfig(),
+        {"bravo": "blended"}, threads=threads,
     )  # fmt: skip
 
 

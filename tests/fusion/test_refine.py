@@ -13,7 +13,7 @@ from pipeline.fusion.refine import View, refine, steps_of
 from pipeline.geometry import se3
 from pipeline.geometry.camera import PinholeCamera
 from pipeline.kernels import Rasterizer
-from pipeline.splat.gaussians import Gaussians
+from pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
 from pipeline.splat.losses import psnr
 
 CAMERA = PinholeCamera(64, 48, 55.0, 55.0, 31.5, 23.5)
@@ -117,6 +117,21 @@ def test_no_steps_change_nothing(spoilt: tuple[Gaussians, list[View]]) -> None:
     assert refine(gaussians, ALL, [], CAMERA, RefineConfig(), 1e-3, "blended", seed=0) is gaussians
 
 
+def test_a_neighbours_map_is_drawn_with_the_depth_that_it_was_made_with() -> None:
+    true, poses = wall(), np.array(POSES[:1])
+    tilted = true.replace(quats_wxyz=np.tile(np.float32([0.9689, 0.0, 0.2474, 0.0]), (400, 1)))
+    evidence = Evidence.from_map("zulu", tilted.replace(anchors=np.zeros(400, np.int32)), None, poses)
+    seen = {}
+    for depth in DEPTH_KINDS:
+        (view,) = peer_views({"zulu": evidence}, {"zulu": poses}, CAMERA, 1, {"zulu": depth}, colors=ALIKE)
+        render = Rasterizer().forward(tilted, CAMERA, se3.inverse(poses[0]), depth=depth)
+        sure = (render.alpha > 0.901) & (view.depth_m > 0)
+        assert sure.any()
+        np.testing.assert_allclose(view.depth_m[sure], (render.depth / render.alpha)[sure], atol=1e-3)
+        seen[depth] = view.depth_m
+    assert np.abs(seen["blended"] - seen["ray_plane"]).max() > 0.01
+
+
 def test_a_neighbours_map_shows_what_it_would_from_where_the_neighbour_stood() -> None:
     true, T_world_map = wall(), se3.exp(np.array([0.3, -0.2, 0.1, 0.02, 0.1, 0.05]))
     poses, anchors = np.array(POSES[:3]), np.arange(400) % 3
@@ -127,7 +142,9 @@ def test_a_neighbours_map_shows_what_it_would_from_where_the_neighbour_stood() -
     hung = true.replace(anchors=anchors.astype(np.int32))
     evidence = Evidence.from_map("zulu", hung, None, poses)
     there = T_world_map @ poses
-    all_of_them = peer_views({"zulu": evidence}, {"zulu": there}, CAMERA, 40, "blended", colors=ALIKE)
+    all_of_them = peer_views(
+        {"zulu": evidence}, {"zulu": there}, CAMERA, 40, {"zulu": "blended"}, colors=ALIKE
+    )
     assert len(all_of_them) == 5  # three keyframes and the two places between them
     for k, view in enumerate(all_of_them[::2]):
         np.testing.assert_allclose(view.T_world_camera, there[k], atol=1e-12)
@@ -141,12 +158,14 @@ def test_a_neighbours_map_shows_what_it_would_from_where_the_neighbour_stood() -
         share = render.alpha[sure]
         np.testing.assert_allclose(view.depth_m[sure], render.depth[sure] / share, atol=1e-3)
         np.testing.assert_allclose(view.color[sure], 255 * render.color[sure] / share[:, None], atol=1)
-    some = peer_views({"zulu": evidence}, {"zulu": there}, CAMERA, 2, "blended", threads=2, colors=ALIKE)
+    some = peer_views(
+        {"zulu": evidence}, {"zulu": there}, CAMERA, 2, {"zulu": "blended"}, threads=2, colors=ALIKE
+    )
     assert [v.T_world_camera.tolist() for v in some] == [
         all_of_them[k].T_world_camera.tolist() for k in (1, 3)
     ]
     assert np.array_equal(some[0].color, all_of_them[1].color)
-    assert peer_views({}, {}, CAMERA, 40, "blended", colors=ALIKE) == []
+    assert peer_views({}, {}, CAMERA, 40, {}, colors=ALIKE) == []
 
 
 def test_neighbours_views_teach_what_own_ones_do_not_see(spoilt: tuple[Gaussians, list[View]]) -> None:

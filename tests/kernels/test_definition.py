@@ -57,6 +57,29 @@ def checkerboard(scene: Scene) -> np.ndarray:
     return (rows // 2 + columns // 3) % 2 == 0
 
 
+# ---------------------------------------------------------------- what a pixel sees
+
+
+@pytest.mark.parametrize("offset_px", [(0.5, 0.0), (0.25, 0.5)])
+def test_a_point_is_seen_through_the_variance_of_a_square_pixel(rasterizer, offset_px):
+    camera = PinholeCamera(5, 5, 100.0, 100.0, 2.0, 2.0)
+    mean = np.array([*np.divide(offset_px, 100.0), 1.0])
+    point = Gaussians(
+        ids=[0],
+        anchors=[0],
+        means=[mean],
+        quats_wxyz=[[1.0, 0.0, 0.0, 0.0]],
+        log_scales=[[-15.0] * 3],
+        colors=[[1.0] * 3],
+        opacity_logits=[2.0],
+    )
+    alpha = rasterizer.forward(point, camera, np.eye(4)).alpha[2:4, 2:4]
+    rows, columns = np.indices((2, 2))
+    squared = (columns - offset_px[0]) ** 2 + (rows - offset_px[1]) ** 2
+    exact = np.exp(-squared / 2 / (1 / 12)) / (1 + np.exp(-2.0))
+    np.testing.assert_allclose(alpha, np.where(exact < 1 / 255, 0.0, exact), rtol=1e-4)
+
+
 # ---------------------------------------------------------------- depth along the ray
 
 
@@ -88,7 +111,7 @@ def test_ray_plane_depth_of_a_disc_is_where_the_ray_meets_its_plane(rasterizer, 
     assert depth[i, j] == pytest.approx(2.0, rel=1e-6)
     by_u, by_v = (depth[i, j + 1] - depth[i, j - 1]) / 2, (depth[i + 1, j] - depth[i - 1, j]) / 2
     exact_u, exact_v = (plane[i, j + 1] - plane[i, j - 1]) / 2, (plane[i + 1, j] - plane[i - 1, j]) / 2
-    # the blur turns the plane by its share of the covariance, 0.3 of about 800 px^2
+    # the blur turns the plane by its share of the covariance, 1/12 of about 800 px^2
     np.testing.assert_allclose([by_u, by_v], [exact_u, exact_v], rtol=2e-3, atol=1e-5)
     distance = np.hypot(*(np.indices(plane.shape) - np.array([i, j])[:, None, None]))
     near = (distance > 0) & (distance < 20)
@@ -232,7 +255,7 @@ def test_a_layer_without_tolerance_is_the_median_gaussian(rasterizer):
     camera, stack = tiny().camera, [wall(z, 0.3) for z in (1.0, 1.02, 1.04, 1.06, 1.08)]
     rasterizer.forward(Gaussians.concatenate(stack), camera, np.eye(4))
     exact, loose = rasterizer.layer_depth(0.0), rasterizer.layer_depth(0.2)
-    assert np.isin(np.round(exact, 4), np.round([1.0, 1.02, 1.04, 1.06, 1.08], 4).astype(np.float32)).all()
+    assert np.isin(np.round(exact.astype(np.float64), 4), [1.0, 1.02, 1.04, 1.06, 1.08]).all()
     assert np.ptp(loose) < np.ptp([1.0, 1.08])
 
 

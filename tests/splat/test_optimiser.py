@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.kernels import CompiledAdam, Gradients, available_isas
 from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.optimiser import BETA_1, BETA_2, Adam, LearningRates
+from pipeline.splat.optimiser import BETA_1, BETA_2, Adam, LearningRates, falling
 
 NAMES = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
 
@@ -151,3 +151,12 @@ def test_what_does_not_fit_is_refused() -> None:
         adam.step(gaussians, replace(g, means=g.means[:2]), LearningRates())
     with pytest.raises(ValueError, match=r"gradients\.colors is float64, expected an array of float32"):
         adam.step(gaussians, replace(g, colors=g.colors.astype(np.float64)), LearningRates())
+
+
+def test_rates_fall_from_one_to_the_last_and_never_rise() -> None:
+    shares = np.array([falling(step, 101, 0.03) for step in range(101)])
+    assert shares[0] == 1.0
+    assert shares[-1] == pytest.approx(0.03)
+    assert shares[50] == pytest.approx((1.0 + 0.03) / 2)
+    assert (np.diff(shares) < 0).all()
+    assert falling(0, 1, 0.03) == 1.0

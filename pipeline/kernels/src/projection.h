@@ -17,7 +17,7 @@ namespace KERNEL_ISA {
 using namespace raster;
 
 constexpr float NEAR_M = 0.01f;              // Gaussians whose centre is nearer are not drawn
-constexpr float BLUR_PX2 = 0.3f;             // low-pass added to the screen covariance
+constexpr float BLUR_PX2 = 1.0f / 12;        // low-pass added to the screen covariance: the variance of a square pixel
 constexpr float FIELD_MARGIN = 1.3f;         // J is linearised no further out than this times the half field
 constexpr float LARGEST_PX2 = 1e12f;         // Gaussians with more variance on the screen are not drawn
 constexpr float SQRT_HALF_LOG2_E = 0.84932180f;  // sqrt(log2(e) / 2)
