@@ -312,7 +312,7 @@ class Tracker:
         if not by_color.ok or by_color.rms_gray > largest:
             return Reason.CONTRADICTION if self._contradiction else found
         T, T_by_color = found.result.T_reference_target, by_color.T_reference_target
-        if self._sound.agrees(T, T_by_color, tracking.failure):
+        if self._sound.agrees(T, T_by_color, tracking.failure, self._contradiction):
             return replace(found, doubted=True)
         self._contradiction = True
         obstructed = (
