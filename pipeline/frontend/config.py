@@ -90,7 +90,7 @@ class FailureConfig(Config):
     of it."""
     sigma_of_way_without_depth: float = 0.07
     """Standard deviation of that error per axis, as a share of the distance; counted in the information."""
-    doubtful_gray_of_usual: float = 1.5
+    doubtful_gray_of_usual: float = 1.75
     """A frame whose grey residual is larger than this many times the usual one is also registered by colour alone."""
     max_contradiction_m: float = 0.01
     """Largest distance between that answer and the usual one."""

@@ -242,10 +242,11 @@ def resized(shots: Sequence[Shot], camera: PinholeCamera) -> list[Shot]:
 
 @dataclass(frozen=True)
 class Row:
-    """A tracked frame of a disturbed run beside the undisturbed one: distance of the poses in the map."""
+    """A tracked frame of a disturbed run, T_map_camera [4, 4], and its distance from the undisturbed one."""
 
     shot: Shot
     frame: TrackedFrame
+    T_map_camera: NDArray[np.float64]
     moved_m: float
     turned_rad: float
 
@@ -303,7 +304,7 @@ class Undisturbed:
         for shot in disturbance(self.shots[start : start + frames], np.random.default_rng(start)):
             frame, pose = track(tracker, shot)
             moved_m, turned_rad = se3.distance(self.poses[shot.index], pose)
-            rows.append(Row(shot, frame, float(moved_m), float(turned_rad)))
+            rows.append(Row(shot, frame, pose, float(moved_m), float(turned_rad)))
         return rows
 
 

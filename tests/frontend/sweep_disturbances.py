@@ -7,15 +7,21 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
+from pipeline.evaluation import groundtruth
+from pipeline.evaluation.results import Absent
 from pipeline.frontend.config import FrontendConfig
 from pipeline.frontend.tracked import Status
 from pipeline.frontend.tracking import Tracker
-from pipeline.recording import open_rgbd
+from pipeline.geometry import se3
+from pipeline.recording import Recording, open_rgbd
 from tests.frontend import disturbances as d
 from tests.frontend.disturbances import Row, Shot, Undisturbed
 from tests.frontend.test_lost import filmed
 
 FRAMES = 50  # of a trial
+BEFORE = 17  # frames before a disturbance, half a second, that a trial is laid on the true poses by
 
 
 def main() -> None:
@@ -29,14 +35,18 @@ def main() -> None:
         camera = log.camera
         shots = [Shot(f.index, f.stamp_ns, f.color, f.depth) for f in map(log.frame, range(len(log)))]
     starts = range(arguments.first, len(shots) - FRAMES // 2, arguments.every)
+    truth = _true_poses(arguments.log, shots)
     run = Undisturbed(Tracker(camera, FrontendConfig()), shots, starts)
     lost = sum(frame.status is Status.LOST for frame in run.frames)
     print(f"{len(shots)} frames, {lost} lost undisturbed; {len(starts)} places")
-    print("disturbance       good while disturbed  wrong  worst mm  found again after  not found")
+    head = "disturbance       good while disturbed  wrong  worst mm  found again after  not found"
+    print(f"{head}  worst mm from truth  undisturbed" if truth else head)
     disturbances = d.further() if arguments.further else d.every(d.resized(filmed(5, 30), camera))
     for disturbance in disturbances:
         rows = [run.disturbed(start, disturbance, FRAMES) for start in starts]
-        print(f"{disturbance.__name__:18}{_summary(rows)}", flush=True)
+        print(
+            f"{disturbance.__name__:18}{_summary(rows)}{_beside_truth(run, truth, starts, rows)}", flush=True
+        )
 
 
 def _summary(trials: Sequence[Sequence[Row]]) -> str:
@@ -49,6 +59,39 @@ def _summary(trials: Sequence[Sequence[Row]]) -> str:
     good = f"{sum(row.good for row in disturbed)} of {len(disturbed)}"
     wrong = f"{sum(row.wrong for row in rows)} in {sum(any(row.wrong for row in t) for t in trials)}"
     return f"{good:>14} {wrong:>12} {1e3 * worst_m:9.0f} {max(after, default=0):18} {missing:10}"
+
+
+def _true_poses(log: Path, shots: Sequence[Shot]) -> dict[int, np.ndarray]:
+    """T_world_camera [4, 4] by frame index, of the frames that the recording has one of."""
+    truth = groundtruth.trajectory(Recording(log.parent), log.stem)
+    if isinstance(truth, Absent):
+        return {}
+    poses = dict(zip(truth.stamps_ns.tolist(), truth.poses, strict=True))
+    return {shot.index: poses[shot.stamp_ns] for shot in shots if shot.stamp_ns in poses}
+
+
+def _beside_truth(
+    run: Undisturbed, truth: dict[int, np.ndarray], starts: Sequence[int], trials: Sequence[Sequence[Row]]
+) -> str:
+    """Largest error of good poses, mm, and that of the undisturbed run in the same frames.
+
+    By the true poses, relative to the half second before the disturbance: what tracking erred from the beginning of
+    the log to there is no error of what came after.
+    """
+    disturbed, undisturbed = [0.0], [0.0]
+    for start, rows in zip(starts, trials, strict=True):
+        before = [k for k in range(start - BEFORE, start) if k in truth]
+        if not before:
+            continue
+        # mean of the motions that lay the map on the truth, in the tangent of the last of them
+        laid = [truth[k] @ se3.inverse(run.poses[k]) for k in before]
+        T_world_map = laid[-1] @ se3.exp(np.mean([se3.log(se3.inverse(laid[-1]) @ T) for T in laid], axis=0))
+        for row in rows:
+            k = row.shot.index
+            if k in truth and row.good and not row.shot.foreign:
+                disturbed.append(float(se3.distance(truth[k], T_world_map @ row.T_map_camera)[0]))
+                undisturbed.append(float(se3.distance(truth[k], T_world_map @ run.poses[k])[0]))
+    return f" {1e3 * max(disturbed):20.0f} {1e3 * max(undisturbed):12.0f}" if len(disturbed) > 1 else ""
 
 
 if __name__ == "__main__":
