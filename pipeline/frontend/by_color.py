@@ -71,6 +71,24 @@ class SoundFrame:
             information=self._information(result, limits.sigma_of_way_without_depth * way_m),
         )
 
+    def way_m(self, T_keyframe_camera: Array) -> float:
+        """Distance from this frame to a pose in its keyframe."""
+        return float(se3.distance(self.T_keyframe_camera, T_keyframe_camera)[0])
+
+    def agrees(
+        self, T_keyframe_camera: Array, by_color: Array, limits: FailureConfig, contradicted: bool
+    ) -> bool:
+        """Whether colour alone puts a frame where colour and depth together do: both T_keyframe_camera, [4, 4].
+
+        If the two images are of different times, or something moves before the camera, the answers differ by as
+        much as the camera moves. Those of a sound camera differ by a share of it. Depth that is late stays as late,
+        and becomes a smaller share of a longer way: once the two have `contradicted`, half of the share is allowed.
+        """
+        apart_m = float(se3.distance(T_keyframe_camera, by_color)[0])
+        way_m = max(self.way_m(T_keyframe_camera), self.way_m(by_color))
+        share = limits.max_contradiction_of_way * (0.5 if contradicted else 1.0)
+        return apart_m <= max(limits.max_contradiction_m, share * way_m)
+
     def _information(self, result: Registration, sigma_m: float) -> Array:
         """Of the pose in the keyframe: what the registration, this frame's pose and the way leave of it."""
         depth_m = max(float(np.median(self._reference.levels[-1].points[:, 2])), 0.1)

@@ -90,6 +90,12 @@ class FailureConfig(Config):
     of it."""
     sigma_of_way_without_depth: float = 0.07
     """Standard deviation of that error per axis, as a share of the distance; counted in the information."""
+    doubtful_gray_of_usual: float = 1.5
+    """A frame whose grey residual is larger than this many times the usual one is also registered by colour alone."""
+    max_contradiction_m: float = 0.01
+    """Largest distance between that answer and the usual one."""
+    max_contradiction_of_way: float = 0.5
+    """The same as a share of the way from the last sound frame; the larger limit holds."""
     max_frames_without_color: int = 3
     """Frames in a row that are tracked by depth alone, because their colour is stuck; walls do not hold it long."""
     stuck_share: float = 0.99

@@ -34,6 +34,7 @@ class Reason(Enum):
     STUCK_DEPTH = "stuck_depth"
     STUCK_COLOR = "stuck_color"
     OBSTRUCTED = "obstructed"
+    CONTRADICTION = "contradiction"
     UNCONFIRMED = "unconfirmed"
 
 
@@ -76,6 +77,27 @@ class StuckImages:
         known = int(np.count_nonzero(image))
         same = int(np.count_nonzero((image == before) & (image != 0)))
         return known > 0 and same >= self.config.stuck_share * known
+
+
+class Pace:
+    """How much time usually lies between two frames."""
+
+    FRAMES = 50  # that tell what is usual
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._intervals_s: tuple[float, ...] = ()
+
+    def look(self, stamp_ns: int) -> None:
+        """Look at the stamp of the next frame."""
+        if self._last_ns is not None:
+            interval_s = (stamp_ns - self._last_ns) * 1e-9
+            self._intervals_s = (*self._intervals_s[1 - self.FRAMES :], interval_s)
+        self._last_ns = stamp_ns
+
+    def usual_s(self) -> float:
+        """Median of the last intervals; 0 before there is one."""
+        return float(np.median(self._intervals_s)) if self._intervals_s else 0.0
 
 
 def _normalised(gray: Image) -> Image:

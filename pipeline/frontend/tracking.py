@@ -17,6 +17,7 @@ from pipeline.frontend.by_color import SoundFrame
 from pipeline.frontend.config import FrontendConfig, is_held_out
 from pipeline.frontend.failure import (
     Obstruction,
+    Pace,
     Reason,
     SeenFrom,
     StuckImages,
@@ -42,16 +43,21 @@ from pipeline.registration.features import Features
 Array = NDArray[np.float64]
 Image = NDArray[np.floating]
 USUAL_FRAMES = 50  # whose residuals are the usual ones
+GAP_INTERVALS = 3  # usual times between frames that make a gap
 FEATURES_TO_SAY = 3  # times the inliers needed: a keyframe with fewer features cannot say where a view is
 
 
 @dataclass(frozen=True)
 class _Found:
-    """A registration of a frame to a keyframe. without: why only its colour, or only its depth, was used."""
+    """A registration of a frame to a keyframe. without: why only its colour, or only its depth, was used.
+
+    doubted: it looked unlike the keyframe, and colour alone was asked, which agrees.
+    """
 
     keyframe_index: int
     result: Registration
     without: Reason = Reason.NONE
+    doubted: bool = False
 
     def why_not(self) -> Reason:
         """Why it is not believed: the registration failed, or it ended well in a place that cannot be."""
@@ -84,11 +90,15 @@ class Tracker:
         self._current = 0  # keyframe that frames are tracked against
         self._T_keyframe_camera = np.eye(4)  # of the last frame that was tracked
         self._stamp_ns = 0  # of the same
+        self._pace = Pace()
         self._velocity = np.zeros(6)  # right tangent per second, of the two frames before; zero after a loss
         self._lost = False
         self._unconfirmed: _Unconfirmed | None = None
         self._gray_rms: list[float] = []  # of the last frames that were followed
         self._obstruction = Obstruction(config.tracking.failure)
+        self._contradiction = (
+            False  # depth and colour contradicted each other, and nothing has cleared that up
+        )
         self._without_depth = self._without_color = 0  # frames in a row without a usable image
         self._sound: SoundFrame | None = None  # the last frame with both, nothing before it
 
@@ -112,6 +122,8 @@ class Tracker:
         """
         if mask is not None:
             depth_m = np.where(mask, depth_m, 0)
+        self._pace.look(stamp_ns)
+        self._lost = self._lost or self._after_gap(stamp_ns)
         levels = len(self.config.tracking.strides)
         pyramid = RgbdPyramid.build(image, depth_m, self.camera, levels, depth_sigma_m)
         found = self._examine(frame_index, stamp_ns, pyramid)
@@ -139,7 +151,7 @@ class Tracker:
         """Follow a frame without depth by its colour alone, for a while, if it looks as frames did before."""
         tracking = self.config.tracking
         enough = self._without_depth > tracking.failure.max_frames_without_depth
-        if enough or self._lost or self._sound is None:
+        if enough or self._lost or self._obstruction.standing or self._sound is None:
             return without
         predicted, known = self._predicted(stamp_ns)
         result = self._sound.follow(pyramid, predicted, tracking.registration, tracking.failure, known)
@@ -184,14 +196,21 @@ class Tracker:
         elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
         followed = keyframe_index == self._current and not self._lost and elapsed_s > 0
         step = se3.inverse(self._T_keyframe_camera) @ result.T_reference_target
+        # a stamp that came late makes the next interval too short
+        elapsed_s = max(elapsed_s, 0.5 * self._pace.usual_s())
         self._velocity = se3.log(step) / elapsed_s if followed else np.zeros(6)
+        if keyframe_index != self._current:
+            self._sound = None
         self._current, self._T_keyframe_camera, self._lost = keyframe_index, result.T_reference_target, False
         self._stamp_ns, self._unconfirmed = stamp_ns, None
         if followed and found.without is Reason.NONE:
             self._gray_rms = [*self._gray_rms[1 - USUAL_FRAMES :], result.rms_gray]
         if found.without is Reason.NONE:
+            self._contradiction = False
             self._obstruction.look(pyramid.levels[-1], self._seen_before(found))
-            self._sound = self._sound_frame(pyramid, result.T_reference_target, result.information)
+            if not (found.doubted or self._obstruction.standing):
+                T, strides = result.T_reference_target, self.config.tracking.strides
+                self._sound = SoundFrame(pyramid, strides, T, result.information)
         if (
             not is_held_out(frame_index)
             and found.without is Reason.NONE
@@ -201,14 +220,6 @@ class Tracker:
         ):
             return self._promote(frame_index, stamp_ns, pyramid, keyframe_index, result, status)
         return TrackedFrame.by(frame_index, stamp_ns, keyframe_index, result, status, found.without)
-
-    def _sound_frame(
-        self, pyramid: RgbdPyramid, T_keyframe_camera: Array, information: Array | None
-    ) -> SoundFrame | None:
-        """A frame that colour alone may be registered to; None if something stands before the camera."""
-        if self._obstruction.standing:
-            return None
-        return SoundFrame(pyramid, self.config.tracking.strides, T_keyframe_camera, information)
 
     def _lose(self, frame_index: int, stamp_ns: int, reason: Reason) -> TrackedFrame:
         """A frame without a pose: it keeps the last known one, and says that it means nothing."""
@@ -247,6 +258,15 @@ class Tracker:
         elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
         return self._lost and elapsed_s > self.config.tracking.max_extrapolation_s
 
+    def _after_gap(self, stamp_ns: int) -> bool:
+        """Whether no frame came for so long that the camera can be anywhere near; odometry bridges a gap."""
+        usual_s, elapsed_s = self._pace.usual_s(), (stamp_ns - self._stamp_ns) * 1e-9
+        longest_s = max(self.config.tracking.max_extrapolation_s, GAP_INTERVALS * usual_s)
+        if not self.keyframes or elapsed_s <= longest_s:
+            return False
+        motion = self.motion.between(self._stamp_ns, stamp_ns) if self.motion is not None else None
+        return motion is None or not motion.knows_translation
+
     def _find_near(
         self, stamp_ns: int, pyramid: RgbdPyramid, view: Features | None = None
     ) -> _Found | Reason:
@@ -260,16 +280,49 @@ class Tracker:
                 information = known if guess is predicted else None
                 result = register(keyframe.reference, pyramid, guess, tracking.registration, information)
                 found = _Found(self._current, result)
+                why_not = found.why_not()
                 if result.ok and self._tells_enough(pyramid, found) and self._followed(predicted, result):
-                    return found
-                reason = reason if reason is not Reason.NONE else found.why_not()
+                    undisputed = self._undisputed(stamp_ns, pyramid, found)
+                    if isinstance(undisputed, _Found):
+                        return undisputed
+                    why_not = undisputed
+                reason = reason if reason is not Reason.NONE else why_not
         view = features_of(pyramid, tracking.relocalisation) if view is None else view
         for guess in starts:
             found = _Found(self._current, settle(keyframe, pyramid, guess, tracking, tracking.recovery))
             if found.result.ok and self._believable(stamp_ns, pyramid, found, view):
-                return found
+                undisputed = self._undisputed(stamp_ns, pyramid, found)
+                if isinstance(undisputed, _Found):
+                    return undisputed
             reason = reason if reason is not Reason.NONE else found.why_not()
         return reason
+
+    def _undisputed(self, stamp_ns: int, pyramid: RgbdPyramid, found: _Found) -> _Found | Reason:
+        """The same, if it looks as usual or colour alone, where that can tell, puts the camera there too.
+
+        If the two contradict each other, depth of another time holds the camera back: then colour alone is believed,
+        unless it says that the camera moved less, or something stands before it.
+        """
+        tracking = self.config.tracking
+        largest = tracking.failure.doubtful_gray_of_usual * self._usual_gray_rms()
+        if self._sound is None or not self._gray_rms or found.result.rms_gray <= largest:
+            return found
+        predicted, known = self._predicted(stamp_ns)
+        by_color = self._sound.follow(pyramid, predicted, tracking.registration, tracking.failure, known)
+        if not by_color.ok or by_color.rms_gray > largest:
+            return Reason.CONTRADICTION if self._contradiction else found
+        T, T_by_color = found.result.T_reference_target, by_color.T_reference_target
+        if self._sound.agrees(T, T_by_color, tracking.failure, self._contradiction):
+            return replace(found, doubted=True)
+        self._contradiction = True
+        obstructed = (
+            self._obstruction.standing
+            or (self._obstruction.intruded(pyramid.levels[-1], self._seen_before(found))[0])
+        )
+        held_back = self._sound.way_m(T) < self._sound.way_m(T_by_color)
+        if self._lost or obstructed or not held_back or not self._looks_as_usual(by_color):
+            return Reason.CONTRADICTION
+        return _Found(self._current, by_color, Reason.CONTRADICTION)
 
     def _find_place(
         self, frame_index: int, stamp_ns: int, pyramid: RgbdPyramid, view: Features
@@ -380,8 +433,12 @@ class Tracker:
 
     def _largest_gray_rms(self) -> float:
         config = self.config.tracking.relocalisation
-        usual = float(np.median(self._gray_rms)) if self._gray_rms else 0.0
-        return config.max_gray_rms + config.max_gray_rms_of_usual * usual
+        # depth of another time looks 2.5 times as bad as usual where it is 4 cm off: then nothing is added
+        added = 0.0 if self._contradiction else config.max_gray_rms
+        return added + config.max_gray_rms_of_usual * self._usual_gray_rms()
+
+    def _usual_gray_rms(self) -> float:
+        return float(np.median(self._gray_rms)) if self._gray_rms else 0.0
 
     def _predicted(self, stamp_ns: int) -> tuple[Array, Array | None]:
         """Where the camera should be in its keyframe, T_keyframe_camera [4, 4], and the information [6, 6] of that.
@@ -445,7 +502,7 @@ class Tracker:
         self._register_to_neighbours(pyramid, previous, T_map_keyframe, new)
         self._add_keyframe(frame_index, stamp_ns, pyramid, previous, T_map_keyframe, result)
         self._current, self._T_keyframe_camera = new, np.eye(4)
-        self._sound = self._sound_frame(pyramid, np.eye(4), None)
+        self._sound = SoundFrame(pyramid, self.config.tracking.strides, np.eye(4), None)
         return replace(
             TrackedFrame.by(frame_index, stamp_ns, new, result, status), T_keyframe_camera=np.eye(4)
         )

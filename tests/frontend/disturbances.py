@@ -113,6 +113,97 @@ def depthless(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]
         yield replace(shot, depth=np.zeros_like(shot.depth), disturbed=True) if k < 20 else shot
 
 
+def blurred(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+    """For 10 frames the colour is smeared over a sixteenth of the image's width, in another direction each."""
+    for k, shot in enumerate(shots):
+        if k >= 10:
+            yield shot
+            continue
+        length = shot.color.shape[1] // 16 | 1
+        line = np.zeros((length, length), dtype=np.float32)
+        end = (length // 2 * np.array([np.cos(k), np.sin(k)])).round().astype(int)
+        cv2.line(line, tuple((length // 2 - end).tolist()), tuple((length // 2 + end).tolist()), 1.0)
+        color = cv2.filter2D(shot.color, -1, line / line.sum())
+        yield replace(shot, color=np.asarray(color, dtype=np.uint8), disturbed=True)
+
+
+def passer(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+    """In 30 frames something patterned, half as wide as the view and 1 m away, crosses it from left to right."""
+    h, w = shots[0].depth.shape
+    pattern = rng.integers(20, 236, (h // 16 + 1, w // 32 + 1, 3), dtype=np.uint8)
+    pattern = cv2.resize(pattern, (w // 2, h), interpolation=cv2.INTER_LINEAR)
+    for k, shot in enumerate(shots):
+        if k >= 30:
+            yield shot
+            continue
+        left = round((k + 1) / 30 * 1.5 * w) - w // 2
+        seen = slice(max(left, 0), min(left + w // 2, w))
+        color, depth = shot.color.copy(), shot.depth.copy()
+        color[:, seen] = pattern[:, seen.start - left : seen.stop - left]
+        depth[:, seen] = np.float32(1.0)
+        yield replace(shot, color=color, depth=depth, disturbed=True)
+
+
+def hunting(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+    """For 30 frames the automatic exposure swings between a third and three times, once in 12 frames."""
+    for k, shot in enumerate(shots):
+        if k >= 30:
+            yield shot
+            continue
+        gain = 3.0 ** np.sin(2 * np.pi * (k + 1) / 12)
+        color = np.clip(gain * shot.color.astype(np.float32), 0, 255).astype(np.uint8)
+        yield replace(shot, color=color, disturbed=True)
+
+
+def dark(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+    """For 20 frames the light is off: the depth camera goes on, the colour is noise."""
+    for k, shot in enumerate(shots):
+        if k >= 20:
+            yield shot
+            continue
+        color = shot.color // 40 + rng.integers(0, 4, shot.color.shape, dtype=np.uint8)
+        yield replace(shot, color=color, disturbed=True)
+
+
+def half_depth(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+    """For 20 frames the right half of the depth image is missing."""
+    for k, shot in enumerate(shots):
+        if k >= 20:
+            yield shot
+            continue
+        depth = shot.depth.copy()
+        depth[:, depth.shape[1] // 2 :] = 0
+        yield replace(shot, depth=depth, disturbed=True)
+
+
+def late_depth(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+    """For 30 frames the depth image is that of two frames before."""
+    for k, shot in enumerate(shots):
+        yield replace(shot, depth=shots[max(k - 2, 0)].depth, disturbed=True) if k < 30 else shot
+
+
+def noisy_stuck(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+    """For 20 frames the depth image is stuck, but something adds 0.3 % of noise to it, new in every frame."""
+    for k, shot in enumerate(shots):
+        if k >= 20:
+            yield shot
+            continue
+        noise = 1 + 0.003 * rng.standard_normal(shot.depth.shape, dtype=np.float32)
+        yield replace(shot, depth=shots[0].depth * noise, disturbed=True)
+
+
+def paused(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+    """25 frames are missing: the driver hangs for most of a second."""
+    yield from shots[25:]
+
+
+def odd_stamps(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+    """For 30 frames every third stamp comes 30 ms late, just before the next; then the clock jumps by ten seconds."""
+    for k, shot in enumerate(shots):
+        later_ns = (30_000_000 if k % 3 == 0 else 0) if k < 30 else 10_000_000_000
+        yield replace(shot, stamp_ns=shot.stamp_ns + later_ns, disturbed=k <= 30)
+
+
 Disturbance = Callable[[Sequence[Shot], np.random.Generator], Iterator[Shot]]
 
 
@@ -129,6 +220,11 @@ def every(other: Sequence[Shot]) -> list[Disturbance]:
         flipped,
         depthless,
     ]
+
+
+def further() -> list[Disturbance]:
+    """What else happens in the field."""
+    return [blurred, passer, hunting, dark, half_depth, late_depth, noisy_stuck, paused, odd_stamps]
 
 
 def resized(shots: Sequence[Shot], camera: PinholeCamera) -> list[Shot]:
@@ -219,4 +315,5 @@ def _copied(tracker: Tracker) -> Tracker:
             setattr(other, name, list(value))
     other._stuck = copy.copy(tracker._stuck)
     other._obstruction = copy.copy(tracker._obstruction)
+    other._pace = copy.copy(tracker._pace)
     return other

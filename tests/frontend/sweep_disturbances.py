@@ -23,6 +23,7 @@ def main() -> None:
     parser.add_argument("log", type=Path)
     parser.add_argument("--first", type=int, default=20, help="first frame that a disturbance begins at")
     parser.add_argument("--every", type=int, default=20, help="frames between such frames")
+    parser.add_argument("--further", action="store_true", help="the other list of disturbances")
     arguments = parser.parse_args()
     with open_rgbd(arguments.log) as log:
         camera = log.camera
@@ -32,7 +33,8 @@ def main() -> None:
     lost = sum(frame.status is Status.LOST for frame in run.frames)
     print(f"{len(shots)} frames, {lost} lost undisturbed; {len(starts)} places")
     print("disturbance       good while disturbed  wrong  worst mm  found again after  not found")
-    for disturbance in d.every(d.resized(filmed(5, 30), camera)):
+    disturbances = d.further() if arguments.further else d.every(d.resized(filmed(5, 30), camera))
+    for disturbance in disturbances:
         rows = [run.disturbed(start, disturbance, FRAMES) for start in starts]
         print(f"{disturbance.__name__:18}{_summary(rows)}", flush=True)
 

@@ -171,6 +171,47 @@ def test_flipped_exposure_is_followed_or_lost(run: Undisturbed, start: int) -> N
     assert_found_again(rows, within=4)
 
 
+@pytest.mark.parametrize("disturbance", d.further(), ids=lambda f: f.__name__)
+def test_nothing_else_makes_it_silently_wrong(run: Undisturbed, disturbance: d.Disturbance) -> None:
+    rows = run.disturbed(STARTS[-1], disturbance, 38)
+    assert max(row.moved_m for row in rows if row.good) < 0.02
+    assert not any(row.wrong for row in rows)
+    assert rows[-1].good
+
+
+def test_depth_of_another_time_contradicts_the_colour(run: Undisturbed) -> None:
+    """Stuck, but noisy, so that no value repeats; or late."""
+    for disturbance in (d.noisy_stuck, d.late_depth):
+        rows = during(run.disturbed(STARTS[0], disturbance, 8))
+        assert Reason.CONTRADICTION in {row.frame.reason for row in rows}
+
+
+def test_after_a_pause_two_frames_must_agree(run: Undisturbed) -> None:
+    rows = run.disturbed(STARTS[0], d.paused)
+    first, second = rows[0].frame, rows[1].frame
+    assert (first.status, first.reason) == (Status.LOST, Reason.UNCONFIRMED)
+    assert second.status is Status.RELOCALISED
+
+
+def test_a_slow_camera_does_not_pause(run: Undisturbed) -> None:
+    """Frames that always come half a second apart are followed."""
+    tracker = Tracker(CAMERA, CONFIG)
+    slow = [replace(shot, stamp_ns=shot.index * 500_000_000) for shot in run.shots[:6]]
+    assert {d.track(tracker, shot)[0].status for shot in slow} == {Status.OK}
+
+
+def test_late_stamps_do_not_throw_the_prediction(run: Undisturbed) -> None:
+    """A frame stamped just before the next: the motion between them took longer than that."""
+    tracker = run.tracker(STARTS[0])
+    shots = run.shots[STARTS[0] : STARTS[0] + 3]
+    for shot, later_ns in zip(shots[:2], (30_000_000, 0), strict=True):
+        d.track(tracker, replace(shot, stamp_ns=shot.stamp_ns + later_ns))
+    predicted, _ = tracker._predicted(shots[2].stamp_ns)
+    T_map_keyframe = tracker.keyframes[tracker._current].T_map_keyframe
+    expected = run.poses[shots[2].index]
+    assert se3.distance(T_map_keyframe @ predicted, expected)[0] < 0.05
+
+
 def test_a_covered_beginning_is_waited_out(run: Undisturbed) -> None:
     """The map begins with the first frame that shows something, and never with one that is held out."""
     tracker = Tracker(CAMERA, CONFIG)
