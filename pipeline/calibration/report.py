@@ -126,10 +126,13 @@ def check_out(out: Path, force: bool, recording: dict[str, Any], folder: Path) -
 
 
 def write(found: Calibration, out: Path) -> None:
-    """Write `toml`; the name appears only when the file is complete."""
-    partial = out.with_name(out.name + ".part")
-    partial.write_text(toml(found), encoding="utf-8")
-    partial.replace(out)
+    """Write `toml`; the name appears only when the file is complete. Raises DuagError."""
+    text, partial = toml(found), out.with_name(out.name + ".part")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(out)
+    except OSError as error:
+        raise DuagError(f"{out}: {error.strerror or error}, expected to write options") from error
 
 
 def format_calibration(found: Calibration) -> str:

@@ -244,9 +244,9 @@ def calibrate(
     if out is not None:
         report.check_out(out, force, Recording(path).description, path)
     found = calibrate_recording(path, load(RunConfig, config, overrides or []).frontend, robots or [], views)
+    print(json.dumps(report.plain(found), indent=2) if as_json else report.format_calibration(found))
     if out is not None:
         report.write(found, out)
-    print(json.dumps(report.plain(found), indent=2) if as_json else report.format_calibration(found))
 
 
 @app.command()

@@ -231,6 +231,9 @@ def test_the_file_of_options_is_one_of_the_converter(tmp_path: Path) -> None:
     text = report.format_calibration(found)
     assert "features 0.80 -> 0.80 px" in text
     assert "--out FILE.toml" in text
+    (tmp_path / "other.toml.part").mkdir()
+    with pytest.raises(DuagError, match=r"other.toml: Is a directory, expected to write options"):
+        report.write(found, tmp_path / "other.toml")
 
 
 def test_recordings_that_take_no_calibration() -> None:
