@@ -60,6 +60,7 @@ def test_imports_go_one_way(path: Path) -> None:
     if allowed is not None:
         assert imported <= allowed | {part}, f"{part} imports {sorted(imported - allowed - {part})}"
     assert part == "viewer" or not any(n.split(".")[0] == "rerun" for n in imports_of(path))
+    assert part in ("bench", "cli") or "bench" not in imported, f"{part} imports what only measures"
 
 
 @pytest.mark.parametrize("part", ESTIMATOR)

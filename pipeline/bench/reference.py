@@ -79,7 +79,7 @@ def run(run_folder: RunFolder, recording: Recording, config: FrontendConfig) -> 
     members = run_folder.largest_component
     if len(members) < len(run_folder.robots):
         raise DuagError(
-            f"{run_folder.path}: {', '.join(members)} share a world, expected all robots of the run"
+            f"{run_folder.path}: found a world of {', '.join(members)} alone, expected one of all its robots"
         )
     robots = [_robot(run_folder.robots[name], recording) for name in members]
     try:

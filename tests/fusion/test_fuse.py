@@ -1,4 +1,4 @@
-"""Fusion as laws: weighted means, nothing from nothing, every robot counted once, whatever the order; coverage."""
+"""Fusion as laws: weighted means, nothing from nothing, every robot counted once, whatever the order."""
 
 import numpy as np
 import pytest
@@ -7,93 +7,19 @@ from pipeline.consensus.config import ColorConfig
 from pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, Evidence, pack_information
 from pipeline.consensus.gaussians import Weights
 from pipeline.consensus.matching import MatchingConfig
-from pipeline.fusion.fuse import FusionConfig, association_covariance, explained, fuse, weighted_move
+from pipeline.fusion.fuse import association_covariance, fuse, weighted_move
 from pipeline.geometry import se3, so3, spd
-from pipeline.geometry.camera import PinholeCamera
 from pipeline.splat.gaussians import Gaussians
-
-CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
-CONFIG = FusionConfig(
-    explained_opacity=0.0
-)  # what was measured explains, though these maps draw hardly anything
-# every robot ends with the same Gaussian
-ALIKE = FusionConfig(
-    association="members", scatter_position_m=0.004, scatter_log_covariance=0.14, explained_opacity=0.0
+from tests.fusion.worlds import (
+    ALIKE,
+    CAMERA,
+    CONFIG,
+    MATCHING,
+    N,
+    World,
+    assert_same_map,
+    random_pose,
 )
-MATCHING = MatchingConfig()
-NAMES = ("alpha", "bravo", "charlie")
-N = 30
-
-
-def random_pose(rng):
-    return se3.from_quat_translation(rng.normal(size=4), rng.normal(size=3))
-
-
-def information(rng, n):
-    """Blocks of full rank with a contrast of about ten per axis."""
-    blocks = []
-    for d, scale in ((3, 1e5), (6, 10.0)):
-        A = rng.normal(size=(n, d, d)) + 2 * np.eye(d)
-        blocks.append(scale * A @ A.swapaxes(-1, -2))
-    return pack_information(*blocks, rng.uniform(100, 1000, (n, 3)), rng.uniform(1, 10, n))
-
-
-class World:
-    """Robots that each hold one Gaussian per place, in anchor frames, with all places matched."""
-
-    def __init__(self, seed, robots=3, keyframes=3):
-        rng = np.random.default_rng(seed)
-        self.names = NAMES[:robots]
-        truth = rng.normal(size=(N, 3))
-        self.T_world, self.maps, self.T_map, self.evidence = {}, {}, {}, {}
-        for k, name in enumerate(self.names):
-            T_world_map = random_pose(rng)
-            self.T_map[name] = np.array([random_pose(rng) for _ in range(keyframes)])
-            self.T_world[name] = T_world_map @ self.T_map[name]
-            means_world = truth + 0.005 * rng.normal(size=(N, 3))
-            self.maps[name] = Gaussians(
-                100 * k + np.arange(N),
-                rng.integers(keyframes, size=N),
-                se3.transform(se3.inverse(T_world_map), means_world),
-                rng.normal(size=(N, 4)),
-                rng.uniform(-5, -3.5, size=(N, 3)),
-                rng.uniform(size=(N, 3)),
-                rng.normal(size=N),
-            )
-            bare = Evidence.from_map(name, self.maps[name], None, self.T_map[name])
-            self.evidence[name] = Evidence(name, bare.ids, bare.anchors, bare.theta, information(rng, N))
-        self.pairs = {
-            (a, b): np.stack([self.maps[a].ids, self.maps[b].ids], axis=1)
-            for i, a in enumerate(self.names)
-            for b in self.names[i + 1 :]
-        }
-
-    def fuse(self, robot, config=CONFIG, depth_images=(), **changes):
-        given = {"evidence": self.evidence, "pairs": self.pairs, "T_world_keyframe": self.T_world} | changes
-        return fuse(
-            robot,
-            self.maps[robot],
-            self.T_map[robot],
-            given["evidence"],
-            given.get("own_splats", given["evidence"][robot]),
-            given["T_world_keyframe"],
-            given["pairs"],
-            depth_images,
-            CAMERA,
-            config,
-            given.get("matching", MATCHING),
-        )
-
-    def without_information(self, name):
-        e = self.evidence[name]
-        return Evidence(name, e.ids, e.anchors, e.theta, np.zeros_like(e.information))
-
-
-def assert_same_map(a, b, atol=0.0):
-    np.testing.assert_array_equal(a.gaussians.ids, b.gaussians.ids)
-    for name in ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits"):
-        np.testing.assert_allclose(getattr(a.gaussians, name), getattr(b.gaussians, name), rtol=0, atol=atol)
-    np.testing.assert_allclose(a.information, b.information, rtol=0, atol=atol * 1e6)
 
 
 def test_fused_means_minimise_the_sum_of_all_members():
@@ -388,125 +314,6 @@ def test_a_thickness_at_the_floor_stays_there():
         scales = np.sort(fused.gaussians.log_scales[0])
         assert abs(scales[0] - np.log(MATCHING.thickness_floor_m)) < 0.1
         np.testing.assert_allclose(scales[1:], np.log(0.02) + 0.15, atol=0.1)
-
-
-def test_neighbours_unmatched_gaussians_fill_only_unseen_space():
-    """An own keyframe at the origin measured a wall 2 m away on the left half of its image, nothing on the right."""
-    world = World(12, robots=2)
-    depth = np.zeros((CAMERA.height, CAMERA.width), np.float32)
-    depth[:, :32] = 2.0
-    points = np.array(
-        [[-0.5, 0, 1.0], [-0.5, 0, 2.1], [-0.5, 0, 2.5], [0.5, 0, 1.0], [0, 0, -1.0], [9, 0, 1.0]]
-    )
-    seen = explained(points, np.eye(4)[None], [(0, depth)], CAMERA, CONFIG)
-    # in front of the wall, at it, behind it, where nothing was measured, behind the camera, beside the image
-    assert seen.tolist() == [True, True, False, False, False, False]
-    theta = np.zeros((6, 13))
-    theta[:, MEAN], theta[:, LOG_COVARIANCE] = points, -8 * np.array([1, 1, 1, 0, 0, 0])
-    rng = np.random.default_rng(13)
-    neighbour = Evidence("bravo", np.arange(6), np.zeros(6), theta, information(rng, 6))
-    given = {
-        "evidence": {"alpha": world.evidence["alpha"], "bravo": neighbour},
-        "pairs": {},
-        "T_world_keyframe": {"alpha": np.tile(np.eye(4), (3, 1, 1)), "bravo": np.eye(4)[None]},
-    }
-    fused = world.fuse("alpha", depth_images=[(0, depth)], **given)
-    assert fused.added == 4
-    new = fused.gaussians.select(slice(N, None))
-    np.testing.assert_allclose(new.means, points[2:], atol=1e-6)
-    np.testing.assert_array_equal(fused.source_ids[N:], [2, 3, 4, 5])
-    assert [fused.robots[s] for s in fused.source[N:]] == ["bravo"] * 4
-    assert len(np.unique(fused.gaussians.ids)) == N + 4
-    beside = np.array([[0.05, 0, 1.0], [0.3, 0, 1.0]])  # 2 and 15 pixels beside the wall's outline
-    for px, count in ((4, 1), (0, 2)):
-        taken = theta[:2].copy()
-        taken[:, MEAN] = beside
-        near = given["evidence"] | {
-            "bravo": Evidence("bravo", np.arange(2), np.zeros(2), taken, information(rng, 2))
-        }
-        config = CONFIG.model_copy(update={"explained_px": px})
-        assert world.fuse("alpha", config, [(0, depth)], **(given | {"evidence": near})).added == count
-    overlap = CONFIG.model_copy(update={"coverage": "overlap"})
-    assert world.fuse("alpha", overlap, [(0, depth)], **given).added == 0
-    capped = world.fuse("alpha", CONFIG.model_copy(update={"max_added": 2}), [(0, depth)], **given)
-    assert capped.added == 2
-    assert set(capped.source_ids[N:]) <= {2, 3, 4, 5}
-    unknown = given["evidence"] | {
-        "bravo": Evidence("bravo", np.arange(6), np.zeros(6), theta, np.zeros((6, 31)))
-    }
-    assert world.fuse("alpha", depth_images=[(0, depth)], **(given | {"evidence": unknown})).added == 0
-
-
-def test_the_own_map_explains_where_depth_is_missing():
-    """A wall of own splats at 2 m without depth: a neighbour's splats at and before it are no news."""
-    grid = np.stack(np.meshgrid(np.linspace(-1.5, 1.5, 40), np.linspace(-1.2, 1.2, 40)), axis=-1).reshape(
-        -1, 2
-    )
-    n = len(grid)
-    own = Gaussians(
-        np.arange(n),
-        np.zeros(n),
-        np.concatenate([grid, np.full((n, 1), 2.0)], axis=1),
-        np.tile([1.0, 0, 0, 0], (n, 1)),
-        np.log(np.tile([0.06, 0.06, 0.001], (n, 1))),
-        np.full((n, 3), 0.5),
-        np.full(n, 4.0),
-    )
-    theta = np.zeros((3, 13))
-    theta[:, MEAN] = [[0, 0, 1.0], [0.1, 0, 2.05], [0, 0.1, 3.0]]
-    theta[:, LOG_COVARIANCE] = -8 * np.array([1, 1, 1, 0, 0, 0])
-    origin = np.eye(4)[None]
-    evidence = {
-        "alpha": Evidence.from_map("alpha", own, None, origin),
-        "bravo": Evidence("bravo", np.arange(3), np.zeros(3), theta, np.ones((3, 31))),
-    }
-    poses, nothing = {"alpha": origin, "bravo": origin}, np.zeros((CAMERA.height, CAMERA.width), np.float32)
-    taken = {
-        opacity: fuse(
-            "alpha", own, origin, evidence, evidence["alpha"], poses, {}, [(0, nothing)], CAMERA,
-            CONFIG.model_copy(update={"explained_opacity": opacity}), MATCHING,
-        ).source_ids[n:].tolist()
-        for opacity in (0.5, 1.0)
-    }  # fmt: skip
-    assert taken == {0.5: [2], 1.0: [0, 1, 2]}
-
-
-def test_a_surface_that_the_own_map_hardly_draws_is_not_explained():
-    """Where own splats are thin, a neighbour's on the measured wall fill it, and only there."""
-    grid = np.stack(np.meshgrid(np.linspace(-1.5, 1.5, 40), np.linspace(-1.2, 1.2, 40)), axis=-1).reshape(
-        -1, 2
-    )
-    n = len(grid)
-    own = Gaussians(
-        np.arange(n), np.zeros(n), np.concatenate([grid, np.full((n, 1), 2.0)], axis=1),
-        np.tile([1.0, 0, 0, 0], (n, 1)), np.log(np.tile([0.06, 0.06, 0.001], (n, 1))), np.full((n, 3), 0.5),
-        np.where(grid[:, 0] < 0, 4.0, -4.0),
-    )  # fmt: skip
-    theta = np.zeros((2, 13))
-    theta[:, MEAN] = [[-0.6, 0, 2.0], [0.6, 0, 2.0]]
-    theta[:, LOG_COVARIANCE] = -8 * np.array([1, 1, 1, 0, 0, 0])
-    origin = np.eye(4)[None]
-    evidence = {
-        "alpha": Evidence.from_map("alpha", own, None, origin),
-        "bravo": Evidence("bravo", np.arange(2), np.zeros(2), theta, np.ones((2, 31))),
-    }
-    wall = [(0, np.full((CAMERA.height, CAMERA.width), 2.0, np.float32))]
-    still = {"alpha": origin, "bravo": origin}
-    fused = fuse(
-        "alpha", own, origin, evidence, evidence["alpha"], still, {}, wall, CAMERA, FusionConfig(), MATCHING
-    )
-    assert fused.source_ids[n:].tolist() == [1]
-
-
-def test_what_two_neighbours_share_is_taken_over_once():
-    world = World(14)
-    pair = {("bravo", "charlie"): world.pairs["bravo", "charlie"]}
-    fused = world.fuse("alpha", pairs=pair)  # bravo's, with what charlie says about them
-    assert (fused.matched, fused.added) == (0, N)
-    assert [fused.robots[s] for s in fused.source[N:]] == ["bravo"] * N
-    both = world.fuse("bravo", evidence={n: world.evidence[n] for n in ("bravo", "charlie")}, pairs=pair)
-    np.testing.assert_allclose(fused.gaussians.means[N:], both.gaussians.means, atol=2e-6)
-    np.testing.assert_array_equal(fused.members[N:], 2)
 
 
 @pytest.mark.parametrize(("config", "most_sigma"), [(CONFIG, 3e-3), (ALIKE, 0.05)])

@@ -49,6 +49,10 @@ class Result:
     T_world_keyframe_of: dict[str, np.ndarray] = field(default_factory=dict)
     pairs: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
 
+    @property
+    def depth_of(self) -> dict[str, str]:
+        return dict.fromkeys(self.evidence, "blended")
+
 
 @dataclass
 class Robot:

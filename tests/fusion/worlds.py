@@ -1,0 +1,93 @@
+"""Small teams whose robots hold the same Gaussians."""
+
+import numpy as np
+
+from pipeline.consensus.evidence import Evidence, pack_information
+from pipeline.consensus.matching import MatchingConfig
+from pipeline.fusion.fuse import FusionConfig, fuse
+from pipeline.geometry import se3
+from pipeline.geometry.camera import PinholeCamera
+from pipeline.splat.gaussians import Gaussians
+
+CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
+CONFIG = FusionConfig(
+    explained_opacity=0.0
+)  # what was measured explains, though these maps draw hardly anything
+# every robot ends with the same Gaussian
+ALIKE = FusionConfig(
+    association="members", scatter_position_m=0.004, scatter_log_covariance=0.14, explained_opacity=0.0
+)
+MATCHING = MatchingConfig()
+NAMES = ("alpha", "bravo", "charlie")
+N = 30
+
+
+def random_pose(rng):
+    return se3.from_quat_translation(rng.normal(size=4), rng.normal(size=3))
+
+
+def information(rng, n):
+    """Blocks of full rank with a contrast of about ten per axis."""
+    blocks = []
+    for d, scale in ((3, 1e5), (6, 10.0)):
+        A = rng.normal(size=(n, d, d)) + 2 * np.eye(d)
+        blocks.append(scale * A @ A.swapaxes(-1, -2))
+    return pack_information(*blocks, rng.uniform(100, 1000, (n, 3)), rng.uniform(1, 10, n))
+
+
+class World:
+    """Robots that each hold one Gaussian per place, in anchor frames, with all places matched."""
+
+    def __init__(self, seed, robots=3, keyframes=3):
+        rng = np.random.default_rng(seed)
+        self.names = NAMES[:robots]
+        truth = rng.normal(size=(N, 3))
+        self.T_world, self.maps, self.T_map, self.evidence = {}, {}, {}, {}
+        for k, name in enumerate(self.names):
+            T_world_map = random_pose(rng)
+            self.T_map[name] = np.array([random_pose(rng) for _ in range(keyframes)])
+            self.T_world[name] = T_world_map @ self.T_map[name]
+            means_world = truth + 0.005 * rng.normal(size=(N, 3))
+            self.maps[name] = Gaussians(
+                100 * k + np.arange(N),
+                rng.integers(keyframes, size=N),
+                se3.transform(se3.inverse(T_world_map), means_world),
+                rng.normal(size=(N, 4)),
+                rng.uniform(-5, -3.5, size=(N, 3)),
+                rng.uniform(size=(N, 3)),
+                rng.normal(size=N),
+            )
+            bare = Evidence.from_map(name, self.maps[name], None, self.T_map[name])
+            self.evidence[name] = Evidence(name, bare.ids, bare.anchors, bare.theta, information(rng, N))
+        self.pairs = {
+            (a, b): np.stack([self.maps[a].ids, self.maps[b].ids], axis=1)
+            for i, a in enumerate(self.names)
+            for b in self.names[i + 1 :]
+        }
+
+    def fuse(self, robot, config=CONFIG, depth_images=(), **changes):
+        given = {"evidence": self.evidence, "pairs": self.pairs, "T_world_keyframe": self.T_world} | changes
+        return fuse(
+            robot,
+            self.maps[robot],
+            self.T_map[robot],
+            given["evidence"],
+            given.get("own_splats", given["evidence"][robot]),
+            given["T_world_keyframe"],
+            given["pairs"],
+            depth_images,
+            CAMERA,
+            config,
+            given.get("matching", MATCHING),
+        )
+
+    def without_information(self, name):
+        e = self.evidence[name]
+        return Evidence(name, e.ids, e.anchors, e.theta, np.zeros_like(e.information))
+
+
+def assert_same_map(a, b, atol=0.0):
+    np.testing.assert_array_equal(a.gaussians.ids, b.gaussians.ids)
+    for name in ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits"):
+        np.testing.assert_allclose(getattr(a.gaussians, name), getattr(b.gaussians, name), rtol=0, atol=atol)
+    np.testing.assert_allclose(a.information, b.information, rtol=0, atol=atol * 1e6)
