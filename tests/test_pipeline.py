@@ -14,11 +14,12 @@ from pipeline.errors import DuagError
 from pipeline.evaluation import evaluate
 from pipeline.evaluation.network import Session
 from pipeline.exchange.record import read_session
+from pipeline.exchange.session import run_session
 from pipeline.inspection import Inspector, format_facts
 from pipeline.recording import Recording
 from pipeline.replay import replay
 from pipeline.run_folder import RunFolder
-from pipeline.runner import RunConfig, run
+from pipeline.runner import RunConfig, agent_input, run
 
 SMALL = (
     "frontend.mapping.max_gaussians=3000",
@@ -240,11 +241,20 @@ def test_what_the_images_allow_is_told_beside_the_error_of_the_team(finished: Pa
     assert " the run |" in reference.format_table(result)
 
 
-def test_a_signed_packet_can_be_asked_for(folder: Path, recording: Path) -> None:
-    """The signature is no part of what a packet says."""
-    run_folder = make_run(recording, folder / "run_signed", "exchange.transport.signatures=ed25519")
-    inspector = Inspector(RunFolder(run_folder))
-    packets = read_session(run_folder / "exchange.mcap").packets
+def test_a_signed_packet_can_be_asked_for(finished: Path, recording: Path, tmp_path: Path) -> None:
+    """The signature is no part of what a packet says. Of the run only the exchange is done again."""
+    settings = load(RunConfig, finished / "config.toml", ["exchange.transport.signatures=ed25519"])
+    logs = Recording(recording)
+    (tmp_path / "robots").symlink_to(finished / "robots")
+    run_session(
+        [agent_input(robot, logs.log(robot), tmp_path / "robots" / robot) for robot in logs.robots],
+        settings.exchange,
+        seed=settings.seed,
+        exchange_path=tmp_path / "exchange.mcap",
+        consensus_path=tmp_path / "consensus.mcap",
+    )
+    inspector = Inspector(RunFolder(tmp_path))
+    packets = read_session(tmp_path / "exchange.mcap").packets
     number = next(k for k, p in enumerate(packets) if p.kind_name == "EVIDENCE")
     facts = inspector.packet(number)
     assert facts["content"]["owner"] in ("alpha", "bravo")
