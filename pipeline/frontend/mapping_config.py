@@ -30,9 +30,9 @@ class MappingConfig(Config):
     """Optimisation steps (one view each) at a keyframe; every second one is on the newest keyframe."""
     iterations_level: int = 0
     """Image pyramid level of these steps: 0 full size, 1 half size."""
-    final_iterations: int = 60
+    final_iterations: int = 90
     """Steps of the final refinement for every keyframe, at full size, shared by all views."""
-    final_iterations_max: int = 2000
+    final_iterations_max: int = 6000
     """Most steps of the final refinement in all."""
     support_views: int = 40
     """Most tracked frames between keyframes that take part in the final refinement; 0: keyframes only."""
