@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -70,8 +71,13 @@ class Tracked:
 
 
 def track_log(path: Path, robot: str, config: FrontendConfig) -> Tracked:
-    """Poses of a log by the front end, without a map."""
-    config = config.model_copy(update={"mapping_enabled": False})
+    """Poses of a log by the front end, without a map.
+
+    That depth and colour contradict each other is what is to be calibrated: no frame is lost for it.
+    """
+    failure = config.tracking.failure.model_copy(update={"doubtful_gray_of_usual": math.inf})
+    tracking = config.tracking.model_copy(update={"failure": failure})
+    config = config.model_copy(update={"mapping_enabled": False, "tracking": tracking})
     with tempfile.TemporaryDirectory(prefix="duagc-calibrate-") as folder:
         run_frontend(path, Path(folder) / "frontend.mcap", config, progress=True)
         frames = RobotRun(robot, Path(folder)).frames
