@@ -32,9 +32,8 @@ MAX_LOG_COVARIANCE = 60.0  # beyond it exponentials overflow in float32
 
 RECORD = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f4", 13), ("information", "<f4", 31)])
 RECORD_DOUBLE = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f8", 13), ("information", "<f8", 31)])
-_EVIDENCE = struct.Struct(
-    "<HHI"
-)  # owner, 1 + index of the depth its map was made with, records of the whole message
+# owner, 1 + index of the depth its map was made with, records of the whole message
+_EVIDENCE = struct.Struct("<HHI")
 assert RECORD.itemsize == EVIDENCE_EXACT_BYTES
 assert RECORD_DOUBLE.itemsize == EVIDENCE_DOUBLE_BYTES
 assert COMPACT.itemsize == EVIDENCE_BYTES

@@ -48,6 +48,7 @@ def result_of(agent: Agent) -> AgentResult:
         T_world_keyframe_of=T_world,
         own_evidence=to_evidence(robot, own[np.argsort(own["id"])]),
         evidence={name: to_evidence(name, records) for name, records in evidence.items()},
+        # a robot that told no kind of depth told no Gaussian either: nothing of it is drawn
         depth_of={name: depths[name] or agent.data.depth for name in evidence},
         pairs=pairs,
         closures=tuple(_closures(agent)),

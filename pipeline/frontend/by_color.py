@@ -18,6 +18,9 @@ from pipeline.geometry import se3
 from pipeline.registration import Outcome, Reference, Registration, RegistrationConfig, RgbdPyramid, register
 
 Array = NDArray[np.float64]
+SHARE_AFTER_CONTRADICTION = (
+    0.5  # of what a contradiction may be; late depth is a smaller share of a longer way
+)
 OPEN_DIRECTION = 1e-4  # 1/m^2, 1/rad^2: a standard deviation of 100 m says nothing
 
 
@@ -81,12 +84,12 @@ class SoundFrame:
         """Whether colour alone puts a frame where colour and depth together do: both T_keyframe_camera, [4, 4].
 
         If the two images are of different times, or something moves before the camera, the answers differ by as
-        much as the camera moves. Those of a sound camera differ by a share of it. Depth that is late stays as late,
-        and becomes a smaller share of a longer way: once the two have `contradicted`, half of the share is allowed.
+        much as the camera moves. Those of a sound camera differ by a share of it; once the two have `contradicted`,
+        only SHARE_AFTER_CONTRADICTION of that share is allowed.
         """
         apart_m = float(se3.distance(T_keyframe_camera, by_color)[0])
         way_m = max(self.way_m(T_keyframe_camera), self.way_m(by_color))
-        share = limits.max_contradiction_of_way * (0.5 if contradicted else 1.0)
+        share = limits.max_contradiction_of_way * (SHARE_AFTER_CONTRADICTION if contradicted else 1.0)
         return apart_m <= max(limits.max_contradiction_m, share * way_m)
 
     def _information(self, result: Registration, sigma_m: float) -> Array:

@@ -96,9 +96,7 @@ class Tracker:
         self._unconfirmed: _Unconfirmed | None = None
         self._gray_rms: list[float] = []  # of the last frames that were followed
         self._obstruction = Obstruction(config.tracking.failure)
-        self._contradiction = (
-            False  # depth and colour contradicted each other, and nothing has cleared that up
-        )
+        self._contradiction = False  # of depth and colour, which nothing has cleared up
         self._without_depth = self._without_color = 0  # frames in a row without a usable image
         self._sound: SoundFrame | None = None  # the last frame with both, nothing before it
 

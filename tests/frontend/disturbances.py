@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -33,26 +34,44 @@ class Shot:
     foreign: bool = False
 
 
-def covered(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+Disturbance = Callable[[Sequence[Shot], np.random.Generator], Iterator[Shot]]
+
+
+def first(
+    frames: int,
+) -> Callable[[Callable[[int, Sequence[Shot], np.random.Generator], Shot]], Disturbance]:
+    """Make a disturbance of the first frames from what becomes of frame k."""
+
+    def of(becomes: Callable[[int, Sequence[Shot], np.random.Generator], Shot]) -> Disturbance:
+        @functools.wraps(becomes)
+        def disturbance(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+            for k, shot in enumerate(shots):
+                yield replace(becomes(k, shots, rng), disturbed=True) if k < frames else shot
+
+        return disturbance
+
+    return of
+
+
+def exposed(shot: Shot, gain: float) -> Shot:
+    """With `gain` times the light; bright pixels saturate."""
+    return replace(shot, color=np.clip(gain * shot.color.astype(np.float32), 0, 255).astype(np.uint8))
+
+
+@first(20)
+def covered(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
     """The lens is covered for 20 frames: dark noise, no depth."""
-    for k, shot in enumerate(shots):
-        if k >= 20:
-            yield shot
-            continue
-        dark = rng.integers(0, 4, shot.color.shape, dtype=np.uint8)
-        yield replace(shot, color=dark, depth=np.zeros_like(shot.depth), disturbed=True)
+    dark = rng.integers(0, 4, shots[k].color.shape, dtype=np.uint8)
+    return replace(shots[k], color=dark, depth=np.zeros_like(shots[k].depth))
 
 
-def hand(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+@first(20)
+def hand(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
     """For 20 frames something 40 cm away that moves with the camera hides half of the view."""
-    for k, shot in enumerate(shots):
-        if k >= 20:
-            yield shot
-            continue
-        color, depth = shot.color.copy(), shot.depth.copy()
-        half = slice(0, depth.shape[1] // 2)
-        color[:, half], depth[:, half] = 30, 0.4
-        yield replace(shot, color=color, depth=depth, disturbed=True)
+    color, depth = shots[k].color.copy(), shots[k].depth.copy()
+    half = slice(0, depth.shape[1] // 2)
+    color[:, half], depth[:, half] = 30, 0.4
+    return replace(shots[k], color=color, depth=depth)
 
 
 def foreign(other: Sequence[Shot]) -> Callable[[Sequence[Shot], np.random.Generator], Iterator[Shot]]:
@@ -69,14 +88,11 @@ def foreign(other: Sequence[Shot]) -> Callable[[Sequence[Shot], np.random.Genera
     return foreign_room
 
 
-def mirrored(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+@first(30)
+def mirrored(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
     """For 30 frames the images are those of the room in a mirror: another place that looks much like this one."""
-    for k, shot in enumerate(shots):
-        if k >= 30:
-            yield shot
-            continue
-        color, depth = (np.ascontiguousarray(a[:, ::-1]) for a in (shot.color, shot.depth))
-        yield replace(shot, color=color, depth=depth, disturbed=True, foreign=True)
+    color, depth = (np.ascontiguousarray(a[:, ::-1]) for a in (shots[k].color, shots[k].depth))
+    return replace(shots[k], color=color, depth=depth, foreign=True)
 
 
 def dropped(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
@@ -84,47 +100,39 @@ def dropped(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
     yield from (replace(shot, disturbed=True) for shot in shots[1::2])
 
 
-def frozen(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+@first(20)
+def frozen(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
     """For 20 frames the depth image is stuck while the colour moves on."""
-    for k, shot in enumerate(shots):
-        yield replace(shot, depth=shots[0].depth, disturbed=True) if k < 20 else shot
+    return replace(shots[k], depth=shots[0].depth)
 
 
-def frozen_color(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+@first(20)
+def frozen_color(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
     """For 20 frames the colour image is stuck while the depth moves on."""
-    for k, shot in enumerate(shots):
-        yield replace(shot, color=shots[0].color, disturbed=True) if k < 20 else shot
+    return replace(shots[k], color=shots[0].color)
 
 
-def flipped(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+@first(30)
+def flipped(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
     """For 30 frames the exposure jumps between a third and three times, every third frame; bright pixels saturate."""
-    for k, shot in enumerate(shots):
-        if k >= 30:
-            yield shot
-            continue
-        gain = (0.33, 3.0)[k // 3 % 2]
-        color = np.clip(gain * shot.color.astype(np.float32), 0, 255).astype(np.uint8)
-        yield replace(shot, color=color, disturbed=True)
+    return exposed(shots[k], (0.33, 3.0)[k // 3 % 2])
 
 
-def depthless(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+@first(20)
+def depthless(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
     """For 20 frames the depth camera delivers nothing."""
-    for k, shot in enumerate(shots):
-        yield replace(shot, depth=np.zeros_like(shot.depth), disturbed=True) if k < 20 else shot
+    return replace(shots[k], depth=np.zeros_like(shots[k].depth))
 
 
-def blurred(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+@first(10)
+def blurred(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
     """For 10 frames the colour is smeared over a sixteenth of the image's width, in another direction each."""
-    for k, shot in enumerate(shots):
-        if k >= 10:
-            yield shot
-            continue
-        length = shot.color.shape[1] // 16 | 1
-        line = np.zeros((length, length), dtype=np.float32)
-        end = (length // 2 * np.array([np.cos(k), np.sin(k)])).round().astype(int)
-        cv2.line(line, tuple((length // 2 - end).tolist()), tuple((length // 2 + end).tolist()), 1.0)
-        color = cv2.filter2D(shot.color, -1, line / line.sum())
-        yield replace(shot, color=np.asarray(color, dtype=np.uint8), disturbed=True)
+    length = shots[k].color.shape[1] // 16 | 1
+    line = np.zeros((length, length), dtype=np.float32)
+    end = (length // 2 * np.array([np.cos(k), np.sin(k)])).round().astype(int)
+    cv2.line(line, tuple((length // 2 - end).tolist()), tuple((length // 2 + end).tolist()), 1.0)
+    color = cv2.filter2D(shots[k].color, -1, line / line.sum())
+    return replace(shots[k], color=np.asarray(color, dtype=np.uint8))
 
 
 def passer(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
@@ -144,52 +152,38 @@ def passer(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
         yield replace(shot, color=color, depth=depth, disturbed=True)
 
 
-def hunting(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+@first(30)
+def hunting(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
     """For 30 frames the automatic exposure swings between a third and three times, once in 12 frames."""
-    for k, shot in enumerate(shots):
-        if k >= 30:
-            yield shot
-            continue
-        gain = 3.0 ** np.sin(2 * np.pi * (k + 1) / 12)
-        color = np.clip(gain * shot.color.astype(np.float32), 0, 255).astype(np.uint8)
-        yield replace(shot, color=color, disturbed=True)
+    return exposed(shots[k], 3.0 ** np.sin(2 * np.pi * (k + 1) / 12))
 
 
-def dark(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+@first(20)
+def dark(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
     """For 20 frames the light is off: the depth camera goes on, the colour is noise."""
-    for k, shot in enumerate(shots):
-        if k >= 20:
-            yield shot
-            continue
-        color = shot.color // 40 + rng.integers(0, 4, shot.color.shape, dtype=np.uint8)
-        yield replace(shot, color=color, disturbed=True)
+    color = shots[k].color // 40 + rng.integers(0, 4, shots[k].color.shape, dtype=np.uint8)
+    return replace(shots[k], color=color)
 
 
-def half_depth(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+@first(20)
+def half_depth(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
     """For 20 frames the right half of the depth image is missing."""
-    for k, shot in enumerate(shots):
-        if k >= 20:
-            yield shot
-            continue
-        depth = shot.depth.copy()
-        depth[:, depth.shape[1] // 2 :] = 0
-        yield replace(shot, depth=depth, disturbed=True)
+    depth = shots[k].depth.copy()
+    depth[:, depth.shape[1] // 2 :] = 0
+    return replace(shots[k], depth=depth)
 
 
-def late_depth(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+@first(30)
+def late_depth(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
     """For 30 frames the depth image is that of two frames before."""
-    for k, shot in enumerate(shots):
-        yield replace(shot, depth=shots[max(k - 2, 0)].depth, disturbed=True) if k < 30 else shot
+    return replace(shots[k], depth=shots[max(k - 2, 0)].depth)
 
 
-def noisy_stuck(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
+@first(20)
+def noisy_stuck(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
     """For 20 frames the depth image is stuck, but something adds 0.3 % of noise to it, new in every frame."""
-    for k, shot in enumerate(shots):
-        if k >= 20:
-            yield shot
-            continue
-        noise = 1 + 0.003 * rng.standard_normal(shot.depth.shape, dtype=np.float32)
-        yield replace(shot, depth=shots[0].depth * noise, disturbed=True)
+    noise = 1 + 0.003 * rng.standard_normal(shots[k].depth.shape, dtype=np.float32)
+    return replace(shots[k], depth=shots[0].depth * noise)
 
 
 def paused(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
@@ -202,9 +196,6 @@ def odd_stamps(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot
     for k, shot in enumerate(shots):
         later_ns = (30_000_000 if k % 3 == 0 else 0) if k < 30 else 10_000_000_000
         yield replace(shot, stamp_ns=shot.stamp_ns + later_ns, disturbed=k <= 30)
-
-
-Disturbance = Callable[[Sequence[Shot], np.random.Generator], Iterator[Shot]]
 
 
 def every(other: Sequence[Shot]) -> list[Disturbance]:
