@@ -1,3 +1,1 @@
-"""DUAG-C: recordings of a robot team to one uncertainty-weighted Gaussian map, without a central server."""
-
-__version__ = "0.1.0"
+"""The stages of a run, the mathematics below them, and the readers of what they leave."""

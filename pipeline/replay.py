@@ -9,12 +9,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.config import load
-from pipeline.digest import ROBOT_RESULTS, digest_file
-from pipeline.errors import DuagError
-from pipeline.files import check_file
-from pipeline.run_folder import RunFolder
-from pipeline.runner import RunConfig, agent_input, fuse_robot, prepare_robot, threads_per_worker
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import check_file
+from duagc.pipeline.config.base import load
+from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.runner import agent_input, fuse_robot, prepare_robot, threads_per_worker
+from duagc.pipeline.runs.digest import ROBOT_RESULTS, digest_file
+from duagc.pipeline.runs.folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def replay(
     Returns:
         One comparison per result file, and one for the packets that the robot sent.
     """
-    from pipeline.recording import Recording
+    from duagc.pipeline.recording import Recording
 
     config = load(RunConfig, RunFolder(run).config_file)
     logs = Recording(recording)
@@ -69,7 +70,7 @@ def replay(
 def _replay_one(
     run: Path, log: Path, robot: str, folder: Path, config: RunConfig, say: Callable[[str], None]
 ) -> list[Comparison]:
-    from pipeline.exchange.replay import replay_agent
+    from duagc.pipeline.exchange.replay import replay_agent
 
     say(f"{robot}: front end and information")
     prepare_robot(log, robot, folder, config, threads_per_worker(1))

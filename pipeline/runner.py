@@ -12,50 +12,20 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-from pydantic import model_validator
-
-from pipeline import __version__, numeric
-from pipeline.config import Config, dump
-from pipeline.digest import digest_file, result_files
-from pipeline.errors import DuagError
-from pipeline.exchange.config import ExchangeConfig
-from pipeline.frontend.config import FrontendConfig
-from pipeline.fusion.config import FusionConfig
-from pipeline.information.config import InformationConfig
-from pipeline.new_folder import new_folder
-from pipeline.robot import AgentInput, AgentResult
-from pipeline.run_folder import SCHEMA
-from pipeline.workers import worker_pool
+from duagc import __version__
+from duagc.pipeline.base import determinism
+from duagc.pipeline.base.atomic_folder import new_folder
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.workers import worker_pool
+from duagc.pipeline.config.base import dump
+from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.runs.digest import digest_file, result_files
+from duagc.pipeline.runs.folder import SCHEMA
+from duagc.pipeline.runs.robot_data import AgentInput, AgentResult
 
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
-
-
-class RunConfig(Config):
-    """Everything that decides what a run computes."""
-
-    seed: int = 0
-    """Seed of every random stream of the run."""
-
-    frontend: FrontendConfig = FrontendConfig()
-    information: InformationConfig = InformationConfig()
-    exchange: ExchangeConfig = ExchangeConfig()
-    fusion: FusionConfig = FusionConfig()
-
-    @model_validator(mode="after")
-    def _one_thickness(self) -> Self:
-        """The information stage and the matching must know the floor that the map was made with."""
-        floor_m = self.frontend.mapping.seeding.thickness_m
-        for name, other_m in (
-            ("information.thickness_floor_m", self.information.thickness_floor_m),
-            ("exchange.matching.thickness_floor_m", self.exchange.matching.thickness_floor_m),
-        ):
-            if other_m != floor_m:
-                raise ValueError(
-                    f"{name} = {other_m}, expected frontend.mapping.seeding.thickness_m = {floor_m}"
-                )
-        return self
 
 
 class Timing:
@@ -91,11 +61,11 @@ def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, thread
     Returns:
         The timings of the stages.
     """
-    from pipeline.frontend.stage import run_frontend
-    from pipeline.information.stage import run_information
-    from pipeline.recording import open_rgbd
+    from duagc.pipeline.frontend.stage import run_frontend
+    from duagc.pipeline.information.stage import run_information
+    from duagc.pipeline.recording import open_rgbd
 
-    numeric.settle_opencv()
+    determinism.settle_opencv()
     with open_rgbd(log) as camera:
         if camera.robot != robot:
             raise DuagError(f"{log}: is the log of {camera.robot}, expected that of {robot}")
@@ -148,8 +118,8 @@ def run(
     Raises:
         DuagError: what a user can fix; nothing is left under the name `out`.
     """
-    from pipeline.evaluation import check_ground_truth
-    from pipeline.recording import Recording, content_digest
+    from duagc.pipeline.evaluation import check_ground_truth
+    from duagc.pipeline.recording import Recording, content_digest
 
     recording = Recording(recording_path)
     with new_folder(out, force) as folder:
@@ -186,9 +156,9 @@ def run(
 def _exchange(
     logs: dict[str, Path], folder: Path, config: RunConfig, timing: Timing
 ) -> dict[str, AgentResult]:
-    from pipeline.exchange.session import run_session
+    from duagc.pipeline.exchange.session import run_session
 
-    numeric.settle_opencv()
+    determinism.settle_opencv()
     inputs = [agent_input(robot, log, folder / "robots" / robot) for robot, log in logs.items()]
     with timing.stage("exchange"):
         return run_session(
@@ -211,7 +181,7 @@ def fuse_robot(robot: str, log: Path, folder: Path, result: AgentResult, config:
     Returns:
         Neighbours of whose maps nothing is used, and why.
     """
-    from pipeline.fusion.stage import run_fusion
+    from duagc.pipeline.fusion.stage import run_fusion
 
     doubts = run_fusion(
         agent_input(robot, log, folder),
@@ -228,7 +198,7 @@ def fuse_robot(robot: str, log: Path, folder: Path, result: AgentResult, config:
 
 
 def _evaluate(folder: Path, recording: Path, timing: Timing) -> None:
-    from pipeline.evaluation import evaluate
+    from duagc.pipeline.evaluation import evaluate
 
     with timing.stage("evaluation"):
         evaluate(folder, recording, threads=threads_per_worker(1))
@@ -236,8 +206,8 @@ def _evaluate(folder: Path, recording: Path, timing: Timing) -> None:
 
 
 def _present(folder: Path, recording: Path, timing: Timing) -> None:
-    from pipeline.report import write_report
-    from pipeline.viewer import write_rrd
+    from duagc.pipeline.report import write_report
+    from duagc.pipeline.viewing.rerun_view import write_rrd
 
     with timing.stage("report"):
         write_report(folder, recording)

@@ -1,5 +1,5 @@
 """Settings that every test shares; they must be in place before numpy is imported."""
 
-from pipeline import numeric
+from duagc.pipeline.base import determinism
 
-numeric.settle()
+determinism.settle()

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import cli
-from pipeline.errors import DuagError
-from pipeline.files import new_file
-from pipeline.new_folder import new_folder
+from duagc.pipeline import cli
+from duagc.pipeline.base.atomic_folder import new_folder
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import new_file
 
 ROOT = Path(__file__).parents[1]
 
 
 def duagc(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", "from pipeline.cli import main; main()", *map(str, arguments)]
+    command = [sys.executable, "-c", "from duagc.pipeline.cli import main; main()", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120, check=False)
 
 
@@ -97,7 +97,7 @@ def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
 
 def test_a_full_disk_is_one_line() -> None:
     command = "lambda: open('/dev/full', 'wb', buffering=0).write(b'a log')"
-    code = f"from pipeline import cli; cli.app = {command}; cli.main()"
+    code = f"from duagc.pipeline import cli; cli.app = {command}; cli.main()"
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False
     )
@@ -160,7 +160,7 @@ def _listen_to_interrupts() -> None:
 
 
 def test_an_interrupted_command_is_one_line(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", "from pipeline.cli import main; main()", "simulate", "--out"]
+    command = [sys.executable, "-c", "from duagc.pipeline.cli import main; main()", "simulate", "--out"]
     process = subprocess.Popen(
         [*command, str(tmp_path / "out")],
         stderr=subprocess.PIPE,

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.config import Config, dump, load
-from pipeline.errors import DuagError
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.base import Config, dump, load
 
 
 class Link(Config):

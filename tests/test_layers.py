@@ -7,34 +7,13 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+from tests.layers import LAYERS, PARTS, ROOT, Part
 
-# what each part of pipeline/ may import from pipeline/, besides itself
-FOUNDATION = {"__init__", "errors", "files", "config", "numeric", "streams", "progress", "geometry"}
-MATHEMATICS = FOUNDATION | {"kernels", "splat", "registration"}
-LOGS = {"messages", "recording"}
-ALLOWED = {
-    "geometry": FOUNDATION,
-    "kernels": FOUNDATION | {"splat"},  # the Gaussians' structure of arrays
-    "splat": FOUNDATION | {"kernels"},
-    "registration": FOUNDATION,
-    "messages": FOUNDATION | {"splat"},
-    "recording": FOUNDATION | {"messages"},
-    "digest": FOUNDATION | LOGS,
-    "frontend": MATHEMATICS | LOGS,
-    "calibration": MATHEMATICS | LOGS | {"frontend", "run_folder"},
-    "information": MATHEMATICS | LOGS,
-    "consensus": MATHEMATICS,
-    "robot": MATHEMATICS | LOGS | {"consensus"},
-    "fusion": MATHEMATICS | LOGS | {"consensus", "robot"},
-    "exchange": MATHEMATICS | LOGS | {"consensus", "robot"},
-    "posegraph": FOUNDATION | {"consensus", "exchange"},
-}
-ESTIMATOR = sorted(set(ALLOWED) - {"messages", "recording", "digest"})
+SOURCES = ("pipeline", "converters", "schemas")
 
 
-def modules(folder: str) -> list[Path]:
-    return sorted((ROOT / folder).rglob("*.py"))
+def modules(folder: Path) -> list[Path]:
+    return sorted(folder.rglob("*.py")) if folder.is_dir() else [folder.with_suffix(".py")]
 
 
 def imports_of(path: Path) -> set[str]:
@@ -48,32 +27,60 @@ def imports_of(path: Path) -> set[str]:
     return names
 
 
-def part_of(path: Path) -> str:
-    return path.relative_to(ROOT / "pipeline").parts[0].removesuffix(".py")
+def part_of(name: str) -> str | None:
+    """The part that a dotted name belongs to; None if it is nobody's."""
+    words = name.split(".")
+    if words[0] != "duagc" or len(words) < 2:
+        return None
+    if words[1] == "pipeline":
+        return words[2] if len(words) > 2 else None
+    return words[1] if words[1] in PARTS else None
 
 
-@pytest.mark.parametrize("path", modules("pipeline"), ids=lambda p: str(p.relative_to(ROOT)))
-def test_imports_go_one_way(path: Path) -> None:
-    part = part_of(path)
-    imported = {name.split(".")[1] for name in imports_of(path) if name.startswith("pipeline.")}
-    allowed = ALLOWED.get(part)
-    if allowed is not None:
-        assert imported <= allowed | {part}, f"{part} imports {sorted(imported - allowed - {part})}"
-    assert part == "viewer" or not any(n.split(".")[0] == "rerun" for n in imports_of(path))
-    assert part in ("bench", "cli") or "bench" not in imported, f"{part} imports what only measures"
+ALL = [path for source in SOURCES for path in modules(ROOT / source)]
 
 
-@pytest.mark.parametrize("part", ESTIMATOR)
-def test_the_estimator_knows_no_ground_truth(part: str) -> None:
-    paths = modules(f"pipeline/{part}") or [ROOT / "pipeline" / f"{part}.py"]
-    for path in paths:
+def test_every_module_belongs_to_a_part_of_the_table() -> None:
+    named = {path for part in PARTS.values() for path in modules(part.folder)}
+    assert set(ALL) - named == {ROOT / "pipeline" / "__init__.py"}
+
+
+def test_the_table_itself_goes_one_way() -> None:
+    below: set[str] = set()
+    for layer in LAYERS:
+        for part in layer:
+            assert part.uses <= below, f"{part.name} uses {sorted(part.uses - below)}, expected lower layers"
+        below |= {part.name for part in layer}
+
+
+@pytest.mark.parametrize("part", PARTS.values(), ids=lambda part: part.name)
+def test_imports_go_one_way(part: Part) -> None:
+    for path in modules(part.folder):
+        imported = {found for name in imports_of(path) if (found := part_of(name)) is not None}
+        wrong = imported - part.uses - {part.name}
+        assert not wrong, f"{path.relative_to(ROOT)} imports {sorted(wrong)}"
+        if part.name != "viewing":
+            assert not any(name.split(".")[0] == "rerun" for name in imports_of(path)), path
+
+
+@pytest.mark.parametrize("part", [p for p in PARTS.values() if p.estimator], ids=lambda part: part.name)
+def test_the_estimator_knows_no_ground_truth(part: Part) -> None:
+    for path in modules(part.folder):
         text = path.read_text().lower()
         for word in ("groundtruth", "ground_truth"):
             assert word not in text, f"{path.relative_to(ROOT)} mentions {word}"
 
 
+@pytest.mark.parametrize("folder", [*SOURCES, "tests", "duagc", "examples"])
+def test_nothing_is_imported_by_a_bare_name(folder: str) -> None:
+    """From a checkout `import pipeline` works as well, and gives a second copy of every class."""
+    for path in modules(ROOT / folder):
+        bare = sorted(name for name in imports_of(path) if name.split(".")[0] in SOURCES)
+        assert not bare, f"{path.relative_to(ROOT)} imports {bare}, expected duagc.{bare[0]}"
+
+
 def test_the_command_starts_light() -> None:
     heavy = {"numpy", "torch", "cv2", "rerun", "open3d", "scipy", "mcap"}
-    code = f"import sys, pipeline.cli; print(sorted({heavy} & set(sys.modules)))"
+    code = f"import sys, duagc.pipeline.cli; print(sorted({heavy} & set(sys.modules)))"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert out.stdout.strip() == "[]"

@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import schemas
-from pipeline import messages as m
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.splat.gaussians import Gaussians
+from duagc import schemas
+from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.splat.gaussians import Gaussians
 
 SEEDS = st.integers(0, 2**32 - 1)
 

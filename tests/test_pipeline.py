@@ -6,20 +6,21 @@ from pathlib import Path
 
 import pytest
 
-from converters.simulate import simulate
-from pipeline.bench import reference, team
-from pipeline.config import load
-from pipeline.digest import digest, digest_file, result_files
-from pipeline.errors import DuagError
-from pipeline.evaluation import evaluate
-from pipeline.evaluation.network import Session
-from pipeline.exchange.record import read_session
-from pipeline.exchange.session import run_session
-from pipeline.inspection import Inspector, format_facts
-from pipeline.recording import Recording
-from pipeline.replay import replay
-from pipeline.run_folder import RunFolder
-from pipeline.runner import RunConfig, agent_input, run
+from duagc.converters.simulate.team import simulate
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.base import load
+from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.evaluation import evaluate
+from duagc.pipeline.evaluation.network import Session
+from duagc.pipeline.exchange.record import read_session
+from duagc.pipeline.exchange.session import run_session
+from duagc.pipeline.experiments import pose_reference, team_faults
+from duagc.pipeline.recording import Recording
+from duagc.pipeline.replay import replay
+from duagc.pipeline.runner import agent_input, run
+from duagc.pipeline.runs.digest import digest, digest_file, result_files
+from duagc.pipeline.runs.folder import RunFolder
+from duagc.pipeline.viewing.inspection import Inspector, format_facts
 
 SMALL = (
     "frontend.mapping.max_gaussians=3000",
@@ -210,7 +211,9 @@ def test_every_candidate_of_a_run_can_be_asked_for_with_its_reason(finished: Pat
 def test_the_exchange_of_a_run_can_be_repeated_under_faults(finished: Path, recording: Path) -> None:
     settings = load(RunConfig, finished / "config.toml", [])
     checks = ["frames", "names", "closures", "silence", "solver"]
-    result = team.run(RunFolder(finished), Recording(recording), settings.exchange, settings.seed, checks, 1)
+    result = team_faults.run(
+        RunFolder(finished), Recording(recording), settings.exchange, settings.seed, checks, 1
+    )
     told = json.loads((finished / "metrics.json").read_text())["team"]["ate_rmse_m"]
     assert result["base"]["team_ate_rmse_m"] == pytest.approx(told, abs=1e-9)
     rows = {row["case"]: row for row in result["rows"]}
@@ -221,12 +224,12 @@ def test_the_exchange_of_a_run_can_be_repeated_under_faults(finished: Path, reco
         assert result["worst"][case]["apart"] == 0
     assert rows["closures"]["closures_measured"] > result["base"]["closures_measured"]
     assert rows["closures"]["false_closures_kept"] == 0
-    assert "not together" in team.format_table(result)
+    assert "not together" in team_faults.format_table(result)
 
 
 def test_what_the_images_allow_is_told_beside_the_error_of_the_team(finished: Path, recording: Path) -> None:
     config = load(RunConfig, finished / "config.toml", []).frontend
-    result = reference.run(RunFolder(finished), Recording(recording), config)
+    result = pose_reference.run(RunFolder(finished), Recording(recording), config)
     metrics = json.loads((finished / "metrics.json").read_text())
     told = metrics["team"]["ate_rmse_m"]
     assert result["closures"] == metrics["team"]["inter_robot_closures"] > 0
@@ -238,7 +241,7 @@ def test_what_the_images_allow_is_told_beside_the_error_of_the_team(finished: Pa
     for start in ("images, from the run", "images, from the truth"):  # exact images lead to the truth
         assert rows[start]["team_ate_rmse_m"] < 0.002
         assert rows[start]["agreement_m"]["within"] < 0.002
-    assert " the run |" in reference.format_table(result)
+    assert " the run |" in pose_reference.format_table(result)
 
 
 def test_a_signed_packet_can_be_asked_for(finished: Path, recording: Path, tmp_path: Path) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import DuagError
-from pipeline.evaluation import evaluate
-from pipeline.replay import replay
-from pipeline.report import write_report
-from pipeline.run_folder import RunFolder
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.evaluation import evaluate
+from duagc.pipeline.replay import replay
+from duagc.pipeline.report import write_report
+from duagc.pipeline.runs.folder import RunFolder
 from tests.evaluation import fake_run
 
 

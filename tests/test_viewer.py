@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import viewer
-from pipeline.errors import DuagError
-from pipeline.evaluation import evaluate
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.evaluation import evaluate
+from duagc.pipeline.viewing import rerun_view
 from tests.evaluation.fake_run import FRAMES, KEYFRAMES, FakeRun, make, wall
 
 
@@ -51,7 +51,7 @@ def test_ground_truth_and_results_open_in_rerun_as_they_are(fake):
 
 
 def test_a_recording_becomes_a_file_with_depth_in_metres(fake, tmp_path):
-    viewer.view(fake.recording, save=tmp_path / "recording.rrd")
+    rerun_view.view(fake.recording, save=tmp_path / "recording.rrd")
     found = of_rrd(tmp_path / "recording.rrd")
     for robot in ("alpha", "bravo"):
         depth = found[f"/{robot}/camera/depth"]
@@ -64,7 +64,7 @@ def test_a_recording_becomes_a_file_with_depth_in_metres(fake, tmp_path):
 
 def test_a_run_becomes_a_file_with_everything_in_it(fake, tmp_path):
     evaluate(fake.run, fake.recording, progress=False)
-    found = of_rrd(viewer.write_rrd(fake.run, fake.recording, tmp_path / "run.rrd"))
+    found = of_rrd(rerun_view.write_rrd(fake.run, fake.recording, tmp_path / "run.rrd"))
     for robot in ("alpha", "bravo"):
         for path in ("before_consensus", "after_consensus", "ground_truth"):
             assert found[f"/world/paths/{robot}/{path}"]["LineStrips3D:strips"] == 1
@@ -84,7 +84,7 @@ def test_a_run_becomes_a_file_with_everything_in_it(fake, tmp_path):
 
 def test_robots_that_never_met_share_no_world(tmp_path):
     fake = make(tmp_path, joined=False, truth=False)
-    found = of_rrd(viewer.write_rrd(fake.run, fake.recording, tmp_path / "run.rrd"))
+    found = of_rrd(rerun_view.write_rrd(fake.run, fake.recording, tmp_path / "run.rrd"))
     assert "/world/maps/alpha/fused" in found
     assert "/world_of_bravo/maps/bravo/fused" in found
     assert "/world/paths/alpha/ground_truth" not in found
@@ -94,22 +94,22 @@ def test_thinning_keeps_what_covers_most():
     gaussians = wall()
     large = gaussians.log_scales.copy()
     large[::7] += 1.0
-    chosen = viewer.thinned(gaussians.replace(log_scales=large), len(large[::7]))
+    chosen = rerun_view.thinned(gaussians.replace(log_scales=large), len(large[::7]))
     assert np.array_equal(chosen, np.arange(len(gaussians))[::7])
-    assert np.array_equal(viewer.thinned(gaussians, 10**6), np.arange(len(gaussians)))
+    assert np.array_equal(rerun_view.thinned(gaussians, 10**6), np.arange(len(gaussians)))
 
 
 def test_a_made_file_is_copied_not_made_again(fake, tmp_path):
     made = fake.run / "run.rrd"
     made.write_bytes(b"made before")
-    viewer.view(fake.run, save=tmp_path / "copy.rrd")
+    rerun_view.view(fake.run, save=tmp_path / "copy.rrd")
     made.unlink()
     assert (tmp_path / "copy.rrd").read_bytes() == b"made before"
 
 
 def test_what_is_neither_a_run_nor_a_recording_is_an_error(tmp_path):
     with pytest.raises(DuagError, match="expected a run"):
-        viewer.view(tmp_path, save=tmp_path / "out.rrd")
+        rerun_view.view(tmp_path, save=tmp_path / "out.rrd")
 
 
 def test_a_machine_that_cannot_draw_says_so(fake, tmp_path, monkeypatch):
@@ -120,7 +120,7 @@ def test_a_machine_that_cannot_draw_says_so(fake, tmp_path, monkeypatch):
 
     monkeypatch.setattr(ViewerClient, "spawn", panic)
     with pytest.raises(DuagError, match=r"No graphics adapter was found.*mesa-vulkan-drivers"):
-        viewer.view(fake.recording, screenshot=tmp_path / "out.png")
+        rerun_view.view(fake.recording, screenshot=tmp_path / "out.png")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -135,4 +135,4 @@ def test_a_window_that_does_not_open_is_an_error(fake, monkeypatch):
 
     monkeypatch.setattr(subprocess, "run", no_display)
     with pytest.raises(DuagError, match=r"DISPLAY is set.*--save"):
-        viewer.view(fake.recording)
+        rerun_view.view(fake.recording)

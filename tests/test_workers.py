@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import DuagError
-from pipeline.workers import worker_pool
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.workers import worker_pool
 
 ROOT = Path(__file__).parents[1]
 
@@ -58,7 +58,7 @@ def test_an_error_ends_the_tasks_of_the_others() -> None:
 def test_workers_end_with_a_killed_parent() -> None:
     code = """
 import os, time
-from pipeline.workers import worker_pool
+from duagc.pipeline.base.workers import worker_pool
 if __name__ == "__main__":
     with worker_pool(1) as pool:
         print(pool.submit(os.getpid).result(), flush=True)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import Any
 
-from converters.logs.files import Log
-from converters.ros_images import is_depth
-from pipeline.errors import DuagError, closest
+from duagc.converters.layouts.ros_images import is_depth
+from duagc.converters.logs.files import Log
+from duagc.pipeline.base.errors import DuagError, closest
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO_TYPE = "sensor_msgs/msg/CameraInfo"

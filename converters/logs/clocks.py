@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.entries import NANOSECONDS
-from converters.logs.files import Log
-from pipeline.geometry import so3
+from duagc.converters.logs.entries import NANOSECONDS
+from duagc.converters.logs.files import Log
+from duagc.pipeline.geometry import so3
 
 Array = NDArray[np.float64]
 MOST_SHARED = 5000  # messages of a log that are compared

@@ -9,18 +9,26 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.derived_depth import ROW_PAIRS, STEREO_SCALE_M, Lidar, StereoFrames, decoded, png, spread
-from converters.logs.files import Log
-from converters.logs.frames import Transforms
-from converters.logs.motion import extrinsics_of
-from converters.logs.options import LogOptions
-from converters.ros_images import RosCamera, color_bytes
-from converters.stereo import RawCamera, StereoRig
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording.lidar import lidar_depth
-from pipeline.recording.motion import MotionPrior
+from duagc.converters.layouts.derived_depth import (
+    ROW_PAIRS,
+    STEREO_SCALE_M,
+    Lidar,
+    StereoFrames,
+    decoded,
+    png,
+    spread,
+)
+from duagc.converters.layouts.ros_images import RosCamera, color_bytes
+from duagc.converters.layouts.stereo import RawCamera, StereoRig
+from duagc.converters.logs.files import Log
+from duagc.converters.logs.frames import Transforms
+from duagc.converters.logs.motion import extrinsics_of
+from duagc.converters.logs.options import LogOptions
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording.lidar import lidar_depth
+from duagc.pipeline.recording.motion import MotionPrior
 
 Array = NDArray[np.float64]
 

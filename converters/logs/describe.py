@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from converters.logs.choice import POINTS_TYPE, Chooser
-from converters.logs.clocks import compare, overlap_warnings
-from converters.logs.entries import NANOSECONDS, Entry
-from converters.logs.files import SUFFIXES, Log, open_log
-from converters.logs.motion import IMU_TYPE, POSE_TYPES
-from converters.logs.robot_log import RobotLog
-from converters.logs.sources import Source, is_log, robot_of, sources_of
-from pipeline.errors import DuagError
-from pipeline.progress import track
-from pipeline.recording.names import LOG_RECORD, MAGIC, RECORDING_FILE
+from duagc.converters.logs.choice import POINTS_TYPE, Chooser
+from duagc.converters.logs.clocks import compare, overlap_warnings
+from duagc.converters.logs.entries import NANOSECONDS, Entry
+from duagc.converters.logs.files import SUFFIXES, Log, open_log
+from duagc.converters.logs.motion import IMU_TYPE, POSE_TYPES
+from duagc.converters.logs.robot_log import RobotLog
+from duagc.converters.logs.sources import Source, is_log, robot_of, sources_of
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.recording.names import LOG_RECORD, MAGIC, RECORDING_FILE
 
 HEAD_BYTES = 1024
 HEADERS_FIRST, HEADERS_EACH = (

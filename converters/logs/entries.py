@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.errors import DuagError
+from duagc.pipeline.base.errors import DuagError
 
 NANOSECONDS = 1_000_000_000
 LAST_NS = 1 << 62

@@ -6,7 +6,7 @@
         for entry in log.entries("/camera/color/image_raw"):
             image = entry.read()          # attributes as ROS names them, whatever the encoding
 
-Types and fields are those of ROS: Foxglove's messages are brought into that form (`converters.logs.foxglove`).
+Types and fields are those of ROS: Foxglove's messages are brought into that form (`duagc.converters.logs.foxglove`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from converters.logs.entries import Entry, Topic
-from pipeline.errors import DuagError
+from duagc.converters.logs.entries import Entry, Topic
+from duagc.pipeline.base.errors import DuagError
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 
@@ -108,11 +108,11 @@ def _open_part(path: Path) -> LogPart:
     if not path.exists():
         raise DuagError(f"{path}: no such file or folder, expected a log ({', '.join(SUFFIXES)})")
     if path.suffix == ".mcap" and path.is_file():
-        from converters.logs.mcap_file import McapFile
+        from duagc.converters.logs.mcap_file import McapFile
 
         return McapFile(path)
     if path.suffix in SUFFIXES or (path / "metadata.yaml").is_file():
-        from converters.logs.rosbag_file import RosBag
+        from duagc.converters.logs.rosbag_file import RosBag
 
         return RosBag(path)
     raise DuagError(f"{path}: is no log, expected {', '.join(SUFFIXES)} or a folder of `ros2 bag`")

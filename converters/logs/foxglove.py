@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from pipeline.errors import DuagError
+from duagc.pipeline.base.errors import DuagError
 
 ROS_TYPES = {
     "foxglove.CompressedImage": "sensor_msgs/msg/CompressedImage",

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.entries import Entry, stamp_ns
-from converters.logs.files import Log
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
+from duagc.converters.logs.entries import Entry, stamp_ns
+from duagc.converters.logs.files import Log
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
 
 Array = NDArray[np.float64]
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")

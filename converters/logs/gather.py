@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.entries import Entry
-from converters.logs.files import Log
-from pipeline.errors import DuagError
+from duagc.converters.logs.entries import Entry
+from duagc.converters.logs.files import Log
+from duagc.pipeline.base.errors import DuagError
 
 MOST_KEPT_BYTES = 512 << 20
 

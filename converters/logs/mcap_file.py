@@ -13,10 +13,11 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from converters.logs import foxglove, ros_json
-from converters.logs.entries import Entry, Topic, ros_type, sound_time, stamp_ns
-from converters.logs.mcap_chunks import Chunks
-from converters.logs.rosbag_file import (
+from duagc import schemas
+from duagc.converters.logs import foxglove, ros_json
+from duagc.converters.logs.entries import Entry, Topic, ros_type, sound_time, stamp_ns
+from duagc.converters.logs.mcap_chunks import Chunks
+from duagc.converters.logs.rosbag_file import (
     LARGEST_CHUNK,
     check_definitions,
     deserialised,
@@ -24,9 +25,9 @@ from converters.logs.rosbag_file import (
     reason,
     ros_header_ns,
 )
-from pipeline.errors import DuagError
-from pipeline.files import check_file
-from pipeline.recording.names import MAGIC
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import check_file
+from duagc.pipeline.recording.names import MAGIC
 
 WANTED = "a sound MCAP log"
 
@@ -294,7 +295,6 @@ class _Foxglove:
         return foxglove.first_stamp_of_protobuf(head)
 
     def _message(self, data: bytes, where: str) -> Any:
-        import schemas
 
         try:
             if self.encoding == "json":

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.entries import NANOSECONDS, Entry, sound_time
-from converters.logs.files import Log
-from converters.logs.frames import TF_TYPES, Transforms, frame_name, pose_matrix, transforms_in
-from converters.logs.options import LogOptions
-from converters.tum_layout import Poses
-from pipeline.errors import DuagError, closest
-from pipeline.geometry import se3
-from pipeline.recording.motion import GyroPrior, MotionPrior, OdometryPrior
+from duagc.converters.layouts.tum_layout import Poses
+from duagc.converters.logs.entries import NANOSECONDS, Entry, sound_time
+from duagc.converters.logs.files import Log
+from duagc.converters.logs.frames import TF_TYPES, Transforms, frame_name, pose_matrix, transforms_in
+from duagc.converters.logs.options import LogOptions
+from duagc.pipeline.base.errors import DuagError, closest
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.recording.motion import GyroPrior, MotionPrior, OdometryPrior
 
 Array = NDArray[np.float64]
 POSE_TYPES = (

@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from converters.stereo import StereoOptions
-from converters.tum_layout import AssociationOptions
+from duagc.converters.layouts.stereo import StereoOptions
+from duagc.converters.layouts.tum_layout import AssociationOptions
 
 
 class LogOptions(AssociationOptions, StereoOptions):

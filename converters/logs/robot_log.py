@@ -12,21 +12,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.logs.choice import REGISTERED, Chooser, video_words
-from converters.logs.clocks import Drift, RobotClock, drift
-from converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
-from converters.logs.entries import NANOSECONDS, Entry, sound_time
-from converters.logs.files import Log
-from converters.logs.frames import Transforms, pose_matrix
-from converters.logs.gather import gathered
-from converters.logs.motion import CameraPoses, Imu, MotionReader, extrinsics_of
-from converters.logs.options import LogOptions
-from converters.ros_images import RosCamera, is_integer_depth, size_of
-from converters.tum_layout import Listed, associate
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
-from pipeline.progress import track
-from pipeline.recording.register_depth import MOST_SAMPLES, sample_steps
+from duagc.converters.layouts.ros_images import RosCamera, is_integer_depth, size_of
+from duagc.converters.layouts.tum_layout import Listed, associate
+from duagc.converters.logs.choice import REGISTERED, Chooser, video_words
+from duagc.converters.logs.clocks import Drift, RobotClock, drift
+from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
+from duagc.converters.logs.entries import NANOSECONDS, Entry, sound_time
+from duagc.converters.logs.files import Log
+from duagc.converters.logs.frames import Transforms, pose_matrix
+from duagc.converters.logs.gather import gathered
+from duagc.converters.logs.motion import CameraPoses, Imu, MotionReader, extrinsics_of
+from duagc.converters.logs.options import LogOptions
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.recording.register_depth import MOST_SAMPLES, sample_steps
 
 Array = NDArray[np.float64]
 HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from converters.logs.entries import stamp_ns
-from converters.logs.foxglove import Base64, json_members
-from converters.logs.rosbag_file import READ_TYPES, reason
-from pipeline.errors import DuagError
+from duagc.converters.logs.entries import stamp_ns
+from duagc.converters.logs.foxglove import Base64, json_members
+from duagc.converters.logs.rosbag_file import READ_TYPES, reason
+from duagc.pipeline.base.errors import DuagError
 
 _ALIASES = {
     "sec": ("secs",),

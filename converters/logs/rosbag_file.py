@@ -9,11 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from converters.logs import foxglove
-from converters.logs.bag_messages import messages
-from converters.logs.entries import NANOSECONDS, Entry, Topic, sound_time, stamp_ns
-from pipeline.errors import DuagError
-from pipeline.files import check_file
+from duagc.converters.logs import foxglove
+from duagc.converters.logs.bag_messages import messages
+from duagc.converters.logs.entries import NANOSECONDS, Entry, Topic, sound_time, stamp_ns
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import check_file
 
 _READ = {
     "builtin_interfaces": "Time",

@@ -17,13 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from converters.base import robot_names
-from converters.image_files import options_of
-from converters.logs.files import SUFFIXES
-from converters.logs.options import LogOptions
-from pipeline.errors import DuagError, closest
-from pipeline.files import check_file, read_text
-from schemas import topics
+from duagc.converters.layouts.image_files import options_of
+from duagc.converters.logs.files import SUFFIXES
+from duagc.converters.logs.options import LogOptions
+from duagc.converters.writer import robot_names
+from duagc.pipeline.base.errors import DuagError, closest
+from duagc.pipeline.base.files import check_file, read_text
+from duagc.schemas import topics
 
 NAMESPACE = "{namespace}"  # stands for that of each robot in the names of topics
 TOPICS = ("color", "depth", "color_info", "depth_info", "imu", "odometry", "truth", "truth_file")

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.simulate.scene import Ball, Box, Cylinder, Flat, Scene, Solid, Surface
-from pipeline import streams
+from duagc.converters.simulate.scene import Ball, Box, Cylinder, Flat, Scene, Solid, Surface
+from duagc.pipeline.base import random_streams
 
 Array = NDArray[np.float64]
 
@@ -102,7 +102,7 @@ def _tile(
     scene: Scene, surface: Surface, shape: tuple[int, int], light: NDArray[np.float32], texel_m: float
 ) -> NDArray[np.uint8]:
     """Lit colours of one surface, uint8 [h, w, 3]; `light` is its coarse grid of brightness."""
-    rng = streams.generator(scene.seed, "simulate.texture", scene=scene.name, surface=surface.name)
+    rng = random_streams.generator(scene.seed, "simulate.texture", scene=scene.name, surface=surface.name)
     albedo = surface.material(rng, *surface.size, texel_m)
     missing = (shape[0] - albedo.shape[0], shape[1] - albedo.shape[1])
     whole = cv2.copyMakeBorder(np.maximum(albedo, 0), 0, missing[0], 0, missing[1], cv2.BORDER_REPLICATE)
@@ -237,7 +237,7 @@ def _meets(solid: Solid, start: Array, way: Array, reach: float) -> NDArray[np.b
 
 def surface_points(scene: Scene, atlas: Atlas, count: int) -> tuple[Array, Array, NDArray[np.uint8]]:
     """About `count` points spread evenly over what can be seen of a scene: points, normals, colours, [n, 3] each."""
-    rng = streams.generator(scene.seed, "simulate.points", scene=scene.name)
+    rng = random_streams.generator(scene.seed, "simulate.points", scene=scene.name)
     areas = np.array([surface.size[0] * surface.size[1] for surface in scene.surfaces])
     points, normals, colors = [], [], []
     for k, surface in enumerate(scene.surfaces):

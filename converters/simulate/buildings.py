@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from converters.simulate import drawn
-from converters.simulate import furniture as fur
-from converters.simulate import textures as tex
-from converters.simulate.furniture import Place
-from converters.simulate.scene import Flat, Lamp, Scene
-from pipeline import streams
+from duagc.converters.simulate import drawn
+from duagc.converters.simulate import furniture as fur
+from duagc.converters.simulate import textures as tex
+from duagc.converters.simulate.furniture import Place
+from duagc.converters.simulate.scene import Flat, Lamp, Scene
+from duagc.pipeline.base import random_streams
 
 WALL_M = 0.12
 DOOR_M, DOOR_HEIGHT_M = 1.05, 2.1
@@ -28,7 +28,7 @@ Rect = tuple[float, float, float, float]  # x0, y0, x1, y1
 def office(seed: int) -> Scene:
     """Six rooms on both sides of a corridor, 13.6 m x 10.4 m: desks, shelves, a meeting room, a lounge."""
     scene = Scene("office", seed, np.array([13.6, 10.4, 2.7]))
-    rng = streams.generator(seed, "simulate.layout", scene="office")
+    rng = random_streams.generator(seed, "simulate.layout", scene="office")
     w, d, _ = scene.size.tolist()
     low, high = 4.2, 6.1  # the corridor is between them
     across = {"south": (4.4, 9.2), "north": (5.2, 9.4)}
@@ -57,7 +57,7 @@ def office(seed: int) -> Scene:
 def corridor(seed: int) -> Scene:
     """A corridor 26 m long and 2.6 m wide, with a hall of 7 m x 7 m in its middle."""
     scene = Scene("corridor", seed, np.array([26.0, 7.0, 2.9]))
-    rng = streams.generator(seed, "simulate.layout", scene="corridor")
+    rng = random_streams.generator(seed, "simulate.layout", scene="corridor")
     w, d, h = scene.size.tolist()
     south, north, hall = 2.2, 4.8, (9.5, 16.5)
     lamps = [(x, d / 2) for x in (1.5, 4.5, 7.5, 18.5, 21.5, 24.5)]

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
-from converters.simulate.paths import HEIGHTS_M, look_at
-from converters.simulate.walks import MAX_TURN_RAD, MIN_CLEARANCE_M, Terrain, route
-from pipeline import streams
-from pipeline.geometry import se3
+from duagc.converters.simulate.trajectories import HEIGHTS_M, look_at
+from duagc.converters.simulate.walks import MAX_TURN_RAD, MIN_CLEARANCE_M, Terrain, route
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.geometry import se3
 
 Array = NDArray[np.float64]
 
@@ -157,7 +157,7 @@ class Ground:
     def figure(self, paradigm: str, robots: int, size: float, attempt: int) -> Figure:
         """A figure drawn by lot, its ways `size` times as long as frames and steps would make them."""
         space, length = self.space, size * (self.frames - 1) * self.terrain.step_m
-        rng = streams.generator(
+        rng = random_streams.generator(
             self.seed, "simulate.figure", paradigm=paradigm, size=str(size), attempt=attempt
         )
         curve = None
@@ -221,7 +221,7 @@ class Ground:
         ahead = spline(s, 1)
         heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
         heading = gaussian_filter1d(heading, SMOOTH_GAZE_M * self.frames / length_m, mode="nearest")
-        rng = streams.generator(self.seed, "simulate.waver", robot=robot)
+        rng = random_streams.generator(self.seed, "simulate.waver", robot=robot)
         waves = (
             rng.uniform((0.02, 0.03), (0.05, 0.08)),
             rng.uniform(1.5, 3.0, 2),

@@ -1,4 +1,4 @@
-"""Reads meshes in a process of their own, `converters.mesh_reader`: whatever ends it becomes one line about a file."""
+"""Reads meshes in a process of their own, `layouts.mesh_reader`: whatever ends it becomes one line about a file."""
 
 import json
 import os
@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from pipeline.errors import DuagError
-from pipeline.progress import track
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.progress import track
 
 Answer = dict[str, str]
 Process = subprocess.Popen[bytes]
@@ -27,7 +27,7 @@ def read(files: list[Path], up: str, cache: Path) -> None:
     Args:
         files: of the meshes, all in one folder. up: the axis that is up in them, "y" or "z".
     Raises:
-        DuagError: a file that cannot be read, or not within the limits of `converters.mesh_reader`.
+        DuagError: a file that cannot be read, or not within the limits of `duagc.converters.layouts.mesh_reader`.
     """
     with _started() as (process, told, tell):
         job = {"tell": tell, "files": _with_sizes(files), "up": up, "cache": str(cache)}
@@ -51,7 +51,7 @@ def _started() -> Iterator[tuple[Process, int, int]]:
     try:
         try:
             process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "converters.mesh_reader"],
+                [sys.executable, "-P", "-m", "duagc.converters.layouts.mesh_reader"],
                 bufsize=0,
                 stdin=subprocess.PIPE,  # it ends when this does
                 stdout=subprocess.DEVNULL,  # libraries write there what is said in one line here

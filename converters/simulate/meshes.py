@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.mesh_reader import LEVELS, NO_TEXTURE, texture_file
-from converters.simulate import mesh_process
-from pipeline.errors import DuagError
-from pipeline.files import check_file
+from duagc.converters.layouts.mesh_reader import LEVELS, NO_TEXTURE, texture_file
+from duagc.converters.simulate import mesh_process
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import check_file
 
 Array = NDArray[np.float64]
 

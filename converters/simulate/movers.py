@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from converters.simulate import meshes, triangles
-from converters.simulate import textures as tex
-from converters.simulate.raycast import Caster, MeshRenderer
-from converters.simulate.scene import Scene
-from converters.simulate.walks import FreeSpace, route
-from pipeline import streams
-from pipeline.geometry.camera import PinholeCamera
+from duagc.converters.simulate import meshes, triangles
+from duagc.converters.simulate import textures as tex
+from duagc.converters.simulate.raycast import Caster, MeshRenderer
+from duagc.converters.simulate.scene import Scene
+from duagc.converters.simulate.walks import FreeSpace, route
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ def walk(
     for k in range(count):
         best: tuple[float, Array] | None = None
         for attempt in range(TRIES):
-            rng = streams.generator(seed, "simulate.mover", mover=k, attempt=attempt)
+            rng = random_streams.generator(seed, "simulate.mover", mover=k, attempt=attempt)
             way = route(space, graph, frames * STEP_M + 1.0, rng)
             spline = CubicSpline(0.025 * np.arange(len(way)), way)
             floor = spline(0.5 + STEP_M * np.arange(frames))
@@ -100,7 +100,7 @@ def _upright(floor: Array, height: float) -> Array:
 def _figure(k: int, seed: int) -> Scene:
     """Legs, a coat, arms and a head, in the axes of the mover."""
     scene = Scene(f"mover{k}", seed, np.full(3, 1e6), even_light=0.9)
-    rng = streams.generator(seed, "simulate.figure-colors", mover=k)
+    rng = random_streams.generator(seed, "simulate.figure-colors", mover=k)
     coat = tex.fabric(tex.vivid(rng, 0.8), tex.vivid(rng, 0.5))
     for side, y in (("left", 0.1), ("right", -0.1)):
         scene.cylinder(f"leg {side}", (0.0, y, 0.02), 0.085, 0.8, tex.fabric((62, 70, 92), (90, 86, 80)))

@@ -5,12 +5,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from converters.simulate import drawn
-from converters.simulate import furniture as fur
-from converters.simulate import textures as tex
-from converters.simulate.furniture import Place
-from converters.simulate.scene import Flat, Scene
-from pipeline import streams
+from duagc.converters.simulate import drawn
+from duagc.converters.simulate import furniture as fur
+from duagc.converters.simulate import textures as tex
+from duagc.converters.simulate.furniture import Place
+from duagc.converters.simulate.scene import Flat, Scene
+from duagc.pipeline.base import random_streams
 
 SIZE_M = (44.0, 34.0, 16.0)
 SUN = (0.45, -0.38, 0.62)  # towards the sun, as long as it is strong
@@ -22,7 +22,7 @@ HOUSE = (23.0, 11.5, 34.0, 22.5)
 def outdoor(seed: int) -> Scene:
     """A block of 44 m x 34 m between facades 5 to 9 m high."""
     scene = Scene("outdoor", seed, np.array(SIZE_M), even_light=EVEN_LIGHT, sun=np.array(SUN))
-    rng = streams.generator(seed, "simulate.layout", scene="outdoor")
+    rng = random_streams.generator(seed, "simulate.layout", scene="outdoor")
     w, d, _ = SIZE_M
     x, y, _ = np.eye(3)
     ground = tex.paint_onto(

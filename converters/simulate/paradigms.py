@@ -13,10 +13,10 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.simulate.figures import APART_M, SHAPES, Figure, Ground, Way, apart
-from converters.simulate.paths import Views, look, shared
-from converters.simulate.render import Eye
-from converters.simulate.walks import (
+from duagc.converters.simulate.figures import APART_M, SHAPES, Figure, Ground, Way, apart
+from duagc.converters.simulate.render import Eye
+from duagc.converters.simulate.trajectories import Views, look, shared
+from duagc.converters.simulate.walks import (
     LEAST_MEDIAN_M,
     MAX_HOLE_SHARE,
     MAX_NEAR_SHARE,
@@ -26,8 +26,8 @@ from converters.simulate.walks import (
     Terrain,
     least_shown,
 )
-from pipeline.errors import DuagError
-from pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
 

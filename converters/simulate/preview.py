@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.files import new_file
+from duagc.pipeline.base.files import new_file
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

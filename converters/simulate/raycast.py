@@ -10,9 +10,9 @@ Where no ray hits there is a hole of the scan: depth 0, black; or, in a scene wi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from converters.simulate.meshes import LEVELS, MeshScene
-from converters.simulate.render import View
-from pipeline.geometry.camera import PinholeCamera
+from duagc.converters.simulate.meshes import LEVELS, MeshScene
+from duagc.converters.simulate.render import View
+from duagc.pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
 

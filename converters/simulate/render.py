@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from converters.simulate.bake import Atlas
-from converters.simulate.scene import Ball, Flat, Scene, Side
-from pipeline.geometry.camera import PinholeCamera
+from duagc.converters.simulate.bake import Atlas
+from duagc.converters.simulate.scene import Ball, Flat, Scene, Side
+from duagc.pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
 

@@ -4,16 +4,16 @@ from typing import Any
 
 import numpy as np
 
-from converters.simulate import drawn
-from converters.simulate import textures as tex
-from converters.simulate.scene import Flat, Lamp, Scene
-from pipeline import streams
+from duagc.converters.simulate import drawn
+from duagc.converters.simulate import textures as tex
+from duagc.converters.simulate.scene import Flat, Lamp, Scene
+from duagc.pipeline.base import random_streams
 
 
 def room(seed: int) -> Scene:
     """A living room, 6.4 m x 5.6 m x 2.7 m: shelf, sideboard, desk, sofa, low table, dresser, plants, boxes."""
     scene = Scene("room", seed, np.array([6.4, 5.6, 2.7]))
-    rng = streams.generator(seed, "simulate.layout", scene="room")
+    rng = random_streams.generator(seed, "simulate.layout", scene="room")
     _shell(scene)
     _bookshelf(scene, rng, (0.45, 5.27), width=1.9, height=2.05, depth=0.33)
     _sideboard(scene, rng)

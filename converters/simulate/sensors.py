@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.simulate.movers import Mover
-from converters.simulate.raycast import OFFSETS, MeshRenderer
-from converters.simulate.render import View
-from pipeline import streams
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
+from duagc.converters.simulate.movers import Mover
+from duagc.converters.simulate.raycast import OFFSETS, MeshRenderer
+from duagc.converters.simulate.render import View
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
 
@@ -57,12 +57,12 @@ class Rig:
     def clock_offset_ns(self, seed: int, robot: str) -> int:
         """What a robot's clock shows at the time 0."""
         return round(
-            1e9 * self.clock_s * streams.generator(seed, "simulate.clock", robot=robot).uniform(-1, 1)
+            1e9 * self.clock_s * random_streams.generator(seed, "simulate.clock", robot=robot).uniform(-1, 1)
         )
 
     def gain(self, seed: int, robot: str, time_s: float) -> float:
         """Exposure of a frame, as a factor of the light."""
-        rng = streams.generator(seed, "simulate.gain", robot=robot)
+        rng = random_streams.generator(seed, "simulate.gain", robot=robot)
         periods, phases = rng.uniform(*GAIN_PERIODS_S, 2), rng.uniform(0, 2 * np.pi, 2)
         return float(2 ** (self.gain_stops * np.sin(2 * np.pi * time_s / periods + phases).mean()))
 
@@ -70,7 +70,7 @@ class Rig:
         """How a robot's camera sees colours: gain [3] (of image values) and black level [3] (0..1) by channel."""
         if self.camera_stops == 0:
             return np.ones(3), np.zeros(3)
-        rng = streams.generator(seed, "simulate.tint", robot=robot)
+        rng = random_streams.generator(seed, "simulate.tint", robot=robot)
         stops, black = self.camera_stops * rng.uniform(-1, 1, (2, 3))
         return 2 ** (stops / GAMMA), BLACK_OF_STOP * black
 

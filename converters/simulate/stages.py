@@ -7,12 +7,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.simulate import bake, meshes, paths, triangles, walks
-from converters.simulate.raycast import Caster, MeshRenderer
-from converters.simulate.render import Eye, Renderer
-from converters.simulate.scenes import MESHES, SCENES, Manner, build
-from pipeline import streams
-from pipeline.geometry.camera import PinholeCamera
+from duagc.converters.simulate import bake, meshes, trajectories, triangles, walks
+from duagc.converters.simulate.raycast import Caster, MeshRenderer
+from duagc.converters.simulate.render import Eye, Renderer
+from duagc.converters.simulate.scene_settings import MESHES, SCENES, Manner, build
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
 Points = tuple[Array, Array, NDArray[np.uint8]]
@@ -96,7 +96,7 @@ class RoomStage:
         return MeshRenderer(Caster(triangles.unpainted(self.scene)), camera)
 
     def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
-        return paths.plan(self.scene, robots, frames, overlap, camera)
+        return trajectories.plan(self.scene, robots, frames, overlap, camera)
 
     def free_space(self) -> walks.FreeSpace:
         def closed(places: Array) -> NDArray[np.bool_]:
@@ -161,7 +161,7 @@ class MeshStage:
     def points(self) -> Points:
         areas = self.scene.areas()
         count = int(np.clip(POINTS_PER_M2 * areas.sum(), ROOM_POINTS, MOST_POINTS))
-        rng = streams.generator(self.seed, "simulate.points")
+        rng = random_streams.generator(self.seed, "simulate.points")
         points, normals, colors = meshes.surface_points(self.scene, areas, count, rng)
         if not self.manner.solid:
             return points, normals, colors

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from converters.simulate import bake, meshes
-from converters.simulate.raycast import Caster
-from converters.simulate.scene import Ball, Flat, Scene, Side, Surface
+from duagc.converters.simulate import bake, meshes
+from duagc.converters.simulate.raycast import Caster
+from duagc.converters.simulate.scene import Ball, Flat, Scene, Side, Surface
 
 Array = NDArray[np.float64]
 

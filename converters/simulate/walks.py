@@ -19,14 +19,14 @@ from scipy.ndimage import gaussian_filter1d, label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from converters.simulate.paths import HEIGHTS_M, OVERLAP_IMAGE, look_at, shared_view
-from converters.simulate.raycast import Caster
-from converters.simulate.render import Eye
-from pipeline import streams
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.progress import track
+from duagc.converters.simulate.raycast import Caster
+from duagc.converters.simulate.render import Eye
+from duagc.converters.simulate.trajectories import HEIGHTS_M, OVERLAP_IMAGE, look_at, shared_view
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
 
@@ -233,7 +233,7 @@ def _candidates(
     found: list[tuple[float, Array]] = []
     reasons = {"too near to something": 0, "turns too fast": 0, "sees holes or a near wall": 0}
     for attempt in range(TRIES):
-        rng = streams.generator(seed, "simulate.walk", robot=robot, attempt=attempt)
+        rng = random_streams.generator(seed, "simulate.walk", robot=robot, attempt=attempt)
         floor_way = route(space, graph, frames * terrain.step_m + 2 * AHEAD_M + 1.0, rng)
         poses = _look_ahead(floor_way, space.floor_m, robot, frames, terrain.step_m, rng)
         if poses is None:

@@ -17,13 +17,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import converters
-from converters.logs.files import open_log
-from converters.logs.robot_log import RobotLog
-from converters.logs.sources import sources_of
-from pipeline.errors import DuagError
-from pipeline.recording.write import mcap_writer
-from pipeline.workers import peak_memory_bytes
+from duagc.converters import registry
+from duagc.converters.logs.files import open_log
+from duagc.converters.logs.robot_log import RobotLog
+from duagc.converters.logs.sources import sources_of
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.workers import peak_memory_bytes
+from duagc.pipeline.recording.write import mcap_writer
 
 TASKS = ("copy", "convert")
 
@@ -58,7 +58,7 @@ def run(src: Path, options: Sequence[str], folder: Path) -> dict[str, Any]:
 
 def _topics(src: Path, options: Sequence[str]) -> list[str]:
     """The topics that a conversion takes, without those that have a few messages only."""
-    sources = sources_of(src, converters.parse_options(options))
+    sources = sources_of(src, registry.parse_options(options))
     if len(sources) != 1 or len(sources[0].paths) != 1:
         raise DuagError(f"{src}: found {len(sources)} robots, expected one log of one robot")
     with open_log(sources[0].paths) as log:
@@ -146,13 +146,13 @@ def _main(said: str) -> None:
     if task == "copy":
         _copy(Path(src), Path(target), topics)
     else:
-        converters.convert("ros", Path(src), Path(target), options=options)
+        registry.convert("ros", Path(src), Path(target), options=options)
     spent = os.times()
     print(json.dumps({"cpu_s": spent.user + spent.system, "peak_bytes": peak_memory_bytes()}))
 
 
 if __name__ == "__main__":
-    from pipeline import numeric
+    from duagc.pipeline.base import determinism
 
-    numeric.settle()
+    determinism.settle()
     _main(sys.argv[1])

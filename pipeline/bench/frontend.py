@@ -21,18 +21,18 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.bench.stopwatch import Calls, Stopwatch, counted, replaced, shares, summary
-from pipeline.errors import DuagError
-from pipeline.evaluation import agreement, groundtruth, trajectory_errors, views
-from pipeline.evaluation.rendering import PosedMap, RenderTask
-from pipeline.evaluation.results import Absent, split_reasons
-from pipeline.evaluation.trajectory_errors import Paired
-from pipeline.frontend.config import FrontendConfig
-from pipeline.geometry.trajectory import Trajectory
-from pipeline.progress import track
-from pipeline.recording import Recording, open_rgbd
-from pipeline.run_folder import RobotRun
-from pipeline.workers import peak_memory_bytes, worker_pool
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.base.workers import peak_memory_bytes, worker_pool
+from duagc.pipeline.bench.stopwatch import Calls, Stopwatch, counted, replaced, shares, summary
+from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.evaluation import groundtruth, map_agreement, trajectory_errors, views
+from duagc.pipeline.evaluation.rendering import PosedMap, RenderTask
+from duagc.pipeline.evaluation.results import Absent, split_reasons
+from duagc.pipeline.evaluation.trajectory_errors import Paired
+from duagc.pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.recording import Recording, open_rgbd
+from duagc.pipeline.runs.folder import RobotRun
 
 SCHEMA = 1
 OPEN3D = {"Open3D, hybrid": "Hybrid", "Open3D, point-to-plane": "PointToPlane"}
@@ -89,7 +89,7 @@ def run(plan: Plan) -> dict[str, Any]:
     Raises:
         DuagError: the recording is broken, or has no such robot.
     """
-    from pipeline.bench.raster import cpu_name
+    from duagc.pipeline.bench.raster import cpu_name
 
     source = Recording(plan.recording)
     robots = list(plan.robots) or source.robots
@@ -158,14 +158,14 @@ def changed(config: FrontendConfig, values: Mapping[str, Any]) -> FrontendConfig
 
 
 def _functions(parts: Mapping[str, tuple[str, str]]) -> dict[str, tuple[Any, str]]:
-    from pipeline.frontend import mapping, model, stage, tracking
-    from pipeline.registration import align
+    from duagc.pipeline.frontend import mapping, model_registration, stage, tracking
+    from duagc.pipeline.registration import align
 
     modules: dict[str, ModuleType] = {
         "mapping": mapping,
         "stage": stage,
         "tracking": tracking,
-        "model": model,
+        "model": model_registration,
         "align": align,
     }
     found = {}
@@ -180,7 +180,7 @@ def _functions(parts: Mapping[str, tuple[str, str]]) -> dict[str, tuple[Any, str
 
 def measure(log: Path, folder: Path, config: FrontendConfig, seed: int, threads: int) -> dict[str, Any]:
     """Run the front end on a log into folder/frontend.mcap, in a fresh process; times and peak memory."""
-    from pipeline.frontend.stage import run_frontend
+    from duagc.pipeline.frontend.stage import run_frontend
 
     whole = {"frame": ("tracking.Tracker", "track"), "poses": ("stage", "_refine")}
     if config.mapping_enabled:
@@ -353,7 +353,7 @@ def _agreement(source: Recording, robot: RobotRun, estimated: Trajectory) -> dic
         pairs = replace(pairs, positions_only=not groundtruth.knows_rotations(source, robot.robot))
     held_out = {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
     path = dict(zip(estimated.stamps_ns.tolist(), estimated.poses, strict=True))
-    return agreement.section(source.log(robot.robot), held_out, {"": path}, pairs)
+    return map_agreement.section(source.log(robot.robot), held_out, {"": path}, pairs)
 
 
 def _map_errors(source: Recording, robot: RobotRun, estimated: Trajectory, threads: int) -> dict[str, Any]:

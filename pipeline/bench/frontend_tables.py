@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.bench.frontend import WITHOUT_MAP
-from pipeline.bench.tables import markdown
-from pipeline.evaluation import agreement
+from duagc.pipeline.bench.frontend import WITHOUT_MAP
+from duagc.pipeline.bench.tables import markdown
+from duagc.pipeline.evaluation import map_agreement
 
 
 def format_tables(result: dict[str, Any]) -> str:
@@ -78,8 +78,8 @@ def _tracking_cells(row: dict[str, Any]) -> list[Any]:
 def _agreement_cells(row: dict[str, Any]) -> list[Any]:
     return [
         *(row["robot"], row["name"]),
-        *(_number(row[f"depth_agreement_m{of}"], 1e3, 2) for of in ("", agreement.OF_TRUTH)),
-        *(_number(row[f"feature_agreement_px{of}"], 1, 2) for of in ("", agreement.OF_TRUTH)),
+        *(_number(row[f"depth_agreement_m{of}"], 1e3, 2) for of in ("", map_agreement.OF_TRUTH)),
+        *(_number(row[f"feature_agreement_px{of}"], 1, 2) for of in ("", map_agreement.OF_TRUTH)),
     ]
 
 

@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from converters.simulate import FRAME_RATE_HZ, camera_of, paradigms, paths, scene_of
-from converters.simulate.stages import set_up
-from pipeline.bench.tables import markdown
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
-from pipeline.progress import track
+from duagc.converters.simulate import paradigms, trajectories
+from duagc.converters.simulate.stages import set_up
+from duagc.converters.simulate.team import FRAME_RATE_HZ, camera_of, scene_of
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.bench.tables import markdown
+from duagc.pipeline.geometry import se3
 
 Row = dict[str, Any]
 
@@ -41,7 +42,7 @@ def run(
         about = scene_of(scene, up)[1]
         with tempfile.TemporaryDirectory(prefix="duagc-scene-") as cache:
             stage = set_up(scene, about.get("up", ""), seed, Path(cache), as_meshes=False)
-            small = stage.eye(camera.scaled(*paths.OVERLAP_IMAGE))
+            small = stage.eye(camera.scaled(*trajectories.OVERLAP_IMAGE))
             stage.free_space()
             for figure, count, asked in track(list(product(figures, robots, overlaps)), f"plan {scene}"):
                 row: Row = {"scene": about["scene"], "paradigm": figure, "robots": count, "asked": asked}
@@ -54,7 +55,7 @@ def run(
                     continue
                 finally:
                     row["cpu_s"] = time.process_time() - start
-                shared = [paths.shared_view(small, a, b) for a, b in pairwise(ways)]
+                shared = [trajectories.shared_view(small, a, b) for a, b in pairwise(ways)]
                 step_m = [float(se3.distance(way[:-1], way[1:])[0].mean()) for way in ways]
                 row |= {
                     "shared": float(np.mean(shared)),

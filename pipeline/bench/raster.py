@@ -25,15 +25,16 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.bench import torch_tiles
-from pipeline.geometry import so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import _raster
-from pipeline.kernels.rasterizer import Rasterizer, available_isas
-from pipeline.kernels.types import FisherSums, Gradients, LossWeights, Statistics
-from pipeline.progress import track
-from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.losses import LossConfig, rgbd_loss
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.bench import torch_tiles
+from duagc.pipeline.config.training import LossConfig
+from duagc.pipeline.geometry import so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import _raster
+from duagc.pipeline.kernels.rasterizer import Rasterizer, available_isas
+from duagc.pipeline.kernels.types import FisherSums, Gradients, LossWeights, Statistics
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.losses import rgbd_loss
 
 Size = tuple[int, int]
 

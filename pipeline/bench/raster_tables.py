@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.bench.raster import FLOPS, TITLES
-from pipeline.bench.tables import markdown
+from duagc.pipeline.bench.raster import FLOPS, TITLES
+from duagc.pipeline.bench.tables import markdown
 
 WHO = ["size", "Gaussians", "threads", "isa"]
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import reference
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import reference
+from duagc.pipeline.splat.gaussians import Gaussians
 
 TILE_PX = 16
 

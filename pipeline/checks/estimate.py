@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.checks.findings import Finding, Severity
+from duagc.pipeline.checks.findings import Finding, Severity
 
 # seconds per million pixels of a frame, whole runs on two idle cores: docs/results.md has RedKitchen with 112 s for 205
 # of them and the demo with about 60 s for 55; textures and speed decide how many keyframes there are

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.checks.findings import Finding, Severity
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import RgbdFrame, RgbdLog
-from pipeline.registration import Reference, RgbdPyramid, register
+from duagc.pipeline.checks.findings import Finding, Severity
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import RgbdFrame, RgbdLog
+from duagc.pipeline.registration import Reference, RgbdPyramid, register
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]

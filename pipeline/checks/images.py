@@ -10,12 +10,12 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.checks.findings import Finding, Severity
-from pipeline.messages import unpack_stamp
-from pipeline.progress import track
-from pipeline.recording import Record, RgbdFrame
-from pipeline.recording.read import LogFile
-from schemas import topics as topic_table
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.checks.findings import Finding, Severity
+from duagc.pipeline.messages import unpack_stamp
+from duagc.pipeline.recording import Record, RgbdFrame
+from duagc.pipeline.recording.read import LogFile
+from duagc.schemas import topics as topic_table
 
 STUCK = 5  # equal images in a row
 MANY_REPEATED = 0.4  # of all images

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from pipeline.checks.findings import Finding, Severity
-from pipeline.recording.pairing import TOLERANCE_NS, Pairing
+from duagc.pipeline.checks.findings import Finding, Severity
+from duagc.pipeline.recording.pairing import TOLERANCE_NS, Pairing
 
 GAP_RATIO = 1.5  # an interval this much longer than the median one is a gap
 LONG_GAP_NS = 500_000_000  # in this time a robot turns out of its last view

@@ -3,21 +3,21 @@
 import errno
 import sys
 
-from pipeline import numeric
-from pipeline.cli.common import EXIT_FAILED, app
-from pipeline.errors import DuagError
+from duagc.pipeline.base import determinism
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.cli.common import EXIT_FAILED, app
 
 # each registers its commands, and `--help` lists them in this order
 # isort: off
-from pipeline.cli import recordings
-from pipeline.cli import runs
-from pipeline.cli import looking
-from pipeline.cli import posegraph
-from pipeline.cli import settings
-from pipeline.cli import bench
+from duagc.pipeline.cli import recordings
+from duagc.pipeline.cli import runs
+from duagc.pipeline.cli import inspect
+from duagc.pipeline.cli import posegraph
+from duagc.pipeline.cli import settings
+from duagc.pipeline.cli import bench
 # isort: on
 
-__all__ = ["app", "bench", "looking", "main", "posegraph", "recordings", "runs", "settings"]
+__all__ = ["app", "bench", "inspect", "main", "posegraph", "recordings", "runs", "settings"]
 
 TYPER_INTERRUPTED = 130  # what typer makes of Ctrl-C, without a word
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's share of it, a limit on files
@@ -25,7 +25,7 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's shar
 
 def main() -> None:
     """Entry point: one line and exit code 1 for whatever a user can fix."""
-    numeric.settle()
+    determinism.settle()
     try:
         app()
     except DuagError as error:

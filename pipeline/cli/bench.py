@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import ConfigFile, Json, Overrides, bench_app
+from duagc.pipeline.cli.common import ConfigFile, Json, Overrides, bench_app
 
 
 @bench_app.command("raster")
@@ -33,8 +33,8 @@ def bench_raster(
 
     Lists are separated by commas. Takes about two minutes on an idle machine; a busy one gives other times.
     """
-    from pipeline.bench import raster, raster_tables
-    from pipeline.kernels import available_isas
+    from duagc.pipeline.bench import raster, raster_tables
+    from duagc.pipeline.kernels import available_isas
 
     isas = available_isas() if isa is None else isa.split(",")
     for name in isas:
@@ -84,16 +84,16 @@ def bench_consensus(
     Examples: `duagc bench consensus --robots 4 --topology chain --loss 0,0.9 --contrast 47`,
     `duagc bench consensus --run outputs/redkitchen --topology full --loss 0 --mode evidence,admm,paper`
     """
-    from pipeline.bench import consensus
+    from duagc.pipeline.experiments import consensus_modes
 
     for option, words, known in (
         ("--topology", topology.split(","), ("full", "ring", "chain", "star")),
-        ("--mode", mode.split(","), consensus.MODES),
+        ("--mode", mode.split(","), consensus_modes.MODES),
     ):
         for word in words:
             if word not in known:
                 raise typer.BadParameter(f"{word!r} is not one of {', '.join(known)}", param_hint=option)
-    plan = consensus.Plan(
+    plan = consensus_modes.Plan(
         robots=tuple(_counts("--robots", robots)),
         topologies=tuple(topology.split(",")),
         losses=tuple(_numbers("--loss", loss, 0.0, 0.99)),
@@ -109,14 +109,14 @@ def bench_consensus(
             raise typer.BadParameter(
                 "a team takes two robots, a ring, chain or star three", param_hint="--robots"
             )
-        result = consensus.run(plan)
+        result = consensus_modes.run(plan)
     else:
-        from pipeline.bench.team_of_run import team_of_run
-        from pipeline.run_folder import RunFolder
+        from duagc.pipeline.experiments.team_of_run import team_of_run
+        from duagc.pipeline.runs.folder import RunFolder
 
-        parts = [consensus.run_on(team_of_run(RunFolder(of_run), t), t, plan) for t in plan.topologies]
+        parts = [consensus_modes.run_on(team_of_run(RunFolder(of_run), t), t, plan) for t in plan.topologies]
         result = {"plan": parts[0]["plan"], "rows": [row for part in parts for row in part["rows"]]}
-    print(json.dumps(result, indent=2) if as_json else consensus.format_table(result))
+    print(json.dumps(result, indent=2) if as_json else consensus_modes.format_table(result))
 
 
 @bench_app.command("team")
@@ -139,23 +139,23 @@ def bench_team(
 
     Example: `duagc bench team outputs/redkitchen --checks frames --seeds 100`
     """
-    from pipeline.bench import team
-    from pipeline.config import load
-    from pipeline.recording import Recording
-    from pipeline.run_folder import RunFolder
-    from pipeline.runner import RunConfig
+    from duagc.pipeline.config.base import load
+    from duagc.pipeline.config.run import RunConfig
+    from duagc.pipeline.experiments import team_faults
+    from duagc.pipeline.recording import Recording
+    from duagc.pipeline.runs.folder import RunFolder
 
     chosen = checks.split(",")
     for name in chosen:
-        if name not in team.CHECKS:
+        if name not in team_faults.CHECKS:
             raise typer.BadParameter(
-                f"{name!r} is not one of {', '.join(team.CHECKS)}", param_hint="--checks"
+                f"{name!r} is not one of {', '.join(team_faults.CHECKS)}", param_hint="--checks"
             )
     run = RunFolder(run_folder)
     settings = load(RunConfig, run.config_file, overrides or [])
     source = Recording(run.recording if recording is None else recording)
-    result = team.run(run, source, settings.exchange, settings.seed, chosen, seeds)
-    print(json.dumps(result, indent=2) if as_json else team.format_table(result))
+    result = team_faults.run(run, source, settings.exchange, settings.seed, chosen, seeds)
+    print(json.dumps(result, indent=2) if as_json else team_faults.format_table(result))
 
 
 @bench_app.command("reference")
@@ -172,18 +172,18 @@ def bench_reference(
 
     Example: `duagc bench reference outputs/redkitchen`
     """
-    from pipeline import numeric
-    from pipeline.bench import reference
-    from pipeline.config import load
-    from pipeline.recording import Recording
-    from pipeline.run_folder import RunFolder
-    from pipeline.runner import RunConfig
+    from duagc.pipeline.base import determinism
+    from duagc.pipeline.config.base import load
+    from duagc.pipeline.config.run import RunConfig
+    from duagc.pipeline.experiments import pose_reference
+    from duagc.pipeline.recording import Recording
+    from duagc.pipeline.runs.folder import RunFolder
 
-    numeric.settle_opencv()
+    determinism.settle_opencv()
     run = RunFolder(run_folder)
     source = Recording(run.recording if recording is None else recording)
-    result = reference.run(run, source, load(RunConfig, run.config_file, []).frontend)
-    print(json.dumps(result, indent=2) if as_json else reference.format_table(result))
+    result = pose_reference.run(run, source, load(RunConfig, run.config_file, []).frontend)
+    print(json.dumps(result, indent=2) if as_json else pose_reference.format_table(result))
 
 
 @bench_app.command("frontend")
@@ -213,10 +213,10 @@ def bench_frontend(
     """
     import tempfile
 
-    from converters.simulate import simulate as simulate_recording
-    from pipeline.bench import frontend, frontend_tables
-    from pipeline.config import load
-    from pipeline.runner import RunConfig
+    from duagc.converters.simulate.team import simulate as simulate_recording
+    from duagc.pipeline.bench import frontend, frontend_tables
+    from duagc.pipeline.config.base import load
+    from duagc.pipeline.config.run import RunConfig
 
     settings = load(RunConfig, config, overrides or [])
     chosen = () if caps == "none" else tuple(_counts("--caps", caps))
@@ -241,8 +241,8 @@ def bench_frontend(
         )
         result = frontend.run(plan)
     if plot is not None:
-        from pipeline.files import new_file
-        from pipeline.report import figures
+        from duagc.pipeline.base.files import new_file
+        from duagc.pipeline.report import figures
 
         with new_file(plot) as part:
             part.write_text(figures.map_sizes(frontend.by_cap(result)), encoding="utf-8")
@@ -271,8 +271,8 @@ def bench_paths(
 
     Example: `duagc bench paths --scenes scans/house --robots 3`
     """
-    from converters.simulate import MAX_ROBOTS, PARADIGMS
-    from pipeline.bench import paths
+    from duagc.converters.simulate.team import MAX_ROBOTS, PARADIGMS
+    from duagc.pipeline.bench import paths
 
     for name in paradigms.split(","):
         if name not in PARADIGMS[1:]:
@@ -305,7 +305,7 @@ def bench_convert(
 
     Example: `duagc bench convert ~/logs/kitchen.bag --set imu=/imu/data`
     """
-    from pipeline.bench import convert
+    from duagc.pipeline.bench import convert
 
     result = convert.run(log, options or [], out)
     print(json.dumps(result, indent=2) if as_json else convert.format_table(result))

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline import __version__
+from duagc import __version__
 
 EXIT_FAILED, EXIT_DIFFERENT = 1, 3
 

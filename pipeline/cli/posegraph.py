@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from pipeline.cli.common import Json, app
+from duagc.pipeline.cli.common import Json, app
 
 
 @app.command()
@@ -43,9 +43,9 @@ def posegraph(
     `duagc posegraph parking-garage.g2o --solver elimination`,
     `duagc posegraph kimera_campus_outdoor --robust gnc --loss 0.3 --json`
     """
-    from pipeline.posegraph.config import settings
-    from pipeline.posegraph.solve import solve
-    from pipeline.posegraph.table import format_result
+    from duagc.pipeline.config.posegraph import settings
+    from duagc.pipeline.team_posegraph.solve import solve
+    from duagc.pipeline.team_posegraph.table import format_result
 
     config = settings(solver, robust, loss, seed, max_rounds)
     result = solve(path, config, robots, only_reference=only_reference)

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import EXIT_FAILED, ConfigFile, Force, Json, Out, Overrides, app, say
-from pipeline.errors import DuagError
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.cli.common import EXIT_FAILED, ConfigFile, Force, Json, Out, Overrides, app, say
 
 
 @app.command()
@@ -61,8 +61,8 @@ def simulate(
     `duagc simulate --scene office --robots 4 --paradigm crossing --preview office.png --out recordings/office`,
     `duagc simulate --scene scans/house --width 640 --height 480 --frames 300 --out recordings/house`
     """
-    from converters.simulate import Rig
-    from converters.simulate import simulate as simulate_recording
+    from duagc.converters.simulate.team import Rig
+    from duagc.converters.simulate.team import simulate as simulate_recording
 
     simulate_recording(
         out,
@@ -135,15 +135,15 @@ def convert(
     Examples: `duagc convert 7scenes ~/data/redkitchen --robots 2 --out recordings/redkitchen`,
     `duagc convert 7scenes ~/data/redkitchen --robots 2 --options cameras.toml --out recordings/calibrated`
     """
-    import converters
+    from duagc.converters import registry
 
     if list_datasets:
-        print(converters.describe())
+        print(registry.describe())
         return
     if dataset is None or source is None or out is None:
         raise typer.BadParameter("expected DATASET SRC --out REC, or --list")
     said = [*(options or []), *([f"time_source={time_source}"] if time_source else [])]
-    converters.convert(
+    registry.convert(
         dataset, source, out, robots=robots, force=force, options=said, options_file=options_file
     )
     _say_warnings(out)
@@ -170,8 +170,8 @@ def info(
     Examples: `duagc info recordings/redkitchen --preview redkitchen.png`,
     `duagc info campus.bag --toml > campus.toml`
     """
-    from converters.logs import describe
-    from pipeline import recording
+    from duagc.converters.logs import describe
+    from duagc.pipeline import recording
 
     if describe.is_foreign(path):
         described = describe.describe(path)
@@ -197,11 +197,12 @@ def check(
 
     Example: `duagc check recordings/redkitchen`
     """
-    from pipeline import checks, numeric
+    from duagc.pipeline.base import determinism
+    from duagc.pipeline.checks import check
 
-    numeric.settle_opencv()
-    report = checks.check(path)
-    print(json.dumps(report.plain(), indent=2) if as_json else checks.format_report(report))
+    determinism.settle_opencv()
+    report = check.check(path)
+    print(json.dumps(report.plain(), indent=2) if as_json else check.format_report(report))
     if not report.sound:
         raise typer.Exit(EXIT_FAILED)
 
@@ -233,14 +234,14 @@ def calibrate(
     Example: `duagc calibrate recordings/redkitchen --out cameras.toml`, then
     `duagc convert 7scenes ~/data/redkitchen --robots 2 --options cameras.toml --out recordings/calibrated`
     """
-    from pipeline import numeric
-    from pipeline.calibration import calibrate as calibrate_recording
-    from pipeline.calibration import report
-    from pipeline.config import load
-    from pipeline.recording import Recording
-    from pipeline.runner import RunConfig
+    from duagc.pipeline.base import determinism
+    from duagc.pipeline.camera_calibration import report
+    from duagc.pipeline.camera_calibration.calibrate import calibrate as calibrate_recording
+    from duagc.pipeline.config.base import load
+    from duagc.pipeline.config.run import RunConfig
+    from duagc.pipeline.recording import Recording
 
-    numeric.settle_opencv()
+    determinism.settle_opencv()
     if out is not None:
         report.check_out(out, force, Recording(path).description, path)
     found = calibrate_recording(path, load(RunConfig, config, overrides or []).frontend, robots or [], views)
@@ -259,7 +260,7 @@ def recover(
 
     Examples: `duagc recover broken/alpha.mcap --out alpha.mcap`, `duagc recover broken --out recordings/saved`
     """
-    from pipeline import recovery
+    from duagc.pipeline.recording import recovery
 
     for salvage in recovery.recover(source, out, force):
         print(salvage.line())

@@ -6,7 +6,17 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import EXIT_DIFFERENT, ConfigFile, Force, Json, Out, Overrides, Workers, app, say
+from duagc.pipeline.cli.common import (
+    EXIT_DIFFERENT,
+    ConfigFile,
+    Force,
+    Json,
+    Out,
+    Overrides,
+    Workers,
+    app,
+    say,
+)
 
 
 @app.command()
@@ -22,10 +32,10 @@ def demo(
 
     Example: `duagc demo --out outputs/demo`
     """
-    from converters.simulate import simulate as simulate_recording
-    from pipeline.new_folder import new_folder
-    from pipeline.runner import RunConfig
-    from pipeline.runner import run as run_stages
+    from duagc.converters.simulate.team import simulate as simulate_recording
+    from duagc.pipeline.base.atomic_folder import new_folder
+    from duagc.pipeline.config.run import RunConfig
+    from duagc.pipeline.runner import run as run_stages
 
     with new_folder(out, force) as folder:
         say(f"simulate: {robots} robots, {frames} frames each")
@@ -52,9 +62,9 @@ def run(
     `duagc run recordings/redkitchen --out outputs/redkitchen`,
     `duagc run recordings/room --out outputs/lossy --set exchange.link.loss_probability=0.3`
     """
-    from pipeline.config import load
-    from pipeline.runner import RunConfig
-    from pipeline.runner import run as run_stages
+    from duagc.pipeline.config.base import load
+    from duagc.pipeline.config.run import RunConfig
+    from duagc.pipeline.runner import run as run_stages
 
     run_stages(
         recording, out, load(RunConfig, config, overrides or []), workers=workers, force=force, say=say
@@ -80,8 +90,8 @@ def replay(
 
     Exit code 3 if anything differs. Example: `duagc replay outputs/demo/run`
     """
-    from pipeline.replay import replay as replay_robots
-    from pipeline.run_folder import RunFolder
+    from duagc.pipeline.replay import replay as replay_robots
+    from duagc.pipeline.runs.folder import RunFolder
 
     run = RunFolder(run_folder)
     robots = [robot] if robot else list(run.robots)
@@ -114,10 +124,10 @@ def evaluate(
 
     Example: `duagc evaluate outputs/demo/run --own-longer`
     """
-    from pipeline.evaluation import evaluate as evaluate_run
-    from pipeline.report.words import comparison_text
-    from pipeline.run_folder import RunFolder
-    from pipeline.runner import threads_per_worker
+    from duagc.pipeline.evaluation import evaluate as evaluate_run
+    from duagc.pipeline.report.labels import comparison_text
+    from duagc.pipeline.runner import threads_per_worker
+    from duagc.pipeline.runs.folder import RunFolder
 
     metrics = evaluate_run(
         run_folder,
@@ -141,8 +151,8 @@ def report(
 
     Example: `duagc report outputs/demo/run`
     """
-    from pipeline.report import write_report
-    from pipeline.run_folder import RunFolder
+    from duagc.pipeline.report import write_report
+    from duagc.pipeline.runs.folder import RunFolder
 
     print(write_report(run_folder, recording or RunFolder(run_folder).recording))
 
@@ -155,6 +165,6 @@ def digest(
 
     Example: `duagc digest outputs/demo/run`
     """
-    from pipeline.digest import digest as digest_path
+    from duagc.pipeline.runs.digest import digest as digest_path
 
     print(digest_path(path))

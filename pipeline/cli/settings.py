@@ -5,14 +5,14 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import ConfigFile, Overrides, config_app
+from duagc.pipeline.cli.common import ConfigFile, Overrides, config_app
 
 
 @config_app.command("show")
 def config_show(config: ConfigFile = None, overrides: Overrides = None) -> None:
     """Print the resolved configuration as TOML, every setting with its documentation."""
-    from pipeline.config import dump, load
-    from pipeline.runner import RunConfig
+    from duagc.pipeline.config.base import dump, load
+    from duagc.pipeline.config.run import RunConfig
 
     print(dump(load(RunConfig, config, overrides or [])), end="")
 
@@ -20,8 +20,8 @@ def config_show(config: ConfigFile = None, overrides: Overrides = None) -> None:
 @config_app.command("check")
 def config_check(config: Annotated[Path, typer.Argument(show_default=False)]) -> None:
     """Say whether a configuration file is sound."""
-    from pipeline.config import load
-    from pipeline.runner import RunConfig
+    from duagc.pipeline.config.base import load
+    from duagc.pipeline.config.run import RunConfig
 
     load(RunConfig, config)
     print(f"{config}: sound")

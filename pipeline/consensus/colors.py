@@ -20,9 +20,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.config import ColorConfig
-from pipeline.consensus.evidence import COLOR, COLOR_INFORMATION, Evidence, rows_by_id
-from pipeline.registration.residuals import MAD_TO_SIGMA
+from duagc.pipeline.config.consensus import ColorConfig
+from duagc.pipeline.consensus.evidence import COLOR, COLOR_INFORMATION, Evidence, rows_by_id
+from duagc.pipeline.registration.residuals import MAD_TO_SIGMA
 
 Array = NDArray[np.float64]
 Pairs = Mapping[tuple[str, str], NDArray[np.int64]]

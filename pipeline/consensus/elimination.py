@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from pipeline.consensus import factors as pose_factors
-from pipeline.consensus.factors import Factors
+from duagc.pipeline.posegraph import factors as pose_factors
+from duagc.pipeline.posegraph.factors import Factors
 
 Array = NDArray[np.float64]
 Variable = tuple[int, int]  # index of the owner in the team, its keyframe

@@ -16,9 +16,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.consensus.factors import inflated
-from pipeline.geometry import se3, so3, spd
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.geometry import se3, so3, spd
+from duagc.pipeline.posegraph.factors import inflated
+from duagc.pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]
 MEAN, LOG_COVARIANCE, COLOR, OPACITY = slice(0, 3), slice(3, 9), slice(9, 12), 12

@@ -24,10 +24,10 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
-from pipeline.consensus.colors import team_colors
-from pipeline.consensus.config import MatchingConfig
-from pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Evidence
-from pipeline.geometry import spd
+from duagc.pipeline.config.consensus import MatchingConfig
+from duagc.pipeline.consensus.colors import team_colors
+from duagc.pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Evidence
+from duagc.pipeline.geometry import spd
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus import factors as pose_factors
-from pipeline.consensus.config import PoseConsensusConfig
-from pipeline.consensus.elimination import Block, Front, Step, Variable, damped, shared_variables
-from pipeline.consensus.factors import Factors, retract
-from pipeline.consensus.robust import RobustWeights
+from duagc.pipeline.config.consensus import PoseConsensusConfig
+from duagc.pipeline.consensus.elimination import Block, Front, Step, Variable, damped, shared_variables
+from duagc.pipeline.posegraph import factors as pose_factors
+from duagc.pipeline.posegraph.factors import Factors, retract
+from duagc.pipeline.posegraph.robust import RobustWeights
 
 Array = NDArray[np.float64]
 Message = dict[Variable, int] | tuple[int, Block] | Step

@@ -16,9 +16,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.consensus.config import WeightKind
-from pipeline.consensus.evidence import Evidence, FisherSums, pack_information, rows_by_id
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.config.consensus import WeightKind
+from duagc.pipeline.consensus.evidence import Evidence, FisherSums, pack_information, rows_by_id
+from duagc.pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]
 UNIT_SIGMA_M, UNIT_SIGMA_SHAPE, UNIT_SIGMA_COLOR, UNIT_SIGMA_OPACITY = 0.01, 1.0, 0.07, 0.5

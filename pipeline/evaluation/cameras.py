@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.evaluation.results import Absent
-from pipeline.fusion.stage import peer_colors
-from pipeline.run_folder import RobotRun
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.fusion.stage import peer_colors
+from duagc.pipeline.runs.folder import RobotRun
 
 CHANNELS = ("red", "green", "blue")
 VALUES = ("gain", "offset", "sigma_gain", "sigma_offset")

@@ -14,9 +14,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation.results import Absent
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]

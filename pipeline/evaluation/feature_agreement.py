@@ -14,11 +14,11 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import streams
-from pipeline.evaluation.results import Absent
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.registration.features import Features, extract, matches, ransac
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.registration.features import Features, extract, matches, ransac
 
 Array = NDArray[np.float64]
 
@@ -72,7 +72,7 @@ def _matched(ours: Features, theirs: Features, a: int, b: int) -> tuple[Array, A
     if len(pairs) < MIN_MATCHES:
         return None
     points_a, points_b = ours.points[pairs[:, 0]].astype(float), theirs.points[pairs[:, 1]].astype(float)
-    rng = streams.generator(0, "evaluation.feature_agreement", first=a, second=b)
+    rng = random_streams.generator(0, "evaluation.feature_agreement", first=a, second=b)
     _, agree = ransac(points_a, points_b, INLIER_M, HYPOTHESES, rng)
     if agree.sum() < max(MIN_MATCHES, MIN_SHARE * len(pairs)):
         return None

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import DuagError
-from pipeline.evaluation.results import Absent
-from pipeline.geometry.trajectory import Trajectory
-from pipeline.messages import unpack_depth, unpack_pose_in_frame
-from pipeline.recording import DEPTH_SCALE_KEY, Recording, read_log, verify
-from schemas import topics
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.messages import unpack_depth, unpack_pose_in_frame
+from duagc.pipeline.recording import DEPTH_SCALE_KEY, Recording, read_log, verify
+from duagc.schemas import topics
 
 
 def trajectory(recording: Recording, robot: str) -> Trajectory | Absent:

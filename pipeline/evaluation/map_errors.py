@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation import calibration
-from pipeline.evaluation.groundtruth import Surface
-from pipeline.evaluation.results import Absent
-from pipeline.geometry import se3
-from pipeline.messages import GaussianMap
-from pipeline.run_folder import position_information
+from duagc.pipeline.evaluation import uncertainty_calibration
+from duagc.pipeline.evaluation.groundtruth import Surface
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.messages import GaussianMap
+from duagc.pipeline.runs.folder import position_information
 
 Array = NDArray[np.float64]
 WORST_CONDITION = 1e12
@@ -91,18 +91,20 @@ def scores(errors: MapErrors, robot: str) -> dict[str, Any]:
         counts = {"gaussians": n, "gaussians_without_information": errors.without_information}
         return {name: counts.get(name, absent) for name in NAMES}
     sigma, error = errors.sigma_m, errors.error_m
-    scale = calibration.fitted_scale(sigma[::2], error[::2])
+    scale = uncertainty_calibration.fitted_scale(sigma[::2], error[::2])
     judged = scale * sigma[1::2], error[1::2]
     return {
-        "ece_paper": calibration.ece_paper(errors.paper_uncertainty, error),
-        "ece_rank": calibration.ece_rank(sigma, error),
-        "ece_rank_shuffled": calibration.ece_rank(calibration.shuffled(sigma, robot), error),
-        "spearman": calibration.spearman(sigma, error),
-        "ause": calibration.ause(sigma, error),
-        "nll": calibration.nll(sigma, error),
-        "coverage_95": calibration.coverage_95(sigma, error),
-        "nll_scaled": calibration.nll(*judged),
-        "coverage_95_scaled": calibration.coverage_95(*judged),
+        "ece_paper": uncertainty_calibration.ece_paper(errors.paper_uncertainty, error),
+        "ece_rank": uncertainty_calibration.ece_rank(sigma, error),
+        "ece_rank_shuffled": uncertainty_calibration.ece_rank(
+            uncertainty_calibration.shuffled(sigma, robot), error
+        ),
+        "spearman": uncertainty_calibration.spearman(sigma, error),
+        "ause": uncertainty_calibration.ause(sigma, error),
+        "nll": uncertainty_calibration.nll(sigma, error),
+        "coverage_95": uncertainty_calibration.coverage_95(sigma, error),
+        "nll_scaled": uncertainty_calibration.nll(*judged),
+        "coverage_95_scaled": uncertainty_calibration.coverage_95(*judged),
         "sigma_scale": scale,
         "gaussians": n,
         "gaussians_without_information": errors.without_information,

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.robust import COUNTS
-from pipeline.errors import DuagError
-from pipeline.evaluation.oracle import gap_to_oracle
-from pipeline.evaluation.results import Absent
-from pipeline.recording import read_log
-from pipeline.run_folder import RunFolder
-from schemas import topics
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.evaluation.oracle import gap_to_oracle
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.posegraph.robust import COUNTS
+from duagc.pipeline.recording import read_log
+from duagc.pipeline.runs.folder import RunFolder
+from duagc.schemas import topics
 
 Series = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
 
@@ -175,7 +175,7 @@ class Session:
     @cached_property
     def pairs(self) -> dict[tuple[str, str], NDArray[np.int64]]:
         """Ids of matched Gaussians [n, 2] by robots, lower name first: the newest pair lists that were sent."""
-        from pipeline.exchange.wire import PairList, read_pairs
+        from duagc.pipeline.exchange.wire.state_wire import PairList, read_pairs
 
         newest: dict[tuple[int, int], PairList] = {}
         for message in self._log("exchange.mcap", topics.PEER_MESSAGE):

@@ -16,28 +16,28 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from pipeline.config import Model
-from pipeline.consensus.central import solve_central, team_graph
-from pipeline.consensus.closures import Closure
-from pipeline.consensus.config import MatchingConfig, PoseConsensusConfig
-from pipeline.consensus.evidence import Evidence, theta_of
-from pipeline.consensus.factors import Factors
-from pipeline.consensus.gaussians import Weights
-from pipeline.consensus.poses import with_floor
-from pipeline.consensus.weighting import own_stiffness, told
-from pipeline.errors import DuagError
-from pipeline.evaluation.results import Absent
-from pipeline.exchange.config import ExchangeConfig
-from pipeline.fusion.config import FusionConfig
-from pipeline.fusion.fuse import fuse
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.messages import GaussianInformation, unpack_pose
-from pipeline.recording import read_log
-from pipeline.robot import Step, factors_of, registrations_of
-from pipeline.run_folder import RobotRun, RunFolder
-from pipeline.splat.gaussians import Gaussians
-from schemas import topics
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.base import Model
+from duagc.pipeline.config.consensus import MatchingConfig, PoseConsensusConfig
+from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.config.fusion import FusionConfig
+from duagc.pipeline.consensus.evidence import Evidence, theta_of
+from duagc.pipeline.consensus.pose_admm import with_floor
+from duagc.pipeline.consensus.weighting import own_stiffness, told
+from duagc.pipeline.consensus.weights import Weights
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.fusion.fuse import fuse
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.messages import GaussianInformation, unpack_pose
+from duagc.pipeline.posegraph.central import solve_central, team_graph
+from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph.loop_closures import Closure
+from duagc.pipeline.recording import read_log
+from duagc.pipeline.runs.folder import RobotRun, RunFolder
+from duagc.pipeline.runs.robot_data import Step, factors_of, registrations_of
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.schemas import topics
 
 Array = NDArray[np.float64]
 NOBODY = Absent("no two robots share a world")

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation import groundtruth, trajectory_errors
-from pipeline.evaluation.results import Absent
-from pipeline.geometry import se3
-from pipeline.geometry.trajectory import Trajectory
-from pipeline.recording import Recording
-from pipeline.run_folder import RunFolder
+from duagc.pipeline.evaluation import groundtruth, trajectory_errors
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.recording import Recording
+from duagc.pipeline.runs.folder import RunFolder
 
 Array = NDArray[np.float64]
 

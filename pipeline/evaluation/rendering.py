@@ -14,21 +14,22 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.colors import ColorMap
-from pipeline.consensus.config import MatchingConfig
-from pipeline.evaluation import groundtruth, views
-from pipeline.evaluation.oracle import section_of
-from pipeline.evaluation.results import Absent, Row
-from pipeline.fusion.config import RefineConfig
-from pipeline.fusion.refine import refine, steps_of
-from pipeline.fusion.stage import peer_colors, training_views
-from pipeline.geometry.trajectory import Trajectory
-from pipeline.progress import track
-from pipeline.recording import Recording, RgbdLog, open_rgbd
-from pipeline.registration.moving import MovingConfig
-from pipeline.robot import AgentInput
-from pipeline.run_folder import RobotRun, RunFolder
-from pipeline.splat.gaussians import DepthKind, Gaussians
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.config.consensus import MatchingConfig
+from duagc.pipeline.config.fusion import RefineConfig
+from duagc.pipeline.config.registration import MovingConfig
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.consensus.colors import ColorMap
+from duagc.pipeline.evaluation import groundtruth, views
+from duagc.pipeline.evaluation.oracle import section_of
+from duagc.pipeline.evaluation.results import Absent, Row
+from duagc.pipeline.fusion.finetune import refine, steps_of
+from duagc.pipeline.fusion.stage import peer_colors, training_views
+from duagc.pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.recording import Recording, RgbdLog, open_rgbd
+from duagc.pipeline.runs.folder import RobotRun, RunFolder
+from duagc.pipeline.runs.robot_data import AgentInput
+from duagc.pipeline.splat.gaussians import Gaussians
 
 COMPARED = ("own", "own_longer", "fused", "refined")
 IN_EVERY_RUN = ("own", "fused", "refined")

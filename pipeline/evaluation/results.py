@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.files import new_file
+from duagc.pipeline.base.files import new_file
 
 
 @dataclass(frozen=True)

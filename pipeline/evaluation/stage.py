@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import DuagError
-from pipeline.evaluation import (
-    agreement,
-    calibration,
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.evaluation import (
     cameras,
     groundtruth,
+    map_agreement,
     map_errors,
     trajectory_errors,
+    uncertainty_calibration,
 )
-from pipeline.evaluation.network import Session
-from pipeline.evaluation.rendering import poses_by_stamp, rendering_sections
-from pipeline.evaluation.results import (
+from duagc.pipeline.evaluation.network import Session
+from duagc.pipeline.evaluation.rendering import poses_by_stamp, rendering_sections
+from duagc.pipeline.evaluation.results import (
     Absent,
     Row,
     leaves,
@@ -31,10 +31,10 @@ from pipeline.evaluation.results import (
     write_json,
     write_parquet,
 )
-from pipeline.evaluation.trajectory_errors import Paired, TeamError
-from pipeline.geometry.trajectory import Trajectory
-from pipeline.recording import Recording
-from pipeline.run_folder import SCHEMA, RobotRun, RunFolder
+from duagc.pipeline.evaluation.trajectory_errors import Paired, TeamError
+from duagc.pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.recording import Recording
+from duagc.pipeline.runs.folder import SCHEMA, RobotRun, RunFolder
 
 PROTOCOL = {
     "alignment": "se3",
@@ -184,7 +184,7 @@ def _robot_section(robot: RobotRun, truth: TruePaths) -> dict[str, Any]:
 def _agreement_section(robot: RobotRun, source: Recording, truth: TruePaths) -> dict[str, Any]:
     held_out = {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
     paths = {"": poses_by_stamp(robot.trajectory), "_before_consensus": poses_by_stamp(robot.odometry)}
-    return agreement.section(source.log(robot.robot), held_out, paths, truth.after[robot.robot])
+    return map_agreement.section(source.log(robot.robot), held_out, paths, truth.after[robot.robot])
 
 
 def _ate_of_keyframes(robot: RobotRun, pairs: Paired) -> float | Absent:
@@ -254,7 +254,7 @@ def _reliability_rows(robot: str, errors: map_errors.MapErrors) -> list[Row]:
         return []
     rows = []
     for decile, (predicted_m, observed_m) in enumerate(
-        calibration.reliability(errors.sigma_m, errors.error_m)
+        uncertainty_calibration.reliability(errors.sigma_m, errors.error_m)
     ):
         rows.append(Row("reliability", robot, f"decile {decile}", -1, "predicted_rms_m", predicted_m))
         rows.append(Row("reliability", robot, f"decile {decile}", -1, "observed_rms_m", observed_m))

@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation.results import Absent, mean
-from pipeline.geometry import se3
-from pipeline.splat import losses
-from pipeline.splat.gaussians import DepthKind, Gaussians
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.evaluation.results import Absent, mean
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.splat import losses
+from duagc.pipeline.splat.gaussians import Gaussians
 
 if TYPE_CHECKING:
-    from pipeline.geometry.camera import PinholeCamera
-    from pipeline.kernels import Render
-    from pipeline.recording import RgbdFrame
+    from duagc.pipeline.geometry.camera import PinholeCamera
+    from duagc.pipeline.kernels import Render
+    from duagc.pipeline.recording import RgbdFrame
 
 Score = float | Absent
 PSNR_CEILING_DB = 100.0  # of a render equal to its image: infinity has no place in a JSON file
@@ -139,7 +140,7 @@ def score_maps(
     Yields:
         Frame index and scores by the maps' names.
     """
-    from pipeline.kernels import Rasterizer
+    from duagc.pipeline.kernels import Rasterizer
 
     own = local()
 

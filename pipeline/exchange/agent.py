@@ -27,20 +27,21 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.closures import plausible
-from pipeline.exchange import injection, places_wire, wire
-from pipeline.exchange.config import ExchangeConfig
-from pipeline.exchange.frames import Frames
-from pipeline.exchange.meeting import HigherEnd, LowerEnd, Meeting, OwnPlaces, Send
-from pipeline.exchange.neighbour import Neighbour
-from pipeline.exchange.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError, Packet, parse
-from pipeline.exchange.sharing import Sharing
-from pipeline.exchange.signatures import Identity
-from pipeline.exchange.solvers import AdmmSolver, EliminationSolver, LinkStart, PoseSolver, SolverStart
-from pipeline.exchange.transport import Arrival, Message, Outgoing, Transport
-from pipeline.exchange.wire import Anchors, PairFrames, State, pair_bit
-from pipeline.geometry import se3
-from pipeline.robot import RobotData
+from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.exchange import injection
+from duagc.pipeline.exchange.loop_closing import HigherEnd, LowerEnd, Meeting, OwnPlaces, Send
+from duagc.pipeline.exchange.map_alignment import Frames
+from duagc.pipeline.exchange.neighbour import Neighbour
+from duagc.pipeline.exchange.sharing import Sharing
+from duagc.pipeline.exchange.solvers import AdmmSolver, EliminationSolver, LinkStart, PoseSolver, SolverStart
+from duagc.pipeline.exchange.wire import places_wire, state_wire
+from duagc.pipeline.exchange.wire.state_wire import Anchors, PairFrames, State, pair_bit
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.network.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError, Packet, parse
+from duagc.pipeline.network.signatures import Identity
+from duagc.pipeline.network.transport import Arrival, Message, Outgoing, Transport
+from duagc.pipeline.posegraph.loop_closures import plausible
+from duagc.pipeline.runs.robot_data import RobotData
 
 Array = NDArray[np.float64]
 EVERYWHERE = 255  # a hop count that has reached the whole component, for good
@@ -190,7 +191,7 @@ class Agent:
         elif arrival.kind is Kind.TREE:
             self._take_tree(n, payload)
         elif arrival.kind is Kind.VOXELS:
-            _, n.voxels = wire.read_voxels(payload, team)
+            _, n.voxels = state_wire.read_voxels(payload, team)
         elif arrival.kind is Kind.ANCHORS:
             n.anchors_told.add(self.knowledge.take_anchors(payload))
         elif arrival.kind is Kind.PAIRS:
@@ -217,7 +218,7 @@ class Agent:
         }
 
     def _take_state(self, n: Neighbour, payload: bytes) -> None:
-        n.state, poses = wire.read_state(payload, len(self.team))
+        n.state, poses = state_wire.read_state(payload, len(self.team))
         if (
             poses
             and n.state.parted == self.frames.parted
@@ -228,7 +229,7 @@ class Agent:
 
     def _take_tree(self, n: Neighbour, payload: bytes) -> None:
         """A message of the solver. One of a start that is still to come here waits for it."""
-        parted, rest = wire.read_labelled(payload, len(self.team))
+        parted, rest = state_wire.read_labelled(payload, len(self.team))
         if self.poses is not None and parted == self.frames.parted:
             self.poses.take_message(n.index, rest)
         elif parted & self.frames.parted == self.frames.parted:
@@ -264,7 +265,7 @@ class Agent:
     def _states(self, neighbour: Neighbour) -> list[Message]:
         """The state of this round, with the poses of this round if there are any."""
         direct = {n.index for n in self._joined()}
-        state = wire.write_state(
+        state = state_wire.write_state(
             State(
                 self.frames.links,
                 self.frames.parted,
@@ -371,7 +372,7 @@ class Agent:
             self.refused.update(self.poses.refused)
             self.poses.refused.clear()
             for receiver, payload in self.poses.messages():
-                labelled = wire.write_labelled(self.frames.parted, len(self.team), payload)
+                labelled = state_wire.write_labelled(self.frames.parted, len(self.team), payload)
                 self._send(self.neighbours[receiver], Kind.TREE, labelled)
         if self.agreed:
             return
@@ -388,7 +389,7 @@ class Agent:
             self.rounds_to_agreement = self.round
             anchors = Anchors(self.own, self.poses.T_world_keyframe, self.data.T_map_keyframe[0])
             self.knowledge.anchors[self.own] = anchors
-            self.knowledge.anchors_bytes[self.own] = wire.write_anchors(anchors)
+            self.knowledge.anchors_bytes[self.own] = state_wire.write_anchors(anchors)
 
     def _start_poses(self) -> None:
         """Give the solver the own map where it was placed, and the joined neighbours."""
@@ -459,7 +460,7 @@ class Agent:
 
     @staticmethod
     def _supplied(n: Neighbour, everyone: list[int]) -> bool:
-        return n.state is not None and all(n.state.sources[m] == wire.COMPLETE for m in everyone)
+        return n.state is not None and all(n.state.sources[m] == state_wire.COMPLETE for m in everyone)
 
 
 def _pair(a: int, b: int) -> tuple[int, int]:

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import streams
-from pipeline.consensus.closures import Closure
-from pipeline.exchange.config import InjectionConfig
-from pipeline.geometry import se3, so3
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.config.exchange import InjectionConfig
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.posegraph.loop_closures import Closure
 
 DETAIL = "injected: false on purpose"
 
@@ -37,7 +37,7 @@ def false_closures(
     count = round(share / (1 - share) * len(closures))
     out = []
     for k in range(count):
-        rng = streams.generator(seed, "injection.closure", robot=robot, peer=peer, number=k)
+        rng = random_streams.generator(seed, "injection.closure", robot=robot, peer=peer, number=k)
         model = closures[int(rng.integers(len(closures)))]
         R = so3.from_quat_wxyz(rng.normal(size=4))
         t = rng.uniform(-config.false_closure_m, config.false_closure_m, 3)
@@ -51,7 +51,7 @@ def false_matches(
     pairs: NDArray[np.int64], config: InjectionConfig, seed: int, robot: str, peer: str
 ) -> NDArray[np.int64]:
     """Pairs [n, 2] of which `config.false_matches` have exchanged partners."""
-    rng = streams.generator(seed, "injection.matches", robot=robot, peer=peer)
+    rng = random_streams.generator(seed, "injection.matches", robot=robot, peer=peer)
     chosen = np.flatnonzero(rng.random(len(pairs)) < config.false_matches)
     out = pairs.copy()
     out[chosen, 1] = pairs[np.roll(chosen, 1), 1]
@@ -62,5 +62,5 @@ def poses_are_missing(config: InjectionConfig, seed: int, robot: str, peer: str,
     """Whether a robot says nothing of its poses to a neighbour in this round."""
     if config.pose_dropouts == 0.0:
         return False
-    rng = streams.generator(seed, "injection.poses", robot=robot, peer=peer, round=round_index)
+    rng = random_streams.generator(seed, "injection.poses", robot=robot, peer=peer, round=round_index)
     return bool(rng.random() < config.pose_dropouts)

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange import evidence_wire, wire
-from pipeline.exchange.packets import EVIDENCE_HEAD_BYTES, Kind, MalformedError
-from pipeline.exchange.wire import Anchors, PairList
-from pipeline.splat.gaussians import DepthKind
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.exchange.wire import evidence_wire, state_wire
+from duagc.pipeline.exchange.wire.state_wire import Anchors, PairList
+from duagc.pipeline.network.packets import EVIDENCE_HEAD_BYTES, Kind, MalformedError
 
 Records = NDArray[Any]
 
@@ -75,10 +75,10 @@ class Knowledge:
         Args:
             direct: neighbours that will send their own evidence themselves. living: neighbours not given up.
         """
-        out = np.full(self.team, wire.NOBODY, np.uint8)
+        out = np.full(self.team, state_wire.NOBODY, np.uint8)
         for owner in range(self.team):
             if owner == self.own or owner in self.evidence:
-                out[owner] = wire.COMPLETE
+                out[owner] = state_wire.COMPLETE
             elif owner in direct:
                 out[owner] = owner
             else:
@@ -89,7 +89,7 @@ class Knowledge:
 
     def take_anchors(self, payload: bytes) -> int:
         """Take agreed poses, if they are news; returns their owner."""
-        anchors = wire.read_anchors(payload, self.team)
+        anchors = state_wire.read_anchors(payload, self.team)
         if anchors.owner == self.own:
             raise MalformedError("anchors: a neighbour speaks for this robot")
         if anchors.owner not in self.anchors:
@@ -98,7 +98,7 @@ class Knowledge:
 
     def take_pairs(self, payload: bytes) -> tuple[int, int]:
         """Take a pair list, if it is news; returns the pair. The lower-named robot of a pair speaks for it."""
-        pairs = wire.read_pairs(payload, self.team)
+        pairs = state_wire.read_pairs(payload, self.team)
         key = (pairs.lower, pairs.higher)
         if pairs.lower == self.own:
             raise MalformedError("pairs: a neighbour speaks for this robot")

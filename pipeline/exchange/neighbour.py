@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange.meeting import Meeting
-from pipeline.exchange.transport import Transport
-from pipeline.exchange.wire import State
+from duagc.pipeline.exchange.loop_closing import Meeting
+from duagc.pipeline.exchange.wire.state_wire import State
+from duagc.pipeline.network.transport import Transport
 
 Pair = tuple[int, int]
 

@@ -8,16 +8,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import schemas
-from pipeline.errors import DuagError
-from pipeline.exchange.agent import Agent
-from pipeline.exchange.links import Fate
-from pipeline.exchange.packets import EVIDENCE_KINDS, HEADER_BYTES, Kind, MalformedError, parse, payload_bytes
-from pipeline.exchange.transport import Outgoing
-from pipeline.messages import map_frame, pack_pose, pack_stamp
-from pipeline.recording import LogWriter, read_log
-from pipeline.robot import AgentResult, RobotData
-from schemas import topics
+from duagc import schemas
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.exchange.agent import Agent
+from duagc.pipeline.messages import map_frame, pack_pose, pack_stamp
+from duagc.pipeline.network.link_model import Fate
+from duagc.pipeline.network.packets import (
+    EVIDENCE_KINDS,
+    HEADER_BYTES,
+    Kind,
+    MalformedError,
+    parse,
+    payload_bytes,
+)
+from duagc.pipeline.network.transport import Outgoing
+from duagc.pipeline.recording import LogWriter, read_log
+from duagc.pipeline.runs.robot_data import AgentResult, RobotData
+from duagc.schemas import topics
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,14 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline import numeric
-from pipeline.exchange import links
-from pipeline.exchange.agent import Agent
-from pipeline.exchange.config import ExchangeConfig
-from pipeline.exchange.outcome import result_of
-from pipeline.exchange.record import read_session
-from pipeline.exchange.session import Delivery, due
-from pipeline.robot import AgentInput, AgentResult, RobotData, load
+from duagc.pipeline.base import determinism
+from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.exchange.agent import Agent
+from duagc.pipeline.exchange.record import read_session
+from duagc.pipeline.exchange.session import Delivery, due
+from duagc.pipeline.exchange.session_result import result_of
+from duagc.pipeline.network import link_model
+from duagc.pipeline.runs.robot_data import AgentInput, AgentResult, RobotData, load
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def replay_agent_of(
     data: RobotData, config: ExchangeConfig, *, seed: int, exchange_path: Path
 ) -> tuple[AgentResult, SentPackets]:
     """`replay_agent` on data in memory."""
-    numeric.settle_opencv()
+    determinism.settle_opencv()
     session = read_session(exchange_path)
     waiting: list[Delivery] = []
     recorded, recomputed = hashlib.sha256(), hashlib.sha256()
@@ -56,7 +56,7 @@ def replay_agent_of(
             recorded.update(p.data)
         if p.receiver == data.robot:
             waiting.extend((at_ns, p.sender, p.sequence, p.data) for at_ns in p.deliver_ns)
-    neighbours = links.neighbours(config.link, session.team)[data.robot]
+    neighbours = link_model.neighbours(config.link, session.team)[data.robot]
     agent = Agent(data, session.team, neighbours, config, seed)
     for round_index in range(session.rounds):
         now_ns = round_index * config.period_ns

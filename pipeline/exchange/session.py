@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline import numeric
-from pipeline.errors import DuagError
-from pipeline.exchange import links
-from pipeline.exchange.agent import Agent
-from pipeline.exchange.config import ExchangeConfig
-from pipeline.exchange.links import LinkModel
-from pipeline.exchange.outcome import result_of
-from pipeline.exchange.record import ConsensusRecorder, ExchangeRecorder, RawAlternative
-from pipeline.exchange.wire import MAX_TEAM
-from pipeline.progress import track
-from pipeline.recording import LogWriter
-from pipeline.robot import AgentInput, AgentResult, RobotData, load
+from duagc.pipeline.base import determinism
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.exchange.agent import Agent
+from duagc.pipeline.exchange.record import ConsensusRecorder, ExchangeRecorder, RawAlternative
+from duagc.pipeline.exchange.session_result import result_of
+from duagc.pipeline.exchange.wire.state_wire import MAX_TEAM
+from duagc.pipeline.network import link_model
+from duagc.pipeline.network.link_model import LinkModel
+from duagc.pipeline.recording import LogWriter
+from duagc.pipeline.runs.robot_data import AgentInput, AgentResult, RobotData, load
 
 __all__ = ["AgentInput", "run_session", "run_session_of"]
 
@@ -55,7 +55,7 @@ def run_session_of(
     consensus_path: Path,
 ) -> dict[str, AgentResult]:
     """`run_session` on data in memory, one entry per robot."""
-    numeric.settle_opencv()
+    determinism.settle_opencv()
     agents = team_of(data, config, seed)
     model = LinkModel(config.link, seed)
     waiting: dict[str, list[Delivery]] = {robot: [] for robot in agents}
@@ -101,7 +101,7 @@ def team_of(data: Sequence[RobotData], config: ExchangeConfig, seed: int) -> dic
     names = sorted(d.robot for d in data)
     if len(set(names)) != len(names) or len(names) > MAX_TEAM:
         raise DuagError(f"team of {len(names)}: expected different names and at most {MAX_TEAM} robots")
-    linked = links.neighbours(config.link, names)
+    linked = link_model.neighbours(config.link, names)
     by_name = {d.robot: d for d in data}
     return {name: Agent(by_name[name], names, linked[name], config, seed) for name in names}
 

@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.exchange import evidence_wire, injection, wire
-from pipeline.exchange.config import ExchangeConfig
-from pipeline.exchange.evidence import best_first, match_pairs, own_records, seen_voxels, within
-from pipeline.exchange.knowledge import Knowledge
-from pipeline.exchange.neighbour import Neighbour
-from pipeline.exchange.packets import Kind
-from pipeline.exchange.wire import PairList
-from pipeline.robot import RobotData
+from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.exchange import injection
+from duagc.pipeline.exchange.evidence_records import best_first, match_pairs, own_records, seen_voxels, within
+from duagc.pipeline.exchange.knowledge import Knowledge
+from duagc.pipeline.exchange.neighbour import Neighbour
+from duagc.pipeline.exchange.wire import evidence_wire, state_wire
+from duagc.pipeline.exchange.wire.state_wire import PairList
+from duagc.pipeline.network.packets import Kind
+from duagc.pipeline.runs.robot_data import RobotData
 
 Array = NDArray[np.float64]
 EVIDENCE_WIRES = {
@@ -82,7 +83,7 @@ class Sharing:
             if self.config.coverage == "overlap" and T_world_map is not None and not n.voxels_told:
                 n.voxels_told = True
                 keys = seen_voxels(self.data.gaussians, T_world_map, self.config.overlap_voxel_m)
-                self._send(n, Kind.VOXELS, wire.write_voxels(self.own, keys))
+                self._send(n, Kind.VOXELS, state_wire.write_voxels(self.own, keys))
             self._tell_evidence(n, members, T_world_map)
             for owner in sorted(k.anchors_bytes):
                 if owner != n.index and owner not in n.anchors_told:
@@ -98,7 +99,7 @@ class Sharing:
         for owner in [self.own, *sorted(self.knowledge.evidence)]:
             if owner not in members:
                 continue
-            wanted = owner != n.index and n.state.sources[owner] in (wire.NOBODY, self.own)
+            wanted = owner != n.index and n.state.sources[owner] in (state_wire.NOBODY, self.own)
             if not wanted and owner in n.evidence_sent:  # it is there, or somebody else brings it
                 n.transport.cancel(n.evidence_sent.pop(owner))
             if not wanted or owner in n.evidence_sent:
@@ -151,4 +152,4 @@ class Sharing:
                 )
                 pairs = PairList(self.own, other, 1, ids)
                 k.pairs[self.own, other] = pairs
-                k.pairs_bytes[self.own, other] = wire.write_pairs(pairs)
+                k.pairs_bytes[self.own, other] = state_wire.write_pairs(pairs)

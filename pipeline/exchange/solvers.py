@@ -9,16 +9,16 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.closures import Closure, closure_factors
-from pipeline.consensus.config import PoseConsensusConfig
-from pipeline.consensus.elimination import Variable
-from pipeline.consensus.factors import Factors
-from pipeline.consensus.links import SharedKeyframes
-from pipeline.consensus.poses import PoseAgent, with_floor
-from pipeline.consensus.robust import COUNTS, RobustWeights
-from pipeline.consensus.tree import TreeGraph, TreeNode, TreePlace
-from pipeline.exchange import tree_wire
-from pipeline.exchange.poses_wire import read_poses, write_poses_in_parts
+from duagc.pipeline.config.consensus import PoseConsensusConfig
+from duagc.pipeline.consensus.admm_edge import SharedKeyframes
+from duagc.pipeline.consensus.elimination import Variable
+from duagc.pipeline.consensus.pose_admm import PoseAgent, with_floor
+from duagc.pipeline.consensus.tree import TreeGraph, TreeNode, TreePlace
+from duagc.pipeline.exchange.wire import elimination_wire
+from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses_in_parts
+from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph.loop_closures import Closure, closure_factors
+from duagc.pipeline.posegraph.robust import COUNTS, RobustWeights
 
 Array = NDArray[np.float64]
 
@@ -186,7 +186,7 @@ class EliminationSolver:
         return TreeGraph(variables, np.concatenate(poses), masks, trusted, doubted)
 
     def advance(self) -> None:
-        self._arrived, refused = tree_wire.take_messages(self.node, self._arrived, self.team)
+        self._arrived, refused = elimination_wire.take_messages(self.node, self._arrived, self.team)
         self.refused += refused
         self.node.advance()
 
@@ -197,7 +197,7 @@ class EliminationSolver:
         raise ValueError("state: poses, where elimination sends messages")
 
     def messages(self) -> list[tuple[int, bytes]]:
-        sent = [(to, tree_wire.write_message(m, self.precision)) for to, m in self.node.outbox]
+        sent = [(to, elimination_wire.write_message(m, self.precision)) for to, m in self.node.outbox]
         self.node.outbox.clear()
         return sent
 

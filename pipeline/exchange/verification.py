@@ -8,11 +8,11 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.closures import Closure
-from pipeline.exchange.config import VerificationConfig
-from pipeline.geometry import se3
-from pipeline.registration import Reference, RgbdPyramid, register
-from pipeline.registration.features import Features, matches, ransac
+from duagc.pipeline.config.exchange import VerificationConfig
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph.loop_closures import Closure
+from duagc.pipeline.registration import Reference, RgbdPyramid, register
+from duagc.pipeline.registration.features import Features, matches, ransac
 
 Array = NDArray[np.float64]
 

@@ -18,10 +18,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.frontend.config import KeyframeConfig
-from pipeline.frontend.keyframes import KeyframePair, Refined, overlap, refine
-from pipeline.geometry import se3
-from pipeline.registration import (
+from duagc.pipeline.config.frontend import KeyframeConfig
+from duagc.pipeline.frontend.keyframe_graph import KeyframePair, Refined, overlap, refine
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import (
     Level,
     Outcome,
     Reference,
@@ -31,7 +31,7 @@ from pipeline.registration import (
     RgbdPyramid,
     linearise,
 )
-from pipeline.registration.features import Features
+from duagc.pipeline.registration.features import Features
 
 Array = NDArray[np.float64]
 Ends = tuple[int, int]  # of a pair: the earlier keyframe, the later one

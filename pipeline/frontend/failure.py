@@ -13,10 +13,10 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.frontend.config import FailureConfig
-from pipeline.geometry import se3
-from pipeline.registration import Level, RegistrationConfig, RgbdPyramid
-from pipeline.registration.moving import largest_of_3x3
+from duagc.pipeline.config.frontend import FailureConfig
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import Level, RegistrationConfig, RgbdPyramid
+from duagc.pipeline.registration.moving import largest_of_3x3
 
 Array = NDArray[np.float64]
 Image = NDArray[np.floating]

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import streams
-from pipeline.frontend.bundle import Images, View
-from pipeline.frontend.config import LoopConfig
-from pipeline.frontend.keyframes import KeyframePair, overlap
-from pipeline.geometry import se3
-from pipeline.registration import RegistrationConfig, register
-from pipeline.registration.features import matches, ransac
-from pipeline.registration.places import Places
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.config.frontend import LoopConfig
+from duagc.pipeline.frontend.bundle import Images, View
+from duagc.pipeline.frontend.keyframe_graph import KeyframePair, overlap
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import RegistrationConfig, register
+from duagc.pipeline.registration.features import matches, ransac
+from duagc.pipeline.registration.place_recognition import Places
 
 Array = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ def _verified(
     pairs = matches(ours.descriptors, theirs.descriptors, config.ratio)
     if len(pairs) < config.min_inliers:
         return None
-    rng = streams.generator(seed, "frontend.loop", robot=robot, first=first, second=second)
+    rng = random_streams.generator(seed, "frontend.loop", robot=robot, first=first, second=second)
     points = ours.points[pairs[:, 0]].astype(np.float64), theirs.points[pairs[:, 1]].astype(np.float64)
     guess, agree = ransac(*points, config.inlier_m, config.hypotheses, rng)
     if agree.sum() < max(config.min_inliers, config.min_inlier_share * len(pairs)):

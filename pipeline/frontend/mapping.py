@@ -14,15 +14,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import streams
-from pipeline.frontend.mapping_config import MappingConfig
-from pipeline.frontend.mapping_views import Bytes, Image, View, overlap
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import CompiledAdam, FisherSums, Gradients, LossWeights, Rasterizer, Render, ViewLoss
-from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.optimiser import LearningRates, falling
-from pipeline.splat.seeding import seed_discs, unexplained, worst_drawn
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.config.training import LearningRates
+from duagc.pipeline.frontend.mapping_views import Bytes, Image, View, overlap
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import (
+    CompiledAdam,
+    FisherSums,
+    Gradients,
+    LossWeights,
+    Rasterizer,
+    Render,
+    ViewLoss,
+)
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.optimizer import falling
+from duagc.pipeline.splat.seeding import seed_discs, unexplained, worst_drawn
 
 
 @dataclass(frozen=True)
@@ -169,7 +178,9 @@ class Mapper:
         for step in range(steps):
             position = step % len(views)
             if position == 0:
-                order = streams.generator(self.seed, "mapping.finish", start=step).permutation(len(views))
+                order = random_streams.generator(self.seed, "mapping.finish", start=step).permutation(
+                    len(views)
+                )
             if step in rounds:
                 came, went = self._densify(1.0 / (len(rounds) - rounds.index(step)))
                 inserted, pruned = inserted + came, pruned + went
@@ -368,7 +379,7 @@ class Mapper:
         chosen = self._covisible(newest, self.config.window)[1:]
         taken = {view.index for view in chosen}
         rest = [view for view in self._views[: newest.index] if view.index not in taken]
-        draw = streams.generator(self.seed, "mapping.window", keyframe=newest.index)
+        draw = random_streams.generator(self.seed, "mapping.window", keyframe=newest.index)
         lot = draw.permutation(len(rest))[: self.config.random_keyframes]
         others = [*chosen, *(rest[k] for k in lot)]
         steps = self.config.iterations

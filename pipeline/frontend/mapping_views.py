@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.splat.losses import depth_certainty, halve
-from pipeline.splat.optimiser import BETA_1, BETA_2
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.splat.losses import depth_certainty, halve
+from duagc.pipeline.splat.optimizer import BETA_1, BETA_2
 
 Image = NDArray[np.float32]
 Bytes = NDArray[np.uint8]

@@ -15,20 +15,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import progress as progress_bar
-from pipeline.errors import DuagError
-from pipeline.frontend import bundle, loops
-from pipeline.frontend.config import FrontendConfig, is_held_out
-from pipeline.frontend.failure import Reason
-from pipeline.frontend.keyframes import KeyframePair, Refined, refine
-from pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
-from pipeline.frontend.tracking import Tracker
-from pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
-from pipeline.recording import LogWriter, RgbdLog, open_rgbd
-from pipeline.registration import RgbdPyramid
-from pipeline.registration.moving import FreeSpace
-from pipeline.splat.gaussians import DepthKind, Gaussians
-from schemas import topics
+from duagc.pipeline.base import progress as progress_bar
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.frontend import bundle, loops
+from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.keyframe_graph import KeyframePair, Refined, refine
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
+from duagc.pipeline.frontend.tracking import Tracker
+from duagc.pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
+from duagc.pipeline.recording import LogWriter, RgbdLog, open_rgbd
+from duagc.pipeline.registration import RgbdPyramid
+from duagc.pipeline.registration.moving import FreeSpace
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.schemas import topics
 
 LATENCY_NS = 30_000_000
 """Outputs are received this long after the frame that they are about: a constant, never the wall clock."""
@@ -196,7 +197,7 @@ def _map(
     if not config.mapping_enabled:
         clock.lap("mapping_s")
         return [], _Maps(Gaussians.empty(), None, config.mapping.depth_kind(noise_m)), frames
-    from pipeline.frontend.mapping import Mapper, MappingStats
+    from duagc.pipeline.frontend.mapping import Mapper, MappingStats
 
     def update(keyframe: Keyframe, stats: MappingStats) -> MapUpdate:
         return MapUpdate(
@@ -267,7 +268,7 @@ def _refine_to_model(
     progress: bool,
 ) -> list[TrackedFrame]:
     """The frames with those between keyframes registered to the map, where that pays."""
-    from pipeline.frontend.model import ModelTracker
+    from duagc.pipeline.frontend.model_registration import ModelTracker
 
     model = ModelTracker(gaussians, depth, log.camera, config.model, config.tracking.registration, threads)
     taken = {keyframe.frame_index for keyframe in keyframes}
@@ -366,9 +367,9 @@ def _write(
 
 
 def _settle_opencv() -> None:
-    from pipeline import numeric
+    from duagc.pipeline.base import determinism
 
-    numeric.settle_opencv()
+    determinism.settle_opencv()
 
 
 class _Clock:

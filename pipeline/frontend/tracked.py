@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.frontend.failure import Reason
-from pipeline.geometry import se3
-from pipeline.registration import Level, Reference, Registration
-from pipeline.registration.features import Features
+from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import Level, Reference, Registration
+from duagc.pipeline.registration.features import Features
 
 Array = NDArray[np.float64]
 

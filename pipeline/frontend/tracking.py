@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.frontend.by_color import SoundFrame
-from pipeline.frontend.config import FrontendConfig, is_held_out
-from pipeline.frontend.failure import (
+from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
+from duagc.pipeline.frontend.color_only import SoundFrame
+from duagc.pipeline.frontend.failure import (
     Obstruction,
     Pace,
     Reason,
@@ -25,20 +25,15 @@ from pipeline.frontend.failure import (
     intruders,
     saturated_share,
 )
-from pipeline.frontend.keyframes import KeyframePair, becomes_keyframe, predicted_overlap
-from pipeline.frontend.relocalisation import features_of, guesses, supports
-from pipeline.frontend.settling import settle
-from pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import MotionPrior
-from pipeline.registration import (
-    Reference,
-    Registration,
-    RgbdPyramid,
-    register,
-)
-from pipeline.registration.features import Features
+from duagc.pipeline.frontend.keyframe_graph import KeyframePair, becomes_keyframe, predicted_overlap
+from duagc.pipeline.frontend.relocalization import features_of, guesses, supports
+from duagc.pipeline.frontend.stable_registration import settle
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import MotionPrior
+from duagc.pipeline.registration import Reference, Registration, RgbdPyramid, register
+from duagc.pipeline.registration.features import Features
 
 Array = NDArray[np.float64]
 Image = NDArray[np.floating]

@@ -22,9 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.consensus.colors import ColorMap, team_colors
-from pipeline.consensus.config import MatchingConfig, WeightKind
-from pipeline.consensus.evidence import (
+from duagc.pipeline.config.consensus import MatchingConfig, WeightKind
+from duagc.pipeline.config.fusion import FusionConfig
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.consensus.colors import ColorMap, team_colors
+from duagc.pipeline.consensus.evidence import (
     COLOR,
     COLOR_INFORMATION,
     LOG_COVARIANCE,
@@ -34,14 +36,13 @@ from pipeline.consensus.evidence import (
     pack_information,
     unpack_symmetric,
 )
-from pipeline.consensus.factors import inflated
-from pipeline.consensus.matching import Pairs, held_thickness, tracks
-from pipeline.consensus.weighting import in_world
-from pipeline.fusion.config import FusionConfig
-from pipeline.geometry import se3, spd
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.registration.residuals import MAD_TO_SIGMA
-from pipeline.splat.gaussians import DepthKind, Gaussians
+from duagc.pipeline.consensus.matching import Pairs, held_thickness, tracks
+from duagc.pipeline.consensus.weighting import in_world
+from duagc.pipeline.geometry import se3, spd
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.posegraph.factors import inflated
+from duagc.pipeline.registration.residuals import MAD_TO_SIGMA
+from duagc.pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -459,7 +460,7 @@ def _surfaces(
     the farthest close by."""
     from scipy.ndimage import maximum_filter
 
-    from pipeline.kernels import Rasterizer
+    from duagc.pipeline.kernels import Rasterizer
 
     rasterizer = Rasterizer()
     for keyframe, measured in depth_images:

@@ -12,16 +12,16 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.consensus.colors import ColorMap
-from pipeline.consensus.config import WeightKind
-from pipeline.consensus.evidence import Evidence
-from pipeline.consensus.weighting import in_world
-from pipeline.fusion.fuse import gaussians_of
-from pipeline.fusion.refine import View
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import Rasterizer
-from pipeline.splat.gaussians import DepthKind
+from duagc.pipeline.config.consensus import WeightKind
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.consensus.colors import ColorMap
+from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.consensus.weighting import in_world
+from duagc.pipeline.fusion.finetune import View
+from duagc.pipeline.fusion.fuse import gaussians_of
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import Rasterizer
 
 Array = NDArray[np.float64]
 COVERED = 0.9

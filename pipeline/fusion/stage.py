@@ -10,20 +10,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import schemas
-from pipeline.consensus.colors import ColorMap
-from pipeline.consensus.config import MatchingConfig, WeightKind
-from pipeline.consensus.evidence import unpack_symmetric
-from pipeline.consensus.weighting import own_stiffness
-from pipeline.errors import DuagError
-from pipeline.fusion.config import FusionConfig, RefineConfig
-from pipeline.fusion.doubt import Doubt, believed
-from pipeline.fusion.fuse import FusedMap, fuse
-from pipeline.fusion.own_pixels import weigh_by_own_pixels
-from pipeline.fusion.peer_views import peer_views
-from pipeline.fusion.refine import View, refine
-from pipeline.geometry.trajectory import Trajectory, write_tum
-from pipeline.messages import (
+from duagc import schemas
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.consensus import MatchingConfig, WeightKind
+from duagc.pipeline.config.fusion import FusionConfig, RefineConfig
+from duagc.pipeline.config.registration import MovingConfig
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.consensus.colors import ColorMap
+from duagc.pipeline.consensus.evidence import unpack_symmetric
+from duagc.pipeline.consensus.weighting import own_stiffness
+from duagc.pipeline.fusion.finetune import View, refine
+from duagc.pipeline.fusion.fuse import FusedMap, fuse
+from duagc.pipeline.fusion.opacity_update import weigh_by_own_pixels
+from duagc.pipeline.fusion.peer_validation import Doubt, believed
+from duagc.pipeline.fusion.peer_views import peer_views
+from duagc.pipeline.geometry.trajectory import Trajectory, write_tum
+from duagc.pipeline.messages import (
     WORLD_FRAME,
     CorrectedKeyframes,
     GaussianInformation,
@@ -31,12 +33,12 @@ from pipeline.messages import (
     Odometry,
     pack_stamp,
 )
-from pipeline.recording import LogWriter, open_rgbd, read_log
-from pipeline.registration.moving import FreeSpace, MovingConfig
-from pipeline.robot import AgentInput, AgentResult, RobotData, load
-from pipeline.splat.gaussians import DepthKind, Gaussians
-from pipeline.splat.ply import write_ply
-from schemas import topics
+from duagc.pipeline.recording import LogWriter, open_rgbd, read_log
+from duagc.pipeline.registration.moving import FreeSpace
+from duagc.pipeline.runs.robot_data import AgentInput, AgentResult, RobotData, load
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.ply import write_ply
+from duagc.schemas import topics
 
 Array = NDArray[np.float64]
 FUSED_KIND = "gauss_newton"

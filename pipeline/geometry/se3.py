@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.geometry import so3
+from duagc.pipeline.geometry import so3
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ Euclidean norm of the vector the Frobenius norm of the matrix.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.geometry import so3
+from duagc.pipeline.geometry import so3
 
 Array = NDArray[np.float64]
 SQRT2 = float(np.sqrt(2.0))

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.errors import DuagError
-from pipeline.files import new_file, read_text
-from pipeline.geometry import se3, so3
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import new_file, read_text
+from duagc.pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
 

@@ -13,17 +13,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import DuagError
-from pipeline.geometry import se3, so3, spd
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.information.config import InformationConfig
-from pipeline.kernels import FisherSums, Rasterizer
-from pipeline.messages import GaussianInformation, GaussianMap, Keyframe, Odometry
-from pipeline.recording import LogWriter, open_rgbd, read_log
-from pipeline.registration.moving import FreeSpace, MovingConfig
-from pipeline.registration.residuals import MAD_TO_SIGMA
-from pipeline.splat.gaussians import DepthKind, Gaussians
-from schemas import topics
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.information import InformationConfig
+from duagc.pipeline.config.registration import MovingConfig
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.geometry import se3, so3, spd
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import FisherSums, Rasterizer
+from duagc.pipeline.messages import GaussianInformation, GaussianMap, Keyframe, Odometry
+from duagc.pipeline.recording import LogWriter, open_rgbd, read_log
+from duagc.pipeline.registration.moving import FreeSpace
+from duagc.pipeline.registration.residuals import MAD_TO_SIGMA
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.schemas import topics
 
 CORRELATION_VIEWS = 8
 MEDIAN_PX = 5

@@ -1,15 +1,15 @@
 """Drawing Gaussians, and the derivatives and information of what was drawn."""
 
-from pipeline.errors import DuagError
+from duagc.pipeline.base.errors import DuagError
 
 try:
-    import pipeline.kernels._raster  # noqa: F401
+    import duagc.pipeline.kernels._raster  # noqa: F401
 except ImportError as error:
     raise DuagError(f"the compiled kernels: {error}, expected what `make setup` builds") from error
 
-from pipeline.kernels.optimiser import CompiledAdam
-from pipeline.kernels.rasterizer import Rasterizer, available_isas
-from pipeline.kernels.types import (
+from duagc.pipeline.kernels.adam import CompiledAdam
+from duagc.pipeline.kernels.rasterizer import Rasterizer, available_isas
+from duagc.pipeline.kernels.types import (
     DepthKind,
     FisherSums,
     Gradients,

@@ -11,11 +11,11 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch.autograd.function import once_differentiable
 
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels.rasterizer import Rasterizer
-from pipeline.kernels.types import DepthKind
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels.rasterizer import Rasterizer
+from duagc.pipeline.kernels.types import DepthKind
+from duagc.pipeline.splat.gaussians import Gaussians
 
 _TAILS = {"means": (3,), "quats_wxyz": (4,), "log_scales": (3,), "colors": (3,), "opacity_logits": ()}
 

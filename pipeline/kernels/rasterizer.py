@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import _raster
-from pipeline.kernels.types import (
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import _raster
+from duagc.pipeline.kernels.types import (
     DEPTH_KINDS,
     FISHER_DIAGONAL_COLUMNS,
     GEOMETRY_COLUMNS,
@@ -25,7 +25,7 @@ from pipeline.kernels.types import (
     Statistics,
     ViewLoss,
 )
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.gaussians import Gaussians
 
 MAX_SIDE_PX = 16384
 MAX_THREADS = 1024

@@ -26,9 +26,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.geometry import spd
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels.types import (
+from duagc.pipeline.geometry import spd
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels.types import (
     DEPTH_KINDS,
     DepthKind,
     FisherSums,
@@ -37,7 +37,7 @@ from pipeline.kernels.types import (
     Render,
     ViewLoss,
 )
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.gaussians import Gaussians
 
 NEAR_M = 0.01
 BLUR_PX2 = 1 / 12

@@ -9,7 +9,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.splat.gaussians import DEPTH_KINDS, DepthKind
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.splat.gaussians import DEPTH_KINDS
 
 __all__ = ["DEPTH_KINDS", "DepthKind"]
 

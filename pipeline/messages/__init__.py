@@ -4,7 +4,7 @@ Poses, information and arrays read back bit for bit. Times are integer nanosecon
 at the fields; their place in the log in `schemas/*.proto`, their topics in `schemas/topics.py`.
 """
 
-from pipeline.messages.estimates import (
+from duagc.pipeline.messages.estimates import (
     CorrectedKeyframes,
     GaussianInformation,
     GaussianMap,
@@ -14,7 +14,7 @@ from pipeline.messages.estimates import (
     Odometry,
     unpack,
 )
-from pipeline.messages.parts import (
+from duagc.pipeline.messages.parts import (
     WORLD_FRAME,
     camera_frame,
     map_frame,
@@ -23,7 +23,7 @@ from pipeline.messages.parts import (
     unpack_pose,
     unpack_stamp,
 )
-from pipeline.messages.sensors import (
+from duagc.pipeline.messages.sensors import (
     pack_calibration,
     pack_color,
     pack_depth,

@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-import schemas
-from pipeline.errors import DuagError
-from pipeline.messages.parts import (
+from duagc import schemas
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.messages.parts import (
     WORLD_FRAME,
     Array,
     map_frame,
@@ -24,7 +25,7 @@ from pipeline.messages.parts import (
     unpack_pose,
     unpack_stamp,
 )
-from pipeline.splat.gaussians import DEPTH_KINDS, DepthKind, Gaussians
+from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
 
 _STATUS = {"ok": 1, "lost": 2, "relocalised": 3}
 _STATUS_NAME = {number: name for name, number in _STATUS.items()}

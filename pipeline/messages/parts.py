@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-import schemas
-from pipeline.errors import DuagError
+from duagc import schemas
+from duagc.pipeline.base.errors import DuagError
 
 Array = NDArray[np.float64]
 NANOSECONDS = 1_000_000_000

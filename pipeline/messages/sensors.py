@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-import schemas
-from pipeline.errors import DuagError
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.messages.parts import Array, camera_frame, numbers, pack_array, pack_stamp, unpack_array
+from duagc import schemas
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.messages.parts import Array, camera_frame, numbers, pack_array, pack_stamp, unpack_array
 
 
 def _foxglove(name: str, stamp_ns: int, frame_id: str, **fields: Any) -> Any:

@@ -1,1 +1,1 @@
-"""Public pose graphs solved by a team of agents: each robot's own factors, packets over lossy links, nothing else."""
+"""Pose graphs: relative poses, solvers, robust weights, loop closures that agree, readers of public formats."""

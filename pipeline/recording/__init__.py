@@ -5,19 +5,19 @@ when it was produced, `sequence` counts per topic from 0; all in the time of the
 The identity of a log is its content digest: the bytes of the file depend on the version of the compressor.
 """
 
-from pipeline.recording.folder import Recording
-from pipeline.recording.motion import Motion, MotionPrior
-from pipeline.recording.names import (
+from duagc.pipeline.recording.folder import Recording
+from duagc.pipeline.recording.motion import Motion, MotionPrior
+from duagc.pipeline.recording.names import (
     DEPTH_SCALE_KEY,
     RANGE_SIGMA_KEY,
     RECORDING_FILE,
     RECORDING_FORMAT,
     RECORDING_SCHEMA,
 )
-from pipeline.recording.read import Record, content_digest, log_metadata, merge, read_log, verify
-from pipeline.recording.rgbd import RgbdFrame, RgbdLog, open_rgbd
-from pipeline.recording.summary import format_info, info, write_preview_of
-from pipeline.recording.write import LogWriter
+from duagc.pipeline.recording.read import Record, content_digest, log_metadata, merge, read_log, verify
+from duagc.pipeline.recording.rgbd import RgbdFrame, RgbdLog, open_rgbd
+from duagc.pipeline.recording.summary import format_info, info, write_preview_of
+from duagc.pipeline.recording.write import LogWriter
 
 __all__ = [
     "DEPTH_SCALE_KEY",

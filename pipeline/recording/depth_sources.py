@@ -10,14 +10,14 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import messages
-from pipeline.errors import DuagError
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording.lidar import lidar_depth
-from pipeline.recording.names import DEPTH_SCALE_KEY, RANGE_SIGMA_KEY
-from pipeline.recording.read import LogFile, Record
-from pipeline.recording.register_depth import register_depth
-from schemas import topics as topic_table
+from duagc.pipeline import messages
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording.lidar import lidar_depth
+from duagc.pipeline.recording.names import DEPTH_SCALE_KEY, RANGE_SIGMA_KEY
+from duagc.pipeline.recording.read import LogFile, Record
+from duagc.pipeline.recording.register_depth import register_depth
+from duagc.schemas import topics as topic_table
 
 Value = TypeVar("Value")
 

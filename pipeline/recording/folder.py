@@ -7,10 +7,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import DuagError
-from pipeline.files import read_bytes
-from pipeline.recording.names import RECORDING_FILE, RECORDING_FORMAT, RECORDING_SCHEMA
-from schemas import topics
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import read_bytes
+from duagc.pipeline.recording.names import RECORDING_FILE, RECORDING_FORMAT, RECORDING_SCHEMA
+from duagc.schemas import topics
 
 
 class Recording:

@@ -9,12 +9,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import messages
-from pipeline.errors import DuagError
-from pipeline.geometry import se3, so3
-from pipeline.recording.depth_sources import constant, transform_rows
-from pipeline.recording.read import LogFile
-from schemas import topics as topic_table
+from duagc.pipeline import messages
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.recording.depth_sources import constant, transform_rows
+from duagc.pipeline.recording.read import LogFile
+from duagc.schemas import topics as topic_table
 
 Array = NDArray[np.float64]
 LONGEST_POSE_GAP_NS = 250_000_000

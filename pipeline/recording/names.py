@@ -1,9 +1,9 @@
 """Names and numbers that writers and readers of logs share."""
 
-import pipeline
+from duagc import __version__
 
 MAGIC = b"\x89MCAP0\r\n"
-LIBRARY = f"duagc/{pipeline.__version__}"
+LIBRARY = f"duagc/{__version__}"
 DIGEST_RECORD = "duagc.digest"  # metadata record with the content digest; itself not part of it
 LOG_RECORD = "duagc.log"  # metadata record with what the writer was told about the log
 ROBOT_KEY = "robot"

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import DuagError
-from pipeline.files import new_file
-from pipeline.recording.rgbd import RgbdFrame, RgbdLog, open_rgbd
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import new_file
+from duagc.pipeline.recording.rgbd import RgbdFrame, RgbdLog, open_rgbd
 
 SHOWN = 6  # frames of a robot
 TILE_PX = 240  # width of a picture

@@ -21,12 +21,12 @@ from mcap.records import Channel, Chunk, Header, MessageIndex
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.summary import Summary
 
-import schemas
-from pipeline import messages
-from pipeline.errors import DuagError
-from pipeline.progress import track
-from pipeline.recording.identity import ContentDigest, channel_identity, framed
-from pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, MAGIC
+from duagc import schemas
+from duagc.pipeline import messages
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.recording.identity import ContentDigest, channel_identity, framed
+from duagc.pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, MAGIC
 
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary start, summary offset start, CRC of the summary
 _DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of everything before
@@ -61,7 +61,7 @@ class Record:
             ) from error
 
     def message(self) -> Any:
-        """The dataclass of `pipeline.messages` if the schema has one, else the protobuf message."""
+        """The dataclass of `duagc.pipeline.messages` if the schema has one, else the protobuf message."""
         try:
             return messages.unpack(self.proto())
         except DuagError as error:

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import messages
-from pipeline.errors import DuagError
-from pipeline.files import decode_image
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording.depth_sources import check_size, constant, depth_source
-from pipeline.recording.motion import MotionPrior, motion_prior
-from pipeline.recording.pairing import TOLERANCE_NS, pair
-from pipeline.recording.read import LogFile, Record
-from schemas import topics as topic_table
+from duagc.pipeline import messages
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import decode_image
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording.depth_sources import check_size, constant, depth_source
+from duagc.pipeline.recording.motion import MotionPrior, motion_prior
+from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
+from duagc.pipeline.recording.read import LogFile, Record
+from duagc.schemas import topics as topic_table
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import DuagError
-from pipeline.recording.folder import Recording
-from pipeline.recording.names import DIGEST_RECORD, LOG_RECORD, RECORDING_FILE, ROBOT_KEY
-from pipeline.recording.pairing import TOLERANCE_NS, pair
-from pipeline.recording.preview import reach, some_frames, write_preview
-from pipeline.recording.read import LogFile, parsing
-from pipeline.recording.rgbd import open_rgbd
-from schemas import topics as topic_table
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.recording.folder import Recording
+from duagc.pipeline.recording.names import DIGEST_RECORD, LOG_RECORD, RECORDING_FILE, ROBOT_KEY
+from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
+from duagc.pipeline.recording.preview import reach, some_frames, write_preview
+from duagc.pipeline.recording.read import LogFile, parsing
+from duagc.pipeline.recording.rgbd import open_rgbd
+from duagc.schemas import topics as topic_table
 
 GAP_RATIO = 1.5  # an interval this much longer than the median one is a gap
 

@@ -11,11 +11,11 @@ from typing import IO, Any
 
 from mcap.writer import CompressionType, IndexType, Writer
 
-import schemas
-from pipeline.errors import DuagError
-from pipeline.recording.identity import ContentDigest, channel_identity
-from pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, ROBOT_KEY
-from schemas import topics as topic_table
+from duagc import schemas
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.recording.identity import ContentDigest, channel_identity
+from duagc.pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, ROBOT_KEY
+from duagc.schemas import topics as topic_table
 
 CHUNK_BYTES = 1 << 20
 
@@ -86,7 +86,7 @@ class LogWriter:
 
         Args:
             topic: a topic of schemas/topics.py.
-            message: a dataclass of `pipeline.messages` or a protobuf message of the topic's schema.
+            message: a dataclass of `duagc.pipeline.messages` or a protobuf message of the topic's schema.
             log_time_ns: when it was received; never earlier than that of the message before.
             publish_time_ns: when it was produced; the log time if not given.
         """

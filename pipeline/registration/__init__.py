@@ -5,10 +5,10 @@
 robots with the about 2000 samples that a peer sent.
 """
 
-from pipeline.registration.align import Outcome, Registration, linearise, register
-from pipeline.registration.pyramid import Level, RgbdPyramid
-from pipeline.registration.reference import Reference, ReferenceLevel
-from pipeline.registration.residuals import RegistrationConfig
+from duagc.pipeline.config.registration import RegistrationConfig
+from duagc.pipeline.registration.align import Outcome, Registration, linearise, register
+from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
+from duagc.pipeline.registration.reference import Reference, ReferenceLevel
 
 __all__ = [
     "Level",

@@ -17,10 +17,11 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry import se3, so3
-from pipeline.registration.pyramid import RgbdPyramid
-from pipeline.registration.reference import Reference
-from pipeline.registration.residuals import Linearisation, RegistrationConfig, linearise_at
+from duagc.pipeline.config.registration import RegistrationConfig
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.registration.pyramid import RgbdPyramid
+from duagc.pipeline.registration.reference import Reference
+from duagc.pipeline.registration.residuals import Linearisation, linearise_at
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
 Descriptors = NDArray[np.uint8]

@@ -12,34 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import Config
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.registration.pyramid import Level
+from duagc.pipeline.config.registration import MovingConfig
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.registration.pyramid import Level
 
 Array = NDArray[np.float64]
 Image = NDArray[np.floating]
 Mask = NDArray[np.bool_]
-
-
-class MovingConfig(Config):
-    """Finding what moves by depth alone."""
-
-    enabled: bool = True
-    gate_m: float = 0.15
-    """A point nearer by this than all that another view measured around its place stands in free space."""
-    gate_relative: float = 0.1
-    """The same as a fraction of the depth; the larger limit holds."""
-    views: int = 16
-    """Other views asked at most, those that look at the nearest places."""
-    min_views: int = 2
-    """Views that must have looked through a point; and they must be more than those that saw it there."""
-    min_region: float = 0.002
-    """Smallest connected region, as a share of the image: smaller ones are noise at edges."""
-    grow_px: int = 8
-    """Pixels, of the whole image, by which a region is enlarged: edges of what moves are mixed with what is behind."""
-    halvings: int = 2
-    """Times the images are halved before they are compared."""
 
 
 @dataclass(frozen=True)

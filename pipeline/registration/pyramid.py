@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.camera import PinholeCamera
 
 Image = NDArray[np.floating]
 

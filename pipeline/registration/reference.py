@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.registration.pyramid import Level, RgbdPyramid
+from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
 
 Samples = NDArray[np.floating]
 

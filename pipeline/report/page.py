@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import DuagError
-from pipeline.evaluation.cameras import CHANNELS
-from pipeline.evaluation.network import Session
-from pipeline.evaluation.paths import Path3, paths, top_view_axes
-from pipeline.evaluation.rendering import COMPARED_SETS
-from pipeline.evaluation.results import Absent
-from pipeline.files import new_file
-from pipeline.recording import Recording
-from pipeline.report import figures, pictures, words
-from pipeline.report.renders import rendered_views
-from pipeline.run_folder import RunFolder
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import new_file
+from duagc.pipeline.evaluation.cameras import CHANNELS
+from duagc.pipeline.evaluation.network import Session
+from duagc.pipeline.evaluation.paths import Path3, paths, top_view_axes
+from duagc.pipeline.evaluation.rendering import COMPARED_SETS
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.recording import Recording
+from duagc.pipeline.report import figures, labels, pictures
+from duagc.pipeline.report.renders import rendered_views
+from duagc.pipeline.runs.folder import RunFolder
 
 TEMPLATE = "page.html.j2"
 
@@ -53,7 +53,7 @@ def write_report(run_dir: Path, recording: Path) -> Path:
             f"{run_dir / 'metrics.json'}: not found, expected an evaluated run; `duagc evaluate` writes it"
         )
     environment = Environment(
-        loader=PackageLoader("pipeline.report", "."),
+        loader=PackageLoader("duagc.pipeline.report", "."),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -79,21 +79,21 @@ def content(run: RunFolder, source: Recording) -> dict[str, Any]:
         "sections": SECTIONS,
         "cards": _cards(metrics, reasons),
         **_paths_content(run, source, metrics),
-        "comparison_sets": [words.VIEW_SETS[s] for s in COMPARED_SETS],
-        "comparison_columns": list(words.COMPARISON.values()),
-        "comparison": words.comparison_rows(metrics),
-        "rendering_columns": list(words.RENDERING.values()),
+        "comparison_sets": [labels.VIEW_SETS[s] for s in COMPARED_SETS],
+        "comparison_columns": list(labels.COMPARISON.values()),
+        "comparison": labels.comparison_rows(metrics),
+        "rendering_columns": list(labels.RENDERING.values()),
         "rendering": _rendering_rows(metrics),
-        "own_longer": words.is_scored(metrics, "own_longer"),
+        "own_longer": labels.is_scored(metrics, "own_longer"),
         "exposure_note": " ".join(["No exposure is fitted to a view.", *_cameras(metrics)]),
         "views": shown_views,
         **_agreement_content(session, metrics, reasons),
         "exchange_charts": _exchange_charts(session),
-        "exchange": words.rows(metrics["exchange"], words.EXCHANGE, reasons, "exchange"),
+        "exchange": labels.rows(metrics["exchange"], labels.EXCHANGE, reasons, "exchange"),
         "uncertainty_lead": _uncertainty_lead(run),
         "information_views": information_views,
         "reliability_chart": _reliability_chart(run),
-        "calibration": words.rows(metrics["calibration"], words.CALIBRATION, reasons, "calibration"),
+        "calibration": labels.rows(metrics["calibration"], labels.CALIBRATION, reasons, "calibration"),
         **_timing_content(run),
         "absent": _absent(reasons),
         "protocol": list(metrics["protocol"].items()),
@@ -130,7 +130,8 @@ def _subtitle(metrics: dict[str, Any]) -> str:
     shared = (
         "no two robots share a world" if agree < 2 else f"{agree} of {team['robots']} robots share one world"
     )
-    return f"{words.text('frames', frames)} frames of {', '.join(robots)} · {shared} · relative poses {_known(metrics)}"
+    count = labels.text("frames", frames)
+    return f"{count} frames of {', '.join(robots)} · {shared} · relative poses {_known(metrics)}"
 
 
 def _known(metrics: dict[str, Any]) -> str:
@@ -145,12 +146,12 @@ def _cards(metrics: dict[str, Any], reasons: dict[str, str]) -> list[dict[str, s
     final = "fused" if metrics["rendering"]["refined"]["held_out"]["psnr_db"] is None else "refined"
 
     def meaning(view_set: str, name: str, what: str) -> str:
-        return f"{final} maps, {what}; own maps: {words.text(name, own[view_set][name])}"
+        return f"{final} maps, {what}; own maps: {labels.text(name, own[view_set][name])}"
 
     held_out, peers = f"rendering.{final}.held_out", f"rendering.{final}.peers"
     chosen = (
-        ("team.ate_rmse_m", *words.TEAM["ate_rmse_m"]),
-        ("team.ate_rmse_m_mean_of_robots", *words.TEAM["ate_rmse_m_mean_of_robots"]),
+        ("team.ate_rmse_m", *labels.TEAM["ate_rmse_m"]),
+        ("team.ate_rmse_m_mean_of_robots", *labels.TEAM["ate_rmse_m_mean_of_robots"]),
         (f"{held_out}.psnr_db", "PSNR", meaning("held_out", "psnr_db", "views never mapped")),
         (f"{peers}.psnr_db", "PSNR, peers' views", meaning("peers", "psnr_db", "where the others stood")),
         (
@@ -158,9 +159,9 @@ def _cards(metrics: dict[str, Any], reasons: dict[str, str]) -> list[dict[str, s
             "Depth L1",
             meaning("held_out", "depth_l1_common_m", "views never mapped, pixels that all maps cover"),
         ),
-        ("team.inter_robot_closures", *words.TEAM["inter_robot_closures"]),
-        ("exchange.bytes_sent", *words.EXCHANGE["bytes_sent"]),
-        ("exchange.rounds", *words.EXCHANGE["rounds"]),
+        ("team.inter_robot_closures", *labels.TEAM["inter_robot_closures"]),
+        ("exchange.bytes_sent", *labels.EXCHANGE["bytes_sent"]),
+        ("exchange.rounds", *labels.EXCHANGE["rounds"]),
     )
     cards = []
     for path, label, what in chosen:
@@ -171,7 +172,7 @@ def _cards(metrics: dict[str, Any], reasons: dict[str, str]) -> list[dict[str, s
         cards.append(
             {
                 "label": label,
-                "value": words.text(name, value),
+                "value": labels.text(name, value),
                 "meaning": what,
                 "reason": reasons.get(path, ""),
             }
@@ -196,7 +197,9 @@ def _paths_content(run: RunFolder, source: Recording, metrics: dict[str, Any]) -
             else " Ground truth is missing for some robots."
         )
     columns = {
-        name: word for name, word in words.ROBOT.items() if any(name in r for r in metrics["robots"].values())
+        name: word
+        for name, word in labels.ROBOT.items()
+        if any(name in r for r in metrics["robots"].values())
     }
     return {
         "paths_lead": lead,
@@ -206,7 +209,7 @@ def _paths_content(run: RunFolder, source: Recording, metrics: dict[str, Any]) -
             {
                 "robot": name,
                 "color": figures.color_of(i),
-                "values": [words.text(column, metrics["robots"][name][column]) for column in columns],
+                "values": [labels.text(column, metrics["robots"][name][column]) for column in columns],
             }
             for i, name in enumerate(run.robots)
         ],
@@ -236,14 +239,14 @@ def _rendering_rows(metrics: dict[str, Any]) -> list[dict[str, Any]]:
     return [
         {
             "map": word,
-            "view_set": words.VIEW_SETS[view_set],
+            "view_set": labels.VIEW_SETS[view_set],
             "values": [
-                words.text(name, metrics["rendering"][kind][view_set][name]) for name in words.RENDERING
+                labels.text(name, metrics["rendering"][kind][view_set][name]) for name in labels.RENDERING
             ],
         }
-        for kind, word in words.MAPS.items()
-        for view_set in words.VIEW_SETS
-        if view_set in metrics["rendering"][kind] and words.is_scored(metrics, kind)
+        for kind, word in labels.MAPS.items()
+        for view_set in labels.VIEW_SETS
+        if view_set in metrics["rendering"][kind] and labels.is_scored(metrics, kind)
     ]
 
 
@@ -273,7 +276,7 @@ def _agreement_content(session: Session, metrics: dict[str, Any], reasons: dict[
     return {
         "agreement_lead": lead,
         "agreement_charts": charts,
-        "consensus": words.rows(metrics["consensus"], words.CONSENSUS, reasons, "consensus"),
+        "consensus": labels.rows(metrics["consensus"], labels.CONSENSUS, reasons, "consensus"),
         "closure_columns": ("Robots", "Keyframes", "Matches", "Agreeing", "Verdict", "Why", "Weight"),
         "closures": [
             (

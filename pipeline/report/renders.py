@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation.rendering import in_colors_of, in_world, mates, poses_by_stamp
-from pipeline.evaluation.results import Absent
-from pipeline.evaluation.views import score_view, surface_depth
-from pipeline.fusion.stage import peer_colors
-from pipeline.geometry import se3
-from pipeline.messages import GaussianMap
-from pipeline.recording import Recording, open_rgbd
-from pipeline.report import figures, pictures, words
-from pipeline.run_folder import RobotRun, RunFolder, position_information
+from duagc.pipeline.evaluation.rendering import in_colors_of, in_world, mates, poses_by_stamp
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.evaluation.views import score_view, surface_depth
+from duagc.pipeline.fusion.stage import peer_colors
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.messages import GaussianMap
+from duagc.pipeline.recording import Recording, open_rgbd
+from duagc.pipeline.report import figures, labels, pictures
+from duagc.pipeline.runs.folder import RobotRun, RunFolder, position_information
 
 if TYPE_CHECKING:
-    from pipeline.kernels import Rasterizer, Render
-    from pipeline.recording import RgbdFrame, RgbdLog
+    from duagc.pipeline.kernels import Rasterizer, Render
+    from duagc.pipeline.recording import RgbdFrame, RgbdLog
 
 Array = NDArray[np.float64]
 PICTURE_WIDTH_PX = 400
@@ -35,7 +35,7 @@ UNDETERMINED_GREY = 0.75
 def rendered_views(run: RunFolder, source: Recording) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Renders beside images, and the fused map coloured by its uncertainty, for a few held-out views per robot, and
     beside the image of a peer."""
-    from pipeline.kernels import Rasterizer
+    from duagc.pipeline.kernels import Rasterizer
 
     rasterizer = Rasterizer(threads=1)
     shown, colored = [], []
@@ -144,7 +144,7 @@ def _view(
 
 def _view_numbers(render: Render, frame: RgbdFrame) -> str:
     score = score_view(render, frame.color, frame.depth, NO_EXACT)
-    depth = words.NONE if isinstance(score.depth_l1_m, Absent) else words.metres_text(score.depth_l1_m)
+    depth = labels.NONE if isinstance(score.depth_l1_m, Absent) else labels.metres_text(score.depth_l1_m)
     return f"{score.psnr_db:.1f} dB, depth {depth}"
 
 
@@ -173,8 +173,8 @@ def _information_view(
         shown.append({"caption": "uncertainty", "uri": _uri(pictures.to_uint8(render.color))})
     scale = _scale(
         "plasma",
-        words.metres_text(low_m),
-        words.metres_text(high_m),
+        labels.metres_text(low_m),
+        labels.metres_text(high_m),
         "standard deviation of a centre, log scale",
     )
     return {"pictures": shown, "scales": [scale]}

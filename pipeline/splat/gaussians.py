@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.geometry import se3, so3
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.geometry import se3, so3
 
-DepthKind: TypeAlias = Literal["blended", "ray_plane"]
-"""Depth of a Gaussian at a pixel: that of its centre, or of its mean along the ray (a flat disc: of its plane)."""
 DEPTH_KINDS: tuple[DepthKind, ...] = ("blended", "ray_plane")
 
 _SHAPES: dict[str, tuple[type, tuple[int, ...]]] = {

@@ -16,8 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import Config
-from pipeline.splat.gaussians import DepthKind
+from duagc.pipeline.config.training import LossConfig
 
 Image = NDArray[np.float32]
 
@@ -31,41 +30,6 @@ class Rendered(Protocol):
     def depth(self) -> Image: ...
     @property
     def alpha(self) -> Image: ...
-
-
-class LossConfig(Config):
-    """Weights of the mapping loss; every term is a mean over its pixels."""
-
-    color_huber: float = 0.1
-    """Colour residual (0..1) where the loss turns from quadratic to linear; the slope beyond is 1."""
-    depth_weight: float = 1.0
-    """Weight of one metre of depth error against one unit of colour."""
-    depth_huber_m: float = 0.02
-    """Depth residual in metres where the loss turns from quadratic to linear; the slope beyond is 1."""
-    alpha_weight: float = 0.04
-    """Weight of missing opacity (1 - alpha) where a surface was measured."""
-    surface_weight: float = 0.0
-    """Weight of one metre between a Gaussian's own depth and the measured one, by its share in the pixel."""
-
-
-class SurfaceLossConfig(LossConfig):
-    """The same where depth is exact: every single Gaussian belongs on the surface."""
-
-    depth_weight: float = 0.25
-    depth_huber_m: float = 0.01
-    alpha_weight: float = 0.02
-    surface_weight: float = 0.5
-
-
-class MapLossConfig(Config):
-    """The loss of a map, by the depth that its Gaussians are drawn with."""
-
-    blended: LossConfig = LossConfig()
-    ray_plane: SurfaceLossConfig = SurfaceLossConfig()
-
-    def of(self, depth: DepthKind) -> LossConfig:
-        """The loss of maps of a kind."""
-        return self.ray_plane if depth == "ray_plane" else self.blended
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import DuagError
-from pipeline.files import new_file, read_bytes
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import new_file, read_bytes
+from duagc.pipeline.splat.gaussians import Gaussians
 
 SH_DEGREE_0 = 0.28209479177387814
 PROPERTIES = (

@@ -11,43 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config import Config
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.losses import Rendered
+from duagc.pipeline.config.mapping import SeedingConfig
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.losses import Rendered
 
 Image = NDArray[np.float32]
-THICKNESS_FLOOR_M = 1e-3
-"""Thickness below which no splat is told from a plane: log-scales stop here, and carry no information there."""
 
 _CELLS_AT_A_TIME = 256  # windows of as many stay in the cache
-
-
-class SeedingConfig(Config):
-    """Where Gaussians are put and what they look like at first."""
-
-    cell_sizes_px: tuple[int, ...] = (8, 4, 2)
-    """Sides of the quadtree's cells, coarse to fine, each half of the one before."""
-    detail: float = 0.02
-    """Standard deviation of grey (0..1) in a cell above which it is split; raised until the budget holds."""
-    min_alpha: float = 0.6
-    """Rendered opacity below which a pixel is not explained."""
-    color_error: float = 0.1
-    """Mean colour error (0..1), smoothed over a cell, above which a pixel is not explained."""
-    worst_color_error: float = 0.02
-    """Root mean square colour error (0..1) of a cell up to which no disc is added where images are drawn worst."""
-    depth_error_m: float = 0.04
-    """Depth error above which a pixel is not explained, plus depth_error_relative times the depth."""
-    depth_error_relative: float = 0.02
-    opacity: float = 0.7
-    """Initial opacity."""
-    spread: float = 0.55
-    """Standard deviation of a disc in units of its cell's side on the surface."""
-    thickness_m: float = THICKNESS_FLOOR_M
-    """Standard deviation across the surface at first; also the floor of every log-scale while mapping."""
-    min_depth_m: float = 0.2
-    max_depth_m: float = 10.0
 
 
 def unexplained(

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from pipeline.bench.consensus import MODES, Plan, format_table, run
+from duagc.pipeline.experiments.consensus_modes import MODES, Plan, format_table, run
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def test_the_command_prints_one_document_and_refuses_unknown_words() -> None:
     command = [
         sys.executable,
         "-c",
-        "from pipeline.cli import main; main()",
+        "from duagc.pipeline.cli import main; main()",
         "bench",
         "consensus",
         "--robots",

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.simulate import simulate
-from pipeline.bench import frontend as bench
-from pipeline.bench import frontend_tables, stopwatch
-from pipeline.errors import DuagError
-from pipeline.frontend.config import FrontendConfig
-from pipeline.report import figures
+from duagc.converters.simulate.team import simulate
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.bench import frontend as bench
+from duagc.pipeline.bench import frontend_tables, stopwatch
+from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.report import figures
 
 MAPPING = {"mapping.final_iterations": 2, "mapping.support_views": 2}
 
@@ -128,7 +128,7 @@ def test_the_command_prints_json(recording: Path) -> None:
     command = [
         sys.executable,
         "-c",
-        "from pipeline.cli import main; main()",
+        "from duagc.pipeline.cli import main; main()",
         "bench",
         "frontend",
         str(recording),

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pipeline import cli
-from pipeline.bench import raster, raster_tables, torch_tiles
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import Rasterizer, _raster, available_isas
+from duagc.pipeline import cli
+from duagc.pipeline.bench import raster, raster_tables, torch_tiles
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import Rasterizer, _raster, available_isas
 
 TINY = raster.Plan(sizes=((40, 30), (20, 16)), gaussians=(500,), threads=(1, 2), rounds=1)
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pipeline.bench.consensus import Plan, run_on
-from pipeline.bench.team_of_run import team_of_run
-from pipeline.errors import DuagError
-from pipeline.run_folder import RunFolder
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.experiments.consensus_modes import Plan, run_on
+from duagc.pipeline.experiments.team_of_run import team_of_run
+from duagc.pipeline.runs.folder import RunFolder
 from tests.evaluation.fake_run import make
 
 

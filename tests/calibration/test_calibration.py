@@ -10,18 +10,26 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from converters import seven_scenes
-from converters.base import RecordingWriter
-from pipeline.calibration import Calibration, calibrate, report
-from pipeline.calibration.adjustment import Quality, _features, _of_planes, _planes, adjust, overlapping
-from pipeline.calibration.rig import NAMES, Rig
-from pipeline.calibration.views import NORMALS_LEVEL, Views, _landmarks
-from pipeline.cli import app
-from pipeline.errors import DuagError
-from pipeline.frontend.config import FrontendConfig
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.registration.pyramid import RgbdPyramid
+from duagc.converters.datasets import seven_scenes
+from duagc.converters.writer import RecordingWriter
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.camera_calibration import report
+from duagc.pipeline.camera_calibration.adjustment import (
+    Quality,
+    _features,
+    _of_planes,
+    _planes,
+    adjust,
+    overlapping,
+)
+from duagc.pipeline.camera_calibration.calibrate import Calibration, calibrate
+from duagc.pipeline.camera_calibration.rig import NAMES, Rig
+from duagc.pipeline.camera_calibration.views import NORMALS_LEVEL, Views, _landmarks
+from duagc.pipeline.cli import app
+from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.registration.pyramid import RgbdPyramid
 
 CAMERA = PinholeCamera(320, 240, 262.0, 262.0, 160.0, 118.0)
 TRUE = Rig(

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from converters.seven_scenes import Options
-from converters.simulate.noise import grey_noise, kinect_depth
-from converters.simulate.stages import Stage, set_up
-from pipeline import numeric, streams
-from pipeline.calibration.rig import DEPTH, NAMES, ROTATION
-from pipeline.cli import app
-from pipeline.geometry import depth_error, se3, so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import Recording, open_rgbd
+from duagc.converters.datasets.seven_scenes import Options
+from duagc.converters.simulate.noise import grey_noise, kinect_depth
+from duagc.converters.simulate.stages import Stage, set_up
+from duagc.pipeline.base import determinism, random_streams
+from duagc.pipeline.camera_calibration.rig import DEPTH, NAMES, ROTATION
+from duagc.pipeline.cli import app
+from duagc.pipeline.geometry import depth_error, se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import Recording, open_rgbd
 
 FRAMES, EVERY = 74, 10
 BARE = 26  # the walk begins before a bare wall, where tracking gets lost
@@ -63,7 +63,7 @@ def write_sequence(folder: Path, stage: Stage) -> np.ndarray:
     for k, T in enumerate(way):
         before, after = max(k - 1, 0), min(k + 1, FRAMES - 1)
         velocity = se3.log(se3.inverse(way[before]) @ way[after]) * 30 / (after - before)
-        rng = streams.generator(0, "test.recovery", frame=k)
+        rng = random_streams.generator(0, "test.recovery", frame=k)
         color = color_eye.render(T @ se3.exp(TRUE["delay_s"] * velocity) @ turned).color
         color = grey_noise(cv2.remap(color, columns, rows, cv2.INTER_LINEAR), rng)
         depth = kinect_depth(measured(depth_eye.render(T).depth), DEPTH_CAMERA, rng)
@@ -97,7 +97,7 @@ def errors(folder: Path, stage: Stage, way: np.ndarray) -> tuple[float, float]:
 @pytest.mark.slow
 def test_cameras_that_were_put_wrong_are_found_and_put_right(tmp_path: Path) -> None:
     """Within four standard deviations as the command states them; the corrected recording is nearer to the truth."""
-    numeric.settle_opencv()
+    determinism.settle_opencv()
     with tempfile.TemporaryDirectory() as cache:
         stage = set_up("room", "auto", 0, Path(cache), as_meshes=False)
         way = write_sequence(tmp_path / "walk", stage)

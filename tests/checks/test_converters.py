@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-import converters
-from pipeline import checks
+from duagc.converters import registry
+from duagc.pipeline.checks import check
 from tests.converters.test_image_folders import CASES
 from tests.converters.test_ros import Ros, scene
 from tests.converters.test_seven_scenes import make_sequence
@@ -43,9 +43,9 @@ SLOW = ("tum", "bonn", "icl-nuim", "7scenes", "kimera-multi")  # seconds of rend
 )
 def test_fixtures_pass(tmp_path: Path, name: str) -> None:
     dataset, make, options = FIXTURES[name]
-    converters.convert(dataset, make(tmp_path / "data"), tmp_path / "recording", options=options)
-    report = checks.check(tmp_path / "recording")
-    alarms = report.of(checks.Severity.ERROR) + report.of(checks.Severity.WARNING)
+    registry.convert(dataset, make(tmp_path / "data"), tmp_path / "recording", options=options)
+    report = check.check(tmp_path / "recording")
+    alarms = report.of(check.Severity.ERROR) + report.of(check.Severity.WARNING)
     known = ("m/s", "could be registered")  # some fixtures fly round their room, in few large steps
-    assert all(any(words in f.found for words in known) for f in alarms), checks.format_report(report)
+    assert all(any(words in f.found for words in known) for f in alarms), check.format_report(report)
     assert report.sound

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from converters.simulate import simulate
-from pipeline import checks
-from pipeline import messages as m
-from pipeline.cli import app
-from pipeline.geometry import se3
-from pipeline.recording import LogWriter, Record, read_log
-from schemas import topics
+from duagc.converters.simulate.team import simulate
+from duagc.pipeline import messages as m
+from duagc.pipeline.checks import check
+from duagc.pipeline.cli import app
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.recording import LogWriter, Record, read_log
+from duagc.schemas import topics
 
 FRAMES = 20
 COLOR, DEPTH = topics.COLOR.of("bravo"), topics.DEPTH.of("bravo")
@@ -181,20 +181,20 @@ FAULTS: dict[str, tuple[Change, dict[str, Any], str, str]] = {
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_planted_fault_is_noticed(sound: Path, tmp_path: Path, name: str) -> None:
     change, how, severity, check = FAULTS[name]
-    report = checks.check(planted(sound, tmp_path / "rec", change, **how))
+    report = check.check(planted(sound, tmp_path / "rec", change, **how))
     found = {(f.severity.value, f.check) for f in report.findings if f.robot == "bravo"}
-    assert (severity, check) in found, checks.format_report(report)
+    assert (severity, check) in found, check.format_report(report)
     assert report.sound == (severity != "error")
 
 
 def test_a_sound_recording_raises_no_alarm(sound: Path, tmp_path: Path) -> None:
-    report = checks.check(sound)
-    assert not report.findings, checks.format_report(report)
+    report = check.check(sound)
+    assert not report.findings, check.format_report(report)
     assert set(report.robots) == {"alpha", "bravo"}
     assert report.robots["alpha"]["frames"] == FRAMES
-    assert "nothing found" in checks.format_report(report)
-    assert checks.check(sound).plain() == report.plain()
-    again = checks.check(planted(sound, tmp_path / "rec", nothing))  # the metadata of the log are lost
+    assert "nothing found" in check.format_report(report)
+    assert check.check(sound).plain() == report.plain()
+    again = check.check(planted(sound, tmp_path / "rec", nothing))  # the metadata of the log are lost
     assert [f.check for f in again.findings] == ["digest"]
 
 
@@ -229,13 +229,13 @@ def test_an_odometry_tells_the_scale(sound: Path, tmp_path: Path) -> None:
 
     for scale, sound_ in ((1.0, True), (2.0, False)):
         out = planted(sound, tmp_path / f"{scale}", with_prior, scale=scale, truth=False)
-        report = checks.check(out)
-        assert report.sound == sound_, checks.format_report(report)
+        report = check.check(out)
+        assert report.sound == sound_, check.format_report(report)
 
 
 @pytest.mark.parametrize("source", ["redkitchen", "replica_office0/office0"])
 def test_real_recordings_raise_no_alarm(tmp_path: Path, source: str) -> None:
-    import converters
+    from duagc.converters import registry
 
     if not (SHARED / source).is_dir():
         pytest.skip("needs ../shared/data")
@@ -245,9 +245,9 @@ def test_real_recordings_raise_no_alarm(tmp_path: Path, source: str) -> None:
         for number in range(300, 324):
             for file in (SHARED / source).glob(f"frame-{number:06d}.*"):
                 (src / file.name).symlink_to(file)
-        converters.convert("7scenes", src, tmp_path / "rec", robots=2)
+        registry.convert("7scenes", src, tmp_path / "rec", robots=2)
     else:
-        converters.convert("replica", SHARED / source, tmp_path / "rec")
-    report = checks.check(tmp_path / "rec")
-    alarms = report.of(checks.Severity.ERROR) + report.of(checks.Severity.WARNING)
-    assert not alarms, checks.format_report(report)
+        registry.convert("replica", SHARED / source, tmp_path / "rec")
+    report = check.check(tmp_path / "rec")
+    alarms = report.of(check.Severity.ERROR) + report.of(check.Severity.WARNING)
+    assert not alarms, check.format_report(report)

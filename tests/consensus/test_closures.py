@@ -2,8 +2,10 @@
 
 import numpy as np
 
-from pipeline.consensus import factors as pose_factors
-from pipeline.consensus.closures import (
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph import factors as pose_factors
+from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph.loop_closures import (
     Closure,
     ClosureConfig,
     chain_frames,
@@ -14,8 +16,6 @@ from pipeline.consensus.closures import (
     plausible,
     robust_frame,
 )
-from pipeline.consensus.factors import Factors
-from pipeline.geometry import se3
 from tests.consensus.worlds import random_information, random_poses
 
 CONFIG = ClosureConfig()

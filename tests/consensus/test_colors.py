@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.consensus.colors import team_colors
-from pipeline.consensus.config import ColorConfig
-from pipeline.consensus.evidence import COLOR, Evidence
+from duagc.pipeline.config.consensus import ColorConfig
+from duagc.pipeline.consensus.colors import team_colors
+from duagc.pipeline.consensus.evidence import COLOR, Evidence
 
 CONFIG = ColorConfig()
 GAIN = {"alpha": [1.0, 1.0, 1.0], "bravo": [0.7, 0.8, 0.9], "charlie": [1.2, 1.0, 0.85]}

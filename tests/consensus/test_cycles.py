@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from pipeline.consensus.cycles import Proposal, place
-from pipeline.geometry import se3
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph.cycle_consistency import Proposal, place
 from tests.consensus.worlds import random_poses
 
 NAMES = ["alpha", "bravo", "charlie", "delta"]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.consensus import factors as pose_factors
-from pipeline.consensus.elimination import Front, damped, shared_variables
-from pipeline.consensus.factors import Factors
+from duagc.pipeline.consensus.elimination import Front, damped, shared_variables
+from duagc.pipeline.posegraph import factors as pose_factors
+from duagc.pipeline.posegraph.factors import Factors
 from tests.consensus.worlds import random_information, random_poses
 
 

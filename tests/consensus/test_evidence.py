@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.consensus.evidence import (
+from duagc.pipeline.consensus.evidence import (
     COLOR,
     LOG_COVARIANCE,
     MEAN,
@@ -17,8 +17,8 @@ from pipeline.consensus.evidence import (
     pack_symmetric,
     unpack_symmetric,
 )
-from pipeline.geometry import se3, so3, spd
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.geometry import se3, so3, spd
+from duagc.pipeline.splat.gaussians import Gaussians
 from tests.consensus.worlds import random_poses
 
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from pipeline.consensus import factors as pose_factors
-from pipeline.consensus.central import solve_central
-from pipeline.consensus.factors import Factors, difference, inflated, isotropic_information, retract
-from pipeline.consensus.start import chordal
-from pipeline.geometry import se3
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph import factors as pose_factors
+from duagc.pipeline.posegraph.central import solve_central
+from duagc.pipeline.posegraph.factors import Factors, difference, inflated, isotropic_information, retract
+from duagc.pipeline.posegraph.initialization import chordal
 from tests.consensus.worlds import benchmark, random_information, random_poses
 
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.consensus.evidence import Evidence, pack_information
-from pipeline.consensus.gaussians import (
+from duagc.pipeline.consensus.evidence import Evidence, pack_information
+from duagc.pipeline.consensus.weights import Weights
+from duagc.pipeline.experiments.gaussian_consensus import (
     COORDINATES,
     GaussianAgent,
     GaussianConsensusConfig,
     Shares,
-    Weights,
     optimum,
     total_weights,
 )

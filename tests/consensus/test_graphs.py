@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.consensus import factors as pose_factors
-from pipeline.consensus.central import team_graph
-from pipeline.consensus.config import ClosureConfig
-from pipeline.consensus.factors import Factors
-from pipeline.consensus.graphs import read_team
-from pipeline.errors import DuagError
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.consensus import ClosureConfig
+from duagc.pipeline.posegraph import factors as pose_factors
+from duagc.pipeline.posegraph.central import team_graph
+from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph.files import read_team
 from tests.posegraph.graphs import KAPPA, TAU, g2o_line, helix, helix_edges, symbol, write_g2o, write_team
 
 EXACT = ClosureConfig(sigma_floor_m=0, sigma_floor_rad=0)

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.consensus.config import ColorConfig
-from pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, Evidence
-from pipeline.consensus.matching import MatchingConfig, gaussian_distance, match, threshold, tracks
-from pipeline.geometry import so3, spd
+from duagc.pipeline.config.consensus import ColorConfig
+from duagc.pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, Evidence
+from duagc.pipeline.consensus.matching import MatchingConfig, gaussian_distance, match, threshold, tracks
+from duagc.pipeline.geometry import so3, spd
 from tests.consensus.worlds import random_poses
 
 CONFIG = MatchingConfig()

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.consensus.closures import Closure, ClosureConfig
-from pipeline.consensus.factors import Factors
-from pipeline.consensus.links import REMEMBERED, SharedKeyframes
-from pipeline.consensus.poses import PoseAgent, PoseConsensusConfig
-from pipeline.consensus.robust import graduated_weights
-from pipeline.geometry import se3
+from duagc.pipeline.consensus.admm_edge import REMEMBERED, SharedKeyframes
+from duagc.pipeline.consensus.pose_admm import PoseAgent, PoseConsensusConfig
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph.loop_closures import Closure, ClosureConfig
+from duagc.pipeline.posegraph.robust import graduated_weights
 from tests.consensus.worlds import (
     EXACT,
     TeamWorld,

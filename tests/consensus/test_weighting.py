@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.consensus.config import WeightKind
-from pipeline.consensus.evidence import Evidence
-from pipeline.consensus.weighting import UNIT_SIGMA_M, UNIT_SIGMA_SHAPE, in_world, own_stiffness, told
+from duagc.pipeline.config.consensus import WeightKind
+from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.consensus.weighting import UNIT_SIGMA_M, UNIT_SIGMA_SHAPE, in_world, own_stiffness, told
 from tests.consensus.test_evidence import Sums, random_map
 from tests.consensus.worlds import random_poses
 

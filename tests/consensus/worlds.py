@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.consensus import factors as pose_factors
-from pipeline.consensus.central import CentralSolution, solve_central, team_graph
-from pipeline.consensus.closures import Closure, ClosureConfig, chain_frames, holder, robust_frame
-from pipeline.consensus.factors import Factors
-from pipeline.consensus.graphs import read_team
-from pipeline.consensus.poses import PoseAgent, PoseConsensusConfig
-from pipeline.consensus.start import chordal
-from pipeline.geometry import se3
+from duagc.pipeline.consensus.pose_admm import PoseAgent, PoseConsensusConfig
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph import factors as pose_factors
+from duagc.pipeline.posegraph.central import CentralSolution, solve_central, team_graph
+from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph.files import read_team
+from duagc.pipeline.posegraph.initialization import chordal
+from duagc.pipeline.posegraph.loop_closures import Closure, ClosureConfig, chain_frames, holder, robust_frame
 
 Array = NDArray[np.float64]
 EXACT = ClosureConfig(sigma_floor_m=0, sigma_floor_rad=0, min_support=1, frame_sigma_m=1.0)

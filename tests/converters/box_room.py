@@ -5,8 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
 
 HALF_M = np.array([4.0, 3.0, 2.5])
 

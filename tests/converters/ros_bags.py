@@ -12,8 +12,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
 from tests.converters.box_room import path, render
 
 COLOR = PinholeCamera(160, 120, 140.0, 141.0, 79.2, 60.3)

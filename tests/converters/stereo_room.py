@@ -5,8 +5,8 @@ from functools import cache
 import cv2
 import numpy as np
 
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
 from tests.converters.box_room import look
 
 LOW, HIGH = np.array([-4.0, -3.0, -2.5]), np.array([4.0, 3.0, 2.5])

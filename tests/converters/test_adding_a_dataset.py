@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import converters
-from pipeline import messages as m
-from pipeline.cli import app
-from pipeline.errors import DuagError
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import open_rgbd, read_log
+from duagc.converters import registry
+from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.cli import app
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import open_rgbd, read_log
 from tests.converters.box_room import path, render, save
 
 DOC = Path(__file__).parents[2] / "docs" / "recordings.md"
@@ -70,7 +70,7 @@ def test_the_example_converts(example: Path, walk: Path, tmp_path: Path) -> None
 def test_its_mistakes_are_one_line(example: Path, walk: Path, tmp_path: Path) -> None:
     def fails(message: str, dataset: Path = example, options: tuple[str, ...] = ()) -> None:
         with pytest.raises(DuagError, match=message) as caught:
-            converters.convert(str(dataset), walk, tmp_path / "rec", options=options)
+            registry.convert(str(dataset), walk, tmp_path / "rec", options=options)
         assert "\n" not in str(caught.value)
         assert not (tmp_path / "rec").exists()
 
@@ -90,4 +90,4 @@ def test_its_mistakes_are_one_line(example: Path, walk: Path, tmp_path: Path) ->
     (walk / "color" / "000003.png").unlink()
     fails("000003.png: No such file")
     with pytest.raises(DuagError, match="dataset 'replcia', expected perhaps replica"):
-        converters.convert("replcia", walk, tmp_path / "rec")
+        registry.convert("replcia", walk, tmp_path / "rec")

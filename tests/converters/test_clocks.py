@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-import converters
-from converters.logs import clocks
-from converters.logs.describe import describe
-from pipeline.checks import check
-from pipeline.errors import DuagError
-from pipeline.geometry import so3
-from pipeline.recording import format_info, info, open_rgbd, read_log
+from duagc.converters import registry
+from duagc.converters.logs import clocks
+from duagc.converters.logs.describe import describe
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.checks.check import check
+from duagc.pipeline.geometry import so3
+from duagc.pipeline.recording import format_info, info, open_rgbd, read_log
 from tests.converters.box_room import path
 from tests.converters.ros_bags import FRAMES, START_NS, STEP_NS, Ros, scene
 from tests.converters.test_kimera_multi import imu
@@ -56,7 +56,7 @@ def test_one_recorder_tells_how_headers_differ(tmp_path: Path) -> None:
     jackal, husky = both(r)
     bag = r.write(tmp_path / "bag", sorted(jackal + husky, key=lambda x: x[1]), "mcap")
     options = ["namespaces=/jackal,/husky"]
-    converters.convert("ros", bag, tmp_path / "kept", options=options)
+    registry.convert("ros", bag, tmp_path / "kept", options=options)
     told = clocks_of(tmp_path / "kept")["husky"]
     assert told["offset_s"] == pytest.approx(HUSKY_LATE_NS / 1e9, abs=1e-6)
     assert told["low_s"] <= HUSKY_LATE_NS / 1e9 <= told["high_s"]
@@ -65,13 +65,13 @@ def test_one_recorder_tells_how_headers_differ(tmp_path: Path) -> None:
     assert start(tmp_path / "kept", "husky") == START_NS + STEP_NS - HUSKY_LATE_NS
     warnings = json.loads((tmp_path / "kept" / "recording.json").read_text())["warnings"]
     assert any("husky: its times" in w and "none in common" in w for w in warnings)
-    converters.convert("ros", bag, tmp_path / "moved", options=[*options, "clocks=estimated"])
+    registry.convert("ros", bag, tmp_path / "moved", options=[*options, "clocks=estimated"])
     assert abs(start(tmp_path / "moved", "husky") - START_NS - STEP_NS) < 1000
     assert start(tmp_path / "moved", "jackal") == START_NS + STEP_NS
     assert clocks_of(tmp_path / "moved")["husky"]["added_s"] == pytest.approx(HUSKY_LATE_NS / 1e9, abs=1e-6)
     shown = format_info(info(tmp_path / "moved"))
     assert "clock 3.250000 s behind the first robot's (one recorder), 3.250000 s were added" in shown
-    converters.convert("ros", bag, tmp_path / "zero", options=[*options, "clocks=from_zero"])
+    registry.convert("ros", bag, tmp_path / "zero", options=[*options, "clocks=from_zero"])
     assert [start(tmp_path / "zero", robot) for robot in ("jackal", "husky")] == [0, 0]
 
 
@@ -87,19 +87,17 @@ def test_readings_before_the_first_frame_have_no_place_from_zero(tmp_path: Path)
     bag = r.write(tmp_path / "bag", sorted(rows, key=lambda x: x[1]), "mcap")
     for clocks_option, count in (("from_zero", 10), ("as_recorded", 14)):
         out = tmp_path / clocks_option
-        converters.convert("ros", bag, out, options=["imu=/imu", f"clocks={clocks_option}"])
+        registry.convert("ros", bag, out, options=["imu=/imu", f"clocks={clocks_option}"])
         assert len(list(read_log(out / "alpha.mcap", ["/alpha/imu"]))) == count
     with pytest.raises(DuagError, match="leads before 1970"):
-        converters.convert("ros", bag, tmp_path / "rec", options=["clock_offset_s=-1e10"])
+        registry.convert("ros", bag, tmp_path / "rec", options=["clock_offset_s=-1e10"])
 
 
 def test_clocks_that_agree_are_left_alone(tmp_path: Path) -> None:
     r = Ros(2)
     rows = scene(r, prefix="/jackal") + scene(r, prefix="/husky", poses=path(FRAMES, 0.2))
     bag = r.write(tmp_path / "bag", sorted(rows, key=lambda x: x[1]), "mcap")
-    converters.convert(
-        "ros", bag, tmp_path / "rec", options=["namespaces=/jackal,/husky", "clocks=estimated"]
-    )
+    registry.convert("ros", bag, tmp_path / "rec", options=["namespaces=/jackal,/husky", "clocks=estimated"])
     assert clocks_of(tmp_path / "rec")["husky"]["added_s"] == 0
     assert start(tmp_path / "rec", "husky") == START_NS + STEP_NS
 
@@ -143,7 +141,7 @@ def two_logs(tmp_path: Path, speakers: tuple[str, ...], namespaces: bool) -> Pat
 
 def test_messages_in_both_directions_bound_the_difference(tmp_path: Path) -> None:
     team = two_logs(tmp_path, ("jackal", "husky"), namespaces=True)
-    converters.convert("ros", team, tmp_path / "rec", options=["clocks=estimated"])
+    registry.convert("ros", team, tmp_path / "rec", options=["clocks=estimated"])
     told = clocks_of(tmp_path / "rec")["jackal"]  # husky is first by name
     assert told["low_s"] <= RECORDER_NS / 1e9 <= told["high_s"]
     assert told["high_s"] - told["low_s"] < 0.025
@@ -153,7 +151,7 @@ def test_messages_in_both_directions_bound_the_difference(tmp_path: Path) -> Non
 
 def test_one_direction_bounds_one_side(tmp_path: Path) -> None:
     team = two_logs(tmp_path, ("jackal",), namespaces=True)
-    converters.convert("ros", team, tmp_path / "rec")
+    registry.convert("ros", team, tmp_path / "rec")
     told = clocks_of(tmp_path / "rec")["jackal"]
     assert told["low_s"] is None
     assert told["high_s"] >= RECORDER_NS / 1e9
@@ -163,7 +161,7 @@ def test_one_direction_bounds_one_side(tmp_path: Path) -> None:
 
 def test_without_common_messages_nothing_is_made_up(tmp_path: Path) -> None:
     team = two_logs(tmp_path, (), namespaces=True)
-    converters.convert("ros", team, tmp_path / "rec", options=["clocks=estimated"])
+    registry.convert("ros", team, tmp_path / "rec", options=["clocks=estimated"])
     told = clocks_of(tmp_path / "rec")["jackal"]
     assert told["offset_s"] is None
     assert told["added_s"] == 0
@@ -213,7 +211,7 @@ def drifting(r: Ros, seconds: int, ppm: float) -> list[tuple[str, int, Any]]:
 def test_a_drift_is_told_and_taken_out_if_asked(tmp_path: Path) -> None:
     r = Ros(2)
     bag = r.write(tmp_path / "bag", drifting(r, 120, 400.0), "mcap")
-    converters.convert("ros", bag, tmp_path / "kept")
+    registry.convert("ros", bag, tmp_path / "kept")
     (told,) = [w for w in warnings_of(tmp_path / "kept") if "ppm" in w]
     assert "the recorder's clock gains 4" in told
     assert "expected one rate, or --set clocks=estimated" in told
@@ -224,7 +222,7 @@ def test_a_drift_is_told_and_taken_out_if_asked(tmp_path: Path) -> None:
     found = describe(bag)
     assert found["robots"]["alpha"]["drift_ppm"] == pytest.approx(400, abs=15)
     assert any("ppm" in w for w in found["robots"]["alpha"]["warnings"])
-    converters.convert("ros", bag, tmp_path / "settled", options=["clocks=estimated"])
+    registry.convert("ros", bag, tmp_path / "settled", options=["clocks=estimated"])
     assert not [f for f in check(tmp_path / "settled").findings if f.check == "clock"]
     kept, settled = (span(tmp_path / name) for name in ("kept", "settled"))
     assert kept[0] == settled[0]
@@ -234,7 +232,7 @@ def test_a_drift_is_told_and_taken_out_if_asked(tmp_path: Path) -> None:
 def test_clocks_of_one_rate_are_left_alone(tmp_path: Path) -> None:
     r = Ros(2)
     bag = r.write(tmp_path / "bag", drifting(r, 120, 0.0), "mcap")
-    converters.convert("ros", bag, tmp_path / "rec", options=["clocks=estimated"])
+    registry.convert("ros", bag, tmp_path / "rec", options=["clocks=estimated"])
     assert not [w for w in warnings_of(tmp_path / "rec") if "ppm" in w]
 
 

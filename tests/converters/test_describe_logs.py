@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-import converters
-from converters.logs import describe
-from pipeline import messages as m
-from pipeline.cli import app
-from pipeline.errors import DuagError
-from pipeline.recording import read_log
+from duagc.converters import registry
+from duagc.converters.logs import describe
+from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.cli import app
+from duagc.pipeline.recording import read_log
 from tests.converters.box_room import path
 from tests.converters.ros_bags import FRAMES, REAL, START_NS, Ros, scene
 from tests.converters.test_clocks import both
@@ -62,13 +62,13 @@ def test_the_toml_file_converts_as_the_log_itself(tmp_path: Path) -> None:
     log = write(tmp_path / "logs" / "a.mcap", scene(r), "protobuf", r)
     text = run.invoke(app, ["info", str(log), "--toml"]).stdout
     (tmp_path / "a.toml").write_text(text)
-    converters.convert("ros", log, tmp_path / "rec")
-    converters.convert("ros", tmp_path / "a.toml", tmp_path / "rec2")
+    registry.convert("ros", log, tmp_path / "rec")
+    registry.convert("ros", tmp_path / "a.toml", tmp_path / "rec2")
     assert digests(tmp_path / "rec") == digests(tmp_path / "rec2")
     moved = tmp_path / "logs" / "b.toml"
     moved.write_text(text.replace(str(log.resolve()), "a.mcap").replace("# truth", "truth"))
     os.rename(tmp_path / "logs", tmp_path / "elsewhere")
-    converters.convert("ros", tmp_path / "elsewhere" / "b.toml", tmp_path / "rec3")
+    registry.convert("ros", tmp_path / "elsewhere" / "b.toml", tmp_path / "rec3")
     assert set(digests(tmp_path / "rec3")) == {"alpha.mcap", "alpha.groundtruth.mcap"}
     assert digests(tmp_path / "rec3")["alpha.mcap"] == digests(tmp_path / "rec")["alpha.mcap"]
     assert str(tmp_path) not in (tmp_path / "rec3" / "recording.json").read_text()
@@ -84,7 +84,7 @@ def test_namespaces_that_decide_become_robots(tmp_path: Path) -> None:
     assert "clock       add -3.250000 s (one recorder)" in shown  # jackal's, on the clock of husky
     assert "warning: jackal: its times" in shown
     (tmp_path / "team.toml").write_text(run.invoke(app, ["info", str(log), "--toml"]).stdout)
-    converters.convert("ros", tmp_path / "team.toml", tmp_path / "rec")
+    registry.convert("ros", tmp_path / "team.toml", tmp_path / "rec")
     robots = json.loads((tmp_path / "rec" / "recording.json").read_text())["robots"]
     assert list(robots) == ["husky", "jackal"]
     same = describe.describe(tmp_path / "team.toml")["robots"]
@@ -99,8 +99,8 @@ def test_a_topic_that_is_said_is_of_one_robot(tmp_path: Path) -> None:
     options = ["namespaces=/jackal,/husky"]
     for option in ("truth=/jackal/odom", "odometry=/jackal/odom", "truth_file=gt.tum"):
         with pytest.raises(DuagError, match=r"for several robots, expected .* a TOML file that says whose"):
-            converters.convert("ros", log, tmp_path / "rec", options=[*options, option])
-    converters.convert("ros", log, tmp_path / "rec", options=[*options, "truth={namespace}/odom"])
+            registry.convert("ros", log, tmp_path / "rec", options=[*options, option])
+    registry.convert("ros", log, tmp_path / "rec", options=[*options, "truth={namespace}/odom"])
     for robot, start in (("jackal", 0.0), ("husky", 0.2)):
         records = read_log(tmp_path / "rec" / f"{robot}.groundtruth.mcap")
         assert np.allclose(
@@ -124,7 +124,7 @@ def test_what_is_not_decided_lists_its_candidates(tmp_path: Path) -> None:
     text = run.invoke(app, ["info", str(bag), "--toml"]).stdout
     assert '# color = "/back/rgb/image_raw"\n# color = "/front/rgb/image_raw"\n' in text
     (tmp_path / "a.toml").write_text(text.replace('# color = "/front', 'color = "/front'))
-    converters.convert("ros", tmp_path / "a.toml", tmp_path / "rec")
+    registry.convert("ros", tmp_path / "a.toml", tmp_path / "rec")
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_mistakes_in_a_toml_file_are_one_line(tmp_path: Path, text: str, message
     write(tmp_path / "a.mcap", scene(r), "cdr", r)
     (tmp_path / "a.toml").write_text(text)
     with pytest.raises(DuagError, match=message) as caught:
-        converters.convert("ros", tmp_path / "a.toml", tmp_path / "rec")
+        registry.convert("ros", tmp_path / "a.toml", tmp_path / "rec")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "rec").exists()
 
@@ -185,13 +185,13 @@ def test_the_command_line_has_the_last_word(tmp_path: Path) -> None:
     row = json.loads((tmp_path / "rec" / "recording.json").read_text())["robots"]["a"]
     assert row["start_ns"] == next(ns for t, ns, _ in scene(r) if t == "/camera/color/image_raw")
     with pytest.raises(DuagError, match="ros: time_sorce is no option; expected perhaps time_source"):
-        converters.convert("ros", tmp_path / "a.mcap", tmp_path / "rec2", options=["time_sorce=log"])
+        registry.convert("ros", tmp_path / "a.mcap", tmp_path / "rec2", options=["time_sorce=log"])
 
 
 def test_our_own_files_are_not_foreign(tmp_path: Path) -> None:
     r = Ros(2)
     log = write(tmp_path / "logs" / "a.mcap", scene(r, poses=path(FRAMES)), "cdr", r)
-    converters.convert("ros", log, tmp_path / "rec")
+    registry.convert("ros", log, tmp_path / "rec")
     assert describe.is_foreign(log)
     assert describe.is_foreign(tmp_path / "logs")
     for own in (
@@ -214,7 +214,7 @@ def test_what_a_cut_log_holds_can_be_saved_and_converted(tmp_path: Path) -> None
     saved = run.invoke(app, ["recover", str(cut), "--out", str(tmp_path / "saved.mcap")])
     assert saved.exit_code == 0, saved.exception
     assert "robot alpha: " in run.invoke(app, ["info", str(tmp_path / "saved.mcap")]).stdout
-    converters.convert("ros", tmp_path / "saved.mcap", tmp_path / "rec")
+    registry.convert("ros", tmp_path / "saved.mcap", tmp_path / "rec")
     frames = json.loads((tmp_path / "rec" / "recording.json").read_text())["robots"]["alpha"]["frames"]
     assert 0 < frames <= FRAMES
 

@@ -16,15 +16,15 @@ import pytest
 from google.protobuf.json_format import MessageToDict
 from mcap.writer import CompressionType, IndexType, Writer
 
-import converters
-import schemas
-from converters.logs import open_log, ros_json
-from converters.logs.foxglove import JsonFields, as_ros
-from pipeline.checks import check
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import open_rgbd, read_log
+from duagc import schemas
+from duagc.converters import registry
+from duagc.converters.logs import open_log, ros_json
+from duagc.converters.logs.foxglove import JsonFields, as_ros
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.checks.check import check
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import open_rgbd, read_log
 from tests.converters.ros_bags import COLOR, DISTORTION, Ros, scene
 
 Row = tuple[str, int, Any]
@@ -171,7 +171,7 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """Digests of the recording made from a bag of ROS 1."""
     folder, r = tmp_path_factory.mktemp("bag"), Ros(1)
     bag = r.write(folder / "bag", scene(r), "plain")
-    converters.convert("ros", bag, folder / "rec", options=["truth=/odom"])
+    registry.convert("ros", bag, folder / "rec", options=["truth=/odom"])
     return digests(folder / "rec")
 
 
@@ -197,7 +197,7 @@ def test_every_encoding_gives_the_same_recording(
     r = Ros(1 if kind.endswith("1") else 2)
     kind = "rosbridge" if kind == "rosbridge1" else kind
     log = write(tmp_path / "log.mcap", scene(r), kind, r, **settings)
-    converters.convert("ros", log, tmp_path / "rec", options=["truth=/odom"])
+    registry.convert("ros", log, tmp_path / "rec", options=["truth=/odom"])
     assert digests(tmp_path / "rec") == expected
     report = check(tmp_path / "rec")
     assert report.sound, report.findings
@@ -210,11 +210,11 @@ def test_pieces_of_a_log_are_one_log(tmp_path: Path, expected: dict[str, str]) -
     write(tmp_path / "src" / "jackal" / "part_2.mcap", rows[:8], "cdr", r)
     write(tmp_path / "src" / "jackal" / "part_10.mcap", rows[8:11], "json", r)
     r1.write(tmp_path / "src" / "jackal" / "part_11", rows1[11:], "lz4")
-    converters.convert(
+    registry.convert(
         "ros", tmp_path / "src" / "jackal", tmp_path / "rec", options=["truth=/odom", "pieces=true"]
     )
     assert digests(tmp_path / "rec") == expected
-    converters.convert("ros", tmp_path / "src", tmp_path / "rec2", options=["truth=/odom"])
+    registry.convert("ros", tmp_path / "src", tmp_path / "rec2", options=["truth=/odom"])
     assert digests(tmp_path / "rec2") == expected
 
 
@@ -226,7 +226,7 @@ def test_transforms_that_never_change_are_extrinsics(tmp_path: Path, expected: d
     repeated = [("/tf", ns, static) for t, ns, _ in rows if t == "/odom"]
     others = [row for row in rows if row[0] != "/tf_static"]
     log = write(tmp_path / "log.mcap", sorted(others + repeated, key=lambda x: x[1]), "protobuf", r)
-    converters.convert("ros", log, tmp_path / "rec", options=["truth=/odom"])
+    registry.convert("ros", log, tmp_path / "rec", options=["truth=/odom"])
     assert digests(tmp_path / "rec") == expected
     T_moved = se3.from_rotation_translation(np.eye(3), [0.01, 0.0, 0.0])
     moved = ("/tf", repeated[-1][1] + 1, r.tf(r.transform(1, "_depth", "_color", T_moved)))
@@ -234,19 +234,19 @@ def test_transforms_that_never_change_are_extrinsics(tmp_path: Path, expected: d
         tmp_path / "moving.mcap", sorted([*others, *repeated, moved], key=lambda x: x[1]), "protobuf", r
     )
     with pytest.raises(DuagError, match="does not tie them"):
-        converters.convert("ros", path, tmp_path / "rec3")
+        registry.convert("ros", path, tmp_path / "rec3")
 
 
 def test_times_of_publication(tmp_path: Path) -> None:
     r = Ros(2)
     log = write(tmp_path / "log.mcap", scene(r), "json", r)
-    converters.convert("ros", log, tmp_path / "rec", options=["time_source=publish"])
+    registry.convert("ros", log, tmp_path / "rec", options=["time_source=publish"])
     row = json.loads((tmp_path / "rec" / "recording.json").read_text())["robots"]["alpha"]
     first = next(ns for topic, ns, _ in scene(r) if topic == "/camera/color/image_raw")
     assert row["start_ns"] == first - 1_000_000
     bag = r.write(tmp_path / "bag", scene(r), "sqlite3")
     with pytest.raises(DuagError, match="no times of publication"):
-        converters.convert("ros", bag, tmp_path / "rec2", options=["time_source=publish"])
+        registry.convert("ros", bag, tmp_path / "rec2", options=["time_source=publish"])
 
 
 def test_compressed_images_of_foxglove(tmp_path: Path) -> None:
@@ -269,7 +269,7 @@ def test_compressed_images_of_foxglove(tmp_path: Path) -> None:
             m = r.compressed(m.header.stamp.sec * 10**9 + m.header.stamp.nanosec, "_depth", png, "png")
         rows.append((topic, ns, m))
     log = write(tmp_path / "log.mcap", rows, "protobuf", r)
-    converters.convert("ros", log, tmp_path / "rec", options=["undistort=false"])
+    registry.convert("ros", log, tmp_path / "rec", options=["undistort=false"])
     colors = [
         record.proto().data for record in read_log(tmp_path / "rec" / "alpha.mcap", ["/alpha/camera/color"])
     ]
@@ -292,7 +292,7 @@ def test_broken_files_are_errors(tmp_path: Path) -> None:
         path = tmp_path / f"{name}.mcap"
         path.write_bytes(broken)
         with pytest.raises(DuagError, match=message):
-            converters.convert("ros", path, tmp_path / "rec")
+            registry.convert("ros", path, tmp_path / "rec")
         assert not (tmp_path / "rec").exists()
 
 
@@ -315,7 +315,7 @@ def test_messages_that_do_not_fit_their_schema_are_errors(tmp_path: Path) -> Non
             writer.add_message(writer.register_channel("/image", kind, schema), 5, data, 5)
             writer.finish()
         with pytest.raises(DuagError, match=message):
-            converters.convert("ros", path, tmp_path / "rec")
+            registry.convert("ros", path, tmp_path / "rec")
     assert base64.b64decode("!") == b""  # what a lenient decoder would have made of the first
 
 
@@ -333,10 +333,10 @@ def test_a_camera_that_changes_is_refused(tmp_path: Path) -> None:
         )
         log = write(tmp_path / "log.mcap", [*rows, later], kind, r)
         if by < 1:
-            converters.convert("ros", log, tmp_path / f"rec_{kind}")
+            registry.convert("ros", log, tmp_path / f"rec_{kind}")
             continue
         with pytest.raises(DuagError, match=r"camera_info changes at .* from .*\[140.0, .*\[143.0"):
-            converters.convert("ros", log, tmp_path / "rec")
+            registry.convert("ros", log, tmp_path / "rec")
 
 
 def raw_log(path: Path, topic: str, schema: tuple[str, str, bytes], data: bytes) -> Path:
@@ -399,7 +399,7 @@ def test_times_that_cannot_be_are_refused(tmp_path: Path, log_ns: int, stamp_ns:
             )
         writer.finish()
     with pytest.raises(DuagError, match=message):
-        converters.convert("ros", path, tmp_path / "rec")
+        registry.convert("ros", path, tmp_path / "rec")
 
 
 @pytest.mark.parametrize("data", [2_147_483_647, True, None, {"a": 1}])
@@ -457,8 +457,8 @@ def test_real_images_in_a_log_are_those_of_the_dataset(tmp_path: Path) -> None:
             )
         )
     log = write(tmp_path / "log.mcap", rows, "protobuf", r)
-    converters.convert("ros", log, tmp_path / "log_rec")
-    converters.convert("7scenes", tmp_path / "seq", tmp_path / "own_rec")
+    registry.convert("ros", log, tmp_path / "log_rec")
+    registry.convert("7scenes", tmp_path / "seq", tmp_path / "own_rec")
     with (
         open_rgbd(tmp_path / "log_rec" / "alpha.mcap") as a,
         open_rgbd(tmp_path / "own_rec" / "alpha.mcap") as b,
@@ -509,7 +509,7 @@ def test_webp_comes_out_as_png(tmp_path: Path) -> None:
         else:
             rows.append((topic, ns, m))
     log = write(tmp_path / "log.mcap", rows, "cdr", r)
-    converters.convert("ros", log, tmp_path / "rec", options=["undistort=false"])
+    registry.convert("ros", log, tmp_path / "rec", options=["undistort=false"])
     with open_rgbd(tmp_path / "rec" / "alpha.mcap") as found:
         kept = [p for k, p in enumerate(pixels) if k != 1]
         assert len(found) == len(kept)
@@ -536,4 +536,4 @@ def test_video_is_refused_by_its_name(tmp_path: Path, others: bool) -> None:
     with pytest.raises(
         DuagError, match=r"/cam/video \(foxglove.CompressedVideo\) is video, which is not read"
     ):
-        converters.convert("ros", path, tmp_path / "rec")
+        registry.convert("ros", path, tmp_path / "rec")

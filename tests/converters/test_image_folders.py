@@ -12,14 +12,15 @@ import cv2
 import numpy as np
 import pytest
 
-import converters
-from converters import bonn, icl_nuim, tum, tum_layout
-from pipeline import messages as m
-from pipeline.errors import DuagError
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import open_rgbd, read_log
-from schemas import topics
+from duagc.converters import registry
+from duagc.converters.datasets import bonn, icl_nuim, tum
+from duagc.converters.layouts import tum_layout
+from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import open_rgbd, read_log
+from duagc.schemas import topics
 from tests.converters.box_room import look, path, render, save
 
 REPLICA = PinholeCamera(1200, 680, 600.0, 600.0, 599.5, 339.5)
@@ -188,7 +189,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Path
     for name, (make, options, _, _) in CASES.items():
         root = tmp_path_factory.mktemp(name.replace("-", "_"))
         src = make(root / "data")
-        converters.convert(name, src, root / "recording", options=options)
+        registry.convert(name, src, root / "recording", options=options)
         out[name] = src, root / "recording"
     return out
 
@@ -257,7 +258,7 @@ def test_times_and_warnings(made: dict[str, tuple[Path, Path]]) -> None:
 
 def test_association_policies(made: dict[str, tuple[Path, Path]], tmp_path: Path) -> None:
     src, _ = made["tum"]
-    converters.convert("tum", src, tmp_path / "near", options=["association=nearest"])
+    registry.convert("tum", src, tmp_path / "near", options=["association=nearest"])
     with open_rgbd(tmp_path / "near" / "alpha.mcap") as log:
         assert len(log) == 6
     listed = [tum_layout.Listed(t * 10**6, Path(str(t))) for t in (0, 10, 30)]
@@ -286,7 +287,7 @@ def test_poses_are_interpolated_and_never_extrapolated() -> None:
 def test_distortion_matters(made: dict[str, tuple[Path, Path]], tmp_path: Path) -> None:
     """Left in, it shows in the depth along a wall."""
     src, recording = made["tum"]
-    converters.convert("tum", src, tmp_path / "raw", options=["undistort=false"])
+    registry.convert("tum", src, tmp_path / "raw", options=["undistort=false"])
     errors = []
     for folder in (recording, tmp_path / "raw"):
         with open_rgbd(folder / "alpha.mcap") as log:
@@ -357,7 +358,7 @@ def test_broken_data_is_named_and_leaves_nothing(
     spoil(copy)
     _, options, robots, _ = CASES[name]
     with pytest.raises(DuagError) as caught:
-        converters.convert(name, copy, tmp_path / "out", robots=robots, options=options)
+        registry.convert(name, copy, tmp_path / "out", robots=robots, options=options)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
     assert [p.name for p in tmp_path.iterdir()] == [copy.parent.name]
@@ -387,7 +388,7 @@ def test_a_wrong_convention_is_found_out(
         poses = [tum_line(i + 1, T).replace(".0000", "", 1) for i, T in enumerate(path(FRAMES))]
         edit(copy / "traj0.gt.freiburg", lambda _: "\n".join(poses))
     with pytest.raises(DuagError, match="do not belong together"):
-        converters.convert(name, copy, tmp_path / "out")
+        registry.convert(name, copy, tmp_path / "out")
 
 
 def test_the_rotation_of_bonn_is_one() -> None:
@@ -398,7 +399,7 @@ def test_the_rotation_of_bonn_is_one() -> None:
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real Replica scene is not there")
 def test_the_real_replica_scene(tmp_path: Path) -> None:
-    converters.convert("replica", REAL, tmp_path / "office0")
+    registry.convert("replica", REAL, tmp_path / "office0")
     check = json.loads((tmp_path / "office0" / "recording.json").read_text())["checks"]["alpha"]
     assert check["reprojection_median_m"] < 0.002
     with open_rgbd(tmp_path / "office0" / "alpha.mcap") as log:

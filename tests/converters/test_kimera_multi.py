@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 import pytest
 
-import converters
-from converters import kimera_multi
-from pipeline import messages as m
-from pipeline.checks import check
-from pipeline.errors import DuagError
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import open_rgbd, read_log
-from pipeline.recording.motion import GyroPrior, motion_prior
-from pipeline.recording.read import LogFile
+from duagc.converters import registry
+from duagc.converters.datasets import kimera_multi
+from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.checks.check import check
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import open_rgbd, read_log
+from duagc.pipeline.recording.motion import GyroPrior, motion_prior
+from duagc.pipeline.recording.read import LogFile
 from tests.converters.box_room import look, render
 from tests.converters.ros_bags import Ros, odometry
 
@@ -152,7 +152,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def recording(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("out") / "rec"
-    converters.convert("kimera-multi", dataset, out)
+    registry.convert("kimera-multi", dataset, out)
     return out
 
 
@@ -217,10 +217,10 @@ def test_what_is_known_and_what_is_not_is_told(recording: Path) -> None:
 
 def test_robots_and_ground_truth_can_be_chosen(dataset: Path, tmp_path: Path) -> None:
     bag = dataset / "10_14_thoth.bag"
-    converters.convert("kimera-multi", bag, tmp_path / "one")
+    registry.convert("kimera-multi", bag, tmp_path / "one")
     assert (tmp_path / "one" / "thoth.groundtruth.mcap").is_file()
     options = ["robots_used=thoth", "ground_truth=none", "imu=false"]
-    converters.convert("kimera-multi", dataset, tmp_path / "two", options=options)
+    registry.convert("kimera-multi", dataset, tmp_path / "two", options=options)
     description = json.loads((tmp_path / "two" / "recording.json").read_text())
     assert list(description["robots"]) == ["thoth"]
     assert not (tmp_path / "two" / "thoth.groundtruth.mcap").exists()
@@ -229,7 +229,7 @@ def test_robots_and_ground_truth_can_be_chosen(dataset: Path, tmp_path: Path) ->
         ([f"ground_truth={tmp_path}"], "acl_jackal_gt_odom.csv: no such file"),
     ):
         with pytest.raises(DuagError, match=message):
-            converters.convert("kimera-multi", dataset, tmp_path / "rec", options=wrong)
+            registry.convert("kimera-multi", dataset, tmp_path / "rec", options=wrong)
 
 
 @pytest.mark.parametrize(
@@ -251,7 +251,7 @@ def test_broken_ground_truth_is_an_error(dataset: Path, tmp_path: Path, text: st
     (tmp_path / "gt" / "thoth_gt_odom.csv").write_text(text)
     options = ["robots_used=thoth", f"ground_truth={tmp_path / 'gt'}"]
     with pytest.raises(DuagError, match=message):
-        converters.convert("kimera-multi", dataset, tmp_path / "rec", options=options)
+        registry.convert("kimera-multi", dataset, tmp_path / "rec", options=options)
     assert not (tmp_path / "rec").exists()
 
 
@@ -264,11 +264,11 @@ def test_poses_that_do_not_belong_are_refused(dataset: Path, tmp_path: Path) -> 
     (tmp_path / "gt" / "thoth_gt_odom.csv").write_text("\n".join([source[0], *swapped]) + "\n")
     options = ["robots_used=thoth", f"ground_truth={tmp_path / 'gt'}"]
     with pytest.raises(DuagError, match="poses, intrinsics and depth do not belong together"):
-        converters.convert("kimera-multi", dataset, tmp_path / "rec", options=options)
+        registry.convert("kimera-multi", dataset, tmp_path / "rec", options=options)
 
 
 def test_other_bags_are_refused(tmp_path: Path) -> None:
     r = Ros(1)
     bag = r.write(tmp_path / "10_14_thoth", bag_rows(r, "thoth", 0.0, "thoth")[:1], "plain")
     with pytest.raises(DuagError, match=r"no topic /<robot>/forward/color/image_raw/compressed"):
-        converters.convert("kimera-multi", bag, tmp_path / "rec")
+        registry.convert("kimera-multi", bag, tmp_path / "rec")

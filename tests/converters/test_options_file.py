@@ -9,9 +9,9 @@ import pytest
 import tomlkit
 from typer.testing import CliRunner
 
-import converters
-from pipeline.cli import app
-from pipeline.errors import DuagError
+from duagc.converters import registry
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.cli import app
 from tests.converters.box_room import path, render, save
 from tests.converters.test_adding_a_dataset import CAMERA, DOC
 from tests.converters.test_seven_scenes import make_sequence
@@ -41,7 +41,7 @@ def test_a_file_is_as_good_as_set_and_set_wins(tmp_path: Path) -> None:
     assert a == b, "digests of the logs too"
     convert(*filed, "--set", "baseline_m=0.02", "--out", tmp_path / "c")
     assert description(tmp_path / "c")["parameters"] == {**a["parameters"], "baseline_m": 0.02}  # type: ignore[dict-item]
-    converters.convert("7scenes", sequence, tmp_path / "d")
+    registry.convert("7scenes", sequence, tmp_path / "d")
     assert description(tmp_path / "d")["options_file"] is None, "one conversion's file is not the next one's"
 
 
@@ -61,20 +61,20 @@ def test_a_converter_of_ones_own_takes_a_file(tmp_path: Path) -> None:
     assert description(tmp_path / "rec")["parameters"]["rate_hz"] == 10  # type: ignore[index]
 
 
-@pytest.mark.parametrize("dataset", sorted(converters.DATASETS))
+@pytest.mark.parametrize("dataset", sorted(registry.DATASETS))
 def test_every_converter_has_its_options_in_a_file(dataset: str, tmp_path: Path) -> None:
     """All of them at their defaults pass, so that the complaint is about the dataset; an unknown one does not."""
-    fields = converters._module(dataset).Options.model_fields
+    fields = registry._module(dataset).Options.model_fields
     file = tmp_path / "options.toml"
     file.write_text(tomlkit.dumps({name: field.default for name, field in fields.items()}))
     assert tomllib.loads(file.read_text())
     with pytest.raises(DuagError, match="nothing_here"):
-        converters.convert(dataset, tmp_path / "nothing_here" / "seq", tmp_path / "rec", options_file=file)
+        registry.convert(dataset, tmp_path / "nothing_here" / "seq", tmp_path / "rec", options_file=file)
     file.write_text("focus = 3\n")
     with pytest.raises(
         DuagError, match=rf"options.toml, for {dataset}: focus is no option; expected"
     ) as caught:
-        converters.convert(dataset, tmp_path / "nothing_here" / "seq", tmp_path / "rec", options_file=file)
+        registry.convert(dataset, tmp_path / "nothing_here" / "seq", tmp_path / "rec", options_file=file)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "rec").exists()
 
@@ -98,7 +98,7 @@ def test_files_that_are_wrong_are_one_line(tmp_path: Path, content: str | bytes 
     if content is not None:
         file.write_bytes(content.encode() if isinstance(content, str) else content)
     with pytest.raises(DuagError, match=message) as caught:
-        converters.convert("7scenes", tmp_path / "nothing_here" / "seq", tmp_path / "rec", options_file=file)
+        registry.convert("7scenes", tmp_path / "nothing_here" / "seq", tmp_path / "rec", options_file=file)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "rec").exists()
 
@@ -107,4 +107,4 @@ def test_files_that_are_wrong_are_one_line(tmp_path: Path, content: str | bytes 
 def test_arguments_are_no_options(tmp_path: Path, option: str) -> None:
     name = option.partition("=")[0]
     with pytest.raises(DuagError, match=f"7scenes: {name} is no option of a converter"):
-        converters.convert("7scenes", tmp_path, tmp_path / "rec", options=[option])
+        registry.convert("7scenes", tmp_path, tmp_path / "rec", options=[option])

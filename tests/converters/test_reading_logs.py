@@ -14,12 +14,12 @@ from mcap.writer import CompressionType, Writer
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-import converters
-from converters.logs import foxglove, open_log
-from converters.logs.entries import Entry
-from pipeline.bench import convert
-from pipeline.errors import DuagError
-from pipeline.geometry.camera import PinholeCamera
+from duagc.converters import registry
+from duagc.converters.logs import foxglove, open_log
+from duagc.converters.logs.entries import Entry
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.bench import convert
+from duagc.pipeline.geometry.camera import PinholeCamera
 from tests.recording.long_logs import COLOR, DEPTH, FRAME, IMU, KINDS, Seed, write
 
 CAMERA = PinholeCamera(96, 64, 80.0, 80.0, 47.5, 31.5)
@@ -114,7 +114,7 @@ def test_damage_behind_the_headers_is_found(logs: dict[str, Path], tmp_path: Pat
     path = tmp_path / "damaged.mcap"
     path.write_bytes(data)
     with pytest.raises(DuagError, match=r"damaged\.mcap"):
-        converters.convert("ros", path, tmp_path / "rec")
+        registry.convert("ros", path, tmp_path / "rec")
     assert not (tmp_path / "rec").exists()
 
 

@@ -14,15 +14,15 @@ import cv2
 import numpy as np
 import pytest
 
-import converters
-from converters.logs.frames import pose_matrix
-from pipeline import messages as m
-from pipeline.errors import DuagError
-from pipeline.geometry import se3, so3
-from pipeline.recording import open_rgbd, read_log
-from pipeline.recording.read import LogFile
-from pipeline.recording.register_depth import register_depth
-from schemas import topics
+from duagc.converters import registry
+from duagc.converters.logs.frames import pose_matrix
+from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.recording import open_rgbd, read_log
+from duagc.pipeline.recording.read import LogFile
+from duagc.pipeline.recording.register_depth import register_depth
+from duagc.schemas import topics
 from tests.converters.box_room import path, render
 from tests.converters.ros_bags import (
     COLOR,
@@ -44,7 +44,7 @@ from tests.converters.ros_bags import (
 def test_every_container_gives_the_same_recording(tmp_path: Path, version: int, container: str) -> None:
     r = Ros(version)
     bag = r.write(tmp_path / "bag", scene(r), container)
-    converters.convert("ros", bag, tmp_path / "rec", options=["truth=/odom"])
+    registry.convert("ros", bag, tmp_path / "rec", options=["truth=/odom"])
     records = read_log(
         tmp_path / "rec" / "alpha.groundtruth.mcap", topics=[topics.GROUNDTRUTH_POSE.of("alpha")]
     )
@@ -72,7 +72,7 @@ def test_a_topic_of_two_types_is_refused(tmp_path: Path) -> None:
     r = Ros(1)
     rows = [*scene(r), ("/tf_static", START_NS, r.info(START_NS, "color", COLOR))]
     with pytest.raises(DuagError, match=r"/tf_static holds .*TFMessage and .*CameraInfo, expected one type"):
-        converters.convert("ros", r.write(tmp_path / "bag", rows, "plain"), tmp_path / "rec")
+        registry.convert("ros", r.write(tmp_path / "bag", rows, "plain"), tmp_path / "rec")
 
 
 @pytest.mark.parametrize("container", ["plain", "lz4"])
@@ -86,7 +86,7 @@ def test_an_index_that_leads_to_another_topic_is_refused(tmp_path: Path, contain
         data[conn] = (data[conn] + 1) % len(entries)
     bag.write_bytes(data)
     with pytest.raises(DuagError, match=r"bag\.bag: .*, expected a sound bag of ROS 1 or ROS 2"):
-        converters.convert("ros", bag, tmp_path / "rec")
+        registry.convert("ros", bag, tmp_path / "rec")
 
 
 def test_colour_that_is_too_fine_for_the_depth_is_refused(tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_colour_that_is_too_fine_for_the_depth_is_refused(tmp_path: Path) -> Non
     with pytest.raises(
         DuagError, match=r"color/image_raw are \d+ times as fine as those of .*, expected at most"
     ):
-        converters.convert("ros", r.write(tmp_path / "bag", rows, "plain"), tmp_path / "rec")
+        registry.convert("ros", r.write(tmp_path / "bag", rows, "plain"), tmp_path / "rec")
 
 
 def test_depth_that_is_not_moved_is_wrong(tmp_path: Path) -> None:
@@ -125,12 +125,12 @@ def test_two_robots_in_one_bag_and_in_two(tmp_path: Path) -> None:
     )
     bag = r.write(tmp_path / "one", both, "mcap")
     with pytest.raises(DuagError, match="expected --set depth=TOPIC"):
-        converters.convert("ros", bag, tmp_path / "rec")
-    converters.convert("ros", bag, tmp_path / "rec", options=["namespaces=/husky,/jackal"])
+        registry.convert("ros", bag, tmp_path / "rec")
+    registry.convert("ros", bag, tmp_path / "rec", options=["namespaces=/husky,/jackal"])
     (tmp_path / "two").mkdir()
     r.write(tmp_path / "two" / "a", scene(r, prefix="/husky", poses=path(FRAMES, 0.2)), "sqlite3")
     r.write(tmp_path / "two" / "b", scene(r, prefix="/jackal"), "sqlite3")
-    converters.convert("ros", tmp_path / "two", tmp_path / "rec2", robots=2)
+    registry.convert("ros", tmp_path / "two", tmp_path / "rec2", robots=2)
     for name, other in (("husky", "alpha"), ("jackal", "bravo")):
         with (
             open_rgbd(tmp_path / "rec" / f"{name}.mcap") as one,
@@ -139,7 +139,7 @@ def test_two_robots_in_one_bag_and_in_two(tmp_path: Path) -> None:
             assert np.array_equal(one.frame(2).depth, two.frame(2).depth)
             assert np.array_equal(one.frame(2).color, two.frame(2).color)
     with pytest.raises(DuagError, match="found 2 robots, expected --robots 2"):
-        converters.convert("ros", tmp_path / "two", tmp_path / "rec3", robots=3)
+        registry.convert("ros", tmp_path / "two", tmp_path / "rec3", robots=3)
 
 
 def test_times(tmp_path: Path) -> None:
@@ -147,15 +147,15 @@ def test_times(tmp_path: Path) -> None:
     r = Ros(1)
     bag = r.write(tmp_path / "late", scene(r, late_ns=23_000_000), "plain")
     with pytest.raises(DuagError, match=r"no image on /camera/depth/image_rect_raw within 0.02 s"):
-        converters.convert("ros", bag, tmp_path / "rec")
-    converters.convert("ros", bag, tmp_path / "log", options=["time_source=log"])
+        registry.convert("ros", bag, tmp_path / "rec")
+    registry.convert("ros", bag, tmp_path / "log", options=["time_source=log"])
     with open_rgbd(tmp_path / "log" / "alpha.mcap") as log:
         assert log.frame(0).stamp_ns == START_NS + STEP_NS + 5_000_000
     rows = scene(r)
     times = [row[1] for row in rows]
     backwards = [(t, times[k], msg) for k, (t, _, msg) in enumerate(rows[:3] + rows[9:] + rows[3:9])]
     bag = r.write(tmp_path / "backwards", sorted(backwards, key=lambda x: x[1]), "plain")
-    converters.convert("ros", bag, tmp_path / "sorted")
+    registry.convert("ros", bag, tmp_path / "sorted")
     warnings = json.loads((tmp_path / "sorted" / "recording.json").read_text())["warnings"]
     assert any("times go backwards" in w for w in warnings)
     with open_rgbd(tmp_path / "sorted" / "alpha.mcap") as log:
@@ -169,19 +169,19 @@ def test_a_frame_tied_to_nothing_needs_extrinsics(tmp_path: Path) -> None:
     rows = [row for row in scene(r) if row[0] != "/tf_static"]
     bag = r.write(tmp_path / "bag", rows, "sqlite3")
     with pytest.raises(DuagError, match="/tf_static does not tie them"):
-        converters.convert("ros", bag, tmp_path / "rec")
+        registry.convert("ros", bag, tmp_path / "rec")
     q, t = so3.to_quat_wxyz(T_COLOR_DEPTH[:3, :3]), T_COLOR_DEPTH[:3, 3]
     numbers = " ".join(repr(float(v)) for v in (*t, *q))
-    converters.convert("ros", bag, tmp_path / "rec", options=[f"T_color_depth='{numbers}'"])
+    registry.convert("ros", bag, tmp_path / "rec", options=[f"T_color_depth='{numbers}'"])
     with_tf = r.write(tmp_path / "with", scene(r), "sqlite3")
-    converters.convert("ros", with_tf, tmp_path / "rec2")
+    registry.convert("ros", with_tf, tmp_path / "rec2")
     with (
         open_rgbd(tmp_path / "rec" / "alpha.mcap") as one,
         open_rgbd(tmp_path / "rec2" / "alpha.mcap") as two,
     ):
         assert np.array_equal(one.frame(0).depth, two.frame(0).depth)
     with pytest.raises(DuagError, match="expected 'x y z qw qx qy qz'"):
-        converters.convert("ros", bag, tmp_path / "rec3", options=["T_color_depth='1 2'"])
+        registry.convert("ros", bag, tmp_path / "rec3", options=["T_color_depth='1 2'"])
 
 
 def test_true_poses_of_a_transform_that_changes(tmp_path: Path) -> None:
@@ -200,13 +200,13 @@ def test_true_poses_of_a_transform_that_changes(tmp_path: Path) -> None:
     for k, options in enumerate(
         (["truth=/tf world _base"], ["truth=/tf /world /_base", "time_source=header"])
     ):
-        converters.convert("ros", bag, tmp_path / f"rec{k}", options=options)
+        registry.convert("ros", bag, tmp_path / f"rec{k}", options=options)
         records = read_log(tmp_path / f"rec{k}" / "alpha.groundtruth.mcap")
         assert np.allclose(
             [m.unpack_pose_in_frame(record.proto()) for record in records], path(FRAMES), atol=1e-9
         )
     with pytest.raises(DuagError, match="/tf has no map _base, expected perhaps world _base"):
-        converters.convert("ros", bag, tmp_path / "rec", options=["truth=/tf map _base"])
+        registry.convert("ros", bag, tmp_path / "rec", options=["truth=/tf map _base"])
 
 
 def test_depth_of_a_lens_is_undistorted_before_it_is_moved(tmp_path: Path) -> None:
@@ -226,7 +226,7 @@ def test_depth_of_a_lens_is_undistorted_before_it_is_moved(tmp_path: Path) -> No
                 topic = "/camera/depth/image_raw"
             rows.append((topic, log_ns, message))
         bags[name] = r.write(tmp_path / name, rows, "plain")
-        converters.convert("ros", bags[name], tmp_path / f"rec_{name}")
+        registry.convert("ros", bags[name], tmp_path / f"rec_{name}")
     depths = []
     for name in bags:
         with open_rgbd(tmp_path / f"rec_{name}" / "alpha.mcap") as log:
@@ -249,7 +249,7 @@ def test_infrared_images_are_not_taken_for_depth(tmp_path: Path) -> None:
         for t, ns, _ in rows
         if t.endswith("image_rect_raw")
     ]
-    converters.convert("ros", r.write(tmp_path / "ir", rows + infrared, "mcap"), tmp_path / "rec")
+    registry.convert("ros", r.write(tmp_path / "ir", rows + infrared, "mcap"), tmp_path / "rec")
     sensors = json.loads((tmp_path / "rec" / "recording.json").read_text())["robots"]["alpha"]["sensors"]
     assert sensors["depth_topic"] == "/camera/depth/image_rect_raw"
     jpeg = cv2.imencode(".jpg", np.full((90, 120), 30, np.uint8))[1].tobytes()
@@ -262,7 +262,7 @@ def test_infrared_images_are_not_taken_for_depth(tmp_path: Path) -> None:
     with pytest.raises(
         DuagError, match="image_rect_raw/compressed holds no depth, or as JPEG, which destroys it"
     ):
-        converters.convert("ros", r.write(tmp_path / "lost", lost, "mcap"), tmp_path / "rec2")
+        registry.convert("ros", r.write(tmp_path / "lost", lost, "mcap"), tmp_path / "rec2")
 
 
 def test_depth_that_is_too_far_is_told(tmp_path: Path) -> None:
@@ -276,7 +276,7 @@ def test_depth_that_is_too_far_is_told(tmp_path: Path) -> None:
             pixels[:45] = 40.0
             message = r.image(stamp, "_depth", pixels, "32FC1")
         rows.append((topic, log_ns, message))
-    converters.convert("ros", r.write(tmp_path / "bag", rows, "sqlite3"), tmp_path / "rec")
+    registry.convert("ros", r.write(tmp_path / "bag", rows, "sqlite3"), tmp_path / "rec")
     warnings = json.loads((tmp_path / "rec" / "recording.json").read_text())["warnings"]
     assert any("pixels are farther away than 32.8 m" in warning for warning in warnings)
 
@@ -296,7 +296,7 @@ def test_what_is_missing_is_named(tmp_path: Path, change: Callable[[Any], Any], 
     r = Ros(2)
     bag = r.write(tmp_path / "bag", change(scene(r)), "sqlite3")
     with pytest.raises(DuagError, match=message):
-        converters.convert("ros", bag, tmp_path / "rec")
+        registry.convert("ros", bag, tmp_path / "rec")
     assert not (tmp_path / "rec").exists()
 
 
@@ -317,7 +317,7 @@ def test_a_database_with_anything_in_it_is_refused(
     bag = r.write(tmp_path / "bag", scene(r), "sqlite3")
     change(bag)
     with pytest.raises(DuagError, match=message):
-        converters.convert("ros", bag, tmp_path / "rec")
+        registry.convert("ros", bag, tmp_path / "rec")
 
 
 def edit_metadata(bag: Path, pattern: str, new: str) -> None:
@@ -340,7 +340,7 @@ def test_a_truncated_bag_is_an_error(tmp_path: Path, version: int, keep: float) 
     data = file.read_bytes()
     file.write_bytes(data[: int(len(data) * keep)])
     with pytest.raises(DuagError):
-        converters.convert("ros", bag, tmp_path / "rec")
+        registry.convert("ros", bag, tmp_path / "rec")
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real bags are not there")
@@ -357,14 +357,14 @@ def test_real_bags_are_refused_for_the_right_reason(
     tmp_path: Path, name: str, options: list[str], message: str
 ) -> None:
     with pytest.raises(DuagError, match=message):
-        converters.convert("ros", REAL / name, tmp_path / "rec", options=options)
+        registry.convert("ros", REAL / name, tmp_path / "rec", options=options)
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real bags are not there")
 def test_a_real_bag_converts_when_told_that_times_differ(tmp_path: Path) -> None:
     """Colour and depth are 100 ms apart; the extrinsics are those that the camera's own software recorded."""
     source = REAL / "realsense_single_depth_color.bag"
-    converters.convert("ros", source, tmp_path / "rec", options=["max_difference_s=0.2"])
+    registry.convert("ros", source, tmp_path / "rec", options=["max_difference_s=0.2"])
     with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
         frame = log.frame(0)
         assert (log.camera.width, log.camera.height) == (640, 480)
@@ -383,7 +383,7 @@ def test_frames_whose_colour_is_cut_short_are_left_out(tmp_path: Path) -> None:
             whole = stamp != START_NS + 2 * STEP_NS
             message = r.compressed(stamp, "_color", data if whole else data[:999], "jpeg")
         rows.append((topic, log_ns, message))
-    converters.convert("ros", r.write(tmp_path / "bag", rows, "lz4"), tmp_path / "rec")
+    registry.convert("ros", r.write(tmp_path / "bag", rows, "lz4"), tmp_path / "rec")
     description = json.loads((tmp_path / "rec" / "recording.json").read_text())
     assert description["robots"]["alpha"]["frames"] == FRAMES - 1
     assert any(
@@ -405,7 +405,7 @@ def test_depth_that_needs_no_moving_keeps_its_numbers(tmp_path: Path) -> None:
             message, k = r.image(stamp, "_color", pixels[k], "16UC1", pad=6, big=k == 2), k + 1
         rows.append((topic, log_ns, message))
     bag = r.write(tmp_path / "bag", rows, "sqlite3")
-    converters.convert("ros", bag, tmp_path / "rec", options=["depth_scale=0.00025"])
+    registry.convert("ros", bag, tmp_path / "rec", options=["depth_scale=0.00025"])
     with LogFile(tmp_path / "rec" / "alpha.mcap") as log:
         records = list(log.records(["/alpha/camera/depth"]))
     assert log.channels["/alpha/camera/depth"].metadata["depth_scale"] == "0.00025"
@@ -422,10 +422,10 @@ def test_times_in_another_order_than_the_recording_do_not_fill_memory(
     rows = scene(r)
     moved = [(t, ns + 10**9 * (k < 9), message) for k, (t, ns, message) in enumerate(rows)]
     bag = r.write(tmp_path / "bag", sorted(moved, key=lambda x: x[1]), "mcap")
-    converters.convert("ros", bag, tmp_path / "rec")
-    monkeypatch.setattr("converters.logs.gather.MOST_KEPT_BYTES", 100_000)
+    registry.convert("ros", bag, tmp_path / "rec")
+    monkeypatch.setattr("duagc.converters.logs.gather.MOST_KEPT_BYTES", 100_000)
     with pytest.raises(DuagError, match="wait for messages of earlier times, expected times in the order"):
-        converters.convert("ros", bag, tmp_path / "rec2")
+        registry.convert("ros", bag, tmp_path / "rec2")
 
 
 @pytest.mark.parametrize("container", ["bz2", "lz4"])
@@ -434,9 +434,9 @@ def test_chunks_that_unpack_into_too_much_are_refused(
 ) -> None:
     r = Ros(1)
     bag = r.write(tmp_path / "bag", scene(r), container)
-    monkeypatch.setattr("converters.logs.rosbag_file.LARGEST_CHUNK", 50_000)
+    monkeypatch.setattr("duagc.converters.logs.rosbag_file.LARGEST_CHUNK", 50_000)
     with pytest.raises(DuagError, match="unpacks to more than 50000 bytes"):
-        converters.convert("ros", bag, tmp_path / "rec")
+        registry.convert("ros", bag, tmp_path / "rec")
 
 
 def test_true_poses_of_a_file(tmp_path: Path) -> None:
@@ -457,14 +457,14 @@ def test_true_poses_of_a_file(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text(
         f'[robots.a]\nlogs = ["bag"]\ntruth_file = "gt.tum"\nT_truth_color = "{told}"\ntruth_offset_s = 0.25\n'
     )
-    converters.convert("ros", tmp_path / "a.toml", tmp_path / "rec")
+    registry.convert("ros", tmp_path / "a.toml", tmp_path / "rec")
     records = read_log(tmp_path / "rec" / "a.groundtruth.mcap")
     assert np.allclose(
         [m.unpack_pose_in_frame(record.proto()) for record in records], path(FRAMES), atol=1e-6
     )
     assert str(tmp_path) not in (tmp_path / "rec" / "recording.json").read_text()
     with pytest.raises(DuagError, match="truth and truth_file are both said"):
-        converters.convert("ros", tmp_path / "a.toml", tmp_path / "rec2", options=["truth=/odom"])
+        registry.convert("ros", tmp_path / "a.toml", tmp_path / "rec2", options=["truth=/odom"])
 
 
 def test_robots_whose_frames_have_the_same_names(tmp_path: Path) -> None:
@@ -477,7 +477,7 @@ def test_robots_whose_frames_have_the_same_names(tmp_path: Path) -> None:
     with pytest.raises(
         DuagError, match=r"does not tie them \(what changes is no extrinsic: _depth to _color\)"
     ):
-        converters.convert("ros", bag, tmp_path / "rec")
+        registry.convert("ros", bag, tmp_path / "rec")
     own = [("/camera/tf_static", START_NS, static), ("/tf_static", START_NS, other), *rows]
     bag = r.write(tmp_path / "own", own, "plain")
-    converters.convert("ros", bag, tmp_path / "rec", options=["namespaces=/camera"])
+    registry.convert("ros", bag, tmp_path / "rec", options=["namespaces=/camera"])

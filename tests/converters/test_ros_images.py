@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from converters import ros_images
-from converters.logs.foxglove import Fields
-from pipeline.errors import DuagError
+from duagc.converters.layouts import ros_images
+from duagc.converters.logs.foxglove import Fields
+from duagc.pipeline.base.errors import DuagError
 from tests.converters.ros_bags import COLOR, Ros
 
 

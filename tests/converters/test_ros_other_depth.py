@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-import converters
-from converters.stereo import RawCamera, StereoOptions, StereoRig
-from pipeline.errors import DuagError
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import Recording, open_rgbd
+from duagc.converters import registry
+from duagc.converters.layouts.stereo import RawCamera, StereoOptions, StereoRig
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import Recording, open_rgbd
 from tests.converters.ros_bags import Ros, odometry
 from tests.converters.stereo_room import path, render, right_of
 from tests.converters.test_s3e import (
@@ -93,7 +93,7 @@ def stereo_log(folder: Path, told: str) -> Path:
 def test_a_stereo_pair(tmp_path: Path, told: str) -> None:
     options = ["depth_from=stereo", "truth=/odom", "min_depth_m=1.5", "max_relative_sigma=0.1"]
     options += [f"T_color_depth={TEXT}"] if told == "option" else []
-    converters.convert("ros", stereo_log(tmp_path, told), tmp_path / "rec", options=options)
+    registry.convert("ros", stereo_log(tmp_path, told), tmp_path / "rec", options=options)
     recording, rig = Recording(tmp_path / "rec"), raw_rig()
     assert recording.description["checks"]["alpha"]["row_difference_px"] < 0.3
     assert recording.description["checks"]["alpha"]["reprojection_median_m"] is not None
@@ -115,13 +115,13 @@ def test_a_pair_whose_rows_do_not_meet_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         DuagError, match=r"/eyes/left/image_raw and /eyes/right/image_raw: matched features lie"
     ):
-        converters.convert("ros", log, tmp_path / "rec", options=["depth_from=stereo"])
+        registry.convert("ros", log, tmp_path / "rec", options=["depth_from=stereo"])
     assert not (tmp_path / "rec").exists()
     log = stereo_log(tmp_path, "option")  # and no option
     with pytest.raises(
         DuagError, match=r"P of /eyes/right/camera_info has no base line, and /tf_static does not tie"
     ):
-        converters.convert("ros", log, tmp_path / "rec", options=["depth_from=stereo"])
+        registry.convert("ros", log, tmp_path / "rec", options=["depth_from=stereo"])
 
 
 def lidar_log(folder: Path, tied: bool = True) -> Path:
@@ -167,7 +167,7 @@ def test_a_lidar_and_what_turns_it(tmp_path: Path) -> None:
     for motion in ("imu=/imu", "odometry=/odom", ""):
         out = tmp_path / f"rec{motion[:3]}"
         options = ["depth_from=lidar", "truth=/odom", *([motion] if motion else [])]
-        converters.convert("ros", log, out, options=options)
+        registry.convert("ros", log, out, options=options)
         recording = Recording(out)
         told = any("hold what the LiDAR moved" in text for text in recording.description["warnings"])
         assert told == (motion == "")
@@ -188,10 +188,10 @@ def test_a_lidar_and_what_turns_it(tmp_path: Path) -> None:
 
 def test_logs_without_depth_say_what_could_be_used(tmp_path: Path) -> None:
     with pytest.raises(DuagError, match=r"holds depth images, but there are points \(depth_from=lidar\)"):
-        converters.convert("ros", lidar_log(tmp_path), tmp_path / "rec")
+        registry.convert("ros", lidar_log(tmp_path), tmp_path / "rec")
     with pytest.raises(DuagError, match=r"/points is of 'velo', and /tf_static does not tie it to 'cam'"):
-        converters.convert(
+        registry.convert(
             "ros", lidar_log(tmp_path, tied=False), tmp_path / "rec", options=["depth_from=lidar"]
         )
     with pytest.raises(DuagError, match="depth_from"):
-        converters.convert("ros", lidar_log(tmp_path / "b"), tmp_path / "rec", options=["depth_from=radar"])
+        registry.convert("ros", lidar_log(tmp_path / "b"), tmp_path / "rec", options=["depth_from=radar"])

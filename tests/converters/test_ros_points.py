@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.ros_points import as_of, points_of
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
-from pipeline.recording.motion import GyroPrior, OdometryPrior
+from duagc.converters.layouts.ros_points import as_of, points_of
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.recording.motion import GyroPrior, OdometryPrior
 
 POINTS = np.array([[1.0, 2.0, 3.0], [-4.0, 0.5, 0.25], [7.0, -8.0, 9.0], [0.5, 0.5, 0.5]])
 CODES = {"i1": 1, "u1": 2, "u2": 4, "u4": 6, "f4": 7, "f8": 8}

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-import converters
-from converters.s3e import read_fixes
-from converters.stereo import RawCamera, StereoOptions, StereoRig
-from pipeline.errors import DuagError
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.messages import unpack_pose_in_frame
-from pipeline.recording import Recording, open_rgbd, read_log
+from duagc.converters import registry
+from duagc.converters.datasets.s3e import read_fixes
+from duagc.converters.layouts.stereo import RawCamera, StereoOptions, StereoRig
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.messages import unpack_pose_in_frame
+from duagc.pipeline.recording import Recording, open_rgbd, read_log
 from tests.converters.stereo_room import path, render, right_of, sweep
 
 # Bob's calibration at a quarter of the size, and two like it
@@ -266,9 +266,9 @@ def rig_of(name: str, shrink: int) -> StereoRig:
 
 def checks_of(recording: Path) -> list[str]:
     """What `duagc check` finds wrong."""
-    from pipeline import checks
+    from duagc.pipeline.checks import check
 
-    return [f.found for f in checks.check(recording).findings if f.severity is checks.Severity.ERROR]
+    return [f.found for f in check.check(recording).findings if f.severity is check.Severity.ERROR]
 
 
 def truth_depth(rig: StereoRig, k: int, frame: int) -> np.ndarray:
@@ -278,7 +278,7 @@ def truth_depth(rig: StereoRig, k: int, frame: int) -> np.ndarray:
 
 
 def test_stereo_of_three_vehicles(dataset: Path, tmp_path: Path) -> None:
-    converters.convert("s3e", dataset, tmp_path / "rec", options=["shrink=1"])
+    registry.convert("s3e", dataset, tmp_path / "rec", options=["shrink=1"])
     recording = Recording(tmp_path / "rec")
     assert recording.robots == ["alpha", "bravo", "charlie"]
     checks, parameters = recording.description["checks"], recording.description["parameters"]
@@ -319,7 +319,7 @@ def test_stereo_of_three_vehicles(dataset: Path, tmp_path: Path) -> None:
 
 
 def test_lidar_is_unturned_by_the_gyroscope(dataset: Path, tmp_path: Path) -> None:
-    converters.convert("s3e", dataset, tmp_path / "rec", options=["depth=lidar", "shrink=1"])
+    registry.convert("s3e", dataset, tmp_path / "rec", options=["depth=lidar", "shrink=1"])
     recording = Recording(tmp_path / "rec")
     for k, (robot, name) in enumerate(zip(recording.robots, NAMES, strict=True)):
         rig, errors = rig_of(name.lower(), 1), []
@@ -341,15 +341,15 @@ def test_bags_without_cameras_are_refused(dataset: Path, tmp_path: Path) -> None
     with pytest.raises(
         DuagError, match=r"no camera in this bag \(found /Alpha/imu/data, /Alpha/velodyne_points\); S3E v2"
     ):
-        converters.convert("s3e", tmp_path / "S3E_Tunnel_1", tmp_path / "rec")
+        registry.convert("s3e", tmp_path / "S3E_Tunnel_1", tmp_path / "rec")
     assert not (tmp_path / "rec").exists()
     with pytest.raises(DuagError, match="no such folder"):
-        converters.convert("s3e", tmp_path / "nothing", tmp_path / "rec")
+        registry.convert("s3e", tmp_path / "nothing", tmp_path / "rec")
     (tmp_path / "empty").mkdir()
     with pytest.raises(DuagError, match=r"\.db3 files: none"):
-        converters.convert("s3e", tmp_path / "empty", tmp_path / "rec")
+        registry.convert("s3e", tmp_path / "empty", tmp_path / "rec")
     with pytest.raises(DuagError, match="found 3 robots, expected --robots 2"):
-        converters.convert("s3e", dataset, tmp_path / "rec", robots=2)
+        registry.convert("s3e", dataset, tmp_path / "rec", robots=2)
 
 
 @pytest.mark.parametrize(
@@ -378,7 +378,7 @@ def test_wrong_calibrations_are_refused(dataset: Path, tmp_path: Path, fault: st
     else:
         write_calibration(file, "bob", **{fault: True})
     with pytest.raises(DuagError, match=message):
-        converters.convert("s3e", dataset, tmp_path / "rec", options=[f"calibration={tmp_path}", "shrink=1"])
+        registry.convert("s3e", dataset, tmp_path / "rec", options=[f"calibration={tmp_path}", "shrink=1"])
     assert not (tmp_path / "rec").exists()
 
 

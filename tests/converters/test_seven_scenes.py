@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
-import converters
-from converters import seven_scenes
-from converters.seven_scenes import Options, Registration, convert, list_frames
-from pipeline import messages as m
-from pipeline.errors import DuagError
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import Recording, content_digest, open_rgbd, read_log
+from duagc.converters import registry
+from duagc.converters.datasets import seven_scenes
+from duagc.converters.datasets.seven_scenes import Options, Registration, convert, list_frames
+from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import Recording, content_digest, open_rgbd, read_log
 
 ROOM_HALF_M = np.array([1.6, 1.3, 1.1])
 BOX_HALF_M = np.array([0.25, 0.3, 0.2])
@@ -542,18 +542,18 @@ def test_broken_files_of_other_poses_are_named(sequence: Path, tmp_path: Path, t
 
 
 def test_the_command_finds_the_converter(sequence: Path, tmp_path: Path) -> None:
-    converters.convert(
+    registry.convert(
         "7scenes", sequence, tmp_path / "rec", options=["color_focal_px=520", "baseline_m = 0.03"]
     )
     parameters = Recording(tmp_path / "rec").description["parameters"]
     assert (parameters["color_focal_px"], parameters["baseline_m"]) == (520, 0.03)
-    text = converters.describe()
+    text = registry.describe()
     assert "7scenes: Microsoft 7-Scenes" in text
     assert "--set baseline_m=0.025" in text
     with pytest.raises(DuagError, match="dataset '8scenes', expected perhaps 7scenes"):
-        converters.convert("8scenes", sequence, tmp_path / "other")
+        registry.convert("8scenes", sequence, tmp_path / "other")
     with pytest.raises(DuagError, match="expected NAME=VALUE"):
-        converters.convert("7scenes", sequence, tmp_path / "other", options=["baseline_m"])
+        registry.convert("7scenes", sequence, tmp_path / "other", options=["baseline_m"])
 
 
 def test_every_option_is_documented() -> None:

@@ -9,16 +9,18 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from converters.simulate import bake, camera_of, noise, paths, simulate, write_points
-from converters.simulate.render import Renderer
-from converters.simulate.scene import Scene
-from converters.simulate.scenes import build
-from pipeline import messages, streams
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import Recording, content_digest, open_rgbd, read_log
-from schemas import topics
+from duagc.converters.simulate import bake, noise, trajectories
+from duagc.converters.simulate.render import Renderer
+from duagc.converters.simulate.scene import Scene
+from duagc.converters.simulate.scene_settings import build
+from duagc.converters.simulate.team import camera_of, simulate, write_points
+from duagc.pipeline import messages
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import Recording, content_digest, open_rgbd, read_log
+from duagc.schemas import topics
 
 SIZE = (160, 120)
 
@@ -40,7 +42,7 @@ def camera() -> PinholeCamera:
 
 @pytest.fixture(scope="module")
 def ways(room: Scene, camera: PinholeCamera) -> list[np.ndarray]:
-    return paths.plan(room, 3, 150, 0.6, camera)
+    return trajectories.plan(room, 3, 150, 0.6, camera)
 
 
 @pytest.fixture(scope="module")
@@ -131,9 +133,9 @@ def test_paths_are_smooth_clear_and_long(room, ways):
 
 @pytest.mark.parametrize("overlap", [0.5, 0.7])
 def test_neighbours_share_as_much_of_the_view_as_asked(room, camera, overlap):
-    small = Renderer(room, None, camera.scaled(*paths.OVERLAP_IMAGE))
-    one, other = paths.plan(room, 2, 150, overlap, camera)
-    assert paths.shared_view(small, one, other) == pytest.approx(overlap, abs=0.04)
+    small = Renderer(room, None, camera.scaled(*trajectories.OVERLAP_IMAGE))
+    one, other = trajectories.plan(room, 2, 150, overlap, camera)
+    assert trajectories.shared_view(small, one, other) == pytest.approx(overlap, abs=0.04)
     apart, _ = se3.distance(one[:, None], other[None])
     assert apart.min(axis=0).max() > 0.2  # and not from the same places
 
@@ -142,14 +144,14 @@ def test_neighbours_share_as_much_of_the_view_as_asked(room, camera, overlap):
 def test_every_robot_finds_a_way_in_every_room(seed):
     scene = build("room", seed)
     for robot in range(4):
-        way = paths._loop(scene, robot).poses(160, 0.7)
+        way = trajectories._loop(scene, robot).poses(160, 0.7)
         assert scene.clearance(way[:, :3, 3]).min() > 0.5
 
 
 def test_kinect_noise_has_the_published_size(camera):
     """Nguyen et al. 2012, on walls seen straight on; and what is measured is a whole number of disparity steps."""
     for z in (0.8, 1.5, 3.0, 5.0):
-        rng = streams.generator(0, "test", depth=str(z))
+        rng = random_streams.generator(0, "test", depth=str(z))
         exact = np.full((240, 320), z)
         measured = noise.kinect_depth(exact, camera.scaled(320, 240), rng)
         assert (measured > 0).mean() > 0.99
@@ -166,7 +168,7 @@ def test_kinect_noise_has_the_published_size(camera):
 def test_kinect_noise_has_holes_where_the_sensor_is_blind(camera, renderer, ways):
     step = np.full((120, 160), 3.0)
     step[:, 60:100] = 1.0  # a board in front of a wall
-    measured = noise.kinect_depth(step, camera, streams.generator(0, "test"))
+    measured = noise.kinect_depth(step, camera, random_streams.generator(0, "test"))
     parallax = camera.fx * noise.BASELINE_M * (1 / 1.0 - 1 / 3.0)
     shadow = measured[:, 100 : 100 + int(parallax) - 1]
     assert (shadow == 0).all()
@@ -176,13 +178,13 @@ def test_kinect_noise_has_holes_where_the_sensor_is_blind(camera, renderer, ways
     assert ((edge > 1.2) & (edge < 2.7)).any()  # mixed pixels
     for T in some_poses(ways):
         depth, _ = renderer.depth(T)
-        holes = (noise.kinect_depth(depth, camera, streams.generator(0, "test")) == 0).mean()
+        holes = (noise.kinect_depth(depth, camera, random_streams.generator(0, "test")) == 0).mean()
         assert 0.0 < holes < 0.15
 
 
 def test_grey_noise_is_one_percent():
     grey = np.full((200, 200, 3), 128, dtype=np.uint8)
-    noisy = noise.grey_noise(grey, streams.generator(0, "test")).astype(float) - 128
+    noisy = noise.grey_noise(grey, random_streams.generator(0, "test")).astype(float) - 128
     assert np.std(noisy) == pytest.approx(2.55, rel=0.05)
 
 

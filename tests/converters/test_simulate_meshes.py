@@ -13,13 +13,14 @@ import cv2
 import numpy as np
 import pytest
 
-from converters.simulate import camera_of, meshes, simulate, walks
-from converters.simulate.paths import look_at, shared_view
-from converters.simulate.raycast import Caster, MeshRenderer
-from converters.simulate.stages import MeshStage
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
-from pipeline.recording import Recording, open_rgbd
+from duagc.converters.simulate import meshes, walks
+from duagc.converters.simulate.raycast import Caster, MeshRenderer
+from duagc.converters.simulate.stages import MeshStage
+from duagc.converters.simulate.team import camera_of, simulate
+from duagc.converters.simulate.trajectories import look_at, shared_view
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.recording import Recording, open_rgbd
 
 HOUSE = Path(__file__).parents[3] / "shared" / "data" / "scenes" / "house_upper"
 ROOM = np.array([5.0, 4.0, 2.6])
@@ -448,7 +449,14 @@ def test_a_scene_that_is_not_there(tmp_path):
 
 def test_the_command_takes_a_folder_and_an_axis(tmp_path):
     folder = folder_of(tmp_path / "room", "obj")
-    command = [sys.executable, "-c", "from pipeline.cli import main; main()", "simulate", "--out", "rec"]
+    command = [
+        sys.executable,
+        "-c",
+        "from duagc.pipeline.cli import main; main()",
+        "simulate",
+        "--out",
+        "rec",
+    ]
     command += ["--scene", str(folder), "--up", "x", "--workers", "1"]
     root = Path(__file__).parents[2]
     done = subprocess.run(command, capture_output=True, text=True, cwd=root)

@@ -11,15 +11,16 @@ import cv2
 import numpy as np
 import pytest
 
-from converters.simulate import PARADIGMS, camera_of, figures, paradigms, simulate, walks
-from converters.simulate.paths import OVERLAP_IMAGE, shared_view
-from converters.simulate.stages import MeshStage, RoomStage, set_up
-from pipeline import messages
-from pipeline.bench import paths
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
-from pipeline.recording import Recording, open_rgbd, read_log
-from schemas import topics
+from duagc.converters.simulate import figures, paradigms, walks
+from duagc.converters.simulate.stages import MeshStage, RoomStage, set_up
+from duagc.converters.simulate.team import PARADIGMS, camera_of, simulate
+from duagc.converters.simulate.trajectories import OVERLAP_IMAGE, shared_view
+from duagc.pipeline import messages
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.bench import paths
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.recording import Recording, open_rgbd, read_log
+from duagc.schemas import topics
 from tests.converters.test_simulate_meshes import HOUSE, folder_of
 
 FRAMES = 80

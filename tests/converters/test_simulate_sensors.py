@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.simulate import Rig, _twists, camera_of, simulate
-from converters.simulate.movers import Mover, walk
-from converters.simulate.sensors import RANGE_SIGMA_M, T_CAMERA_LIDAR, MovingCamera, with_gain
-from converters.simulate.stages import MeshStage, set_up
-from pipeline import streams
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
-from pipeline.recording import Recording, open_rgbd
+from duagc.converters.simulate.movers import Mover, walk
+from duagc.converters.simulate.sensors import RANGE_SIGMA_M, T_CAMERA_LIDAR, MovingCamera, with_gain
+from duagc.converters.simulate.stages import MeshStage, set_up
+from duagc.converters.simulate.team import Rig, _twists, camera_of, simulate
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.recording import Recording, open_rgbd
 from tests.converters.test_simulate_meshes import ROOM, folder_of, some_poses
 from tests.converters.test_simulate_paradigms import true_poses
 
@@ -100,7 +100,7 @@ def test_movers_keep_clear_of_walls_and_robots(stage, movers):
 def test_lidar_points_lie_on_surfaces(stage):
     for T in some_poses():
         points = MovingCamera(stage.eye(CAMERA), Rig(sensor="lidar"), []).sweep(
-            T, 0, streams.generator(0, "test")
+            T, 0, random_streams.generator(0, "test")
         )
         world = se3.transform(T @ T_CAMERA_LIDAR, points)
         assert len(points) > 20_000

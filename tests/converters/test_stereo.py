@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from converters.stereo import RawCamera, RowCheck, StereoOptions, StereoRig, disparity_sigma_m
-from pipeline.errors import DuagError
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
+from duagc.converters.layouts.stereo import RawCamera, RowCheck, StereoOptions, StereoRig, disparity_sigma_m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
 from tests.converters.stereo_room import path, render, right_of
 
 LEFT = PinholeCamera(306, 256, 294.1, 294.0, 155.4, 127.0)

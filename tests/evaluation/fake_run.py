@@ -12,15 +12,15 @@ from typing import Any
 import cv2
 import numpy as np
 
-import schemas
-from converters.base import RecordingWriter
-from converters.simulate import write_points
-from pipeline.exchange.wire import PairList, write_pairs
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.geometry.trajectory import Trajectory, write_tum
-from pipeline.kernels import Rasterizer
-from pipeline.messages import (
+from duagc import schemas
+from duagc.converters.simulate.team import write_points
+from duagc.converters.writer import RecordingWriter
+from duagc.pipeline.exchange.wire.state_wire import PairList, write_pairs
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.trajectory import Trajectory, write_tum
+from duagc.pipeline.kernels import Rasterizer
+from duagc.pipeline.messages import (
     CorrectedKeyframes,
     GaussianInformation,
     GaussianMap,
@@ -32,9 +32,9 @@ from pipeline.messages import (
     pack_pose,
     pack_stamp,
 )
-from pipeline.recording import LogWriter
-from pipeline.splat.gaussians import Gaussians
-from schemas import topics
+from duagc.pipeline.recording import LogWriter
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.schemas import topics
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 FRAMES = 21

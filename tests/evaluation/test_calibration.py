@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pipeline.evaluation import calibration
+from duagc.pipeline.evaluation import uncertainty_calibration
 
 
 @pytest.fixture(scope="module")
@@ -14,52 +14,63 @@ def predicted() -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_right_prediction_scores_well(predicted):
     sigma, error = predicted
-    assert calibration.coverage_95(sigma, error) == pytest.approx(0.95, abs=0.006)  # 4 standard errors
-    assert calibration.fitted_scale(sigma, error) == pytest.approx(1.0, abs=0.02)
-    for predicted_rms, observed_rms in calibration.reliability(sigma, error):
+    assert uncertainty_calibration.coverage_95(sigma, error) == pytest.approx(
+        0.95, abs=0.006
+    )  # 4 standard errors
+    assert uncertainty_calibration.fitted_scale(sigma, error) == pytest.approx(1.0, abs=0.02)
+    for predicted_rms, observed_rms in uncertainty_calibration.reliability(sigma, error):
         assert observed_rms == pytest.approx(predicted_rms, rel=0.1)
 
 
 def test_shuffled_uncertainty_scores_clearly_worse_on_every_metric(predicted):
     """Except the companion code's: that one does not notice, which is why it is for comparison only."""
     sigma, error = predicted
-    dealt = calibration.shuffled(sigma, "test")
+    dealt = uncertainty_calibration.shuffled(sigma, "test")
     assert np.array_equal(np.sort(dealt), np.sort(sigma))
-    assert calibration.spearman(sigma, error) > 0.6 > 0.05 > abs(calibration.spearman(dealt, error))
-    assert calibration.ause(sigma, error) < 0.25 < 0.5 < calibration.ause(dealt, error)
-    assert calibration.nll(sigma, error) + 0.3 < calibration.nll(dealt, error)
-    assert calibration.coverage_95(dealt, error) < 0.8
-    assert calibration.ece_rank(sigma, error) < 0.12
-    assert calibration.ece_rank(dealt, error) == pytest.approx(0.25, abs=0.02)
-    assert calibration.ece_paper(dealt, error) < 0.05
+    assert (
+        uncertainty_calibration.spearman(sigma, error)
+        > 0.6
+        > 0.05
+        > abs(uncertainty_calibration.spearman(dealt, error))
+    )
+    assert (
+        uncertainty_calibration.ause(sigma, error) < 0.25 < 0.5 < uncertainty_calibration.ause(dealt, error)
+    )
+    assert uncertainty_calibration.nll(sigma, error) + 0.3 < uncertainty_calibration.nll(dealt, error)
+    assert uncertainty_calibration.coverage_95(dealt, error) < 0.8
+    assert uncertainty_calibration.ece_rank(sigma, error) < 0.12
+    assert uncertainty_calibration.ece_rank(dealt, error) == pytest.approx(0.25, abs=0.02)
+    assert uncertainty_calibration.ece_paper(dealt, error) < 0.05
 
 
 def test_perfect_order_gives_the_ideal_values():
     error = np.linspace(0.001, 0.1, 1000)
     sigma = 3.0 * error
-    assert calibration.spearman(sigma, error) == pytest.approx(1.0)
-    assert calibration.ause(sigma, error) == pytest.approx(0.0, abs=1e-15)
-    assert calibration.ece_rank(sigma, error) == pytest.approx(0.0, abs=1e-12)
-    assert calibration.fitted_scale(sigma, error) == pytest.approx(1 / 3)
-    assert calibration.spearman(sigma, error[::-1]) == pytest.approx(-1.0)
+    assert uncertainty_calibration.spearman(sigma, error) == pytest.approx(1.0)
+    assert uncertainty_calibration.ause(sigma, error) == pytest.approx(0.0, abs=1e-15)
+    assert uncertainty_calibration.ece_rank(sigma, error) == pytest.approx(0.0, abs=1e-12)
+    assert uncertainty_calibration.fitted_scale(sigma, error) == pytest.approx(1 / 3)
+    assert uncertainty_calibration.spearman(sigma, error[::-1]) == pytest.approx(-1.0)
 
 
 def test_ranks_do_not_depend_on_scale_and_nll_does(predicted):
     sigma, error = predicted
-    assert calibration.ause(10 * sigma, error) == calibration.ause(sigma, error)
-    assert calibration.ece_rank(10 * sigma, error) == calibration.ece_rank(sigma, error)
-    assert calibration.nll(10 * sigma, error) > calibration.nll(sigma, error)
+    assert uncertainty_calibration.ause(10 * sigma, error) == uncertainty_calibration.ause(sigma, error)
+    assert uncertainty_calibration.ece_rank(10 * sigma, error) == uncertainty_calibration.ece_rank(
+        sigma, error
+    )
+    assert uncertainty_calibration.nll(10 * sigma, error) > uncertainty_calibration.nll(sigma, error)
 
 
 def test_spearman_shares_ranks_among_equals():
-    assert calibration.spearman(
+    assert uncertainty_calibration.spearman(
         np.array([1.0, 1.0, 2.0, 2.0]), np.array([1.0, 2.0, 3.0, 4.0])
     ) == pytest.approx(0.894427191, abs=1e-9)
-    assert calibration.spearman(np.ones(5), np.arange(5.0)) == 0.0
+    assert uncertainty_calibration.spearman(np.ones(5), np.arange(5.0)) == 0.0
 
 
 def test_the_companion_codes_formula():
     uncertainty = np.array([0.0, 0.05, 1.0])
     error = np.array([0.0, 1.0, 0.5])
     # bins [0, 0.1): mean u 0.025, mean e 0.5, two values; [0.9, 1]: u 1, e 0.5
-    assert calibration.ece_paper(uncertainty, error) == pytest.approx((2 * 0.475 + 0.5) / 3)
+    assert uncertainty_calibration.ece_paper(uncertainty, error) == pytest.approx((2 * 0.475 + 0.5) / 3)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pipeline.evaluation.feature_agreement import MIN_PAIRS, feature_agreement
-from pipeline.evaluation.results import Absent
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.evaluation.feature_agreement import MIN_PAIRS, feature_agreement
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
 from tests.registration.room import pose, render, texture
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 159.5, 119.5)

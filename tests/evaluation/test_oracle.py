@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from pipeline.consensus.config import PoseConsensusConfig
-from pipeline.consensus.factors import Factors
-from pipeline.consensus.poses import with_floor
-from pipeline.evaluation.oracle import WeightedClosure, gap_to_oracle, pose_gap, solve_component
-from pipeline.evaluation.results import Absent
-from pipeline.geometry import se3
-from pipeline.run_folder import RunFolder
+from duagc.pipeline.config.consensus import PoseConsensusConfig
+from duagc.pipeline.consensus.pose_admm import with_floor
+from duagc.pipeline.evaluation.oracle import WeightedClosure, gap_to_oracle, pose_gap, solve_component
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.runs.folder import RunFolder
 from tests.consensus.worlds import make_team, talk
 from tests.evaluation.fake_run import make
 

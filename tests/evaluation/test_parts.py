@@ -6,20 +6,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import schemas
-from converters.simulate import write_points
-from pipeline.digest import digest_file
-from pipeline.errors import DuagError
-from pipeline.evaluation import map_errors, views
-from pipeline.evaluation.groundtruth import Surface, surface
-from pipeline.evaluation.network import Session
-from pipeline.evaluation.paths import top_view_axes
-from pipeline.evaluation.results import Absent
-from pipeline.geometry import se3
-from pipeline.kernels import Render
-from pipeline.recording import LogWriter
-from pipeline.run_folder import RunFolder, position_information
-from schemas import topics
+from duagc import schemas
+from duagc.converters.simulate.team import write_points
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.evaluation import map_errors, views
+from duagc.pipeline.evaluation.groundtruth import Surface, surface
+from duagc.pipeline.evaluation.network import Session
+from duagc.pipeline.evaluation.paths import top_view_axes
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.kernels import Render
+from duagc.pipeline.recording import LogWriter
+from duagc.pipeline.runs.digest import digest_file
+from duagc.pipeline.runs.folder import RunFolder, position_information
+from duagc.schemas import topics
 from tests.evaluation.fake_run import make
 
 

@@ -3,7 +3,7 @@ import json
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.evaluation.results import (
+from duagc.pipeline.evaluation.results import (
     Absent,
     Row,
     leaves,

@@ -7,10 +7,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.errors import DuagError
-from pipeline.evaluation import evaluate
-from pipeline.recording import LogWriter, read_log
-from schemas import topics
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.evaluation import evaluate
+from duagc.pipeline.recording import LogWriter, read_log
+from duagc.schemas import topics
 from tests.evaluation.fake_run import DRIFT_M, FRAMES, KEYFRAMES, FakeRun, make
 
 NUMBER = (int, float)

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from pipeline.evaluation import trajectory_errors
-from pipeline.evaluation.results import Absent
-from pipeline.evaluation.trajectory_errors import Paired
-from pipeline.geometry import se3
-from pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.evaluation import trajectory_errors
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.evaluation.trajectory_errors import Paired
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.trajectory import Trajectory
 
 
 def curved_path(n: int = 50, seed: int = 0) -> np.ndarray:

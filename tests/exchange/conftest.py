@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline import streams
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.messages import GaussianInformation
-from pipeline.robot import Images, RobotData, Step
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.messages import GaussianInformation
+from duagc.pipeline.runs.robot_data import Images, RobotData, Step
+from duagc.pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]
 MakeRobot = Callable[..., tuple[RobotData, Array]]
@@ -25,7 +25,7 @@ HALF_M = np.array([2.0, 1.3, 2.4])  # half the edges of the room
 @lru_cache(maxsize=1)
 def textures() -> Array:
     """Colour of the six walls, [6, 256, 256, 3], smooth noise with edges."""
-    rng = streams.generator(0, "textures")
+    rng = random_streams.generator(0, "textures")
     walls = np.zeros((6, 256, 256, 3))
     for cells, weight in ((8, 0.3), (32, 0.4), (128, 0.3)):
         coarse = rng.random((6, cells, cells, 3))
@@ -64,7 +64,7 @@ def robot(
     name: str, first_turn_rad: float, keyframes: int = 5, gaussians: int = 300
 ) -> tuple[RobotData, Array]:
     """A robot's data, and the truth: T_world_camera of its keyframes."""
-    rng = streams.generator(0, "boxworld", robot=name)
+    rng = random_streams.generator(0, "boxworld", robot=name)
     truth = path(first_turn_rad, keyframes)
     steps, T_map = [], [np.eye(4)]
     for k in range(1, keyframes):

@@ -8,18 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.consensus.closures import Closure
-from pipeline.consensus.config import MatchingConfig, PoseConsensusConfig
-from pipeline.consensus.evidence import Evidence
-from pipeline.consensus.gaussians import Weights
-from pipeline.consensus.poses import with_floor
-from pipeline.evaluation.oracle import WeightedClosure, pose_gap, solve_component
-from pipeline.exchange.config import ExchangeConfig, LinkConfig
-from pipeline.exchange.session import run_session_of
-from pipeline.fusion.config import FusionConfig
-from pipeline.fusion.fuse import fuse
-from pipeline.geometry import se3
-from pipeline.robot import AgentResult, RobotData, factors_of
+from duagc.pipeline.config.consensus import MatchingConfig, PoseConsensusConfig
+from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.config.fusion import FusionConfig
+from duagc.pipeline.config.network import LinkConfig
+from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.consensus.pose_admm import with_floor
+from duagc.pipeline.consensus.weights import Weights
+from duagc.pipeline.evaluation.oracle import WeightedClosure, pose_gap, solve_component
+from duagc.pipeline.exchange.session import run_session_of
+from duagc.pipeline.fusion.fuse import fuse
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph.loop_closures import Closure
+from duagc.pipeline.runs.robot_data import AgentResult, RobotData, factors_of
 
 NAMES = ("alpha", "bravo", "charlie", "delta", "echo", "foxtrot", "golf", "hotel")
 BURSTS = {"burst_gap_ns": 900_000_000, "burst_length_ns": 300_000_000}

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.exchange.agreement import agreement, coarse_depth
-from pipeline.geometry import se3
-from pipeline.robot import RobotData
+from duagc.pipeline.exchange.convergence import agreement, coarse_depth
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.runs.robot_data import RobotData
 
 
 def judged(own: RobotData, T_own: np.ndarray, peer: RobotData, T_peer: np.ndarray, off: np.ndarray) -> float:

@@ -9,10 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.exchange.agent import Agent
-from pipeline.exchange.config import ExchangeConfig, TransportConfig
-from pipeline.exchange.outcome import result_of
-from pipeline.exchange.packets import (
+from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.config.network import TransportConfig
+from duagc.pipeline.exchange.agent import Agent
+from duagc.pipeline.exchange.record import read_session
+from duagc.pipeline.exchange.replay import replay_agent_of
+from duagc.pipeline.exchange.session import run_session_of, team_of
+from duagc.pipeline.exchange.session_result import result_of
+from duagc.pipeline.network.packets import (
     HEADER_BYTES,
     Kind,
     MalformedError,
@@ -21,11 +25,8 @@ from pipeline.exchange.packets import (
     payload_bytes,
     serialise,
 )
-from pipeline.exchange.record import read_session
-from pipeline.exchange.replay import replay_agent_of
-from pipeline.exchange.session import run_session_of, team_of
-from pipeline.exchange.signatures import SIGNATURE_BYTES, Identity
-from pipeline.robot import AgentResult, RobotData
+from duagc.pipeline.network.signatures import SIGNATURE_BYTES, Identity
+from duagc.pipeline.runs.robot_data import AgentResult, RobotData
 from tests.exchange.test_session import same
 
 NAMES = ("alpha", "bravo")

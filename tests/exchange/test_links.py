@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pipeline.config import dump, load
-from pipeline.errors import DuagError
-from pipeline.exchange import links
-from pipeline.exchange.config import ExchangeConfig, LinkConfig, LinkWindow
-from pipeline.exchange.links import Fate, LinkModel, neighbours
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.base import dump, load
+from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.config.network import LinkConfig, LinkWindow
+from duagc.pipeline.network import link_model
+from duagc.pipeline.network.link_model import Fate, LinkModel, neighbours
 
 TEAM = ["delta", "alpha", "charlie", "bravo"]
 MS = 1_000_000
@@ -73,7 +74,7 @@ def test_losses_are_independent() -> None:
     lost = np.array([not f.delivered for f in fates(LinkConfig(loss_probability=0.3), 4000)])
     assert lost.mean() == pytest.approx(0.3, abs=0.03)
     assert (lost[1:] & lost[:-1]).mean() == pytest.approx(0.09, abs=0.02)
-    assert {f.reason for f in fates(LinkConfig(loss_probability=1.0), 3)} == {links.LOST}
+    assert {f.reason for f in fates(LinkConfig(loss_probability=1.0), 3)} == {link_model.LOST}
 
 
 def test_bursts_have_their_length_and_share() -> None:
@@ -85,7 +86,7 @@ def test_bursts_have_their_length_and_share() -> None:
     assert runs.mean() == pytest.approx(10.5, abs=1.0)  # packets, 10 ms apart, of bursts of 100 ms
     half = fates(config.model_copy(update={"burst_loss_probability": 0.5}), 40_000, every_ns=10 * MS)
     assert np.mean([not f.delivered for f in half]) == pytest.approx(0.125, abs=0.02)
-    assert {f.reason for f in half if not f.delivered} == {links.BURST}
+    assert {f.reason for f in half if not f.delivered} == {link_model.BURST}
 
 
 def test_jitter_reorders() -> None:
@@ -112,7 +113,7 @@ def test_a_bandwidth_holds() -> None:
     config = LinkConfig(latency_ns=0, bandwidth_bytes_per_s=100_000, queue_ns=95 * MS)
     got = fates(config, 30)
     assert [f.deliver_ns for f in got[:10]] == [((k + 1) * 10 * MS,) for k in range(10)]
-    assert {f.reason for f in got[10:]} == {links.QUEUE_FULL}
+    assert {f.reason for f in got[10:]} == {link_model.QUEUE_FULL}
     model = LinkModel(config, 0)
     assert model.fate("alpha", "bravo", 0, 0, 1000) == model.fate(
         "bravo", "alpha", 0, 0, 1000
@@ -131,9 +132,9 @@ def test_windows_open_close_and_have_a_direction() -> None:
         return model.fate(sender, receiver, 0, now_ns, 100).reason
 
     assert reason("alpha", "bravo", 99) == reason("bravo", "alpha", 99) == ""
-    assert reason("alpha", "bravo", 100) == reason("bravo", "alpha", 250) == links.DOWN
-    assert reason("alpha", "bravo", 250) == links.LOST  # the first window that fits counts
-    assert reason("alpha", "charlie", 0) == links.DOWN
+    assert reason("alpha", "bravo", 100) == reason("bravo", "alpha", 250) == link_model.DOWN
+    assert reason("alpha", "bravo", 250) == link_model.LOST  # the first window that fits counts
+    assert reason("alpha", "charlie", 0) == link_model.DOWN
 
 
 def test_range_follows_the_waypoints() -> None:
@@ -145,7 +146,7 @@ def test_range_follows_the_waypoints() -> None:
     config = LinkConfig(topology="range", range_m=30.0, waypoints=waypoints)  # type: ignore[arg-type]
     assert neighbours(config, ["alpha", "bravo"]) == {"alpha": ("bravo",), "bravo": ("alpha",)}
     got = {t: LinkModel(config, 0).fate("alpha", "bravo", 0, t, 100).reason for t in (0, 299, 301, 5000)}
-    assert got == {0: "", 299: "", 301: links.FAR, 5000: links.FAR}
+    assert got == {0: "", 299: "", 301: link_model.FAR, 5000: link_model.FAR}
     with pytest.raises(DuagError, match="none of charlie, expected one for each robot"):
         neighbours(config, ["alpha", "bravo", "charlie"])
     with pytest.raises(DuagError, match="robot 'bravo', expected one of alpha"):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.exchange.packets import (
+from duagc.pipeline.network.packets import (
     FIRE_AND_FORGET,
     MAX_PACKET_BYTES,
     Kind,

@@ -10,15 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.consensus.config import PoseConsensusConfig
-from pipeline.exchange.config import ExchangeConfig, LinkConfig
-from pipeline.exchange.meeting import LowerEnd
-from pipeline.exchange.replay import replay_agent_of
-from pipeline.exchange.session import run_session_of
-from pipeline.exchange.verification import Verdict
-from pipeline.geometry import se3
-from pipeline.recording import read_log
-from pipeline.robot import AgentResult, RobotData
+from duagc.pipeline.config.consensus import PoseConsensusConfig
+from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.config.network import LinkConfig
+from duagc.pipeline.exchange.loop_closing import LowerEnd
+from duagc.pipeline.exchange.replay import replay_agent_of
+from duagc.pipeline.exchange.session import run_session_of
+from duagc.pipeline.exchange.verification import Verdict
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.recording import read_log
+from duagc.pipeline.runs.robot_data import AgentResult, RobotData
 
 NAMES = ("alpha", "bravo", "charlie")
 TRUE = np.eye(4)
@@ -193,7 +194,7 @@ def test_where_nothing_tells_which_link_is_false_nobody_is_put_anywhere(
 ) -> None:
     """Rooms that are alike in every image: the cycle of the three does not close, and that is all that is known."""
     more_false_than_true(monkeypatch)
-    monkeypatch.setattr("pipeline.exchange.meeting.agreement", lambda *_: 0.6)
+    monkeypatch.setattr("duagc.pipeline.exchange.loop_closing.agreement", lambda *_: 0.6)
     config = {"link": LinkConfig(loss_probability=loss)}
     results = meet(team, NAMES, tmp_path, **config)
     for name in NAMES:

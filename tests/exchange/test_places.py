@@ -6,21 +6,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline import streams
-from pipeline.consensus.config import ClosureConfig
-from pipeline.exchange import places, places_wire
-from pipeline.exchange.config import (
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.config.consensus import ClosureConfig
+from duagc.pipeline.config.exchange import (
     ExchangeConfig,
     PeerRegistrationConfig,
     PlacesConfig,
     VerificationConfig,
 )
-from pipeline.exchange.meeting import OwnPlaces
-from pipeline.exchange.places import Candidate, Planner
-from pipeline.exchange.verification import Verdict, inverse_information, verify
-from pipeline.geometry import se3
-from pipeline.registration import features
-from pipeline.robot import Images
+from duagc.pipeline.exchange import place_recognition
+from duagc.pipeline.exchange.loop_closing import OwnPlaces
+from duagc.pipeline.exchange.place_recognition import Candidate, Planner
+from duagc.pipeline.exchange.verification import Verdict, inverse_information, verify
+from duagc.pipeline.exchange.wire import places_wire
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import features
+from duagc.pipeline.runs.robot_data import Images
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +54,7 @@ def test_ransac_finds_the_motion_among_false_matches() -> None:
     points_b = rng.uniform([-1, -1, 1], [1, 1, 3], (60, 3))
     points_a = se3.transform(T, points_b) + rng.normal(0, 0.003, (60, 3))
     points_a[:35] = rng.uniform([-1, -1, 1], [1, 1, 3], (35, 3))
-    found, inliers = features.ransac(points_a, points_b, 0.03, 500, streams.generator(0, "test"))
+    found, inliers = features.ransac(points_a, points_b, 0.03, 500, random_streams.generator(0, "test"))
     assert inliers[35:].all()
     assert inliers[:35].sum() <= 2
     assert max(float(d) for d in se3.distance(found, T)) < 0.01
@@ -64,7 +65,7 @@ def test_a_closure_is_as_good_as_its_information_says(robots: dict) -> None:
     sample = places_wire.read_sample(places_wire.write_sample(bravo.sample(0)), 3)
     result = verify(
         2, 0, alpha.features[2], alpha.pyramid(2), sample.features, sample.reference, 0.8, VerificationConfig(),
-        streams.generator(0, "test"),
+        random_streams.generator(0, "test"),
     )  # fmt: skip
     assert result.verdict is Verdict.KEPT
     assert result.closure is not None
@@ -85,13 +86,13 @@ def test_a_darker_camera_finds_the_same_place(robots: dict) -> None:
     darker = OwnPlaces(replace(alpha.data, images=dark), ExchangeConfig())
     sample = places_wire.read_sample(places_wire.write_sample(bravo.sample(0)), 3)
     given = darker.features[2], darker.pyramid(2), sample.features, sample.reference, 0.8
-    result = verify(2, 0, *given, VerificationConfig(), streams.generator(0, "test"))
+    result = verify(2, 0, *given, VerificationConfig(), random_streams.generator(0, "test"))
     assert result.closure is not None
     moved_m, moved_rad = se3.distance(result.closure.T_own_peer, se3.inverse(truth_a[2]) @ truth_b[0])
     assert moved_m < 0.003
     assert moved_rad < 0.002
     alike = VerificationConfig(registration=PeerRegistrationConfig(max_gain=2.0))  # as within one robot
-    assert verify(2, 0, *given, alike, streams.generator(0, "test")).verdict is Verdict.NOT_REGISTERED
+    assert verify(2, 0, *given, alike, random_streams.generator(0, "test")).verdict is Verdict.NOT_REGISTERED
 
 
 def test_different_places_are_refused(robots: dict, make_robot: Any) -> None:
@@ -100,7 +101,7 @@ def test_different_places_are_refused(robots: dict, make_robot: Any) -> None:
     sample = OwnPlaces(far, ExchangeConfig()).sample(0)
     result = verify(
         0, 0, alpha.features[0], alpha.pyramid(0), sample.features, sample.reference, 0.8, VerificationConfig(),
-        streams.generator(0, "test"),
+        random_streams.generator(0, "test"),
     )  # fmt: skip
     assert result.verdict in (Verdict.FEW_MATCHES, Verdict.FEW_INLIERS)
     assert result.closure is None
@@ -117,10 +118,10 @@ def planner(candidates: list[Candidate], **config: Any) -> Planner:
 def test_every_pair_of_keyframes_is_scored_or_has_a_word_said_about_it(robots: dict) -> None:
     (alpha, _), (bravo, _) = robots["alpha"], robots["bravo"]
     peer = [f.descriptors[:80] for f in bravo.features]
-    found, unlike = places.scored(alpha.features, peer, 0.8, 8)
+    found, unlike = place_recognition.scored(alpha.features, peer, 0.8, 8)
     assert found
     assert [c.score for c in found] == sorted((c.score for c in found), reverse=True)
-    none, unlike = places.scored(alpha.features, peer, 0.8, 1000)
+    none, unlike = place_recognition.scored(alpha.features, peer, 0.8, 1000)
     assert none == []
     assert [c.peer_keyframe for c in unlike] == [0, 1, 2]
 

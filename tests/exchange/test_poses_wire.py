@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.consensus.links import STEP_M, PosePacket, rounded
-from pipeline.exchange.packets import MalformedError
-from pipeline.exchange.poses_wire import read_poses, write_poses, write_poses_in_parts
-from pipeline.geometry import se3, so3
+from duagc.pipeline.consensus.admm_edge import STEP_M, PosePacket, rounded
+from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses, write_poses_in_parts
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.network.packets import MalformedError
 
 
 def poses(rng, n):

@@ -7,13 +7,14 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from pipeline import numeric
-from pipeline.exchange import links
-from pipeline.exchange.agent import Agent
-from pipeline.exchange.config import ExchangeConfig, LinkConfig
-from pipeline.exchange.links import LinkModel
-from pipeline.exchange.outcome import result_of
-from pipeline.exchange.session import Delivery, due, run_session_of
+from duagc.pipeline.base import determinism
+from duagc.pipeline.config.exchange import ExchangeConfig
+from duagc.pipeline.config.network import LinkConfig
+from duagc.pipeline.exchange.agent import Agent
+from duagc.pipeline.exchange.session import Delivery, due, run_session_of
+from duagc.pipeline.exchange.session_result import result_of
+from duagc.pipeline.network import link_model
+from duagc.pipeline.network.link_model import LinkModel
 from tests.exchange.conftest import robot
 from tests.exchange.test_session import same
 
@@ -23,9 +24,9 @@ CONFIG = ExchangeConfig(link=LinkConfig(topology="chain", loss_probability=0.3))
 
 def live(pipe: Connection, place: int) -> None:
     """A robot's whole life: it makes its own data, and knows its name, its neighbours and the settings."""
-    numeric.settle_opencv()
+    determinism.settle_opencv()
     data, _ = robot(NAMES[place], 0.6 * place, keyframes=4)
-    agent = Agent(data, NAMES, links.neighbours(CONFIG.link, NAMES)[NAMES[place]], CONFIG, seed=0)
+    agent = Agent(data, NAMES, link_model.neighbours(CONFIG.link, NAMES)[NAMES[place]], CONFIG, seed=0)
     while (heard := pipe.recv()) is not None:
         round_index, now_ns, packets = heard
         sent = [(out.receiver, out.packet) for out in agent.tick(round_index, now_ns, packets)]

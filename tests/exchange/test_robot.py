@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import DuagError
-from pipeline.messages import GaussianMap, Keyframe, KeyframeFactor
-from pipeline.recording import LogWriter
-from pipeline.robot import AgentInput, load, registrations_of
-from schemas import topics
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.messages import GaussianMap, Keyframe, KeyframeFactor
+from duagc.pipeline.recording import LogWriter
+from duagc.pipeline.runs.robot_data import AgentInput, load, registrations_of
+from duagc.schemas import topics
 
 
 def write(

@@ -12,18 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.consensus.config import PoseConsensusConfig
-from pipeline.exchange.agent import Agent
-from pipeline.exchange.config import ExchangeConfig, InjectionConfig, LinkConfig, TransportConfig
-from pipeline.exchange.evidence import best_first, own_records, paper_priority
-from pipeline.exchange.outcome import result_of
-from pipeline.exchange.packets import Kind, Packet, chunk_bytes, parse, serialise
-from pipeline.exchange.record import read_session
-from pipeline.exchange.replay import replay_agent_of
-from pipeline.exchange.session import run_session_of
-from pipeline.geometry import se3
-from pipeline.recording import content_digest, read_log
-from pipeline.robot import AgentResult, RobotData, Step
+from duagc.pipeline.config.consensus import PoseConsensusConfig
+from duagc.pipeline.config.exchange import ExchangeConfig, InjectionConfig
+from duagc.pipeline.config.network import LinkConfig, TransportConfig
+from duagc.pipeline.exchange.agent import Agent
+from duagc.pipeline.exchange.evidence_records import best_first, own_records, paper_priority
+from duagc.pipeline.exchange.record import read_session
+from duagc.pipeline.exchange.replay import replay_agent_of
+from duagc.pipeline.exchange.session import run_session_of
+from duagc.pipeline.exchange.session_result import result_of
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.network.packets import Kind, Packet, chunk_bytes, parse, serialise
+from duagc.pipeline.recording import content_digest, read_log
+from duagc.pipeline.runs.robot_data import AgentResult, RobotData, Step
 
 NAMES = ("alpha", "bravo", "charlie")
 
@@ -475,7 +476,7 @@ def test_an_agent_can_reach_nothing_but_its_own() -> None:
         if path.name not in readers:
             assert not any(n.split(".")[0] in ("pathlib", "os", "io", "mcap") for n in names), path.name
             assert not any(
-                n.startswith(("pipeline.recording", "pipeline.exchange.session")) for n in names
+                n.startswith(("duagc.pipeline.recording", "duagc.pipeline.exchange.session")) for n in names
             ), path.name
 
 

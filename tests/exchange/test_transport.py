@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.exchange.config import LinkConfig, TransportConfig
-from pipeline.exchange.links import LinkModel
-from pipeline.exchange.packets import Kind, MalformedError, Packet, parse
-from pipeline.exchange.transport import Message, Transport
+from duagc.pipeline.config.network import LinkConfig, TransportConfig
+from duagc.pipeline.network.link_model import LinkModel
+from duagc.pipeline.network.packets import Kind, MalformedError, Packet, parse
+from duagc.pipeline.network.transport import Message, Transport
 
 
 def two_ends(config: TransportConfig | None = None) -> tuple[Transport, Transport]:

@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.consensus.cycles import Proposal
-from pipeline.consensus.evidence import pack_symmetric, unpack_symmetric
-from pipeline.consensus.links import PosePacket, SharedKeyframes
-from pipeline.exchange import evidence_wire, places_wire, wire
-from pipeline.exchange.packets import EVIDENCE_KINDS, Kind, MalformedError, chunk_bytes
-from pipeline.exchange.poses_wire import read_poses, write_poses
-from pipeline.geometry import se3
-from pipeline.registration import Reference, ReferenceLevel
-from pipeline.registration.features import Features
-from pipeline.splat.gaussians import DEPTH_KINDS
+from duagc.pipeline.consensus.admm_edge import PosePacket, SharedKeyframes
+from duagc.pipeline.consensus.evidence import pack_symmetric, unpack_symmetric
+from duagc.pipeline.exchange.wire import evidence_wire, places_wire, state_wire
+from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.network.packets import EVIDENCE_KINDS, Kind, MalformedError, chunk_bytes
+from duagc.pipeline.posegraph.cycle_consistency import Proposal
+from duagc.pipeline.registration import Reference, ReferenceLevel
+from duagc.pipeline.registration.features import Features
+from duagc.pipeline.splat.gaussians import DEPTH_KINDS
 
 RNG = np.random.default_rng(5)
 TEAM = 4
@@ -72,8 +72,10 @@ def records(n: int) -> np.ndarray:
 
 MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
     "state": (
-        wire.write_state(wire.State(0b1101, 0b101, 3, 0, True, False, np.array([254, 255, 0, 1], np.uint8))),
-        lambda d: wire.read_state(d, TEAM),
+        state_wire.write_state(
+            state_wire.State(0b1101, 0b101, 3, 0, True, False, np.array([254, 255, 0, 1], np.uint8))
+        ),
+        lambda d: state_wire.read_state(d, TEAM),
     ),
     "places": (
         places_wire.write_places(
@@ -104,22 +106,24 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
         lambda d: read_poses(d, SHARED, False),
     ),
     "frame": (
-        wire.write_frames(
-            wire.PairFrames(1, 2, tuple(Proposal(n, poses(1)[0], (0.01 * n, 0.02), 0.1 * n) for n in (7, 2)))
+        state_wire.write_frames(
+            state_wire.PairFrames(
+                1, 2, tuple(Proposal(n, poses(1)[0], (0.01 * n, 0.02), 0.1 * n) for n in (7, 2))
+            )
         ),
-        lambda d: wire.read_frames(d, TEAM),
+        lambda d: state_wire.read_frames(d, TEAM),
     ),
     "anchors": (
-        wire.write_anchors(wire.Anchors(2, poses(4), poses(1)[0])),
-        lambda d: wire.read_anchors(d, TEAM),
+        state_wire.write_anchors(state_wire.Anchors(2, poses(4), poses(1)[0])),
+        lambda d: state_wire.read_anchors(d, TEAM),
     ),
     "voxels": (
-        wire.write_voxels(3, np.cumsum(RNG.integers(1, 1 << 40, 50))),
-        lambda d: wire.read_voxels(d, TEAM),
+        state_wire.write_voxels(3, np.cumsum(RNG.integers(1, 1 << 40, 50))),
+        lambda d: state_wire.read_voxels(d, TEAM),
     ),
     "pairs": (
-        wire.write_pairs(wire.PairList(0, 2, 1, np.array([[1, 5], [3, 4]]))),
-        lambda d: wire.read_pairs(d, TEAM),
+        state_wire.write_pairs(state_wire.PairList(0, 2, 1, np.array([[1, 5], [3, 4]]))),
+        lambda d: state_wire.read_pairs(d, TEAM),
     ),
     "evidence": (
         evidence_wire.write_evidence(
@@ -159,12 +163,12 @@ def test_a_wrong_length_is_refused(name: str, change: int) -> None:
 
 
 def test_final_poses_and_voxels_come_back_bit_for_bit() -> None:
-    anchors = wire.Anchors(2, poses(4), poses(1)[0])
-    back = wire.read_anchors(wire.write_anchors(anchors), TEAM)
+    anchors = state_wire.Anchors(2, poses(4), poses(1)[0])
+    back = state_wire.read_anchors(state_wire.write_anchors(anchors), TEAM)
     assert np.array_equal(back.T_common_keyframe, anchors.T_common_keyframe)
     assert np.array_equal(back.T_map_first, anchors.T_map_first)
     for keys in (np.zeros(0, np.int64), np.array([0, 1, 127, 128, (1 << 60) - 1])):
-        assert np.array_equal(wire.read_voxels(wire.write_voxels(1, keys), TEAM)[1], keys)
+        assert np.array_equal(state_wire.read_voxels(state_wire.write_voxels(1, keys), TEAM)[1], keys)
 
 
 def test_a_sample_comes_back_within_its_quantisation() -> None:

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.frontend.config import FrontendConfig
-from pipeline.frontend.tracked import Status, TrackedFrame
-from pipeline.frontend.tracking import Tracker
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame
+from duagc.pipeline.frontend.tracking import Tracker
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
 
 WRONG_M, WRONG_RAD = 0.05, np.deg2rad(3.0)
 """A pose called good that is farther than this from that of the undisturbed run is wrong."""

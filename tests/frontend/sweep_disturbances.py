@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.evaluation import groundtruth
-from pipeline.evaluation.results import Absent
-from pipeline.frontend.config import FrontendConfig
-from pipeline.frontend.tracked import Status
-from pipeline.frontend.tracking import Tracker
-from pipeline.geometry import se3
-from pipeline.recording import Recording, open_rgbd
+from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.evaluation import groundtruth
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.frontend.tracked import Status
+from duagc.pipeline.frontend.tracking import Tracker
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.recording import Recording, open_rgbd
 from tests.frontend import disturbances as d
 from tests.frontend.disturbances import Row, Shot, Undisturbed
 from tests.frontend.test_lost import filmed

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.frontend import bundle, loops
-from pipeline.frontend.bundle import Neighbourhood, optimise
-from pipeline.frontend.config import KeyframeConfig, LoopConfig, RelocalisationConfig
-from pipeline.frontend.keyframes import KeyframePair, refine
-from pipeline.frontend.loops import find_loops
-from pipeline.frontend.relocalisation import features_of
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.registration import Level, Reference, RegistrationConfig, RgbdPyramid, register
-from pipeline.registration.features import Features, matches
+from duagc.pipeline.config.frontend import KeyframeConfig, LoopConfig, RelocalisationConfig
+from duagc.pipeline.frontend import bundle, loops
+from duagc.pipeline.frontend.bundle import Neighbourhood, optimise
+from duagc.pipeline.frontend.keyframe_graph import KeyframePair, refine
+from duagc.pipeline.frontend.loops import find_loops
+from duagc.pipeline.frontend.relocalization import features_of
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.registration import Level, Reference, RegistrationConfig, RgbdPyramid, register
+from duagc.pipeline.registration.features import Features, matches
 from tests.registration.room import pose, render
 
 CAMERA = PinholeCamera(320, 240, 220.0, 220.0, 159.5, 119.5)

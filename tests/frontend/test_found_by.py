@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from converters.simulate import camera_of
-from pipeline.frontend.config import FrontendConfig
-from pipeline.frontend.failure import Reason
-from pipeline.frontend.relocalisation import features_of
-from pipeline.frontend.tracked import Status
-from pipeline.frontend.tracking import Tracker, _Found
-from pipeline.geometry import se3
-from pipeline.registration import RgbdPyramid, register
+from duagc.converters.simulate.team import camera_of
+from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.relocalization import features_of
+from duagc.pipeline.frontend.tracked import Status
+from duagc.pipeline.frontend.tracking import Tracker, _Found
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import RgbdPyramid, register
 from tests.frontend import disturbances as d
 from tests.frontend.disturbances import Shot, Undisturbed
 from tests.frontend.test_lost import CONFIG, filmed

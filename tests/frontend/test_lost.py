@@ -11,16 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from converters.simulate import bake, camera_of, paths
-from converters.simulate.render import Renderer
-from converters.simulate.scenes import build
-from pipeline.frontend.config import FrontendConfig, TrackingConfig
-from pipeline.frontend.failure import Reason, StuckImages, intruders
-from pipeline.frontend.tracked import Status
-from pipeline.frontend.tracking import Tracker
-from pipeline.geometry import se3
-from pipeline.recording import open_rgbd
-from pipeline.registration import RgbdPyramid
+from duagc.converters.simulate import bake, trajectories
+from duagc.converters.simulate.render import Renderer
+from duagc.converters.simulate.scene_settings import build
+from duagc.converters.simulate.team import camera_of
+from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
+from duagc.pipeline.frontend.failure import Reason, StuckImages, intruders
+from duagc.pipeline.frontend.tracked import Status
+from duagc.pipeline.frontend.tracking import Tracker
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.recording import open_rgbd
+from duagc.pipeline.registration import RgbdPyramid
 from tests.frontend import disturbances as d
 from tests.frontend.disturbances import Row, Shot, Undisturbed
 
@@ -36,7 +37,7 @@ def filmed(seed: int, frames: int) -> list[Shot]:
     """Frames of a robot in a simulated room, 22 mm apart."""
     room = build("room", seed)
     renderer = Renderer(room, bake.bake(room, 0.008), CAMERA)
-    way = paths.plan(room, 1, 160, 0.6, CAMERA)[0]
+    way = trajectories.plan(room, 1, 160, 0.6, CAMERA)[0]
     views = [renderer.render(T) for T in way[:frames]]
     return [Shot(k, k * FRAME_NS, view.color, view.depth.astype(np.float32)) for k, view in enumerate(views)]
 

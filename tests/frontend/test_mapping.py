@@ -5,14 +5,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.frontend.mapping import Mapper, MappingStats
-from pipeline.frontend.mapping_config import MappingConfig
-from pipeline.frontend.mapping_views import overlap
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import Rasterizer
-from pipeline.splat.gaussians import DepthKind, Gaussians
-from pipeline.splat.losses import MapLossConfig, SurfaceLossConfig, depth_error, psnr
+from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.config.training import DepthKind, MapLossConfig, SurfaceLossConfig
+from duagc.pipeline.frontend.mapping import Mapper, MappingStats
+from duagc.pipeline.frontend.mapping_views import overlap
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import Rasterizer
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.losses import depth_error, psnr
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 PLANES = (

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from pipeline.frontend.config import ModelConfig
-from pipeline.frontend.failure import Reason
-from pipeline.frontend.mapping import Mapper
-from pipeline.frontend.mapping_config import MappingConfig
-from pipeline.frontend.model import ModelTracker
-from pipeline.frontend.tracked import Status, TrackedFrame
-from pipeline.geometry import se3
-from pipeline.recording import RgbdFrame
-from pipeline.registration import RegistrationConfig
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.config.frontend import ModelConfig
+from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.mapping import Mapper
+from duagc.pipeline.frontend.model_registration import ModelTracker
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.recording import RgbdFrame
+from duagc.pipeline.registration import RegistrationConfig
+from duagc.pipeline.splat.gaussians import Gaussians
 from tests.registration.room import CAMERA, pose, render
 
 KEYFRAME = pose(z=-0.9)

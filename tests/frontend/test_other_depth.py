@@ -9,19 +9,20 @@ import cv2
 import numpy as np
 import pytest
 
-from converters.base import RecordingWriter
-from converters.simulate import bake, camera_of, paths
-from converters.simulate.render import Renderer
-from converters.simulate.scenes import build
-from converters.stereo import StereoRig
-from pipeline.frontend.config import FrontendConfig
-from pipeline.frontend.stage import run_frontend
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.geometry.trajectory import align
-from pipeline.kernels import Rasterizer
-from pipeline.recording import RgbdLog, read_log
-from pipeline.splat.losses import depth_error
+from duagc.converters.layouts.stereo import StereoRig
+from duagc.converters.simulate import bake, trajectories
+from duagc.converters.simulate.render import Renderer
+from duagc.converters.simulate.scene_settings import build
+from duagc.converters.simulate.team import camera_of
+from duagc.converters.writer import RecordingWriter
+from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.frontend.stage import run_frontend
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.trajectory import align
+from duagc.pipeline.kernels import Rasterizer
+from duagc.pipeline.recording import RgbdLog, read_log
+from duagc.pipeline.splat.losses import depth_error
 
 CAMERA = camera_of((240, 180))
 FRAMES = 20
@@ -57,7 +58,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
     """A room filmed by a stereo rig with a LiDAR on top, grey values and ranges with noise."""
     room = build("room", 0)
     eye, wide = Renderer(room, bake.bake(room, 0.02), CAMERA), Renderer(room, None, WIDE)
-    poses = paths.plan(room, 1, 160, 0.6, CAMERA)[0][:FRAMES]
+    poses = trajectories.plan(room, 1, 160, 0.6, CAMERA)[0][:FRAMES]
     pixels, rng, rig = beams(16, 720), np.random.default_rng(1), StereoRig(CAMERA, BASELINE_M)
     rays = WIDE.rays()[pixels[:, 1], pixels[:, 0]]
     units = rays / np.linalg.norm(rays, axis=1, keepdims=True)

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from converters.simulate import simulate
-from pipeline.frontend.config import FrontendConfig
-from pipeline.frontend.stage import run_frontend
-from pipeline.recording import Recording, open_rgbd, read_log
+from duagc.converters.simulate.team import simulate
+from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.frontend.stage import run_frontend
+from duagc.pipeline.recording import Recording, open_rgbd, read_log
 from tests.converters.test_simulate_meshes import folder_of
 
 

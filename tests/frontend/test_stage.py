@@ -6,19 +6,19 @@ import cv2
 import numpy as np
 import pytest
 
-from converters.base import RecordingWriter
-from pipeline.errors import DuagError
-from pipeline.frontend.config import FrontendConfig, KeyframeConfig, TrackingConfig
-from pipeline.frontend.failure import Reason
-from pipeline.frontend.keyframes import KeyframePair, refine
-from pipeline.frontend.mapping_config import MappingConfig
-from pipeline.frontend.stage import LATENCY_NS, _support, depth_noise_m, run_frontend
-from pipeline.frontend.tracked import Status, TrackedFrame
-from pipeline.geometry import se3
-from pipeline.geometry.trajectory import ate_rmse_m
-from pipeline.recording import content_digest, log_metadata, read_log
-from pipeline.registration.moving import MovingConfig
-from schemas import topics
+from duagc.converters.writer import RecordingWriter
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig, TrackingConfig
+from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.config.registration import MovingConfig
+from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.keyframe_graph import KeyframePair, refine
+from duagc.pipeline.frontend.stage import LATENCY_NS, _support, depth_noise_m, run_frontend
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.trajectory import ate_rmse_m
+from duagc.pipeline.recording import content_digest, log_metadata, read_log
+from duagc.schemas import topics
 from tests.registration.room import CAMERA, pose, render
 from tests.registration.test_moving import RADIUS_M, with_ball
 

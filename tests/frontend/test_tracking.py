@@ -5,13 +5,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pipeline.frontend.config import FrontendConfig, KeyframeConfig, TrackingConfig, is_held_out
-from pipeline.frontend.keyframes import KeyframePair, refine
-from pipeline.frontend.tracked import Status, TrackedFrame
-from pipeline.frontend.tracking import Tracker
-from pipeline.geometry import se3
-from pipeline.geometry.trajectory import ate_rmse_m
-from pipeline.recording import Motion
+from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig, TrackingConfig, is_held_out
+from duagc.pipeline.frontend.keyframe_graph import KeyframePair, refine
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame
+from duagc.pipeline.frontend.tracking import Tracker
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.trajectory import ate_rmse_m
+from duagc.pipeline.recording import Motion
 from tests.registration.room import CAMERA, pose, render
 
 CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)))

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from pipeline.consensus.evidence import LOG_COVARIANCE, MEAN, Evidence
-from pipeline.fusion.fuse import FusionConfig, explained, fuse
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.consensus.evidence import LOG_COVARIANCE, MEAN, Evidence
+from duagc.pipeline.fusion.fuse import FusionConfig, explained, fuse
+from duagc.pipeline.splat.gaussians import Gaussians
 from tests.fusion.worlds import (
     CAMERA,
     CONFIG,

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.consensus.config import MatchingConfig
-from pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Evidence, theta_of
-from pipeline.fusion.config import FusionConfig
-from pipeline.fusion.doubt import Believed, believed
-from pipeline.fusion.refine import View
-from pipeline.geometry import se3
-from pipeline.kernels import Rasterizer
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.config.consensus import MatchingConfig
+from duagc.pipeline.config.fusion import FusionConfig
+from duagc.pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Evidence, theta_of
+from duagc.pipeline.fusion.finetune import View
+from duagc.pipeline.fusion.peer_validation import Believed, believed
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.kernels import Rasterizer
+from duagc.pipeline.splat.gaussians import Gaussians
 from tests.fusion.test_refine import CAMERA, POSES
 from tests.fusion.test_refine import wall as speckled
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from pipeline.consensus.config import ColorConfig
-from pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, Evidence, pack_information
-from pipeline.consensus.gaussians import Weights
-from pipeline.consensus.matching import MatchingConfig
-from pipeline.fusion.fuse import association_covariance, fuse, weighted_move
-from pipeline.geometry import se3, so3, spd
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.config.consensus import ColorConfig
+from duagc.pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, Evidence, pack_information
+from duagc.pipeline.consensus.matching import MatchingConfig
+from duagc.pipeline.consensus.weights import Weights
+from duagc.pipeline.fusion.fuse import association_covariance, fuse, weighted_move
+from duagc.pipeline.geometry import se3, so3, spd
+from duagc.pipeline.splat.gaussians import Gaussians
 from tests.fusion.worlds import (
     ALIKE,
     CAMERA,

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from pipeline.consensus.evidence import OPACITY, theta_of
-from pipeline.fusion.config import FusionConfig
-from pipeline.fusion.fuse import FusedMap
-from pipeline.fusion.own_pixels import OPACITY_INFORMATION, weigh_by_own_pixels
-from pipeline.fusion.refine import View
-from pipeline.geometry import se3
-from pipeline.kernels import Rasterizer
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.config.fusion import FusionConfig
+from duagc.pipeline.consensus.evidence import OPACITY, theta_of
+from duagc.pipeline.fusion.finetune import View
+from duagc.pipeline.fusion.fuse import FusedMap
+from duagc.pipeline.fusion.opacity_update import OPACITY_INFORMATION, weigh_by_own_pixels
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.kernels import Rasterizer
+from duagc.pipeline.splat.gaussians import Gaussians
 from tests.fusion.test_refine import CAMERA, POSES, wall
 
 CONFIG = FusionConfig()

@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.consensus.colors import ColorMap
-from pipeline.consensus.evidence import Evidence
-from pipeline.fusion.config import RefineConfig
-from pipeline.fusion.peer_views import peer_views
-from pipeline.fusion.refine import View, refine, steps_of
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import Rasterizer
-from pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
-from pipeline.splat.losses import psnr
+from duagc.pipeline.config.fusion import RefineConfig
+from duagc.pipeline.consensus.colors import ColorMap
+from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.fusion.finetune import View, refine, steps_of
+from duagc.pipeline.fusion.peer_views import peer_views
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import Rasterizer
+from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
+from duagc.pipeline.splat.losses import psnr
 
 CAMERA = PinholeCamera(64, 48, 55.0, 55.0, 31.5, 23.5)
 ALL = np.ones(400, bool)

@@ -8,16 +8,17 @@ import cv2
 import numpy as np
 import pytest
 
-from converters.base import RecordingWriter
-from pipeline.consensus.config import ColorConfig, MatchingConfig
-from pipeline.consensus.evidence import Evidence
-from pipeline.errors import DuagError
-from pipeline.fusion.config import FusionConfig
-from pipeline.fusion.stage import peer_colors, run_fusion
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.geometry.trajectory import read_tum
-from pipeline.messages import (
+from duagc.converters.writer import RecordingWriter
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.consensus import ColorConfig, MatchingConfig
+from duagc.pipeline.config.fusion import FusionConfig
+from duagc.pipeline.config.registration import MovingConfig
+from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.fusion.stage import peer_colors, run_fusion
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.trajectory import read_tum
+from duagc.pipeline.messages import (
     CorrectedKeyframes,
     GaussianInformation,
     GaussianMap,
@@ -26,12 +27,11 @@ from pipeline.messages import (
     Odometry,
     map_frame,
 )
-from pipeline.recording import LogWriter, read_log
-from pipeline.registration.moving import MovingConfig
-from pipeline.robot import AgentInput
-from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.ply import write_ply
-from schemas import topics
+from duagc.pipeline.recording import LogWriter, read_log
+from duagc.pipeline.runs.robot_data import AgentInput
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.ply import write_ply
+from duagc.schemas import topics
 
 CAMERA = PinholeCamera(32, 24, 25.0, 25.0, 15.5, 11.5)
 FRAMES, KEYFRAMES, N = 6, (0, 3), 12

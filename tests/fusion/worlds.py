@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from pipeline.consensus.evidence import Evidence, pack_information
-from pipeline.consensus.matching import MatchingConfig
-from pipeline.fusion.fuse import FusionConfig, fuse
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.consensus.evidence import Evidence, pack_information
+from duagc.pipeline.consensus.matching import MatchingConfig
+from duagc.pipeline.fusion.fuse import FusionConfig, fuse
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.splat.gaussians import Gaussians
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 CONFIG = FusionConfig(

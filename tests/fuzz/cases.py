@@ -29,7 +29,7 @@ from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 
-from pipeline.errors import DuagError
+from duagc.pipeline.base.errors import DuagError
 from tests.fuzz import mutate
 from tests.fuzz.readers import Reader
 

@@ -15,15 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-import converters
-from converters import mesh_reader
-from converters.logs import describe
-from converters.simulate import mesh_process, meshes
-from pipeline import checks, digest, recovery
-from pipeline.config import load
-from pipeline.errors import DuagError
-from pipeline.geometry.trajectory import read_tum
-from pipeline.recording import Recording, format_info, info, open_rgbd, read_log
+from duagc.converters import registry
+from duagc.converters.layouts import mesh_reader
+from duagc.converters.logs import describe
+from duagc.converters.simulate import mesh_process, meshes
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.checks import check
+from duagc.pipeline.config.base import load
+from duagc.pipeline.geometry.trajectory import read_tum
+from duagc.pipeline.recording import Recording, format_info, info, open_rgbd, read_log, recovery
+from duagc.pipeline.runs import digest
 from tests.converters import test_image_folders
 from tests.fuzz import seeds
 from tests.fuzz.formats import Special, any_special
@@ -67,7 +68,7 @@ def converter(
         made[:] = [make(seed / "data").relative_to(seed)]
 
     def read(src: Path, out: Path) -> None:
-        converters.convert(dataset, src / made[0], out / "rec", options=options())
+        registry.convert(dataset, src / made[0], out / "rec", options=options())
         read_back(out / "rec")
 
     return Reader(name, write, read, any_special)
@@ -78,7 +79,7 @@ def read_recording(src: Path, out: Path) -> None:
     errors = []
     for step in (
         lambda: format_info(info(src / "rec")),
-        lambda: checks.check(src / "rec"),
+        lambda: check.check(src / "rec"),
         lambda: [
             list(open_rgbd(Recording(src / "rec").log(r)).frames()) for r in Recording(src / "rec").robots
         ],
@@ -106,7 +107,7 @@ class Forked:
     `mesh_process` uses of `subprocess.Popen` is here."""
 
     def __init__(self, command: list[str], pass_fds: list[int], **others: object) -> None:
-        assert command[-1] == "converters.mesh_reader"
+        assert command[-1] == "duagc.converters.layouts.mesh_reader"
         heard, said = os.pipe()
         self.pid = os.fork()
         if self.pid == 0:
@@ -164,7 +165,7 @@ def read_scene(src: Path, out: Path) -> None:
 
 def graph_reader(name: str, make: Callable[[Path], None], file: str, robots: int | None) -> Reader:
     def read(src: Path, out: Path) -> None:
-        from pipeline.consensus.graphs import read_team
+        from duagc.pipeline.posegraph.files import read_team
 
         read_team(src / file, robots)
 
@@ -185,21 +186,21 @@ def _read(result: object) -> None:
 
 
 def read_config(src: Path, out: Path) -> None:
-    from pipeline.runner import RunConfig
+    from duagc.pipeline.config.run import RunConfig
 
     load(RunConfig, src / "config.toml")
 
 
 def read_gaussians(src: Path, out: Path) -> None:
-    from pipeline.splat.ply import read_ply
+    from duagc.pipeline.splat.ply import read_ply
 
     read_ply(src / "map.ply")
 
 
 def read_run(src: Path, out: Path) -> None:
     """Everything that opens a run but the evaluation, which takes long."""
-    from pipeline.inspection import Inspector
-    from pipeline.run_folder import RunFolder
+    from duagc.pipeline.runs.folder import RunFolder
+    from duagc.pipeline.viewing.inspection import Inspector
 
     errors = []
     for step in (

@@ -48,9 +48,9 @@ def reason(line: str) -> str:
 
 
 def main() -> int:
-    from pipeline import numeric
+    from duagc.pipeline.base import determinism
 
-    numeric.settle()  # before OpenCV is imported: it reads its limit of pixels then
+    determinism.settle()  # before OpenCV is imported: it reads its limit of pixels then
     from tests.fuzz import seeds
     from tests.fuzz.cases import cases
     from tests.fuzz.readers import READERS

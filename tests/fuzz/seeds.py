@@ -17,9 +17,9 @@ from rosbags.highlevel import anyreader
 from rosbags.serde import utils as serde_utils
 from rosbags.typesys import store
 
-from converters import bonn, icl_nuim, seven_scenes, tum
-from converters.ros_images import rows_of
-from pipeline.geometry.camera import PinholeCamera
+from duagc.converters.datasets import bonn, icl_nuim, seven_scenes, tum
+from duagc.converters.layouts.ros_images import rows_of
+from duagc.pipeline.geometry.camera import PinholeCamera
 from tests.converters import (
     box_room,
     ros_bags,
@@ -243,14 +243,14 @@ def make_csv(seed: Path) -> None:
 
 
 def make_config(seed: Path) -> None:
-    from pipeline.config import dump
-    from pipeline.runner import RunConfig
+    from duagc.pipeline.config.base import dump
+    from duagc.pipeline.config.run import RunConfig
 
     (seed / "config.toml").write_text(dump(RunConfig()))
 
 
 def make_gaussians(seed: Path) -> None:
-    from pipeline.splat.ply import write_ply
+    from duagc.pipeline.splat.ply import write_ply
 
     write_ply(seed / "map.ply", fake_run.wall().select(slice(40)))
 

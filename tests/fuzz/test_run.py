@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.errors import DuagError
+from duagc.pipeline.base.errors import DuagError
 from tests.fuzz.cases import cases
 from tests.fuzz.readers import Reader
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pipeline.geometry import se3, so3
+from duagc.pipeline.geometry import se3, so3
 
 angles = st.one_of(st.floats(-3.1, 3.1), st.floats(-1e-6, 1e-6))
 

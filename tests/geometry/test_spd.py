@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.linalg import logm
 
-from pipeline.geometry import so3, spd
+from duagc.pipeline.geometry import so3, spd
 
 
 def test_chart_is_an_isometry_and_rotates() -> None:

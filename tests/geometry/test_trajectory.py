@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import DuagError
-from pipeline.geometry import se3, trajectory
-from pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3, trajectory
+from duagc.pipeline.geometry.trajectory import Trajectory
 
 BENCHMARK = Path(__file__).parents[2].parent / "shared" / "data" / "trajectories"
 

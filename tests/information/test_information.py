@@ -7,12 +7,14 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline import messages
-from pipeline.errors import DuagError
-from pipeline.geometry import se3, so3, spd
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.information.config import InformationConfig
-from pipeline.information.stage import (
+from duagc.pipeline import messages
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.information import InformationConfig
+from duagc.pipeline.config.mapping import THICKNESS_FLOOR_M
+from duagc.pipeline.config.registration import MovingConfig
+from duagc.pipeline.geometry import se3, so3, spd
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.information.stage import (
     Noise,
     View,
     estimate_noise,
@@ -23,12 +25,10 @@ from pipeline.information.stage import (
     without_moving,
     without_thickness,
 )
-from pipeline.kernels import FisherSums, Rasterizer
-from pipeline.recording import LogWriter, read_log
-from pipeline.registration.moving import MovingConfig
-from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.seeding import THICKNESS_FLOOR_M
-from schemas import topics
+from duagc.pipeline.kernels import FisherSums, Rasterizer
+from duagc.pipeline.recording import LogWriter, read_log
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.schemas import topics
 
 CAMERA = PinholeCamera(48, 36, 40.0, 40.0, 23.5, 17.5)
 NOISE = Noise(0.02, 1.0, 0.0012, 0.0019)

@@ -15,8 +15,8 @@ from collections import defaultdict
 
 import numpy as np
 
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import DepthKind
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import DepthKind
 from tests.kernels.agreement import Error, compare
 from tests.kernels.drawn_scenes import OPACITIES, PLACES, SHAPES, made_scene
 from tests.kernels.scenes import KINDS, Scene, make_scene

@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import DepthKind, FisherSums, Gradients, LossWeights, Rasterizer
-from pipeline.kernels.reference import ReferenceRasterizer
-from pipeline.splat.losses import rgbd_loss
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import DepthKind, FisherSums, Gradients, LossWeights, Rasterizer
+from duagc.pipeline.kernels.reference import ReferenceRasterizer
+from duagc.pipeline.splat.losses import rgbd_loss
 from tests.kernels.scenes import Scene
 
 PARAMETERS = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")

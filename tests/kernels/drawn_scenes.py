@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from hypothesis import strategies as st
 
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.splat.gaussians import Gaussians
 from tests.kernels.scenes import Scene
 
 SHAPES = ("plain", "needle", "disc", "ball", "nearly equal", "huge", "tiny")

@@ -8,7 +8,7 @@ import os
 import sys
 from pathlib import Path
 
-NAME = "pipeline.kernels._raster"
+NAME = "duagc.pipeline.kernels._raster"
 PATH = Path(os.environ["DUAGC_RASTER"]).resolve(strict=True)
 
 assert NAME not in sys.modules, "the installed extension was imported first"

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.splat.gaussians import Gaussians
 
 BACKGROUND = (0.2, 0.7, 0.4)
 

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.kernels import FisherSums, Rasterizer, available_isas
-from pipeline.kernels.reference import ReferenceRasterizer
-from pipeline.kernels.types import DEPTH_KINDS
+from duagc.pipeline.kernels import FisherSums, Rasterizer, available_isas
+from duagc.pipeline.kernels.reference import ReferenceRasterizer
+from duagc.pipeline.kernels.types import DEPTH_KINDS
 from tests.kernels.scenes import KINDS, make_scene
 
 ISAS = available_isas()

@@ -5,9 +5,9 @@ import reprlib
 import numpy as np
 import pytest
 
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import FisherSums, Rasterizer, available_isas
-from pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import FisherSums, Rasterizer, available_isas
+from duagc.pipeline.splat.gaussians import Gaussians
 from tests.kernels.scenes import make_scene, random_gaussians
 
 CAMERA = PinholeCamera(20, 10, 15.0, 15.0, 9.5, 4.5)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.geometry import se3
-from pipeline.kernels import Rasterizer
-from pipeline.kernels.autograd import rasterize
-from pipeline.kernels.reference import ReferenceRasterizer
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.kernels import Rasterizer
+from duagc.pipeline.kernels.autograd import rasterize
+from duagc.pipeline.kernels.reference import ReferenceRasterizer
 from tests.kernels.scenes import make_scene
 
 PARAMETERS = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pipeline.geometry import so3, spd
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import Rasterizer
-from pipeline.kernels.reference import ReferenceRasterizer
-from pipeline.kernels.types import DEPTH_KINDS, FisherSums, Gradients, LossWeights
-from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.losses import rgbd_loss
+from duagc.pipeline.geometry import so3, spd
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import Rasterizer
+from duagc.pipeline.kernels.reference import ReferenceRasterizer
+from duagc.pipeline.kernels.types import DEPTH_KINDS, FisherSums, Gradients, LossWeights
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.losses import rgbd_loss
 from tests.kernels.scenes import BACKGROUND, Scene, make_scene, random_gaussians
 
 IMPLEMENTATIONS = [ReferenceRasterizer, Rasterizer]

@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import FisherSums, LossWeights, Rasterizer, available_isas
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import FisherSums, LossWeights, Rasterizer, available_isas
 from tests.kernels.scenes import make_scene, random_gaussians
 
 CAMERA = PinholeCamera(203, 117, 90.0, 92.0, 101.2, 57.1)

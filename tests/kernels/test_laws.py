@@ -5,10 +5,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from pipeline.geometry import se3, spd
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import FisherSums, Rasterizer
-from pipeline.kernels.reference import ReferenceRasterizer
+from duagc.pipeline.geometry import se3, spd
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import FisherSums, Rasterizer
+from duagc.pipeline.kernels.reference import ReferenceRasterizer
 from tests.kernels.scenes import BACKGROUND, make_scene, random_gaussians
 
 

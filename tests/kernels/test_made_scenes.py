@@ -12,9 +12,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import DepthKind, Rasterizer, available_isas
-from pipeline.kernels.types import DEPTH_KINDS
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import DepthKind, Rasterizer, available_isas
+from duagc.pipeline.kernels.types import DEPTH_KINDS
 from tests.kernels.agreement import compare, outputs
 from tests.kernels.drawn_scenes import (
     OPACITIES,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry import se3, so3
+from duagc.pipeline.geometry import se3, so3
 
 Array = NDArray[np.float64]
 KAPPA, TAU = 2000.0, 400.0  # 0.016 rad and 0.05 m

@@ -7,8 +7,8 @@ import json
 
 import pytest
 
-from pipeline.posegraph import solve
-from pipeline.posegraph.config import settings
+from duagc.pipeline.config.posegraph import settings
+from duagc.pipeline.team_posegraph import solve
 from tests.consensus.worlds import POSE_GRAPHS
 
 pytestmark = pytest.mark.slow

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pipeline.consensus.graphs import read_team
-from pipeline.exchange.packets import parse, serialise
-from pipeline.posegraph import network
-from pipeline.posegraph.config import settings
+from duagc.pipeline.config.posegraph import settings
+from duagc.pipeline.network.packets import parse, serialise
+from duagc.pipeline.posegraph.files import read_team
+from duagc.pipeline.team_posegraph import network
 from tests.posegraph.graphs import helix_edges, write_g2o
 
 

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.consensus.graphs import read_team
-from pipeline.exchange.packets import MAX_PACKET_BYTES, parse
-from pipeline.posegraph import network, solve
-from pipeline.posegraph.config import settings
-from pipeline.posegraph.network import Traffic, meet
+from duagc.pipeline.config.posegraph import settings
+from duagc.pipeline.network.packets import MAX_PACKET_BYTES, parse
+from duagc.pipeline.posegraph.files import read_team
+from duagc.pipeline.team_posegraph import network, solve
+from duagc.pipeline.team_posegraph.network import Traffic, meet
 from tests.posegraph.graphs import helix_edges, wild_edges, write_g2o, write_team
 from tests.test_cli import assert_one_line, duagc
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.consensus.elimination import Block, Step
-from pipeline.exchange import tree_wire
-from pipeline.exchange.packets import MalformedError
-from pipeline.geometry import se3
-from pipeline.posegraph import wire
-from pipeline.posegraph.wire import NamedKeyframes, PairFrame, Roster
+from duagc.pipeline.consensus.elimination import Block, Step
+from duagc.pipeline.exchange.wire import elimination_wire
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.network.packets import MalformedError
+from duagc.pipeline.team_posegraph import wire
+from duagc.pipeline.team_posegraph.wire import NamedKeyframes, PairFrame, Roster
 
 
 def poses(rng, n):
@@ -32,7 +32,7 @@ def test_set_up_messages_come_back():
     assert (back.lower, back.higher, back.support) == (1, 3, 12)
     np.testing.assert_allclose(back.T_lower_higher, frame.T_lower_higher, atol=1e-5)
     front = {(0, 4): 0b11, (2, 1): 0, (0, 9): 0b101}
-    assert tree_wire.read_front(tree_wire.write_front(front), 3) == front
+    assert elimination_wire.read_front(elimination_wire.write_front(front), 3) == front
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
@@ -44,22 +44,22 @@ def test_blocks_and_steps_come_back_and_zeros_cost_nothing(precision):
     H[:6, 12:18] = H[12:18, :6] = 0.0
     H = H.astype(precision).astype(np.float64)
     block = Block(H, rng.normal(size=6 * n), 3.5, 0.25, reweighted=True, unsure=False)
-    data = tree_wire.write_block(9, block, precision)
-    exchange, read = tree_wire.read_block(data, n)
+    data = elimination_wire.write_block(9, block, precision)
+    exchange, read = elimination_wire.read_block(data, n)
     assert exchange == 9
     np.testing.assert_array_equal(read.H, H)
     np.testing.assert_array_equal(read.g, block.g)
     assert (read.cost, read.largest_step, read.reweighted, read.unsure) == (3.5, 0.25, True, False)
     dense = Block(np.where(H == 0, 1.0, H), block.g, 3.5, 0.25, reweighted=True, unsure=False)
-    assert len(tree_wire.write_block(9, dense, precision)) - len(data) == 36 * (
+    assert len(elimination_wire.write_block(9, dense, precision)) - len(data) == 36 * (
         4 if precision == "float32" else 8
     )
     same = Block(None, block.g, 3.5, 0.25, reweighted=False, unsure=True)
-    short = tree_wire.write_block(10, same, precision)
+    short = elimination_wire.write_block(10, same, precision)
     assert len(short) < 400
-    assert tree_wire.read_block(short, n)[1].H is None
+    assert elimination_wire.read_block(short, n)[1].H is None
     step = Step(4, accepted=True, finished=False, fresh=True, damping=1e-3, delta=rng.normal(size=(3, 6)))
-    back = tree_wire.read_step(tree_wire.write_step(step), 3)
+    back = elimination_wire.read_step(elimination_wire.write_step(step), 3)
     np.testing.assert_array_equal(back.delta, step.delta)
     assert (back.exchange, back.accepted, back.finished, back.fresh, back.damping) == (
         4,
@@ -83,9 +83,9 @@ def test_what_is_cut_short_or_does_not_fit_is_refused():
         ),
         (wire.write_verdict(np.ones(9, bool)), lambda d: wire.read_verdict(d, 9)),
         (wire.write_frame(PairFrame(0, 1, 2, np.eye(4))), lambda d: wire.read_frame(d, 2)),
-        (tree_wire.write_front({(0, 1): 3}), lambda d: tree_wire.read_front(d, 2)),
-        (tree_wire.write_block(0, block, "float64"), lambda d: tree_wire.read_block(d, 2)),
-        (tree_wire.write_step(step), lambda d: tree_wire.read_step(d, 2)),
+        (elimination_wire.write_front({(0, 1): 3}), lambda d: elimination_wire.read_front(d, 2)),
+        (elimination_wire.write_block(0, block, "float64"), lambda d: elimination_wire.read_block(d, 2)),
+        (elimination_wire.write_step(step), lambda d: elimination_wire.read_step(d, 2)),
     ]
     for data, read in messages:
         read(data)
@@ -95,4 +95,4 @@ def test_what_is_cut_short_or_does_not_fit_is_refused():
     with pytest.raises(MalformedError, match="team"):
         wire.read_roster(wire.write_roster(Roster(0, 0b1000)), 3)
     with pytest.raises(MalformedError, match="expected 3"):
-        tree_wire.read_block(tree_wire.write_block(0, block, "float64"), 3)
+        elimination_wire.read_block(elimination_wire.write_block(0, block, "float64"), 3)

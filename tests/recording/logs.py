@@ -7,15 +7,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from converters.base import RecordingWriter, RobotWriter, robot_names
-from pipeline import messages as m
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import (
-    LogWriter,
-    read_log,
-)
-from schemas import topics
+from duagc.converters.writer import RecordingWriter, RobotWriter, robot_names
+from duagc.pipeline import messages as m
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import LogWriter, read_log
+from duagc.schemas import topics
 
 CAMERA = PinholeCamera(16, 12, 14.0, 14.0, 7.5, 5.5)
 FRAME_NS = 33_333_333

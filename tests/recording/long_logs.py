@@ -24,10 +24,10 @@ from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 
-import schemas as foxglove
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import Recording, open_rgbd, read_log
-from schemas import topics
+from duagc import schemas as foxglove
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import Recording, open_rgbd, read_log
+from duagc.schemas import topics
 from tests.converters.ros_bags import Ros
 
 KINDS = ("bag", "db3", "cdr", "protobuf", "json")

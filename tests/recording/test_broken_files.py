@@ -9,17 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
-import schemas
-from pipeline.errors import DuagError
-from pipeline.recording import (
-    Record,
-    content_digest,
-    info,
-    log_metadata,
-    open_rgbd,
-    read_log,
-    verify,
-)
+from duagc import schemas
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.recording import Record, content_digest, info, log_metadata, open_rgbd, read_log, verify
 from tests.recording.logs import update, write_camera, write_updates
 
 

@@ -5,16 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import messages as m
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import (
-    LogWriter,
-    open_rgbd,
-)
-from pipeline.recording.register_depth import register_depth
-from schemas import topics
+from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import LogWriter, open_rgbd
+from duagc.pipeline.recording.register_depth import register_depth
+from duagc.schemas import topics
 from tests.recording.logs import CALIBRATION, COLOR, png
 
 WIDE = PinholeCamera(64, 48, 56.0, 56.0, 31.5, 23.5)

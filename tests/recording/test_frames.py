@@ -8,17 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from converters.base import RecordingWriter
-from pipeline import messages as m
-from pipeline.errors import DuagError
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import (
-    LogWriter,
-    info,
-    open_rgbd,
-)
-from pipeline.recording.pairing import TOLERANCE_NS, pair
-from schemas import topics
+from duagc.converters.writer import RecordingWriter
+from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import LogWriter, info, open_rgbd
+from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
+from duagc.schemas import topics
 from tests.recording.logs import CALIBRATION, CAMERA, COLOR, DEPTH, FRAME_NS, depth, image, png, write_camera
 
 

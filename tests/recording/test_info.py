@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.errors import DuagError
-from pipeline.recording import format_info, info, open_rgbd, preview, write_preview_of
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.recording import format_info, info, open_rgbd, preview, write_preview_of
 from tests.recording.logs import CAMERA, COLOR, DEPTH, write_camera, write_recording, write_updates
 
 

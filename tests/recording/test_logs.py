@@ -10,16 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
-from pipeline import messages as m
-from pipeline.errors import DuagError
-from pipeline.recording import (
-    LogWriter,
-    content_digest,
-    log_metadata,
-    merge,
-    read_log,
-)
-from schemas import topics
+from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.recording import LogWriter, content_digest, log_metadata, merge, read_log
+from duagc.schemas import topics
 from tests.recording.logs import update, write_camera, write_updates
 
 
@@ -137,7 +131,7 @@ def test_digest_does_not_depend_on_the_encoder(tmp_path: Path) -> None:
 def test_digest_is_the_same_in_every_process(tmp_path: Path) -> None:
     write_camera(tmp_path / "alpha.mcap")
     code = (
-        "import sys; from pathlib import Path; from pipeline.recording import content_digest;"
+        "import sys; from pathlib import Path; from duagc.pipeline.recording import content_digest;"
         "print(content_digest(Path(sys.argv[1])))"
     )
     out = subprocess.run(

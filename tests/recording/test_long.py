@@ -11,17 +11,18 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer
 
-from pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.camera import PinholeCamera
 from tests.converters.test_ros import START_NS, STEP_NS, Ros
 
 CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 319.5, 239.5)
 SHORT, LONG = 15, 150
 GROWTH_MB = 30  # the longer bag is 130 MB longer
 STEPS = {
-    "convert": "import converters; converters.convert('ros', Path({bag!r}), Path({rec!r}))",
-    "info": "from pipeline.recording import info; info(Path({rec!r}))",
-    "check": "from pipeline.checks import check; assert check(Path({rec!r})).sound",
-    "recover": "from pipeline.recovery import recover; recover(Path({rec!r}), Path({rec!r} + '-saved'))",
+    "convert": "from duagc.converters.registry import convert; convert('ros', Path({bag!r}), Path({rec!r}))",
+    "info": "from duagc.pipeline.recording import info; info(Path({rec!r}))",
+    "check": "from duagc.pipeline.checks.check import check; assert check(Path({rec!r})).sound",
+    "recover": "from duagc.pipeline.recording.recovery import recover; "
+    "recover(Path({rec!r}), Path({rec!r} + '-saved'))",
 }
 
 
@@ -53,7 +54,8 @@ def write_bag(path: Path, frames: int) -> None:
 
 def peak_mb(code: str) -> float:
     """Largest memory of a process that runs some code."""
-    before = "import resource; from pathlib import Path; from pipeline import numeric; numeric.settle(); "
+    before = "import resource; from pathlib import Path; "
+    before += "from duagc.pipeline.base import determinism; determinism.settle(); "
     after = "; print('PEAK', resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
     root = Path(__file__).parents[2]
     arguments = [sys.executable, "-c", before + code + after]

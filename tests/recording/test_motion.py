@@ -5,13 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import messages as m
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
-from pipeline.recording import (
-    LogWriter,
-    open_rgbd,
-)
+from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.recording import LogWriter, open_rgbd
 from tests.recording.logs import copy_camera, write_camera
 
 

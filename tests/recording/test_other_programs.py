@@ -4,14 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import DuagError
-from pipeline.recording import (
-    Recording,
-    content_digest,
-    info,
-    open_rgbd,
-    read_log,
-)
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.recording import Recording, content_digest, info, open_rgbd, read_log
 from tests.recording.logs import CALIBRATION, COLOR, DEPTH, LOGS, write_recording, write_updates
 
 

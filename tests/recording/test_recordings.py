@@ -7,16 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from converters.base import RecordingWriter, RobotWriter, robot_names
-from pipeline import messages as m
-from pipeline.errors import DuagError
-from pipeline.geometry import se3
-from pipeline.recording import (
-    Recording,
-    log_metadata,
-    open_rgbd,
-    read_log,
-)
+from duagc.converters.writer import RecordingWriter, RobotWriter, robot_names
+from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.recording import Recording, log_metadata, open_rgbd, read_log
 from tests.recording.logs import CAMERA, depth, image, png, write_recording, write_robot
 
 

@@ -12,13 +12,13 @@ import pytest
 from mcap.writer import CompressionType, Writer
 from typer.testing import CliRunner
 
-from converters.base import RecordingWriter
-from pipeline import checks, recovery
-from pipeline import messages as m
-from pipeline.cli import app
-from pipeline.errors import DuagError
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import LogWriter, Record, Recording, content_digest, read_log
+from duagc.converters.writer import RecordingWriter
+from duagc.pipeline import messages as m
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.checks import check
+from duagc.pipeline.cli import app
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import LogWriter, Record, Recording, content_digest, read_log, recovery
 from tests.recording.logs import COLOR, FRAME_NS, png, update
 
 BLOBS = 12
@@ -176,7 +176,7 @@ def test_a_recording_is_recovered_as_a_whole(tmp_path: Path) -> None:
     assert saved.robots == ["alpha", "bravo"]
     assert 0 < saved.description["robots"]["alpha"]["frames"] < 9
     assert saved.description["robots"]["bravo"] == Recording(rec).description["robots"]["bravo"]
-    assert not [f for f in checks.check(saved.path).findings if f.check in ("log", "digest")]
+    assert not [f for f in check.check(saved.path).findings if f.check in ("log", "digest")]
     assert any("recovered: alpha.mcap" in text for text in saved.description["warnings"])
     assert (rec / "alpha.mcap").stat().st_size == int(0.55 * len(data))
     with pytest.raises(DuagError, match="exists already"):

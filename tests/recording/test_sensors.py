@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from converters.base import RecordingWriter, RobotWriter
-from pipeline.errors import DuagError
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.recording import Recording, open_rgbd
-from pipeline.recording.lidar import lidar_depth
+from duagc.converters.writer import RecordingWriter, RobotWriter
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import Recording, open_rgbd
+from duagc.pipeline.recording.lidar import lidar_depth
 from tests.converters.stereo_room import path, render, sweep
 
 CAMERA = PinholeCamera(240, 180, 200.0, 201.0, 119.2, 89.7)

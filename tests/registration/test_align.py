@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.geometry import se3
-from pipeline.registration import (
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import (
     Outcome,
     Reference,
     ReferenceLevel,

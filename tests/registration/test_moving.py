@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.geometry import se3
-from pipeline.registration.moving import FreeSpace, MovingConfig
+from duagc.pipeline.config.registration import MovingConfig
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration.moving import FreeSpace
 from tests.registration.room import CAMERA, pose, render
 
 CONFIG = MovingConfig(halvings=1, grow_px=2)

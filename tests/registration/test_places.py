@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.registration.places import Places
+from duagc.pipeline.registration.place_recognition import Places
 
 
 @pytest.fixture(scope="module")

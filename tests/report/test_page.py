@@ -5,10 +5,10 @@ from html import unescape
 import numpy as np
 import pytest
 
-from pipeline.errors import DuagError
-from pipeline.evaluation import evaluate
-from pipeline.report import figures, pictures, words, write_report
-from pipeline.report.renders import sigma_colors
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.evaluation import evaluate
+from duagc.pipeline.report import figures, labels, pictures, write_report
+from duagc.pipeline.report.renders import sigma_colors
 from tests.evaluation.fake_run import make
 
 
@@ -61,13 +61,13 @@ def test_the_page_shows_numbers_with_units_pictures_and_reasons(html):
 
 def test_maps_stand_beside_each_other_for_all_and_for_each_robot(fake, html):
     metrics = json.loads((fake.run / "metrics.json").read_text())
-    rows = words.comparison_rows(metrics)
+    rows = labels.comparison_rows(metrics)
     assert [r["robot"] for r in rows if r["first"]] == ["all robots", "alpha", "bravo"]
     assert len(rows) == 3 * 3
     assert all(len(r["values"]) == 3 * 4 for r in rows)
     assert "Which map is better?" in html
     assert "own, trained longer" not in html  # it was not asked for
-    lines = words.comparison_text(metrics).splitlines()
+    lines = labels.comparison_text(metrics).splitlines()
     bravo = metrics["robots"]["bravo"]["rendering"]["own"]
     own = next(line for line in lines if line.startswith("bravo")).split()
     assert own[:2] == ["bravo", "own"]
@@ -122,7 +122,7 @@ def test_a_run_that_was_not_evaluated_is_an_error(tmp_path):
     ],
 )
 def test_values_are_written_with_their_unit(name, value, text):
-    assert words.text(name, value) == text
+    assert labels.text(name, value) == text
 
 
 def test_figures_stay_the_same_and_leave_the_settings_alone():

@@ -6,8 +6,8 @@ import pytest
 from google.protobuf import descriptor_pb2
 from google.protobuf.descriptor import FieldDescriptor
 
-import schemas
-from schemas import build, topics
+from duagc import schemas
+from duagc.schemas import build, topics
 
 ELEMENT_TYPES = (
     "_int32",
@@ -97,7 +97,7 @@ def test_unknown_schemas_are_key_errors(schema: str) -> None:
 
 
 def test_the_documentation_has_every_topic() -> None:
-    text = (build.FOLDER.parent / "docs" / "formats.md").read_text()
+    text = (build.FOLDER.resolve().parent / "docs" / "formats.md").read_text()
     for row in topics.TOPICS:
         assert f"| `{row.pattern}` | `{row.schema}` | {row.producer} | {row.scope.value} |" in text, (
             row.pattern

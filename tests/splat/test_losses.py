@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from pipeline.splat.losses import (
-    LossConfig,
+from duagc.pipeline.config.training import LossConfig
+from duagc.pipeline.splat.losses import (
     depth_certainty,
     depth_error,
     halve,

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.kernels import CompiledAdam, Gradients, available_isas
-from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.optimiser import BETA_1, BETA_2, Adam, LearningRates, falling
+from duagc.pipeline.config.training import LearningRates
+from duagc.pipeline.kernels import CompiledAdam, Gradients, available_isas
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.optimizer import BETA_1, BETA_2, Adam, falling
 
 NAMES = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import DuagError
-from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.ply import PROPERTIES, SH_DEGREE_0, read_ply, write_ply
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.ply import PROPERTIES, SH_DEGREE_0, read_ply, write_ply
 
 
 def some(n: int = 7, seed: int = 0) -> Gaussians:

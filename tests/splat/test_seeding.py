@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.geometry import se3, so3
-from pipeline.geometry.camera import PinholeCamera
-from pipeline.kernels import Rasterizer, Render
-from pipeline.splat.gaussians import Gaussians
-from pipeline.splat.seeding import THICKNESS_FLOOR_M, SeedingConfig, seed_discs, unexplained
+from duagc.pipeline.config.mapping import THICKNESS_FLOOR_M, SeedingConfig
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import Rasterizer, Render
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.seeding import seed_discs, unexplained
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 T_MAP_CAMERA = se3.exp(np.array([0.3, -0.2, 0.5, 0.2, -0.4, 0.1]))

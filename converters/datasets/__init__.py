@@ -1,0 +1,1 @@
+"""One module per dataset; convert.py names them."""

@@ -1,0 +1,29 @@
+"""AriaMultiagent (MAGiC-SLAM): clips of Aria Digital Twin, three robots in one apartment, rendered depth.
+
+SRC is a room, for example `AriaMultiagent/room0`, with folders `agent_0`, `agent_1`, `agent_2`. Colour is real, with a
+rolling shutter; depth is rendered from the scene's model, without moving things, and beyond 10 m its 16 bits have
+wrapped round. The clips were not taken at the same time.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from duagc.converters.layouts import replica_layout
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+CAMERA = PinholeCamera(512, 512, 280.0, 280.0, 255.5, 255.5)
+DEPTH_SCALE = 10 / 65535
+PART = re.compile(r"agent_(\d+)")
+SENSORS = {"color": "rolling shutter", "depth": "rendered ground truth"}
+WARNINGS: tuple[str, ...] = ("the robots were not recorded at the same time",)
+Options = replica_layout.TeamOptions
+
+
+def convert(src: Path, out: Path, robots: int = 3, force: bool = False, **options: Any) -> None:
+    """Convert a scene, one robot for each folder; see `replica_layout.convert_team`."""
+    replica_layout.convert_team(
+        "aria-multiagent", src, out, robots, force, options, PART, CAMERA, DEPTH_SCALE, SENSORS, WARNINGS
+    )

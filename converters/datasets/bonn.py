@@ -1,0 +1,71 @@
+"""Bonn RGB-D Dynamic: rooms with moving people and things, in the layout of TUM RGB-D.
+
+SRC is a sequence, for example `rgbd_bonn_balloon`. `groundtruth.txt` is of the marker body, not of the camera:
+
+    T_world_camera = T_ros^-1 T_marker T_ros T_m
+
+with the published T_m, whose 3x3 block is a rotation times 1.059; its rotation is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from duagc.converters.layouts import image_folder, tum_layout
+from duagc.converters.layouts.image_files import options_of
+from duagc.converters.layouts.image_folder import Clip
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+DEPTH_SCALE = 1 / 5000
+CAMERA = PinholeCamera(640, 480, 542.822841, 542.576870, 315.593520, 237.756098)
+DISTORTION = (0.039903, -0.099343, -0.000730, -0.000144, 0.0)
+T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+_M = np.array(
+    [
+        [1.0157, 0.1828, -0.2389, 0.0113],
+        [0.0009, -0.8431, -0.6413, -0.0098],
+        [-0.3009, 0.6147, -0.8085, 0.0111],
+    ]
+)
+T_MARKER_CAMERA = se3.from_rotation_translation(so3.project(_M[:, :3]), _M[:, 3])
+
+
+class Options(tum_layout.AssociationOptions):
+    """Lens and association."""
+
+    undistort: bool = True
+    """Take the lens distortion out of colour and depth together."""
+
+
+def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:
+    """Convert a sequence, cut into `robots` contiguous parts.
+
+    Raises:
+        DuagError: names the file, what was found and what was expected.
+    """
+    settings = options_of(Options, options, "bonn")
+    frames, _, warnings = tum_layout.frames_of(src, settings)
+    frames = [
+        f if f.T_world_camera is None else replace(f, T_world_camera=camera_pose(f.T_world_camera))
+        for f in frames
+    ]
+    clip = Clip(
+        "",
+        frames,
+        CAMERA,
+        DEPTH_SCALE,
+        distortion=DISTORTION if settings.undistort else (),
+        sensors={"moving_objects": "in colour and depth; no masks"},
+    )
+    parameters = {"robots": robots, **settings.model_dump()}
+    image_folder.write(out, "bonn", src, clip.cut(robots, src), parameters, warnings, force)
+
+
+def camera_pose(T_marker: np.ndarray) -> np.ndarray:
+    """T_world_camera [4, 4] of a line of groundtruth.txt."""
+    return se3.inverse(T_ROS) @ T_marker @ T_ROS @ T_MARKER_CAMERA

@@ -1,0 +1,51 @@
+"""Replica as rendered for iMAP and NICE-SLAM: one camera in one of eight rooms, exact depth and poses.
+
+SRC is a scene, for example `Replica/room0`; `cam_params.json` lies beside it. The original Replica release has no
+`traj.txt` and is another dataset; Replica-V2 (vMAP) has another layout.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from duagc.converters.layouts import image_folder, replica_layout
+from duagc.converters.layouts.image_files import options_of
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import read_text
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+
+class Options(replica_layout.LayoutOptions):
+    """Time; camera and depth scale are those of cam_params.json."""
+
+
+def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:
+    """Convert a scene, cut into `robots` contiguous parts.
+
+    Raises:
+        DuagError: names the file, what was found and what was expected.
+    """
+    settings = options_of(Options, options, "replica")
+    camera, depth_scale = _read_camera(src)
+    clip, warnings = replica_layout.read_part(src, "", camera, depth_scale, settings)
+    parameters = {"robots": robots, **settings.model_dump()}
+    image_folder.write(out, "replica", src, clip.cut(robots, src), parameters, warnings, force)
+
+
+def _read_camera(src: Path) -> tuple[PinholeCamera, float]:
+    """Camera and metres per unit of depth, from cam_params.json in the scene or beside it."""
+    path = next((f / "cam_params.json" for f in (src, src.parent) if (f / "cam_params.json").is_file()), None)
+    if path is None:
+        raise DuagError(f"{src.parent / 'cam_params.json'}: not found, expected the camera of the renders")
+    try:
+        c = json.loads(read_text(path, "the camera of the renders"))["camera"]
+        camera = PinholeCamera(
+            int(c["w"]), int(c["h"]), *(float(c[name]) for name in ("fx", "fy", "cx", "cy"))
+        )
+        return camera, 1.0 / float(c["scale"])
+    except (ValueError, TypeError, KeyError, ArithmeticError) as error:
+        raise DuagError(
+            f"{path}: {type(error).__name__} {error}, expected camera with w, h, fx, fy, cx, cy, scale"
+        ) from error

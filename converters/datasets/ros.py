@@ -1,0 +1,241 @@
+"""Logs of ROS 1, ROS 2 and Foxglove: colour and depth of RGB-D cameras, chosen by type and name of their topics.
+
+SRC is a `.bag`, a `.db3`, an `.mcap` or a folder of `ros2 bag`; a folder with one of these per robot, or with a folder
+of them per robot; or a TOML file that says which logs and topics each robot has (`duagc info LOG --toml`). Images are
+paired by the stamps of their headers. Colour is undistorted, and depth that another camera saw is registered to it,
+with extrinsics from the log's constant transforms or given ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.converters.layouts.ros_images import (
+    color_bytes,
+    depth_values,
+    encoded_size,
+    in_metres,
+    is_cut_short,
+)
+from duagc.converters.layouts.self_check import GAP, MAX_RATIO, ReprojectionCheck
+from duagc.converters.logs import open_log
+from duagc.converters.logs.clocks import LEAST_OFFSET_S, angular_speed, compare, lag, overlap_warnings
+from duagc.converters.logs.derived import Picture, Sweeps
+from duagc.converters.logs.options import LogOptions
+from duagc.converters.logs.robot_log import RobotLog
+from duagc.converters.logs.sources import sources_of
+from duagc.converters.writer import NANOSECONDS, RecordingWriter, RobotWriter
+from duagc.pipeline.base import determinism
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import decode_image
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording.register_depth import register_depth
+
+Options = LogOptions
+FARTHEST = np.iinfo(np.uint16).max  # in units of depth
+
+
+def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **options: Any) -> None:
+    """Convert logs, one robot per log, per folder of logs, or per namespace.
+
+    Args:
+        robots: how many there must be; 0: as many as are found.
+    Raises:
+        DuagError: names log and topic, what was found and what was expected.
+    """
+    determinism.settle_opencv()
+    sources = sources_of(src, options)
+    if robots and robots != len(sources):
+        raise DuagError(f"{src}: found {len(sources)} robots, expected --robots {len(sources)}")
+    said = {s.robot: s.settings.model_dump() for s in sources}
+    for row in said.values():
+        row["truth_file"] = Path(row["truth_file"]).name  # no paths of this machine
+    parameters = {"robots": said}
+    source = {"dataset": "ros", "folder": src.resolve().name, "parts": [s.label for s in sources]}
+    with RecordingWriter(out, "", source, "ros", parameters, force) as recording, ExitStack() as opened:
+        robot_logs = {}
+        for part in sources:
+            log = opened.enter_context(open_log(part.paths, part.name))
+            robot_logs[part.robot] = RobotLog(log, part.namespace, part.settings)
+        settle_clocks(recording, robot_logs)
+        for part in sources:
+            write_robot(recording, part.robot, robot_logs[part.robot], part.label)
+
+
+def settle_clocks(recording: RecordingWriter, robot_logs: Mapping[str, RobotLog]) -> None:
+    """Say how the robots' clocks differ, and shift their times as the options ask."""
+    for robot_log in robot_logs.values():
+        robot_log.settle_drift()
+    clocks = [robot_log.clock(robot) for robot, robot_log in robot_logs.items()]
+    offsets = compare(clocks)
+    for robot, robot_log in robot_logs.items():
+        kind, offset = robot_log.settings.clocks, offsets[robot]
+        if kind == "from_zero":
+            robot_log.shift_ns -= min(robot_log.pairs)
+        elif kind == "estimated" and offset.seconds is not None and offset.matters:
+            robot_log.shift_ns += round(offset.seconds * NANOSECONDS)
+        elif kind == "estimated" and offset.seconds is None:
+            robot_log.warnings.append(f"its clock is kept: {offset.how}")
+    if len(robot_logs) > 1:
+        recording.clocks = {
+            robot: {**offsets[robot].row(), "added_s": robot_log.shift_ns / NANOSECONDS}
+            for robot, robot_log in robot_logs.items()
+        }
+        recording.warnings += overlap_warnings(clocks)
+
+
+def write_robot(
+    recording: RecordingWriter,
+    name: str,
+    source: RobotLog,
+    label: str,
+    max_ratio: float = MAX_RATIO,
+    gap: int = GAP,
+) -> None:
+    """Write all frames of a robot, what the self-check measured, and warnings.
+
+    Args:
+        label: which part of the source it was. max_ratio, gap: see `ReprojectionCheck`.
+    """
+    sensors = {"part": label, **source.sensors()}
+    with recording.robot(name, source.camera, source.depth_scale, sensors) as robot:
+        recording.checks[name] = _write_frames(robot, source, max_ratio, gap)
+    recording.warnings += [f"{name}: {text}" for text in source.warnings]
+
+
+def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: int) -> dict[str, Any]:
+    settings, log, pairs, derived = source.settings, source.name, source.pairs, source.derived
+    readings, rows = _Readings(robot, source), source.check_rows()
+    if isinstance(derived, Sweeps):
+        robot.set_lidar(derived.lidar.T_camera_lidar, derived.lidar.range_sigma_m)
+    check = ReprojectionCheck(source.camera, len(pairs), gap)
+    without = empty = far = cut = 0
+    progress = track(source.frames(), f"convert {robot.name}", len(pairs))
+    for index, (stamp_ns, color, depth) in enumerate(progress):
+        if is_cut_short(color) or is_cut_short(depth):
+            cut += 1
+            continue
+        if derived:
+            picture = derived.picture(color, depth, stamp_ns, pairs[stamp_ns])
+        else:
+            picture, beyond = _measured(source, stamp_ns, color, depth)
+            far += beyond
+        T = source.truth.at(stamp_ns, settings.max_pose_gap_s) if source.truth else None
+        T = None if T is None else T @ source.T_color_camera
+        without += T is None
+        readings.write_until(stamp_ns)
+        at_ns, encoded = source.written_ns(stamp_ns), (picture.color, picture.color_format)
+        if picture.points_lidar is not None:
+            robot.add_points(at_ns, picture.points_lidar)
+        robot.add_frame(at_ns, *encoded, picture.depth, T, depth_sigma_m=picture.depth_sigma_m)
+        if check.needs(index, T):
+            check.add(index, source.depth_m(picture), T)
+        empty += 0 if picture.depth is None else picture.depth.size - int(np.count_nonzero(picture.depth))
+    if cut:
+        source.warnings.append(f"{cut} frames have colour or depth that is cut short; left out")
+    if far:
+        limit = FARTHEST * source.depth_scale
+        source.warnings.append(
+            f"{far} pixels are farther away than {limit:.1f} m, which depth can hold; left out"
+        )
+    readings.write_until(np.iinfo(np.int64).max)
+    if source.truth is not None and without:
+        source.warnings.append(f"{without} of {len(pairs)} frames have no true pose")
+    if not isinstance(derived, Sweeps):
+        rows["without_depth"] = empty / max(
+            1, (len(pairs) - cut) * source.camera.width * source.camera.height
+        )
+    drift = {} if source.drift is None else {"clock_drift_ppm": 1e6 * source.drift.rate}
+    return {**rows, **check.result(log, max_ratio), **_truth_lag(source), **drift}
+
+
+def _measured(source: RobotLog, stamp_ns: int, color: Any, depth: Any) -> tuple[Picture, int]:
+    """The frame of a depth image, and how many pixels are too far away for the log."""
+    import cv2
+
+    log, maps = source.name, source.color_maps
+    where = f"{log}: {source.color} at {stamp_ns} ns"
+    data, color_format = color_bytes(color, where)
+    _check_size(where, encoded_size(data) or (0, 0), source.camera)
+    if maps is not None:
+        image = decode_image(data, cv2.IMREAD_COLOR)
+        if image is None:
+            raise DuagError(f"{where}: no decoder reads it, expected a colour image")
+        data = cv2.imencode(".png", cv2.remap(image, *maps, cv2.INTER_LINEAR))[1].tobytes()
+        color_format = "png"
+    where = f"{log}: {source.depth} at {stamp_ns} ns"
+    values: NDArray[Any] = depth_values(depth, where)
+    _check_size(where, (values.shape[1], values.shape[0]), source.depth_camera.camera)
+    if source.depth_maps is not None:
+        values = cv2.remap(values, *source.depth_maps, cv2.INTER_NEAREST)
+    if source.keeps_depth and values.dtype == np.uint16:
+        return Picture(data, color_format, np.asarray(values, dtype=np.uint16)), 0
+    metres = in_metres(values, source.settings.depth_scale)
+    if source.T_color_depth is not None:
+        metres = register_depth(metres, source.depth_camera.camera, source.T_color_depth, source.camera)
+    units = np.rint(metres / source.depth_scale)
+    raw = np.where(units <= FARTHEST, units, 0).astype(np.uint16)
+    return Picture(data, color_format, raw), int((units > FARTHEST).sum())
+
+
+def _check_size(where: str, found: tuple[int, int], camera: PinholeCamera) -> None:
+    if found != (camera.width, camera.height):
+        raise DuagError(
+            f"{where} is {found[0]}x{found[1]}, expected {camera.width}x{camera.height} as in its CameraInfo"
+        )
+
+
+def _truth_lag(source: RobotLog) -> dict[str, float]:
+    """How much later the true poses turn than what the robot itself measured; nothing where that cannot be told."""
+    if source.truth is None or (source.imu is None and source.odometry is None):
+        return {}
+    true = angular_speed(source.truth.body.stamps_ns, source.truth.body.T_world_body)
+    if source.imu is not None:
+        own = source.imu.stamps_ns, np.linalg.norm(source.imu.values[:, :3], axis=1)
+    elif source.odometry is not None:
+        own = angular_speed(source.odometry.body.stamps_ns, source.odometry.body.T_world_body)
+    found = lag(*own, *true)
+    if found is None:
+        return {}
+    if abs(found[0]) > LEAST_OFFSET_S:
+        source.warnings.append(
+            f"true poses are {found[0]:.3f} s late by the robot's own clock (they turn so much later)"
+        )
+    return {"truth_lag_s": found[0], "truth_lag_correlation": found[1]}
+
+
+class _Readings:
+    """Writes IMU and odometry in order of time, between the frames."""
+
+    def __init__(self, robot: RobotWriter, source: RobotLog) -> None:
+        self._robot, self._imu, self._odometry = robot, source.imu, source.odometry
+        imu = self._imu.stamps_ns if self._imu else np.zeros(0, np.int64)
+        odometry = self._odometry.body.stamps_ns if self._odometry else np.zeros(0, np.int64)
+        self._stamps = np.concatenate([imu, odometry])
+        self._order = np.argsort(self._stamps, kind="stable")
+        self._imu_count, self._source = len(imu), source
+        self._next = int((self._stamps < -source.shift_ns).sum())
+        self._T_color_camera = source.T_color_camera
+        if self._imu:
+            robot.set_imu(se3.inverse(self._T_color_camera) @ self._imu.T_color_imu)
+
+    def write_until(self, stamp_ns: int) -> None:
+        """Write what was measured before a time; what comes before time 0 of the recording is left out."""
+        while self._next < len(self._order) and self._stamps[k := self._order[self._next]] < stamp_ns:
+            stamp = self._source.written_ns(int(self._stamps[k]))
+            if k < self._imu_count and self._imu:
+                values = self._imu.values[k]
+                self._robot.add_imu(stamp, values[:3], values[3:])
+            elif self._odometry:
+                T_odometry_body = self._odometry.body.T_world_body[k - self._imu_count]
+                T_odometry_color = T_odometry_body @ self._odometry.T_body_color
+                self._robot.add_odometry(stamp, T_odometry_color @ self._T_color_camera)
+            self._next += 1

@@ -1,0 +1,388 @@
+"""S3E v1: three ground vehicles with stereo cameras and a LiDAR, all of a sequence in one bag of ROS 2.
+
+SRC is the folder of a sequence: a `.db3` of all robots, `metadata.yaml`, `<robot>_gt.txt`, and beside it
+`Calibration/<robot>.yaml`. The bags of v2 hold no camera and are refused. The calibration files are not what they look
+like: `RIGHT.R` is the rotation from the left to the right camera and the last column of `RIGHT.P` its translation in
+millimetres, no rectification; the cameras are rectified here, and that is tested on the images.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from duagc.converters.layouts.derived_depth import (
+    MAX_RATIO_ERROR,
+    RATIO_FRAMES,
+    ROW_PAIRS,
+    STEREO_SCALE_M,
+    ImuFeed,
+    Lidar,
+    ScaleCheck,
+    StereoFrames,
+    decoded,
+    gyro,
+    imu_readings,
+    png,
+    spread,
+)
+from duagc.converters.layouts.image_files import options_of
+from duagc.converters.layouts.stereo import RawCamera, StereoOptions, StereoRig
+from duagc.converters.layouts.tum_layout import nanoseconds
+from duagc.converters.logs import open_log
+from duagc.converters.logs.entries import Entry
+from duagc.converters.logs.files import Log
+from duagc.converters.logs.gather import gathered, nearest
+from duagc.converters.writer import NANOSECONDS, RecordingWriter, RobotWriter, robot_names
+from duagc.pipeline.base import determinism
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import read_text
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.geometry import se3, so3
+
+Array = NDArray[np.float64]
+LEFT, RIGHT = "left_camera/compressed", "right_camera/compressed"
+POINTS, IMU = "velodyne_points", "imu/data"
+EYES_NS = 10_000_000  # left and right farther apart in time are no pair; they differ by 2 ms
+SWEEP_NS = 55_000_000  # half a turn of the LiDAR
+FIX_NS = 55_000_000  # a fix is given to the image next to it, one of ten per second
+FIX_GAP_NS = 1_500_000_000  # fixes farther apart are not interpolated
+MOST_NUMBERS = 16  # in a matrix of the calibration
+NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+
+
+class Options(StereoOptions):
+    """Where depth comes from, and how the stereo pair is matched."""
+
+    depth: Literal["stereo", "lidar"] = "stereo"
+    """Depth of the stereo pair, or sweeps of the LiDAR."""
+    calibration: str = ""
+    """Folder of the calibration files; empty: Calibration beside the sequence."""
+    shrink: int = Field(default=2, ge=1, le=8)
+    """Side of the blocks of rectified pixels that become one: 2 makes 612x512 of 1224x1024."""
+    min_depth_m: float = Field(default=1.5, gt=0)
+    """Nearest depth that the stereo pair looks for."""
+    range_sigma_m: float = Field(default=0.03, gt=0)
+    """Standard deviation of the LiDAR's ranges (VLP-16)."""
+
+
+def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **options: Any) -> None:
+    """Convert a sequence, one robot for each vehicle in the bag.
+
+    Args:
+        robots: how many there must be; 0: as many as are found.
+    Raises:
+        DuagError: names file and topic, what was found and what was expected.
+    """
+    determinism.settle_opencv()
+    settings = options_of(Options, options, "s3e")
+    bag = _bag(src)
+    with open_log([bag]) as log:
+        vehicles = _vehicles(log)
+        if robots and robots != len(vehicles):
+            raise DuagError(f"{bag}: found {len(vehicles)} robots, expected --robots {robots}")
+        folder = Path(settings.calibration) if settings.calibration else src.resolve().parent / "Calibration"
+        calibrations = {v: Calibration.read(folder / f"{v.lower()}.yaml") for v in vehicles}
+        fixes = {v: read_fixes(src / f"{v.lower()}_gt.txt") for v in vehicles}
+        known = [f.positions[0] for f in fixes.values() if f is not None]
+        origin = np.floor(known[0]) if known else np.zeros(3)
+        parameters = {**settings.model_dump(), "calibration": folder.name, "origin_m": origin.tolist()}
+        source = {"dataset": "s3e", "sequence": src.resolve().name, "vehicles": vehicles}
+        with RecordingWriter(out, "", source, "s3e", parameters, force) as recording:
+            for name, vehicle in zip(robot_names(len(vehicles)), vehicles, strict=True):
+                one = _Vehicle(log, vehicle, calibrations[vehicle], fixes[vehicle], origin, settings)
+                with recording.robot(name, one.rig.camera, STEREO_SCALE_M, one.sensors()) as robot:
+                    recording.checks[name] = one.write(robot)
+                recording.warnings += [f"{name} ({vehicle}): {text}" for text in one.warnings]
+
+
+def _bag(src: Path) -> Path:
+    """The bag of a sequence: its only .db3."""
+    if not src.is_dir():
+        raise DuagError(f"{src}: no such folder, expected the folder of a sequence with a .db3 in it")
+    found = sorted(src.glob("*.db3"))
+    if len(found) != 1:
+        names = ", ".join(path.name for path in found) or "none"
+        raise DuagError(f"{src}: .db3 files: {names}; expected one with all robots of the sequence")
+    return found[0]
+
+
+def _vehicles(log: Log) -> list[str]:
+    """Names of the vehicles with cameras.
+
+    Raises:
+        DuagError: no vehicle has cameras: S3E v2, or another bag.
+    """
+    names = {
+        topic.name.split("/")[1] for topic in log.topics.values() if topic.count and topic.name.count("/") > 1
+    }
+    seeing = sorted(v for v in names if all(_count(log, f"/{v}/{t}") for t in (LEFT, RIGHT)))
+    if seeing:
+        return seeing
+    others = ", ".join(sorted(t.name for t in log.topics.values() if t.count)) or "no topic"
+    if any(_count(log, f"/{v}/{POINTS}") for v in names):
+        raise DuagError(
+            f"{log.name}: no camera in this bag (found {others}); S3E v2 has none, and a map is made of images: "
+            "expected a sequence of S3E v1. Its LiDAR, IMU and GNSS serve other programs (LiDAR odometry)"
+        )
+    raise DuagError(f"{log.name}: found {others}, expected /<robot>/{LEFT} and /<robot>/{RIGHT} of S3E v1")
+
+
+def _count(log: Log, topic: str) -> int:
+    return log.topics[topic].count if topic in log.topics else 0
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The cameras of one vehicle, T_right_left, and where LiDAR and IMU are in the left camera, [4, 4] each."""
+
+    left: RawCamera
+    right: RawCamera
+    T_right_left: Array
+    T_left_lidar: Array
+    T_left_imu: Array
+    where: str
+
+    @staticmethod
+    def read(path: Path) -> Calibration:
+        """From the file of a vehicle, in the notation of OpenCV.
+
+        Raises:
+            DuagError: a part is missing or no calibration, for example a translation that is not in millimetres.
+        """
+        import cv2
+
+        text = read_text(path, "the calibration of a vehicle")
+        try:
+            store = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        except (cv2.error, SystemError) as error:
+            raise DuagError(
+                f"{path}: is no YAML of OpenCV, expected %YAML:1.0 with !!opencv-matrix"
+            ) from error
+
+        def numbers(name: str) -> Array | None:
+            node = store.getNode(name)
+            try:
+                size = node.getNode("rows").real() * node.getNode("cols").real() if node.isMap() else 0
+                return np.asarray(node.mat(), dtype=np.float64) if 0 < size <= MOST_NUMBERS else None
+            except (cv2.error, SystemError, TypeError, ValueError) as error:
+                raise DuagError(f"{path}: {name} is no !!opencv-matrix, expected one") from error
+
+        def matrix(name: str, *shape: int) -> Array:
+            found = numbers(name)
+            if found is None or found.size != np.prod(shape) or not np.isfinite(found).all():
+                size = "nothing" if found is None else f"{found.shape}"
+                raise DuagError(f"{path}: {name} is {size}, expected a matrix of {shape}")
+            return np.asarray(found, dtype=np.float64).reshape(shape)
+
+        def camera(side: str) -> RawCamera:
+            width, height = (int(store.getNode(f"{side}.{name}").real()) for name in ("width", "height"))
+            distortion = numbers(f"{side}.D")
+            if width <= 0 or height <= 0 or distortion is None or distortion.size not in (4, 5, 8):
+                raise DuagError(f"{path}: {side}.width, height or D is missing, expected those of a camera")
+            return RawCamera(matrix(f"{side}.K", 3, 3), tuple(distortion.ravel().tolist()), width, height)
+
+        def motion(name: str) -> Array:
+            T = matrix(name, 4, 4)
+            return se3.from_rotation_translation(so3.project(T[:3, :3]), T[:3, 3])
+
+        baseline_mm = matrix("RIGHT.P", 3, 4)[:, 3]
+        if not 50 < np.linalg.norm(baseline_mm) < 5000:
+            raise DuagError(
+                f"{path}: last column of RIGHT.P is {baseline_mm.tolist()}, expected the translation to the right "
+                "camera in millimetres"
+            )
+        T_right_left = se3.from_rotation_translation(so3.project(matrix("RIGHT.R", 3, 3)), baseline_mm / 1000)
+        return Calibration(
+            camera("LEFT"),
+            camera("RIGHT"),
+            T_right_left,
+            se3.inverse(motion("Tlc")),  # the files give p_lidar = Tlc p_left
+            se3.inverse(motion("Tic")),
+            str(path),
+        )
+
+
+@dataclass(frozen=True)
+class Fixes:
+    """Satellite positions: times, increasing, ns; positions [n, 3], m (UTM, altitude)."""
+
+    stamps_ns: list[int]
+    positions: Array
+
+    def near(self, images_ns: list[int]) -> dict[int, Array]:
+        """Position at the image next to each fix, moved along the path to the time of the image."""
+        found = {}
+        stamps = np.array(self.stamps_ns)
+        for image_ns in nearest(self.stamps_ns, images_ns, FIX_NS).values():
+            k = int(np.searchsorted(stamps, image_ns))
+            if stamps[min(k, len(stamps) - 1)] == image_ns:
+                found[image_ns] = self.positions[k]
+            elif 0 < k < len(stamps) and stamps[k] - stamps[k - 1] <= FIX_GAP_NS:
+                share = (image_ns - stamps[k - 1]) / (stamps[k] - stamps[k - 1])
+                found[image_ns] = (1 - share) * self.positions[k - 1] + share * self.positions[k]
+        return found
+
+
+def read_fixes(path: Path) -> Fixes | None:
+    """Fixes of a `<robot>_gt.txt`; None if there is no such file, or only two indoor poses without times.
+
+    Raises:
+        DuagError: a line is not `t x y z qx qy qz qw`; numbers may lack the blank before a minus sign.
+    """
+    if not path.is_file():
+        return None
+    rows: dict[int, list[float]] = {}
+    for number, line in enumerate(read_text(path, "lines t x y z qx qy qz qw").splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        words = NUMBER.findall(line)
+        if len(words) != 8 or NUMBER.sub("", line).strip():
+            raise DuagError(
+                f"{path}:{number}: {line.strip()[:60]!r}, expected eight numbers t x y z qx qy qz qw"
+            )
+        place = [float(word) for word in words[1:4]]
+        if not np.isfinite(place).all():
+            raise DuagError(f"{path}:{number}: {line.strip()[:60]!r}, expected metres")
+        rows.setdefault(nanoseconds(words[0], f"{path}:{number}"), place)
+    if len(rows) < 3 and all(stamp < 10 * NANOSECONDS for stamp in rows):
+        return None
+    stamps = sorted(rows)
+    return Fixes(stamps, np.array([rows[stamp] for stamp in stamps]))
+
+
+class _Vehicle:
+    """One vehicle of the bag and its part of the recording."""
+
+    def __init__(
+        self,
+        log: Log,
+        vehicle: str,
+        calibration: Calibration,
+        fixes: Fixes | None,
+        origin: Array,
+        settings: Options,
+    ) -> None:
+        self.log, self.settings, self.warnings = log, settings, list[str]()
+        self.left, self.right, self.points, self.imu = (f"/{vehicle}/{t}" for t in (LEFT, RIGHT, POINTS, IMU))
+        self.where = f"{log.name}: {self.left}"
+        c = calibration
+        self.rig = StereoRig.of(c.left, c.right, c.T_right_left, c.where, settings)
+        self.frames = StereoFrames(self.rig, (c.left.width, c.left.height))
+        T_camera_left = se3.from_rotation_translation(self.rig.R_rectified_left, np.zeros(3))
+        self.T_camera_imu = T_camera_left @ c.T_left_imu
+        self.readings = imu_readings((entry.header_ns(), entry) for entry in log.entries(self.imu))
+        motion = gyro(self.readings, self.T_camera_imu)
+        self.lidar = Lidar(T_camera_left @ c.T_left_lidar, settings.range_sigma_m, motion)
+        self.groups = self._groups()
+        self.truth = self._truth(fixes, origin)
+
+    def sensors(self) -> dict[str, str]:
+        """What the log says about its source."""
+        depth = "stereo" if self.settings.depth == "stereo" else "lidar, drawn on reading"
+        return {"part": self.left.split("/")[1], "depth": depth, "truth": "position", "imu": self.imu}
+
+    def _groups(self) -> list[dict[str, int]]:
+        """Topic -> time of what belongs together, for every frame in order."""
+        times: dict[str, set[int]] = {topic: set() for topic in (self.left, self.right, self.points)}
+        for entry in self.log.entries(*times):
+            times[entry.topic].add(entry.header_ns())
+        left, right, points = (sorted(times[topic]) for topic in (self.left, self.right, self.points))
+        eyes, sweeps = nearest(left, right, EYES_NS), nearest(left, points, SWEEP_NS)
+        stereo = self.settings.depth == "stereo"
+        used = [stamp for stamp in left if stamp in (eyes if stereo else sweeps)]
+        if len(used) < len(left):
+            other = (
+                f"right image within {EYES_NS // 10**6} ms"
+                if stereo
+                else f"sweep within {SWEEP_NS // 10**6} ms"
+            )
+            self.warnings.append(
+                f"{len(left) - len(used)} of {len(left)} left images have no {other}; left out"
+            )
+        if not used:
+            raise DuagError(
+                f"{self.where}: none of {len(left)} images has a partner near in time, expected pairs"
+            )
+        compared = spread(len(used), RATIO_FRAMES)
+        groups = []
+        for k, stamp in enumerate(used):
+            group = {self.left: stamp}
+            if stereo or k in spread(len(used), ROW_PAIRS):
+                group |= {self.right: eyes[stamp]} if stamp in eyes else {}
+            if (not stereo or k in compared) and stamp in sweeps:
+                group |= {self.points: sweeps[stamp]}
+            groups.append(group)
+        return groups
+
+    def _truth(self, fixes: Fixes | None, origin: Array) -> dict[int, Array]:
+        """Poses [4, 4] of the images next to a fix; rotations mean nothing and are the identity."""
+        if fixes is None:
+            self.warnings.append("no positions with times (indoors there are only two): no ground truth")
+            return {}
+        found = fixes.near([group[self.left] for group in self.groups])
+        self.warnings.append(
+            f"ground truth: {len(found)} positions of the satellite antenna, whose place on the vehicle is not known; "
+            "no rotations"
+        )
+        return {
+            stamp: se3.from_rotation_translation(np.eye(3), position - origin)
+            for stamp, position in found.items()
+        }
+
+    def write(self, robot: RobotWriter) -> dict[str, Any]:
+        """Write all frames; returns what the checks measured."""
+        rows = self._check_rows()
+        robot.set_imu(self.T_camera_imu)
+        if self.settings.depth == "lidar":
+            robot.set_lidar(self.lidar.T_camera_lidar, self.lidar.range_sigma_m)
+        feed, scale, empty = ImuFeed(robot, self.readings), ScaleCheck(self.lidar, self.rig), 0
+        found = gathered(self.log, self.groups, lambda entry: entry.header_ns())
+        for parts in track(found, f"convert {robot.name}", len(self.groups)):
+            stamp = parts[self.left].header_ns()
+            feed.until(stamp)
+            points = self._sweep(parts, stamp)
+            if self.settings.depth == "lidar":
+                robot.add_points(stamp, points)
+                color = self.rig.rectify_left(
+                    self.frames.sized(decoded(parts[self.left].read(), self.where), self.where)
+                )
+                robot.add_frame(stamp, png(color), "png", None, self.truth.get(stamp))
+                continue
+            image, depth, sigma_m = self.frames.frame(
+                parts[self.left].read(), parts[self.right].read(), self.where
+            )
+            robot.add_frame(stamp, image, "png", depth, self.truth.get(stamp), depth_sigma_m=sigma_m)
+            empty += int((depth == 0).sum())
+            if len(points):
+                scale.add(points, depth)
+        if self.settings.depth == "lidar":
+            return rows
+        pixels = len(self.groups) * self.rig.camera.width * self.rig.camera.height
+        ratio = scale.result()
+        if ratio is not None and abs(ratio - 1) > MAX_RATIO_ERROR:
+            self.warnings.append(f"stereo depth is {ratio:.3f} times that of the LiDAR, expected 1 to 2 %")
+        return {**rows, "without_depth": empty / pixels, "stereo_over_lidar": ratio}
+
+    def _sweep(self, parts: Mapping[str, Entry], at_ns: int) -> Array:
+        """The points of a frame as of its time; none where it has no sweep."""
+        entry = parts.get(self.points)
+        if entry is None:
+            return np.zeros((0, 3))
+        return self.lidar.points(entry.read(), entry.header_ns(), at_ns, f"{self.log.name}: {self.points}")
+
+    def _check_rows(self) -> dict[str, Any]:
+        """The test of the rectification on some pairs."""
+        eyes = [{t: g[t] for t in (self.left, self.right)} for g in self.groups if self.right in g]
+        chosen = [eyes[k] for k in sorted(spread(len(eyes), ROW_PAIRS))] if eyes else []
+        found = gathered(self.log, chosen, lambda entry: entry.header_ns())
+        return self.frames.check_rows(
+            ((parts[self.left].read(), parts[self.right].read()) for parts in found), self.where
+        )

@@ -1,0 +1,89 @@
+"""ScanNet v2 as its own SensReader exports it: rooms scanned with a tablet, poses by BundleFusion.
+
+SRC is a scan with `color/N.jpg` (1296x968), `depth/N.png` (640x480, millimetres), `pose/N.txt` (camera to world; -inf
+where tracking was lost) and `intrinsic/`, or with all of these in `frames/`. Colour is resampled into the camera of
+the depth, which lies in the same place.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from duagc.converters.layouts import image_folder
+from duagc.converters.layouts.image_files import options_of, rigid
+from duagc.converters.layouts.image_folder import Clip, FrameFiles, stamps_of
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import decode_image, read_bytes, read_text
+from duagc.pipeline.config.base import Config
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+DEPTH_SCALE = 0.001
+
+
+class Options(Config):
+    """Time; exported scans have none."""
+
+    rate_hz: int = Field(30, gt=0)
+    """Frames per second."""
+
+
+def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:
+    """Convert a scan, cut into `robots` contiguous parts. Frames without a pose are kept, without ground truth.
+
+    Raises:
+        DuagError: names the file, what was found and what was expected.
+    """
+    settings = options_of(Options, options, "scannet")
+    root = src / "frames" if (src / "frames").is_dir() else src
+    color, depth, pose = (_numbered(root / kind) for kind in ("color", "depth", "pose"))
+    numbers = sorted(set(color) & set(depth))
+    if not numbers:
+        raise DuagError(f"{root}: no number is both in color/ and in depth/, expected N.jpg and N.png")
+    warnings = [f"no time stamps: made from frame numbers at {settings.rate_hz} Hz"]
+    alone = len(set(color) ^ set(depth))
+    if alone:
+        warnings.append(f"{alone} images have no partner and were left out")
+    camera = _camera(root / "intrinsic" / "intrinsic_depth.txt", depth[numbers[0]])
+    color_camera = _camera(root / "intrinsic" / "intrinsic_color.txt", color[numbers[0]])
+    frames = [
+        FrameFiles(n, stamp, color[n], depth[n], _read_pose(pose[n]) if n in pose else None)
+        for n, stamp in zip(numbers, stamps_of(numbers, settings.rate_hz), strict=True)
+    ]
+    clip = Clip("", frames, camera, DEPTH_SCALE, color_camera=color_camera)
+    parameters = {"robots": robots, **settings.model_dump()}
+    image_folder.write(out, "scannet", src, clip.cut(robots, src), parameters, warnings, force)
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    if not folder.is_dir():
+        raise DuagError(
+            f"{folder}: no such folder, expected files named by number, as SensReader writes them"
+        )
+    return {int(p.stem): p for p in sorted(folder.iterdir()) if p.stem.isdecimal()}
+
+
+def _camera(path: Path, image: Path) -> PinholeCamera:
+    """Intrinsics of a 4x4 file, with the size of an image."""
+    import cv2
+
+    try:
+        K = np.array(read_text(path, "4x4 intrinsics").split(), dtype=np.float64).reshape(4, 4)
+    except ValueError as error:
+        raise DuagError(f"{path}: {error}, expected 4x4 numbers") from error
+    pixels = decode_image(read_bytes(image, "an image"), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise DuagError(f"{image}: no decoder reads it, expected an image")
+    return PinholeCamera(pixels.shape[1], pixels.shape[0], K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+
+
+def _read_pose(path: Path) -> np.ndarray | None:
+    """T_world_camera [4, 4]; None where tracking was lost."""
+    try:
+        T = np.array(read_text(path, "4x4 numbers").split(), dtype=np.float64).reshape(4, 4)
+    except ValueError as error:
+        raise DuagError(f"{path}: {error}, expected 4x4 numbers") from error
+    return rigid(T, str(path)) if np.all(np.isfinite(T)) else None

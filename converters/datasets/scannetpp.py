@@ -1,0 +1,99 @@
+"""ScanNet++: rooms photographed with a DSLR camera, depth rendered from a laser scan.
+
+SRC is a scene. Used are `dslr/nerfstudio/transforms_undistorted.json` and, beside it, `dslr/undistorted_images` and
+`dslr/undistorted_depths` (16 bit, millimetres), which are not shipped: make them with the dataset's toolbox. Poses are
+camera to world with OpenGL axes. Photographs are not a video: consecutive ones may be far apart.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from duagc.converters.layouts import image_folder
+from duagc.converters.layouts.image_files import options_of, rigid
+from duagc.converters.layouts.image_folder import Clip, FrameFiles, stamps_of
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import read_text
+from duagc.pipeline.config.base import Config
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+DEPTH_SCALE = 0.001
+OPENCV_OF_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+class Options(Config):
+    """Time and choice of images."""
+
+    rate_hz: int = Field(1, gt=0)
+    """Frames per second; photographs have none."""
+    bad: bool = False
+    """Take images too that the dataset marks as bad."""
+
+
+def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:
+    """Convert a scene, cut into `robots` contiguous parts, test images included.
+
+    Raises:
+        DuagError: names the file, what was found and what was expected.
+    """
+    settings = options_of(Options, options, "scannetpp")
+    path = src / "dslr" / "nerfstudio" / "transforms_undistorted.json"
+    try:
+        content = json.loads(read_text(path, "cameras and poses of ScanNet++"))
+        size = int(content["w"]), int(content["h"])
+        camera = PinholeCamera(
+            *size,
+            *(float(content[name]) for name in ("fl_x", "fl_y")),
+            *(float(content[name]) - 0.5 for name in ("cx", "cy")),
+        )
+        rows = [*content["frames"], *content.get("test_frames", [])]
+        entries = sorted(
+            (
+                (
+                    str(row["file_path"]),
+                    np.array(row["transform_matrix"], dtype=np.float64).reshape(4, 4),
+                    row.get("is_bad", False),
+                )
+                for row in rows
+            ),
+            key=lambda entry: entry[0],
+        )
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
+        raise DuagError(
+            f"{path}: {type(error).__name__} {error}, expected w, h, fl_x, fl_y, cx, cy and frames"
+        ) from error
+    taken = [e for e in entries if settings.bad or not e[2]]
+    if not taken:
+        raise DuagError(f"{path}: names no usable image, expected frames")
+    stamps = stamps_of(range(len(taken)), settings.rate_hz)
+    frames = [
+        FrameFiles(
+            number,
+            stamp,
+            _made(src / "dslr" / "undistorted_images" / Path(name).name),
+            _made(src / "dslr" / "undistorted_depths" / f"{Path(name).stem}.png"),
+            rigid(T @ OPENCV_OF_OPENGL, f"{path}: {name}"),
+        )
+        for number, (stamp, (name, T, _)) in enumerate(zip(stamps, taken, strict=True))
+    ]
+    warnings = ["photographs, not a video: consecutive frames may be far apart", "no time stamps"]
+    if len(taken) < len(entries):
+        warnings.append(f"{len(entries) - len(taken)} images are marked as bad and were left out")
+    clip = Clip("", frames, camera, DEPTH_SCALE, sensors={"depth": "rendered from a laser scan"})
+    parameters = {"robots": robots, **settings.model_dump()}
+    image_folder.write(out, "scannetpp", src, clip.cut(robots, src), parameters, warnings, force)
+
+
+def _made(path: Path) -> Path:
+    """A file that the user had to make."""
+    if not path.is_file():
+        raise DuagError(
+            f"{path}: not found; undistorted images and depths are not shipped, expected them from the toolbox of "
+            "ScanNet++"
+        )
+    return path

@@ -1,0 +1,399 @@
+"""Microsoft 7-Scenes: Kinect v1 sequences of seven rooms, poses by KinectFusion, one world per room.
+
+A sequence is a folder of `frame-NNNNNN.color.png` (or .jpg), `.depth.png` (16 bit, millimetres, 0 and 65535 invalid)
+and `.pose.txt` (4x4, depth camera to world, x right, y down, z forward). There are no time stamps: they are made at
+30 Hz from the frame number. The depth is not registered to colour: it is here, with the constants below. True poses
+may be those of others (`reference_poses`).
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationInfo, field_validator
+
+from duagc.converters.layouts import reference_poses
+from duagc.converters.layouts.calibrated import ColorLens, correct, numbers, resampled
+from duagc.converters.layouts.image_files import options_of, read_color, read_depth, rigid
+from duagc.converters.layouts.self_check import ReprojectionCheck
+from duagc.converters.writer import NANOSECONDS, RecordingWriter, RobotWriter, robot_names
+from duagc.pipeline.base import determinism
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import read_text
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.config.base import Config
+from duagc.pipeline.geometry import depth_error, se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+Array = NDArray[np.float64]
+Depth = NDArray[np.float64]
+Reference = dict[int, Array]  # T_world_color [4, 4] by frame number
+
+WIDTH, HEIGHT = 640, 480
+DEPTH_SCALE = 0.001
+NO_DEPTH = (0, 65535)
+FRAME_FILE = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(png|jpg|jpeg|txt)")
+SEQUENCE_FOLDER = re.compile(r"seq-(\d+)")
+KINDS = ("color", "depth", "pose")
+
+CONNECTED_RATIO = (
+    0.03  # neighbouring depths that differ by less than this share of the nearer are one surface
+)
+
+LENGTHS = {
+    "color_distortion": (4, 5),
+    "color_rotation_rad": (3,),
+    "depth_correction_per_m": (depth_error.COEFFICIENTS,),
+}
+"""How many numbers options hold that are lists of numbers."""
+
+
+class Options(Config):
+    """Cameras and time; the defaults are those of the Kinect that recorded 7-Scenes."""
+
+    depth_focal_px: float = Field(585.0, gt=0)
+    """Focal length of the depth camera, as the dataset's page gives it."""
+    depth_cx_px: float = 320.0
+    """Principal point of the depth camera, as the dataset's page gives it."""
+    depth_cy_px: float = 240.0
+    """Principal point of the depth camera, as the dataset's page gives it."""
+    color_focal_px: float = Field(525.0, gt=0)
+    """Focal length of the colour camera, nominal; it agrees with the images of RedKitchen to 2 px."""
+    color_cx_px: float = 320.0
+    """Principal point of the colour camera; fitted on RedKitchen to 1 px, together with the baseline."""
+    color_cy_px: float = 237.8
+    """Principal point of the colour camera; fitted on RedKitchen: depth edges fall on colour edges."""
+    baseline_m: float = 0.025
+    """The colour camera sits this far to the right (+x) of the depth camera; a point shifts by -f b / z pixels."""
+    color_focal_y_px: float = Field(0.0, ge=0)
+    """Focal length of the colour camera along y; 0: that along x."""
+    color_distortion: str = ""
+    """Lens of the colour camera: k1 k2 p1 p2 [k3] as OpenCV has them; empty: none. With this option, the one before or
+    the one after, colour is resampled as a pinhole camera sees it that is turned as the depth camera is."""
+    color_rotation_rad: str = ""
+    """Rotation vector x y z that takes directions of the depth camera to those of the colour camera; empty: none."""
+    depth_correction_per_m: str = ""
+    """Smooth error of the depth camera, c0 .. c5: 1/z + c0 (1 - 2 m / z) + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2 is
+    the true 1/z at the ray (x, y, 1); empty: none."""
+    rate_hz: int = Field(30, gt=0)
+    """Frames per second; the dataset has no time stamps."""
+    reference_poses: str = ""
+    """File of true poses to take instead of the dataset's, by structure from motion: a line per image, in the format of
+    `pgt/sfm/7scenes/redkitchen_train.txt` of Brachmann et al. (ICCV 2021). Frames it lacks have no ground truth."""
+    reference_sequence: str = ""
+    """Which sequence of that file a folder holds that is not called seq-NN, for example "seq-01"."""
+    sequences: str = Field("", coerce_numbers_to_str=True)
+    """Numbers of the sequences to take, for example "1,3"; all if empty. Several make one robot each."""
+
+    def depth_camera(self) -> PinholeCamera:
+        """The camera that the depth images were taken with."""
+        f = self.depth_focal_px
+        return PinholeCamera(WIDTH, HEIGHT, f, f, self.depth_cx_px, self.depth_cy_px)
+
+    @field_validator(*LENGTHS)
+    @classmethod
+    def _are_numbers(cls, text: str, info: ValidationInfo) -> str:
+        assert info.field_name is not None
+        numbers(text, LENGTHS[info.field_name])
+        return text
+
+    def lens(self) -> ColorLens:
+        """The camera that the colour images were taken with."""
+        f, fy = self.color_focal_px, self.color_focal_y_px or self.color_focal_px
+        source = PinholeCamera(WIDTH, HEIGHT, f, fy, self.color_cx_px, self.color_cy_px)
+        rotation = numbers(self.color_rotation_rad, LENGTHS["color_rotation_rad"])
+        return ColorLens(source, numbers(self.color_distortion, LENGTHS["color_distortion"]), rotation)
+
+    def color_camera(self) -> PinholeCamera:
+        """The camera of the colour images in the recording."""
+        return self.lens().camera
+
+    def depth_correction(self) -> tuple[float, ...]:
+        """c0 .. c5, or nothing."""
+        return numbers(self.depth_correction_per_m, LENGTHS["depth_correction_per_m"])
+
+
+@dataclass(frozen=True)
+class FrameFiles:
+    """The files of one frame; `pose` is None in a sequence without poses."""
+
+    number: int
+    color: Path
+    depth: Path
+    pose: Path | None
+
+
+def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:
+    """Convert one sequence, cut into `robots` contiguous parts, or several sequences, one robot each.
+
+    All robots start at time 0, as if they had moved together; they share the world of the dataset.
+
+    Args:
+        src: a folder of frames, or a folder of `seq-NN` folders.
+        out: the recording to write.
+        robots: number of parts of a single sequence; of several sequences, their number.
+        force: replace a recording that is there.
+        options: see `Options`.
+    Raises:
+        DuagError: names the file, what was found and what was expected.
+    """
+    determinism.settle_opencv()
+    settings = options_of(Options, options, "7scenes")
+    parts, skipped = _parts(Path(src), robots, settings)
+    source = {
+        "dataset": "7-Scenes",
+        "folder": Path(src).resolve().name,
+        "sequences": sorted({p[0] for p in parts if p[0]}),
+    }
+    references = [_reference(Path(src), sequence, frames, settings) for sequence, frames in parts]
+    parameters = {"robots": robots, **settings.model_dump()}
+    parameters["reference_poses"] = Path(settings.reference_poses).name
+    with RecordingWriter(out, "", source, "7scenes", parameters, force) as recording:
+        recording.warnings += skipped
+        recording.warnings.append(
+            f"no time stamps in the dataset: made from frame numbers at {settings.rate_hz} Hz"
+        )
+        for name, (sequence, frames), reference in zip(
+            robot_names(len(parts)), parts, references, strict=True
+        ):
+            sensors = {"depth": "Kinect v1, registered to colour by the converter", "sequence": sequence}
+            with recording.robot(name, settings.color_camera(), DEPTH_SCALE, sensors) as robot:
+                check = _write_robot(robot, frames, reference, settings, str(src))
+            recording.checks[name] = {
+                "first_frame": frames[0].number,
+                "last_frame": frames[-1].number,
+                **check,
+            }
+            if reference is not None:
+                known = sum(files.number in reference for files in frames)
+                if known < len(frames):
+                    recording.warnings.append(f"{name}: reference poses of {known} of {len(frames)} frames")
+            elif frames[0].pose is None:
+                recording.warnings.append(f"{name}: the sequence has no poses: no ground truth")
+
+
+# --- which frames make which robot ----------------------------------------------------------------------------------
+
+
+def _parts(src: Path, robots: int, options: Options) -> tuple[list[tuple[str, list[FrameFiles]]], list[str]]:
+    """(name of the sequence, its frames) per robot, and warnings about frames that are missing."""
+    folders = _sequence_folders(src, options)
+    warnings: list[str] = []
+    sequences = []
+    for folder in folders:
+        frames, missing = list_frames(folder)
+        sequences.append((folder.name if len(folders) > 1 or folder != src else "", frames))
+        if missing:
+            shown = ", ".join(str(n) for n in missing[:10]) + (", ..." if len(missing) > 10 else "")
+            warnings.append(
+                f"{folder.name}: {len(missing)} frame numbers are missing and were skipped: {shown}"
+            )
+    if len(sequences) > 1:
+        if robots != len(sequences):
+            found = ", ".join(name for name, _ in sequences)
+            expected = f"expected --robots {len(sequences)}, or one sequence chosen with --set sequences=1"
+            raise DuagError(f"{src}: found sequences {found} for {robots} robots, {expected}")
+        return sequences, warnings
+    name, frames = sequences[0]
+    robot_names(robots)
+    if len(frames) < robots:
+        raise DuagError(f"{src}: found {len(frames)} frames, expected at least {robots} for {robots} robots")
+    cuts = [i * len(frames) // robots for i in range(robots + 1)]
+    return [(name, frames[a:b]) for a, b in pairwise(cuts)], warnings
+
+
+def _sequence_folders(src: Path, options: Options) -> list[Path]:
+    if not src.is_dir():
+        raise DuagError(f"{src}: no such folder, expected a sequence of 7-Scenes")
+    found = {
+        int(m[1]): p for p in sorted(src.iterdir()) if (m := SEQUENCE_FOLDER.fullmatch(p.name)) and p.is_dir()
+    }
+    if not options.sequences:
+        return [found[n] for n in sorted(found)] or [src]
+    wanted = [text.strip() for text in options.sequences.split(",")]
+    if not all(text.isdigit() and int(text) in found for text in wanted):
+        numbers = ", ".join(str(n) for n in sorted(found)) or "none"
+        raise DuagError(f"{src}: found sequences {numbers}, expected {options.sequences!r} among them")
+    return [found[n] for n in sorted({int(text) for text in wanted})]
+
+
+def list_frames(folder: Path) -> tuple[list[FrameFiles], list[int]]:
+    """Frames of a sequence in order of their number, and the numbers that are missing in between.
+
+    Raises:
+        DuagError: a frame lacks its colour, depth or (unless the sequence has no pose at all) its pose.
+    """
+    files: dict[str, dict[int, Path]] = {kind: {} for kind in KINDS}
+    for path in sorted(folder.iterdir()):
+        match = FRAME_FILE.fullmatch(path.name)
+        if match and (match[2] == "pose") == (match[3] == "txt"):
+            other = files[match[2]].setdefault(int(match[1]), path)
+            if other != path:
+                raise DuagError(f"{path}: found beside {other.name}, expected one of them")
+    numbers = sorted(set().union(*files.values()))
+    if not numbers:
+        raise DuagError(f"{folder}: found no frame-NNNNNN.color.png or .jpg, expected a sequence of 7-Scenes")
+    kinds = KINDS if files["pose"] else KINDS[:2]
+    for kind in kinds:
+        for number in numbers:
+            if number not in files[kind]:
+                there = next(files[k][number] for k in KINDS if number in files[k])
+                raise DuagError(f"{there}: has no {kind} beside it, expected frame-{number:06d}.{kind}.*")
+    missing = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers))
+    return [
+        FrameFiles(n, files["color"][n], files["depth"][n], files["pose"].get(n)) for n in numbers
+    ], missing
+
+
+def _reference(src: Path, sequence: str, frames: list[FrameFiles], options: Options) -> Reference | None:
+    """T_world_color by frame number where other poses than the dataset's are asked for."""
+    if not options.reference_poses:
+        if options.reference_sequence:
+            raise DuagError("7scenes: found reference_sequence alone, expected reference_poses with it")
+        return None
+    path = Path(options.reference_poses)
+    name = sequence or (src.name if SEQUENCE_FOLDER.fullmatch(src.name) else options.reference_sequence)
+    reference = reference_poses.read(path, name)
+    first, last = frames[0].number, frames[-1].number
+    if not any(files.number in reference for files in frames):
+        raise DuagError(f"{path}: found none of frames {first} to {last}, expected poses of some of them")
+    return reference
+
+
+# --- one robot ------------------------------------------------------------------------------------------------------
+
+
+def _write_robot(
+    robot: RobotWriter, frames: list[FrameFiles], reference: Reference | None, options: Options, label: str
+) -> dict[str, Any]:
+    """Write all frames of a robot; returns what the self-check measured."""
+    register = Registration(options.depth_camera(), options.color_camera(), options.baseline_m)
+    check = ReprojectionCheck(options.color_camera(), len(frames))
+    lens, correction = options.lens(), options.depth_correction()
+    maps = None if lens.is_pinhole else lens.maps()
+    holes = invalid = 0
+    for index, files in enumerate(track(frames, f"convert {robot.name}")):
+        depth = register(correct(_depth_m(files.depth), options.depth_camera(), correction))
+        color, color_format = read_color(files.color, (WIDTH, HEIGHT))
+        if maps is not None:
+            color, color_format = resampled(color, maps), "png"
+        T_world_camera = _true_pose(files, reference, options)
+        check.add(index, depth, T_world_camera)
+        stamp_ns = (files.number - frames[0].number) * NANOSECONDS // options.rate_hz
+        raw = np.rint(depth / DEPTH_SCALE).astype(np.uint16)
+        robot.add_frame(stamp_ns, color, color_format, raw, T_world_camera)
+        holes += _count_holes(raw)
+        invalid += int((raw == 0).sum())
+    pixels = len(frames) * WIDTH * HEIGHT
+    rates = {"registered_without_depth": invalid / pixels, "registered_holes": holes / pixels}
+    return {**rates, **check.result(label)}
+
+
+def _true_pose(files: FrameFiles, reference: Reference | None, options: Options) -> Array | None:
+    """T_world_camera [4, 4] of the recording's camera, None where it is not known."""
+    if reference is not None:
+        T_world_color = reference.get(files.number)
+        return None if T_world_color is None else T_world_color @ options.lens().turned()
+    if files.pose is None:
+        return None
+    T_depth_camera = se3.from_rotation_translation(np.eye(3), [options.baseline_m, 0.0, 0.0])
+    return _read_pose(files.pose) @ T_depth_camera
+
+
+def _count_holes(depth: NDArray[np.uint16]) -> int:
+    """Pixels without depth whose left and right, or upper and lower, neighbours have some: cracks of the warp."""
+    empty, full = depth == 0, depth != 0
+    crack = np.zeros_like(empty)
+    crack[:, 1:-1] |= empty[:, 1:-1] & full[:, :-2] & full[:, 2:]
+    crack[1:-1] |= empty[1:-1] & full[:-2] & full[2:]
+    return int(crack.sum())
+
+
+def _depth_m(path: Path) -> Depth:
+    """Depth [480, 640] in metres, 0 where there is none."""
+    raw = read_depth(path, (WIDTH, HEIGHT), "depth in millimetres")
+    return np.where(np.isin(raw, NO_DEPTH), 0, raw) * DEPTH_SCALE
+
+
+def _read_pose(path: Path) -> Array:
+    """T_world_depth [4, 4], its rotation made exactly orthonormal."""
+    try:
+        T = np.array(read_text(path, "4x4 numbers").split(), dtype=np.float64).reshape(4, 4)
+    except ValueError as error:
+        raise DuagError(f"{path}: {error}, expected 4x4 numbers") from error
+    return rigid(T, str(path))
+
+
+# --- depth into the colour camera -----------------------------------------------------------------------------------
+
+
+class Registration:
+    """Resamples depth for a camera displaced along x, with another focal length and principal point.
+
+    With w = 1 / z a point of depth pixel (u, v) falls on colour column A u + B - f b w and row A v + C: rows map to
+    rows. First the rows are resampled, then each row is redrawn as a chain of segments between neighbours. Inverse
+    depth is interpolated, in which planes are linear, and only within a surface (CONNECTED_RATIO); where surfaces
+    overlap the nearest wins; at the border of a surface a pixel covers half its width.
+    """
+
+    def __init__(self, depth_camera: PinholeCamera, color_camera: PinholeCamera, baseline_m: float) -> None:
+        d, c = depth_camera, color_camera
+        self._zoom = c.fx / d.fx
+        self._offset = c.cx - self._zoom * d.cx
+        self._shift_px_m = c.fx * baseline_m
+        self._shape = (c.height, c.width)
+        row = (np.arange(c.height) - c.cy) * (d.fy / c.fy) + d.cy
+        self._row_near = np.clip(np.floor(row).astype(int), 0, d.height - 2)
+        self._row_part = (row - self._row_near)[:, None]
+        self._row_inside = ((row >= -0.5) & (row <= d.height - 0.5))[:, None]
+        self._columns = np.arange(d.width)
+
+    def __call__(self, depth: Depth) -> Depth:
+        """Depth [h, w] in metres of the depth camera, 0 where none -> depth [H, W] in metres of the colour camera."""
+        with np.errstate(divide="ignore"):
+            w = np.where(depth > 0, 1.0 / depth, 0.0)
+        w = self._resample_rows(w)
+        out = np.zeros(self._shape)
+        self._draw_segments(w, out)
+        with np.errstate(divide="ignore"):
+            return np.where(out > 0, 1.0 / out, 0.0)
+
+    def _resample_rows(self, w: Depth) -> Depth:
+        upper, lower, part = w[self._row_near], w[self._row_near + 1], self._row_part
+        nearest = np.where(part < 0.5, upper, lower)
+        between = _connected(upper, lower) & (part >= 0) & (part <= 1)
+        return np.where(self._row_inside, np.where(between, upper + part * (lower - upper), nearest), 0.0)
+
+    def _draw_segments(self, w: Depth, out: Depth) -> None:
+        x = self._zoom * self._columns + self._offset - self._shift_px_m * w
+        left, right, w_left, w_right = x[:, :-1], x[:, 1:], w[:, :-1], w[:, 1:]
+        joined = _connected(w_left, w_right)
+        first = np.ceil(left)
+        for column in (first, first + 1):  # connected neighbours are less than two columns apart
+            inside = joined & (column <= right)
+            part = (column - left) / np.where(right > left, right - left, 1.0)
+            self._keep_nearest(out, inside, column, w_left + part * (w_right - w_left))
+        half = 0.5 * self._zoom
+        nearest = np.rint(x)
+        border_left = np.ones(w.shape, bool)
+        border_left[:, 1:] = ~joined
+        border_right = np.ones(w.shape, bool)
+        border_right[:, :-1] = ~joined
+        covered = np.where(nearest < x, border_left, border_right) & (np.abs(nearest - x) <= half)
+        self._keep_nearest(out, covered & (w > 0), nearest, w)
+
+    def _keep_nearest(self, out: Depth, mask: NDArray[np.bool_], column: Depth, w: Depth) -> None:
+        mask = mask & (column >= 0) & (column < self._shape[1])
+        rows = np.nonzero(mask)[0]
+        np.maximum.at(out, (rows, column[mask].astype(int)), w[mask])
+
+
+def _connected(w_a: Depth, w_b: Depth) -> NDArray[np.bool_]:
+    """Whether two inverse depths belong to one surface; no measurement belongs to none."""
+    return (w_a > 0) & (w_b > 0) & (np.abs(w_a - w_b) <= CONNECTED_RATIO * np.minimum(w_a, w_b))

@@ -1,0 +1,1 @@
+"""File layouts and image sources that several datasets share."""

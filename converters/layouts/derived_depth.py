@@ -1,0 +1,164 @@
+"""Frames whose depth is not measured by a depth camera: images of a stereo pair, sweeps of a LiDAR."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.converters.layouts.ros_images import color_bytes
+from duagc.converters.layouts.ros_points import as_of, points_of
+from duagc.converters.layouts.stereo import RowCheck, StereoRig
+from duagc.converters.logs.entries import Entry
+from duagc.converters.writer import RobotWriter
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import decode_image
+from duagc.pipeline.recording.lidar import lidar_depth
+from duagc.pipeline.recording.motion import GyroPrior, MotionPrior
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+STEREO_SCALE_M = 0.002  # per unit of the depth images
+ROW_PAIRS = 6  # image pairs whose rows are tested
+RATIO_FRAMES = 12  # frames whose stereo depth is compared with the LiDAR's
+IMPOSSIBLE = 1e3  # rad/s and m/s^2: no vehicle turns or falls so
+MAX_RATIO_ERROR = 0.02
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """A LiDAR beside a camera. motion: of that camera, to take out what it moved during a sweep; None: not known."""
+
+    T_camera_lidar: Array
+    range_sigma_m: float
+    motion: MotionPrior | None
+
+    def points(self, message: Any, stamp_ns: int, at_ns: int, where: str) -> Array:
+        """Points [n, 3] of a sweep with this stamp, all as of one time."""
+        points, seconds = points_of(message, where)
+        times_ns = stamp_ns + np.rint(seconds * 1e9).astype(np.int64)
+        return as_of(at_ns, points, times_ns, self.T_camera_lidar, self.motion)
+
+
+def decoded(message: Any, where: str) -> Image:
+    """Colour [h, w, 3], BGR as OpenCV has it, of an Image or CompressedImage."""
+    import cv2
+
+    data, _ = color_bytes(message, where)
+    image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise DuagError(f"{where}: {len(data)} bytes that no decoder reads, expected an image")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def png(image: Image) -> bytes:
+    """A BGR image as PNG, lightly compressed."""
+    import cv2
+
+    return bytes(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
+
+
+class StereoFrames:
+    """Rectified colour, depth and sigma of the pairs of one rig."""
+
+    def __init__(self, rig: StereoRig, size: tuple[int, int]) -> None:
+        """size: width and height of the images as they come."""
+        self.rig, self._size = rig, size
+
+    def sized(self, image: Image, where: str) -> Image:
+        """The image, if it has the size of the calibration."""
+        if (image.shape[1], image.shape[0]) != self._size:
+            raise DuagError(
+                f"{where} is {image.shape[1]}x{image.shape[0]}, expected {self._size[0]}x{self._size[1]} as in the "
+                "calibration"
+            )
+        return image
+
+    def rectified(self, left: Any, right: Any, where: str) -> tuple[Image, Image]:
+        """Left and right messages as rectified BGR images."""
+        first, second = (self.sized(decoded(message, where), where) for message in (left, right))
+        return self.rig.rectify_left(first), self.rig.rectify_right(second)
+
+    def check_rows(self, pairs: Iterable[tuple[Any, Any]], where: str) -> dict[str, Any]:
+        """The test of the rectification on some pairs of messages; see `RowCheck`."""
+        check = RowCheck()
+        for left, right in pairs:
+            check.add(*(gray(image) for image in self.rectified(left, right, where)))
+        return check.result(where)
+
+    def frame(
+        self, left: Any, right: Any, where: str
+    ) -> tuple[bytes, NDArray[np.uint16], NDArray[np.float32]]:
+        """PNG of the left image, depth in units of `STEREO_SCALE_M`, and its standard deviation in metres."""
+        color, other = self.rectified(left, right, where)
+        depth_m, sigma_m = self.rig.depth(gray(color), gray(other))
+        units = np.rint(depth_m / STEREO_SCALE_M)
+        return png(color), np.where(units <= np.iinfo(np.uint16).max, units, 0).astype(np.uint16), sigma_m
+
+
+def gray(image: Image) -> Image:
+    """Grey values of a BGR image."""
+    import cv2
+
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+
+
+class ScaleCheck:
+    """Compares the depth of a stereo pair with that of a LiDAR: they need not know of each other's mistakes."""
+
+    def __init__(self, lidar: Lidar, rig: StereoRig) -> None:
+        self._lidar, self._rig = lidar, rig
+        self._ratios: list[Array] = [np.zeros(0)]
+
+    def add(self, points_lidar: Array, depth: NDArray[np.uint16]) -> None:
+        """Take a sweep [n, 3] and the depth image of the same time."""
+        sigma = self._lidar.range_sigma_m
+        measured, sigma_m = lidar_depth(points_lidar, self._lidar.T_camera_lidar, self._rig.camera, sigma)
+        both = (depth > 0) & (measured > 0) & (sigma_m < 2 * sigma)
+        self._ratios.append(depth[both] * STEREO_SCALE_M / measured[both].astype(np.float64))
+
+    def result(self) -> float | None:
+        """Median of stereo depth over LiDAR depth; None where nothing was seen by both."""
+        ratios = np.concatenate(self._ratios)
+        return float(np.median(ratios)) if len(ratios) > 100 else None
+
+
+def imu_readings(entries: Iterable[tuple[int, Entry]]) -> list[tuple[int, Array, Array]]:
+    """Time, rates and accelerations of IMU messages, in order of time, each time once."""
+    found: dict[int, tuple[Array, Array]] = {}
+    for stamp_ns, entry in entries:
+        m = entry.read()
+        w, a = m.angular_velocity, m.linear_acceleration
+        reading = np.array([w.x, w.y, w.z], dtype=float), np.array([a.x, a.y, a.z], dtype=float)
+        if np.all(np.abs(reading) < IMPOSSIBLE):
+            found.setdefault(stamp_ns, reading)
+    return [(stamp, *found[stamp]) for stamp in sorted(found)]
+
+
+def gyro(readings: Sequence[tuple[int, Array, Array]], T_camera_imu: Array) -> GyroPrior | None:
+    """How the camera turned, by its IMU; None without readings."""
+    if not readings:
+        return None
+    rates = np.array([rates for _, rates, _ in readings])
+    return GyroPrior([stamp for stamp, _, _ in readings], rates @ T_camera_imu[:3, :3].T)
+
+
+class ImuFeed:
+    """Writes IMU readings into a log up to the time of what comes next."""
+
+    def __init__(self, robot: RobotWriter, readings: Sequence[tuple[int, Array, Array]]) -> None:
+        self._robot, self._readings, self._at = robot, readings, 0
+
+    def until(self, stamp_ns: int) -> None:
+        """Write what was read up to a time."""
+        while self._at < len(self._readings) and self._readings[self._at][0] <= stamp_ns:
+            self._robot.add_imu(*self._readings[self._at])
+            self._at += 1
+
+
+def spread(count: int, most: int) -> set[int]:
+    """Up to `most` indices, evenly spread over 0 .. count - 1."""
+    return set(np.linspace(0, count - 1, min(count, most)).astype(int).tolist())

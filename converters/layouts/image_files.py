@@ -1,0 +1,85 @@
+"""Reading what datasets keep in single files: images, depth, poses; every complaint names the file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from duagc.pipeline.base.errors import DuagError, closest
+from duagc.pipeline.base.files import decode_image, read_bytes
+from duagc.pipeline.config.base import Config
+from duagc.pipeline.geometry import se3, so3
+
+MAX_ROTATION_DEFECT = 0.01  # largest entry of |R - nearest rotation|
+Options = TypeVar("Options", bound=Config)
+
+
+def options_of(model: type[Options], values: Mapping[str, Any], dataset: str) -> Options:
+    """The options of a converter. Raises DuagError that names a wrong one."""
+    try:
+        return model(**values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            hint = closest(name, list(model.model_fields), "options")
+            raise DuagError(f"{dataset}: {name} is no option; {hint}") from error
+        raise DuagError(f"{dataset}: {name} = {first['input']!r}: {first['msg']}") from error
+
+
+def read_color(path: Path, size: tuple[int, int]) -> tuple[bytes, str]:
+    """Bytes of a colour image as they are, known to decode to `size` (width, height), and their format."""
+    import cv2
+
+    data = read_bytes(path, "a colour image")
+    image = decode_image(data, cv2.IMREAD_COLOR)
+    if image is None:
+        raise DuagError(f"{path}: {len(data)} bytes that no decoder reads, expected a colour image")
+    check_size(path, image.shape, size)
+    if data.startswith(b"\x89PNG"):
+        return data, "png"
+    if data.startswith(b"\xff\xd8\xff"):
+        return data, "jpeg"
+    raise DuagError(f"{path}: is neither JPEG nor PNG, expected one of them")
+
+
+def read_depth(path: Path, size: tuple[int, int], unit: str = "depth") -> NDArray[np.uint16]:
+    """A 16-bit depth image [H, W] of `size` (width, height), in the units of its file."""
+    import cv2
+
+    data = read_bytes(path, "a depth image")
+    raw = decode_image(data, cv2.IMREAD_UNCHANGED)
+    if raw is None:
+        raise DuagError(f"{path}: {len(data)} bytes that no decoder reads, expected a depth image")
+    if raw.dtype != np.uint16 or raw.ndim != 2:
+        raise DuagError(f"{path}: is {raw.dtype} with {raw.ndim} axes, expected 16-bit {unit}")
+    check_size(path, raw.shape, size)
+    return np.asarray(raw, dtype=np.uint16)
+
+
+def check_size(path: Path, shape: tuple[int, ...], size: tuple[int, int]) -> None:
+    """Refuse an image of another size."""
+    if (shape[1], shape[0]) != size:
+        raise DuagError(f"{path}: is {shape[1]}x{shape[0]}, expected {size[0]}x{size[1]}")
+
+
+def rigid(T: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+    """A pose [4, 4] with its rotation made exactly orthonormal.
+
+    Raises:
+        DuagError: `where` holds something that is no rigid motion.
+    """
+    if not np.all(np.isfinite(T)):
+        raise DuagError(f"{where}: found numbers that are not finite, expected a pose")
+    R = so3.project(T[:3, :3])
+    defect = float(np.abs(T[:3, :3] - R).max())
+    if defect > MAX_ROTATION_DEFECT or not np.allclose(T[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
+        raise DuagError(
+            f"{where}: its rotation is off by {defect:.2g}, expected a rigid motion (within {MAX_ROTATION_DEFECT})"
+        )
+    return se3.from_rotation_translation(R, T[:3, 3])

@@ -1,0 +1,165 @@
+"""Datasets that are folders of images with a list of poses: what all of their converters share.
+
+A converter says which files make which robot (`Clip`); `write` checks, undistorts and writes them, and moves depth by
+the poses as a self-check.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.converters.layouts.image_files import read_color, read_depth
+from duagc.converters.layouts.self_check import ReprojectionCheck
+from duagc.converters.writer import NANOSECONDS, RecordingWriter, RobotWriter, robot_names
+from duagc.pipeline.base import determinism
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FrameFiles:
+    """One frame: its number in the dataset, time, files, and T_world_camera [4, 4] where known."""
+
+    number: int
+    stamp_ns: int
+    color: Path
+    depth: Path
+    T_world_camera: Array | None = None
+
+
+@dataclass(frozen=True)
+class Clip:
+    """What one robot saw.
+
+    label: in the dataset. camera: of the depth images, and of the colour images unless `color_camera` is given; then
+    colour is resampled into `camera` (same place, same axes). depth_scale: metres per unit. no_depth: values that
+    mean none. distortion: (k1, k2, p1, p2, k3) of colour and depth alike, removed; empty: none.
+    """
+
+    label: str
+    frames: list[FrameFiles]
+    camera: PinholeCamera
+    depth_scale: float
+    no_depth: tuple[int, ...] = (0,)
+    distortion: tuple[float, ...] = ()
+    color_camera: PinholeCamera | None = None
+    sensors: Mapping[str, str] = field(default_factory=dict)
+
+    def cut(self, robots: int, src: Path) -> list[Clip]:
+        """Contiguous parts of equal length."""
+        robot_names(robots)
+        n = len(self.frames)
+        if n < robots:
+            raise DuagError(f"{src}: found {n} frames, expected at least {robots} for {robots} robots")
+        cuts = [i * n // robots for i in range(robots + 1)]
+        return [replace(self, frames=self.frames[a:b]) for a, b in pairwise(cuts)]
+
+
+def stamps_of(numbers: Sequence[int], rate_hz: int) -> list[int]:
+    """Times of frames of a dataset that has none, from their numbers."""
+    return [number * NANOSECONDS // rate_hz for number in numbers]
+
+
+def write(
+    out: Path,
+    dataset: str,
+    src: Path,
+    clips: Sequence[Clip],
+    parameters: Mapping[str, Any],
+    warnings: Sequence[str],
+    force: bool,
+    names: Sequence[str] = (),
+) -> None:
+    """Write a recording of clips, one robot each; all start at time 0, as if they had moved together.
+
+    Args:
+        names: of the robots; alpha, bravo, ... by default.
+    Raises:
+        DuagError: a file is not what it should be, or depth and poses do not belong together.
+    """
+    determinism.settle_opencv()
+    source = {"dataset": dataset, "folder": src.resolve().name, "parts": [c.label for c in clips if c.label]}
+    with RecordingWriter(out, "", source, dataset, dict(parameters), force) as recording:
+        recording.warnings += warnings
+        for name, clip in zip(names or robot_names(len(clips)), clips, strict=True):
+            sensors = {"part": clip.label, **clip.sensors}
+            with recording.robot(name, clip.camera, clip.depth_scale, sensors) as robot:
+                check = _write_clip(robot, clip, f"{src}: {clip.label}" if clip.label else str(src))
+            numbers = {"first_frame": clip.frames[0].number, "last_frame": clip.frames[-1].number}
+            recording.checks[name] = {**numbers, **check}
+            without = sum(frame.T_world_camera is None for frame in clip.frames)
+            if without:
+                recording.warnings.append(f"{name}: {without} of {len(clip.frames)} frames have no true pose")
+
+
+def _write_clip(robot: RobotWriter, clip: Clip, label: str) -> dict[str, Any]:
+    """Write all frames of a robot; returns what the self-check measured."""
+    lens = _Lens(clip)
+    check = ReprojectionCheck(clip.camera, len(clip.frames))
+    empty = 0
+    size = clip.camera.width, clip.camera.height
+    start_ns = clip.frames[0].stamp_ns
+    for index, files in enumerate(track(clip.frames, f"convert {robot.name}")):
+        raw = read_depth(files.depth, size)
+        raw = lens.depth(np.where(np.isin(raw, clip.no_depth), 0, raw).astype(np.uint16))
+        color, color_format = lens.color(files.color)
+        robot.add_frame(files.stamp_ns - start_ns, color, color_format, raw, files.T_world_camera)
+        check.add(index, raw.astype(np.float64) * clip.depth_scale, files.T_world_camera)
+        empty += int((raw == 0).sum())
+    pixels = len(clip.frames) * size[0] * size[1]
+    return {"without_depth": empty / pixels, **check.result(label)}
+
+
+class _Lens:
+    """Takes distortion out of colour and depth, and colour into the camera of the depth, where there is need."""
+
+    def __init__(self, clip: Clip) -> None:
+        self._source = clip.color_camera or clip.camera
+        self._size = self._source.width, self._source.height
+        self._maps: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
+        self._depth_too = bool(clip.distortion)
+        if clip.distortion or clip.color_camera is not None:
+            self._maps = _maps(clip.camera, self._source, clip.distortion)
+
+    def depth(self, raw: NDArray[np.uint16]) -> NDArray[np.uint16]:
+        """Depth [H, W]; never interpolated."""
+        import cv2
+
+        if self._maps is None or not self._depth_too:
+            return raw
+        return np.asarray(cv2.remap(raw, *self._maps, cv2.INTER_NEAREST), dtype=np.uint16)
+
+    def color(self, path: Path) -> tuple[bytes, str]:
+        """Encoded colour: the file's own bytes, or a PNG of what was resampled."""
+        import cv2
+
+        data, color_format = read_color(path, self._size)
+        if self._maps is None:
+            return data, color_format
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None  # read_color has decoded it
+        moved = cv2.remap(image, *self._maps, cv2.INTER_LINEAR)
+        return cv2.imencode(".png", moved)[1].tobytes(), "png"
+
+
+def _maps(
+    camera: PinholeCamera, source: PinholeCamera, distortion: tuple[float, ...]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where in the source every pixel of the camera lies."""
+    import cv2
+
+    K = np.array([[source.fx, 0, source.cx], [0, source.fy, source.cy], [0, 0, 1]])
+    rays = camera.rays().reshape(-1, 3)
+    pixels, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, np.array(distortion or np.zeros(5)))
+    u, v = pixels.reshape(camera.height, camera.width, 2).astype(np.float32).transpose(2, 0, 1)
+    return u, v

@@ -1,0 +1,142 @@
+"""The layout of the iMAP / NICE-SLAM renders of Replica, which other datasets took over.
+
+A part is a folder with `results/frameNNNNNN.jpg`, `results/depthNNNNNN.png` (16 bit) and `traj.txt`: one line of 16
+numbers per frame, camera to world, x right, y down, z forward. There are no time stamps.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from duagc.converters.layouts.image_files import options_of, rigid
+from duagc.converters.layouts.image_folder import Clip, FrameFiles, stamps_of, write
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import read_text
+from duagc.pipeline.config.base import Config
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+FILE = re.compile(r"(frame|depth)(\d+)\.(jpg|jpeg|png)")
+
+
+class LayoutOptions(Config):
+    """Time; the dataset has none."""
+
+    rate_hz: int = Field(30, gt=0)
+    """Frames per second; the dataset has no time stamps."""
+    frame_limit: int = Field(0, ge=0)
+    """Most frames of each part; 0: all. Published runs on Office-0 of ReplicaMultiagent stop at 1500."""
+
+
+class TeamOptions(LayoutOptions):
+    """Time, length and size of images."""
+
+    size: str = ""
+    """Of the images, WIDTHxHEIGHT, if they were scaled; the camera is that of the published size, scaled."""
+
+
+def convert_team(
+    dataset: str,
+    src: Path,
+    out: Path,
+    robots: int,
+    force: bool,
+    options: Mapping[str, Any],
+    part: re.Pattern[str],
+    camera: PinholeCamera,
+    depth_scale: float,
+    sensors: Mapping[str, str],
+    warnings: Sequence[str] = (),
+) -> None:
+    """Convert a scene with a folder for each robot.
+
+    Args:
+        part: of the folders' names; its first group is their number. camera: of images of the published size.
+        sensors, warnings: what is known of all parts.
+    Raises:
+        DuagError: names the file, what was found and what was expected.
+    """
+    settings = options_of(TeamOptions, options, dataset)
+    if not src.is_dir():
+        raise DuagError(f"{src}: no such folder, expected folders {part.pattern} in it")
+    folders = {int(m[1]): p for p in sorted(src.iterdir()) if (m := part.fullmatch(p.name)) and p.is_dir()}
+    if robots != len(folders):
+        raise DuagError(
+            f"{src}: found {len(folders)} folders {part.pattern} for {robots} robots, "
+            f"expected --robots {len(folders)}"
+            if folders
+            else f"{src}: found no folder {part.pattern}, expected one for each robot"
+        )
+    if settings.size:
+        camera = _scaled(camera, settings.size, dataset)
+    clips, notes = [], list(warnings)
+    for number in sorted(folders):
+        clip, told = read_part(folders[number], folders[number].name, camera, depth_scale, settings)
+        clips.append(replace(clip, sensors=sensors))
+        notes += told
+    write(out, dataset, src, clips, {"robots": robots, **settings.model_dump()}, notes, force)
+
+
+def _scaled(camera: PinholeCamera, size: str, dataset: str) -> PinholeCamera:
+    """The camera of images of another size, given as WIDTHxHEIGHT."""
+    width, cross, height = size.partition("x")
+    if not (cross and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise DuagError(f"{dataset}: size = {size!r}, expected WIDTHxHEIGHT")
+    return camera.scaled(int(width), int(height))
+
+
+def read_part(
+    folder: Path, label: str, camera: PinholeCamera, depth_scale: float, options: LayoutOptions
+) -> tuple[Clip, list[str]]:
+    """The clip of one part, and warnings about what does not fit together.
+
+    Raises:
+        DuagError: files are missing or broken.
+    """
+    results, path = folder / "results", folder / "traj.txt"
+    if not results.is_dir():
+        raise DuagError(f"{results}: no such folder, expected frameNNNNNN.jpg and depthNNNNNN.png in it")
+    files: dict[str, dict[int, Path]] = {"frame": {}, "depth": {}}
+    for file in sorted(results.iterdir()):
+        if match := FILE.fullmatch(file.name):
+            files[match[1]][int(match[2])] = file
+    color, depth = files["frame"], files["depth"]
+    for number in sorted(set(color) ^ set(depth)):
+        there, kind = (color[number], "depth") if number in color else (depth[number], "frame")
+        raise DuagError(f"{there}: has no partner, expected {kind}{number:06d}.* beside it")
+    if not color:
+        raise DuagError(f"{results}: found no frameNNNNNN.jpg, expected images")
+    poses = _read_poses(path)
+    numbers = sorted(color)
+    usable = [n for n in numbers if n < len(poses)]
+    warnings = [f"{label or folder.name}: no time stamps: made from frame numbers at {options.rate_hz} Hz"]
+    if len(usable) < len(numbers):
+        raise DuagError(f"{path}: has {len(poses)} poses, expected one for frame {numbers[-1]} as well")
+    if len(poses) != numbers[-1] + 1:
+        warnings.append(f"{label or folder.name}: {len(poses)} poses for frames up to {numbers[-1]}")
+    if options.frame_limit:
+        numbers = numbers[: options.frame_limit]
+    stamps = stamps_of(numbers, options.rate_hz)
+    frames = [
+        FrameFiles(n, stamp, color[n], depth[n], poses[n]) for n, stamp in zip(numbers, stamps, strict=True)
+    ]
+    return Clip(label, frames, camera, depth_scale), warnings
+
+
+def _read_poses(path: Path) -> list[np.ndarray]:
+    poses = []
+    for number, line in enumerate(read_text(path, "a line of 16 numbers per frame").splitlines(), start=1):
+        if not line.strip():
+            continue
+        try:
+            T = np.array(line.split(), dtype=np.float64).reshape(4, 4)
+        except ValueError as error:
+            raise DuagError(f"{path}:{number}: {error}, expected 16 numbers") from error
+        poses.append(rigid(T, f"{path}:{number}"))
+    return poses

@@ -1,0 +1,344 @@
+"""Images and cameras as ROS messages hold them: colour to encoded bytes, depth to metres, CameraInfo to a pinhole."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import decode_image
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+Depth = NDArray[np.float32]
+PNG_LEVEL = 1
+_COLOR_CODES = {  # encoding: channels, and the name of OpenCV's conversion to BGR
+    "rgb8": (3, "COLOR_RGB2BGR"),
+    "bgr8": (3, None),
+    "8UC3": (3, None),
+    "rgba8": (4, "COLOR_RGBA2BGR"),
+    "bgra8": (4, "COLOR_BGRA2BGR"),
+    "mono8": (1, "COLOR_GRAY2BGR"),
+    "8UC1": (1, "COLOR_GRAY2BGR"),
+    "bayer_rggb8": (1, "COLOR_BayerBG2BGR"),  # OpenCV names a pattern by its second row
+    "bayer_bggr8": (1, "COLOR_BayerRG2BGR"),
+    "bayer_gbrg8": (1, "COLOR_BayerGR2BGR"),
+    "bayer_grbg8": (1, "COLOR_BayerGB2BGR"),
+    "yuv422": (2, "COLOR_YUV2BGR_UYVY"),
+    "uyvy": (2, "COLOR_YUV2BGR_UYVY"),
+    "yuv422_yuy2": (2, "COLOR_YUV2BGR_YUY2"),
+    "yuyv": (2, "COLOR_YUV2BGR_YUY2"),
+}
+LONGEST_LENS = 200  # focal length over the longer side of the image, and the inverse
+FISHEYE = (
+    "equidistant",
+    "fisheye",
+    "kannala_brandt",
+)  # one model, by the names that ROS, RealSense, Foxglove give it
+# with no name, as older drivers; RealSense names the model whose numbers are zero or those of plumb_bob
+POLYNOMIAL = (
+    "",
+    "plumb_bob",
+    "rational_polynomial",
+    "radtan",
+    "brown_conrady",
+    "Brown Conrady",
+    "Modified Brown Conrady",
+)
+DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
+
+
+def encoded_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height that a JPEG or PNG tells, without decoding; None if it is cut short or neither."""
+    if data.startswith(b"\x89PNG"):
+        whole = len(data) > 24 and b"IEND" in data[-64:]
+        return (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) if whole else None
+    at = 2 if data.startswith(b"\xff\xd8") else len(data)
+    while at + 9 < len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of a frame
+            if data.rfind(b"\xff\xd9", at) < 0:  # no end; some cameras write more behind it
+                return None
+            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+        at += 1 if marker == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return None
+
+
+def is_cut_short(message: Any) -> bool:
+    """Whether a CompressedImage lacks its end (JPEG, PNG, WebP); that of compressedDepth has 12 bytes before it."""
+    if not hasattr(message, "format"):
+        return False
+    data = bytes(message.data)
+    data = data[12:] if data[12:].startswith(b"\x89PNG") else data
+    if _is_webp(data):
+        return len(data) < 8 + int.from_bytes(data[4:8], "little")
+    return data.startswith((b"\xff\xd8\xff", b"\x89PNG")) and encoded_size(data) is None
+
+
+def is_depth(message: Any) -> bool:
+    """Whether an Image or CompressedImage holds depth, by what it says of itself."""
+    if hasattr(message, "encoding"):
+        return message.encoding in DEPTH_ENCODINGS
+    return "compressedDepth" in message.format or _is_gray_png_of_16_bits(bytes(message.data[:26]))
+
+
+def is_integer_depth(message: Any) -> bool:
+    """Whether depth comes as integers, whose numbers can be kept; else as floats."""
+    encoding = message.encoding if hasattr(message, "encoding") else message.format.split(";")[0].strip()
+    return bool(encoding != "32FC1")
+
+
+def _is_gray_png_of_16_bits(head: bytes) -> bool:
+    """By the first chunk of a PNG: 16 bits, and gray (colour type 0)."""
+    return head.startswith(b"\x89PNG") and head[24:26] == b"\x10\x00"
+
+
+def size_of(message: Any, where: str) -> tuple[int, int]:
+    """Width and height of an Image or CompressedImage."""
+    import cv2
+
+    if hasattr(message, "encoding"):
+        return int(message.width), int(message.height)
+    if is_depth(message):
+        height, width = depth_m(message, where, 1.0).shape
+        return width, height
+    image = decode_image(color_bytes(message, where)[0], cv2.IMREAD_COLOR)
+    if image is None:
+        raise DuagError(f"{where}: no decoder reads it, expected a colour image")
+    return int(image.shape[1]), int(image.shape[0])
+
+
+def rows_of(message: Any, where: str, dtype: str, channels: int) -> NDArray[Any]:
+    """Pixels [h, w, channels] of an Image, without the padding of its rows, in native byte order."""
+    kind = np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<")
+    if not (message.width > 0 and message.height > 0):
+        raise DuagError(f"{where}: is {message.width}x{message.height} pixels, expected an image")
+    used = message.width * channels * kind.itemsize
+    if message.step < used or len(message.data) < message.step * (message.height - 1) + used:
+        raise DuagError(
+            f"{where}: {len(message.data)} bytes with rows of {message.step}, expected {message.height} rows of at "
+            f"least {used}"
+        )
+    data = np.frombuffer(message.data, np.uint8)  # the last row may come without its padding
+    step = message.step if message.height > 1 else used  # of a single row, nothing bounds it
+    rows = as_strided(data, (message.height, used), (step, 1), writeable=False).view(kind)
+    return rows.reshape(message.height, message.width, channels).astype(dtype)
+
+
+def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
+    """Encoded colour and its format: the message's own JPEG or PNG, or a PNG of its raw pixels."""
+    import cv2
+
+    if hasattr(message, "format"):
+        data = bytes(message.data)
+        if data.startswith(b"\xff\xd8\xff"):
+            return data, "jpeg"
+        if data.startswith(b"\x89PNG"):
+            return data, "png"
+        if _is_webp(data):
+            return _webp_as_png(data, where), "png"
+        raise DuagError(
+            f"{where}: {len(data)} bytes of format {message.format!r}, expected JPEG, PNG or WebP"
+        )
+    if message.encoding not in _COLOR_CODES:
+        known = ", ".join(_COLOR_CODES)
+        raise DuagError(f"{where}: encoding {message.encoding!r}, expected one of {known}")
+    channels, conversion = _COLOR_CODES[message.encoding]
+    pixels = rows_of(message, where, "uint8", channels)
+    if conversion is not None:
+        pixels = cv2.cvtColor(pixels, getattr(cv2, conversion))
+    settings = [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]
+    return cv2.imencode(".png", np.ascontiguousarray(pixels), settings)[1].tobytes(), "png"
+
+
+def _is_webp(data: bytes) -> bool:
+    return data.startswith(b"RIFF") and data[8:12] == b"WEBP"
+
+
+def _webp_as_png(data: bytes, where: str) -> bytes:
+    """The pixels of a WebP, which recordings do not hold, as PNG."""
+    import cv2
+
+    image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise DuagError(f"{where}: {len(data)} bytes of WebP that no decoder reads, expected an image")
+    return cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])[1].tobytes()
+
+
+def depth_m(message: Any, where: str, scale: float) -> Depth:
+    """Depth [h, w] in metres, 0 where there is none. scale: metres per unit of integer depth."""
+    return in_metres(depth_values(message, where), scale)
+
+
+def in_metres(values: NDArray[np.uint16] | Depth, scale: float) -> Depth:
+    """What `depth_values` gives, in metres."""
+    if values.dtype == np.uint16:
+        return values.astype(np.float32) * np.float32(scale)
+    return values.astype(np.float32, copy=False)
+
+
+def depth_values(message: Any, where: str) -> NDArray[np.uint16] | Depth:
+    """Depth [h, w], 0 where there is none: integers as they stand, uint16, or metres, float32."""
+    if hasattr(message, "format"):
+        return _compressed_depth(message.format, bytes(message.data), where)
+    if message.encoding in ("16UC1", "mono16"):
+        return rows_of(message, where, "uint16", 1)[..., 0]
+    if message.encoding == "32FC1":
+        return _sound(rows_of(message, where, "float32", 1)[..., 0])
+    raise DuagError(f"{where}: encoding {message.encoding!r}, expected one of {', '.join(DEPTH_ENCODINGS)}")
+
+
+def _sound(depth: NDArray[Any]) -> Depth:
+    """Depth without NaN, infinity and negative numbers."""
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isfinite(depth) & (depth > 0), depth, 0.0).astype(np.float32)
+
+
+def _compressed_depth(text: str, data: bytes, where: str) -> NDArray[np.uint16] | Depth:
+    """compressedDepth of image_transport: a header of 12 bytes, then PNG or RVL; plain PNG too.
+
+    A PNG of 32FC1 holds inverse depth, z = A / (v - B); the encoding in `format` decides, not the header.
+    """
+    import cv2
+
+    if data.startswith(b"\xff\xd8\xff"):
+        raise DuagError(f"{where}: depth as JPEG, expected 16-bit depth; eight bits of it are lost")
+    plain = data.startswith(b"\x89PNG")
+    if not plain and len(data) < 12:
+        raise DuagError(f"{where}: {len(data)} bytes, expected compressed depth")
+    body = data if plain else data[12:]
+    encoding = text.split(";")[0].strip()
+    if not body.startswith(b"\x89PNG"):
+        values = _rvl(body, where)
+    else:
+        image = decode_image(body, cv2.IMREAD_UNCHANGED)
+        if image is None or image.dtype != np.uint16 or image.ndim != 2:
+            raise DuagError(f"{where}: no decoder finds 16-bit depth in it, expected a PNG of 16 bits")
+        values = image.astype(np.uint16)
+    if encoding != "32FC1":
+        return values
+    if plain:
+        raise DuagError(f"{where}: inverse depth without its header of 12 bytes, expected compressedDepth")
+    _, a, b = struct.unpack("<iff", data[:12])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return _sound(np.where(values > 0, a / (values.astype(np.float32) - np.float32(b)), 0.0))
+
+
+def _rvl(body: bytes, where: str) -> NDArray[np.uint16]:
+    """RVL (Wilson 2017): runs of zeros and of differences in nibbles of three bits; columns and rows in front."""
+    broken = f"{where}: broken RVL depth, expected columns, rows and runs"
+    if len(body) < 8:
+        raise DuagError(broken)
+    columns, rows = struct.unpack("<II", body[:8])
+    if not 0 < columns * rows <= 1 << 26:
+        raise DuagError(broken)
+    words = np.frombuffer(body[8 : 8 + (len(body) - 8) // 4 * 4], "<u4")
+    shifts = np.arange(28, -4, -4, dtype=np.uint32)
+    nibbles = ((words[:, None] >> shifts) & 15).ravel().astype(np.int64)  # the highest nibble comes first
+    ends = np.flatnonzero(nibbles < 8)
+    if not len(ends):
+        raise DuagError(broken)
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    nibbles = nibbles[: ends[-1] + 1]
+    place = np.arange(len(nibbles)) - np.repeat(starts, ends - starts + 1)
+    if place.max() > 10:
+        raise DuagError(broken)
+    numbers = np.add.reduceat((nibbles & 7) << (3 * place), starts)
+    out = np.zeros(columns * rows, np.int64)
+    at = position = previous = 0
+    while position < len(out):
+        if at + 1 >= len(numbers):
+            raise DuagError(broken)
+        zeros, count = int(numbers[at]), int(numbers[at + 1])
+        at += 2
+        position += zeros
+        if position + count > len(out) or at + count > len(numbers):
+            raise DuagError(broken)
+        coded = numbers[at : at + count]
+        steps = (coded >> 1) ^ -(coded & 1)
+        values = previous + np.cumsum(steps)
+        out[position : position + count] = values
+        previous = int(values[-1]) if count else previous
+        at, position = at + count, position + count
+    if out.min(initial=0) < 0 or out.max(initial=0) > 65535:
+        raise DuagError(broken)
+    return out.reshape(rows, columns).astype(np.uint16)
+
+
+@dataclass(frozen=True)
+class RosCamera:
+    """A CameraInfo: the pinhole, and the distortion of its images; fisheye: by the equidistant model."""
+
+    camera: PinholeCamera
+    distortion: tuple[float, ...]
+    fisheye: bool
+    frame_id: str
+
+    @staticmethod
+    def of(message: Any, rectified: bool, where: str) -> RosCamera:
+        """From a CameraInfo of ROS 1 or 2. rectified: the images belong to P, without distortion."""
+        K, D, P = (
+            np.array(getattr(message, name if hasattr(message, name) else name.lower()), dtype=np.float64)
+            for name in ("K", "D", "P")
+        )
+        if K.size != 9 or P.size not in (0, 12):
+            raise DuagError(f"{where}: K and P of {K.size} and {P.size} numbers, expected 9 and 12")
+        model = message.distortion_model
+        if rectified and np.any(P):
+            fx, cx, fy, cy = P[0], P[2], P[5], P[6]
+            D = np.zeros(0)
+        else:
+            fx, cx, fy, cy = K[0], K[2], K[4], K[5]
+        side = max(message.width, message.height)
+        if not (
+            np.abs([cx, cy]).max() < LONGEST_LENS * side
+            and all(side / LONGEST_LENS < f < LONGEST_LENS * side for f in (fx, fy))
+        ):
+            raise DuagError(
+                f"{where}: focal length {fx:g}, {fy:g} px and centre {cx:g}, {cy:g} px of {message.width}x"
+                f"{message.height}, expected those of a camera"
+            )
+        binning = max(1, message.binning_x), max(1, message.binning_y)
+        roi = message.roi
+        width, height = (roi.width or message.width), (roi.height or message.height)
+        camera = PinholeCamera(
+            int(width) // binning[0],
+            int(height) // binning[1],
+            fx / binning[0],
+            fy / binning[1],
+            (cx - roi.x_offset + 0.5) / binning[0] - 0.5,
+            (cy - roi.y_offset + 0.5) / binning[1] - 0.5,
+        )
+        if not np.any(D):
+            return RosCamera(camera, (), False, message.header.frame_id)
+        fisheye = model in FISHEYE
+        lengths = {True: (4,), False: (4, 5, 8, 12, 14)}[fisheye]
+        if not fisheye and model not in POLYNOMIAL:
+            known = ", ".join((*POLYNOMIAL[1:], *FISHEYE))
+            raise DuagError(f"{where}: distortion model {model!r}, expected one of {known}")
+        if len(D) not in lengths or not np.isfinite(D).all():
+            raise DuagError(
+                f"{where}: distortion {D.tolist()} of {model!r}, expected {' or '.join(map(str, lengths))} numbers"
+            )
+        return RosCamera(camera, tuple(D.tolist()), fisheye, message.header.frame_id)
+
+    def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """Where in its images every pixel of the pinhole lies; None without distortion."""
+        import cv2
+
+        if not self.distortion:
+            return None
+        c = self.camera
+        K = np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
+        rays, zero = c.rays().reshape(-1, 1, 3), np.zeros(3)
+        project = cv2.fisheye.projectPoints if self.fisheye else cv2.projectPoints
+        if self.fisheye:
+            pixels, _ = project(rays, zero, zero, K, np.array(self.distortion[:4]))
+        else:
+            pixels, _ = project(rays, zero, zero, K, np.array(self.distortion))
+        u, v = pixels.reshape(c.height, c.width, 2).astype(np.float32).transpose(2, 0, 1)
+        return np.ascontiguousarray(u), np.ascontiguousarray(v)

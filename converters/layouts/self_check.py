@@ -1,0 +1,87 @@
+"""One number for axes, direction of the poses, scale, intrinsics and association: depth moved by the poses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+GAP = 10  # frames
+PAIRS = 8
+STRIDE = 6  # pixels
+MIN_PIXELS = 200
+MAX_RATIO = 0.02  # of the median depth
+
+
+class ReprojectionCheck:
+    """Moves the depth of a frame into a later one by the poses and compares."""
+
+    def __init__(self, camera: PinholeCamera, frames: int, gap: int = GAP) -> None:
+        """gap: frames between the two of a pair; more where the true poses are known to be rough."""
+        self._camera = camera
+        gap = min(gap, frames - 1)
+        starts: list[int] = []
+        if gap > 0:
+            starts = np.linspace(0, frames - 1 - gap, PAIRS).astype(int).tolist()
+        self._second = {start + gap: start for start in starts}  # second frame of a pair -> first
+        self._kept: dict[int, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+        self._residuals: list[NDArray[np.float64]] = []
+        self._depths: list[NDArray[np.float64]] = []
+
+    def needs(self, index: int, T_world_camera: NDArray[np.float64] | None) -> bool:
+        """Whether frame `index` is compared with another."""
+        return T_world_camera is not None and (index in self._second or index in self._second.values())
+
+    def add(
+        self, index: int, depth_m: NDArray[np.float64], T_world_camera: NDArray[np.float64] | None
+    ) -> None:
+        """Take frame `index`: depth [H, W] (m, 0 = none) and its pose, None where there is none."""
+        if T_world_camera is None:
+            return
+        if index in self._second.values():
+            self._kept[index] = (depth_m, T_world_camera)
+        if index in self._second and self._second[index] in self._kept:
+            first, T_world_first = self._kept.pop(self._second[index])
+            self._compare(first, T_world_first, depth_m, T_world_camera)
+
+    def _compare(
+        self,
+        first: NDArray[np.float64],
+        T_world_first: NDArray[np.float64],
+        second: NDArray[np.float64],
+        T_world_second: NDArray[np.float64],
+    ) -> None:
+        points = self._camera.back_project(first)[::STRIDE, ::STRIDE].reshape(-1, 3)
+        points = se3.transform(se3.inverse(T_world_second) @ T_world_first, points[points[:, 2] > 0])
+        points = points[points[:, 2] > 0.05]
+        pixels = np.rint(self._camera.project(points)).astype(int)
+        inside = ((pixels >= 0) & (pixels < (self._camera.width, self._camera.height))).all(axis=1)
+        found = second[pixels[inside, 1], pixels[inside, 0]]
+        expected = points[inside, 2]
+        self._residuals.append(np.abs(found - expected)[found > 0])
+        self._depths.append(found[found > 0])
+
+    def result(self, label: str, max_ratio: float = MAX_RATIO) -> dict[str, Any]:
+        """Median residual and median depth in metres, None where too little overlaps.
+
+        Args:
+            label: of the source, for the message. max_ratio: largest residual as a share of the depth; more where the
+                true poses are known to be rough.
+        Raises:
+            DuagError: the residual is too large: poses, depth and intrinsics do not belong together.
+        """
+        residuals = np.concatenate([*self._residuals, np.zeros(0)])
+        if len(residuals) < MIN_PIXELS:
+            return {"reprojection_median_m": None, "median_depth_m": None}
+        residual, depth = float(np.median(residuals)), float(np.median(np.concatenate(self._depths)))
+        if residual > max_ratio * depth:
+            raise DuagError(
+                f"{label}: depth moved by the poses differs by {residual:.3f} m at {depth:.2f} m (medians), expected "
+                f"less than {max_ratio:.0%}: poses, intrinsics and depth do not belong together"
+            )
+        return {"reprojection_median_m": residual, "median_depth_m": depth}

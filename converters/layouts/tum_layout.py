@@ -1,0 +1,191 @@
+"""The layout of TUM RGB-D, which other datasets took over: lists of images with times, poses with times."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from duagc.converters.layouts.image_folder import FrameFiles
+from duagc.converters.writer import NANOSECONDS
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import read_text
+from duagc.pipeline.config.base import Config
+from duagc.pipeline.geometry import se3, so3
+
+Array = NDArray[np.float64]
+LAST_NS = 1 << 62  # about the year 2116
+
+
+class AssociationOptions(Config):
+    """Which depth image belongs to which colour image, and where the camera was."""
+
+    association: Literal["official", "nearest"] = "official"
+    """`official`: closest pairs first, each image once, as the dataset's associate.py. `nearest`: for each colour image
+    the nearest depth image, which may be used twice, as most published loaders do."""
+    max_difference_s: float = Field(0.0, ge=0.0)
+    """Largest difference of their times; 0: 0.02 for `official`, 0.08 for `nearest`."""
+    max_pose_gap_s: float = Field(0.1, gt=0.0)
+    """Poses are interpolated between two measured ones that are no further apart; never beyond the ends."""
+
+    @property
+    def limit_ns(self) -> int:
+        """Largest difference of times of colour and depth."""
+        default = 0.02 if self.association == "official" else 0.08
+        return round((self.max_difference_s or default) * NANOSECONDS)
+
+
+@dataclass(frozen=True)
+class Listed:
+    """One line of a list: time and file."""
+
+    stamp_ns: int
+    path: Path
+
+
+def nanoseconds(text: str, where: str) -> int:
+    """Decimal seconds as integer nanoseconds, exactly."""
+    try:
+        time_ns = Decimal(text) * NANOSECONDS
+        if abs(time_ns) < LAST_NS:
+            return int(time_ns.to_integral_value())
+    except (InvalidOperation, ValueError) as error:
+        raise DuagError(f"{where}: {text!r}, expected a time in seconds") from error
+    raise DuagError(f"{where}: {text[:60]!r}, expected a time in seconds before the year 2116")
+
+
+def read_list(path: Path) -> list[Listed]:
+    """A list of images, in order of time.
+
+    Raises:
+        DuagError: a line is not a time and a file name, or a time comes twice.
+    """
+    listed = []
+    for number, line in enumerate(read_text(path, "lines of time and file name").splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if len(words) != 2:
+            raise DuagError(f"{path}:{number}: {line.strip()[:60]!r}, expected a time and a file name")
+        listed.append(Listed(nanoseconds(words[0], f"{path}:{number}"), path.parent / words[1]))
+    listed.sort(key=lambda entry: entry.stamp_ns)
+    for before, after in pairwise(listed):
+        if before.stamp_ns == after.stamp_ns:
+            raise DuagError(f"{path}: {after.path.name} has the time of {before.path.name}, expected its own")
+    if not listed:
+        raise DuagError(f"{path}: lists no image, expected lines of time and file name")
+    return listed
+
+
+def associate(
+    color: list[Listed], depth: list[Listed], options: AssociationOptions
+) -> list[tuple[Listed, Listed]]:
+    """Pairs of colour and depth, in order of the colour's time."""
+    limit = options.limit_ns
+    times = [d.stamp_ns for d in depth]
+    candidates = []
+    for i, c in enumerate(color):
+        first, last = bisect_left(times, c.stamp_ns - limit), bisect_left(times, c.stamp_ns + limit + 1)
+        candidates += [(abs(times[j] - c.stamp_ns), i, j) for j in range(first, last)]
+    candidates.sort()
+    taken_color: set[int] = set()
+    taken_depth: set[int] = set()
+    pairs = []
+    for _, i, j in candidates:
+        if i in taken_color or (options.association == "official" and j in taken_depth):
+            continue
+        taken_color.add(i)
+        taken_depth.add(j)
+        pairs.append((i, j))
+    return [(color[i], depth[j]) for i, j in sorted(pairs)]
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Measured poses: stamps_ns int64 [n], increasing, T_world_body [n, 4, 4]; how many lines were no pose."""
+
+    stamps_ns: NDArray[np.int64]
+    T_world_body: Array
+    unusable: int
+
+    @staticmethod
+    def read(path: Path) -> Poses:
+        """From `timestamp tx ty tz qx qy qz qw`; lines with nan are counted and left out."""
+        rows: dict[int, list[float]] = {}
+        unusable = 0
+        for number, line in enumerate(read_text(path, "lines of time and pose").splitlines(), start=1):
+            words = line.split()
+            if not words or words[0].startswith("#"):
+                continue
+            where = f"{path}:{number}"
+            try:
+                values = [float(word) for word in words[1:]]
+            except ValueError:
+                values = []
+            if len(values) != 7:
+                raise DuagError(f"{where}: {line.strip()[:60]!r}, expected eight numbers")
+            if np.all(np.isfinite(values)) and np.linalg.norm(values[3:]) > 0.5:
+                rows.setdefault(nanoseconds(words[0], where), values)
+            else:
+                unusable += 1
+        if not rows:
+            raise DuagError(f"{path}: found no pose, expected lines `timestamp tx ty tz qx qy qz qw`")
+        stamps = sorted(rows)
+        values_of = np.array([rows[s] for s in stamps])
+        T = se3.from_quat_translation(values_of[:, [6, 3, 4, 5]], values_of[:, :3])
+        return Poses(np.array(stamps, dtype=np.int64), T, unusable)
+
+    def at(self, stamp_ns: int, max_gap_s: float) -> Array | None:
+        """Pose [4, 4] at a time: on the way between two measured ones; None where there are none near."""
+        k = int(np.searchsorted(self.stamps_ns, stamp_ns))
+        if k < len(self.stamps_ns) and self.stamps_ns[k] == stamp_ns:
+            return self.T_world_body[k]
+        if k in (0, len(self.stamps_ns)):
+            return None
+        before, after = int(self.stamps_ns[k - 1]), int(self.stamps_ns[k])
+        if after - before > max_gap_s * NANOSECONDS:
+            return None
+        share = (stamp_ns - before) / (after - before)
+        a, b = self.T_world_body[k - 1], self.T_world_body[k]
+        R = a[:3, :3] @ so3.exp(share * so3.log(a[:3, :3].T @ b[:3, :3]))
+        return se3.from_rotation_translation(R, a[:3, 3] + share * (b[:3, 3] - a[:3, 3]))
+
+
+def frames_of(src: Path, options: AssociationOptions) -> tuple[list[FrameFiles], Poses | None, list[str]]:
+    """Frames of a sequence with the pose of its body, the poses, and warnings."""
+    if not src.is_dir():
+        raise DuagError(f"{src}: no such folder, expected rgb.txt, depth.txt and groundtruth.txt in it")
+    color, depth = read_list(src / "rgb.txt"), read_list(src / "depth.txt")
+    pairs = associate(color, depth, options)
+    if not pairs:
+        raise DuagError(
+            f"{src / 'depth.txt'}: no image within {options.limit_ns / NANOSECONDS:g} s of one in rgb.txt, "
+            "expected pairs"
+        )
+    warnings = []
+    if len(pairs) < len(color):
+        warnings.append(f"{len(color) - len(pairs)} of {len(color)} colour images have no depth near in time")
+    truth = src / "groundtruth.txt"
+    poses = Poses.read(truth) if truth.is_file() else None
+    if poses is None:
+        warnings.append("no groundtruth.txt: no ground truth")
+    elif poses.unusable:
+        warnings.append(f"{poses.unusable} lines of groundtruth.txt hold no pose")
+    frames = [
+        FrameFiles(
+            number,
+            c.stamp_ns,
+            c.path,
+            d.path,
+            None if poses is None else poses.at(c.stamp_ns, options.max_pose_gap_s),
+        )
+        for number, (c, d) in enumerate(pairs)
+    ]
+    return frames, poses, warnings

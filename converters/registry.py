@@ -1,0 +1,137 @@
+"""From files as they are distributed to recordings: one module per dataset, named in one table."""
+
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from duagc.pipeline.base.errors import DuagError, closest
+
+# name on the command line -> module with `Options` and `convert(src, out, robots=, force=, **options)`
+DATASETS = {
+    "7scenes": "duagc.converters.datasets.seven_scenes",
+    "aria-multiagent": "duagc.converters.datasets.aria_multiagent",
+    "bonn": "duagc.converters.datasets.bonn",
+    "icl-nuim": "duagc.converters.datasets.icl_nuim",
+    "kimera-multi": "duagc.converters.datasets.kimera_multi",
+    "replica": "duagc.converters.datasets.replica",
+    "ros": "duagc.converters.datasets.ros",
+    "replica-multiagent": "duagc.converters.datasets.replica_multiagent",
+    "s3e": "duagc.converters.datasets.s3e",
+    "scannet": "duagc.converters.datasets.scannet",
+    "scannetpp": "duagc.converters.datasets.scannetpp",
+    "tum": "duagc.converters.datasets.tum",
+}
+
+
+def _module(dataset: str) -> ModuleType:
+    if dataset.endswith(".py"):
+        return _from_file(Path(dataset))
+    if dataset not in DATASETS:
+        raise DuagError(f"dataset {dataset!r}, {closest(dataset, sorted(DATASETS), 'datasets')}")
+    return import_module(DATASETS[dataset])
+
+
+def _from_file(path: Path) -> ModuleType:
+    """A converter of the user's own."""
+    if not path.is_file():
+        raise DuagError(f"{path}: no such file, expected a converter in Python, or the name of a dataset")
+    spec = spec_from_file_location(path.stem, path)
+    assert spec is not None  # there is a loader for every .py
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except (ImportError, SyntaxError) as error:
+        raise DuagError(f"{path}: {type(error).__name__} {error}, expected a converter in Python") from error
+    if not hasattr(module, "convert"):
+        raise DuagError(
+            f"{path}: found no `convert`, expected convert(src, out, robots=1, force=False, **options)"
+        )
+    return module
+
+
+def convert(
+    dataset: str,
+    src: Path,
+    out: Path,
+    robots: int | None = None,
+    force: bool = False,
+    options: Sequence[str] = (),
+    options_file: Path | None = None,
+) -> None:
+    """Convert a dataset into a recording.
+
+    Args:
+        dataset: a name in `DATASETS`, or a Python file with a converter like those.
+        src: where its files are. out: the folder to write.
+        robots: how many robots to make of it; None: one, or as many as the dataset has.
+        force: replace a recording that is there.
+        options: `name=value` of the converter, values in TOML notation.
+        options_file: TOML file of options; those of `options` win. `recording.json` keeps its text.
+    Raises:
+        DuagError: names the file, what was found and what was expected.
+    """
+    module = _module(dataset)
+    count = {} if robots is None else {"robots": robots}
+    said = parse_options(options)
+    with _options_of_file(options_file, module, dataset) as filed:
+        for name in ("src", "out", "robots", "force"):
+            if name in filed or name in said:
+                raise DuagError(
+                    f"{dataset}: {name} is no option of a converter, expected it among the arguments"
+                )
+        module.convert(Path(src), Path(out), force=force, **count, **{**filed, **said})
+
+
+@contextmanager
+def _options_of_file(path: Path | None, module: ModuleType, dataset: str) -> Iterator[dict[str, Any]]:
+    """Options by name, sound by themselves; recordings that are written meanwhile keep the text."""
+    if path is None:
+        yield {}
+        return
+    from duagc.converters.layouts.image_files import options_of
+    from duagc.converters.writer import OPTIONS_FILE
+    from duagc.pipeline.base.files import read_text
+
+    text = read_text(path, "options of a converter in TOML")
+    try:
+        values = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise DuagError(f"{path}: {error}, expected options of a converter in TOML") from error
+    if hasattr(module, "Options"):
+        options_of(module.Options, values, f"{path}, for {dataset}")
+    token = OPTIONS_FILE.set({"name": path.name, "text": text})
+    try:
+        yield values
+    finally:
+        OPTIONS_FILE.reset(token)
+
+
+def parse_options(options: Sequence[str]) -> dict[str, Any]:
+    """Options by name. options: `name=value`, values in TOML notation; what is none is text."""
+    values: dict[str, Any] = {}
+    for option in options:
+        name, separator, text = option.partition("=")
+        if not separator or not name.strip():
+            raise DuagError(f"--set {option}: expected NAME=VALUE")
+        try:
+            values[name.strip()] = tomllib.loads(f"value = {text.strip()}")["value"]
+        except tomllib.TOMLDecodeError:
+            values[name.strip()] = text.strip()
+    return values
+
+
+def describe() -> str:
+    """The datasets and the options of their converters, as text."""
+    lines = []
+    for name in sorted(DATASETS):
+        module = _module(name)
+        lines.append(f"{name}: {(module.__doc__ or '').splitlines()[0]}")
+        for option, field in module.Options.model_fields.items():
+            lines.append(f"    --set {option}={field.default}  {' '.join((field.description or '').split())}")
+    return "\n".join(lines)

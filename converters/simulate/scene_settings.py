@@ -1,0 +1,44 @@
+"""The procedural scenes by name, and how robots move and measure in them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from duagc.converters.simulate.buildings import corridor, office
+from duagc.converters.simulate.outdoor import outdoor
+from duagc.converters.simulate.room import room
+from duagc.converters.simulate.scene import Scene
+from duagc.pipeline.base.errors import DuagError
+
+
+@dataclass(frozen=True)
+class Manner:
+    """texel_m: of the texture. step_m: way of a robot per frame. depth_scale_m: metres per unit of depth images.
+
+    sky: there is a sky above instead of a ceiling. solid: things are closed, and only their fronts can be seen.
+    """
+
+    texel_m: float = 0.005
+    step_m: float = 0.028
+    depth_scale_m: float = 1 / 5000
+    sky: bool = False
+    solid: bool = True
+
+
+MESHES = Manner(solid=False)
+SCENES: dict[str, tuple[Callable[[int], Scene], Manner]] = {
+    "room": (room, Manner(texel_m=0.004, step_m=0.022)),
+    "office": (office, Manner()),
+    "corridor": (corridor, Manner()),
+    "outdoor": (outdoor, Manner(texel_m=0.01, step_m=0.06, depth_scale_m=1 / 1000, sky=True)),
+}
+
+
+def build(name: str, seed: int) -> Scene:
+    """Build a scene by its name.
+
+    Raises:
+        DuagError: there is no scene of that name.
+    """
+    if name not in SCENES:
+        raise DuagError(f"scene is {name!r}, expected one of {', '.join(SCENES)}")
+    return SCENES[name][0](seed)

@@ -1,0 +1,1 @@
+"""Errors, files, worker processes, random streams, progress: what every other part stands on."""

@@ -1,0 +1,73 @@
+"""A folder that appears under its name only when it is finished, and is one process's alone until then."""
+
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from duagc.pipeline.base.errors import DuagError
+
+RUN = "a run", ("manifest.json", "run/manifest.json")  # the latter of a demo
+RECORDING = "a recording", ("recording.json",)
+
+
+@contextmanager
+def new_folder(out: Path, force: bool, kind: tuple[str, tuple[str, ...]] = RUN) -> Iterator[Path]:
+    """A folder beside `out` that takes its name when the block ends well, and is removed when it does not.
+
+    force: replace what is there, if it is empty or of this kind: its name, and the files that tell.
+    """
+    _check_out(out, force, kind)
+    partial = out.with_name(out.name + ".part")
+    with _locked(partial):
+        try:
+            yield partial
+            _check_out(out, force, kind)  # it may have appeared meanwhile
+            if out.exists():
+                shutil.rmtree(out)
+            partial.rename(out)
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """An empty folder that is this process's alone; what a killed one has left in it is removed."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise DuagError(f"{folder}: {error.strerror or error}, expected to write a folder") from error
+    try:
+        _take(lock, folder)
+        for path in folder.iterdir():
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+        yield
+    finally:
+        os.close(lock)
+
+
+def _take(lock: int, folder: Path) -> None:
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the kernel gives it up with the process
+    except BlockingIOError as error:
+        raise DuagError(f"{folder}: another process is writing it; wait, or choose another --out") from error
+
+
+def _check_out(out: Path, force: bool, kind: tuple[str, tuple[str, ...]]) -> None:
+    """Refuse to replace what is there, unless `force` and nothing of another kind would be lost."""
+    if not out.name:
+        raise DuagError(f"{out}: found a path without a name, expected the name of a new folder")
+    if not out.exists():
+        return
+    if not force:
+        raise DuagError(f"{out}: exists already; choose another --out or give --force")
+    name, marks = kind
+    if not out.is_dir() or (any(out.iterdir()) and not any((out / mark).is_file() for mark in marks)):
+        raise DuagError(f"{out}: is not {name}, expected one; --force replaces nothing else")

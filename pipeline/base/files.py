@@ -1,0 +1,95 @@
+"""Whole files: reading regular ones of bounded size from outside, writing ones that appear when they are finished."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from duagc.pipeline.base.errors import DuagError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+LARGEST_BYTES = 1 << 29
+
+
+def check_file(path: Path, expected: str, largest: int | None = None) -> int:
+    """The size of a regular file in bytes; opening anything else might never end.
+
+    Raises:
+        DuagError: it is missing, a folder, a pipe or a device, or larger than `largest` bytes.
+    """
+    try:
+        size = path.stat().st_size
+        regular = path.is_file()
+    except (OSError, ValueError) as error:
+        reason = (error.strerror if isinstance(error, OSError) else None) or error
+        raise DuagError(f"{path}: {reason}, expected {expected}") from error
+    if not regular:
+        kind = "a folder" if path.is_dir() else "no regular file"
+        raise DuagError(f"{path}: is {kind}, expected {expected}")
+    if largest is not None and size > largest:
+        raise DuagError(
+            f"{path}: has {size / 1e6:.0f} MB, expected {expected}, at most {largest / 1e6:.0f} MB"
+        )
+    return size
+
+
+def read_bytes(path: Path, expected: str) -> bytes:
+    """The bytes of a file. Raises DuagError as `check_file` does."""
+    check_file(path, expected, LARGEST_BYTES)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DuagError(f"{path}: {error.strerror or error}, expected {expected}") from error
+
+
+def read_text(path: Path, expected: str) -> str:
+    """The text of a file in UTF-8. Raises DuagError as `check_file` does."""
+    try:
+        return read_bytes(path, expected).decode()
+    except UnicodeDecodeError as error:
+        raise DuagError(f"{path}: is not text, expected {expected}") from error
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """A name beside `path` to write to: it becomes `path` when the block ends well, else it is removed.
+
+    Raises:
+        DuagError: it cannot be written there.
+    """
+    part = path.with_name(path.name + ".part")
+    try:
+        yield part
+        part.replace(path)
+    except OSError as error:
+        raise DuagError(f"{path}: {error.strerror or error}, expected to write a file") from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def decode_image(data: bytes, flags: int) -> NDArray[Any] | None:
+    """What OpenCV makes of an encoded image; None if nothing, or more pixels than `determinism` allows."""
+    import cv2
+    import numpy as np
+
+    if not data or _is_torn_png(data):
+        return None
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # it refuses large sizes by an exception
+        return None
+
+
+def _is_torn_png(data: bytes) -> bool:
+    """Whether a chunk of a PNG claims more bytes than follow: OpenCV takes up to 4 GB of memory to find that out."""
+    if not data.startswith(b"\x89PNG"):
+        return False
+    at = 8
+    while at + 8 <= len(data) and data[at + 4 : at + 8] != b"IEND":
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+    return at + 8 > len(data)

@@ -1,0 +1,77 @@
+"""Worker processes that end with whoever started them: on an error, on Ctrl-C, and when the parent is killed.
+
+Light on purpose: a fresh process imports this module first, and from then on it leaves Ctrl-C to its parent.
+"""
+
+import multiprocessing
+import os
+import resource
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from duagc.pipeline.base.errors import DuagError
+
+
+@contextmanager
+def worker_pool(
+    workers: int,
+    start: Callable[..., None] | None = None,
+    arguments: tuple[Any, ...] = (),
+) -> Iterator[ProcessPoolExecutor]:
+    """A pool of fresh processes, each kept for all its tasks: replacing them (`max_tasks_per_child`) can hang.
+
+    Args:
+        workers: how many. start, arguments: called once in each of them before its first task.
+    Raises:
+        DuagError: a process ended before its task did, for example for want of memory.
+    """
+    before = {child.pid for child in multiprocessing.active_children()}
+    pool = ProcessPoolExecutor(
+        workers,
+        multiprocessing.get_context("spawn"),
+        _begin,
+        (start, arguments),
+    )
+    try:
+        yield pool
+    except BaseException as error:
+        for child in multiprocessing.active_children():
+            if child.pid not in before:
+                child.terminate()
+        pool.shutdown(cancel_futures=True)
+        if isinstance(error, BrokenProcessPool):
+            raise DuagError(
+                "a worker process ended before its task, expected it to finish; was it killed, or out of memory?"
+            ) from error
+        raise
+    pool.shutdown()
+
+
+def _begin(start: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    if start is not None:
+        start(*arguments)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def peak_memory_bytes() -> int:
+    """Most memory that this process has held. `getrusage` would count the parent that it was started from."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

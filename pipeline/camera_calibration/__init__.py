@@ -1,0 +1,1 @@
+"""Cameras of a recording estimated from its own images."""

@@ -1,0 +1,183 @@
+"""A calibration in words, and as options of a converter."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from duagc import __version__
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.camera_calibration.adjustment import Quality
+from duagc.pipeline.camera_calibration.calibrate import Calibration
+from duagc.pipeline.camera_calibration.rig import DEPTH, LENS, NAMES, ROTATION
+
+CONVERTER = "7scenes"
+AS_RECORDED = ("depth_focal_px", "depth_cx_px", "depth_cy_px", "baseline_m")
+OPTIONS = {
+    "color_focal_px": ("fx",),
+    "color_focal_y_px": ("fy",),
+    "color_cx_px": ("cx",),
+    "color_cy_px": ("cy",),
+    "color_distortion": ("k1", "k2", "k3"),
+    "color_rotation_rad": ROTATION,
+    "depth_correction_per_m": DEPTH,
+}
+"""Options of the converter that take a calibration, and the numbers that each takes."""
+BEFORE = ("color_focal_px", "color_cx_px", "color_cy_px")  # a recording may have other values of these
+
+UNITS = dict.fromkeys(NAMES, "1/m") | dict.fromkeys(LENS, "px") | dict.fromkeys(("k1", "k2", "k3"), "")
+UNITS |= dict.fromkeys(ROTATION, "rad") | {"delay_s": "s"}
+
+
+def plain(found: Calibration) -> dict[str, Any]:
+    """As plain values: every number with its standard deviation and that of each half, the self-check, options."""
+    values = [found.rig.values(), *(half.values() for half in found.halves)]
+    return {
+        "views": found.views,
+        "landmarks": found.landmarks,
+        "halves": found.names,
+        "values": {
+            name: {
+                "value": float(values[0][k]),
+                "sigma": found.sigma[name],
+                "of_halves": [float(v[k]) for v in values[1:]],
+                "unit": UNITS[name],
+            }
+            for k, name in enumerate(NAMES)
+        },
+        "held_out": [
+            {"half": name, "as_recorded": vars(before), "calibrated_by_the_other": vars(after)}
+            for name, before, after in _held_out(found)
+        ],
+        "options": options(found),
+    }
+
+
+def not_taken(recording: dict[str, Any]) -> str:
+    """Why no options of a converter would take a calibration of this recording (its description); "" if some do."""
+    converter, used = recording.get("converter", {}).get("name"), recording.get("parameters", {})
+    if converter != CONVERTER:
+        return f"was made by {converter}, which takes no calibration, expected one by {CONVERTER}"
+    resampled = [name for name in OPTIONS if name not in BEFORE and used.get(name)]
+    return f"was converted with {', '.join(resampled)}, expected one without" if resampled else ""
+
+
+def options(found: Calibration) -> dict[str, float | str] | None:
+    """Options of the recording's converter that take it, None if there are none (see `not_taken`).
+
+    They hold what the cameras were taken for, too: what was found is relative to that.
+    """
+    if not_taken(found.recording):
+        return None
+    v = {name: float(value) for name, value in zip(NAMES, found.rig.values(), strict=True)}
+    used = found.recording["parameters"]
+    as_recorded = {name: used[name] for name in AS_RECORDED if name in used}
+    pixels = {option: round(v[names[0]], 2) for option, names in OPTIONS.items() if names[0] in LENS[:4]}
+    return (
+        as_recorded
+        | pixels
+        | {
+            "color_distortion": _text([v["k1"], v["k2"], 0, 0, v["k3"]]),
+            "color_rotation_rad": _text([v[name] for name in ROTATION]),
+            "depth_correction_per_m": _text([v[name] for name in DEPTH]),
+        }
+    )
+
+
+def toml(found: Calibration) -> str:
+    """The options as a file for `duagc convert --options`; comments say how well each number is known.
+
+    Raises:
+        ValueError: no options take the calibration.
+    """
+    taken = options(found)
+    if taken is None:
+        raise ValueError(not_taken(found.recording))
+    values = plain(found)["values"]
+    name, version = json.dumps(found.recording["name"]), __version__
+    lines = [
+        f"Cameras of the recording {name} from its own images, by duagc {version}:",
+        f"{found.views} views, {found.landmarks} features followed. As recorded -> calibrated by the other half:",
+        *(f"{name}: {_change(before, after)}" for name, before, after in _held_out(found)),
+        f"To use them: duagc convert {CONVERTER} SRC --options THIS_FILE --out REC",
+        "",
+        "what the cameras were taken for, which the rest belongs to",
+    ]
+    lines = [f"# {line}" if line else "" for line in lines]
+    for option, value in taken.items():
+        if option in OPTIONS:
+            lines += ["", *(f"# {_known(name, values[name])}" for name in OPTIONS[option])]
+        lines.append(f"{option} = {json.dumps(value)}")
+    later = _known("delay_s", values["delay_s"])
+    return "\n".join([*lines, "", f"# {later}: colour is so much later than depth; no option takes it", ""])
+
+
+def check_out(out: Path, force: bool, recording: dict[str, Any], folder: Path) -> None:
+    """Refuse, before anything is measured, a file that `write` would not write. Raises DuagError."""
+    if why := not_taken(recording):
+        raise DuagError(f"{folder}: {why}, for --out")
+    if out.suffix != ".toml" or not out.absolute().parent.is_dir():
+        raise DuagError(
+            f"{out}: found no such place for a file of options, expected NAME.toml in a folder that exists"
+        )
+    if out.exists() and not (force and out.is_file()):
+        raise DuagError(f"{out}: exists already; choose another --out or give --force")
+
+
+def write(found: Calibration, out: Path) -> None:
+    """Write `toml`; the name appears only when the file is complete. Raises DuagError."""
+    text, partial = toml(found), out.with_name(out.name + ".part")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(out)
+    except OSError as error:
+        raise DuagError(f"{out}: {error.strerror or error}, expected to write options") from error
+
+
+def format_calibration(found: Calibration) -> str:
+    """The same for people."""
+    tree = plain(found)
+    lines = [
+        f"{found.views} views, {found.landmarks} features followed; halves: {'; '.join(found.names)}",
+        "",
+        f"{'':8} {'value':>11} {'sigma':>10} {'first half':>11} {'second half':>11}",
+    ]
+    for name, entry in tree["values"].items():
+        first, second = entry["of_halves"]
+        lines.append(
+            f"{name:8} {entry['value']:11.5f} {entry['sigma']:10.5f} {first:11.5f} {second:11.5f} {entry['unit']}"
+        )
+    lines += ["", "agreement of a half: as recorded -> calibrated by the other half"]
+    for name, before, after in _held_out(found):
+        lines.append(f"{name}: {_change(before, after)}")
+    why = not_taken(found.recording)
+    lines += [
+        "",
+        f"the recording {why}" if why else "--out FILE.toml writes this as options for duagc convert",
+    ]
+    return "\n".join(lines)
+
+
+def _held_out(found: Calibration) -> list[tuple[str, Quality, Quality]]:
+    """Name of every half, its agreement as recorded and as the other half calibrates it."""
+    return list(zip(found.names, found.before, found.after, strict=True))
+
+
+def _known(name: str, entry: dict[str, Any]) -> str:
+    """A number with its standard deviation, and what the halves say."""
+    first, second = entry["of_halves"]
+    text = f"{name} = {entry['value']:.5f} +- {entry['sigma']:.5f} {entry['unit']}".rstrip()
+    return f"{text} (halves {first:.5f}, {second:.5f})"
+
+
+def _change(before: Quality, after: Quality) -> str:
+    return (
+        f"features {before.features_px:.2f} -> {after.features_px:.2f} px, "
+        f"their depth {before.depth_of_features:.2f} -> {after.depth_of_features:.2f} sigma(z), "
+        f"depth images {before.depth:.2f} -> {after.depth:.2f} sigma(z)"
+    )
+
+
+def _text(values: list[float]) -> str:
+    return " ".join(f"{value:.5f}" for value in values)

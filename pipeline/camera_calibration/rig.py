@@ -1,0 +1,99 @@
+"""A colour and a depth camera: what is not as a recording has it.
+
+In a recording depth is registered to a pinhole colour camera. Here the camera that took the colour images has a lens,
+is turned against the registered depth and took its images later; the depth has a smooth error in 1/z.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.geometry import depth_error, so3
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+Array = NDArray[np.float64]
+
+LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3")
+ROTATION = ("rx", "ry", "rz")
+DEPTH = ("c0", "c1", "c2", "c3", "c4", "c5")
+NAMES = (*LENS, *ROTATION, "delay_s", *DEPTH)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Both cameras.
+
+    camera: of the recording, to which depth is registered. lens: [7], focal lengths and principal point in pixels,
+    radial distortion k1 k2 k3 as OpenCV defines it. R_color_depth: [3, 3]. delay_s: colour was taken so much later.
+    depth_error: [6], 1/m, see `geometry.depth_error`.
+    """
+
+    camera: PinholeCamera
+    lens: Array
+    R_color_depth: Array
+    delay_s: float
+    depth_error: Array
+
+    @staticmethod
+    def of(camera: PinholeCamera) -> Rig:
+        """As the recording has it: a pinhole, not turned, at the same time, exact depth."""
+        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, 0, 0, 0])
+        return Rig(camera, lens, np.eye(3), 0.0, np.zeros(6))
+
+    def values(self) -> Array:
+        """The numbers of `NAMES`; the rotation as a rotation vector."""
+        return np.concatenate([self.lens, so3.log(self.R_color_depth), [self.delay_s], self.depth_error])
+
+    def moved(self, step: Array) -> Rig:
+        """With a step of all numbers added; that of the rotation from the left."""
+        return replace(
+            self,
+            lens=self.lens + step[:7],
+            R_color_depth=so3.exp(step[7:10]) @ self.R_color_depth,
+            delay_s=float(self.delay_s + step[10]),
+            depth_error=self.depth_error + step[11:],
+        )
+
+    def project(self, points_color: Array) -> tuple[Array, Array, Array]:
+        """Pixels [n, 2] of points [n, 3] of the colour camera; derivatives by point [n, 2, 3] and lens [n, 2, 7]."""
+        fx, fy, cx, cy, k1, k2, k3 = self.lens
+        z = points_color[:, 2]
+        x, y = points_color[:, 0] / z, points_color[:, 1] / z
+        r2 = x * x + y * y
+        g, dg = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2 * k2 + r2 * 3 * k3)
+        one, nought = np.ones_like(x), np.zeros_like(x)
+        by_ray = np.stack(
+            [
+                np.stack([fx * (g + 2 * x * x * dg), fx * 2 * x * y * dg], axis=-1),
+                np.stack([fy * 2 * x * y * dg, fy * (g + 2 * y * y * dg)], axis=-1),
+            ],
+            axis=1,
+        )
+        ray_by_point = np.stack(
+            [
+                np.stack([1 / z, nought, -x / z], axis=-1),
+                np.stack([nought, 1 / z, -y / z], axis=-1),
+            ],
+            axis=1,
+        )
+        u_by = [x * g, nought, one, nought, fx * x * r2, fx * x * r2**2, fx * x * r2**3]
+        v_by = [nought, y * g, nought, one, fy * y * r2, fy * y * r2**2, fy * y * r2**3]
+        by_lens = np.stack([np.stack(u_by, axis=-1), np.stack(v_by, axis=-1)], axis=1)
+        return np.stack([fx * x * g + cx, fy * y * g + cy], axis=-1), by_ray @ ray_by_point, by_lens
+
+    def depth(self, inverse: Array, rays: Array) -> Array:
+        """True depth [...], metres, of a measured inverse depth at rays [..., 3]."""
+        terms = depth_error.terms(inverse, rays[..., 0], rays[..., 1])
+        return np.asarray(1 / np.maximum(inverse + terms @ self.depth_error, 1 / depth_error.FARTHEST_M))
+
+    def depth_by(self, depth_m: Array, rays: Array) -> Array:
+        """Derivative [..., 6] of a depth [...] at rays [..., 3] by the coefficients of the error, to their first order.
+
+        Give it a depth whose noise is not the residual's: it grows with depth squared, and were that the measured one,
+        noise would push all coefficients one way, the farther the less they are determined.
+        """
+        terms = depth_error.terms(1 / depth_m, rays[..., 0], rays[..., 1])
+        return np.asarray(-(depth_m**2)[..., None] * terms)

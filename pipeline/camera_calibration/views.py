@@ -1,0 +1,277 @@
+"""What a calibration sees of a recording: some views with their tracked poses, and features followed through them."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.frontend.stage import run_frontend
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import open_rgbd
+from duagc.pipeline.registration.features import DIMENSIONS, matches, root_sift
+from duagc.pipeline.registration.pyramid import SAME_SURFACE, RgbdPyramid
+from duagc.pipeline.runs.folder import RobotRun
+
+Array = NDArray[np.float64]
+
+FEATURES = 1200
+RATIO = 0.75
+LINE_PX, POINT_PX = 8.0, 25.0  # of 640 px: how far a match may be from where the tracked poses put it
+MIN_MATCHES = 10
+MIN_TRACK = 3  # views
+NORMALS_LEVEL = 2  # quarter size: noisy normals feign information along a surface, and steps get too short
+SAMPLES = 150  # of the depth of a view
+FARTHEST_SAMPLE_M = 4.0
+MAX_TURN, MAX_WAY_M = 0.6, 2.0  # cosine between the axes of views that are compared, way between them
+
+
+@dataclass
+class Views:
+    """Views of one part of a recording; poses and points are changed by the adjustment.
+
+    T_map_camera: [n, 4, 4]. velocity: [n, 6] of the camera, right tangent per second. inverse_depth: [n, h, w], NaN
+    where unknown. normals: [n, h', w', 3] of smaller images, zero where unknown. samples: [n, SAMPLES, 2], columns and
+    rows with a normal. view, landmark, pixel: of every observation of a feature, [k], [k], [k, 2]. points_map: of the
+    landmarks [m, 3].
+    """
+
+    name: str
+    camera: PinholeCamera
+    T_map_camera: Array
+    velocity: Array
+    inverse_depth: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    samples: NDArray[np.int64]
+    view: NDArray[np.int64]
+    landmark: NDArray[np.int64]
+    pixel: Array
+    points_map: Array
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A log with the poses of its frames: T_map_camera [n, 4, 4], and whether each was tracked [n]."""
+
+    path: Path
+    robot: str
+    T_map_camera: Array
+    ok: NDArray[np.bool_]
+    stamps_ns: NDArray[np.int64]
+
+
+def track_log(path: Path, robot: str, config: FrontendConfig) -> Tracked:
+    """Poses of a log by the front end, without a map.
+
+    That depth and colour contradict each other is what is to be calibrated: no frame is lost for it.
+    """
+    failure = config.tracking.failure.model_copy(update={"doubtful_gray_of_usual": math.inf})
+    tracking = config.tracking.model_copy(update={"failure": failure})
+    config = config.model_copy(update={"mapping_enabled": False, "tracking": tracking})
+    with tempfile.TemporaryDirectory(prefix="duagc-calibrate-") as folder:
+        run_frontend(path, Path(folder) / "frontend.mcap", config, progress=True)
+        frames = RobotRun(robot, Path(folder)).frames
+    return Tracked(
+        path,
+        robot,
+        np.array([frame.T_map_camera for frame in frames]),
+        np.array([frame.status == "ok" for frame in frames]),
+        np.array([frame.stamp_ns for frame in frames]),
+    )
+
+
+def load_views(tracked: Tracked, first: int, last: int, most: int) -> Views:
+    """At most so many views of the frames first .. last - 1, evenly spread, and the features followed through them.
+
+    Raises:
+        DuagError: too few frames were tracked, or too few features followed.
+    """
+    import cv2
+
+    name = f"{tracked.robot}, frames {first} to {last - 1}"
+    good = first + np.flatnonzero(tracked.ok[first:last])
+    if len(good) < 8:
+        raise DuagError(f"{tracked.path}: {len(good)} tracked frames in {name}, expected at least 8")
+    chosen = good[np.unique(np.linspace(0, len(good) - 1, most).round().astype(int))]
+    sift = cv2.SIFT.create(nfeatures=FEATURES)
+    pixels, descriptors, depths, inverse, normals, samples = [], [], [], [], [], []
+    with open_rgbd(tracked.path) as log:
+        camera = log.camera
+        for index in track(chosen, f"features of {name}"):
+            frame = log.frame(int(index))
+            depth = np.asarray(frame.usable_depth, dtype=np.float32)
+            gray = np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+            keypoints, found = sift.detectAndCompute(gray, None)
+            pixel = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
+            row, column = np.rint(pixel[:, 1]).astype(int), np.rint(pixel[:, 0]).astype(int)
+            pyramid = RgbdPyramid.build(np.zeros(depth.shape, np.float32), depth, camera, NORMALS_LEVEL + 1)
+            pixels.append(pixel)
+            descriptors.append(
+                root_sift(np.asarray(found, dtype=np.float32))
+                if len(pixel)
+                else np.zeros((0, DIMENSIONS), np.uint8)
+            )
+            depths.append(depth[row, column].astype(np.float64))
+            w = pyramid.levels[0].inverse_depth
+            inverse.append(np.where(w > 0, w, np.float32(np.nan)))
+            normals.append(pyramid.levels[NORMALS_LEVEL].normals)
+            samples.append(_samples(normals[-1], depth, tracked.robot, int(index), tracked.path))
+    T = tracked.T_map_camera[chosen]
+    view, landmark, pixel, points = _landmarks(pixels, descriptors, depths, camera, T)
+    return Views(
+        name,
+        camera,
+        T,
+        _velocities(tracked, chosen),
+        np.array(inverse),
+        np.array(normals),
+        np.array(samples),
+        view,
+        landmark,
+        pixel,
+        points,
+    )
+
+
+def coarse(index: NDArray[np.int64], size: int) -> NDArray[np.int64]:
+    """Rows or columns of the images of normals, which have `size` of them, for those of full images."""
+    return np.minimum(index >> NORMALS_LEVEL, size - 1)
+
+
+def normals_at(
+    views: Views, view: NDArray[np.int64], row: NDArray[np.int64], column: NDArray[np.int64]
+) -> Array:
+    """Normals [..., 3] at pixels of views."""
+    height, width = views.normals.shape[1:3]
+    return views.normals[view, coarse(row, height), coarse(column, width)].astype(np.float64)
+
+
+def _velocities(tracked: Tracked, chosen: NDArray[np.int64]) -> Array:
+    before, after = np.maximum(chosen - 1, 0), np.minimum(chosen + 1, len(tracked.ok) - 1)
+    T = tracked.T_map_camera
+    seconds = 1e-9 * (tracked.stamps_ns[after] - tracked.stamps_ns[before])
+    motion = se3.log(se3.inverse(T[before]) @ T[after]) / np.maximum(seconds, 1e-3)[:, None]
+    return np.where((tracked.ok[before] & tracked.ok[after])[:, None], motion, 0.0)
+
+
+def _samples(
+    normals: NDArray[np.float32], depth: NDArray[np.float32], robot: str, index: int, path: Path
+) -> NDArray[np.int64]:
+    row, column = np.nonzero((depth > 0) & (depth < FARTHEST_SAMPLE_M))
+    sound = np.abs(normals[coarse(row, normals.shape[0]), coarse(column, normals.shape[1])]).sum(axis=-1) > 0
+    row, column = row[sound], column[sound]
+    if len(row) < SAMPLES:
+        raise DuagError(
+            f"{path}: depth of frame {index} shows a surface at {len(row)} pixels, expected {SAMPLES}"
+        )
+    rng = random_streams.generator(0, "calibration.samples", robot=robot, frame=index)
+    picked = np.sort(rng.choice(len(row), SAMPLES, replace=False))
+    return np.stack([column[picked], row[picked]], axis=-1)
+
+
+def _landmarks(
+    pixels: Sequence[Array],
+    descriptors: Sequence[NDArray[np.uint8]],
+    depths: Sequence[Array],
+    camera: PinholeCamera,
+    T: Array,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
+    """Features followed through the views: view, landmark and pixel of every observation, and the landmarks."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    offsets = np.concatenate([[0], np.cumsum([len(p) for p in pixels])])
+    edges = [
+        np.stack([offsets[a] + found[:, 0], offsets[b] + found[:, 1]], axis=-1)
+        for a, b, found in _matched(pixels, descriptors, depths, camera, T)
+    ]
+    if not edges:
+        none = np.zeros(0, dtype=np.int64)
+        return none, none, np.zeros((0, 2)), np.zeros((0, 3))
+    ends = np.concatenate(edges)
+    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(offsets[-1], offsets[-1]))
+    _, label = connected_components(graph, directed=False)
+    view = np.repeat(np.arange(len(pixels)), np.diff(offsets))
+    pixel, depth = np.concatenate(pixels), np.concatenate(depths)
+    # a feature that a view shows twice is none
+    twice = np.unique(np.stack([label, view]), axis=1, return_inverse=True, return_counts=True)
+    single = (twice[2] == 1)[twice[1]]
+    kept = np.flatnonzero(single)
+    views_of, depths_of = (np.bincount(label[kept], w, len(label)) for w in (None, depth[kept] > 0))
+    kept = kept[(views_of >= MIN_TRACK)[label[kept]] & (depths_of > 0)[label[kept]]]
+    _, landmark = np.unique(label[kept], return_inverse=True)
+    count = int(landmark.max()) + 1 if len(kept) else 0
+    points, seen = np.zeros((count, 3)), np.zeros(count)
+    known = depth[kept] > 0
+    rays = camera.rays_at(*pixel[kept].T)
+    there = se3.transform(T[view[kept]], (rays * depth[kept, None])[:, None])[:, 0]
+    np.add.at(points, landmark[known], there[known])
+    np.add.at(seen, landmark[known], 1)
+    return view[kept], landmark, pixel[kept], points / np.maximum(seen, 1)[:, None]
+
+
+def _matched(
+    pixels: Sequence[Array],
+    descriptors: Sequence[NDArray[np.uint8]],
+    depths: Sequence[Array],
+    camera: PinholeCamera,
+    T: Array,
+) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
+    """Pairs of views, and their matches that are roughly where the poses put them."""
+    rays = [camera.rays_at(*p.T) for p in pixels]
+    scale = camera.width / 640
+    axes, centres = T[:, :3, 2], T[:, :3, 3]
+    for a in range(len(T)):
+        for b in range(a + 1, len(T)):
+            if axes[a] @ axes[b] < MAX_TURN or np.linalg.norm(centres[a] - centres[b]) > MAX_WAY_M:
+                continue
+            found = matches(descriptors[a], descriptors[b], RATIO)
+            if len(found) < MIN_MATCHES:
+                continue
+            i, j = found.T
+            T_b_a = se3.inverse(T[b]) @ T[a]
+            good = _line_distance(rays[a][i], rays[b][j], T_b_a) * camera.fx < LINE_PX * scale
+            for points, T_other, other in (
+                (rays[a][i] * depths[a][i, None], T_b_a, pixels[b][j]),
+                (rays[b][j] * depths[b][j, None], se3.inverse(T_b_a), pixels[a][i]),
+            ):
+                there = se3.transform(T_other, points)
+                there[:, 2] = np.maximum(there[:, 2], 0.05)
+                off = np.linalg.norm(camera.project(there) - other, axis=-1)
+                good &= (points[:, 2] == 0) | (off < POINT_PX * scale)
+            if good.sum() >= MIN_MATCHES:
+                yield a, b, found[good]
+
+
+def _line_distance(rays_a: Array, rays_b: Array, T_b_a: Array) -> Array:
+    """First-order distance of matches from the epipolar lines, in focal lengths (Sampson)."""
+    t = T_b_a[:3, 3]
+    E = np.cross(np.eye(3), t).T @ T_b_a[:3, :3]
+    line_b, line_a = rays_a @ E.T, rays_b @ E
+    norm = np.sqrt((line_b[:, :2] ** 2).sum(axis=-1) + (line_a[:, :2] ** 2).sum(axis=-1))
+    return np.asarray(np.abs((rays_b * line_b).sum(axis=-1)) / np.maximum(norm, 1e-9))
+
+
+def look_up(views: Views, view: NDArray[np.int64], u: Array, v: Array) -> Array:
+    """Inverse depth of views at pixels, between neighbours of one surface; NaN where there is none."""
+    height, width = views.inverse_depth.shape[1:]
+    inside = (u >= 1) & (u < width - 2) & (v >= 1) & (v < height - 2)
+    u, v = np.where(inside, u, 1), np.where(inside, v, 1)
+    i, j = v.astype(np.int64), u.astype(np.int64)
+    a, b = u - j, v - i
+    w = views.inverse_depth
+    corners = np.stack([w[view, i, j], w[view, i, j + 1], w[view, i + 1, j], w[view, i + 1, j + 1]])
+    with np.errstate(invalid="ignore"):
+        whole = inside & (corners.max(axis=0) - corners.min(axis=0) < SAME_SURFACE * corners[0])
+    weights = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
+    return np.where(whole, (weights * corners).sum(axis=0), np.nan)

@@ -1,0 +1,155 @@
+"""`duagc check`: whether a recording is sound, before a run spends its time on it. A reader like the evaluation: true
+poses are compared with the depth, and go nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.checks import estimate, geometry, images, stamps
+from duagc.pipeline.checks.findings import Finding, Report, Severity, lines
+from duagc.pipeline.evaluation import groundtruth
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.recording import Recording, RgbdLog, log_metadata, open_rgbd
+from duagc.pipeline.recording.names import DIGEST_RECORD
+from duagc.pipeline.recording.read import LogFile
+
+__all__ = ["Finding", "Report", "Severity", "check", "format_report"]
+
+LOOKED_AT = 16  # frames of a robot whose pixels are counted
+
+
+def check(path: Path) -> Report:
+    """Check a recording, or the log of one robot.
+
+    Raises:
+        DuagError: it is neither. Everything else that is wrong is a finding.
+    """
+    path = Path(path)
+    report = Report(str(path))
+    recording = None if path.is_file() else Recording(path)
+    sights: dict[str, images.Sight] = {}
+    for robot in recording.robots if recording else [""]:
+        log = None
+        try:
+            log = recording.log(robot) if recording else path
+            with open_rgbd(log) as rgbd:
+                _check_robot(report, recording, rgbd, sights)
+        except DuagError as error:
+            advice = "duagc recover may save it" if log else ""
+            report.findings.append(_unreadable(robot, error, advice))
+    report.findings += images.check_colors(sights)
+    report.estimate = estimate.estimate(report.robots)
+    report.findings += estimate.check_disk(path.parent, report.estimate["bytes"])
+    return report
+
+
+def _unreadable(robot: str, error: DuagError, advice: str) -> Finding:
+    found, _, expected = str(error).partition(", expected ")
+    return Finding(Severity.ERROR, "log", robot, found, expected or "a sound log", advice)
+
+
+def _check_robot(
+    report: Report, recording: Recording | None, log: RgbdLog, sights: dict[str, images.Sight]
+) -> None:
+    robot, add = log.robot, report.findings.extend
+    with LogFile(log.path) as file:
+        if recording is not None:
+            add(_check_digest(recording, robot, file))
+            add(_check_clock(recording, robot))
+        topics = images.read_repeats(file, robot)
+    for topic, repeats in topics.items():
+        add(stamps.check_stamps(robot, topic, repeats.stamps_ns))
+        add(images.check_repeats(robot, topic, repeats))
+    add(stamps.check_pairs(robot, log.pairing))
+    add(geometry.check_camera(robot, log.camera))
+    shown = np.unique(np.linspace(0, len(log) - 1, LOOKED_AT).astype(int)).tolist()
+    sight = sights[robot] = images.Sight.of((log.frame(i) for i in shown), log.depth_scale)
+    add(images.check_sight(robot, sight))
+    moved: list[geometry.Move] = []
+    if sight.known:
+        moved = geometry.moves(log)
+        add(geometry.check_moves(robot, moved))
+        sensors = " ".join(f"{key} {value}" for key, value in log_metadata(log.path).items())
+        add(geometry.check_range(robot, sight.depth_m, moved, sensors))
+        add(_check_scales(recording, log, moved))
+        add(geometry.check_edges(robot, geometry.edges_of(log)))
+    residuals = [move.residual for move in moved if np.isfinite(move.residual)]
+    report.robots[robot] = {
+        "frames": len(log),
+        "pixels": log.camera.width * log.camera.height,
+        "depth_m": [round(value, 4) for value in sight.depth_m] if sight.known else None,
+        "with_depth": round(sight.known, 4),
+        "registered_pairs": f"{sum(move.T_first_second is not None for move in moved)} of {len(moved)}",
+        "reprojection": round(float(np.median(residuals)), 5) if residuals else None,
+    }
+
+
+def _check_digest(recording: Recording, robot: str, file: LogFile) -> Iterator[Finding]:
+    told, found = recording.digest(file.path.name), dict(file.metadata()).get(DIGEST_RECORD, {}).get("sha256")
+    if told not in ("nothing", found):
+        yield Finding(
+            Severity.WARNING,
+            "digest",
+            robot,
+            f"{file.path.name} has digest {str(found)[:12]}",
+            f"{told[:12]} as in recording.json",
+            "the log is not the one that was converted",
+        )
+
+
+def _check_clock(recording: Recording, robot: str) -> Iterator[Finding]:
+    """What the converter said about a clock that runs at another rate than the recorder's, and left as it was."""
+    for text in recording.description["warnings"]:
+        if str(text).startswith(f"{robot}: ") and " ppm on that of the headers" in str(text):
+            found, _, expected = str(text).removeprefix(f"{robot}: ").partition("; expected ")
+            if expected:
+                yield Finding(
+                    Severity.WARNING, "clock", robot, found, expected, "convert it again with that option"
+                )
+
+
+def _check_scales(recording: Recording | None, log: RgbdLog, moved: list[geometry.Move]) -> Iterator[Finding]:
+    prior = log.motion_prior()
+
+    def by_odometry(start_ns: int, stop_ns: int) -> float | None:
+        motion = prior.between(start_ns, stop_ns) if prior else None
+        return (
+            float(np.linalg.norm(motion.T_start_stop[:3, 3])) if motion and motion.knows_translation else None
+        )
+
+    yield from geometry.check_scale(log.robot, moved, "its odometry", by_odometry)
+    truth = groundtruth.trajectory(recording, log.robot) if recording else Absent("a log alone")
+    if isinstance(truth, Absent):
+        return
+    poses = dict(zip(truth.stamps_ns.tolist(), truth.poses, strict=True))
+
+    def by_truth(start_ns: int, stop_ns: int) -> float | None:
+        if start_ns not in poses or stop_ns not in poses:
+            return None
+        return float(np.linalg.norm(poses[start_ns][:3, 3] - poses[stop_ns][:3, 3]))
+
+    yield from geometry.check_scale(log.robot, moved, "its true poses", by_truth)
+
+
+def format_report(report: Report) -> str:
+    """The report as text for people."""
+    out = []
+    for robot, row in report.robots.items():
+        depth = row["depth_m"]
+        reach = f"depth {depth[0]:.2f} {depth[1]:.2f} {depth[2]:.2f} m (1, 50, 99 %)" if depth else "no depth"
+        moved = "" if row["reprojection"] is None else f", reprojection {row['reprojection']:.2%}"
+        out.append(
+            f"{robot}: {row['frames']} frames, {reach} in {row['with_depth']:.0%} of the pixels{moved}"
+        )
+    e = report.estimate
+    unit, name = (60, "minutes") if e["seconds_to"] > 120 else (1, "seconds")
+    span = f"{e['seconds_from'] / unit:.0f} to {e['seconds_to'] / unit:.0f} {name}"
+    if report.robots:
+        out.append(f"a run takes about {span} on two cores, and {e['bytes'] / 1e6:.0f} MB of disk")
+    out += lines(report.findings)
+    counts = [f"{len(found)} {s.value}{'s' * (len(found) != 1)}" for s in Severity if (found := report.of(s))]
+    return "\n".join([*out, ", ".join(counts) or "nothing found"])

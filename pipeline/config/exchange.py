@@ -1,0 +1,105 @@
+"""Configuration of the exchange: links, transport, places, verification, what is sent."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from duagc.pipeline.config.base import Config
+from duagc.pipeline.config.consensus import MatchingConfig, PoseConsensusConfig, WeightKind
+from duagc.pipeline.config.network import LinkConfig, TransportConfig
+from duagc.pipeline.config.registration import RegistrationConfig
+
+
+class PlacesConfig(Config):
+    """Place descriptors and candidates for closures."""
+
+    features_per_place: int = Field(default=80, ge=4)
+    """Descriptors of one keyframe that a neighbour gets to recognise the place (128 bytes each)."""
+    features_per_keyframe: int = Field(default=400, ge=4)
+    """Descriptors with 3-D points of one keyframe, for verification."""
+    ratio: float = Field(default=0.8, gt=0.0, lt=1.0)
+    """Nearest over second-nearest distance below which a match counts."""
+    min_score: int = Field(default=8, ge=1)
+    """Matches from which a pair of keyframes is a candidate."""
+    candidates_per_keyframe: int = Field(default=3, ge=1)
+    """Best candidates tried for each keyframe of the neighbour."""
+    max_requested_keyframes: int = Field(default=24, ge=1)
+    """Most keyframes whose sample is requested from one neighbour."""
+    keyframes_per_request: int = Field(default=6, ge=1)
+    """Keyframes asked for at once; what came of them decides about the next."""
+    worth_nats: float = Field(default=1.0, ge=0.0)
+    """Least information about the two robots that a sample must promise, in nats; 0: all that the budget allows."""
+
+
+class PeerRegistrationConfig(RegistrationConfig):
+    """Registration of two robots' views, whose cameras may differ."""
+
+    max_gain: float = 4.0
+    """The gain must lie between 1 / max_gain and max_gain. A covered lens, which less would find out, has no features
+    that agree on a motion."""
+
+
+class VerificationConfig(Config):
+    """From a candidate to a closure: RANSAC over 3-D matches, then registration."""
+
+    hypotheses: int = Field(default=500, ge=1)
+    """Three-point hypotheses per candidate."""
+    inlier_m: float = Field(default=0.05, gt=0.0)
+    """Distance below which a match agrees with a hypothesis, at one metre of depth; grows with depth."""
+    min_inliers: int = Field(default=12, ge=4)
+    """Matches that must agree."""
+    min_inlier_share: float = Field(default=0.25, ge=0.0, le=1.0)
+    """Share of the matches that must agree."""
+    samples: int = Field(default=2000, ge=50)
+    """Points with normal and intensity of the neighbour's keyframe used by the registration."""
+    max_refinement_m: float = Field(default=0.15, gt=0.0)
+    """Largest translation by which the registration may change what RANSAC found."""
+    registration: PeerRegistrationConfig = PeerRegistrationConfig()
+    """The registration itself."""
+    max_refinement_rad: float = Field(default=0.10, gt=0.0)
+    """Largest rotation by which the registration may change what RANSAC found."""
+
+
+class InjectionConfig(Config):
+    """Faults made on purpose; all off unless asked for."""
+
+    false_closures: float = Field(default=0.0, ge=0.0, lt=1.0)
+    """Share of false ones among all closures of a pair of robots that found any."""
+    false_closure_m: float = Field(default=3.0, gt=0.0)
+    """Largest coordinate of the translation of a false closure; its rotation is any."""
+    false_matches: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Share of the matched Gaussians of a pair of robots whose partners are exchanged."""
+    pose_dropouts: float = Field(default=0.0, ge=0.0, lt=1.0)
+    """Chance that a robot says nothing of its poses to a neighbour in a round."""
+
+
+class ExchangeConfig(Config):
+    """One session of the team."""
+
+    period_ns: int = Field(default=100_000_000, ge=1)
+    """Length of one round."""
+    max_rounds: int = Field(default=3000, ge=1)
+    """The session ends here, whatever has been agreed."""
+    solver: Literal["admm", "elimination"] = "admm"
+    """Of the poses. admm: relaxed edge-ADMM, a few poses per round and link; elimination: exact steps along a tree of
+    robots, matrices in few rounds."""
+    elimination_wire: Literal["float32", "float64"] = "float64"
+    """Precision of the matrices of elimination on the wire."""
+    coverage: Literal["all", "overlap"] = "all"
+    """Send every Gaussian to everybody, or only those in space that the receiver's keyframes saw."""
+    evidence_wire: Literal["compact", "float32", "float64"] = "compact"
+    """100 bytes per Gaussian, rounded far below its uncertainty, or 188, or 364 bytes and not rounded at all."""
+    weights: WeightKind = "block"
+    """How sure a robot says it is of a Gaussian: its information, or one of the simpler kinds to compare with
+    (`docs/consensus.md`)."""
+    evidence_order: Literal["gain", "paper"] = "gain"
+    """Which Gaussians go first: those that promise the receiver most information per byte, or by the paper's (4)."""
+    overlap_voxel_m: float = Field(default=0.25, gt=0.0)
+    """Edge of the voxels that say which space a robot saw (coverage = overlap)."""
+    link: LinkConfig = LinkConfig()
+    transport: TransportConfig = TransportConfig()
+    places: PlacesConfig = PlacesConfig()
+    verification: VerificationConfig = VerificationConfig()
+    consensus: PoseConsensusConfig = PoseConsensusConfig()
+    matching: MatchingConfig = MatchingConfig()
+    injection: InjectionConfig = InjectionConfig()

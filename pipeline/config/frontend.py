@@ -1,0 +1,241 @@
+"""Configuration of the front end: tracking, keyframes, mapping."""
+
+from duagc.pipeline.config.base import Config
+from duagc.pipeline.config.mapping import MappingConfig
+from duagc.pipeline.config.registration import MovingConfig, RegistrationConfig
+
+# Not settings: the files of a run and their readers promise this rule.
+HELD_OUT_PERIOD = 8
+HELD_OUT_OFFSET = 4
+
+
+def is_held_out(frame_index: int) -> bool:
+    """Whether a frame is kept for evaluation: tracked, but never a keyframe and never mapped."""
+    return frame_index % HELD_OUT_PERIOD == HELD_OUT_OFFSET
+
+
+class LoopConfig(Config):
+    """Recognising places of the robot's own path."""
+
+    enabled: bool = True
+    min_gap: int = 3
+    """Keyframes that lie between the two at least, less one."""
+    known_overlap: float = 0.3
+    """Overlap by the tracked poses from which a pair needs no recognition."""
+    compared: int = 32
+    """Earlier keyframes, those that share most visual words, whose features are compared."""
+    features_compared: int = 120
+    """The strongest features, by which earlier keyframes are ranked."""
+    ratio: float = 0.8
+    """Nearest over second-nearest distance of descriptors below which a match counts."""
+    min_matches: int = 10
+    """Matches among them from which a pair is a candidate."""
+    candidates: int = 2
+    """Earlier keyframes tried per keyframe, those with most matches."""
+    hypotheses: int = 300
+    """Three-point samples of RANSAC."""
+    inlier_m: float = 0.05
+    """Distance below which a match agrees with a motion, at one metre of depth; grows with depth."""
+    min_inliers: int = 15
+    """Matches that must agree on one motion."""
+    min_inlier_share: float = 0.3
+    """The same as a share of the matches; the larger number holds."""
+    min_overlap: float = 0.4
+    """Overlap that the registrations must find."""
+    max_disagreement_m: float = 0.03
+    """Largest distance between the registration one way and the other."""
+    max_disagreement_rad: float = 0.03
+    """The same for the rotation."""
+
+
+class KeyframeConfig(Config):
+    """When a frame becomes a keyframe, and how keyframe poses are refined together."""
+
+    min_overlap: float = 0.8
+    """A frame that sees less of its keyframe than this becomes the next one."""
+    max_translation_of_depth: float = 0.3
+    """A frame that moved by more than this fraction of the median depth becomes a keyframe."""
+    max_rotation_rad: float = 0.5
+    """A frame that turned by more than this becomes a keyframe."""
+    neighbours: int = 4
+    """Earlier keyframes that a new one is registered to, besides the one it was tracked against."""
+    neighbour_overlap: float = 0.5
+    """Least overlap, predicted and found, of such a registration."""
+    huber_sigmas: float = 3.0
+    """Registrations that disagree by more than this with the refined poses count linearly."""
+    local_optimisation: bool = True
+    """Optimise all keyframe poses jointly on the images; without, only the registrations made in tracking count."""
+    optimisation_rounds: int = 10
+    """Rounds over all keyframes at most; they end when no pose moves by more than 0.1 mm and 0.1 mrad, and look again
+    only at pairs that moved by as much."""
+    optimisation_overlap: float = 0.3
+    """Least overlap, at the present poses, of two keyframes that are compared."""
+    optimisation_candidates: int = 24
+    """Earlier keyframes, those that look at the nearest places, whose overlap with one is computed."""
+    optimisation_neighbours: int = 8
+    """Earlier keyframes that a keyframe is compared with at most, those with most overlap."""
+    loops: LoopConfig = LoopConfig()
+
+
+class FailureConfig(Config):
+    """Tests of whether what the camera shows can be true."""
+
+    max_frames_without_depth: int = 15
+    """Frames in a row that are tracked by colour alone, because their depth is missing or stuck."""
+    min_view_without_depth: float = 0.6
+    """Share of the last such frame's samples that must be seen: colour alone is poor where little is shared."""
+    max_way_without_depth_m: float = 0.12
+    """Distance from the last frame with depth up to which colour alone is followed: it errs by up to a quarter
+    of it."""
+    sigma_of_way_without_depth: float = 0.07
+    """Standard deviation of that error per axis, as a share of the distance; counted in the information."""
+    doubtful_gray_of_usual: float = 1.75
+    """A frame whose grey residual is larger than this many times the usual one is also registered by colour alone."""
+    max_contradiction_m: float = 0.01
+    """Largest distance between that answer and the usual one."""
+    max_contradiction_of_way: float = 0.5
+    """The same as a share of the way from the last sound frame; the larger limit holds."""
+    max_frames_without_color: int = 3
+    """Frames in a row that are tracked by depth alone, because their colour is stuck; walls do not hold it long."""
+    stuck_share: float = 0.99
+    """An image is stuck if this share of its measured pixels has the very values of the image before."""
+    stuck_gray_change: float = 0.08
+    """Change of a grey value of the coarsest image, in standard deviations of that image, that counts as one."""
+    stuck_gray_share: float = 0.02
+    """Share of changed grey values from which a stuck depth image no longer belongs to the colour."""
+    stuck_depth_change: float = 0.01
+    """Relative change of a depth of the coarsest image that counts as one."""
+    stuck_depth_share: float = 0.1
+    """Share of changed depths from which a stuck colour image no longer belongs to the depth."""
+    intruder_gate_m: float = 0.15
+    """A point nearer by this than what a keyframe saw there stands in space that was free."""
+    intruder_gate_relative: float = 0.1
+    """The same as a fraction of the depth; the larger limit holds."""
+    max_intruders: float = 0.1
+    """Largest share of such points in a frame that becomes a keyframe, or by which a lost camera is found again."""
+    max_sigma_obstructed_m: float = 0.01
+    """Largest standard deviation of the position of a frame with more of them than that: what is left beside a hand
+    may tell little, and its errors are several of these."""
+    min_told: float = 0.65
+    """Share of a frame's points that its keyframe must be able to judge to say that what stood before it is gone."""
+    min_overlap_unlike: float = 0.7
+    """Least overlap by which a frame is followed that looks unlike its keyframe, as where the exposure jumps."""
+    max_speed_m_s: float = 3.0
+    """Greatest speed of the camera: a lost one is not found farther away than it can have come."""
+    slack_m: float = 0.1
+    """Added to that distance."""
+    slack_rad: float = 0.1
+    """With `slack_m`, how far from where it was expected a camera may be found on a surface without features."""
+
+
+class MotionPriorConfig(Config):
+    """How far a motion prior of the log is believed: standard deviations of a motion between two frames."""
+
+    odometry_sigma_m: float = 0.005
+    odometry_sigma_of_path: float = 0.05
+    """Plus this share of the path."""
+    odometry_sigma_rad: float = 0.005
+    odometry_sigma_of_angle: float = 0.05
+    """Plus this share of the angle."""
+    gyro_sigma_rad: float = 0.002
+    gyro_sigma_rad_per_s: float = 0.01
+    """Plus this for every second: the bias."""
+
+
+class RelocalisationConfig(Config):
+    """Finding a lost camera again by features of its image."""
+
+    features: int = 400
+    """Features kept per keyframe."""
+    features_compared: int = 120
+    """The strongest of them, by which keyframes are ranked."""
+    max_width_px: int = 400
+    """Features come from the finest image of the pyramid that is not wider."""
+    ratio: float = 0.8
+    """Nearest over second-nearest distance of descriptors below which a match counts."""
+    candidates: int = 3
+    """Keyframes tried per frame, those with most matches."""
+    min_matches: int = 6
+    """Matches among the strongest features from which a keyframe is tried."""
+    hypotheses: int = 300
+    """Three-point samples of RANSAC."""
+    inlier_m: float = 0.05
+    """Distance below which a match agrees with a motion, at one metre of depth; grows with depth."""
+    min_inliers: int = 10
+    """Matches that must agree on one motion."""
+    min_inlier_share: float = 0.25
+    """The same as a share of the matches; the larger number holds."""
+    min_overlap: float = 0.5
+    """Overlap by which a place must be seen to be believed."""
+    max_contradiction_m: float = 0.03
+    """Largest distance between a place that was found and where a later keyframe, not believed itself, has it."""
+    max_conflict: float = 0.1
+    """Largest fraction of a keyframe's seen samples in space that the frame saw to be free, to be believed."""
+    max_gray_rms: float = 0.03
+    """Largest grey residual of a place that is believed, plus `max_gray_rms_of_usual` times the usual one: that of the
+    frames tracked before. Rooms built alike agree in shape, not in their pictures."""
+    max_gray_rms_of_usual: float = 2.0
+    confirmations: int = 1
+    """Later frames that must be tracked from there before the camera counts as found."""
+
+
+class TrackingConfig(Config):
+    """Tracking of frames against the latest keyframe."""
+
+    registration: RegistrationConfig = RegistrationConfig()
+    """The usual registration, from the motion of the two frames before."""
+    recovery: RegistrationConfig = RegistrationConfig(
+        iterations=(5, 8, 12, 15),
+        depth_gate_m=0.3,
+        depth_gate_relative=0.1,
+        max_translation_m=0.6,
+        max_rotation_rad=0.6,
+    )
+    """The second attempt: one more pyramid level, wider gates; its result is checked by the usual registration."""
+    strides: tuple[int, ...] = (4, 2, 1, 1)
+    """Pixels between samples of a keyframe, per pyramid level, finest first."""
+    max_extrapolation_s: float = 0.2
+    """Longest gap in time over which the last velocity is believed."""
+    equalise_from_gain: float = 1.2
+    """A frame that failed is tried again with brightness and contrast brought to those of the keyframe if the contrast
+    differs by more than this factor."""
+    max_keyframe_gain: float = 1.5
+    """A frame brighter or darker than its keyframe by more than this factor, or with a grey residual that would not be
+    believed of a place found again, becomes a keyframe only below `relocalisation.min_overlap`, and only if little of
+    it is saturated."""
+    max_saturated: float = 0.1
+    """Share of black and white pixels up to which that is so."""
+    failure: FailureConfig = FailureConfig()
+    relocalisation: RelocalisationConfig = RelocalisationConfig()
+    prior: MotionPriorConfig = MotionPriorConfig()
+
+
+class ModelConfig(Config):
+    """Registering frames between keyframes to the map, once it is grown."""
+
+    enabled: bool = False
+    """Gains a little on RedKitchen for twice the time of a frame, and spoils the depth of a small stereo rig."""
+    max_sigma_ratio: float = 3.0
+    """A frame is moved only if the map knows its position no worse than this many times what the keyframe knows: exact
+    depth it knows 50 times worse, simulated Kinect noise 9 times, RedKitchen about equally well."""
+    patience: int = 60
+    """Frames in a row that are not moved after which no other is tried."""
+    level: int = 1
+    """Image size at which the map is drawn: 0 full, 1 half."""
+    min_alpha: float = 0.9
+    """Opacity of the drawn map below which a pixel is not used."""
+    strides: tuple[int, ...] = (2, 1, 1)
+    """Pixels between samples of the drawn map, finest level first."""
+
+
+class FrontendConfig(Config):
+    """Front end of one robot."""
+
+    tracking: TrackingConfig = TrackingConfig()
+    keyframes: KeyframeConfig = KeyframeConfig()
+    mapping_enabled: bool = True
+    """Grow a map; without, the log holds odometry and keyframes and an empty map."""
+    mapping: MappingConfig = MappingConfig()
+    model: ModelConfig = ModelConfig()
+    moving: MovingConfig = MovingConfig()
+    """What moves, by depth: not mapped, in no Fisher sum, not trained on after fusion."""

@@ -1,0 +1,100 @@
+"""Configuration of the mapping."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from duagc.pipeline.config.base import Config
+from duagc.pipeline.config.training import DepthKind, LearningRates, MapLossConfig
+
+THICKNESS_FLOOR_M = 1e-3
+"""Thickness below which no splat is told from a plane: log-scales stop here, and carry no information there."""
+
+
+class SeedingConfig(Config):
+    """Where Gaussians are put and what they look like at first."""
+
+    cell_sizes_px: tuple[int, ...] = (8, 4, 2)
+    """Sides of the quadtree's cells, coarse to fine, each half of the one before."""
+    detail: float = 0.02
+    """Standard deviation of grey (0..1) in a cell above which it is split; raised until the budget holds."""
+    min_alpha: float = 0.6
+    """Rendered opacity below which a pixel is not explained."""
+    color_error: float = 0.1
+    """Mean colour error (0..1), smoothed over a cell, above which a pixel is not explained."""
+    worst_color_error: float = 0.02
+    """Root mean square colour error (0..1) of a cell up to which no disc is added where images are drawn worst."""
+    depth_error_m: float = 0.04
+    """Depth error above which a pixel is not explained, plus depth_error_relative times the depth."""
+    depth_error_relative: float = 0.02
+    opacity: float = 0.7
+    """Initial opacity."""
+    spread: float = 0.55
+    """Standard deviation of a disc in units of its cell's side on the surface."""
+    thickness_m: float = THICKNESS_FLOOR_M
+    """Standard deviation across the surface at first; also the floor of every log-scale while mapping."""
+    min_depth_m: float = 0.2
+    max_depth_m: float = 10.0
+
+
+class MappingConfig(Config):
+    """How the map is grown and optimised."""
+
+    max_gaussians: int = 60_000
+    """Hard cap. When a keyframe would exceed it, the Gaussians whose removal changes the keyframes least go first."""
+    first_share: float = 0.35
+    """Share of the cap that the first keyframe may fill."""
+    keyframe_share: float = 0.12
+    """Share of the cap that any later keyframe may add."""
+    window: int = 8
+    """Keyframes optimised together: the newest and those that see most of what it sees."""
+    candidates: int = 24
+    """Most older keyframes, by the places they look at, whose overlap with a new one is computed."""
+    random_keyframes: int = 2
+    """Older keyframes added to the window by lot, against forgetting."""
+    iterations: int = 24
+    """Optimisation steps (one view each) at a keyframe; every second one is on the newest keyframe."""
+    iterations_level: int = 0
+    """Image pyramid level of these steps: 0 full size, 1 half size."""
+    final_iterations: int = 90
+    """Steps of the final refinement for every keyframe, at full size, shared by all views."""
+    final_iterations_max: int = 6000
+    """Most steps of the final refinement in all."""
+    support_views: int = 40
+    """Most tracked frames between keyframes that take part in the final refinement; 0: keyframes only."""
+    densify_rounds: int = 4
+    """Times, in the first half of the final refinement, that Gaussians that contribute nothing are pruned and the
+    room below the cap is seeded where the keyframes are drawn worst; 0: never. The last round fills the cap."""
+    rates: LearningRates = LearningRates()
+    final_rate_decay: float = 0.03
+    """The final refinement's learning rates fall to this share: slowly, fast, slowly."""
+    stable_steps: int = 0
+    """Steps after which a Gaussian is stable: frozen until the final refinement; 0: never."""
+    depth: DepthKind | Literal["auto"] = "auto"
+    """Depth of a Gaussian at a pixel: that of its centre (`blended`), or of its disc along the ray (`ray_plane`).
+    `auto`: `ray_plane` where the measured noise of the depth images is below `exact_depth_m`."""
+    exact_depth_m: float = Field(default=0.002, ge=0.0)
+    """Depth that agrees this well from frame to frame tells the surface of every single Gaussian."""
+    loss: MapLossConfig = MapLossConfig()
+    seeding: SeedingConfig = SeedingConfig()
+    min_opacity: float = 0.03
+    """Gaussians below are pruned."""
+    max_scale_m: float = 0.5
+    """Gaussians that grew beyond are pruned."""
+    sweep_keyframes: int = 6
+    """Keyframes, the newest and those that see most of what it sees, in whose images every keyframe measures again
+    what the Gaussians contribute."""
+    min_contribution: float = 0.25
+    """Gaussians whose removal changes all keyframes together by less are pruned in the first half of the final
+    refinement: the squared change of half-size images, in units of the noise below."""
+    contribution_color_sigma: float = 0.03
+    contribution_depth_sigma_m: float = 0.02
+    exposure: bool = False
+    """Fit a gain and an offset per view; the map ends in the mean exposure of its keyframes."""
+    exposure_rate: float = 2e-3
+
+    def depth_kind(self, depth_noise_m: float | None) -> DepthKind:
+        """How the Gaussians' depth is drawn; depth_noise_m: of the depth images, None: nobody knows."""
+        if self.depth != "auto":
+            return self.depth
+        return "ray_plane" if depth_noise_m is not None and depth_noise_m < self.exact_depth_m else "blended"

@@ -1,0 +1,60 @@
+"""Settings of a run on a pose graph."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from duagc.pipeline.config.base import Config
+from duagc.pipeline.config.consensus import ClosureConfig, PoseConsensusConfig
+
+Solver = Literal["admm", "elimination", "paper"]
+Robust = Literal["none", "gnc"]
+
+_AS_GIVEN = ClosureConfig(
+    sigma_floor_m=0, sigma_floor_rad=0, drift_floor_m=0, drift_floor_rad=0, min_support=1,
+    frame_sigma_m=5.0, frame_sigma_rad=0.1,
+)  # fmt: skip
+_ROBUST_PENALTY = 0.1
+
+
+class PoseGraphConfig(Config):
+    """One run: the same at every robot. The weights of the file count as they are, without floors."""
+
+    solver: Solver = "admm"
+    """admm: relaxed edge-ADMM; elimination: exact steps along a tree of robots; paper: the printed iteration."""
+    loss_probability: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Chance that a packet is lost, independent of every other packet."""
+    seed: int = 0
+    """Of the losses; nothing else is random."""
+    max_rounds: int = Field(default=5000, ge=1)
+    """A round is one burst of every robot to every neighbour; the run ends here whatever has been agreed."""
+    consensus: PoseConsensusConfig = PoseConsensusConfig(
+        tolerance=1e-5,
+        wire="float32",
+        odometry_floor_m=0,
+        odometry_floor_rad=0,
+        closures=_AS_GIVEN,
+        robust=False,
+        robust_skip=False,
+        robust_convexity=0.0,
+    )
+    """Shared by all solvers: robust weights, tolerance, and what only edge-ADMM uses."""
+    elimination_tolerance: float = Field(default=1e-7, gt=0.0)
+    """The exact steps end when nothing moves more than this (m, rad)."""
+    elimination_wire: Literal["float32", "float64"] = "float64"
+    """Precision of the matrices on the wire; float32 halves the bytes, and slows ill-conditioned graphs."""
+    paper_penalty: float = Field(default=0.01, gt=0.0)
+    """rho of the printed iteration, as a multiple of the closures' information; larger ones diverge sooner."""
+
+
+def settings(
+    solver: Solver = "admm", robust: Robust = "none", loss: float = 0.0, seed: int = 0, max_rounds: int = 5000
+) -> PoseGraphConfig:
+    """Settings of the command line."""
+    default = PoseGraphConfig()
+    consensus = default.consensus
+    if robust == "gnc":  # penalties stay as they are while weights change, and long chains want small ones
+        consensus = consensus.model_copy(update={"robust": True, "penalty_start": _ROBUST_PENALTY})
+    return PoseGraphConfig(
+        solver=solver, loss_probability=loss, seed=seed, max_rounds=max_rounds, consensus=consensus
+    )

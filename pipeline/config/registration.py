@@ -1,0 +1,79 @@
+"""Settings of dense RGB-D registration."""
+
+from typing import Literal
+
+from duagc.pipeline.config.base import Config
+
+
+class RegistrationConfig(Config):
+    """Joint point-to-plane and photometric registration."""
+
+    residuals: Literal["joint", "depth", "gray"] = "joint"
+    """Which residuals count: both, point-to-plane only, or grey values only (for comparisons)."""
+    iterations: tuple[int, ...] = (4, 5, 6)
+    """Gauss-Newton steps per pyramid level, finest first."""
+    depth_gate_m: float = 0.1
+    """Smallest limit of the distance between a sample and the surface it falls on; farther ones do not count."""
+    depth_gate_relative: float = 0.05
+    """The same as a fraction of the depth; the larger limit holds."""
+    normal_gate_rad: float = 0.0
+    """Largest angle between the normals of a sample and of the surface it falls on; 0 = no test, the default, because
+    normals of a structured-light camera scatter by more than any useful limit."""
+    huber_sigmas: float = 1.5
+    """Residuals beyond this many sigmas count linearly."""
+    depth_sigma_base_m: float = 0.0012
+    """Depth noise sigma(z) = base + slope * (z - 0.4)^2, where the log does not tell it pixel by pixel; only its shape
+    counts, its scale is estimated."""
+    depth_sigma_slope_per_m: float = 0.0019
+    """See depth_sigma_base_m (Nguyen, Izadi and Lovell 2012)."""
+    depth_sigma_floor: float = 0.05
+    """Smallest estimated scale of the depth noise at the finest level, as a multiple of sigma(z). Four times more at
+    each coarser one, where edges are blurred: without noise the depth would else outweigh the grey values so far
+    that the way to the minimum becomes a narrow valley, which takes hundreds of steps."""
+    gray_sigma_floor: float = 0.002
+    """Smallest estimated noise of grey values (about half a step of 8 bits)."""
+    gray_sigma_of_depth: float = 0.03
+    """Smallest estimated noise of grey values as a multiple of the scale of the depth noise. A camera with poor depth
+    also has depth registered to colour only to a pixel, and texture turns that pixel into a grey error that is the
+    same in all frames; without this the many sharp grey values overrule the depth (RedKitchen: 2.7 cm, with it 2.3)."""
+    min_gradient: float = 0.0
+    """Grey gradient (1/px) below which a sample's grey value is not used."""
+    min_samples: int = 100
+    """Fewer agreeing samples are LOW_OVERLAP."""
+    min_overlap: float = 0.3
+    """Smaller overlap is LOW_OVERLAP."""
+    max_conflict: float = 0.3
+    """Largest fraction of seen samples that lie in space which the target saw to be free."""
+    max_depth_scale: float = 8.0
+    """Largest estimated scale of the depth noise, as a multiple of sigma(z); more is RESIDUAL."""
+    max_gray_rms: float = 0.15
+    """Largest weighted grey residual; more is RESIDUAL."""
+    max_gain: float = 2.0
+    """The gain must lie between 1 / max_gain and max_gain; else RESIDUAL (covered lens, other scene)."""
+    max_sigma_m: float = 0.03
+    """Directions with a larger standard deviation at the median depth are weak: they stay at the guess, or where the
+    prior pulls them, and carry no information. The outcome is ILL_CONDITIONED unless the prior knows them better."""
+    max_translation_m: float = 0.3
+    """Largest correction of the guess; more is JUMP."""
+    max_rotation_rad: float = 0.35
+    """Largest correction of the guess; more is JUMP."""
+
+
+class MovingConfig(Config):
+    """Finding what moves by depth alone."""
+
+    enabled: bool = True
+    gate_m: float = 0.15
+    """A point nearer by this than all that another view measured around its place stands in free space."""
+    gate_relative: float = 0.1
+    """The same as a fraction of the depth; the larger limit holds."""
+    views: int = 16
+    """Other views asked at most, those that look at the nearest places."""
+    min_views: int = 2
+    """Views that must have looked through a point; and they must be more than those that saw it there."""
+    min_region: float = 0.002
+    """Smallest connected region, as a share of the image: smaller ones are noise at edges."""
+    grow_px: int = 8
+    """Pixels, of the whole image, by which a region is enlarged: edges of what moves are mixed with what is behind."""
+    halvings: int = 2
+    """Times the images are halved before they are compared."""

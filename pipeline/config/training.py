@@ -1,0 +1,62 @@
+"""Settings of training Gaussians: losses and learning rates."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias
+
+from duagc.pipeline.config.base import Config
+
+DepthKind: TypeAlias = Literal["blended", "ray_plane"]
+"""Depth of a Gaussian at a pixel: that of its centre, or of its mean along the ray (a flat disc: of its plane)."""
+
+
+class LossConfig(Config):
+    """Weights of the mapping loss; every term is a mean over its pixels."""
+
+    color_huber: float = 0.1
+    """Colour residual (0..1) where the loss turns from quadratic to linear; the slope beyond is 1."""
+    depth_weight: float = 1.0
+    """Weight of one metre of depth error against one unit of colour."""
+    depth_huber_m: float = 0.02
+    """Depth residual in metres where the loss turns from quadratic to linear; the slope beyond is 1."""
+    alpha_weight: float = 0.04
+    """Weight of missing opacity (1 - alpha) where a surface was measured."""
+    surface_weight: float = 0.0
+    """Weight of one metre between a Gaussian's own depth and the measured one, by its share in the pixel."""
+
+
+class SurfaceLossConfig(LossConfig):
+    """The same where depth is exact: every single Gaussian belongs on the surface."""
+
+    depth_weight: float = 0.25
+    depth_huber_m: float = 0.01
+    alpha_weight: float = 0.02
+    surface_weight: float = 0.5
+
+
+class MapLossConfig(Config):
+    """The loss of a map, by the depth that its Gaussians are drawn with."""
+
+    blended: LossConfig = LossConfig()
+    ray_plane: SurfaceLossConfig = SurfaceLossConfig()
+
+    def of(self, depth: DepthKind) -> LossConfig:
+        """The loss of maps of a kind."""
+        return self.ray_plane if depth == "ray_plane" else self.blended
+
+
+class LearningRates(Config):
+    """Step lengths of Adam: about the change of a parameter per step while its gradient keeps its sign."""
+
+    means: float = 2e-3
+    """Metres."""
+    quats_wxyz: float = 2e-2
+    """Of a unit quaternion."""
+    log_scales: float = 0.08
+    colors: float = 2e-2
+    """RGB in 0..1."""
+    opacity_logits: float = 6e-2
+
+    def times(self, factor: float) -> LearningRates:
+        """All rates scaled."""
+        return LearningRates(**{name: rate * factor for name, rate in self.model_dump().items()})

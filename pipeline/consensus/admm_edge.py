@@ -1,0 +1,154 @@
+"""One end of a link between two robots, and what crosses it: shared keyframes once, a pose packet per round."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.config.consensus import ClosureConfig
+from duagc.pipeline.geometry import so3
+from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph.loop_closures import Closure, closure_factors
+from duagc.pipeline.posegraph.robust import RobustWeights
+
+Array = NDArray[np.float64]
+STEP_M = 2.0**-27
+"""Steps of translations on the wire `fixed`: 7.5 nm."""
+BLOCK = [0, 0, 0, 1, 1, 1]
+"""Translation, rotation -> the six rows of a tangent."""
+REMEMBERED = 8
+"""Arrivals that must have changed little before an end holds still."""
+
+
+@dataclass(frozen=True)
+class SharedKeyframes:
+    """Set-up message of a link, from the end that holds the closures to the end that owns the keyframes.
+
+    keyframes: int32 [s], indices of the receiver's keyframes, ascending. metric: float32 [s, 6], diagonal of the
+    information (translation, rotation) that the pair's closures have about each, isotropic per block, so that it
+    holds in every frame; both ends must use the same numbers.
+    """
+
+    keyframes: NDArray[np.int32]
+    metric: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class PosePacket:
+    """One direction of one link in one round. It may be cut by keyframe; every part is useful alone.
+
+    sequence: counts the sender's packets on this link. version: of the penalties. keyframes: int32 [s], indices of
+    the non-holder's keyframes. quats_wxyz [s, 4], translations [s, 3] (m): 2 x - y in the sender's world frame; both
+    float32, both float64, or translations alone float64: multiples of STEP_M.
+    penalties: float32 [2] (translation, rotation) of this version. curvature: float32 [2] or None, the stiffness that
+    the sender met in this version. converged: the sender is settled.
+    """
+
+    sequence: int
+    version: int
+    keyframes: NDArray[np.int32]
+    quats_wxyz: NDArray[Any]
+    translations: NDArray[Any]
+    penalties: NDArray[np.float32]
+    curvature: NDArray[np.float32] | None
+    converged: bool
+
+    def part(self, index: slice | NDArray[np.int64]) -> PosePacket:
+        """The packet with some of its keyframes only."""
+        return PosePacket(
+            self.sequence,
+            self.version,
+            self.keyframes[index],
+            self.quats_wxyz[index],
+            self.translations[index],
+            self.penalties,
+            self.curvature,
+            self.converged,
+        )
+
+
+@dataclass
+class Link:
+    """One end of a link. Arrays over its s shared keyframes, which belong to the end that holds no closures."""
+
+    peer: str
+    decides: bool
+    keyframes: NDArray[np.int32]
+    metric: Array
+    slots: NDArray[np.int64]  # [s] where the shared keyframes stand among this robot's variables
+    closures: tuple[Closure, ...]  # held ones; none at the other end
+    factors: Factors  # the same, between this robot's variables
+    robust: RobustWeights  # of the same
+    penalties: Array  # [2] translation, rotation
+    offset: Array = field(init=False)  # [s, 6] d = x - y (translation, rotation)
+    version: int = 0
+    sent: int = 0
+    received: float = 0.0  # packets since the last change of penalties, parts counted by their share
+    received_total: float = 0.0
+    adapting_from: float = 0.0  # received_total when the robust weights became final after their schedule
+    newest: NDArray[np.int64] = field(init=False)  # [s] sequence last used
+    newest_header: int = 0
+    changes: Array = field(init=False)  # [s, REMEMBERED] by the last arrivals (m, rad), the newest last
+    reference: tuple[Array, Array] | None = None  # force and poses when the curvature window began
+    peer_curvature: Array | None = None
+    peer_converged: bool = False
+
+    def __post_init__(self) -> None:
+        self.offset = np.zeros((len(self.keyframes), 6))
+        self.newest = np.zeros(len(self.keyframes), np.int64)
+        self.changes = np.full((len(self.keyframes), REMEMBERED), np.inf)
+
+    @property
+    def holds(self) -> bool:
+        """Whether this end has the closures of the pair."""
+        return bool(self.closures)
+
+    def penalty(self) -> Array:
+        """Diagonal penalty [s, 6]."""
+        return self.metric * self.penalties[BLOCK]
+
+    def force(self) -> Array:
+        """W (x - y) [s, 6]: the multiplier of this end (dual)."""
+        return self.penalty() * self.offset
+
+    def moved(self, at: NDArray[np.int64], change: Array) -> None:
+        """Note by how much an arrival moved the edge variables `at` (m, rad)."""
+        self.changes[at] = np.concatenate([self.changes[at, 1:], change[:, None]], axis=1)
+
+    def largest_change(self) -> float:
+        """Largest change of an edge variable by the last arrivals (m, rad); infinite before the first."""
+        return float(self.changes[:, -1].max())
+
+    def largest_recent_change(self) -> float:
+        """The same over the last arrivals; infinite before there were so many.
+
+        A neighbour that has not heard since says nearly the same again: the less arrives, the less a single small
+        change means.
+        """
+        return float(self.changes.max())
+
+
+def rounded(T: Array, wire: str) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Poses [s, 4, 4] as they stand in a packet: quats_wxyz [s, 4] and translations [s, 3], see `PosePacket`."""
+    quats_wxyz, translations = so3.to_quat_wxyz(T[:, :3, :3]), T[:, :3, 3]
+    if wire == "fixed":
+        return quats_wxyz.astype(np.float32), np.asarray(np.rint(translations / STEP_M) * STEP_M)
+    return quats_wxyz.astype(wire), translations.astype(wire)
+
+
+def link_metric(
+    closures: Sequence[Closure], keyframes: NDArray[np.int64], config: ClosureConfig
+) -> NDArray[np.float32]:
+    """Information [s, 6] of the closures about each copied keyframe, averaged over directions per block."""
+    position = np.searchsorted(keyframes, [c.peer_keyframe for c in closures])
+    information = closure_factors(closures, np.zeros(len(closures)), position, config).information
+    blocks = np.diagonal(information, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)
+    total = np.zeros((len(keyframes), 2))
+    np.add.at(total, position, blocks)
+    if not np.all(total > 0):
+        raise ValueError("a closure without information about translation or rotation cannot join two robots")
+    return total[:, BLOCK].astype(np.float32)

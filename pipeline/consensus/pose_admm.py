@@ -1,0 +1,452 @@
+"""Pose consensus of one robot: relaxed edge-ADMM (Douglas-Rachford form) with per-pair adaptive penalties.
+
+Every closure between two robots is held by one of them, which keeps a *copy* of the other's keyframe beside its own
+poses. For every copied keyframe there is one edge variable y at each end of the link. Per round a robot
+
+    1. takes one Gauss-Newton step on  f(x) + 1/2 sum over links |x - y|_W^2,   W = penalty * metric,
+    2. sends                           m = 2 x - y,
+    3. on arrival sets                 y <- y + relaxation (m - y);
+
+a packet that does not arrive changes nothing. At a fixed point x agrees at both ends and the forces W (x - y) of
+the two ends cancel, so that x minimises the sum of all robots' costs: the centralised optimum, whatever the
+penalties and the losses on the way were. Source: `docs/consensus.md`; paper eqs. (8), (10), (11), (14), corrected.
+
+On the product group the edge variable is kept as its *offset* d = x - y, a vector of the tangent at x: a step delta
+adds delta to d, m is x (+) d, y is x (+) (-d), and an arrival subtracts relaxation (m (-) y) from d. Unlike the
+logarithm of a pose y, an offset does not wrap at pi, and offsets are large where forces are (d = force / W).
+
+Penalty handshake. The end with the lower name decides. Versions count up from 0, and a packet is used only by a
+receiver of the same version.
+
+    * Every packet carries the sender's version; the decider's also its penalties; the follower's also its curvature
+      once it has received enough in this version.
+    * The decider, having received enough itself and holding a curvature of this version, takes new penalties, moves
+      its y so that its force W d stays, and counts the version up.
+    * The follower takes over penalties and version from the first newer packet that reaches it, keeping its force
+      likewise, and then uses that packet.
+
+So the ends differ by at most one version (the decider cannot decide again before it has heard the follower in the new
+version), a lost packet only delays the follower's change, and what the follower sent before it is dropped by the
+decider, as if lost. Keeping the force keeps every fixed point: there m = y before and after.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from duagc.pipeline.config.consensus import PoseConsensusConfig
+from duagc.pipeline.consensus.admm_edge import BLOCK, Link, PosePacket, SharedKeyframes, link_metric, rounded
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph import factors as pose_factors
+from duagc.pipeline.posegraph.factors import Factors, difference, inflated, retract
+from duagc.pipeline.posegraph.loop_closures import Closure, closure_factors
+from duagc.pipeline.posegraph.robust import COUNTS, RobustWeights
+
+Array = NDArray[np.float64]
+_STEADY = 1e-3  # m, rad: a link that moves less has left its start behind
+
+
+class PoseAgent:
+    """One robot's side of the pose consensus: own keyframes, copies of the neighbours', and what packets brought.
+
+    Robots have names that sort; the lower name of a pair decides on penalties. Nobody is held during the iteration;
+    results may be expressed in any frame afterwards (`docs/consensus.md`, gauge).
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        T_map_keyframe: ArrayLike,
+        odometry: Factors,
+        config: PoseConsensusConfig,
+        *,
+        loops: Factors | None = None,
+        keep_loops: ArrayLike | None = None,
+    ) -> None:
+        """Take a robot's own graph.
+
+        Args:
+            robot: its name.
+            T_map_keyframe: [n, 4, 4], keyframes in its own map; also the start of the iteration.
+            odometry: factors between own keyframes (by index) that are trusted.
+            config: the same at all robots.
+            loops: factors between own keyframes that get robust weights like closures do; default none.
+            keep_loops: bool per loop, start of the robust weights (default: all).
+        """
+        self.robot, self.config = robot, config
+        self.T_map_keyframe = np.array(T_map_keyframe, dtype=np.float64)
+        self.odometry = with_floor(odometry, config)
+        self.loops = Factors.empty() if loops is None else with_floor(loops, config)
+        kept = np.ones(len(self.loops)) if keep_loops is None else np.array(keep_loops, dtype=np.float64)
+        self.loop_weights = RobustWeights(kept, config)
+        self.T_world_map = np.eye(4)
+        self.links: dict[str, Link] = {}
+        self.rounds = self.factorisations = 0
+        self.step_change = np.inf
+        self._copies_start: dict[str, Array] = {}
+        self._started = False
+        self._x = self.T_map_keyframe.copy()
+        self._factors = Factors.concatenate([self.odometry, self.loops])
+        self._collect_weights()
+        self._solve: Callable[[Array], Array] | None = None
+        self._moved_rad = 0.0
+        self._dual_change = 0.0
+
+    # ---- set-up ----
+
+    def set_frame(self, T_world_map: ArrayLike) -> None:
+        """Start from this pose of the own map in the common frame; call before the first step."""
+        if self._started:
+            raise ValueError(f"{self.robot}: the frame cannot change after the first step")
+        self.T_world_map = np.array(T_world_map, dtype=np.float64)
+
+    def add_link(
+        self,
+        peer: str,
+        closures_held: Sequence[Closure] = (),
+        shared: SharedKeyframes | None = None,
+        *,
+        keep: ArrayLike | None = None,
+        T_world_keyframe_peer: Mapping[int, ArrayLike] | None = None,
+    ) -> SharedKeyframes:
+        """Join a neighbour, either with the closures that this end holds or with the keyframes that it shares.
+
+        Args:
+            peer: the neighbour's name.
+            closures_held: all closures of the pair, if this end holds them.
+            shared: what the neighbour's `add_link` returned, if it holds them.
+            keep: bool per closure, start of the robust weights (default: all).
+            T_world_keyframe_peer: start of the copies by peer keyframe index, in this robot's idea of the world
+                frame; default: from the first kept closure that names it.
+        Returns:
+            What the neighbour needs for its own `add_link` (with `shared`: the same again).
+        """
+        if self._started:
+            raise ValueError(f"{self.robot}: a link to {peer} cannot be added after the first step")
+        if peer in self.links or peer == self.robot:
+            raise ValueError(f"{self.robot}: there is a link to {peer} already")
+        if bool(closures_held) == (shared is not None):
+            raise ValueError(
+                f"{self.robot}: a link to {peer} needs held closures or shared keyframes, one of the two"
+            )
+        closures = tuple(closures_held)
+        kept = np.ones(len(closures), dtype=bool) if keep is None else np.asarray(keep, dtype=bool)
+        if shared is None:
+            keyframes = np.unique([c.peer_keyframe for c in closures])
+            shared = SharedKeyframes(
+                keyframes.astype(np.int32), link_metric(closures, keyframes, self.config.closures)
+            )
+            self._copies_start[peer] = self._copies(closures, kept, keyframes, T_world_keyframe_peer or {})
+        self.links[peer] = Link(
+            peer=peer,
+            decides=self.robot < peer,
+            keyframes=np.asarray(shared.keyframes, dtype=np.int32),
+            metric=np.asarray(shared.metric, dtype=np.float64),
+            slots=np.asarray(shared.keyframes, dtype=np.int64),
+            closures=closures,
+            factors=Factors.empty(),
+            robust=RobustWeights(kept.astype(np.float64), self.config),
+            penalties=np.full(2, np.float64(np.float32(self.config.penalty_start))),
+        )
+        self.links = {name: self.links[name] for name in sorted(self.links)}
+        return shared
+
+    def _copies(
+        self,
+        closures: Sequence[Closure],
+        kept: NDArray[np.bool_],
+        keyframes: NDArray[np.int64],
+        known: Mapping[int, ArrayLike],
+    ) -> Array:
+        """Start of the peer's keyframes [s, 4, 4] in the own map frame."""
+        out = np.zeros((len(keyframes), 4, 4))
+        from_world = se3.inverse(self.T_world_map)
+        for s, keyframe in enumerate(keyframes.tolist()):
+            if keyframe in known:
+                out[s] = from_world @ np.asarray(known[keyframe], dtype=np.float64)
+            else:
+                named = [k for k, c in enumerate(closures) if c.peer_keyframe == keyframe]
+                best = closures[max(named, key=lambda k: bool(kept[k]))]
+                out[s] = self.T_map_keyframe[best.own_keyframe] @ best.T_own_peer
+        return out
+
+    def _start(self) -> None:
+        """Lay out the variables: own keyframes, then copies by neighbour; factors over all of them."""
+        self._started = True
+        poses, parts, count = [self.T_map_keyframe], [self._factors], len(self.T_map_keyframe)
+        for link in self.links.values():
+            if link.holds:
+                copies = self._copies_start[link.peer]
+                link.slots = count + np.arange(len(copies))
+                poses.append(copies)
+                own = [c.own_keyframe for c in link.closures]
+                copy = link.slots[np.searchsorted(link.keyframes, [c.peer_keyframe for c in link.closures])]
+                link.factors = closure_factors(link.closures, own, copy, self.config.closures)
+                parts.append(link.factors)
+                count += len(copies)
+        self._x = self.T_world_map @ np.concatenate(poses)
+        self._factors = Factors.concatenate(parts)
+        self._collect_weights()
+
+    def _collect_weights(self) -> None:
+        held = [link.robust.weights for link in self.links.values() if link.holds]
+        self._weights = np.concatenate([np.ones(len(self.odometry)), self.loop_weights.weights, *held])
+        self._solve = None
+
+    # ---- one round ----
+
+    def step(self) -> float:
+        """One Gauss-Newton step; returns its largest component (m, rad). Without links nothing moves."""
+        self.rounds += 1
+        if not self.links:
+            self.step_change = 0.0
+            return 0.0
+        if not self._started:
+            self._start()
+        self._weigh_loops()
+        for link in self.links.values():
+            self._weigh(link)
+            self._decide(link)
+        force_before = {peer: link.force() for peer, link in self.links.items()}
+        g, jacobians = pose_factors.gradient(self._factors, self._weights, self._x)
+        for peer, link in self.links.items():
+            g[link.slots] += force_before[peer]
+        if self._solve is None or self._moved_rad > self.config.relinearise_rad:
+            diagonal = np.zeros_like(g)
+            for link in self.links.values():
+                diagonal[link.slots] += link.penalty()
+            diagonal += 1e-9 * diagonal.max()  # a variable that nothing holds stays where it is
+            H = pose_factors.curvature_matrix(self._factors, jacobians, diagonal)
+            self._solve, self._moved_rad = pose_factors.factorised(H), 0.0
+            self.factorisations += 1
+        delta = -self._solve(g.ravel()).reshape(-1, 6)
+        turn_rad = float(np.linalg.norm(delta[:, 3:], axis=1).max())
+        if turn_rad > self.config.step_limit_rad:
+            delta *= self.config.step_limit_rad / turn_rad
+        self._x = retract(self._x, delta)
+        for link in self.links.values():
+            link.offset = link.offset + delta[link.slots]
+        self._moved_rad += float(np.abs(delta[:, 3:]).max())
+        self.step_change = float(np.abs(delta).max())
+        self._dual_change = max(
+            float(np.abs((link.force() - force_before[peer]) / np.sqrt(link.metric)).max())
+            for peer, link in self.links.items()
+        )
+        return self.step_change
+
+    def outgoing(self, peer: str) -> PosePacket:
+        """What to send to a neighbour after a step."""
+        if not self._started:
+            self._start()
+        link = self.links[peer]
+        link.sent += 1
+        quats_wxyz, translations = rounded(retract(self._x[link.slots], link.offset), self.config.wire)
+        curvature = None if link.decides else self._curvature(link)
+        return PosePacket(
+            sequence=link.sent,
+            version=link.version,
+            keyframes=link.keyframes,
+            quats_wxyz=quats_wxyz,
+            translations=translations,
+            penalties=link.penalties.astype(np.float32),
+            curvature=None if curvature is None else curvature.astype(np.float32),
+            converged=self.settled,
+        )
+
+    def receive(self, peer: str, packet: PosePacket) -> bool:
+        """Use a neighbour's packet; False if it was of another version or brought nothing newer."""
+        if not self._started:
+            self._start()
+        link = self.links[peer]
+        if not link.decides and packet.version > link.version:
+            self._change_penalties(link, packet.penalties.astype(np.float64), packet.version)
+        if packet.version != link.version:
+            return False
+        if packet.sequence >= link.newest_header:
+            link.newest_header, link.peer_converged = packet.sequence, packet.converged
+            if packet.curvature is not None:
+                link.peer_curvature = packet.curvature.astype(np.float64)
+        at = np.searchsorted(link.keyframes, packet.keyframes)
+        if not np.array_equal(link.keyframes[np.minimum(at, len(link.keyframes) - 1)], packet.keyframes):
+            raise ValueError(f"{self.robot}: {peer} sent keyframes that the link does not share")
+        newer = packet.sequence > link.newest[at]
+        if not newer.any():
+            return False
+        at = at[newer]
+        m = se3.from_quat_translation(
+            packet.quats_wxyz[newer].astype(np.float64), packet.translations[newer].astype(np.float64)
+        )
+        y = retract(self._x[link.slots[at]], -link.offset[at])
+        delta = self.config.relaxation * difference(m, y)
+        link.offset[at] -= delta
+        link.newest[at] = packet.sequence
+        link.moved(at, np.abs(delta).max(axis=1))
+        share = len(at) / len(link.keyframes)
+        link.received += share
+        link.received_total += share
+        return True
+
+    # ---- penalties ----
+
+    def _curvature(self, link: Link) -> Array | None:
+        """Stiffness [2] met on the way since the last change of penalties: |change of force| / |change of pose|.
+
+        In the metric, for translation and rotation apart; None before enough was received or if nothing moved.
+        """
+        if not (self.config.adaptive and self.robust_done) or link.received < self.config.penalty_period:
+            return None
+        if link.reference is None:
+            self._mark(link)
+            return None
+        force, poses = link.reference
+        root = np.sqrt(link.metric)
+        d_force = (link.force() - force) / root
+        d_pose = difference(self._x[link.slots], poses) * root
+        stiffness = []
+        for block in (slice(0, 3), slice(3, 6)):
+            moved = float(np.linalg.norm(d_pose[:, block]))
+            changed = float(np.linalg.norm(d_force[:, block]))
+            if moved == 0.0 or changed == 0.0:
+                return None
+            stiffness.append(changed / moved)
+        return np.array(stiffness)
+
+    def _mark(self, link: Link) -> None:
+        """Begin a new window of the curvature."""
+        link.reference = (link.force(), self._x[link.slots].copy())
+        link.received = 0.0
+        link.peer_curvature = None
+
+    def _decide(self, link: Link) -> None:
+        """At the lower end: take new penalties once both ends have met enough of the path in this version."""
+        if not link.decides:
+            return
+        own = self._curvature(link)
+        if own is None or link.peer_curvature is None:
+            return
+        c = self.config
+        received = link.received_total - link.adapting_from
+        limit = 1.0 + 2.0 / max(1.0, received / c.penalty_decay)
+        penalties = np.sqrt(own * link.peer_curvature)
+        penalties = np.clip(penalties, link.penalties / limit, link.penalties * limit)
+        penalties = np.clip(penalties, c.penalty_min, c.penalty_max).astype(np.float32).astype(np.float64)
+        self._change_penalties(link, penalties, link.version + 1)
+
+    def _change_penalties(self, link: Link, penalties: Array, version: int) -> None:
+        """Change W and move y so that the force W (x - y) stays."""
+        link.offset = link.offset * (link.penalties / penalties)[BLOCK]
+        link.penalties, link.version = penalties, version
+        self._solve = None
+        self._mark(link)
+
+    # ---- robust weights of held closures ----
+
+    def _weigh(self, link: Link) -> None:
+        """Robust weights of a link's held closures, paced by what arrives on it."""
+
+        def squared() -> Array:
+            return pose_factors.squared_residuals(link.factors, self._x)
+
+        if link.robust.advance(link.received_total, self._steady(link), squared):
+            self._reweighted()
+            if link.robust.done:
+                link.reference, link.received = None, 0.0
+
+    def _weigh_loops(self) -> None:
+        """Robust weights of own loops, paced by the link on which least arrives."""
+        links = self.links.values()
+
+        def squared() -> Array:
+            return pose_factors.squared_residuals(self.loops, self._x)
+
+        received = min(link.received_total for link in links)
+        if self.loop_weights.advance(received, all(self._steady(link) for link in links), squared):
+            self._reweighted()
+
+    def _reweighted(self) -> None:
+        """Some weights changed; when the last are final, penalties begin to adapt as if the links were new."""
+        self._collect_weights()
+        groups = [self.loop_weights, *(link.robust for link in self.links.values())]
+        if self.robust_done and any(group.graduated for group in groups):
+            for link in self.links.values():
+                link.adapting_from = link.received_total
+
+    def _steady(self, link: Link) -> bool:
+        """Whether a link has left its start behind."""
+        return link.received_total >= self.config.penalty_period and link.largest_change() < _STEADY
+
+    # ---- results ----
+
+    @property
+    def robust_done(self) -> bool:
+        """Whether the weights of all held closures and own loops are final."""
+        return self.loop_weights.done and all(link.robust.done for link in self.links.values())
+
+    @property
+    def largest_change(self) -> float:
+        """Largest change of a pose or an edge variable in the last round (m, rad)."""
+        return max([self.step_change, *(link.largest_change() for link in self.links.values())])
+
+    @property
+    def settled(self) -> bool:
+        """This end changes less than the tolerance, by the last arrivals too, and its weights are final."""
+        recent = [link.largest_recent_change() for link in self.links.values()]
+        return self.robust_done and max([self.step_change, *recent]) < self.config.tolerance
+
+    @property
+    def agreed(self) -> bool:
+        """This end and, by their last packets, all neighbours are settled."""
+        return self.settled and all(link.peer_converged for link in self.links.values())
+
+    @property
+    def T_world_keyframe(self) -> Array:  # noqa: N802
+        """Own keyframes [n, 4, 4] in the common frame; those of the own map, bit for bit, if without links."""
+        if not self.links:
+            return self.T_map_keyframe.copy()
+        if not self._started:
+            self._start()
+        return self._x[: len(self.T_map_keyframe)].copy()
+
+    def weights(self, peer: str) -> Array:
+        """Weight [m] of every closure held with a neighbour, in the order given."""
+        return self.links[peer].robust.weights.copy()
+
+    def refuted(self, peer: str) -> bool:
+        """Whether the closures held with a neighbour join nobody any more: final weights, too few of which count.
+
+        It takes `closures.min_support` to join two robots, and as many to keep them joined.
+        """
+        link = self.links[peer]
+        kept = int(np.count_nonzero(link.robust.weights >= COUNTS))
+        return link.holds and link.robust.done and kept < self.config.closures.min_support
+
+    def residuals(self) -> dict[str, Any]:
+        """What a round looked like, for the record.
+
+        primal: largest |2 x_peer - y_peer - y| over links, the disagreement (m, rad). dual: largest change of a force
+        in the last step, over the root of the metric (no unit). cost: own factors, weighted. step: largest component
+        of the last step (m, rad). penalties: (translation, rotation) per neighbour. versions, weights: per neighbour.
+        """
+        changes = [link.largest_change() for link in self.links.values()]
+        return {
+            "primal": max(changes, default=0.0) / self.config.relaxation,
+            "dual": self._dual_change,
+            "cost": pose_factors.cost(self._factors, self._x, self._weights) if self._started else 0.0,
+            "step": self.step_change,
+            "penalties": {peer: tuple(link.penalties.tolist()) for peer, link in self.links.items()},
+            "versions": {peer: link.version for peer, link in self.links.items()},
+            "weights": {
+                peer: link.robust.weights.tolist() for peer, link in self.links.items() if link.holds
+            },
+            "factorisations": self.factorisations,
+        }
+
+
+def with_floor(odometry: Factors, config: PoseConsensusConfig) -> Factors:
+    """Odometry as it counts in the objective: its covariance plus the floor of the settings."""
+    floor = np.repeat([config.odometry_floor_m**2, config.odometry_floor_rad**2], 3) * np.eye(6)
+    return Factors(odometry.i, odometry.j, odometry.T_i_j, inflated(odometry.information, floor))

@@ -1,0 +1,59 @@
+"""Agreement of held-out views under several trajectories, of their depth and of their features."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.evaluation.depth_agreement import depth_agreement
+from duagc.pipeline.evaluation.feature_agreement import feature_agreement
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.evaluation.trajectory_errors import NO_ROTATIONS, Paired
+from duagc.pipeline.recording import open_rgbd
+
+Path3D = Mapping[int, NDArray[np.float64]]
+"""T_frame_camera [4, 4] by time stamp."""
+
+VIEWS = 40
+"""Held-out views, evenly spread, that are compared in pairs."""
+OF_TRUTH = "_of_truth"
+
+
+def section(
+    log_path: Path, held_out: Mapping[int, int], paths: Mapping[str, Path3D], true: Paired | Absent
+) -> dict[str, Any]:
+    """How well held-out views agree under trajectories, and under the ground truth where there is one.
+
+    Args:
+        log_path: sensor log of the robot. held_out: stamp of every held-out frame that was tracked, by its index.
+        paths: by the ending of their names in the result. true: estimate and ground truth, paired.
+    Returns:
+        `depth_agreement_m` and `feature_agreement_px` of every path, and of how many pairs of views.
+    """
+    found: dict[str, Any] = {}
+    if isinstance(true, Absent) or true.positions_only:
+        absent = true if isinstance(true, Absent) else NO_ROTATIONS
+        found = {f"depth_agreement_m{OF_TRUTH}": absent, f"feature_agreement_px{OF_TRUTH}": absent}
+    else:
+        paths = {**paths, OF_TRUTH: dict(zip(true.stamps_ns.tolist(), true.true, strict=True))}
+    known = [i for i, stamp in held_out.items() if all(stamp in path for path in paths.values())]
+    most = min(VIEWS, len(known))
+    chosen = [known[(2 * k + 1) * len(known) // (2 * most)] for k in range(most)]
+    with open_rgbd(log_path) as log:
+        camera, frames = log.camera, [log.frame(index) for index in chosen]
+    depths = [f.depth if f.mask is None else np.where(f.mask, f.depth, np.float32(0)) for f in frames]
+    poses = {
+        name: np.array([path[held_out[index]] for index in chosen]).reshape(-1, 4, 4)
+        for name, path in paths.items()
+    }
+    pairs, by_depth = depth_agreement(depths, camera, poses)
+    matched, by_features = feature_agreement([f.color for f in frames], depths, camera, poses)
+    found |= {"depth_agreement_pairs": pairs, "feature_agreement_pairs": matched}
+    for name in paths:
+        found[f"depth_agreement_m{name}"] = by_depth[name]
+        found[f"feature_agreement_px{name}"] = by_features[name]
+    return found

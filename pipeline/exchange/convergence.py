@@ -1,0 +1,68 @@
+"""Whether the keyframes of two robots see the same surfaces when one map is laid into the other.
+
+Closures say that two places look alike. Laid into each other by what they say, the maps must agree everywhere else too:
+where own keyframes see what a neighbour's samples stand on, they must see it at the same depth. A place that only looks
+like another does not pass that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+Array = NDArray[np.float64]
+STRIDE_PX = 4  # of the own depth images
+GATE_M, GATE_RELATIVE = 0.1, 0.05  # same surface: the larger of the two, the second by the depth
+MIN_TOLD = 50  # samples that a keyframe must be able to judge
+KEYFRAMES = 24  # own keyframes that are asked about one of the neighbour's, the nearest
+
+
+def coarse_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What is kept of a depth image [h, w] (m, 0 = unknown)."""
+    return np.ascontiguousarray(depth_m[::STRIDE_PX, ::STRIDE_PX])
+
+
+def agreement(
+    coarse_m: Sequence[NDArray[np.float32]],
+    camera: PinholeCamera,
+    T_ownmap_keyframe: Array,
+    samples: Sequence[NDArray[np.floating]],
+    T_ownmap_peer: Array,
+) -> float:
+    """Share of a neighbour's samples that own keyframes see where the samples say, of all that they can judge.
+
+    Args:
+        coarse_m: `coarse_depth` of the own keyframes. camera: of the whole images.
+        T_ownmap_keyframe: [n, 4, 4], own keyframes. samples: [m, 3] of every keyframe of the neighbour that is known,
+            in its camera frame. T_ownmap_peer: [k, 4, 4], these keyframes where they lie in the own map.
+    Returns:
+        0 to 1; 0 if no own keyframe can judge anything.
+    """
+    told = agree = 0
+    for points, T_ownmap_sample in zip(samples, T_ownmap_peer, strict=True):
+        placed = se3.transform(T_ownmap_sample, np.asarray(points, dtype=np.float64))
+        distance = np.linalg.norm(T_ownmap_keyframe[:, :3, 3] - T_ownmap_sample[:3, 3], axis=1)
+        for k in np.argsort(distance, kind="stable")[:KEYFRAMES].tolist():
+            q = se3.transform(se3.inverse(T_ownmap_keyframe[k]), placed)
+            found, seen = _judged(coarse_m[k], camera, q[q[:, 2] > 0.05])
+            if seen >= MIN_TOLD:
+                told, agree = told + seen, agree + found
+    return agree / told if told else 0.0
+
+
+def _judged(coarse_m: NDArray[np.float32], camera: PinholeCamera, q: Array) -> tuple[int, int]:
+    """How many of the points q [n, 3] in the camera frame lie on the surface seen there, and how many could be told."""
+    u = np.rint((camera.fx * q[:, 0] / q[:, 2] + camera.cx) / STRIDE_PX)
+    v = np.rint((camera.fy * q[:, 1] / q[:, 2] + camera.cy) / STRIDE_PX)
+    rows, columns = coarse_m.shape
+    inside = (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
+    depth = q[inside, 2]
+    seen_m = coarse_m[v[inside].astype(np.int64), u[inside].astype(np.int64)]
+    known = seen_m > 0
+    near = np.abs(seen_m - depth) < np.maximum(GATE_M, GATE_RELATIVE * depth)
+    return int(np.count_nonzero(near & known)), int(np.count_nonzero(known))

@@ -1,0 +1,112 @@
+"""Evidence as records on the wire: made from a robot's own map, ranked, cut to the space a neighbour saw."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.config.consensus import MatchingConfig, WeightKind
+from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.consensus.matching import match
+from duagc.pipeline.consensus.weighting import told
+from duagc.pipeline.exchange.wire.evidence_wire import record_dtype
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.network.packets import Kind
+from duagc.pipeline.runs.robot_data import RobotData
+from duagc.pipeline.splat.gaussians import Gaussians
+
+Array = NDArray[np.float64]
+Records = NDArray[Any]
+
+# what a receiver expects before it is told: standard deviations of position (m), log-covariance, colour, opacity logit
+PRIOR_SIGMA = np.repeat([0.05, 1.0, 0.1, 2.0], [3, 6, 3, 1])
+# places of the diagonal in the 31 numbers of information: upper triangles of 3x3 and 6x6, then colour and opacity
+DIAGONAL = np.array([0, 3, 5, 6, 12, 17, 21, 24, 26, 27, 28, 29, 30])
+VOXEL_BITS = 20  # per axis; voxels beyond +-2^19 share those at the border
+
+
+def own_records(data: RobotData, kind: Kind, weights: WeightKind) -> Records:
+    """A robot's own evidence in the frames of its anchors, in the precision of this kind of evidence."""
+    evidence = told(data.robot, data.gaussians, data.information, data.T_map_keyframe, weights)
+    return to_records(evidence, kind)
+
+
+def to_records(evidence: Evidence, kind: Kind) -> Records:
+    """Records of evidence, in the same order."""
+    records = np.zeros(len(evidence), record_dtype(kind))
+    records["id"], records["anchor"] = evidence.ids, evidence.anchors
+    records["theta"], records["information"] = evidence.theta, evidence.information
+    return records
+
+
+def to_evidence(owner: str, records: Records) -> Evidence:
+    """Evidence of records, in the same order."""
+    return Evidence(owner, records["id"], records["anchor"], records["theta"], records["information"])
+
+
+def gain(records: Records) -> Array:
+    """Expected information gain [n], nats: 1/2 sum over dimensions of log(1 + information * prior variance).
+
+    It has no unit, unlike the paper's (4), which adds 1/m^2 to 1/rad^2. All records have the same size.
+    """
+    known = np.maximum(records["information"][:, DIAGONAL].astype(np.float64), 0.0)
+    return 0.5 * np.log1p(known * PRIOR_SIGMA**2).sum(axis=1)
+
+
+def paper_priority(records: Records) -> Array:
+    """The paper's (4) [n]: the sum of the information over all dimensions, which depends on the unit of length."""
+    return np.maximum(records["information"][:, DIAGONAL].astype(np.float64), 0.0).sum(axis=1)
+
+
+def best_first(records: Records, order: Literal["gain", "paper"] = "gain") -> NDArray[np.int64]:
+    """Order by falling gain (all records have the same size), or by the paper's priority; ties by id."""
+    value = gain(records) if order == "gain" else paper_priority(records)
+    return np.lexsort((records["id"], -value))
+
+
+def voxel_keys(points: Array, edge_m: float) -> NDArray[np.int64]:
+    """Key of the voxel of every point [n, 3]."""
+    half = 1 << (VOXEL_BITS - 1)
+    cell = np.clip(np.floor(points / edge_m), -half, half - 1).astype(np.int64) + half
+    return (cell[:, 0] << 2 * VOXEL_BITS) | (cell[:, 1] << VOXEL_BITS) | cell[:, 2]
+
+
+def seen_voxels(gaussians: Gaussians, T_world_map: Array, edge_m: float) -> NDArray[np.int64]:
+    """Ascending keys of the voxels with a Gaussian of this map, and of those around them."""
+    points = se3.transform(T_world_map, gaussians.means.astype(np.float64))
+    steps = np.array(np.meshgrid(*[[-1, 0, 1]] * 3)).reshape(3, -1).T * edge_m
+    occupied = np.unique(np.floor(points / edge_m), axis=0) * edge_m + 0.5 * edge_m
+    return np.unique(voxel_keys((occupied[:, None] + steps).reshape(-1, 3), edge_m))
+
+
+def within(
+    records: Records, T_world_keyframe: Array, voxels: NDArray[np.int64], edge_m: float
+) -> NDArray[np.bool_]:
+    """Which records [n] lie in one of the voxels.
+
+    Args:
+        T_world_keyframe: [k, 4, 4] of the owner's keyframes, by anchor.
+    """
+    T = T_world_keyframe[records["anchor"]]
+    mean = records["theta"][:, :3].astype(np.float64)
+    points = (T[:, :3, :3] @ mean[:, :, None])[..., 0] + T[:, :3, 3]
+    return np.isin(voxel_keys(points, edge_m), voxels)
+
+
+def match_pairs(
+    own: str,
+    own_evidence: Records,
+    T_common_own: Array,
+    peer: str,
+    peer_evidence: Records,
+    T_common_peer: Array,
+    config: MatchingConfig,
+) -> NDArray[np.int64]:
+    """Ids of matched Gaussians of two robots, int64 [n, 2]. Poses are [k, 4, 4], by anchor, in one frame."""
+    return match(
+        to_evidence(own, own_evidence).in_world(T_common_own),
+        to_evidence(peer, peer_evidence).in_world(T_common_peer),
+        config,
+    )

@@ -1,0 +1,139 @@
+"""Bytes of evidence of every kind, in chunks that are useful alone. Strict as `wire`."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.consensus.evidence import unpack_symmetric
+from duagc.pipeline.exchange.wire.compact_wire import COMPACT, decode, encode
+from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, Reader
+from duagc.pipeline.network.packets import (
+    EVIDENCE_BYTES,
+    EVIDENCE_DOUBLE_BYTES,
+    EVIDENCE_EXACT_BYTES,
+    EVIDENCE_HEAD_BYTES,
+    EVIDENCE_KINDS,
+    Kind,
+    MalformedError,
+    chunk_bytes,
+    records_per_chunk,
+)
+from duagc.pipeline.splat.gaussians import DEPTH_KINDS
+
+Array = NDArray[np.float64]
+
+MAX_INFORMATION = 1e15  # of a coordinate, 1/m^2: 30 nm
+INDEFINITE_TOLERANCE = 1e-4  # of the largest eigenvalue: rounding of float32
+MAX_LOG_COVARIANCE = 60.0  # beyond it exponentials overflow in float32
+
+RECORD = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f4", 13), ("information", "<f4", 31)])
+RECORD_DOUBLE = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f8", 13), ("information", "<f8", 31)])
+# owner, 1 + index of the depth its map was made with, records of the whole message
+_EVIDENCE = struct.Struct("<HHI")
+assert RECORD.itemsize == EVIDENCE_EXACT_BYTES
+assert RECORD_DOUBLE.itemsize == EVIDENCE_DOUBLE_BYTES
+assert COMPACT.itemsize == EVIDENCE_BYTES
+assert _EVIDENCE.size == EVIDENCE_HEAD_BYTES
+
+
+def record_dtype(kind: Kind) -> np.dtype[Any]:
+    """Records as they are made and read for this kind of evidence."""
+    return RECORD_DOUBLE if kind is Kind.EVIDENCE_DOUBLE else RECORD
+
+
+def to_body(kind: Kind, records: NDArray[Any]) -> NDArray[Any]:
+    """Records as they stand in a packet of this kind. Rounding happens here, once: a body is handed on as it is."""
+    return encode(records) if kind is Kind.EVIDENCE else records
+
+
+def from_body(kind: Kind, body: NDArray[Any]) -> NDArray[Any]:
+    """Records as every receiver reads them."""
+    return decode(body, RECORD) if kind is Kind.EVIDENCE else body
+
+
+def write_evidence(kind: Kind, owner: int, depth: DepthKind, body: NDArray[Any]) -> bytes:
+    """Bytes of evidence of any kind: chunks of whole records, each with its own head, as they are cut.
+
+    depth: of a Gaussian at a pixel, as the owner's map was made.
+    """
+    n, per, size = len(body), records_per_chunk(kind), body.itemsize
+    head = _EVIDENCE.pack(owner, 1 + DEPTH_KINDS.index(depth), n)
+    chunks = max(1, -(-n // per))
+    rows = np.zeros((chunks, chunk_bytes(kind)), np.uint8)
+    rows[:, :EVIDENCE_HEAD_BYTES] = np.frombuffer(head, np.uint8)
+    padded = np.zeros(chunks * per, body.dtype)
+    padded[:n] = body
+    rows[:, EVIDENCE_HEAD_BYTES:] = padded.view(np.uint8).reshape(chunks, per * size)
+    return rows.tobytes()[: chunks * EVIDENCE_HEAD_BYTES + n * size]
+
+
+def read_evidence_head(kind: Kind, chunk: bytes, team: int) -> tuple[int, DepthKind, int]:
+    """Owner of a chunk of evidence, the depth its map was made with, and the number of records of the whole message."""
+    owner, depth, n = Reader(chunk[:EVIDENCE_HEAD_BYTES], "evidence").fields(_EVIDENCE)
+    if owner >= team or (len(chunk) - EVIDENCE_HEAD_BYTES) % EVIDENCE_KINDS[kind]:
+        raise MalformedError("evidence: names a robot outside the team, or holds a part of a record")
+    if not 1 <= depth <= len(DEPTH_KINDS):
+        raise MalformedError("evidence: of a map with an unknown kind of depth")
+    return owner, DEPTH_KINDS[depth - 1], n
+
+
+def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any], NDArray[Any]]:
+    """Owner, body and records of any number of consecutive chunks of one message, each id once.
+
+    A complete message has the announced number of records; parts of one have fewer.
+    """
+    owner, _, announced = read_evidence_head(kind, data[:EVIDENCE_HEAD_BYTES], team)
+    step = chunk_bytes(kind)
+    chunks = -(-len(data) // step)
+    padded = np.zeros(chunks * step, np.uint8)
+    padded[: len(data)] = np.frombuffer(data, np.uint8)
+    rows = padded.reshape(chunks, step)
+    if (rows[:, :EVIDENCE_HEAD_BYTES] != rows[0, :EVIDENCE_HEAD_BYTES]).any():
+        raise MalformedError("evidence: chunks of different messages")
+    n, odd = divmod(len(data) - chunks * EVIDENCE_HEAD_BYTES, EVIDENCE_KINDS[kind])
+    if odd or n > announced:
+        raise MalformedError(f"evidence: {len(data)} bytes are no {announced} records")
+    flat = np.ascontiguousarray(rows[:, EVIDENCE_HEAD_BYTES:]).reshape(-1)
+    body: NDArray[Any] = flat.view(COMPACT if kind is Kind.EVIDENCE else record_dtype(kind))[:n].copy()
+    for name in body.dtype.names or ():
+        if body[name].dtype.kind == "f" and not np.isfinite(body[name]).all():
+            raise MalformedError("evidence: not a finite number")
+    records = from_body(kind, body)
+    check_evidence(records)
+    if kind is not Kind.EVIDENCE:  # the factors of the compact kind cannot say anything impossible
+        check_information(records["information"].astype(np.float64))
+    return owner, body, records
+
+
+def check_evidence(records: NDArray[Any]) -> None:
+    """Refuse records with impossible numbers. Raises MalformedError."""
+    theta = records["theta"]
+    if len(records) and (
+        np.abs(theta).max() > MAX_COORDINATE or np.abs(theta[:, 3:9]).max() > MAX_LOG_COVARIANCE
+    ):
+        raise MalformedError("evidence: a Gaussian of impossible place or size")
+    if len(records) and records["anchor"].min() < 0:
+        raise MalformedError("evidence: a negative keyframe")
+    if len(np.unique(records["id"])) != len(records):
+        raise MalformedError("evidence: a Gaussian twice")
+
+
+def check_information(information: Array) -> None:
+    """Refuse information [n, 31] that no measurement can give: indefinite, or beyond all sensors.
+
+    Raises:
+        MalformedError: with the reason.
+    """
+    if np.abs(information).max(initial=0.0) > MAX_INFORMATION:
+        raise MalformedError(f"evidence: information beyond {MAX_INFORMATION:g}")
+    if information[:, 27:].min(initial=0.0) < 0:
+        raise MalformedError("evidence: negative information")
+    for part, size in ((slice(0, 6), 3), (slice(6, 27), 6)):
+        values = np.linalg.eigvalsh(unpack_symmetric(information[:, part], size))
+        if (values[:, 0] < -INDEFINITE_TOLERANCE * np.maximum(values[:, -1], 1e-6)).any():
+            raise MalformedError("evidence: indefinite information")

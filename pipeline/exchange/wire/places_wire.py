@@ -1,0 +1,210 @@
+"""Bytes of what two robots say when they meet: places, samples of keyframes, the verdict. Strict as `wire`."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.consensus.admm_edge import SharedKeyframes
+from duagc.pipeline.exchange.wire.state_wire import MAX_KEYFRAMES, Reader, array_bytes, pose_bytes
+from duagc.pipeline.network.packets import MalformedError
+from duagc.pipeline.registration import Reference, ReferenceLevel
+from duagc.pipeline.registration.features import DIMENSIONS, Descriptors, Features
+
+Array = NDArray[np.float64]
+
+DIGEST_BYTES = 8
+
+
+def read_digest(data: bytes) -> bytes:
+    """From HELLO."""
+    if len(data) != DIGEST_BYTES:
+        raise MalformedError(f"hello: {len(data)} bytes, expected {DIGEST_BYTES}")
+    return data
+
+
+@dataclass(frozen=True)
+class PlaceBook:
+    """What a robot tells its neighbour to let it recognise places.
+
+    descriptors: one array per keyframe. T_first_keyframe: [n, 4, 4], as seen from its
+    first keyframe. drift: [n, 2], accumulated variance of its
+    odometry from keyframe 0 (m^2, rad^2).
+    """
+
+    descriptors: list[Descriptors]
+    T_first_keyframe: Array
+    drift: Array
+
+
+_COUNT = struct.Struct("<I")
+
+
+def write_places(book: PlaceBook) -> bytes:
+    """Bytes of DESCRIPTORS."""
+    return b"".join(
+        [
+            _COUNT.pack(len(book.descriptors)),
+            pose_bytes(book.T_first_keyframe),
+            array_bytes(book.drift, "float64"),
+            array_bytes([len(d) for d in book.descriptors], "uint16"),
+            *(array_bytes(d, "uint8") for d in book.descriptors),
+        ]
+    )
+
+
+def read_places(data: bytes) -> PlaceBook:
+    """From DESCRIPTORS."""
+    reader = Reader(data, "descriptors")
+    n = _keyframe_count(reader)
+    T, drift = reader.poses(n), reader.array("float64", (n, 2))
+    if n and (drift.min() < 0 or drift.max() > 1e12 or np.diff(drift, axis=0).min(initial=0.0) < 0):
+        raise MalformedError("descriptors: the drift of the odometry must grow from zero")
+    counts = reader.array("uint16", (n,)).tolist()
+    book = PlaceBook([reader.array("uint8", (count, DIMENSIONS)) for count in counts], T, drift)
+    reader.done()
+    return book
+
+
+def _keyframe_count(reader: Reader) -> int:
+    (n,) = reader.fields(_COUNT)
+    if n > MAX_KEYFRAMES:
+        raise MalformedError(f"{reader.what}: {n} keyframes, at most {MAX_KEYFRAMES}")
+    return int(n)
+
+
+def write_indices(indices: list[int]) -> bytes:
+    """Bytes of REQUEST: keyframe indices."""
+    return array_bytes(indices, "uint32")
+
+
+def read_indices(data: bytes, limit: int) -> list[int]:
+    """From REQUEST: ascending keyframe indices below `limit`."""
+    if len(data) % 4:
+        raise MalformedError("request: not a list of indices")
+    indices = Reader(data, "request").array("uint32", (len(data) // 4,)).tolist()
+    if indices != sorted(set(indices)) or (indices and indices[-1] >= limit):
+        raise MalformedError(f"request: indices must ascend and stay below {limit}")
+    return indices
+
+
+# --- the verdict on a pair of robots
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """What the lower-named end found out about a pair.
+
+    candidates, verified, consistent: pairs of keyframes that were tried, that became closures, that agree.
+    joined: the two robots share a frame. shared: then, the keyframes of the higher end that the lower one copies, and
+    their metric.
+    """
+
+    candidates: int
+    verified: int
+    consistent: int
+    joined: bool
+    shared: SharedKeyframes
+
+
+_VERDICTS = struct.Struct("<IIIBI")
+
+
+def write_verdicts(verdicts: Verdicts) -> bytes:
+    """Bytes of CLOSURES."""
+    n = len(verdicts.shared.keyframes)
+    head = (verdicts.candidates, verdicts.verified, verdicts.consistent, verdicts.joined, n)
+    return b"".join(
+        [
+            _VERDICTS.pack(*head),
+            array_bytes(verdicts.shared.keyframes, "int32"),
+            array_bytes(verdicts.shared.metric, "float32"),
+        ]
+    )
+
+
+def read_verdicts(data: bytes, limit: int) -> Verdicts:
+    """From CLOSURES about keyframes below `limit`."""
+    reader = Reader(data, "closures")
+    candidates, verified, consistent, joined, n = reader.fields(_VERDICTS)
+    if joined > 1 or bool(joined) != bool(n) or n > MAX_KEYFRAMES:
+        raise MalformedError("closures: joined robots share keyframes, others do not")
+    keyframes, metric = reader.array("int32", (n,)), reader.array("float32", (n, 6))
+    reader.done()
+    if n and (keyframes[0] < 0 or keyframes[-1] >= limit or np.diff(keyframes).min(initial=1) < 1):
+        raise MalformedError(f"closures: shared keyframes must ascend and stay below {limit}")
+    if n and not (metric.min() > 0 and metric.max() < 1e15):
+        raise MalformedError("closures: the metric must be positive")
+    return Verdicts(candidates, verified, consistent, bool(joined), SharedKeyframes(keyframes, metric))
+
+
+# --- one keyframe
+
+
+@dataclass(frozen=True)
+class KeyframeSample:
+    """What is needed of a keyframe to verify a closure with it: features, and samples for the registration."""
+
+    keyframe: int
+    features: Features
+    reference: Reference
+
+
+_SAMPLE = struct.Struct("<IHfHBf")
+_INT16 = 32767
+
+
+def write_sample(sample: KeyframeSample) -> bytes:
+    """Bytes of SAMPLE; points in steps of the largest coordinate / 32767, normals in bytes, grey in bytes."""
+    levels = sample.reference.levels
+    feature_scale, feature_points = _shorts(sample.features.points)
+    sample_scale, sample_points = _shorts(levels[0].points)
+    return b"".join(
+        [
+            _SAMPLE.pack(
+                sample.keyframe,
+                len(sample.features),
+                feature_scale,
+                len(levels[0]),
+                len(levels),
+                sample_scale,
+            ),
+            array_bytes(sample.features.descriptors, "uint8"),
+            feature_points,
+            sample_points,
+            array_bytes(np.rint(levels[0].normals * 127), "int8"),
+            *(array_bytes(np.rint(np.clip(level.intensities, 0, 1) * 255), "uint8") for level in levels),
+        ]
+    )
+
+
+def read_sample(data: bytes, limit: int) -> KeyframeSample:
+    """From SAMPLE of a keyframe below `limit`."""
+    reader = Reader(data, "sample")
+    keyframe, n, feature_scale, m, levels, sample_scale = reader.fields(_SAMPLE)
+    if keyframe >= limit:
+        raise MalformedError(f"sample: keyframe {keyframe}, expected one below {limit}")
+    if not (0 <= feature_scale < 1 and 0 <= sample_scale < 1) or not 1 <= levels <= 8:
+        raise MalformedError("sample: impossible scale of points or number of levels")
+    descriptors = reader.array("uint8", (n, DIMENSIONS))
+    points = reader.array("int16", (n, 3)).astype(np.float32) * np.float32(feature_scale)
+    sample_points = reader.array("int16", (m, 3)).astype(np.float32) * np.float32(sample_scale)
+    normals = reader.array("int8", (m, 3)).astype(np.float32)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    if m and length.min() == 0:
+        raise MalformedError("sample: a normal of length zero")
+    normals = (normals / np.maximum(length, np.float32(1e-6))).astype(np.float32)
+    grays = [reader.array("uint8", (m,)).astype(np.float32) / np.float32(255) for _ in range(levels)]
+    reader.done()
+    reference = Reference(tuple(ReferenceLevel(sample_points, normals, gray) for gray in grays))
+    return KeyframeSample(keyframe, Features(descriptors, points), reference)
+
+
+def _shorts(points: NDArray[np.float32]) -> tuple[float, bytes]:
+    """Step (m) and bytes of points in that step; the step as it will be read back."""
+    largest = float(np.abs(points).max(initial=0.0))
+    step = np.float32(largest * 1.000001 / _INT16)
+    return float(step), array_bytes(np.rint(points / max(step, np.float32(1e-12))), "int16")

@@ -1,0 +1,305 @@
+"""Bytes of messages, and their strict reading: state, frames, final poses, space seen, matches. Little-endian.
+
+Readers trust nothing: every count is checked against the bytes that are there, every index against its limit, every
+number that enters the mathematics must be finite. What does not fit raises MalformedError with the reason. Others:
+`places_wire`, `poses_wire`, `tree_wire`, `evidence_wire`.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.network.packets import MalformedError
+from duagc.pipeline.posegraph.cycle_consistency import Proposal
+
+Array = NDArray[np.float64]
+
+MAX_KEYFRAMES = 100_000
+MAX_COORDINATE = 1e6  # m, or units of theta; beyond it positions lose their meaning
+ROTATION_TOLERANCE = 1e-6  # of R R' = 1 in a pose that a neighbour sent
+
+
+class Reader:
+    """Walks through the bytes of a message and never past their end."""
+
+    def __init__(self, data: bytes, what: str) -> None:
+        self.data, self.what, self.position = data, what, 0
+
+    def fields(self, layout: struct.Struct) -> tuple[Any, ...]:
+        """Fixed fields."""
+        return layout.unpack(self._take(layout.size))
+
+    def array(self, dtype: str, shape: tuple[int, ...]) -> NDArray[Any]:
+        """An array in C order; floats must be finite."""
+        kind = np.dtype(dtype).newbyteorder("<")
+        count = 1
+        for n in shape:
+            count *= n
+        values = np.frombuffer(self._take(count * kind.itemsize), kind).reshape(shape).astype(dtype)
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            raise MalformedError(f"{self.what}: not a finite number")
+        return values
+
+    def poses(self, n: int) -> Array:
+        """Motions [n, 4, 4] from their upper rows, float64."""
+        T = np.tile(np.eye(4), (n, 1, 1))
+        T[:, :3] = self.array("float64", (n, 3, 4))
+        R = T[:, :3, :3]
+        if np.abs(R).max(initial=0.0) > 2.0 or np.abs(T[:, :3, 3]).max(initial=0.0) > MAX_COORDINATE:
+            raise MalformedError(f"{self.what}: a pose is not a rigid motion, or beyond {MAX_COORDINATE:g} m")
+        off = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(initial=0.0)
+        if off > ROTATION_TOLERANCE or np.linalg.det(R).min(initial=1.0) < 0:
+            raise MalformedError(f"{self.what}: a pose is not a rigid motion")
+        return T
+
+    def done(self) -> None:
+        """Check that nothing is left."""
+        if self.position != len(self.data):
+            raise MalformedError(f"{self.what}: {len(self.data) - self.position} bytes too many")
+
+    def _take(self, size: int) -> bytes:
+        if self.position + size > len(self.data):
+            raise MalformedError(f"{self.what}: {len(self.data)} bytes, more were announced")
+        part = self.data[self.position : self.position + size]
+        self.position += size
+        return part
+
+
+def array_bytes(values: Any, dtype: str) -> bytes:
+    """Little-endian bytes in C order."""
+    return np.ascontiguousarray(values, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()
+
+
+def pose_bytes(T: Array) -> bytes:
+    """Upper rows of motions [..., 4, 4], float64."""
+    return array_bytes(np.asarray(T)[..., :3, :], "float64")
+
+
+# --- state: once per link and round
+
+
+@dataclass(frozen=True)
+class State:
+    """Where an agent stands, as it tells its neighbours in every round.
+
+    links: pairs of robots whose relative frame it knows. parted: those of them that it knows to have been parted; what
+    else is told holds for the team without them. Both are bit masks over the pairs of the team (`pair_bit`).
+    frames_hops, still_hops: how many hops around it everybody has decided on all links, and holds still; 0 = not
+    itself. agreed: its poses are final. done: it needs nothing more. sources: uint8 [team], for each owner of
+    evidence where it comes from: a neighbour's index, COMPLETE or NOBODY.
+    """
+
+    links: int
+    parted: int
+    frames_hops: int
+    still_hops: int
+    agreed: bool
+    done: bool
+    sources: NDArray[np.uint8]
+
+
+COMPLETE, NOBODY = 254, 255
+MAX_TEAM = 64
+_STATE = struct.Struct("<BBBB")
+
+
+def pair_bit(a: int, b: int) -> int:
+    """The bit of a pair of robots, by index, in a mask over all pairs."""
+    lower, higher = min(a, b), max(a, b)
+    return 1 << (higher * (higher - 1) // 2 + lower)
+
+
+def _pairs_bytes(pairs: int, team: int) -> bytes:
+    return pairs.to_bytes(_pairs_size(team), "little")
+
+
+def _pairs_size(team: int) -> int:
+    return -(-(team * (team - 1) // 2) // 8)
+
+
+def _read_pairs(reader: Reader, team: int) -> int:
+    """A mask over the pairs of the team."""
+    pairs = int.from_bytes(reader.array("uint8", (_pairs_size(team),)).tobytes(), "little")
+    if pairs >> (team * (team - 1) // 2):
+        raise MalformedError(f"{reader.what}: names a pair outside the team")
+    return pairs
+
+
+def write_state(state: State) -> bytes:
+    """Bytes of a state; the poses of the round may follow."""
+    flags, team = int(state.agreed) | 2 * int(state.done), len(state.sources)
+    head = _STATE.pack(state.frames_hops, state.still_hops, flags, team)
+    masks = _pairs_bytes(state.links, team) + _pairs_bytes(state.parted, team)
+    return head + array_bytes(state.sources, "uint8") + masks
+
+
+def read_state(data: bytes, team: int) -> tuple[State, bytes]:
+    """A state and the bytes that follow it."""
+    reader = Reader(data, "state")
+    frames_hops, still_hops, flags, n = reader.fields(_STATE)
+    if n != team:
+        raise MalformedError(f"state: about a team of {n}, expected {team}")
+    if flags > 3:
+        raise MalformedError("state: unknown flags")
+    sources = reader.array("uint8", (n,))
+    links, parted = _read_pairs(reader, team), _read_pairs(reader, team)
+    state = State(links, parted, frames_hops, still_hops, bool(flags & 1), bool(flags & 2), sources)
+    return state, data[reader.position :]
+
+
+def write_labelled(parted: int, team: int, payload: bytes) -> bytes:
+    """Bytes of TREE: a message of the solver, for the team without these links."""
+    return _pairs_bytes(parted, team) + payload
+
+
+def read_labelled(data: bytes, team: int) -> tuple[int, bytes]:
+    """From TREE: the parted links, and the message."""
+    reader = Reader(data, "elimination")
+    return _read_pairs(reader, team), data[reader.position :]
+
+
+# --- frames and final poses
+
+
+_FRAME = struct.Struct("<HHB")
+_PROPOSAL = struct.Struct("<Iddd")
+MAX_PROPOSALS = 8
+
+
+@dataclass(frozen=True)
+class PairFrames:
+    """What the closures of two robots say of their relative frame, best supported first; lower index first."""
+
+    lower: int
+    higher: int
+    proposals: tuple[Proposal, ...]
+
+
+def write_frames(frames: PairFrames) -> bytes:
+    """Bytes of FRAME."""
+    parts = [_FRAME.pack(frames.lower, frames.higher, len(frames.proposals))]
+    for p in frames.proposals:
+        parts += [_PROPOSAL.pack(p.support, *p.variance, p.agreement), pose_bytes(p.T_a_b)]
+    return b"".join(parts)
+
+
+def read_frames(data: bytes, team: int) -> PairFrames:
+    """From FRAME."""
+    reader = Reader(data, "frame")
+    lower, higher, n = reader.fields(_FRAME)
+    if not lower < higher < team or not 1 <= n <= MAX_PROPOSALS:
+        raise MalformedError("frame: the two robots must be in the team, lower first, and have a frame")
+    proposals = []
+    for _ in range(n):
+        support, *variance, agreement = reader.fields(_PROPOSAL)
+        if not (all(0 < v < MAX_COORDINATE**2 for v in variance) and 0 <= agreement <= 1):
+            raise MalformedError("frame: impossible variance or agreement")
+        proposals.append(Proposal(support, reader.poses(1)[0], (variance[0], variance[1]), agreement))
+    reader.done()
+    return PairFrames(lower, higher, tuple(proposals))
+
+
+@dataclass(frozen=True)
+class Anchors:
+    """Agreed poses of one robot's keyframes in the common frame of the consensus, and of the first in its own map.
+
+    T_common_keyframe: [n, 4, 4]. T_map_first: [4, 4].
+    """
+
+    owner: int
+    T_common_keyframe: Array
+    T_map_first: Array
+
+
+_OWNER = struct.Struct("<HI")
+
+
+def write_anchors(anchors: Anchors) -> bytes:
+    """Bytes of ANCHORS."""
+    head = _OWNER.pack(anchors.owner, len(anchors.T_common_keyframe))
+    return head + pose_bytes(anchors.T_map_first) + pose_bytes(anchors.T_common_keyframe)
+
+
+def read_anchors(data: bytes, team: int) -> Anchors:
+    """From ANCHORS."""
+    reader = Reader(data, "anchors")
+    owner, n = reader.fields(_OWNER)
+    if owner >= team or not 1 <= n <= MAX_KEYFRAMES:
+        raise MalformedError("anchors: names a robot outside the team, or no keyframe")
+    first, T = reader.poses(1)[0], reader.poses(n)
+    reader.done()
+    return Anchors(owner, T, first)
+
+
+# --- space seen, matched Gaussians
+
+
+def write_voxels(owner: int, keys: NDArray[np.int64]) -> bytes:
+    """Bytes of VOXELS: ascending keys of the voxels that `owner` saw, differences in LEB128."""
+    out = bytearray(_OWNER.pack(owner, len(keys)))
+    for step in np.diff(keys, prepend=np.int64(0)).tolist():
+        while step > 127:
+            out.append(step & 127 | 128)
+            step >>= 7
+        out.append(step)
+    return bytes(out)
+
+
+def read_voxels(data: bytes, team: int) -> tuple[int, NDArray[np.int64]]:
+    """From VOXELS: owner and ascending keys."""
+    reader = Reader(data, "voxels")
+    owner, n = reader.fields(_OWNER)
+    values = np.frombuffer(data, np.uint8, offset=_OWNER.size).astype(np.int64)
+    last = np.flatnonzero(values < 128)
+    if owner >= team or len(last) != n or (len(values) and values[-1] >= 128):
+        raise MalformedError("voxels: the list does not have the announced length")
+    first = np.concatenate([[0], last[:-1] + 1]) if n else last
+    place = np.arange(len(values)) - np.repeat(first, last - first + 1)
+    if place.max(initial=0) > 8:
+        raise MalformedError("voxels: a number is too large")
+    steps = np.add.reduceat((values & 127) << (7 * place), first) if n else np.zeros(0, np.int64)
+    if n > 1 and steps[1:].min() < 1:
+        raise MalformedError("voxels: keys must ascend")
+    if float(steps.astype(np.float64).sum()) >= 2.0**63:
+        raise MalformedError("voxels: a number is too large")
+    return owner, np.cumsum(steps)
+
+
+_PAIRS = struct.Struct("<HHHI")
+
+
+@dataclass(frozen=True)
+class PairList:
+    """Matched Gaussians of two robots, lower index first.
+
+    ids: int64 [n, 2]. version: of the list; a later one replaces an earlier one.
+    """
+
+    lower: int
+    higher: int
+    version: int
+    ids: NDArray[np.int64]
+
+
+def write_pairs(pairs: PairList) -> bytes:
+    """Bytes of PAIRS."""
+    head = _PAIRS.pack(pairs.lower, pairs.higher, pairs.version, len(pairs.ids))
+    return head + array_bytes(pairs.ids, "int64")
+
+
+def read_pairs(data: bytes, team: int) -> PairList:
+    """From PAIRS."""
+    reader = Reader(data, "pairs")
+    lower, higher, version, n = reader.fields(_PAIRS)
+    if not lower < higher < team:
+        raise MalformedError("pairs: the two robots must be in the team, lower first")
+    ids = reader.array("int64", (n, 2))
+    reader.done()
+    if len(np.unique(ids[:, 0])) != n or len(np.unique(ids[:, 1])) != n:
+        raise MalformedError("pairs: a Gaussian is matched twice")
+    return PairList(lower, higher, version, ids)

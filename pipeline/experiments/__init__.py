@@ -1,0 +1,1 @@
+"""Research that no run depends on: other consensus modes, injected faults, references."""

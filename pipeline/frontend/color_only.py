@@ -1,0 +1,115 @@
+"""Following a camera whose depth is missing or stuck, by its colour alone.
+
+What colour says of the way that a camera went is off by a share of that way, because depth and colour of a real
+camera do not fit together to the pixel. Against a keyframe this error is there at once, as large as the way from it:
+5 cm in RedKitchen. So such frames are registered to the last one that had both images, from which the way is short.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.config.frontend import FailureConfig
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import (
+    Outcome,
+    Reference,
+    Registration,
+    RegistrationConfig,
+    RgbdPyramid,
+    register,
+)
+
+Array = NDArray[np.float64]
+SHARE_AFTER_CONTRADICTION = (
+    0.5  # of what a contradiction may be; late depth is a smaller share of a longer way
+)
+OPEN_DIRECTION = 1e-4  # 1/m^2, 1/rad^2: a standard deviation of 100 m says nothing
+
+
+@dataclass(frozen=True)
+class SoundFrame:
+    """A frame whose depth and colour were both sound.
+
+    T_keyframe_camera: [4, 4]. information: [6, 6] of it; None: it is the keyframe. strides: of its samples.
+    """
+
+    pyramid: RgbdPyramid = field(repr=False)
+    strides: tuple[int, ...]
+    T_keyframe_camera: Array
+    information: Array | None
+
+    @cached_property
+    def _reference(self) -> Reference:
+        return Reference.from_pyramid(self.pyramid, self.strides)
+
+    def follow(
+        self,
+        pyramid: RgbdPyramid,
+        T_keyframe_guess: Array,
+        registration: RegistrationConfig,
+        limits: FailureConfig,
+        prior_information: Array | None,
+    ) -> Registration:
+        """Register the colour of a later frame to this one.
+
+        Args:
+            T_keyframe_guess: where it should be, [4, 4]; prior_information: [6, 6] of that, None: unknown.
+        Returns:
+            The registration with T_reference_target and information in the keyframe; overlap and view are shares of
+            this frame. JUMP if it is too far from here for colour alone, LOW_OVERLAP if too little is shared.
+        """
+        T_here_guess = se3.inverse(self.T_keyframe_camera) @ T_keyframe_guess
+        result = register(
+            self._reference, pyramid.without_depth(), T_here_guess, registration, prior_information
+        )
+        T = result.T_reference_target
+        way_m = float(np.linalg.norm(T[:3, 3]))
+        outcome = result.outcome
+        if result.ok and way_m > limits.max_way_without_depth_m:
+            outcome = Outcome.JUMP
+        elif result.ok and result.view < limits.min_view_without_depth:
+            outcome = Outcome.LOW_OVERLAP
+        return replace(
+            result,
+            outcome=outcome,
+            T_reference_target=self.T_keyframe_camera @ T,
+            information=self._information(result, limits.sigma_of_way_without_depth * way_m),
+        )
+
+    def way_m(self, T_keyframe_camera: Array) -> float:
+        """Distance from this frame to a pose in its keyframe."""
+        return float(se3.distance(self.T_keyframe_camera, T_keyframe_camera)[0])
+
+    def agrees(
+        self, T_keyframe_camera: Array, by_color: Array, limits: FailureConfig, contradicted: bool
+    ) -> bool:
+        """Whether colour alone puts a frame where colour and depth together do: both T_keyframe_camera, [4, 4].
+
+        If the two images are of different times, or something moves before the camera, the answers differ by as
+        much as the camera moves. Those of a sound camera differ by a share of it; once the two have `contradicted`,
+        only SHARE_AFTER_CONTRADICTION of that share is allowed.
+        """
+        apart_m = float(se3.distance(T_keyframe_camera, by_color)[0])
+        way_m = max(self.way_m(T_keyframe_camera), self.way_m(by_color))
+        share = limits.max_contradiction_of_way * (SHARE_AFTER_CONTRADICTION if contradicted else 1.0)
+        return apart_m <= max(limits.max_contradiction_m, share * way_m)
+
+    def _information(self, result: Registration, sigma_m: float) -> Array:
+        """Of the pose in the keyframe: what the registration, this frame's pose and the way leave of it."""
+        depth_m = max(float(np.median(self._reference.levels[-1].points[:, 2])), 0.1)
+        covariance = _covariance(result.information)
+        covariance += sigma_m**2 * np.diag([1.0, 1.0, 1.0, *[depth_m**-2.0] * 3])
+        if self.information is not None:
+            A = se3.adjoint(se3.inverse(result.T_reference_target))
+            covariance += A @ _covariance(self.information) @ A.T
+        information = np.linalg.inv(covariance)
+        return np.asarray(0.5 * (information + information.T))
+
+
+def _covariance(information: Array) -> Array:
+    return np.asarray(np.linalg.inv(information + OPEN_DIRECTION * np.eye(6)))

@@ -1,0 +1,178 @@
+"""Keyframes: which frames become one, and the refinement of their poses by all registrations between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.config.frontend import KeyframeConfig
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import Level, Reference, ReferenceLevel, Registration, RgbdPyramid
+
+Array = NDArray[np.float64]
+MAX_STEPS = 20
+STEP_TOLERANCE = 1e-9
+OPEN_DIRECTION = 1e-4  # 1/m^2, 1/rad^2: a standard deviation of 100 m says nothing
+
+
+@dataclass(frozen=True)
+class KeyframePair:
+    """A registration between two keyframes: T_first_second [4, 4] and its information [6, 6], right tangent."""
+
+    first: int
+    second: int
+    T_first_second: Array
+    information: Array
+
+
+@dataclass(frozen=True)
+class Refined:
+    """Keyframe poses after the refinement.
+
+    T_map_keyframe: [k, 4, 4]. normal_matrix: sparse [6k, 6k] of their right tangents, identity for the first, which is
+    held. weights: [m], robust weight of every pair, 0..1. contradiction: factor >= 1 on the covariance, by which the
+    pairs contradict each other more than their information says.
+    """
+
+    T_map_keyframe: Array
+    normal_matrix: Any
+    weights: Array
+    contradiction: float
+
+    @cached_property
+    def _factors(self) -> Any:
+        """Factorisation of the normal matrix."""
+        from scipy.sparse.linalg import splu
+
+        return splu(self.normal_matrix)
+
+    def covariance(self, keyframes: Sequence[int]) -> Array:
+        """Joint covariance [6n, 6n] of n keyframes' right tangents; zero for the first keyframe."""
+        rows = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in keyframes])
+        columns = np.zeros((self.normal_matrix.shape[0], len(rows)))
+        columns[rows, np.arange(len(rows))] = rows >= 6
+        covariance = self._factors.solve(columns)[rows] * self.contradiction
+        covariance[rows < 6] = 0.0
+        return 0.5 * (covariance + covariance.T)
+
+    def relative_information(self, first: int, second: int) -> Array:
+        """Information [6, 6] of T_first_second (right tangent)."""
+        T = self.T_map_keyframe
+        C = self.covariance([first, second])
+        J = np.hstack([-se3.adjoint(se3.inverse(se3.inverse(T[first]) @ T[second])), np.eye(6)])
+        information = np.linalg.inv(J @ C @ J.T)
+        return 0.5 * (information + information.T)
+
+
+def becomes_keyframe(result: Registration, pyramid: RgbdPyramid, config: KeyframeConfig) -> bool:
+    """Whether a tracked frame sees too little of its keyframe, or moved or turned too far from it.
+
+    Motion is measured by the median depth: a step of 10 cm changes a near view more than a far one.
+    """
+    if min(result.overlap, result.view) < config.min_overlap:
+        return True
+    coarsest = pyramid.levels[-1].inverse_depth
+    known = coarsest[coarsest > 0]
+    median_depth_m = 1 / float(np.median(known)) if len(known) else np.inf
+    moved_m, turned_rad = se3.distance(np.eye(4), result.T_reference_target)
+    return bool(
+        moved_m > config.max_translation_of_depth * median_depth_m or turned_rad > config.max_rotation_rad
+    )
+
+
+def predicted_overlap(reference: Reference, pyramid: RgbdPyramid, T_reference_target: Array) -> float:
+    """Fraction of a reference's coarsest samples that a view would see on the same surface (within 10 % of depth)."""
+    return overlap(reference.levels[-1], pyramid.levels[len(reference.levels) - 1], T_reference_target)
+
+
+def overlap(samples: ReferenceLevel, level: Level, T_reference_target: Array) -> float:
+    """Fraction of samples that a view would see on the same surface (within 10 % of depth)."""
+    if len(samples) == 0:
+        return 0.0
+    points = se3.transform(se3.inverse(T_reference_target), samples.points.astype(np.float64))
+    points = points[points[:, 2] > 0.05]
+    u, v = np.rint(level.camera.project(points)).astype(np.int64).T
+    inside = (u >= 0) & (u < level.camera.width) & (v >= 0) & (v < level.camera.height)
+    inverse_depth = level.inverse_depth[v[inside], u[inside]]
+    same = (inverse_depth > 0) & (np.abs(points[inside, 2] * inverse_depth - 1) < 0.1)
+    return float(np.count_nonzero(same)) / len(samples)
+
+
+def refine(T_map_keyframes: Array, pairs: Sequence[KeyframePair], huber_sigmas: float) -> Refined:
+    """Keyframe poses that agree best with all registrations between them; the first keyframe stays.
+
+    Gauss-Newton on sum |log(T_first_second^-1 T_map_first^-1 T_map_second)|^2 weighted by the information, with
+    Huber weights, in the right tangents of the poses. The normal matrix is sparse: its work grows with the pairs.
+
+    Args:
+        T_map_keyframes: [k, 4, 4], start.
+        pairs: registrations; every keyframe is connected to the first through them.
+    """
+    from scipy.sparse.linalg import splu
+
+    T = np.array(T_map_keyframes, dtype=np.float64)
+    k = len(T)
+    H, gradient, squares, weights = _normal_equations(T, pairs, huber_sigmas)
+    if k < 2:
+        return Refined(T, H, np.zeros(0), 1.0)
+    for _ in range(MAX_STEPS):
+        step = -splu(H).solve(gradient).reshape(k, 6)
+        T = T @ se3.exp(step)
+        H, gradient, squares, weights = _normal_equations(T, pairs, huber_sigmas)
+        if np.max(np.abs(step)) < STEP_TOLERANCE:
+            break
+    redundant = 6 * (len(pairs) - (k - 1))
+    contradiction = max(1.0, float(squares.sum()) / redundant) if redundant > 0 else 1.0
+    return Refined(T, H, weights, contradiction)
+
+
+def _normal_equations(
+    T: Array, pairs: Sequence[KeyframePair], huber_sigmas: float
+) -> tuple[Any, Array, Array, Array]:
+    """Sparse H [6k, 6k] and gradient [6k] with the first pose held, every pair's weighted square, and its weight."""
+    from scipy.sparse import csc_array
+
+    k = len(T)
+    first = np.array([pair.first for pair in pairs], dtype=np.int64)
+    second = np.array([pair.second for pair in pairs], dtype=np.int64)
+    measured = np.array([pair.T_first_second for pair in pairs]).reshape(-1, 4, 4)
+    information = np.array([pair.information for pair in pairs]).reshape(-1, 6, 6)
+    T_first_second = se3.inverse(T[first]) @ T[second]
+    residual = se3.log(se3.inverse(measured) @ T_first_second)
+    # log(E exp(d)) = log E + d for a small error E; moving the first pose by d moves the second by -Ad d
+    J_first = -se3.adjoint(se3.inverse(T_first_second))
+    squares = np.einsum("ma,mab,mb->m", residual, information, residual)
+    limit = huber_sigmas * np.sqrt(6)
+    weights = np.minimum(1.0, limit / np.sqrt(np.maximum(squares, limit**2 * 1e-12)))
+    W = weights[:, None, None] * information
+    J_W = np.swapaxes(J_first, 1, 2) @ W
+    forces = (W @ residual[..., None])[..., 0]
+    gradient = np.zeros((k, 6))
+    np.add.at(gradient, first, (J_W @ residual[..., None])[..., 0])
+    np.add.at(gradient, second, forces)
+    gradient[0] = 0.0
+    # a trace of a prior on every pose keeps H regular where registrations leave a direction open
+    prior = np.repeat(OPEN_DIRECTION * np.eye(6)[None], k, axis=0)
+    prior[0] = np.eye(6)
+    rows = np.concatenate([np.arange(k), first, first, second, second])
+    columns = np.concatenate([np.arange(k), first, second, first, second])
+    blocks = np.concatenate([prior, J_W @ J_first, J_W, np.swapaxes(J_W, 1, 2), W])
+    held = ((rows == 0) | (columns == 0)) & (np.arange(len(rows)) >= k)
+    rows, columns, blocks = rows[~held], columns[~held], blocks[~held]
+    inner_row, inner_column = (axis.ravel() for axis in np.mgrid[:6, :6])
+    H = csc_array(
+        (
+            blocks.reshape(-1),
+            (
+                (6 * rows[:, None] + inner_row).reshape(-1),
+                (6 * columns[:, None] + inner_column).reshape(-1),
+            ),
+        ),
+        shape=(6 * k, 6 * k),
+    )
+    return H, gradient.reshape(-1), weights * squares, weights

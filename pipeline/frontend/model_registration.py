@@ -1,0 +1,100 @@
+"""Frames registered to the map: the second look at a frame that is no keyframe.
+
+Tracking registers a frame to one keyframe, whose depth image has the noise of one view. The map is made of all
+keyframes. Drawn where a frame was tracked, with the depth of one layer per pixel, it is a better reference
+where the sensor is poor, and a worse one where depth is exact and the map is not. What decides is the information of
+either registration. Keyframes stay where their joint optimisation put them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.config.frontend import ModelConfig
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.frontend.tracked import TrackedFrame
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import Rasterizer
+from duagc.pipeline.recording import RgbdFrame
+from duagc.pipeline.registration import Reference, Registration, RegistrationConfig, RgbdPyramid, register
+from duagc.pipeline.splat.gaussians import Gaussians
+
+Array = NDArray[np.float64]
+
+
+class ModelTracker:
+    """Registers frames to a map that does not change."""
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        depth: DepthKind,
+        camera: PinholeCamera,
+        config: ModelConfig,
+        registration: RegistrationConfig,
+        threads: int = 1,
+    ) -> None:
+        """Args:
+        gaussians: in the map frame. depth: of a Gaussian at a pixel, as the map was made. camera: of the frames.
+        threads: of the rasterizer; changes no bit.
+        """
+        self.config, self._registration = config, registration
+        self._gaussians, self._depth, self._full = gaussians, depth, camera
+        self._camera = camera
+        for _ in range(config.level):
+            self._camera = self._camera.halved()
+        self._levels = max(1, len(registration.iterations) - config.level)
+        self._rasterizer = Rasterizer(threads=threads)
+        self._in_vain = 0  # frames in a row that gained nothing
+
+    @property
+    def pays(self) -> bool:
+        """Whether some of the last frames gained; if none did, the others need not be tried."""
+        return self.config.enabled and self._in_vain < self.config.patience
+
+    def refine(self, tracked: TrackedFrame, frame: RgbdFrame, T_map_keyframe: Array) -> TrackedFrame:
+        """The frame where map and keyframe together say that it is, each by its information.
+
+        As tracked if the map knows that much less well: its errors are not all noise.
+
+        Its information stays that of tracking: map and frame share keyframes, so that adding would count them twice.
+
+        Args:
+            tracked: not lost, and no keyframe. frame: its images. T_map_keyframe: [4, 4], of the keyframe it hangs on.
+        """
+        found = self._register(frame, T_map_keyframe @ tracked.T_keyframe_camera, tracked.information)
+        if not found.ok or _sigma_m(found.information) > self.config.max_sigma_ratio * _sigma_m(
+            tracked.information
+        ):
+            self._in_vain += 1
+            return tracked
+        self._in_vain = 0
+        return replace(tracked, T_keyframe_camera=tracked.T_keyframe_camera @ found.T_reference_target)
+
+    def _register(self, frame: RgbdFrame, T_map_camera: Array, information: Array) -> Registration:
+        """The frame against the map drawn at T_map_camera, known with `information`; the motion is from there."""
+        drawn = self._rasterizer.forward(
+            self._gaussians, self._camera, se3.inverse(T_map_camera), depth=self._depth
+        )
+        solid = drawn.alpha > self.config.min_alpha
+        depth_m = np.where(solid, self._rasterizer.layer_depth(), np.float32(0))
+        color = np.clip(drawn.color, np.float32(0), np.float32(1))
+        model = RgbdPyramid.build(color, depth_m, self._camera, self._levels)
+        reference = Reference.from_pyramid(model, self.config.strides[: self._levels])
+        image = frame.color * np.float32(1 / 255)
+        levels = self._levels + self.config.level
+        seen = RgbdPyramid.build(image, frame.usable_depth, self._full, levels, frame.depth_sigma)
+        target = RgbdPyramid(seen.levels[self.config.level :])
+        return register(reference, target, np.eye(4), self._registration, information)
+
+
+def _sigma_m(information: Array) -> float:
+    """Standard deviation of a position, metres, from the information [6, 6] of a pose; infinite if not determined."""
+    values = np.linalg.eigvalsh(information)
+    if not values[0] > 1e-12 * values[-1]:
+        return np.inf
+    return float(np.sqrt(np.trace(np.linalg.inv(information)[:3, :3])))

@@ -1,0 +1,57 @@
+"""The steps of `splat.optimiser.Adam`, compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from duagc.pipeline.config.training import LearningRates
+from duagc.pipeline.kernels import _raster
+from duagc.pipeline.kernels.rasterizer import empty
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.optimizer import BETA_1, BETA_2, EPSILON, Adam, GaussianGradients
+
+_CONSTANTS = np.array([BETA_1, 1 - BETA_1, BETA_2, 1 - BETA_2, EPSILON], np.float32)
+
+
+class CompiledAdam(Adam):
+    """`splat.optimiser.Adam` on all cores asked for; the same bits as that, for any number of threads."""
+
+    def __init__(self, n: int = 0, isa: str = "auto", threads: int = 1) -> None:
+        super().__init__(n)
+        self.isa, self.threads = isa, threads
+
+    def step(self, gaussians: Gaussians, gradients: GaussianGradients, rates: LearningRates) -> Gaussians:
+        """The Gaussians after one step; those without any gradient of colour or opacity are untouched."""
+        if len(gaussians) != len(self):
+            raise ValueError(f"gaussians are {len(gaussians)}, expected {len(self)}, as many as have a state")
+        names = list(self._first)
+        values = [getattr(gaussians, name) for name in names]
+        for name, value in zip(names, values, strict=True):
+            _check_gradient(name, getattr(gradients, name), value.shape)
+        out = [empty(*value.shape) for value in values]
+        _raster.adam(
+            self.isa,
+            values,
+            [getattr(gradients, name) for name in names],
+            [self._first[name] for name in names],
+            [self._second[name] for name in names],
+            out,
+            np.array([getattr(rates, name) for name in names], np.float32),
+            _CONSTANTS,
+            gradients.colors,
+            gradients.opacity_logits,
+            self._steps,
+            self._corrections,
+            self.threads,
+        )
+        return gaussians.replace(**dict(zip(names, out, strict=True)))
+
+
+def _check_gradient(name: str, gradient: object, shape: tuple[int, ...]) -> None:
+    if not isinstance(gradient, np.ndarray) or gradient.dtype != np.float32:
+        found = gradient.dtype if isinstance(gradient, np.ndarray) else type(gradient).__name__
+        raise ValueError(f"gradients.{name} is {found}, expected an array of float32")
+    if gradient.shape != shape:
+        raise ValueError(
+            f"gradients.{name} has shape {gradient.shape}, expected {shape}, that of gaussians.{name}"
+        )

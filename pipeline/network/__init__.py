@@ -1,0 +1,1 @@
+"""What a radio does: packets, reliable transport, signatures, and the model of lossy links."""

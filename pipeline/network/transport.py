@@ -1,0 +1,356 @@
+"""Reliable messages to one neighbour: cutting, bursts within a budget, selective acknowledgement, reassembly.
+
+A burst holds, in this order: acknowledgements, the state of this round, then the open messages by kind and id,
+what is overdue before what is new. Nothing here looks into a payload, save that evidence is handed on chunk by chunk.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.config.network import TransportConfig
+from duagc.pipeline.network.packets import (
+    EVIDENCE_KINDS,
+    HEADER_BYTES,
+    MAX_PAYLOAD_BYTES,
+    URGENT_KINDS,
+    Kind,
+    MalformedError,
+    Packet,
+    chunk_bytes,
+    chunk_count,
+    serialise,
+)
+from duagc.pipeline.network.signatures import SIGNATURE_BYTES, Identity
+
+_ACK_HEAD = struct.Struct("<IIH")  # message id, first chunk, number of chunks told; then one bit per chunk
+MAX_REPEATS = 32
+SEQUENCE_BLOCK = 1024
+ACK_CHUNKS = 8 * (MAX_PAYLOAD_BYTES - _ACK_HEAD.size)
+
+
+@dataclass(frozen=True)
+class Message:
+    """A message on its way out: id unique for its sender, kind, bytes."""
+
+    id: int
+    kind: Kind
+    payload: bytes
+
+
+@dataclass(frozen=True)
+class Outgoing:
+    """One packet on its way out, and the message it is cut from."""
+
+    receiver: str
+    packet: bytes
+    message: Message
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """What a delivered packet brought: a chunk of evidence, or a complete message."""
+
+    kind: Kind
+    message: int
+    payload: bytes
+    complete: bool
+
+
+@dataclass
+class _Open:
+    """An outgoing message: which chunks are acknowledged, and from which round each may be sent (again)."""
+
+    message: Message
+    acknowledged: NDArray[np.bool_]
+    due_round: NDArray[np.int64]
+
+
+@dataclass
+class _Partial:
+    """An incoming message: its chunks so far."""
+
+    kind: Kind
+    total: int
+    chunks: dict[int, bytes] = field(default_factory=dict)
+
+
+@dataclass
+class _News:
+    """Chunks of one message to acknowledge: from `first` to `last`, up to and including a round."""
+
+    first: int
+    last: int
+    until_round: int
+
+
+def _priority(entry: _Open) -> tuple[bool, int, int]:
+    """Evidence last, else by kind, then in the order of sending."""
+    return entry.message.kind in EVIDENCE_KINDS, entry.message.kind, entry.message.id
+
+
+class Transport:
+    """One end of the link to one neighbour."""
+
+    def __init__(
+        self,
+        own: int,
+        peer: int,
+        peer_name: str,
+        config: TransportConfig,
+        new_id: Callable[[], int],
+        identity: Identity | None = None,
+    ) -> None:
+        """own, peer: indices in the sorted team. new_id: gives message ids that are unique for this sender.
+
+        identity: signs the packets; without, they are not signed.
+        """
+        self.own, self.peer, self.peer_name, self.config = own, peer, peer_name, config
+        self.new_id = new_id
+        self._seal = serialise if identity is None else identity.seal
+        self._overhead_bytes = HEADER_BYTES + (0 if identity is None else SIGNATURE_BYTES)
+        self.sequence = 0
+        self.last_heard: int | None = None
+        self._open: dict[int, _Open] = {}
+        self._partial: dict[int, _Partial] = {}
+        self._received: dict[int, tuple[Kind, int]] = {}  # complete messages: kind, total bytes
+        self._to_acknowledge: dict[int, _News] = {}
+        self._packets_heard = self._highest_sequence = 0
+        self._heard: dict[int, int] = {}  # sequence numbers, a mask for each block of SEQUENCE_BLOCK
+        self._delay_rounds: int | None = None  # least seen between sending and arrival
+
+    # --- outgoing
+
+    def send(self, message: Message) -> None:
+        """Queue a reliable message."""
+        n = chunk_count(message.kind, len(message.payload))
+        self._open[message.id] = _Open(message, np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64))
+
+    def cancel(self, message: int) -> None:
+        """Stop sending a message, if it is still open."""
+        self._open.pop(message, None)
+
+    def cancel_all(self) -> None:
+        """Stop sending whatever is still open."""
+        self._open.clear()
+
+    def is_open(self, message: int) -> bool:
+        """Whether a message is not yet fully acknowledged."""
+        return message in self._open
+
+    @property
+    def open_messages(self) -> int:
+        """Queued messages that are not yet fully acknowledged."""
+        return len(self._open)
+
+    @property
+    def idle(self) -> bool:
+        """Whether every queued message has been acknowledged."""
+        return not self._open
+
+    def in_contact(self, round_index: int) -> bool:
+        """Whether the neighbour was heard lately."""
+        return (
+            self.last_heard is not None
+            and round_index - self.last_heard <= self.config.contact_lost_after_rounds
+        )
+
+    def burst(self, round_index: int, states: list[Message], budget_bytes: int) -> list[Outgoing]:
+        """All packets of this round for this neighbour.
+
+        Args:
+            states: fire-and-forget messages, one packet each. budget_bytes: most that may be sent, headers included.
+        """
+        out: list[Outgoing] = []
+        for message in [*self._acknowledgements(round_index), *states]:
+            budget_bytes -= self._overhead_bytes + len(message.payload)
+            if budget_bytes < 0:
+                return out
+            out.append(self._packet(message, 0, round_index))
+        if self.in_contact(round_index):
+            for entry, chunk in self._due(round_index):
+                size = self._overhead_bytes + min(
+                    chunk_bytes(entry.message.kind),
+                    len(entry.message.payload) - chunk * chunk_bytes(entry.message.kind),
+                )
+                if size > budget_bytes:
+                    break
+                budget_bytes -= size
+                entry.due_round[chunk] = round_index + self._retransmit_after(entry.message.kind)
+                out.append(self._packet(entry.message, chunk, round_index))
+        return out
+
+    def _retransmit_after(self, kind: Kind) -> int:
+        """Rounds until a packet counts as lost: never less than there and back take.
+
+        What others wait for goes out again the sooner the more is lost: an answer that will not come is no use.
+        """
+        rounds = max(self.config.retransmit_after_rounds, 2 * (self._delay_rounds or 0) + 2)
+        heard = self._packets_heard / (self._highest_sequence + 1)
+        return max(1, round(rounds * heard)) if kind in URGENT_KINDS else rounds
+
+    def _due(self, round_index: int) -> Iterator[tuple[_Open, int]]:
+        for entry in sorted(self._open.values(), key=_priority):
+            for chunk in np.flatnonzero(~entry.acknowledged & (entry.due_round <= round_index)).tolist():
+                yield entry, chunk
+
+    def _packet(self, message: Message, chunk: int, round_index: int) -> Outgoing:
+        step = chunk_bytes(message.kind)
+        packet = Packet(
+            message.kind,
+            self.own,
+            self.peer,
+            self.sequence,
+            round_index,
+            message.id,
+            chunk * step,
+            len(message.payload),
+            message.payload[chunk * step : (chunk + 1) * step],
+        )
+        self.sequence += 1
+        return Outgoing(self.peer_name, self._seal(packet), message)
+
+    def _acknowledgements(self, round_index: int) -> list[Message]:
+        """ACK messages for every chunk that arrived lately, with what arrived around it."""
+        parts: list[bytes] = []
+        for message in sorted(self._to_acknowledge):
+            news = self._to_acknowledge[message]
+            for base in range(news.first - news.first % 8, news.last + 1, ACK_CHUNKS):
+                bits = self._bits(message, base, ACK_CHUNKS)  # up to the last one that is here
+                head = _ACK_HEAD.pack(message, base, len(bits))
+                parts.append(head + np.packbits(bits, bitorder="little").tobytes())
+            if news.until_round <= round_index:
+                del self._to_acknowledge[message]
+        payloads: list[bytes] = []
+        for part in parts:
+            if payloads and len(payloads[-1]) + len(part) <= MAX_PAYLOAD_BYTES:
+                payloads[-1] += part
+            else:
+                payloads.append(part)
+        return [Message(self.new_id(), Kind.ACK, payload) for payload in payloads]
+
+    def _repeats(self) -> int:
+        """In how many further rounds to repeat an acknowledgement, so that 19 of 20 get through.
+
+        The loss is that of the packets heard, seen from the gaps in their sequence numbers: none, no repetition.
+        """
+        loss = 1.0 - self._packets_heard / (self._highest_sequence + 1)
+        if loss <= 0.0:
+            return 0
+        return min(MAX_REPEATS, math.ceil(math.log(0.05) / math.log(loss)))
+
+    def _bits(self, message: int, base: int, most: int) -> NDArray[np.bool_]:
+        """Which of the chunks from `base` on, at most so many, are here."""
+        if message in self._received:
+            n = chunk_count(*self._received[message])
+            return np.ones(min(most, n - base), dtype=bool)
+        partial = self._partial[message]
+        bits = np.zeros(min(most, chunk_count(partial.kind, partial.total) - base), dtype=bool)
+        here = np.fromiter(partial.chunks, dtype=np.int64, count=len(partial.chunks)) - base
+        here = here[(here >= 0) & (here < len(bits))]
+        bits[here] = True
+        return bits[: here.max(initial=-1) + 1]
+
+    # --- incoming
+
+    def receive(self, packet: Packet, round_index: int) -> Arrival | None:
+        """Take one parsed packet from this neighbour.
+
+        Returns:
+            A complete message, or a chunk of evidence not seen before; None if there is nothing to act on.
+        Raises:
+            MalformedError: it contradicts what came before, or asks for too much; it is then ignored.
+        """
+        if not self._is_new(packet.sequence):
+            return None  # a copy that the network made, or somebody repeats what was heard
+        self.last_heard = round_index
+        self._packets_heard += 1
+        delay = max(0, round_index - packet.round)
+        self._delay_rounds = delay if self._delay_rounds is None else min(self._delay_rounds, delay)
+        self._highest_sequence = max(self._highest_sequence, packet.sequence)
+        if packet.kind is Kind.ACK:
+            self._take_acknowledgements(packet.payload)
+            return None
+        if packet.kind is Kind.STATE:
+            return Arrival(packet.kind, packet.message, packet.payload, complete=True)
+        return self._take_chunk(packet, round_index)
+
+    def _is_new(self, sequence: int) -> bool:
+        """Whether a sequence number is heard for the first time; remembers it, however far it jumps."""
+        block, bit = sequence // SEQUENCE_BLOCK, 1 << sequence % SEQUENCE_BLOCK
+        heard = self._heard.get(block, 0)
+        self._heard[block] = heard | bit
+        return not heard & bit
+
+    def _take_chunk(self, packet: Packet, round_index: int) -> Arrival | None:
+        known = self._received.get(packet.message)
+        partial = self._partial.get(packet.message)
+        if partial is not None:
+            known = (partial.kind, partial.total)
+        if known is not None and known != (packet.kind, packet.total):
+            raise MalformedError(
+                f"message {packet.message} was {known[0].name} of {known[1]} bytes, "
+                f"now {packet.kind.name} of {packet.total}"
+            )
+        chunk = packet.offset // chunk_bytes(packet.kind)
+        if known is None:
+            if packet.total > self.config.max_message_bytes:
+                raise MalformedError(
+                    f"message of {packet.total} bytes, at most {self.config.max_message_bytes}"
+                )
+            if len(self._partial) >= self.config.max_open_messages:
+                raise MalformedError(f"more than {self.config.max_open_messages} incomplete messages")
+            partial = self._partial[packet.message] = _Partial(packet.kind, packet.total)
+        news = self._to_acknowledge.setdefault(packet.message, _News(chunk, chunk, 0))
+        news.first, news.last = min(news.first, chunk), max(news.last, chunk)
+        news.until_round = round_index + self._repeats()
+        if partial is None or chunk in partial.chunks:
+            return None
+        partial.chunks[chunk] = packet.payload
+        n = chunk_count(packet.kind, packet.total)
+        complete = len(partial.chunks) == n
+        if complete:
+            del self._partial[packet.message]
+            self._received[packet.message] = (packet.kind, packet.total)
+            return Arrival(
+                packet.kind, packet.message, b"".join(partial.chunks[i] for i in range(n)), complete=True
+            )
+        if packet.kind in EVIDENCE_KINDS:
+            return Arrival(packet.kind, packet.message, packet.payload, complete=False)
+        return None
+
+    def accept_rest(self, message: int, round_index: int) -> None:
+        """Acknowledge all of a message that is not needed any more: its content is here already."""
+        partial = self._partial.pop(message, None)
+        if partial is not None:
+            self._received[message] = (partial.kind, partial.total)
+            last = chunk_count(partial.kind, partial.total) - 1
+            self._to_acknowledge[message] = _News(0, last, round_index + self._repeats())
+
+    def _take_acknowledgements(self, payload: bytes) -> None:
+        """Mark what the neighbour says it has; what it says about anything else has no effect."""
+        position = 0
+        while position < len(payload):
+            if position + _ACK_HEAD.size > len(payload):
+                raise MalformedError("acknowledgement is cut short")
+            message, base, count = _ACK_HEAD.unpack_from(payload, position)
+            position += _ACK_HEAD.size
+            size = -(-count // 8)
+            if position + size > len(payload):
+                raise MalformedError("bits of an acknowledgement are cut short")
+            raw = np.frombuffer(payload, np.uint8, size, position)
+            position += size
+            entry = self._open.get(message)
+            if entry is None or base + count > len(entry.acknowledged):
+                continue
+            entry.acknowledged[base : base + count] |= np.unpackbits(
+                raw, count=count, bitorder="little"
+            ).astype(bool)
+            if entry.acknowledged.all():
+                del self._open[message]

@@ -1,0 +1,422 @@
+"""Pose graphs of a team as the field distributes them: `.g2o`, one `.g2o` per robot, Kimera-Multi csv.
+
+Weights are SE-Sync's: tau = 3 / trace of the covariance's translation block, kappa = 3 / (2 trace of its rotation
+block), so that costs compare with certified optima. A closure that both ends' files hold counts once; both ends know
+it, as in these files.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import read_text
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph.factors import Factors, isotropic_information
+from duagc.pipeline.posegraph.loop_closures import Closure
+
+Array = NDArray[np.float64]
+SYMBOL_BITS = 56  # a gtsam symbol is a character in the highest byte and an index below it
+_IGNORED_TAGS = {
+    "VERTEX_SE3:QUAT",
+    "FIX",
+    "PARAMS_SE3OFFSET",
+}  # start values and gauge: agents find their own
+_REFERENCES = ("reference_inliers.csv", "gt_info.xml")
+
+Key = tuple[str, int]  # robot (or "" before a graph is cut), index
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Measured relative poses as a file lists them.
+
+    i, j: keys of the two poses. T_i_j [m, 4, 4]. kappa, tau [m]: SE-Sync's weights. inlier: bool [m], what a file
+    beside it names as true, for the evaluation; None if there is none.
+    """
+
+    i: list[Key]
+    j: list[Key]
+    T_i_j: Array
+    kappa: Array
+    tau: Array
+    inlier: NDArray[np.bool_] | None = None
+
+    def select(self, keep: NDArray[np.bool_]) -> Edges:
+        """The edges of a mask."""
+        at = np.flatnonzero(keep).tolist()
+        inlier = None if self.inlier is None else self.inlier[keep]
+        i, j = [self.i[k] for k in at], [self.j[k] for k in at]
+        return Edges(i, j, self.T_i_j[keep], self.kappa[keep], self.tau[keep], inlier)
+
+
+@dataclass(frozen=True)
+class RobotGraph:
+    """All that one robot is told.
+
+    keyframes: how many. odometry: factors between own keyframes that are trusted: consecutive ones. loops: all other
+    own factors. closures: by neighbour, from this robot's side.
+    """
+
+    name: str
+    keyframes: int
+    odometry: Factors
+    loops: Factors
+    closures: dict[str, list[Closure]]
+
+
+@dataclass(frozen=True)
+class TeamGraph:
+    """What the robots know, by name, and what only the evaluation knows.
+
+    loops_true: by robot, bool per loop; closures_true: by pair (a < b), bool per closure; both None without reference.
+    ignored: files of the folder that were not read.
+    """
+
+    robots: dict[str, RobotGraph]
+    loops_true: dict[str, NDArray[np.bool_]] | None = None
+    closures_true: dict[tuple[str, str], NDArray[np.bool_]] | None = None
+    reference: str | None = None
+    ignored: tuple[str, ...] = ()
+
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Pairs (a < b) of robots with closures, sorted."""
+        return sorted((a, b) for a, robot in self.robots.items() for b in robot.closures if a < b)
+
+    def components(self) -> list[tuple[str, ...]]:
+        """Robots that closures connect, each group and the list of groups sorted."""
+        left, found = set(self.robots), []
+        while left:
+            reached, border = set(), {min(left)}
+            while border:
+                reached |= border
+                border = {b for a in border for b in self.robots[a].closures} - reached
+            found.append(tuple(sorted(reached)))
+            left -= reached
+        return found
+
+
+def read_team(path: Path, robots: int | None = None, *, only_reference: bool = False) -> TeamGraph:
+    """Read a pose graph and give every robot its own.
+
+    Args:
+        path: a `.g2o` file; a folder of one `.g2o` per robot with gtsam symbols as keys; a folder of Kimera-Multi
+            `robot*/measurements.csv`; or a folder with one `.g2o`.
+        robots: cut a single graph into so many blocks of consecutive keys (default 4); for a team's own files, at most
+            a check.
+        only_reference: leave out loops and closures that the reference beside the graph does not name as true.
+    Raises:
+        DuagError: nothing of the kind is there, a line is not understood, or the graph is two-dimensional.
+    """
+    edges, ignored = _read(path)
+    names = sorted({key[0] for key in (*edges.i, *edges.j)})
+    if names == [""]:
+        edges = _cut(edges, 4 if robots is None else robots, path)
+    elif robots is not None and robots != len(names):
+        raise DuagError(
+            f"{path}: --robots {robots}, but the graph is that of {len(names)} robots: {', '.join(names)}"
+        )
+    edges, reference = _with_reference(edges, path)
+    if only_reference:
+        if edges.inlier is None:
+            raise DuagError(f"{path}: no reference beside it, expected {' or '.join(_REFERENCES)}")
+        edges = edges.select(edges.inlier | _consecutive(edges))
+    return _team(edges, reference, ignored, path)
+
+
+def _read(path: Path) -> tuple[Edges, tuple[str, ...]]:
+    """Edges of a file or a folder, and the files of it that were not read."""
+    if path.is_file():
+        return _merge([read_g2o(path)]), ()
+    if not path.is_dir():
+        raise DuagError(f"{path}: not found, expected a .g2o file or a folder of a team's pose graphs")
+    tables = sorted(path.glob("robot*/measurements.csv"), key=_natural)
+    if tables:
+        return _merge([read_kimera(table) for table in tables]), ()
+    files = sorted(path.glob("*.g2o"), key=_natural)
+    if not files:
+        raise DuagError(f"{path}: neither *.g2o nor robot*/measurements.csv in this folder")
+    graphs = [read_g2o(file) for file in files]
+    if len(files) == 1:
+        return _merge(graphs), ()
+    plain = [all(key[0] == "" for key in (*g.i, *g.j)) for g in graphs]
+    team = [g for g, is_plain in zip(graphs, plain, strict=True) if not is_plain]
+    if not team:
+        raise DuagError(
+            f"{path}: {len(files)} graphs with plain keys; a team's graphs need gtsam symbols as keys"
+        )
+    return _merge(team), tuple(f.name for f, is_plain in zip(files, plain, strict=True) if is_plain)
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Sort key that puts robot10 behind robot9."""
+    return [(int(word), "") if word.isdigit() else (-1, word) for word in re.split(r"(\d+)", str(path))]
+
+
+def read_g2o(path: Path) -> Edges:
+    """Edges of one `.g2o` file in 3-D; keys with a gtsam symbol name their robot by its character.
+
+    Raises:
+        DuagError: names the line that is not understood.
+    """
+    i: list[Key] = []
+    j: list[Key] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(read_text(path, "a pose graph").splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#") or words[0] in _IGNORED_TAGS:
+            continue
+        if "SE2" in words[0] or words[0] in ("VERTEX2", "EDGE2"):
+            raise DuagError(f"{path}: line {number} is {words[0]}: a 2-D graph, expected 3-D (EDGE_SE3:QUAT)")
+        if words[0] != "EDGE_SE3:QUAT":
+            raise DuagError(f"{path}: line {number} is {words[0]}, expected VERTEX_SE3:QUAT or EDGE_SE3:QUAT")
+        try:
+            keys, row = [int(word) for word in words[1:3]], [float(word) for word in words[3:]]
+        except ValueError:
+            raise DuagError(f"{path}: line {number} holds something that is not a number") from None
+        sound = len(row) == 28 and np.isfinite(row).all() and min(keys) >= 0 and max(keys) < 1 << 64
+        if not sound or not any(row[3:7]):
+            raise DuagError(
+                f"{path}: line {number} is not an edge: 2 keys of 64 bits and 28 finite numbers expected"
+            )
+        i.append(_symbol(keys[0]))
+        j.append(_symbol(keys[1]))
+        rows.append(row)
+    if not rows:
+        raise DuagError(f"{path}: no EDGE_SE3:QUAT in this file")
+    values = np.array(rows)
+    kappa, tau = _isotropic(values[:, 7:], path)
+    return Edges(i, j, se3.from_quat_translation(values[:, [6, 3, 4, 5]], values[:, :3]), kappa, tau)
+
+
+def _symbol(key: int) -> Key:
+    character = key >> SYMBOL_BITS
+    return (chr(character), key & ((1 << SYMBOL_BITS) - 1)) if character else ("", key)
+
+
+def _isotropic(upper: Array, path: Path) -> tuple[Array, Array]:
+    """SE-Sync's kappa and tau [m] from the upper triangles [m, 21] of the information matrices."""
+    at = np.triu_indices(6)
+    full = np.zeros((len(upper), 6, 6))
+    full[:, at[0], at[1]] = full[:, at[1], at[0]] = upper
+    for block in (full[:, :3, :3], full[:, 3:, 3:]):
+        bad = np.linalg.eigvalsh(block)[:, 0] <= 0
+        if bad.any():
+            raise DuagError(
+                f"{path}: the information of edge {int(np.argmax(bad)) + 1} is not positive definite"
+            )
+    tau = 3 / np.trace(np.linalg.inv(full[:, :3, :3]), axis1=1, axis2=2)
+    kappa = 3 / (2 * np.trace(np.linalg.inv(full[:, 3:, 3:]), axis1=1, axis2=2))
+    return kappa, tau
+
+
+def read_kimera(path: Path) -> Edges:
+    """Edges of one robot's `measurements.csv` of Kimera-Multi; `weight` and `is_known_inlier` are ignored."""
+    needed = [
+        "robot_src",
+        "pose_src",
+        "robot_dst",
+        "pose_dst",
+        "qx",
+        "qy",
+        "qz",
+        "qw",
+        "tx",
+        "ty",
+        "tz",
+        "kappa",
+        "tau",
+    ]
+    reader = csv.DictReader(read_text(path, "a pose graph").splitlines())
+    missing = [name for name in needed if name not in (reader.fieldnames or [])]
+    if missing:
+        raise DuagError(f"{path}: no column {missing[0]}, expected {', '.join(needed)}")
+    i: list[Key] = []
+    j: list[Key] = []
+    rows: list[list[float]] = []
+    for number, fields in enumerate(reader, start=2):
+        try:
+            ids = [int(fields[name]) for name in needed[:4]]
+            row = [float(fields[name]) for name in needed[4:]]
+        except (TypeError, ValueError):
+            raise DuagError(f"{path}: line {number} holds something that is not a number") from None
+        if min(ids) < 0 or not np.isfinite(row).all() or min(row[7:]) <= 0 or not any(row[:4]):
+            raise DuagError(f"{path}: line {number} is not a measurement with positive kappa and tau")
+        i.append((f"robot{ids[0]}", ids[1]))
+        j.append((f"robot{ids[2]}", ids[3]))
+        rows.append(row)
+    if not rows:
+        raise DuagError(f"{path}: no measurements in this file")
+    v = np.array(rows)
+    return Edges(i, j, se3.from_quat_translation(v[:, [3, 0, 1, 2]], v[:, 4:7]), v[:, 7], v[:, 8])
+
+
+def _merge(graphs: Sequence[Edges]) -> Edges:
+    """All edges of all files; one that another file holds too, number for number, counts once."""
+    i: list[Key] = []
+    j: list[Key] = []
+    kept: list[NDArray[np.bool_]] = []
+    seen: set[tuple[Key, Key, bytes]] = set()
+    for g in graphs:
+        names = [(a, b, T.tobytes()) for a, b, T in zip(g.i, g.j, g.T_i_j, strict=True)]
+        new = np.array([name not in seen for name in names], dtype=bool)
+        seen.update(names)
+        kept.append(new)
+        i += [k for k, is_new in zip(g.i, new, strict=True) if is_new]
+        j += [k for k, is_new in zip(g.j, new, strict=True) if is_new]
+
+    def joined(name: str) -> Array:
+        return np.concatenate([getattr(g, name)[k] for g, k in zip(graphs, kept, strict=True)])
+
+    return Edges(i, j, joined("T_i_j"), joined("kappa"), joined("tau"))
+
+
+def _cut(edges: Edges, robots: int, path: Path) -> Edges:
+    """One graph cut into blocks of consecutive keys, as equal as they can be."""
+    keys = sorted({key[1] for key in (*edges.i, *edges.j)})
+    if robots > len(keys) // 2:
+        raise DuagError(f"{path}: {len(keys)} poses cannot be cut into {robots} robots of two poses or more")
+    width = len(str(robots - 1))
+    owner = {key: f"robot{min(at * robots // len(keys), robots - 1):0{width}}" for at, key in enumerate(keys)}
+    i, j = [(owner[key[1]], key[1]) for key in edges.i], [(owner[key[1]], key[1]) for key in edges.j]
+    return Edges(i, j, edges.T_i_j, edges.kappa, edges.tau, edges.inlier)
+
+
+def _with_reference(edges: Edges, path: Path) -> tuple[Edges, str | None]:
+    """Mark what a file beside the graph names as true; for the evaluation only."""
+    folder = path if path.is_dir() else path.parent
+    found = [folder / name for name in _REFERENCES if (folder / name).is_file()]
+    if not found:
+        return edges, None
+    file = found[0]
+    inlier = np.zeros(len(edges.i), dtype=bool)
+    if file.suffix == ".csv":
+        true = set()
+        for line in read_text(file, "a pose graph").splitlines()[1:]:
+            words = line.split(",")
+            if len(words) != 5 or not all(word.strip().isdigit() for word in words):
+                raise DuagError(
+                    f"{file}: expected robot_src,pose_src,robot_dst,pose_dst,inlier, found {line!r}"
+                )
+            a, i, b, j, flag = (int(word) for word in words)
+            if flag:
+                true.add(((f"robot{a}", i), (f"robot{b}", j)))
+        inlier[:] = [(a, b) in true for a, b in zip(edges.i, edges.j, strict=True)]
+    else:  # numbers of edges of the only graph, counted from 1 in the order of the file; the rest is odometry
+        false = [
+            int(n) for n in re.findall(r"<outlier_lc_indices>\s*(\d+)\s*<", read_text(file, "a pose graph"))
+        ]
+        if not false or max(false) > len(inlier) or min(false) < 1:
+            raise DuagError(
+                f"{file}: expected <outlier_lc_indices> from 1 to the {len(inlier)} edges of the graph"
+            )
+        inlier[:] = True
+        inlier[np.array(false) - 1] = False
+    return Edges(edges.i, edges.j, edges.T_i_j, edges.kappa, edges.tau, inlier), file.name
+
+
+def _indices(edges: Edges) -> dict[str, dict[int, int]]:
+    """By robot: index of a keyframe among its own by key, ascending."""
+    keys: dict[str, set[int]] = {}
+    for robot, key in (*edges.i, *edges.j):
+        keys.setdefault(robot, set()).add(key)
+    return {robot: {key: at for at, key in enumerate(sorted(own))} for robot, own in sorted(keys.items())}
+
+
+def _consecutive(edges: Edges) -> NDArray[np.bool_]:
+    """Edges between neighbouring keyframes of one robot: its odometry."""
+    at = _indices(edges)
+    pairs = zip(edges.i, edges.j, strict=True)
+    return np.array([a == b and abs(at[a][p] - at[b][q]) == 1 for (a, p), (b, q) in pairs], dtype=bool)
+
+
+@dataclass
+class _Own:
+    """Rows of the edge list that belong to one robot."""
+
+    odometry: list[int] = field(default_factory=list)
+    loops: list[int] = field(default_factory=list)
+
+
+def _team(edges: Edges, reference: str | None, ignored: tuple[str, ...], path: Path) -> TeamGraph:
+    """Give every edge to the robots that it concerns."""
+    at = _indices(edges)
+    own = {robot: _Own() for robot in at}
+    pairs: dict[tuple[str, str], list[int]] = {}
+    consecutive = _consecutive(edges)
+    for k, ((a, _), (b, _)) in enumerate(zip(edges.i, edges.j, strict=True)):
+        if a == b:
+            (own[a].odometry if consecutive[k] else own[a].loops).append(k)
+        else:
+            pairs.setdefault((min(a, b), max(a, b)), []).append(k)
+    information = isotropic_information(edges.kappa, edges.tau)
+
+    def factors(rows: Iterable[int]) -> Factors:
+        k = np.array(list(rows), dtype=np.int64)
+        i, j = ([at[keys[r][0]][keys[r][1]] for r in k] for keys in (edges.i, edges.j))
+        return Factors(np.array(i, np.int64), np.array(j, np.int64), edges.T_i_j[k], information[k])
+
+    def closure(k: int, side: str) -> Closure:
+        (a, i), (b, j) = edges.i[k], edges.j[k]
+        seen_from_i = Closure(at[a][i], at[b][j], edges.T_i_j[k], information[k])
+        return seen_from_i if a == side else seen_from_i.reversed()
+
+    robots = {}
+    for name in at:
+        _tie(own[name], edges, at[name], name, path)
+        closures = {
+            (b if a == name else a): [closure(k, name) for k in rows]
+            for (a, b), rows in sorted(pairs.items())
+            if name in (a, b)
+        }
+        robots[name] = RobotGraph(
+            name, len(at[name]), factors(own[name].odometry), factors(own[name].loops), closures
+        )
+    if edges.inlier is None:
+        return TeamGraph(robots, ignored=ignored)
+    return TeamGraph(
+        robots,
+        {name: edges.inlier[np.array(rows.loops, np.int64)] for name, rows in own.items()},
+        {pair: edges.inlier[np.array(rows, np.int64)] for pair, rows in pairs.items()},
+        reference,
+        ignored,
+    )
+
+
+def _tie(own: _Own, edges: Edges, at: dict[int, int], name: str, path: Path) -> None:
+    """Trust loops without which a robot's own keyframes fall apart: nothing could contradict them.
+
+    Raises:
+        DuagError: they fall apart even so.
+    """
+    group = list(range(len(at)))
+
+    def root(k: int) -> int:
+        while group[k] != k:
+            k = group[k] = group[group[k]]
+        return k
+
+    loops = []
+    for k in (*own.odometry, *own.loops):
+        a, b = root(at[edges.i[k][1]]), root(at[edges.j[k][1]])
+        group[max(a, b)] = min(a, b)
+        if k in own.odometry:
+            continue
+        if a == b:
+            loops.append(k)
+        else:
+            own.odometry.append(k)
+    own.loops = loops
+    pieces = len({root(k) for k in range(len(at))})
+    if pieces > 1:
+        raise DuagError(
+            f"{path}: the own keyframes of {name} fall into {pieces} pieces without the other robots; expected one"
+        )

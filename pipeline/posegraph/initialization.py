@@ -1,0 +1,74 @@
+"""Where a robot starts: its own graph solved alone, in its own frame."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import linalg as sparse_linalg
+
+from duagc.pipeline.config.consensus import PoseConsensusConfig
+from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.posegraph import factors as pose_factors
+from duagc.pipeline.posegraph.central import solve_central
+from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph.robust import controls, graduated_weights
+
+Array = NDArray[np.float64]
+_STEPS = 3  # Gauss-Newton steps per step of the graduated weights
+
+
+def chordal(factors: Factors, n: int) -> Array:
+    """Chordal start [n, 4, 4]: linear rotations, then linear translations; variable 0 at the identity.
+
+    Args:
+        factors: isotropic ones (`isotropic_information`); the graph must be connected.
+        n: number of variables.
+    Source: Martinec and Pajdla 2007; Carlone et al., "Initialization techniques for 3D SLAM", 2015.
+    """
+    m, R = len(factors), factors.T_i_j[:, :3, :3]
+    root = np.sqrt(factors.information[:, 3, 3] / 2)
+    rows, columns, values = [], [], []
+    for a in range(3):
+        e = 3 * np.arange(m) + a
+        rows += [e] * 4
+        columns += [3 * factors.j + a, *(3 * factors.i + b for b in range(3))]
+        values += [root, *(-root * R[:, b, a] for b in range(3))]
+    index = (np.concatenate(rows), np.concatenate(columns))
+    M = sparse.csc_matrix((np.concatenate(values), index), shape=(3 * m, 3 * n))
+    Y = np.concatenate([np.eye(3), np.zeros((3 * n - 3, 3))])
+    Y[3:] = sparse_linalg.splu((M[:, 3:].T @ M[:, 3:]).tocsc()).solve(-(M[:, 3:].T @ M[:, :3]).toarray())
+    rotations = so3.project(Y.reshape(n, 3, 3).swapaxes(-1, -2))
+    e, root = np.arange(m), np.sqrt(factors.information[:, 0, 0])
+    index = (np.concatenate([e, e]), np.concatenate([factors.j, factors.i]))
+    B = sparse.csc_matrix((np.concatenate([root, -root]), index), shape=(m, n))[:, 1:]
+    right = root[:, None] * (rotations[factors.i] @ factors.T_i_j[:, :3, 3:])[..., 0]
+    t = np.concatenate([np.zeros((1, 3)), sparse_linalg.splu((B.T @ B).tocsc()).solve(B.T @ right)])
+    return se3.from_rotation_translation(rotations, t)
+
+
+def own_start(
+    odometry: Factors, loops: Factors, n: int, config: PoseConsensusConfig
+) -> tuple[Array, NDArray[np.bool_]]:
+    """A robot's own optimum before it has met anybody.
+
+    Args:
+        odometry: connects all n keyframes and is trusted. loops: the rest.
+        config: `robust` says whether loops are in doubt.
+    Returns:
+        T_map_keyframe [n, 4, 4], keyframe 0 at the identity; which loops fit (all of them if none is in doubt).
+    """
+    kept = np.ones(len(loops), dtype=bool)
+    if n == 1:
+        return np.eye(4)[None], kept
+    both = Factors.concatenate([odometry, loops])
+    if not (config.robust and len(loops)):
+        return solve_central(both, chordal(both, n)).poses, kept
+    T = solve_central(odometry, chordal(odometry, n)).poses
+    c2, trusted = config.truncation**2, np.ones(len(odometry))
+    for mu in controls(config):
+        squared = pose_factors.squared_residuals(loops, T)
+        weights = graduated_weights(squared, c2, mu)
+        T = solve_central(both, T, np.concatenate([trusted, weights]), iterations=_STEPS).poses
+    kept = pose_factors.squared_residuals(loops, T) <= c2
+    return solve_central(both, T, np.concatenate([trusted, kept])).poses, kept

@@ -1,0 +1,94 @@
+"""Graduated non-convexity with truncated least squares: robust weights that need no message of their own.
+
+Whoever holds a factor weighs it from its own estimate. The control parameter mu grows with what arrives, not with
+time, so that loss slows the schedule and does not starve it. Source: Yang, Antonante, Tzoumas, Carlone 2020.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.config.consensus import PoseConsensusConfig
+
+Array = NDArray[np.float64]
+COUNTS = 0.5
+"""Robust weight from which a closure counts as kept."""
+_LEAST_PACKETS = 2  # per step: the other end has answered to the last weights
+
+
+def graduated_weights(squared: Array, c2: float, mu: float) -> Array:
+    """Weights of truncated least squares at control parameter mu: mu -> infinity truncates at c2."""
+    low, high = mu / (mu + 1) * c2, (mu + 1) / mu * c2
+    between = np.sqrt(c2 * mu * (mu + 1) / np.maximum(squared, low)) - mu
+    return np.where(squared <= low, 1.0, np.where(squared >= high, 0.0, between))
+
+
+def first_control(squared: Array, config: PoseConsensusConfig) -> float:
+    """Where the schedule begins: a share of the control parameter at which the worst factor is just convex."""
+    c2, (least, last) = config.truncation**2, config.robust_mu
+    beyond = 2 * float(squared.max()) - c2
+    convex = c2 / beyond if beyond > 0 else last
+    return min(max(least, config.robust_convexity * convex), last)
+
+
+def controls(config: PoseConsensusConfig) -> list[float]:
+    """The whole schedule of the control parameter."""
+    first, last = config.robust_mu
+    steps = 1 + math.floor(math.log(last / first) / math.log(config.robust_growth))
+    return [first * config.robust_growth**k for k in range(steps)]
+
+
+class RobustWeights:
+    """The weights of one group of factors and how far their schedule is.
+
+    weights: [m], the start until the warm-up is over. done: they are final.
+    """
+
+    def __init__(self, start: Array, config: PoseConsensusConfig) -> None:
+        self.weights, self.config = start, config
+        self.done = not (config.robust and len(start))
+        self._mu: float | None = None  # None while warming up
+        self._changed_at = 0.0  # packets received when the weights last changed
+
+    def advance(self, received: float, steady: bool, squared_residuals: Callable[[], Array]) -> bool:
+        """Take the next step if it is due; True if the weights changed.
+
+        Args:
+            received: packets so far, parts counted by their share.
+            steady: what the factors join moves little any more; a step need not wait for its full number of packets.
+            squared_residuals: [m], computed only when needed.
+        """
+        c, c2 = self.config, self.config.truncation**2
+        wait = c.robust_warm_up if self._mu is None else c.robust_packets
+        least = 0.0 if self._mu is None else _LEAST_PACKETS
+        waited = received - self._changed_at
+        if self.done or waited < (least if steady else wait):
+            return False
+        squared = squared_residuals()
+        if self._mu is None:
+            if c.robust_skip and np.all(squared <= c2):  # nothing is in doubt: every truncated weight is one
+                return self._finish(np.ones(len(squared)))
+            self._mu = first_control(squared, c)
+        else:
+            self._mu *= c.robust_growth
+        self._changed_at = received
+        if self._mu > c.robust_mu[1]:
+            return self._finish((squared <= c2).astype(np.float64))
+        weights = graduated_weights(squared, c2, self._mu)
+        if np.all((weights == 0.0) | (weights == 1.0)):  # no later step would change them by itself
+            return self._finish(weights)
+        self.weights = weights
+        return True
+
+    @property
+    def graduated(self) -> bool:
+        """Whether the schedule ran, and was not skipped because nothing was in doubt."""
+        return self._mu is not None
+
+    def _finish(self, weights: Array) -> bool:
+        self.weights, self.done = weights, True
+        return True

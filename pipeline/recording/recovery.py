@@ -1,0 +1,479 @@
+"""`duagc recover`: a sound log from a damaged one, with every message that is certain, and what was lost.
+
+A record is read where the one before ends. After damage the next chunk is found by the name of its compression. A
+chunk counts only if its checksum agrees; of the last one of a file that is cut, what is still there counts. Nothing is
+guessed: a message is kept as it was written or not at all.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.summary import Summary
+
+from duagc.pipeline.base.atomic_folder import new_folder
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import check_file, read_bytes
+from duagc.pipeline.base.progress import track
+from duagc.pipeline.recording import RECORDING_FILE, RECORDING_FORMAT, RECORDING_SCHEMA, open_rgbd
+from duagc.pipeline.recording.identity import ContentDigest, channel_identity, framed
+from duagc.pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, MAGIC, ROBOT_KEY
+from duagc.pipeline.recording.write import mcap_writer
+
+_RECORD = struct.Struct("<BQ")  # opcode, length
+_CHUNK = struct.Struct("<QQQII")  # first and last time, size, checksum, length of the compression's name
+_COMPRESSIONS = (b"zstd", b"lz4")
+LARGEST_CHUNK = 1 << 28  # bytes, unpacked; more is damage
+LARGEST_RECORD = 1 << 28  # bytes, outside chunks
+_SEARCH_BYTES = 1 << 22
+TRUTH = ".groundtruth.mcap"  # how the names of true logs end
+
+
+@dataclass
+class Salvage:
+    """What became of one log.
+
+    lost: messages known to be missing, by the counts at the end of the log or, where that is lost, by the gaps in
+    their numbers; what a cut has taken from the end cannot be counted. damage: one line for each place.
+    """
+
+    path: str
+    messages: int = 0
+    lost: int = 0
+    cut: bool = False
+    damage: list[str] = field(default_factory=list)
+    digest: str = ""
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing was damaged."""
+        return not (self.damage or self.cut or self.lost)
+
+    def line(self) -> str:
+        """One line for people."""
+        if self.whole:
+            return f"{self.path}: {self.messages} messages, nothing lost"
+        lost = f"{self.lost} lost in between"
+        end = ", and all after the cut" if self.cut else ""
+        return f"{self.path}: {self.messages} messages, {lost}{end}: {'; '.join(self.damage[:5])}"
+
+
+def recover(source: Path, out: Path, force: bool = False) -> list[Salvage]:
+    """Write what can be read of a log, or of a recording, into a new log or recording.
+
+    Raises:
+        DuagError: nothing can be read, or `out` exists.
+    """
+    source, out = Path(source), Path(out)
+    if not source.exists():
+        raise DuagError(f"{source}: no such file or folder, expected a log or a recording")
+    if not source.is_dir():
+        check_file(source, "a log or a recording")
+    else:
+        with new_folder(out, force) as folder:
+            return _recover_recording(source, folder, out.resolve().name)
+    if out.exists() and not force:
+        raise DuagError(f"{out}: exists already; choose another --out or give --force")
+    if out.is_dir():
+        raise DuagError(f"{out}: is a folder, expected the name of a log")
+    return [_recover_log(source, out)]
+
+
+# --- one log ---------------------------------------------------------------------------------------------------------
+
+
+def _recover_log(source: Path, out: Path) -> Salvage:
+    part = out.with_name(out.name + ".part")
+    salvage = Salvage(source.name)
+    try:
+        with source.open("rb") as stream, part.open("wb") as target:
+            copy = _Copy(target, salvage)
+            summary = _summary_of(stream)
+            if summary:
+                copy.know([*summary.schemas.values(), *summary.channels.values()])
+            records = _records(stream, source.stat().st_size, salvage)
+            count = summary.statistics.message_count if summary and summary.statistics else None
+            for record in track(records, f"recover {source.name}", count):
+                copy.add(record)
+            if summary and summary.statistics:
+                salvage.lost = max(0, summary.statistics.message_count - salvage.messages)
+            elif not salvage.cut:
+                salvage.damage.append("the index at the end was damaged")
+            copy.finish()
+        if not salvage.messages:
+            raise DuagError(f"{source}: found no message that is whole, expected an MCAP log")
+        os.replace(part, out)
+    except OSError as error:
+        raise DuagError(f"{source}: {error.strerror or error}, expected to recover it to {out}") from error
+    finally:
+        part.unlink(missing_ok=True)
+    return salvage
+
+
+def _summary_of(stream: IO[bytes]) -> Summary | None:
+    """The end of the file, where that is left."""
+    try:
+        summary = SeekingReader(stream, record_size_limit=LARGEST_RECORD).get_summary()
+    except Exception:  # whatever a reader stumbles over: it is damaged, and that is why we are here
+        return None
+    return summary
+
+
+_KNOWN: dict[int, Any] = {
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.METADATA: Metadata,
+    Opcode.ATTACHMENT: Attachment,
+}
+
+
+def _records(stream: IO[bytes], size: int, salvage: Salvage) -> Iterator[Any]:
+    """Every schema, channel, message, metadata and attachment of a file that is certain."""
+    stream.seek(0)
+    at = len(MAGIC) if stream.read(len(MAGIC)) == MAGIC else 0
+    if at == 0:
+        salvage.damage.append("the file does not begin as a log")
+    while at < size:
+        stream.seek(at)
+        head = stream.read(_RECORD.size)
+        opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, 0)
+        end = at + _RECORD.size + length
+        if opcode == Opcode.DATA_END and length == 4:
+            return
+        limit = LARGEST_CHUNK if opcode == Opcode.CHUNK else LARGEST_RECORD
+        if not Opcode.HEADER <= opcode <= Opcode.DATA_END or length > limit:
+            at = _after_damage(stream, at, size, salvage)
+            continue
+        if end > size:
+            salvage.cut = True
+            salvage.damage.append(f"cut after {size} bytes")
+            if opcode == Opcode.CHUNK:
+                yield from _rest_of_chunk(stream.read(length))
+            return
+        body = stream.read(length) if opcode in (Opcode.CHUNK, Opcode.MESSAGE, *_KNOWN) else b""
+        try:
+            found = list(_chunk(body)) if opcode == Opcode.CHUNK else list(_one(opcode, body))
+        except Exception as error:  # a wrong checksum, and whatever damage provokes
+            salvage.damage.append(f"at byte {at}: {type(error).__name__} ({error})")
+            goes_on = _is_record(stream, end, size)
+            at = end if goes_on else _after_damage(stream, at, size, salvage, told=True)
+            continue
+        yield from found
+        at = end
+    salvage.cut = True
+    salvage.damage.append(f"no end of the log after {size} bytes")
+
+
+def _is_record(stream: IO[bytes], at: int, size: int) -> bool:
+    """Whether a record may begin here."""
+    stream.seek(at)
+    head = stream.read(_RECORD.size)
+    opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (0, 0)
+    return Opcode.HEADER <= opcode <= Opcode.DATA_END and at + _RECORD.size + length <= size
+
+
+def _after_damage(stream: IO[bytes], at: int, size: int, salvage: Salvage, told: bool = False) -> int:
+    """Where the next sound chunk begins after a place that is no record; the end of the file if there is none."""
+    start = at
+    while True:
+        at = _next_chunk(stream, at + 1, size)
+        if at == size:
+            break
+        stream.seek(at)
+        _, length = _RECORD.unpack(stream.read(_RECORD.size))
+        if at + _RECORD.size + length > size:
+            break  # the caller takes what is left of it
+        try:
+            list(_chunk(stream.read(length)))
+            break
+        except Exception:  # by chance, or damaged as well
+            continue
+    if not told:
+        salvage.damage.append(f"at byte {start}: {at - start} bytes that are no record")
+    return at
+
+
+def _next_chunk(stream: IO[bytes], start: int, size: int) -> int:
+    """Where the next record that looks like a chunk begins; `size` if there is none."""
+    overlap = _RECORD.size + _CHUNK.size + 4
+    at = start
+    while at < size:
+        stream.seek(at)
+        window = stream.read(_SEARCH_BYTES + overlap)
+        places = [p for name in _COMPRESSIONS for p in _places(window, struct.pack("<I", len(name)) + name)]
+        for place in sorted(places):
+            begin = place + 4 - _RECORD.size - _CHUNK.size
+            if begin >= 0 and _looks_like_chunk(window[begin:]):
+                return at + begin
+        at += _SEARCH_BYTES
+    return size
+
+
+def _places(window: bytes, pattern: bytes) -> Iterator[int]:
+    at = window.find(pattern)
+    while at >= 0:
+        yield at
+        at = window.find(pattern, at + 1)
+
+
+def _looks_like_chunk(data: bytes) -> bool:
+    if len(data) < _RECORD.size + _CHUNK.size + 16:
+        return False
+    opcode, length = _RECORD.unpack_from(data)
+    first, last, unpacked, _, name = _CHUNK.unpack_from(data, _RECORD.size)
+    (packed,) = struct.unpack_from("<Q", data, _RECORD.size + _CHUNK.size + name)
+    sound = opcode == Opcode.CHUNK and first <= last and unpacked <= LARGEST_CHUNK
+    return sound and length == _CHUNK.size + name + 8 + packed
+
+
+def _unpack(body: bytes) -> tuple[bytes, int, int]:
+    """The bytes of a chunk as far as they are there, the size and the checksum they should have."""
+    import lz4.frame
+    import zstandard
+
+    _, _, size, crc, name = _CHUNK.unpack_from(body)
+    compression = body[_CHUNK.size : _CHUNK.size + name]
+    packed = body[_CHUNK.size + name + 8 :]
+    if size > LARGEST_CHUNK:
+        raise ValueError(f"a chunk of {size} bytes")
+    if compression == b"zstd":
+        reader = zstandard.ZstdDecompressor().stream_reader(BytesIO(packed))
+        pieces = []
+        left = size
+        try:
+            while left > 0 and (piece := reader.read(min(left, 1 << 16))):
+                pieces.append(piece)
+                left -= len(piece)
+        except zstandard.ZstdError:
+            pass  # what came before is checked by size and checksum
+        out = b"".join(pieces)
+    elif compression == b"lz4":
+        try:
+            out = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
+        except RuntimeError:
+            out = b""
+    elif compression == b"":
+        out = packed
+    else:
+        raise ValueError(f"compression {compression!r}")
+    return out, size, crc
+
+
+def _chunk(body: bytes) -> Iterator[Any]:
+    data, size, crc = _unpack(body)
+    if len(data) != size:
+        raise ValueError(f"a chunk of {len(data)} bytes instead of {size}")
+    if crc and zlib.crc32(data) != crc:
+        raise ValueError("a chunk with another checksum")
+    return _inside(data)
+
+
+def _rest_of_chunk(body: bytes) -> Iterator[Any]:
+    """The whole records in the beginning of a chunk that is cut."""
+    try:
+        data, *_ = _unpack(body)
+        yield from _inside(data, cut=True)
+    except (struct.error, ValueError, IndexError):
+        return
+
+
+def _inside(data: bytes, cut: bool = False) -> Iterator[Any]:
+    at = 0
+    while at + _RECORD.size <= len(data):
+        opcode, length = _RECORD.unpack_from(data, at)
+        end = at + _RECORD.size + length
+        if end > len(data):
+            if cut:
+                return
+            raise ValueError("a chunk with records that are longer than it")
+        yield from _one(opcode, data[at + _RECORD.size : end])
+        at = end
+
+
+def _one(opcode: int, body: bytes) -> Iterator[Any]:
+    if opcode == Opcode.MESSAGE:
+        yield Message.read(ReadDataStream(BytesIO(body)), len(body))
+    elif opcode in _KNOWN:
+        yield _KNOWN[opcode].read(ReadDataStream(BytesIO(body)))
+
+
+class _Copy:
+    """Writes records into a new log, as `LogWriter` writes it: the digest of a log that lost nothing is the same."""
+
+    def __init__(self, target: IO[bytes], salvage: Salvage) -> None:
+        self._writer = mcap_writer(target)
+        self._writer.start(profile="", library=LIBRARY)
+        self._salvage = salvage
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._written: dict[int, tuple[int, bytes]] = {}  # channel in the source -> in the copy, identity
+        self._copied_schemas: dict[int, int] = {}
+        self._sequences: dict[int, int] = {}
+        self._metadata: list[tuple[str, dict[str, str]]] = []
+        self._attachments: list[bytes] = []
+        self._content = ContentDigest()
+        self._last_ns, self._in_order = 0, True
+
+    def know(self, records: list[Schema | Channel]) -> None:
+        """Take in schemas and channels that messages may need."""
+        for record in records:
+            if isinstance(record, Schema):
+                self._schemas.setdefault(record.id, record)
+            else:
+                self._channels.setdefault(record.id, record)
+
+    def add(self, record: Any) -> None:
+        """Take in the next record of the source."""
+        if isinstance(record, Schema | Channel):
+            self.know([record])
+        elif isinstance(record, Message):
+            self._message(record)
+        elif isinstance(record, Metadata) and record.name != DIGEST_RECORD:
+            self._writer.add_metadata(record.name, record.metadata)
+            self._metadata.append((record.name, record.metadata))
+        elif isinstance(record, Attachment):
+            times = (record.create_time, record.log_time)
+            self._writer.add_attachment(*times, record.name, record.media_type, record.data)
+            names = (record.name.encode(), record.media_type.encode())
+            self._attachments.append(framed(*names, struct.pack("<QQ", *times), record.data))
+
+    def _message(self, m: Message) -> None:
+        channel = self._channels.get(m.channel_id)
+        if channel is None or (channel.schema_id and channel.schema_id not in self._schemas):
+            self._salvage.lost += 1
+            said = f"what channel {m.channel_id} is was lost"
+            if said not in self._salvage.damage:
+                self._salvage.damage.append(said)
+            return
+        number, identity = self._open(channel)
+        expected = self._sequences.get(m.channel_id, 0)
+        if m.sequence > expected and self._ours(channel):
+            self._salvage.lost += m.sequence - expected
+        self._sequences[m.channel_id] = m.sequence + 1
+        self._writer.add_message(number, m.log_time, m.data, m.publish_time, m.sequence)
+        self._content.add(identity, m.log_time, m.publish_time, m.sequence, m.data)
+        self._in_order &= m.log_time >= self._last_ns
+        self._last_ns = m.log_time
+        self._salvage.messages += 1
+
+    def _ours(self, channel: Channel) -> bool:
+        """Whether messages are numbered from 0 without gaps; other programs number as they like."""
+        from duagc.schemas import topics
+
+        return topics.find(channel.topic) is not None
+
+    def _open(self, channel: Channel) -> tuple[int, bytes]:
+        if channel.id not in self._written:
+            number, name, data = 0, "", b""
+            if channel.schema_id:
+                schema = self._schemas[channel.schema_id]
+                name, data = schema.name, schema.data
+                if schema.id not in self._copied_schemas:
+                    self._copied_schemas[schema.id] = self._writer.register_schema(
+                        name, schema.encoding, data
+                    )
+                number = self._copied_schemas[schema.id]
+            new = self._writer.register_channel(
+                channel.topic, channel.message_encoding, number, channel.metadata
+            )
+            self._written[channel.id] = new, channel_identity(channel.topic, name, data)
+        return self._written[channel.id]
+
+    def finish(self) -> None:
+        """Write the end of the log."""
+        channels = [(identity, self._channels[id].metadata) for id, (_, identity) in self._written.items()]
+        if self._in_order:
+            self._salvage.digest = self._content.finish(channels, self._metadata, self._attachments)
+            self._writer.add_metadata(DIGEST_RECORD, {"sha256": self._salvage.digest})
+        self._writer.finish()
+
+
+# --- a recording -----------------------------------------------------------------------------------------------------
+
+
+def _recover_recording(source: Path, folder: Path, name: str) -> list[Salvage]:
+    """Every log of a folder that is or was to become a recording, and a description that agrees with them."""
+    try:
+        description = json.loads(read_bytes(source / RECORDING_FILE, "the JSON of a recording"))
+        rows = dict(description["robots"])
+        warnings = list(description.get("warnings", []))
+    except (DuagError, ValueError, KeyError, TypeError, RecursionError):
+        description, rows = {"name": name, "source": {"folder": source.resolve().name}}, {}
+        warnings = [f"{RECORDING_FILE} was lost and made again from the logs"]
+    salvaged = []
+    for path in sorted(source.iterdir()):
+        if not path.is_file() or path.is_symlink() or not path.name.endswith((".mcap", ".mcap.part")):
+            continue
+        try:
+            salvage = _recover_log(path, folder / path.name.removesuffix(".part"))
+        except DuagError as error:
+            warnings.append(f"{path.name} is lost: {str(error).partition(': ')[2]}")
+            continue
+        salvaged.append(salvage)
+        if not salvage.whole:
+            warnings.append(f"recovered: {salvage.line()}")
+    robots = {}
+    for path in sorted(folder.glob("*.mcap")):
+        if path.name.endswith(TRUTH):
+            continue
+        try:
+            robot, row = _describe(path)
+        except DuagError as error:
+            warnings.append(f"{path.name} is no log of a robot's camera: {str(error).partition(': ')[2]}")
+            continue
+        told = rows.get(robot)
+        robots[robot] = {**(told if isinstance(told, dict) else {"sensors": {}, "path": None}), **row}
+    if not robots:
+        raise DuagError(f"{source}: found no log of a robot with frames, expected one or more")
+    geometry = description.get("geometry")
+    if isinstance(geometry, str) and Path(geometry).name == geometry and (source / geometry).is_file():
+        (folder / geometry).write_bytes((source / geometry).read_bytes())
+    else:
+        description["geometry"] = None
+    description |= {"format": RECORDING_FORMAT, "schema": RECORDING_SCHEMA, "robots": robots}
+    description["warnings"] = warnings
+    (folder / RECORDING_FILE).write_text(json.dumps(description, indent=2) + "\n")
+    return salvaged
+
+
+def _describe(path: Path) -> tuple[str, dict[str, Any]]:
+    """The robot of a log and what a recording says about it."""
+    from duagc.pipeline.recording.read import LogFile
+
+    with open_rgbd(path) as log:
+        stamps = [color for color, _ in log.pairing.pairs]
+        row: dict[str, Any] = {
+            "log": path.name,
+            "frames": len(log),
+            "start_ns": stamps[0],
+            "end_ns": stamps[-1],
+            "longest_interval_ns": int(np.diff(stamps).max()) if len(stamps) > 1 else 0,
+            "camera": asdict(log.camera),
+            "depth_scale_m": float(log.depth_scale),
+        }
+        robot = log.robot
+    truth = path.with_name(f"{robot}{TRUTH}")
+    row["groundtruth"] = truth.name if truth.is_file() else None
+    row["digests"] = {}
+    for file in (path, truth):
+        if file.is_file():
+            with LogFile(file) as log_file:
+                found = dict(log_file.metadata())
+            row["digests"][file.name] = found.get(DIGEST_RECORD, {}).get("sha256", "")
+            if file == path:
+                told = found.get(LOG_RECORD, {})
+                row["sensors"] = {key: value for key, value in told.items() if key != ROBOT_KEY}
+    return robot, row

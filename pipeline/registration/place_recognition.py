@@ -1,0 +1,65 @@
+"""Which of many views a view may show: a shortlist, so that only a bounded number is compared feature by feature.
+
+A descriptor becomes one word per table: of the directions of the table, all with entries +1 and -1, the one that it
+points along most, and the sign (cross-polytope hashing: Andoni et al. 2015). Near descriptors mostly share some word.
+A view is the set of its words; views are ranked by words in common. No vocabulary is trained; the directions are drawn
+once and for all. Sums of small integers are exact in float32, so the ranking does not depend on the order of sums.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.registration.features import DIMENSIONS, Descriptors
+
+TABLES = 8
+DIRECTIONS = 128  # per table, two words each
+WORDS = 2 * DIRECTIONS
+
+
+class Places:
+    """Views by the words of their descriptors."""
+
+    def __init__(self, views: Sequence[Descriptors]) -> None:
+        """Args:
+        views: descriptors of every view, uint8 [n, 128] each.
+        """
+        # what all features have in common tells no places apart
+        total = sum((d.sum(axis=0, dtype=np.int64) for d in views), np.zeros(DIMENSIONS, dtype=np.int64))
+        centre = np.rint(total / max(sum(map(len, views)), 1)).astype(np.float32)
+        self._has = np.stack([_words(d.astype(np.float32) - centre) for d in views])
+
+    def alike(self, view: int, among: int, most: int) -> list[int]:
+        """Those of the first `among` views that share most words with a view; at most so many, ascending.
+
+        A view of few features has few words to share: the count is divided by the root of its words.
+        """
+        if among <= most:
+            return list(range(among))
+        shared = self._has[:among] @ self._has[view]
+        score = shared / np.sqrt(np.maximum(self._has[:among].sum(axis=1), 1))
+        return sorted(np.argsort(-score, kind="stable")[:most].tolist())
+
+
+def _words(centred: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Which words descriptors [n, 128] have, [TABLES * WORDS], 0 or 1."""
+    has = np.zeros((TABLES, WORDS), dtype=np.float32)
+    if len(centred):
+        for table, directions in enumerate(_DIRECTIONS):
+            along = centred @ directions
+            nearest = np.abs(along).argmax(axis=1)
+            positive = along[np.arange(len(along)), nearest] > 0
+            has[table, 2 * nearest + positive] = 1
+    return has.ravel()
+
+
+def _signs(table: int) -> NDArray[np.float32]:
+    draw = random_streams.generator(0, "places", table=table).integers(0, 2, (DIMENSIONS, DIRECTIONS))
+    return np.where(draw == 1, np.float32(1), np.float32(-1))
+
+
+_DIRECTIONS = [_signs(table) for table in range(TABLES)]

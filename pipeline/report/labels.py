@@ -1,0 +1,222 @@
+"""Numbers in words: how a value is written with its unit, and what every metric means in one phrase."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from duagc.pipeline.evaluation.rendering import COMPARED, COMPARED_SETS
+from duagc.pipeline.evaluation.results import unit_of
+
+NONE = "–"
+
+
+def bytes_text(count: float) -> str:
+    """Bytes with a decimal prefix: 1 kB is 1000 B."""
+    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.3g} {unit}"
+    return f"{count:.0f} B" if float(count).is_integer() else f"{count:.1f} B"
+
+
+def metres_text(value_m: float) -> str:
+    """Metres, or millimetres below a tenth of a metre."""
+    if abs(value_m) < 0.1:
+        millimetres = 1e3 * abs(value_m)
+        if 0.0 < millimetres < 1e-3:
+            return "< 0.001 mm"
+        return f"{1e3 * value_m:.1f} mm" if millimetres >= 1.0 else f"{1e3 * value_m:.3g} mm"
+    return f"{value_m:.3f} m"
+
+
+def text(name: str, value: Any) -> str:
+    """A metric's value with its unit, as the report prints it; a dash for a value that is absent."""
+    if value is None:
+        return NONE
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, str):
+        return value
+    unit = unit_of(name)
+    if unit == "m":
+        return metres_text(value)
+    if unit == "rad":
+        return f"{np.degrees(value):.3g}°"
+    if unit == "B":
+        return bytes_text(value)
+    if name == "depth_completeness" or name.startswith("coverage_95"):
+        return f"{100 * value:.1f} %"
+    if isinstance(value, int):
+        return f"{value:,}".replace(",", "\u202f")
+    if unit == "dB":
+        return f"{value:.2f} dB"
+    number = f"{value:.3f}" if 1e-3 <= abs(value) < 1e3 else f"{value:.3g}"
+    return number if unit == "1" else f"{number} {unit.replace('sigma', 'σ')}"
+
+
+# path in metrics.json -> (label, what it means in one phrase)
+TEAM = {
+    "ate_rmse_m": ("Team ATE", "position error of all robots of the largest component under one common alignment"),
+    "ate_rmse_m_mean_of_robots": ("Mean robot ATE", "each robot aligned by itself: blind to errors between robots"),
+    "robots": ("Robots", "robots in this run"),
+    "robots_in_largest_component": ("Largest component", "robots that agree on one common world"),
+    "inter_robot_closures": ("Closures between robots", "places that two robots recognised, counted in the end"),
+    "inter_robot_closures_rejected": ("Closures rejected", "measured, then refused by geometry or outvoted"),
+}  # fmt: skip
+
+ROBOT = {
+    "frames": ("Frames", "images in the robot's log"),
+    "tracked": ("Tracked", "frames whose pose the front end trusts"),
+    "keyframes": ("Keyframes", "frames that carry the map"),
+    "gaussians": ("Own Gaussians", "Gaussians in the robot's own map"),
+    "gaussians_fused": ("Fused Gaussians", "Gaussians in the robot's map after fusion"),
+    "ate_rmse_m_before_consensus": ("ATE before", "position error of the front end alone, own alignment, all frames"),
+    "ate_rmse_m": ("ATE after", "position error after consensus, own alignment, all frames"),
+    "ate_rmse_m_joint": ("ATE, joint", "position error after consensus under the alignment that the whole team shares"),
+    "rpe_trans_m": ("RPE, position", "error of the motion from one frame to the next"),
+    "rpe_rot_rad": ("RPE, rotation", "error of the turn from one frame to the next"),
+}  # fmt: skip
+
+MAPS = {
+    "own": "own",
+    "own_unrefined": "own, before its final refinement",
+    "own_longer": "own, trained longer",
+    "fused": "fused",
+    "refined": "refined (final)",
+}  # fmt: skip
+
+VIEW_SETS = {
+    "held_out": "own held-out views",
+    "peers": "peers' held-out views",
+    "team": "the team's held-out views",
+    "training": "own keyframes",
+}  # fmt: skip
+
+COMPARISON = {
+    "psnr_db": ("PSNR", "likeness of colours; what a map does not cover is black and counts"),
+    "depth_l1_common_m": ("Depth L1", "mean depth error over pixels that own, fused and refined map cover"),
+    "depth_l1_layer_m": ("one layer", "the same over what the map itself covers, drawn as one surface"),
+    "depth_completeness": ("Covered", "share of recorded depth pixels that the map covers"),
+}  # fmt: skip
+
+RENDERING = {
+    "views": ("Views", "rendered and compared with the image taken there"),
+    "psnr_db": ("PSNR", "likeness of colours; higher is better"),
+    "ssim": ("SSIM", "likeness of structure at one scale; 1 is equal"),
+    "ms_ssim": ("MS-SSIM", "likeness of structure over five scales; 1 is equal, always kinder than SSIM"),
+    "lpips": ("LPIPS", "perceptual distance by a trained network"),
+    "depth_l1_m": ("Depth L1", "mean error against the recorded depth, where both exist"),
+    "depth_l1_exact_m": ("Depth L1, exact", "the same against the exact depth"),
+    "depth_l1_layer_m": ("Depth L1, one layer", "the same, drawn as the surface that stops a pixel's light"),
+    "depth_l1_common_m": ("Depth L1, common", "over pixels that all maps but the unrefined cover"),
+    "depth_completeness": ("Completeness", "share of recorded depth pixels that the map covers"),
+}  # fmt: skip
+
+EXCHANGE = {
+    "sessions": ("Sessions", "meetings of the team"),
+    "rounds": ("Rounds", "ticks of the agents until the session ended"),
+    "messages": ("Messages", "what the robots had to say, before cutting into packets"),
+    "packets_sent": ("Packets sent", "of at most 1200 bytes, all attempts"),
+    "packets_dropped": ("Packets lost", "by the simulated radio"),
+    "bytes_sent": ("Bytes sent", "all attempts, headers included"),
+    "bytes_delivered": ("Bytes delivered", "what arrived, headers included"),
+    "bytes_setup": ("Set-up bytes", "descriptors, samples, closures, frames, agreed poses, pair lists"),
+    "bytes_per_round_per_robot_pair": ("Bytes per round and pair", "both directions, mean over the session"),
+    "bytes_raw_alternative": ("Raw alternative", "maps with information and pose graphs to every other robot, once"),
+    "bytes_raw_alternative_maps_only": ("Raw maps", "the same without the information: to look at, not to fuse"),
+    "bytes_paper_accounting": ("Paper's accounting", "28 float32 per matched pair, both ways, in every round"),
+    "matched_pairs": ("Matched Gaussians", "pairs of Gaussians of two robots that show the same piece of surface"),
+}  # fmt: skip
+
+CONSENSUS = {
+    "solver": ("Solver", "how the robots reach agreement"),
+    "converged": ("Converged", "every robot agreed with its component before the last allowed round"),
+    "rounds_to_tolerance": ("Rounds to tolerance", "until no pose moved by more than the tolerance"),
+    "gap_to_oracle_sigma": ("Gap to oracle, Gaussians", "largest difference from the centralised answer"),
+    "gap_to_oracle_sigma_p99": ("Gap to oracle, 99 %", "of the matched Gaussians differ by less"),
+    "gap_to_oracle_m": ("Gap to oracle, position", "largest difference of a keyframe from the centralised answer"),
+    "gap_to_oracle_rad": ("Gap to oracle, rotation", "largest turn of a keyframe from the centralised answer"),
+}  # fmt: skip
+
+CALIBRATION = {
+    "spearman": ("Spearman", "rank correlation of predicted and observed error; 1 is perfect, 0 knows nothing"),
+    "ause": ("AUSE", "cost of trusting the predicted order of errors; 0 is perfect"),
+    "ece_rank": ("ECE, ranks", "gap between predicted and observed rank per decile; 0 is perfect, 0.25 knows nothing"),
+    "ece_rank_shuffled": ("ECE, ranks, shuffled", "the same with the predictions dealt out at random"),
+    "ece_paper": ("ECE, companion code", "the paper's formula, for comparison only: near 0 without any knowledge, too"),
+    "coverage_95": ("Coverage of 95 %", "share of errors within 1.96 predicted σ, as predicted"),
+    "coverage_95_scaled": ("Coverage, one scale fitted", "the same after one factor, fitted on the other half"),
+    "sigma_scale": ("Fitted scale", "the factor on σ; 1 if well scaled, above 1 if over-confident"),
+    "nll": ("NLL", "negative log-likelihood of the errors; lower is better"),
+    "nll_scaled": ("NLL, one scale fitted", "the same after the factor"),
+    "gaussians": ("Gaussians judged", "fused Gaussians with full position information, all robots"),
+    "gaussians_without_information": ("Left out", "Gaussians with a direction that nothing determines"),
+}  # fmt: skip
+
+
+def rows(
+    section: dict[str, Any], words: dict[str, tuple[str, str]], reasons: dict[str, str], path: str
+) -> list[dict[str, str]]:
+    """Label, value with unit, meaning and, if the value is absent, the reason: one row per metric that is known."""
+    return [
+        {
+            "label": label,
+            "value": text(name, section[name]),
+            "meaning": meaning,
+            "reason": reasons.get(f"{path}.{name}", ""),
+        }
+        for name, (label, meaning) in words.items()
+        if name in section
+    ]
+
+
+def is_scored(metrics: dict[str, Any], kind: str) -> bool:
+    """Whether a map was evaluated; `own_longer` is only if asked for."""
+    return kind != "own_longer" or bool(metrics["rendering"][kind]["held_out"]["views"])
+
+
+def _compared(metrics: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Of all robots together and of each: name, map, its scores by set of views."""
+    kinds = [kind for kind in COMPARED if is_scored(metrics, kind)]
+    yield from (("all robots", kind, metrics["rendering"][kind]) for kind in kinds)
+    for name, robot in metrics["robots"].items():
+        yield from ((name, kind, robot["rendering"][kind]) for kind in kinds)
+
+
+def comparison_rows(metrics: dict[str, Any]) -> list[dict[str, Any]]:
+    """A robot's maps beside each other, for all robots and for each: own views, peers' views, both.
+
+    Returns:
+        Rows of "robot", "map", "first" (of its robot) and "values": the columns of COMPARISON for each set of views.
+    """
+    return [
+        {
+            "robot": name,
+            "map": MAPS[kind],
+            "first": kind == COMPARED[0],
+            "values": [
+                text(column, found[view_set][column]) for view_set in COMPARED_SETS for column in COMPARISON
+            ],
+        }
+        for name, kind, found in _compared(metrics)
+    ]
+
+
+def comparison_text(metrics: dict[str, Any]) -> str:
+    """The same as lines of text, without units: dB, mm, mm, %; for own, peers' and team's views."""
+    scale = {"psnr_db": (1.0, 2), "depth_completeness": (100.0, 1)}
+    heads = ("PSNR, dB", "depth L1, mm", "one layer, mm", "covered, %")
+    width = 8 * len(COMPARED_SETS)
+    lines = [" " * 24 + "".join(head.rjust(width) for head in heads)]
+    lines.append(" " * 24 + "".join(s.rjust(8) for _ in heads for s in ("own", "peers", "team")))
+    for name, kind, found in _compared(metrics):
+        line = f"{name if kind == COMPARED[0] else '':<12}{kind:<12}"
+        for column in COMPARISON:
+            factor, digits = scale.get(column, (1e3, 1))
+            for view_set in COMPARED_SETS:
+                value = found[view_set][column]
+                line += (NONE if value is None else f"{factor * value:.{digits}f}").rjust(8)
+        lines.append(line)
+    return "\n".join(lines)

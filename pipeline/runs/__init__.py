@@ -1,0 +1,1 @@
+"""Runs and what a robot's stages leave in them, as arrays: read by stages, evaluation, report and viewers."""

@@ -1,0 +1,69 @@
+"""Digests of results: what a run computed, whatever the file encoders, clocks and folders around it."""
+
+import hashlib
+from pathlib import Path
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.recording import content_digest
+
+RESULT_SUFFIXES = (".mcap", ".ply", ".tum")
+TEAM_RESULTS = ("consensus.mcap", "exchange.mcap")
+ROBOT_RESULTS = (
+    "frontend.mcap",
+    "information.mcap",
+    "fused.mcap",
+    "fused.ply",
+    "refined.ply",
+    "trajectory.tum",
+    "odometry.tum",
+)
+
+
+def result_files(run: Path) -> list[Path]:
+    """Files of a run that its digest covers, relative to the run, sorted."""
+    found = [p for name in TEAM_RESULTS if (p := run / name).is_file()]
+    found += [p for p in (run / "robots").rglob("*") if p.suffix in RESULT_SUFFIXES]
+    return sorted(p.relative_to(run) for p in found)
+
+
+def digest_file(path: Path) -> str:
+    """64 hex characters: over the messages of a log, over the bytes of any other file."""
+    if path.suffix == ".mcap":
+        return content_digest(path)
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise DuagError(f"{path}: {error.strerror or error}, expected a result of a run") from error
+
+
+def digest(path: Path) -> str:
+    """64 hex characters of a log, a recording, a run, or one of its files.
+
+    Raises:
+        DuagError: the path is absent, or is neither a file, a recording nor a whole run.
+    """
+    if path.is_file():
+        return digest_file(path)
+    if (path / "recording.json").is_file():
+        names = sorted(p.relative_to(path) for p in path.glob("*.mcap"))
+    elif (path / "robots").is_dir():
+        names = result_files(path)
+        _check_complete(path)
+    else:
+        raise DuagError(f"{path}: expected a log, a recording (recording.json) or a run (robots/)")
+    whole = hashlib.sha256()
+    for name in names:
+        whole.update(f"{name.as_posix()} {digest_file(path / name)}\n".encode())
+    return whole.hexdigest()
+
+
+def _check_complete(run: Path) -> None:
+    """An unfinished or damaged run has no digest: it would equal nothing and say nothing."""
+    folders = sorted(p for p in (run / "robots").iterdir() if p.is_dir())
+    if not folders:
+        raise DuagError(f"{run}: found no folder robots/<robot>, expected a run")
+    wanted = [run / name for name in TEAM_RESULTS]
+    wanted += [folder / name for folder in folders for name in ROBOT_RESULTS]
+    for path in wanted:
+        if not path.is_file():
+            raise DuagError(f"{path}: not found, expected every result of a finished run")

@@ -1,0 +1,238 @@
+"""A finished run as arrays: what evaluation, report and viewer read. Nothing here opens ground truth."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.geometry.trajectory import Trajectory, read_tum
+from duagc.pipeline.messages import CorrectedKeyframes, GaussianInformation, GaussianMap, Keyframe, Odometry
+from duagc.pipeline.recording import read_log
+from duagc.pipeline.runs.digest import digest_file
+from duagc.schemas import topics
+
+SCHEMA = 1  # of manifest.json and metrics.json
+
+
+@dataclass(frozen=True)
+class RobotRun:
+    """What a run says about one robot; files are read when they are asked for, and once."""
+
+    robot: str
+    folder: Path
+    digests: Mapping[str, str] = field(default_factory=dict)
+    """Digest of every result file by its name, as the manifest has it; empty while the run is being made."""
+
+    @cached_property
+    def odometry(self) -> Trajectory:
+        """T_map_camera of all frames, before consensus, in the robot's own map frame."""
+        return self._trajectory("odometry.tum")
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """T_world_camera of all frames, after consensus, by the robot's own estimate."""
+        return self._trajectory("trajectory.tum")
+
+    @cached_property
+    def frames(self) -> list[Odometry]:
+        """Every frame of the log, in order, as the front end tracked it."""
+        return self._all("frontend.mcap", topics.ODOMETRY)
+
+    @cached_property
+    def held_out(self) -> frozenset[int]:
+        """Indices of the frames that the front end kept for evaluation."""
+        return frozenset(f.frame_index for f in self.frames if f.held_out)
+
+    @cached_property
+    def keyframes(self) -> list[Keyframe]:
+        """Every keyframe, in order of its index."""
+        return self._all("frontend.mcap", topics.KEYFRAME)
+
+    @cached_property
+    def own_map(self) -> GaussianMap:
+        """The robot's own map, in its own map frame, as it was at the end of its log."""
+        return self._last("frontend.mcap", topics.MAP)
+
+    @cached_property
+    def unrefined_map(self) -> GaussianMap | None:
+        """The own map before its final refinement; None if the front end wrote none."""
+        maps = self._all("frontend.mcap", topics.UNREFINED_MAP)
+        return maps[-1] if maps else None
+
+    @cached_property
+    def information(self) -> GaussianInformation:
+        """Fisher information of the own map."""
+        return self._last("information.mcap", topics.INFORMATION)
+
+    @cached_property
+    def fused_map(self) -> GaussianMap:
+        """The map after fusion, world frame, with the information of its Gaussians."""
+        return self._last("fused.mcap", topics.FUSED_MAP)
+
+    @cached_property
+    def refined_map(self) -> GaussianMap | None:
+        """The robot's final map: the fused one after training, world frame; None if it met nobody."""
+        maps = self._all("fused.mcap", topics.REFINED_MAP)
+        return maps[-1] if maps else None
+
+    @cached_property
+    def corrected(self) -> CorrectedKeyframes:
+        """Keyframe poses after consensus, and the component that the robot believes to be in."""
+        return self._last("fused.mcap", topics.CORRECTED_KEYFRAMES)
+
+    @property
+    def component(self) -> tuple[str, ...]:
+        """Names of the robots that share this robot's world frame, itself among them."""
+        return tuple(sorted({*self.corrected.component, self.robot}))
+
+    def _trajectory(self, file: str) -> Trajectory:
+        """A log has checksums of its own; of a text file only the manifest knows what was written."""
+        path = self.folder / file
+        trajectory = read_tum(path)
+        if file in self.digests and (found := digest_file(path)) != self.digests[file]:
+            raise DuagError(
+                f"{path}: has digest {found[:12]}, expected {self.digests[file][:12]} as in manifest.json"
+            )
+        return trajectory
+
+    def _all(self, file: str, topic: topics.Topic) -> list[Any]:
+        path = self.folder / file
+        if not path.is_file():
+            raise DuagError(f"{path}: not found; run the stages that write it first")
+        return [r.message() for r in read_log(path, topics=[topic.of(self.robot)])]
+
+    def _last(self, file: str, topic: topics.Topic) -> Any:
+        found = self._all(file, topic)
+        if not found:
+            raise DuagError(
+                f"{self.folder / file}: found no message on {topic.of(self.robot)}, expected at least one"
+            )
+        return found[-1]
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run: its robots in order of their names, its settings and timings."""
+
+    path: Path
+
+    @cached_property
+    def robots(self) -> dict[str, RobotRun]:
+        """Robots by name, in order of the names."""
+        folder = self.path / "robots"
+        names = sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
+        if not names:
+            raise DuagError(f"{self.path}: found no folder robots/<robot>, expected a run")
+        for name in self._json("manifest.json").get("inputs", {}):
+            if name not in names:
+                raise DuagError(
+                    f"{folder / name}: no such folder, expected the results that manifest.json names"
+                )
+        return {name: RobotRun(name, folder / name, self._digests(name)) for name in names}
+
+    @cached_property
+    def largest_component(self) -> tuple[str, ...]:
+        """The robots that agree to share one world, most robots first, then lowest names.
+
+        A robot counts as a member if its own belief about the component is the same as that of the others.
+        """
+        claims = [robot.component for robot in self.robots.values()]
+        members = {
+            claim: tuple(r for r in self.robots if self.robots[r].component == claim) for claim in claims
+        }
+        return min(members.values(), key=lambda names: (-len(names), names))
+
+    @property
+    def recording(self) -> Path:
+        """Where the manifest says that the recording of this run is.
+
+        Raises:
+            DuagError: this is not a finished run, or the recording is no longer there.
+        """
+        path = self.path / "manifest.json"
+        if not path.is_file():
+            raise DuagError(f"{path}: no such file, expected the manifest of a finished run")
+        named = self._json(path.name).get("recording")
+        if named is None:
+            raise DuagError(f"{path}: names no recording, expected the manifest of a finished run")
+        if not (self.path / named).is_dir():
+            raise DuagError(f"{path}: recording {named} not found; give --recording")
+        return (self.path / named).resolve()
+
+    @property
+    def config_file(self) -> Path:
+        """config.toml, checked against the manifest where there is one.
+
+        Raises:
+            DuagError: it is missing, or not what the run was made with.
+        """
+        path = self.path / "config.toml"
+        if not path.is_file():
+            raise DuagError(f"{path}: no such file, expected the configuration of the run")
+        told = self._json("manifest.json").get("config")
+        if told is not None and (found := digest_file(path)) != told:
+            raise DuagError(f"{path}: has digest {found[:12]}, expected {told[:12]} as in manifest.json")
+        return path
+
+    @property
+    def config_text(self) -> str:
+        """The resolved configuration as TOML."""
+        return self.config_file.read_text(encoding="utf-8")
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration, nested by section."""
+        try:
+            return tomllib.loads(self.config_text)
+        except tomllib.TOMLDecodeError as error:
+            raise DuagError(f"{self.path / 'config.toml'}: not valid TOML: {error}") from error
+
+    @property
+    def timing(self) -> dict[str, dict[str, Any]]:
+        """Stage -> {"robot", "wall_s", "cpu_s", "peak_rss_mb"}; empty if the run has no timing.json."""
+        return self._json("timing.json").get("stages", {})
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """metrics.json; empty if the run was not evaluated."""
+        return self._json("metrics.json")
+
+    def _digests(self, robot: str) -> dict[str, str]:
+        outputs = self._json("manifest.json").get("outputs", {})
+        start = f"robots/{robot}/"
+        return {name.removeprefix(start): d for name, d in outputs.items() if name.startswith(start)}
+
+    def _json(self, name: str) -> dict[str, Any]:
+        path = self.path / name
+        if not path.is_file():
+            return {}
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise DuagError(f"{path}: not valid JSON: {error}") from error
+        if not isinstance(content, dict):
+            raise DuagError(f"{path}: found a {type(content).__name__}, expected a JSON object")
+        if content.get("schema", SCHEMA) != SCHEMA:
+            raise DuagError(f"{path}: schema is {content['schema']}, expected {SCHEMA}")
+        return content
+
+
+def position_information(geometry: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Position block [n, 3, 3], 1/m^2, of geometry information [n, 45] (upper triangle of 9x9, row-major)."""
+    values = geometry.astype(np.float64)
+    row_1, row_2 = 9, 17  # places of the diagonal elements (1, 1) and (2, 2) in the upper triangle
+    F = np.empty((len(values), 3, 3))
+    F[:, 0, 0], F[:, 0, 1], F[:, 0, 2] = values[:, 0], values[:, 1], values[:, 2]
+    F[:, 1, 1], F[:, 1, 2] = values[:, row_1], values[:, row_1 + 1]
+    F[:, 2, 2] = values[:, row_2]
+    F[:, 1, 0], F[:, 2, 0], F[:, 2, 1] = F[:, 0, 1], F[:, 0, 2], F[:, 1, 2]
+    return F

@@ -1,0 +1,227 @@
+"""One robot: its own files and what its front end made of them, and what it takes home from a session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.messages import GaussianInformation, GaussianMap, Keyframe, KeyframeFactor
+from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.schemas import topics
+
+Array = NDArray[np.float64]
+
+
+class Images(NamedTuple):
+    """Images of a keyframe: RGB [h, w, 3], depth [h, w] (m, 0 = unknown), its sigma (m) where the log tells it."""
+
+    color: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    depth_sigma_m: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True)
+class AgentInput:
+    """The files of one robot."""
+
+    robot: str
+    log: Path
+    frontend: Path
+    information: Path
+
+
+@dataclass(frozen=True)
+class Step:
+    """A motion between two own keyframes: T_i_j [4, 4] and its information [6, 6] (right tangent)."""
+
+    i: int
+    j: int
+    T_i_j: Array
+    information: Array
+
+
+@dataclass(frozen=True)
+class RobotData:
+    """One robot's own results in memory.
+
+    T_map_keyframe: [n, 4, 4] by keyframe index. odometry: from the keyframe that each was tracked against, refined,
+    with its marginal information. registrations: the measurements behind it, independent of each other. images: gives
+    colour uint8 RGB [h, w, 3] and depth float32 [h, w] (m, 0 = unknown) of a keyframe. information: of the Gaussians,
+    in the map frame, by the same ids. depth: of a Gaussian at a pixel, as the map was made.
+    """
+
+    robot: str
+    camera: PinholeCamera
+    T_map_keyframe: Array
+    odometry: list[Step]
+    registrations: list[Step]
+    images: Callable[[int], Images]
+    gaussians: Gaussians
+    information: GaussianInformation
+    depth: DepthKind = "blended"
+
+    @property
+    def keyframes(self) -> int:
+        """Number of keyframes."""
+        return len(self.T_map_keyframe)
+
+
+@dataclass(frozen=True)
+class ClosureRecord:
+    """One candidate for a closure between two keyframes, and what became of it.
+
+    robot: the end that decided. score: matches of compact descriptors. T_own_peer: [4, 4] if it was measured,
+    with its information [6, 6] (right tangent, as measured, without floor). weight: robust weight at the end, 0 on a
+    link that was parted; None if it took no part in the pose consensus.
+    """
+
+    robot: str
+    peer: str
+    own_keyframe: int
+    peer_keyframe: int
+    score: int
+    verdict: str
+    matches: int
+    inliers: int
+    detail: str
+    weight: float | None
+    T_own_peer: Array | None
+    information: Array | None
+
+
+@dataclass(frozen=True)
+class AgentResult:
+    """One robot after a session, by its own estimate.
+
+    component: names of the robots that share its world frame, sorted; only itself if it met nobody.
+    T_world_keyframe: [n, 4, 4], own keyframes in the map frame of component[0]; exactly those of its own map if it is
+    alone. T_world_keyframe_of: the same of every member, itself included, as far as their agreed poses arrived.
+    own_evidence: as it was sent, sorted by id. evidence: of the other members with agreed poses, by name, as far as
+    it arrived. depth_of: of a Gaussian at a pixel, as their maps were made, by name.
+    pairs: ids of matched Gaussians, int64 [n, 2], by (lower, higher) name.
+    closures: every candidate that this robot decided on. agreed: its poses are final. converged: it also has
+    everything it should have; a robot that is alone has. rounds: ticks it took part in. rounds_to_agreement: None if
+    its poses were not agreed. refused: reasons of packets that could not be used, and how many.
+    """
+
+    robot: str
+    component: tuple[str, ...]
+    T_world_keyframe: Array
+    T_world_keyframe_of: dict[str, Array]
+    own_evidence: Evidence
+    evidence: dict[str, Evidence]
+    depth_of: dict[str, DepthKind]
+    pairs: dict[tuple[str, str], NDArray[np.int64]]
+    closures: tuple[ClosureRecord, ...]
+    agreed: bool
+    converged: bool
+    rounds: int
+    rounds_to_agreement: int | None
+    refused: dict[str, int]
+
+
+def steps_of(keyframes: Sequence[Keyframe]) -> list[Step]:
+    """Odometry of a robot, in order of its keyframes: each to the one that it was registered to."""
+    return [
+        Step(k.previous_index, k.keyframe_index, k.T_previous_keyframe, k.information)
+        for k in keyframes
+        if k.previous_index >= 0
+    ]
+
+
+def registrations_of(
+    frontend: Path, keyframes: Sequence[Keyframe], factors: Sequence[KeyframeFactor]
+) -> list[Step]:
+    """Registrations between a robot's keyframes as its refinement weighed them, in order of the log.
+
+    Args:
+        frontend: file that both come from, for the complaint. keyframes: in order of their index.
+    Raises:
+        DuagError: a keyframe that no registration ties to an earlier one, or a registration of none.
+    """
+    tied = {f.second_index for f in factors if 0 <= f.first_index < f.second_index}
+    expected = {k.keyframe_index for k in keyframes[1:]}
+    if tied != expected:
+        raise DuagError(
+            f"{frontend}: registrations tie keyframes {sorted(tied)} to earlier ones, expected {sorted(expected)}"
+        )
+    return [Step(f.first_index, f.second_index, f.T_first_second, f.weight * f.information) for f in factors]
+
+
+def factors_of(steps: Sequence[Step]) -> Factors:
+    """Steps as factors between keyframes, in the same order."""
+    return Factors(
+        np.array([s.i for s in steps], dtype=np.int64),
+        np.array([s.j for s in steps], dtype=np.int64),
+        np.array([s.T_i_j for s in steps], dtype=np.float64).reshape(-1, 4, 4),
+        np.array([s.information for s in steps], dtype=np.float64).reshape(-1, 6, 6),
+    )
+
+
+def load(source: AgentInput) -> RobotData:
+    """One robot's files in memory; its sensor log is opened again for every image that is asked for.
+
+    Raises:
+        DuagError: a file lacks what it should hold, or two files do not belong together.
+    """
+    from duagc.pipeline.recording import open_rgbd, read_log
+
+    robot = source.robot
+    wanted = (topics.KEYFRAME.of(robot), topics.MAP.of(robot), topics.KEYFRAME_FACTOR.of(robot))
+    keyframes: list[Keyframe] = []
+    factors: list[KeyframeFactor] = []
+    gaussian_map: GaussianMap | None = None
+    for record in read_log(source.frontend, wanted):
+        message = record.message()
+        if isinstance(message, Keyframe):
+            keyframes.append(message)
+        elif isinstance(message, KeyframeFactor):
+            factors.append(message)
+        else:
+            gaussian_map = message
+    if gaussian_map is None:
+        raise DuagError(f"{source.frontend}: {wanted[1]} not found, expected the final map")
+    if [k.keyframe_index for k in keyframes] != list(range(len(keyframes))):
+        raise DuagError(f"{source.frontend}: {wanted[0]} is not numbered 0, 1, 2, ...")
+    information: GaussianInformation | None = None
+    for record in read_log(source.information, (topics.INFORMATION.of(robot),)):
+        information = record.message()
+    if information is None:
+        raise DuagError(f"{source.information}: {topics.INFORMATION.of(robot)} not found")
+    if not np.array_equal(information.ids, gaussian_map.gaussians.ids):
+        raise DuagError(
+            f"{source.information}: is about other Gaussians than {source.frontend}, expected the same ids"
+        )
+    registrations = registrations_of(source.frontend, keyframes, factors)
+    poses = np.array([k.T_map_camera for k in keyframes], dtype=np.float64).reshape(-1, 4, 4)
+    with open_rgbd(source.log) as log:
+        camera = log.camera
+        if log.robot != robot:
+            raise DuagError(f"{source.log}: is the log of {log.robot}, expected that of {robot}")
+
+    def images(keyframe: int) -> Images:
+        with open_rgbd(source.log) as log:
+            frame = log.frame(keyframes[keyframe].frame_index)
+        return Images(frame.color, frame.usable_depth, frame.depth_sigma)
+
+    return RobotData(
+        robot,
+        camera,
+        poses,
+        steps_of(keyframes),
+        registrations,
+        images,
+        gaussian_map.gaussians,
+        information,
+        gaussian_map.depth,
+    )

@@ -1,0 +1,113 @@
+"""Adam on a structure of arrays: elementwise, per Gaussian, so its result depends on no thread and no order."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.config.training import LearningRates
+from duagc.pipeline.splat.gaussians import Gaussians
+
+Array = NDArray[np.float32]
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "means": (3,),
+    "quats_wxyz": (4,),
+    "log_scales": (3,),
+    "colors": (3,),
+    "opacity_logits": (),
+}
+BETA_1, BETA_2, EPSILON = 0.9, 0.99, 1e-12
+_LONGEST = 1024  # steps after which both bias corrections are 1 within float32
+
+
+class GaussianGradients(Protocol):
+    """Derivatives of a loss by every parameter of n Gaussians, shapes as in `Gaussians`."""
+
+    @property
+    def means(self) -> Array: ...
+    @property
+    def quats_wxyz(self) -> Array: ...
+    @property
+    def log_scales(self) -> Array: ...
+    @property
+    def colors(self) -> Array: ...
+    @property
+    def opacity_logits(self) -> Array: ...
+
+
+def falling(step: int, steps: int, last: float) -> float:
+    """Share of the learning rates at a step of `steps`: from 1 to `last`, level at both ends."""
+    done = step / max(steps - 1, 1)
+    return last + (1.0 - last) * (1.0 - done * done * (3.0 - 2.0 * done))
+
+
+class Adam:
+    """Adam whose moments and step counts belong to single Gaussians.
+
+    A Gaussian that a view does not touch keeps its parameters, moments and step count: a new one starts with its
+    own bias correction, and one outside the view does not drift on old momentum. `kernels.CompiledAdam` takes the
+    same steps, faster.
+    """
+
+    def __init__(self, n: int = 0) -> None:
+        self._first, self._second = _zeros(n), _zeros(n)
+        self._steps = np.zeros(n, np.int32)
+        # running products, not powers: the same on every machine
+        unbias_1 = 1.0 / (1.0 - np.cumprod(np.full(_LONGEST, BETA_1)))
+        unbias_2 = 1.0 / (1.0 - np.cumprod(np.full(_LONGEST, BETA_2)))
+        self._unbiased = (unbias_1 / np.sqrt(unbias_2)).astype(np.float32)
+        self._corrections = self._unbiased
+
+    def __len__(self) -> int:
+        return len(self._steps)
+
+    def freeze_after(self, steps: int | None) -> None:
+        """From now on Gaussians settle: their step lengths fall to a tenth over their first `steps` steps, and then
+        they stay as they are, and their moments too. None: they never settle.
+
+        Steps go on being counted.
+        """
+        self._corrections = self._unbiased.copy()
+        if steps is not None:
+            decay = np.cumprod(np.full(_LONGEST, 0.1 ** (1.0 / steps)))
+            self._corrections *= decay.astype(np.float32)
+            self._corrections[steps:] = 0.0
+
+    def select(self, index: NDArray) -> None:
+        """Keep the state of the Gaussians of a mask or an index array, in that order."""
+        self._first = {name: moments[index] for name, moments in self._first.items()}
+        self._second = {name: moments[index] for name, moments in self._second.items()}
+        self._steps = self._steps[index]
+
+    def extend(self, n: int) -> None:
+        """Add n Gaussians at the end that were never optimised."""
+        new = _zeros(n)
+        self._first = {name: np.concatenate([moments, new[name]]) for name, moments in self._first.items()}
+        self._second = {name: np.concatenate([moments, new[name]]) for name, moments in self._second.items()}
+        self._steps = np.concatenate([self._steps, np.zeros(n, np.int32)])
+
+    def step(self, gaussians: Gaussians, gradients: GaussianGradients, rates: LearningRates) -> Gaussians:
+        """The Gaussians after one step; those without any gradient of colour or opacity are untouched.
+
+        Source: Kingma and Ba, ICLR 2015, algorithm 1, with beta_2 = 0.99 (few steps per Gaussian).
+        """
+        touched = (gradients.opacity_logits != 0) | (gradients.colors != 0).any(axis=1)
+        rows = np.flatnonzero(touched)
+        self._steps[rows] = np.minimum(self._steps[rows] + 1, _LONGEST)
+        rows = rows[self._corrections[self._steps[rows] - 1] > 0]
+        correction = self._corrections[self._steps[rows] - 1]
+        values = {name: getattr(gaussians, name).copy() for name in _SHAPES}
+        for name, value in values.items():
+            g = getattr(gradients, name)[rows]
+            first = BETA_1 * self._first[name][rows] + (1 - BETA_1) * g
+            second = BETA_2 * self._second[name][rows] + (1 - BETA_2) * (g * g)
+            self._first[name][rows], self._second[name][rows] = first, second
+            change = first / (np.sqrt(second) + EPSILON) * np.float32(getattr(rates, name))
+            value[rows] -= change * correction.reshape(-1, *[1] * (g.ndim - 1))
+        return gaussians.replace(**values)
+
+
+def _zeros(n: int) -> dict[str, Array]:
+    return {name: np.zeros((n, *tail), np.float32) for name, tail in _SHAPES.items()}

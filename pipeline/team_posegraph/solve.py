@@ -1,0 +1,302 @@
+"""`duagc posegraph`: let a team solve its graph, and compare with the graph solved in one place.
+
+The centralised optimum is computed here, for the comparison; no agent sees it, nor another robot's factors.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.config.posegraph import PoseGraphConfig
+from duagc.pipeline.network.packets import HEADER_BYTES, MAX_PAYLOAD_BYTES
+from duagc.pipeline.posegraph import factors as pose_factors
+from duagc.pipeline.posegraph.central import CentralSolution, Team, solve_central, team_graph
+from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph.files import TeamGraph, read_team
+from duagc.pipeline.posegraph.initialization import chordal
+from duagc.pipeline.posegraph.robust import COUNTS
+from duagc.pipeline.team_posegraph.agent import GraphAgent
+from duagc.pipeline.team_posegraph.elimination import EliminationAgent
+from duagc.pipeline.team_posegraph.network import Traffic, meet
+
+Array = NDArray[np.float64]
+GAPS = {"1e-2": 1e-2, "1e-4": 1e-4, "1e-6": 1e-6}
+RAW_FACTOR_BYTES = 40  # two keys, rotation vector, translation, kappa, tau
+_TRUNCATIONS = 30
+
+
+@dataclass
+class _Component:
+    """One group of connected robots: its whole graph in one place, and what was seen of its agents.
+
+    factors: odometry and loops by robot, then closures by pair. trusted: bool per factor. true: bool per factor that
+    is in doubt, what the reference says.
+    """
+
+    robots: tuple[str, ...]
+    team: Team
+    trusted: NDArray[np.bool_]
+    true: NDArray[np.bool_] | None
+    closures: int
+    optimum: CentralSolution | None = None
+    trace: list[tuple[int, float, int]] = field(default_factory=list)  # round, cost, bytes by these robots
+    setup: tuple[int, int] = (0, 0)  # last round before all of them iterated, bytes until then
+
+    def cost(self, T: Array, c2: float | None) -> float:
+        """Sum of |r|^2, truncated at c2 for what is not trusted."""
+        squared = pose_factors.squared_residuals(self.team.factors, T)
+        if c2 is not None:
+            squared = np.where(self.trusted, squared, np.minimum(squared, c2))
+        return float(squared.sum())
+
+
+def solve(
+    path: Path, config: PoseGraphConfig, robots: int | None = None, *, only_reference: bool = False
+) -> dict[str, Any]:
+    """Read, cut, let the team meet, compare; see `docs/posegraph.md` for the result."""
+    graph = read_team(path, robots, only_reference=only_reference)
+    c2 = config.consensus.truncation**2 if config.consensus.robust else None
+    components = [_component(graph, members, config) for members in graph.components()]
+    if c2 is None:
+        for component in components:
+            component.optimum = _central(component)
+    began = time.perf_counter()
+    agents, traffic, rounds = meet(graph, config, lambda k, a, t: _watch(components, k, a, t, c2))
+    seconds = time.perf_counter() - began
+    results = [_result(component, agents, config, c2) for component in components]
+    return _summary(graph, path, config, results, agents, traffic, rounds, seconds)
+
+
+# --- the graph in one place
+
+
+def _component(graph: TeamGraph, members: tuple[str, ...], config: PoseGraphConfig) -> _Component:
+    robots = [graph.robots[name] for name in members]
+    own = {r.name: Factors.concatenate([r.odometry, r.loops]) for r in robots}
+    pairs = [pair for pair in graph.pairs if pair[0] in members]
+    closures = [(a, b, graph.robots[a].closures[b]) for a, b in pairs]
+    starts = {r.name: np.tile(np.eye(4), (r.keyframes, 1, 1)) for r in robots}
+    team = team_graph(starts, own, closures, config.consensus.closures)
+    between = sum(len(held) for _, _, held in closures)
+    trusted = [np.arange(len(r.odometry) + len(r.loops)) < len(r.odometry) for r in robots]
+    true = None
+    if graph.loops_true is not None and graph.closures_true is not None:
+        true = np.concatenate(
+            [*(graph.loops_true[name] for name in members), *(graph.closures_true[pair] for pair in pairs)]
+        )
+    return _Component(members, team, np.concatenate([*trusted, np.zeros(between, bool)]), true, between)
+
+
+def _central(component: _Component) -> CentralSolution:
+    """The optimum from a chordal start of the whole graph."""
+    n = len(component.team.T_start)
+    start = chordal(component.team.factors, n) if n > 1 else component.team.T_start
+    return solve_central(component.team.factors, start)
+
+
+def _truncated(component: _Component, T: Array, kept: NDArray[np.bool_], c2: float) -> CentralSolution:
+    """Truncated least squares in one place, from poses and a selection [doubtful]: solve, select, until it stays."""
+    weights = component.trusted.astype(np.float64)
+    best = None
+    for _ in range(_TRUNCATIONS):
+        weights[~component.trusted] = kept
+        found = solve_central(component.team.factors, T, weights)
+        T = found.poses
+        cost = component.cost(T, c2)
+        if best is None or cost < best.cost:
+            best = CentralSolution(T, cost, found.iterations, found.converged)
+        again = pose_factors.squared_residuals(component.team.factors, T)[~component.trusted] <= c2
+        if np.array_equal(again, kept):
+            break
+        kept = again
+    assert best is not None
+    return best
+
+
+# --- what is seen of the agents
+
+
+def _watch(
+    components: list[_Component], k: int, agents: dict[str, GraphAgent], traffic: Traffic, c2: float | None
+) -> None:
+    """After round k: costs of all components that are past their set-up."""
+    for component in components:
+        members = [agents[name] for name in component.robots]
+        sent = sum(traffic.sent[name] for name in component.robots)
+        if any(agent.first_round is None for agent in members):
+            component.setup = (k, sent)
+            continue
+        T = np.concatenate([agent.T_world_keyframe for agent in members])
+        component.trace.append((k, component.cost(T, c2), sent))
+
+
+def _result(
+    component: _Component, agents: dict[str, GraphAgent], config: PoseGraphConfig, c2: float | None
+) -> dict[str, Any]:
+    """What one component reached."""
+    members = [agents[name] for name in component.robots]
+    T = np.concatenate([agent.T_world_keyframe for agent in members])
+    kept = _kept(component, agents)
+    optimum = component.optimum or _truncated(component, T, kept, c2 or np.inf)
+    cost = component.cost(T, c2)
+    squared = pose_factors.squared_residuals(component.team.factors, T)
+    counted = component.trusted.copy()
+    counted[~component.trusted] = kept
+    first, bytes_before = component.setup
+    reached: dict[str, tuple[int, int] | None] = {}
+    for name, gap in GAPS.items():
+        hit = next((t for t in component.trace if t[1] <= optimum.cost * (1 + gap)), None)
+        reached[name] = (hit[0] - first, hit[2]) if hit else None
+    exchanges = max((a.exchange for a in members if isinstance(a, EliminationAgent)), default=None)
+    return {
+        "robots": list(component.robots),
+        "keyframes": len(T),
+        "factors": len(component.team.factors),
+        "closures": component.closures,
+        "cost": cost,
+        "inlier_cost": float(squared[counted].sum()),
+        "optimum": optimum.cost,
+        "gap": cost / optimum.cost - 1 if optimum.cost > 0 else None,
+        "distance_rms_m": _distance(T, optimum.poses),
+        "rounds": component.trace[-1][0] - first if component.trace else 0,
+        "rounds_setup": first,
+        "bytes": component.trace[-1][2] if component.trace else bytes_before,
+        "bytes_setup": bytes_before,
+        "exchanges": exchanges,
+        "rounds_to": {name: hit and hit[0] for name, hit in reached.items()},
+        "bytes_to": {name: hit and hit[1] for name, hit in reached.items()},
+        "bytes_raw_alternative": _raw_bytes(members),
+        "converged": all(agent.settled for agent in members),
+        "kept": int(kept.sum()),
+        "reference": None if component.true is None else _against_reference(component, kept, T, c2),
+    }
+
+
+def _kept(component: _Component, agents: dict[str, GraphAgent]) -> NDArray[np.bool_]:
+    """Which doubtful factors count, in the order of the team's graph; closures that nobody holds yet do not."""
+    members = [agents[name] for name in component.robots]
+    pairs = [
+        (agent.graph.name, n.name, len(n.closures)) for agent in members for n in agent.neighbours.values()
+    ]
+    held = {(a, b): np.zeros(count) for a, b, count in pairs if a < b}
+    loops = []
+    for name in component.robots:
+        weights, by_peer = agents[name].kept()
+        loops.append(weights)
+        held.update({(min(name, peer), max(name, peer)): w for peer, w in by_peer.items()})
+    return np.concatenate([*loops, *(held[pair] for pair in sorted(held))]) >= COUNTS
+
+
+def _against_reference(
+    component: _Component, kept: NDArray[np.bool_], T: Array, c2: float | None
+) -> dict[str, Any]:
+    """Precision and recall of loops and closures together, and of closures between robots alone."""
+    assert component.true is not None
+    true = component.true
+
+    def ratio(part: slice) -> dict[str, Any]:
+        both = int((kept[part] & true[part]).sum())
+        found, named = int(kept[part].sum()), int(true[part].sum())
+        return {
+            "true": named,
+            "kept": found,
+            "precision": both / found if found else None,
+            "recall": both / named if named else None,
+        }
+
+    result = ratio(slice(None)) | {"between_robots": ratio(slice(len(true) - component.closures, None))}
+    if c2 is not None:
+        weights = component.trusted.astype(np.float64)
+        weights[~component.trusted] = true
+        solved = solve_central(component.team.factors, T, weights)
+        result["cost_of_reference"] = component.cost(solved.poses, c2)
+    return result
+
+
+def _distance(T: Array, T_optimum: Array) -> float:
+    """Root mean square distance (m) of the keyframes from the optimum, after the best rigid alignment."""
+    p, q = T[:, :3, 3], T_optimum[:, :3, 3]
+    a, b = p - p.mean(axis=0), q - q.mean(axis=0)
+    U, _, Vt = np.linalg.svd(b.T @ a)
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return float(np.sqrt(((b - a @ R.T) ** 2).sum(axis=1).mean()))
+
+
+def _raw_bytes(members: list[GraphAgent]) -> int:
+    """What it takes to send every robot's graph once to every other robot, each closure from one end."""
+    total = 0
+    for agent in members:
+        closures = sum(len(n.closures) for n in agent.neighbours.values() if agent.own < n.index)
+        share = RAW_FACTOR_BYTES * (len(agent.own_factors()) + closures)
+        total += share + HEADER_BYTES * -(-share // MAX_PAYLOAD_BYTES)
+    return total * (len(members) - 1)
+
+
+# --- the result
+
+
+def _summary(
+    graph: TeamGraph,
+    path: Path,
+    config: PoseGraphConfig,
+    components: list[dict[str, Any]],
+    agents: dict[str, GraphAgent],
+    traffic: Traffic,
+    rounds: int,
+    seconds: float,
+) -> dict[str, Any]:
+    """The whole team: sums over the components, and the slowest of them."""
+
+    def total(name: str) -> Any:
+        return sum(c[name] for c in components)
+
+    def last(name: str, gap: str) -> int | None:
+        values = [c[name][gap] for c in components]
+        return None if None in values else max(values)
+
+    together = [c for c in components if len(c["robots"]) > 1]
+    optimum = total("optimum")
+    return {
+        "path": str(path),
+        "robots": len(graph.robots),
+        "solver": config.solver,
+        "robust": "gnc" if config.consensus.robust else "none",
+        "loss": config.loss_probability,
+        "seed": config.seed,
+        "keyframes": total("keyframes"),
+        "factors": total("factors"),
+        "closures": total("closures"),
+        "cost": total("cost"),
+        "inlier_cost": total("inlier_cost"),
+        "optimum": optimum,
+        "gap": total("cost") / optimum - 1 if optimum > 0 else None,
+        "rounds": max((c["rounds"] for c in components), default=0),
+        "rounds_setup": max((c["rounds_setup"] for c in components), default=0),
+        "bytes": traffic.bytes,
+        "bytes_setup": total("bytes_setup"),
+        "packets": traffic.packets,
+        "packets_lost": traffic.lost,
+        "rounds_to": {gap: last("rounds_to", gap) if together else 0 for gap in GAPS},
+        "bytes_to": {
+            gap: last("bytes_to", gap) if len(together) == 1 else _sum(together, gap) for gap in GAPS
+        },
+        "bytes_raw_alternative": total("bytes_raw_alternative"),
+        "converged": all(agent.settled for agent in agents.values()),
+        "packets_refused": sum(len(agent.refused) for agent in agents.values()),
+        "seconds": round(seconds, 3),
+        "robot_ms_per_round": round(1e3 * seconds / (rounds * len(agents)), 3),
+        "reference": graph.reference,
+        "ignored_files": list(graph.ignored),
+        "components": components,
+    }
+
+
+def _sum(components: list[dict[str, Any]], gap: str) -> int | None:
+    values = [c["bytes_to"][gap] for c in components]
+    return None if None in values else sum(values)
