@@ -99,7 +99,7 @@ def check_camera(camera: PinholeCamera, where: str) -> None:
     sides, focals = (camera.width, camera.height), (camera.fx, camera.fy)
     sound = all(1 <= side <= MAX_SIDE_PX for side in sides)
     sound = sound and all(0 < focal < MAX_FOCAL_PX for focal in focals)
-    sound = sound and all(abs(centre) < MAX_FOCAL_PX for centre in (camera.cx, camera.cy))
+    sound = sound and all(abs(center) < MAX_FOCAL_PX for center in (camera.cx, camera.cy))
     if not sound:
         raise DuagError(
             f"{where}: camera {camera}, expected sides up to {MAX_SIDE_PX} px and sound intrinsics"
@@ -124,8 +124,8 @@ class RobotWriter:
         """Args:
         folder: `RecordingWriter.folder`.
         name: of the robot: lower-case letters, digits, underscores.
-        camera: of colour and depth alike.
-        depth_scale: metres per unit of the depth images.
+        camera: of color and depth alike.
+        depth_scale: meters per unit of the depth images.
         sensors: what is known about the sensors, for example {"depth_noise": "none"}; kept in the log's metadata.
         """
         if not re.fullmatch(topics.ROBOT_NAME, name):
@@ -165,20 +165,20 @@ class RobotWriter:
 
         Args:
             stamp_ns: time of the recording, increasing.
-            color: the encoded colour image as it is; color_format: "jpeg" or "png".
-            depth: uint16 [H, W] in units of depth_scale along z, registered to colour, 0 = none. None: the depth is
+            color: the encoded color image as it is; color_format: "jpeg" or "png".
+            depth: uint16 [H, W] in units of depth_scale along z, registered to color, 0 = none. None: the depth is
                 that of another camera or a LiDAR.
-            T_world_camera: true pose [4, 4] of the colour camera in the world that all robots share, where known.
+            T_world_camera: true pose [4, 4] of the color camera in the world that all robots share, where known.
             exact_depth: like depth, without noise, where that differs and is known.
             mask: bool [H, W], False where a pixel must not be used (a moving object); None = all may.
-            depth_sigma_m: [H, W], standard deviation of the depth in metres, where it is known pixel by pixel: then
+            depth_sigma_m: [H, W], standard deviation of the depth in meters, where it is known pixel by pixel: then
                 with every frame. It is kept to 3 %, and from 0.1 mm to 6.5 m.
         """
         for image in (depth, mask, depth_sigma_m):
             if image is not None:
                 self._check_size(image)
         if color_format not in ("jpeg", "png"):
-            raise ValueError(f"colour format {color_format!r}, expected 'jpeg' or 'png'")
+            raise ValueError(f"color format {color_format!r}, expected 'jpeg' or 'png'")
         if self._stamps and stamp_ns <= self._stamps[-1]:
             raise ValueError(f"frame at {stamp_ns} ns comes after one at {self._stamps[-1]} ns")
         name = self.name
@@ -235,14 +235,14 @@ class RobotWriter:
     def set_depth_camera(
         self, camera: PinholeCamera, T_camera_depth: NDArray[np.float64], depth_scale: float
     ) -> None:
-        """Announce a depth camera of its own: intrinsics, T_camera_depth [4, 4], metres per unit of its images."""
+        """Announce a depth camera of its own: intrinsics, T_camera_depth [4, 4], meters per unit of its images."""
         self._depth_camera = camera
         self._sensors[topics.RAW_DEPTH_TRANSFORM.of(self.name)] = T_camera_depth
         text = {DEPTH_SCALE_KEY: repr(float(depth_scale))}
         self._log.channel(topics.RAW_DEPTH.of(self.name), topics.RAW_DEPTH.schema, text)
 
     def add_depth(self, stamp_ns: int, depth: NDArray[np.uint16]) -> None:
-        """Append an image of the depth camera, uint16 [h, w] along its z, 0 = none; not registered to colour."""
+        """Append an image of the depth camera, uint16 [h, w] along its z, 0 = none; not registered to color."""
         if depth.shape != (self._depth_camera.height, self._depth_camera.width):
             raise ValueError(f"an image is {depth.shape}, expected that of {self._depth_camera}")
         if self._announce(topics.RAW_DEPTH_TRANSFORM, stamp_ns, "depth_camera"):
@@ -259,7 +259,7 @@ class RobotWriter:
         self._log.channel(topics.LIDAR.of(self.name), topics.LIDAR.schema, text)
 
     def add_points(self, stamp_ns: int, points_lidar: NDArray[np.floating]) -> None:
-        """Append a sweep of the LiDAR: points [n, 3], metres, all as of the one time."""
+        """Append a sweep of the LiDAR: points [n, 3], meters, all as of the one time."""
         self._announce(topics.LIDAR_TRANSFORM, stamp_ns, "lidar")
         points = messages.pack_points(stamp_ns, f"{self.name}/lidar", points_lidar)
         self._log.write(topics.LIDAR.of(self.name), points, stamp_ns)
@@ -307,9 +307,9 @@ class RobotWriter:
     ) -> None:
         self._files.__exit__(kind, error, trace)
         if kind is None:
-            self.summary = self._summarise()
+            self.summary = self._summarize()
 
-    def _summarise(self) -> dict[str, Any]:
+    def _summarize(self) -> dict[str, Any]:
         if not self._stamps:
             raise DuagError(f"robot {self.name}: found no frame, expected at least one")
         gaps = np.diff(self._stamps) if len(self._stamps) > 1 else np.zeros(1, np.int64)

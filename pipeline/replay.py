@@ -1,6 +1,6 @@
 """Recompute a robot from its own log and the packets it received, and compare with what the run recorded.
 
-This is the proof of decentralisation: nothing of the other robots' logs, maps or memory is read.
+This is the proof of decentralization: nothing of the other robots' logs, maps or memory is read.
 """
 
 import shutil

@@ -65,7 +65,7 @@ def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, thread
     from duagc.pipeline.information.stage import run_information
     from duagc.pipeline.recording import open_rgbd
 
-    determinism.settle_opencv()
+    determinism.configure_opencv()
     with open_rgbd(log) as camera:
         if camera.robot != robot:
             raise DuagError(f"{log}: is the log of {camera.robot}, expected that of {robot}")
@@ -143,8 +143,8 @@ def run(
             say(f"fusion: {robot}")
             with timing.stage("fusion", robot):
                 left_out = fuse_robot(robot, logs[robot], robots[robot], result, config)
-            for neighbour, reason in left_out.items():
-                say(f"warning: {robot} uses nothing of {neighbour}'s map: {reason}")
+            for neighbor, reason in left_out.items():
+                say(f"warning: {robot} uses nothing of {neighbor}'s map: {reason}")
         _write_json(folder / "manifest.json", _manifest(recording, folder, config))
         _write_json(folder / "timing.json", {"stages": timing.stages})
         say("evaluation")
@@ -158,7 +158,7 @@ def _exchange(
 ) -> dict[str, AgentResult]:
     from duagc.pipeline.exchange.session import run_session
 
-    determinism.settle_opencv()
+    determinism.configure_opencv()
     inputs = [agent_input(robot, log, folder / "robots" / robot) for robot, log in logs.items()]
     with timing.stage("exchange"):
         return run_session(
@@ -179,11 +179,11 @@ def fuse_robot(robot: str, log: Path, folder: Path, result: AgentResult, config:
     """Fused map and corrected trajectory of one robot, into the folder of its own results; one robot at a time.
 
     Returns:
-        Neighbours of whose maps nothing is used, and why.
+        Neighbors of whose maps nothing is used, and why.
     """
     from duagc.pipeline.fusion.stage import run_fusion
 
-    doubts = run_fusion(
+    reports = run_fusion(
         agent_input(robot, log, folder),
         result,
         folder,
@@ -194,7 +194,7 @@ def fuse_robot(robot: str, log: Path, folder: Path, result: AgentResult, config:
         seed=config.seed,
         threads=threads_per_worker(1),
     )
-    return {doubt.neighbour: doubt.reason for doubt in doubts if not doubt.trusted}
+    return {report.peer: report.reason for report in reports if not report.trusted}
 
 
 def _evaluate(folder: Path, recording: Path, timing: Timing) -> None:

@@ -18,7 +18,7 @@ FOXGLOVE = "foxglove"
 
 
 def _pool_of(descriptor_set: bytes) -> descriptor_pool.DescriptorPool:
-    """A pool of its own with every file of a serialised FileDescriptorSet, whatever their order in it."""
+    """A pool of its own with every file of a serialized FileDescriptorSet, whatever their order in it."""
     pool = descriptor_pool.DescriptorPool()
     files = {f.name: f for f in descriptor_pb2.FileDescriptorSet.FromString(descriptor_set).file}
     done: set[str] = set()
@@ -60,7 +60,7 @@ def message_class(schema: str) -> type[Message]:
 
 
 def message_class_from(schema: str, descriptor_set: bytes) -> type[Message]:
-    """The class of a schema described by a serialised FileDescriptorSet, as a log carries it."""
+    """The class of a schema described by a serialized FileDescriptorSet, as a log carries it."""
     return message_factory.GetMessageClass(_pool_of(descriptor_set).FindMessageTypeByName(schema))
 
 
@@ -71,7 +71,7 @@ def new(schema: str, **fields: Any) -> Any:
 
 @cache
 def descriptor_set(schema: str) -> bytes:
-    """Serialised FileDescriptorSet of a schema's file and all it imports, imports first; the same bytes always."""
+    """Serialized FileDescriptorSet of a schema's file and all it imports, imports first; the same bytes always."""
     out = descriptor_pb2.FileDescriptorSet()
     seen: set[str] = set()
 

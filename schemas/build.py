@@ -13,7 +13,7 @@ PACKAGE_FOLDER = "duagc/v1"
 
 
 def compile_descriptors() -> bytes:
-    """Serialised FileDescriptorSet of all .proto files in this folder and what they import, without comments."""
+    """Serialized FileDescriptorSet of all .proto files in this folder and what they import, without comments."""
     import grpc_tools
     from grpc_tools import protoc
 

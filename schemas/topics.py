@@ -34,14 +34,14 @@ COLOR = Topic(
     "foxglove.CompressedImage",
     "converters",
     Scope.SENSOR,
-    "colour image, JPEG or PNG as the source had it",
+    "color image, JPEG or PNG as the source had it",
 )
 DEPTH = Topic(
     "/<robot>/camera/depth",
     "foxglove.RawImage",
     "converters",
     Scope.SENSOR,
-    "16UC1 depth along z, registered to colour, 0 = none; channel metadata depth_scale = metres per unit",
+    "16UC1 depth along z, registered to color, 0 = none; channel metadata depth_scale = meters per unit",
 )
 DEPTH_SIGMA = Topic(
     "/<robot>/camera/depth_sigma",
@@ -55,14 +55,14 @@ MASK = Topic(
     "foxglove.RawImage",
     "converters",
     Scope.SENSOR,
-    "8UC1, pixels of the colour image that may be used: 255 = yes, 0 = no, for example a moving object",
+    "8UC1, pixels of the color image that may be used: 255 = yes, 0 = no, for example a moving object",
 )
 CALIBRATION = Topic(
     "/<robot>/camera/calibration",
     "foxglove.CameraCalibration",
     "converters",
     Scope.SENSOR,
-    "pinhole intrinsics of the colour camera",
+    "pinhole intrinsics of the color camera",
 )
 RAW_DEPTH = Topic(
     "/<robot>/depth_camera/depth",
@@ -83,28 +83,28 @@ RAW_DEPTH_TRANSFORM = Topic(
     "foxglove.FrameTransform",
     "converters",
     Scope.SENSOR,
-    "pose of the depth camera in the colour camera, constant",
+    "pose of the depth camera in the color camera, constant",
 )
 LIDAR = Topic(
     "/<robot>/lidar/points",
     "foxglove.PointCloud",
     "converters",
     Scope.SENSOR,
-    "points of one sweep, x y z in metres, read where there is no depth image; channel metadata range_sigma = metres",
+    "points of one sweep, x y z in meters, read where there is no depth image; channel metadata range_sigma = meters",
 )
 LIDAR_TRANSFORM = Topic(
     "/<robot>/lidar/transform",
     "foxglove.FrameTransform",
     "converters",
     Scope.SENSOR,
-    "pose of the LiDAR in the colour camera, constant",
+    "pose of the LiDAR in the color camera, constant",
 )
 ODOMETRY_PRIOR = Topic(
     "/<robot>/odometry_prior",
     "foxglove.PoseInFrame",
     "converters",
     Scope.SENSOR,
-    "pose of the colour camera by another odometry (wheels, legs), in a frame of its own",
+    "pose of the color camera by another odometry (wheels, legs), in a frame of its own",
 )
 IMU = Topic("/<robot>/imu", "duagc.v1.Imu", "converters", Scope.SENSOR, "rates and accelerations of an IMU")
 IMU_TRANSFORM = Topic(
@@ -112,14 +112,14 @@ IMU_TRANSFORM = Topic(
     "foxglove.FrameTransform",
     "converters",
     Scope.SENSOR,
-    "pose of the IMU in the colour camera, constant",
+    "pose of the IMU in the color camera, constant",
 )
 GROUNDTRUTH_POSE = Topic(
     "/<robot>/groundtruth/pose",
     "foxglove.PoseInFrame",
     "converters",
     Scope.TRUTH,
-    "pose of the colour camera in the common world frame",
+    "pose of the color camera in the common world frame",
 )
 GROUNDTRUTH_DEPTH = Topic(
     "/<robot>/groundtruth/depth",
@@ -170,19 +170,19 @@ CORRECTED_KEYFRAMES = Topic(
     Scope.ROBOT,
     "keyframe poses after consensus",
 )
-NEIGHBOUR_DOUBT = Topic(
-    "/<robot>/neighbour_doubt",
-    "duagc.v1.NeighbourDoubt",
+PEER_MAP_REPORT = Topic(
+    "/<robot>/peer_map_report",
+    "duagc.v1.PeerMapReport",
     "fusion",
     Scope.ROBOT,
-    "what own images say against a neighbour's map, and whether it is used",
+    "check of a peer's map against own images, and whether it is used",
 )
 PEER_COLORS = Topic(
     "/<robot>/peer_colors",
     "duagc.v1.PeerColors",
     "fusion",
     Scope.ROBOT,
-    "how every neighbour's camera sees colours beside its own",
+    "colors of every peer's camera relative to its own",
 )
 PEER_MESSAGE = Topic(
     "/<robot>/peer/message",
@@ -215,12 +215,12 @@ CONSENSUS_ROUND = Topic(
     Scope.TEAM,
     "one round of the pose consensus",
 )
-CLOSURE_DECISION = Topic(
-    "/<robot>/consensus/closure",
-    "duagc.v1.ClosureDecision",
+LOOP_CLOSURE_DECISION = Topic(
+    "/<robot>/consensus/loop_closure",
+    "duagc.v1.LoopClosureDecision",
     "exchange",
     Scope.TEAM,
-    "every candidate for a closure and what became of it",
+    "every candidate for a loop closure and what became of it",
 )
 
 TOPICS: tuple[Topic, ...] = (
@@ -249,14 +249,14 @@ TOPICS: tuple[Topic, ...] = (
     FUSED_MAP,
     REFINED_MAP,
     CORRECTED_KEYFRAMES,
-    NEIGHBOUR_DOUBT,
+    PEER_MAP_REPORT,
     PEER_COLORS,
     PEER_MESSAGE,
     PEER_PACKET,
     EXCHANGE_SUMMARY,
     AGENT_ROUND,
     CONSENSUS_ROUND,
-    CLOSURE_DECISION,
+    LOOP_CLOSURE_DECISION,
 )
 
 ROBOT_NAME = r"[a-z][a-z0-9_]*"

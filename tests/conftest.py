@@ -2,4 +2,4 @@
 
 from duagc.pipeline.base import determinism
 
-determinism.settle()
+determinism.configure_determinism()

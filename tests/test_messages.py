@@ -60,7 +60,7 @@ def all_messages(seed: int, n: int) -> list[Any]:
     rng = np.random.default_rng(seed)
     stamp = int(rng.integers(2**62))
     k = n % 5
-    status = ("ok", "lost", "relocalised")[seed % 3]
+    status = ("ok", "lost", "relocalized")[seed % 3]
     T = np.array([pose(rng) for _ in range(k)]).reshape(k, 4, 4)
     component = ["alpha", "bravo"]
     return [

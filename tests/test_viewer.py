@@ -50,7 +50,7 @@ def test_ground_truth_and_results_open_in_rerun_as_they_are(fake):
     assert frontend["/alpha/odometry"]["duagc.v1.Odometry:message"] == FRAMES
 
 
-def test_a_recording_becomes_a_file_with_depth_in_metres(fake, tmp_path):
+def test_a_recording_becomes_a_file_with_depth_in_meters(fake, tmp_path):
     rerun_view.view(fake.recording, save=tmp_path / "recording.rrd")
     found = of_rrd(tmp_path / "recording.rrd")
     for robot in ("alpha", "bravo"):
@@ -68,8 +68,8 @@ def test_a_run_becomes_a_file_with_everything_in_it(fake, tmp_path):
     for robot in ("alpha", "bravo"):
         for path in ("before_consensus", "after_consensus", "ground_truth"):
             assert found[f"/world/paths/{robot}/{path}"]["LineStrips3D:strips"] == 1
-        for colouring in ("fused", "uncertainty"):
-            assert found[f"/world/maps/{robot}/{colouring}"]["GaussianSplats3D:centers"] == 1
+        for coloring in ("fused", "uncertainty"):
+            assert found[f"/world/maps/{robot}/{coloring}"]["GaussianSplats3D:centers"] == 1
         camera = found[f"/world/cameras/{robot}"]
         assert camera["Pinhole:image_from_camera"] == 1
         assert camera["Transform3D:translation"] == len(KEYFRAMES)

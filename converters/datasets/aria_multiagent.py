@@ -1,6 +1,6 @@
 """AriaMultiagent (MAGiC-SLAM): clips of Aria Digital Twin, three robots in one apartment, rendered depth.
 
-SRC is a room, for example `AriaMultiagent/room0`, with folders `agent_0`, `agent_1`, `agent_2`. Colour is real, with a
+SRC is a room, for example `AriaMultiagent/room0`, with folders `agent_0`, `agent_1`, `agent_2`. Color is real, with a
 rolling shutter; depth is rendered from the scene's model, without moving things, and beyond 10 m its 16 bits have
 wrapped round. The clips were not taken at the same time.
 """

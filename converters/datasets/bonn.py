@@ -39,7 +39,7 @@ class Options(tum_layout.AssociationOptions):
     """Lens and association."""
 
     undistort: bool = True
-    """Take the lens distortion out of colour and depth together."""
+    """Take the lens distortion out of color and depth together."""
 
 
 def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **options: Any) -> None:
@@ -60,7 +60,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         CAMERA,
         DEPTH_SCALE,
         distortion=DISTORTION if settings.undistort else (),
-        sensors={"moving_objects": "in colour and depth; no masks"},
+        sensors={"moving_objects": "in color and depth; no masks"},
     )
     parameters = {"robots": robots, **settings.model_dump()}
     image_folder.write(out, "bonn", src, clip.cut(robots, src), parameters, warnings, force)

@@ -1,7 +1,7 @@
 """ICL-NUIM: rendered living room and office, exact depth and poses.
 
 SRC is a sequence in the TUM-compatible form, for example `living_room_traj0_frei_png`: `associations.txt` (number and
-file of depth, then of colour) and `*.gt.freiburg`. The poses are of a world with y up while the images are top-down:
+file of depth, then of color) and `*.gt.freiburg`. The poses are of a world with y up while the images are top-down:
 both are reflected at the xz plane, T' = S T S with S = diag(1, -1, 1, 1).
 """
 
@@ -64,19 +64,19 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
 
 
 def _read_associations(path: Path) -> dict[int, tuple[Path, Path]]:
-    """Number of the colour image -> files of depth and colour."""
+    """Number of the color image -> files of depth and color."""
     images = {}
-    for number, line in enumerate(read_text(path, "number and file, of depth and colour").splitlines(), 1):
+    for number, line in enumerate(read_text(path, "number and file, of depth and color").splitlines(), 1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
         if len(words) != 4 or not words[2].isdecimal():
             raise DuagError(
-                f"{path}:{number}: {line.strip()[:60]!r}, expected number and file of depth, then of colour"
+                f"{path}:{number}: {line.strip()[:60]!r}, expected number and file of depth, then of color"
             )
         images[int(words[2])] = path.parent / words[1], path.parent / words[3]
     if not images:
-        raise DuagError(f"{path}: lists no image, expected number and file of depth, then of colour")
+        raise DuagError(f"{path}: lists no image, expected number and file of depth, then of color")
     return images
 
 

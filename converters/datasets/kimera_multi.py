@@ -3,7 +3,7 @@
 SRC is a bag, or the folder of a sequence (`10_14_<robot>.bag`, ...). Robots are known by the namespace of their
 topics: in some bags `frame_id` names another robot. The bags hold no /tf: the factory's extrinsics of the cameras, as
 the dataset's repository publishes them, are in this file. Depth is seen from the left infrared camera and is registered
-to colour; colour is undistorted. The true poses are of the robot's body, from LiDAR SLAM.
+to color; color is undistorted. The true poses are of the robot's body, from LiDAR SLAM.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
     Raises:
         DuagError: names file and topic, what was found and what was expected.
     """
-    determinism.settle_opencv()
+    determinism.configure_opencv()
     settings = options_of(Options, options, "kimera-multi")
     with ExitStack() as opened:
         found = _robots(src, settings, opened)
@@ -160,7 +160,7 @@ def _robot_log(robot: _Robot, settings: Options, src: Path) -> RobotLog:
         ),
     )
     if known != "published":
-        log.warnings.append(f"extrinsics of depth and colour are {known}")
+        log.warnings.append(f"extrinsics of depth and color are {known}")
     if settings.imu and not has_imu:
         log.warnings.append(f"no readings on {imu}")
     path = _truth_file(robot, settings, src)

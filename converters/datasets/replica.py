@@ -35,7 +35,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
 
 
 def _read_camera(src: Path) -> tuple[PinholeCamera, float]:
-    """Camera and metres per unit of depth, from cam_params.json in the scene or beside it."""
+    """Camera and meters per unit of depth, from cam_params.json in the scene or beside it."""
     path = next((f / "cam_params.json" for f in (src, src.parent) if (f / "cam_params.json").is_file()), None)
     if path is None:
         raise DuagError(f"{src.parent / 'cam_params.json'}: not found, expected the camera of the renders")

@@ -1,8 +1,8 @@
-"""Logs of ROS 1, ROS 2 and Foxglove: colour and depth of RGB-D cameras, chosen by type and name of their topics.
+"""Logs of ROS 1, ROS 2 and Foxglove: color and depth of RGB-D cameras, chosen by type and name of their topics.
 
 SRC is a `.bag`, a `.db3`, an `.mcap` or a folder of `ros2 bag`; a folder with one of these per robot, or with a folder
 of them per robot; or a TOML file that says which logs and topics each robot has (`duagc info LOG --toml`). Images are
-paired by the stamps of their headers. Colour is undistorted, and depth that another camera saw is registered to it,
+paired by the stamps of their headers. Color is undistorted, and depth that another camera saw is registered to it,
 with extrinsics from the log's constant transforms or given ones.
 """
 
@@ -20,7 +20,7 @@ from duagc.converters.layouts.ros_images import (
     color_bytes,
     depth_values,
     encoded_size,
-    in_metres,
+    in_meters,
     is_cut_short,
 )
 from duagc.converters.layouts.self_check import GAP, MAX_RATIO, ReprojectionCheck
@@ -51,7 +51,7 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
     Raises:
         DuagError: names log and topic, what was found and what was expected.
     """
-    determinism.settle_opencv()
+    determinism.configure_opencv()
     sources = sources_of(src, options)
     if robots and robots != len(sources):
         raise DuagError(f"{src}: found {len(sources)} robots, expected --robots {len(sources)}")
@@ -140,7 +140,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
             check.add(index, source.depth_m(picture), T)
         empty += 0 if picture.depth is None else picture.depth.size - int(np.count_nonzero(picture.depth))
     if cut:
-        source.warnings.append(f"{cut} frames have colour or depth that is cut short; left out")
+        source.warnings.append(f"{cut} frames have color or depth that is cut short; left out")
     if far:
         limit = FARTHEST * source.depth_scale
         source.warnings.append(
@@ -168,7 +168,7 @@ def _measured(source: RobotLog, stamp_ns: int, color: Any, depth: Any) -> tuple[
     if maps is not None:
         image = decode_image(data, cv2.IMREAD_COLOR)
         if image is None:
-            raise DuagError(f"{where}: no decoder reads it, expected a colour image")
+            raise DuagError(f"{where}: no decoder reads it, expected a color image")
         data = cv2.imencode(".png", cv2.remap(image, *maps, cv2.INTER_LINEAR))[1].tobytes()
         color_format = "png"
     where = f"{log}: {source.depth} at {stamp_ns} ns"
@@ -178,10 +178,10 @@ def _measured(source: RobotLog, stamp_ns: int, color: Any, depth: Any) -> tuple[
         values = cv2.remap(values, *source.depth_maps, cv2.INTER_NEAREST)
     if source.keeps_depth and values.dtype == np.uint16:
         return Picture(data, color_format, np.asarray(values, dtype=np.uint16)), 0
-    metres = in_metres(values, source.settings.depth_scale)
+    meters = in_meters(values, source.settings.depth_scale)
     if source.T_color_depth is not None:
-        metres = register_depth(metres, source.depth_camera.camera, source.T_color_depth, source.camera)
-    units = np.rint(metres / source.depth_scale)
+        meters = register_depth(meters, source.depth_camera.camera, source.T_color_depth, source.camera)
+    units = np.rint(meters / source.depth_scale)
     raw = np.where(units <= FARTHEST, units, 0).astype(np.uint16)
     return Picture(data, color_format, raw), int((units > FARTHEST).sum())
 

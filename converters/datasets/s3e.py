@@ -3,7 +3,7 @@
 SRC is the folder of a sequence: a `.db3` of all robots, `metadata.yaml`, `<robot>_gt.txt`, and beside it
 `Calibration/<robot>.yaml`. The bags of v2 hold no camera and are refused. The calibration files are not what they look
 like: `RIGHT.R` is the rotation from the left to the right camera and the last column of `RIGHT.P` its translation in
-millimetres, no rectification; the cameras are rectified here, and that is tested on the images.
+millimeters, no rectification; the cameras are rectified here, and that is tested on the images.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
     Raises:
         DuagError: names file and topic, what was found and what was expected.
     """
-    determinism.settle_opencv()
+    determinism.configure_opencv()
     settings = options_of(Options, options, "s3e")
     bag = _bag(src)
     with open_log([bag]) as log:
@@ -155,7 +155,7 @@ class Calibration:
         """From the file of a vehicle, in the notation of OpenCV.
 
         Raises:
-            DuagError: a part is missing or no calibration, for example a translation that is not in millimetres.
+            DuagError: a part is missing or no calibration, for example a translation that is not in millimeters.
         """
         import cv2
 
@@ -197,7 +197,7 @@ class Calibration:
         if not 50 < np.linalg.norm(baseline_mm) < 5000:
             raise DuagError(
                 f"{path}: last column of RIGHT.P is {baseline_mm.tolist()}, expected the translation to the right "
-                "camera in millimetres"
+                "camera in millimeters"
             )
         T_right_left = se3.from_rotation_translation(so3.project(matrix("RIGHT.R", 3, 3)), baseline_mm / 1000)
         return Calibration(
@@ -250,7 +250,7 @@ def read_fixes(path: Path) -> Fixes | None:
             )
         place = [float(word) for word in words[1:4]]
         if not np.isfinite(place).all():
-            raise DuagError(f"{path}:{number}: {line.strip()[:60]!r}, expected metres")
+            raise DuagError(f"{path}:{number}: {line.strip()[:60]!r}, expected meters")
         rows.setdefault(nanoseconds(words[0], f"{path}:{number}"), place)
     if len(rows) < 3 and all(stamp < 10 * NANOSECONDS for stamp in rows):
         return None

@@ -1,7 +1,7 @@
 """ScanNet v2 as its own SensReader exports it: rooms scanned with a tablet, poses by BundleFusion.
 
-SRC is a scan with `color/N.jpg` (1296x968), `depth/N.png` (640x480, millimetres), `pose/N.txt` (camera to world; -inf
-where tracking was lost) and `intrinsic/`, or with all of these in `frames/`. Colour is resampled into the camera of
+SRC is a scan with `color/N.jpg` (1296x968), `depth/N.png` (640x480, millimeters), `pose/N.txt` (camera to world; -inf
+where tracking was lost) and `intrinsic/`, or with all of these in `frames/`. Color is resampled into the camera of
 the depth, which lies in the same place.
 """
 

@@ -1,8 +1,8 @@
 """Microsoft 7-Scenes: Kinect v1 sequences of seven rooms, poses by KinectFusion, one world per room.
 
-A sequence is a folder of `frame-NNNNNN.color.png` (or .jpg), `.depth.png` (16 bit, millimetres, 0 and 65535 invalid)
+A sequence is a folder of `frame-NNNNNN.color.png` (or .jpg), `.depth.png` (16 bit, millimeters, 0 and 65535 invalid)
 and `.pose.txt` (4x4, depth camera to world, x right, y down, z forward). There are no time stamps: they are made at
-30 Hz from the frame number. The depth is not registered to colour: it is here, with the constants below. True poses
+30 Hz from the frame number. The depth is not registered to color: it is here, with the constants below. True poses
 may be those of others (`reference_poses`).
 """
 
@@ -42,9 +42,7 @@ FRAME_FILE = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(png|jpg|jpeg|txt)")
 SEQUENCE_FOLDER = re.compile(r"seq-(\d+)")
 KINDS = ("color", "depth", "pose")
 
-CONNECTED_RATIO = (
-    0.03  # neighbouring depths that differ by less than this share of the nearer are one surface
-)
+CONNECTED_RATIO = 0.03  # neighboring depths that differ by less than this share of the nearer are one surface
 
 LENGTHS = {
     "color_distortion": (4, 5),
@@ -64,20 +62,20 @@ class Options(Config):
     depth_cy_px: float = 240.0
     """Principal point of the depth camera, as the dataset's page gives it."""
     color_focal_px: float = Field(525.0, gt=0)
-    """Focal length of the colour camera, nominal; it agrees with the images of RedKitchen to 2 px."""
+    """Focal length of the color camera, nominal; it agrees with the images of RedKitchen to 2 px."""
     color_cx_px: float = 320.0
-    """Principal point of the colour camera; fitted on RedKitchen to 1 px, together with the baseline."""
+    """Principal point of the color camera; fitted on RedKitchen to 1 px, together with the baseline."""
     color_cy_px: float = 237.8
-    """Principal point of the colour camera; fitted on RedKitchen: depth edges fall on colour edges."""
+    """Principal point of the color camera; fitted on RedKitchen: depth edges fall on color edges."""
     baseline_m: float = 0.025
-    """The colour camera sits this far to the right (+x) of the depth camera; a point shifts by -f b / z pixels."""
+    """The color camera sits this far to the right (+x) of the depth camera; a point shifts by -f b / z pixels."""
     color_focal_y_px: float = Field(0.0, ge=0)
-    """Focal length of the colour camera along y; 0: that along x."""
+    """Focal length of the color camera along y; 0: that along x."""
     color_distortion: str = ""
-    """Lens of the colour camera: k1 k2 p1 p2 [k3] as OpenCV has them; empty: none. With this option, the one before or
-    the one after, colour is resampled as a pinhole camera sees it that is turned as the depth camera is."""
+    """Lens of the color camera: k1 k2 p1 p2 [k3] as OpenCV has them; empty: none. With this option, the one before or
+    the one after, color is resampled as a pinhole camera sees it that is turned as the depth camera is."""
     color_rotation_rad: str = ""
-    """Rotation vector x y z that takes directions of the depth camera to those of the colour camera; empty: none."""
+    """Rotation vector x y z that takes directions of the depth camera to those of the color camera; empty: none."""
     depth_correction_per_m: str = ""
     """Smooth error of the depth camera, c0 .. c5: 1/z + c0 (1 - 2 m / z) + c1 x + c2 y + c3 x^2 + c4 x y + c5 y^2 is
     the true 1/z at the ray (x, y, 1); empty: none."""
@@ -104,14 +102,14 @@ class Options(Config):
         return text
 
     def lens(self) -> ColorLens:
-        """The camera that the colour images were taken with."""
+        """The camera that the color images were taken with."""
         f, fy = self.color_focal_px, self.color_focal_y_px or self.color_focal_px
         source = PinholeCamera(WIDTH, HEIGHT, f, fy, self.color_cx_px, self.color_cy_px)
         rotation = numbers(self.color_rotation_rad, LENGTHS["color_rotation_rad"])
         return ColorLens(source, numbers(self.color_distortion, LENGTHS["color_distortion"]), rotation)
 
     def color_camera(self) -> PinholeCamera:
-        """The camera of the colour images in the recording."""
+        """The camera of the color images in the recording."""
         return self.lens().camera
 
     def depth_correction(self) -> tuple[float, ...]:
@@ -143,7 +141,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     Raises:
         DuagError: names the file, what was found and what was expected.
     """
-    determinism.settle_opencv()
+    determinism.configure_opencv()
     settings = options_of(Options, options, "7scenes")
     parts, skipped = _parts(Path(src), robots, settings)
     source = {
@@ -162,7 +160,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         for name, (sequence, frames), reference in zip(
             robot_names(len(parts)), parts, references, strict=True
         ):
-            sensors = {"depth": "Kinect v1, registered to colour by the converter", "sequence": sequence}
+            sensors = {"depth": "Kinect v1, registered to color by the converter", "sequence": sequence}
             with recording.robot(name, settings.color_camera(), DEPTH_SCALE, sensors) as robot:
                 check = _write_robot(robot, frames, reference, settings, str(src))
             recording.checks[name] = {
@@ -227,7 +225,7 @@ def list_frames(folder: Path) -> tuple[list[FrameFiles], list[int]]:
     """Frames of a sequence in order of their number, and the numbers that are missing in between.
 
     Raises:
-        DuagError: a frame lacks its colour, depth or (unless the sequence has no pose at all) its pose.
+        DuagError: a frame lacks its color, depth or (unless the sequence has no pose at all) its pose.
     """
     files: dict[str, dict[int, Path]] = {kind: {} for kind in KINDS}
     for path in sorted(folder.iterdir()):
@@ -307,7 +305,7 @@ def _true_pose(files: FrameFiles, reference: Reference | None, options: Options)
 
 
 def _count_holes(depth: NDArray[np.uint16]) -> int:
-    """Pixels without depth whose left and right, or upper and lower, neighbours have some: cracks of the warp."""
+    """Pixels without depth whose left and right, or upper and lower, neighbors have some: cracks of the warp."""
     empty, full = depth == 0, depth != 0
     crack = np.zeros_like(empty)
     crack[:, 1:-1] |= empty[:, 1:-1] & full[:, :-2] & full[:, 2:]
@@ -316,8 +314,8 @@ def _count_holes(depth: NDArray[np.uint16]) -> int:
 
 
 def _depth_m(path: Path) -> Depth:
-    """Depth [480, 640] in metres, 0 where there is none."""
-    raw = read_depth(path, (WIDTH, HEIGHT), "depth in millimetres")
+    """Depth [480, 640] in meters, 0 where there is none."""
+    raw = read_depth(path, (WIDTH, HEIGHT), "depth in millimeters")
     return np.where(np.isin(raw, NO_DEPTH), 0, raw) * DEPTH_SCALE
 
 
@@ -330,14 +328,14 @@ def _read_pose(path: Path) -> Array:
     return rigid(T, str(path))
 
 
-# --- depth into the colour camera -----------------------------------------------------------------------------------
+# --- depth into the color camera -----------------------------------------------------------------------------------
 
 
 class Registration:
     """Resamples depth for a camera displaced along x, with another focal length and principal point.
 
-    With w = 1 / z a point of depth pixel (u, v) falls on colour column A u + B - f b w and row A v + C: rows map to
-    rows. First the rows are resampled, then each row is redrawn as a chain of segments between neighbours. Inverse
+    With w = 1 / z a point of depth pixel (u, v) falls on color column A u + B - f b w and row A v + C: rows map to
+    rows. First the rows are resampled, then each row is redrawn as a chain of segments between neighbors. Inverse
     depth is interpolated, in which planes are linear, and only within a surface (CONNECTED_RATIO); where surfaces
     overlap the nearest wins; at the border of a surface a pixel covers half its width.
     """
@@ -355,7 +353,7 @@ class Registration:
         self._columns = np.arange(d.width)
 
     def __call__(self, depth: Depth) -> Depth:
-        """Depth [h, w] in metres of the depth camera, 0 where none -> depth [H, W] in metres of the colour camera."""
+        """Depth [h, w] in meters of the depth camera, 0 where none -> depth [H, W] in meters of the color camera."""
         with np.errstate(divide="ignore"):
             w = np.where(depth > 0, 1.0 / depth, 0.0)
         w = self._resample_rows(w)
@@ -375,7 +373,7 @@ class Registration:
         left, right, w_left, w_right = x[:, :-1], x[:, 1:], w[:, :-1], w[:, 1:]
         joined = _connected(w_left, w_right)
         first = np.ceil(left)
-        for column in (first, first + 1):  # connected neighbours are less than two columns apart
+        for column in (first, first + 1):  # connected neighbors are less than two columns apart
             inside = joined & (column <= right)
             part = (column - left) / np.where(right > left, right - left, 1.0)
             self._keep_nearest(out, inside, column, w_left + part * (w_right - w_left))

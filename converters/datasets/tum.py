@@ -1,7 +1,7 @@
 """TUM RGB-D: handheld and robot sequences with motion capture, Kinect v1.
 
 SRC is a sequence, for example `rgbd_dataset_freiburg1_desk`: `rgb.txt`, `depth.txt` (time, file), `groundtruth.txt`
-(pose of the colour camera). Depth is registered to the distorted colour image, so both are undistorted together.
+(pose of the color camera). Depth is registered to the distorted color image, so both are undistorted together.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Options(tum_layout.AssociationOptions):
     camera: Literal["auto", "freiburg1", "freiburg2", "freiburg3"] = "auto"
     """Which Kinect; auto takes it from the name of the folder."""
     undistort: bool = True
-    """Take the lens distortion out of colour and depth together; without, images stay as they are and a pinhole camera
+    """Take the lens distortion out of color and depth together; without, images stay as they are and a pinhole camera
     does not describe them."""
 
 
@@ -55,7 +55,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         camera,
         DEPTH_SCALE,
         distortion=distortion if settings.undistort else (),
-        sensors={"depth": "Kinect v1, registered to colour by the dataset"},
+        sensors={"depth": "Kinect v1, registered to color by the dataset"},
     )
     parameters = {"robots": robots, **settings.model_dump()}
     image_folder.write(out, "tum", src, clip.cut(robots, src), parameters, warnings, force)

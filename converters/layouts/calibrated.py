@@ -1,6 +1,6 @@
-"""A colour camera with a lens, turned against its depth camera, and a depth camera whose disparity is warped.
+"""A color camera with a lens, turned against its depth camera, and a depth camera whose disparity is warped.
 
-What they give is what `seven_scenes.Registration` wants: colour as a pinhole camera sees it that is turned as the depth
+What they give is what `seven_scenes.Registration` wants: color as a pinhole camera sees it that is turned as the depth
 camera is, and depth without its smooth error. Directions of the depth camera are (x, y, 1), x right, y down.
 """
 
@@ -34,10 +34,10 @@ def numbers(text: str, counts: tuple[int, ...]) -> Numbers:
 
 @dataclass(frozen=True)
 class ColorLens:
-    """The colour camera as it is.
+    """The color camera as it is.
 
     source: its focal lengths and principal point. distortion: (k1, k2, p1, p2[, k3]) in OpenCV's order, or empty.
-    rotation_rad: rotation vector [3] that takes directions of the depth camera to those of the colour camera.
+    rotation_rad: rotation vector [3] that takes directions of the depth camera to those of the color camera.
     """
 
     source: PinholeCamera
@@ -63,7 +63,7 @@ class ColorLens:
         return PinholeCamera(s.width, s.height, s.fx, s.fx, s.cx + s.fx * x / z, s.cy + s.fy * y / z)
 
     def turned(self) -> Array:
-        """T_color_camera [4, 4], from `camera` to the colour camera as it is: they are at one place."""
+        """T_color_camera [4, 4], from `camera` to the color camera as it is: they are at one place."""
         R = so3.exp(np.array(self.rotation_rad or (0.0, 0.0, 0.0)))
         return se3.from_rotation_translation(R, np.zeros(3))
 
@@ -80,7 +80,7 @@ class ColorLens:
 
 
 def resampled(data: bytes, maps: tuple[NDArray[np.float32], NDArray[np.float32]]) -> bytes:
-    """An encoded colour image at the pixels of `ColorLens.maps`, as PNG; beyond its border the border is repeated."""
+    """An encoded color image at the pixels of `ColorLens.maps`, as PNG; beyond its border the border is repeated."""
     import cv2
 
     image = decode_image(data, cv2.IMREAD_COLOR)

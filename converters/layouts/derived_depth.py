@@ -44,7 +44,7 @@ class Lidar:
 
 
 def decoded(message: Any, where: str) -> Image:
-    """Colour [h, w, 3], BGR as OpenCV has it, of an Image or CompressedImage."""
+    """Color [h, w, 3], BGR as OpenCV has it, of an Image or CompressedImage."""
     import cv2
 
     data, _ = color_bytes(message, where)
@@ -62,7 +62,7 @@ def png(image: Image) -> bytes:
 
 
 class StereoFrames:
-    """Rectified colour, depth and sigma of the pairs of one rig."""
+    """Rectified color, depth and sigma of the pairs of one rig."""
 
     def __init__(self, rig: StereoRig, size: tuple[int, int]) -> None:
         """size: width and height of the images as they come."""
@@ -92,7 +92,7 @@ class StereoFrames:
     def frame(
         self, left: Any, right: Any, where: str
     ) -> tuple[bytes, NDArray[np.uint16], NDArray[np.float32]]:
-        """PNG of the left image, depth in units of `STEREO_SCALE_M`, and its standard deviation in metres."""
+        """PNG of the left image, depth in units of `STEREO_SCALE_M`, and its standard deviation in meters."""
         color, other = self.rectified(left, right, where)
         depth_m, sigma_m = self.rig.depth(gray(color), gray(other))
         units = np.rint(depth_m / STEREO_SCALE_M)
@@ -100,7 +100,7 @@ class StereoFrames:
 
 
 def gray(image: Image) -> Image:
-    """Grey values of a BGR image."""
+    """Gray values of a BGR image."""
     import cv2
 
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)

@@ -33,13 +33,13 @@ def options_of(model: type[Options], values: Mapping[str, Any], dataset: str) ->
 
 
 def read_color(path: Path, size: tuple[int, int]) -> tuple[bytes, str]:
-    """Bytes of a colour image as they are, known to decode to `size` (width, height), and their format."""
+    """Bytes of a color image as they are, known to decode to `size` (width, height), and their format."""
     import cv2
 
-    data = read_bytes(path, "a colour image")
+    data = read_bytes(path, "a color image")
     image = decode_image(data, cv2.IMREAD_COLOR)
     if image is None:
-        raise DuagError(f"{path}: {len(data)} bytes that no decoder reads, expected a colour image")
+        raise DuagError(f"{path}: {len(data)} bytes that no decoder reads, expected a color image")
     check_size(path, image.shape, size)
     if data.startswith(b"\x89PNG"):
         return data, "png"

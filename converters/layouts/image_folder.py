@@ -41,9 +41,9 @@ class FrameFiles:
 class Clip:
     """What one robot saw.
 
-    label: in the dataset. camera: of the depth images, and of the colour images unless `color_camera` is given; then
-    colour is resampled into `camera` (same place, same axes). depth_scale: metres per unit. no_depth: values that
-    mean none. distortion: (k1, k2, p1, p2, k3) of colour and depth alike, removed; empty: none.
+    label: in the dataset. camera: of the depth images, and of the color images unless `color_camera` is given; then
+    color is resampled into `camera` (same place, same axes). depth_scale: meters per unit. no_depth: values that
+    mean none. distortion: (k1, k2, p1, p2, k3) of color and depth alike, removed; empty: none.
     """
 
     label: str
@@ -87,7 +87,7 @@ def write(
     Raises:
         DuagError: a file is not what it should be, or depth and poses do not belong together.
     """
-    determinism.settle_opencv()
+    determinism.configure_opencv()
     source = {"dataset": dataset, "folder": src.resolve().name, "parts": [c.label for c in clips if c.label]}
     with RecordingWriter(out, "", source, dataset, dict(parameters), force) as recording:
         recording.warnings += warnings
@@ -121,7 +121,7 @@ def _write_clip(robot: RobotWriter, clip: Clip, label: str) -> dict[str, Any]:
 
 
 class _Lens:
-    """Takes distortion out of colour and depth, and colour into the camera of the depth, where there is need."""
+    """Takes distortion out of color and depth, and color into the camera of the depth, where there is need."""
 
     def __init__(self, clip: Clip) -> None:
         self._source = clip.color_camera or clip.camera
@@ -140,7 +140,7 @@ class _Lens:
         return np.asarray(cv2.remap(raw, *self._maps, cv2.INTER_NEAREST), dtype=np.uint16)
 
     def color(self, path: Path) -> tuple[bytes, str]:
-        """Encoded colour: the file's own bytes, or a PNG of what was resampled."""
+        """Encoded color: the file's own bytes, or a PNG of what was resampled."""
         import cv2
 
         data, color_format = read_color(path, self._size)

@@ -216,12 +216,12 @@ def _check_extent(path: Path, name: str, vertices: Array) -> None:
     if extent.max() > MAX_EXTENT_M:
         size = " x ".join(f"{x:.4g}" for x in extent)
         raise DuagError(
-            f"{path}: {name} is {size} m large, expected at most {MAX_EXTENT_M:.0f} m; is it in metres?"
+            f"{path}: {name} is {size} m large, expected at most {MAX_EXTENT_M:.0f} m; is it in meters?"
         )
 
 
 def _texture(path: Path, materials: Any, index: int) -> NDArray[np.uint8] | None:
-    """The base colour texture of a material, uint8 [h, w, 3], or None."""
+    """The base color texture of a material, uint8 [h, w, 3], or None."""
     if not 0 <= index < len(materials) or materials[index].albedo_img is None:
         return None
     image = np.asarray(materials[index].albedo_img)
@@ -240,7 +240,7 @@ def _texture(path: Path, materials: Any, index: int) -> NDArray[np.uint8] | None
 
 
 def _flat_color(path: Path, materials: list[Any], index: int) -> NDArray[np.uint8] | None:
-    """The one colour of a material, uint8 [3]; for parts without texture beside others that have one."""
+    """The one color of a material, uint8 [3]; for parts without texture beside others that have one."""
     if not 0 <= index < len(materials):
         return None
     color = np.clip(np.asarray(materials[index].base_color, dtype=np.float64)[:3], 0, 1)
@@ -252,11 +252,11 @@ def _flat_color(path: Path, materials: list[Any], index: int) -> NDArray[np.uint
 def _part(
     path: Path, name: str, mesh: Any, image: NDArray[np.uint8] | None, flat: NDArray[np.uint8] | None
 ) -> _Part:
-    """A part as arrays; `flat` is its colour if it has neither a texture nor colours of its vertices."""
+    """A part as arrays; `flat` is its color if it has neither a texture nor colors of its vertices."""
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     triangles = np.asarray(mesh.triangles, dtype=np.int32)
     if not np.isfinite(vertices).all():
-        raise DuagError(f"{path}: {name} has vertices that are not finite, expected metres")
+        raise DuagError(f"{path}: {name} has vertices that are not finite, expected meters")
     _check_extent(path, name, vertices)
     if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(vertices):
         raise DuagError(
@@ -281,7 +281,7 @@ def _part(
     elif flat is not None:
         colors[:] = flat
     else:
-        raise DuagError(f"{path}: {name} has neither a texture nor colours of its vertices, expected one")
+        raise DuagError(f"{path}: {name} has neither a texture nor colors of its vertices, expected one")
     return _Part(vertices, triangles, texels, NO_TEXTURE, colors)
 
 

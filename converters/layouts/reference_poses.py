@@ -1,8 +1,8 @@
 """Poses of 7-Scenes by others than the data set: the files that Brachmann et al. publish (ICCV 2021).
 
 "On the Limits of Pseudo Ground Truth in Visual Camera Re-Localization" finds the poses of all images of a scene by
-structure from motion, from colour alone. A file has a line per image, in any order: `seq-01/frame-000000.color.png`,
-the rotation as quaternion w x y z and the translation (m) that take the scene's coordinates to the colour camera's,
+structure from motion, from color alone. A file has a line per image, in any order: `seq-01/frame-000000.color.png`,
+the rotation as quaternion w x y z and the translation (m) that take the scene's coordinates to the color camera's,
 and a focal length, which is not used here.
 """
 
@@ -24,7 +24,7 @@ MAX_NORM_DEFECT = 1e-3  # of a quaternion; the files have six digits
 
 
 def read(path: Path, sequence: str) -> dict[int, NDArray[np.float64]]:
-    """T_scene_color [4, 4], metres, of the colour camera by frame number, of one sequence.
+    """T_scene_color [4, 4], meters, of the color camera by frame number, of one sequence.
 
     Args:
         path: the file.

@@ -1,4 +1,4 @@
-"""Images and cameras as ROS messages hold them: colour to encoded bytes, depth to metres, CameraInfo to a pinhole."""
+"""Images and cameras as ROS messages hold them: color to encoded bytes, depth to meters, CameraInfo to a pinhole."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def is_integer_depth(message: Any) -> bool:
 
 
 def _is_gray_png_of_16_bits(head: bytes) -> bool:
-    """By the first chunk of a PNG: 16 bits, and gray (colour type 0)."""
+    """By the first chunk of a PNG: 16 bits, and gray (color type 0)."""
     return head.startswith(b"\x89PNG") and head[24:26] == b"\x10\x00"
 
 
@@ -108,7 +108,7 @@ def size_of(message: Any, where: str) -> tuple[int, int]:
         return width, height
     image = decode_image(color_bytes(message, where)[0], cv2.IMREAD_COLOR)
     if image is None:
-        raise DuagError(f"{where}: no decoder reads it, expected a colour image")
+        raise DuagError(f"{where}: no decoder reads it, expected a color image")
     return int(image.shape[1]), int(image.shape[0])
 
 
@@ -130,7 +130,7 @@ def rows_of(message: Any, where: str, dtype: str, channels: int) -> NDArray[Any]
 
 
 def color_bytes(message: Any, where: str) -> tuple[bytes, str]:
-    """Encoded colour and its format: the message's own JPEG or PNG, or a PNG of its raw pixels."""
+    """Encoded color and its format: the message's own JPEG or PNG, or a PNG of its raw pixels."""
     import cv2
 
     if hasattr(message, "format"):
@@ -170,19 +170,19 @@ def _webp_as_png(data: bytes, where: str) -> bytes:
 
 
 def depth_m(message: Any, where: str, scale: float) -> Depth:
-    """Depth [h, w] in metres, 0 where there is none. scale: metres per unit of integer depth."""
-    return in_metres(depth_values(message, where), scale)
+    """Depth [h, w] in meters, 0 where there is none. scale: meters per unit of integer depth."""
+    return in_meters(depth_values(message, where), scale)
 
 
-def in_metres(values: NDArray[np.uint16] | Depth, scale: float) -> Depth:
-    """What `depth_values` gives, in metres."""
+def in_meters(values: NDArray[np.uint16] | Depth, scale: float) -> Depth:
+    """What `depth_values` gives, in meters."""
     if values.dtype == np.uint16:
         return values.astype(np.float32) * np.float32(scale)
     return values.astype(np.float32, copy=False)
 
 
 def depth_values(message: Any, where: str) -> NDArray[np.uint16] | Depth:
-    """Depth [h, w], 0 where there is none: integers as they stand, uint16, or metres, float32."""
+    """Depth [h, w], 0 where there is none: integers as they stand, uint16, or meters, float32."""
     if hasattr(message, "format"):
         return _compressed_depth(message.format, bytes(message.data), where)
     if message.encoding in ("16UC1", "mono16"):
@@ -299,7 +299,7 @@ class RosCamera:
             and all(side / LONGEST_LENS < f < LONGEST_LENS * side for f in (fx, fy))
         ):
             raise DuagError(
-                f"{where}: focal length {fx:g}, {fy:g} px and centre {cx:g}, {cy:g} px of {message.width}x"
+                f"{where}: focal length {fx:g}, {fy:g} px and center {cx:g}, {cy:g} px of {message.width}x"
                 f"{message.height}, expected those of a camera"
             )
         binning = max(1, message.binning_x), max(1, message.binning_y)

@@ -24,7 +24,7 @@ MOMENT_NS = 2_000_000  # points no further apart in time are moved together
 
 
 def points_of(message: Any, where: str) -> tuple[Array, Array]:
-    """Points [n, 3] in metres, frame of the message, and when each was measured, s after its stamp; all finite.
+    """Points [n, 3] in meters, frame of the message, and when each was measured, s after its stamp; all finite.
 
     Without a field of times they are zero: `time` (s, Velodyne), `t` (ns, Ouster), `offset_time` (ns, Livox).
     """

@@ -67,7 +67,7 @@ class ReprojectionCheck:
         self._depths.append(found[found > 0])
 
     def result(self, label: str, max_ratio: float = MAX_RATIO) -> dict[str, Any]:
-        """Median residual and median depth in metres, None where too little overlaps.
+        """Median residual and median depth in meters, None where too little overlaps.
 
         Args:
             label: of the source, for the message. max_ratio: largest residual as a share of the depth; more where the

@@ -33,8 +33,8 @@ SUBPIXELS = 16  # SGBM gives disparities in sixteenths
 MAX_ROW_PX = 1.0  # largest median row difference of matched features
 MIN_MATCHES = 50
 MATCH_RATIO = 0.8  # Lowe's, of the two best distances of descriptors
-SIGMA_OF_NOISE = 0.13  # disparity error x gradient / grey noise; of 5x5 blocks and their paths, measured
-LEAST_GRADIENT = 0.3  # grey values per px: below it is noise
+SIGMA_OF_NOISE = 0.13  # disparity error x gradient / gray noise; of 5x5 blocks and their paths, measured
+LEAST_GRADIENT = 0.3  # gray values per px: below it is noise
 
 
 class StereoOptions(Config):
@@ -47,7 +47,7 @@ class StereoOptions(Config):
     disparity_sigma_px: float = Field(default=0.2, gt=0)
     """Standard deviation of a disparity where the texture is strong: what block matching does at its best."""
     gray_sigma: float = Field(default=2.0, gt=0)
-    """Noise of the grey values (of 255): where the texture is weak it decides."""
+    """Noise of the gray values (of 255): where the texture is weak it decides."""
     shrink: int = Field(default=1, ge=1, le=8)
     """Side of the blocks of rectified pixels that become one."""
 
@@ -66,7 +66,7 @@ class RawCamera:
 class StereoRig:
     """A calibrated pair. camera: of the rectified left images, to which the depth belongs. baseline_m.
 
-    R_rectified_left [3, 3]: takes coordinates in the left camera to the rectified one (the centre is the same).
+    R_rectified_left [3, 3]: takes coordinates in the left camera to the rectified one (the center is the same).
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class StereoRig:
         if -t[0] <= abs(t[1]) + abs(t[2]):
             raise DuagError(
                 f"{where}: the right camera sees the left one at {np.round(t, 3).tolist()} m, expected it to the left "
-                "(cameras side by side, not swapped, translation in metres)"
+                "(cameras side by side, not swapped, translation in meters)"
             )
         D = [np.array(c.distortion or (0.0,) * 4) for c in (left, right)]
         model: Any = cv2.fisheye if left.fisheye else cv2
@@ -185,7 +185,7 @@ class StereoRig:
         return StereoRig(a, rig.baseline_m, options, (maps[0], maps[1]), turns[0])
 
     def rectify_left(self, image: Image) -> Image:
-        """A left image, grey or colour, as the rectified camera sees it."""
+        """A left image, gray or color, as the rectified camera sees it."""
         return self._rectify(image, 0)
 
     def rectify_right(self, image: Image) -> Image:
@@ -228,7 +228,7 @@ class StereoRig:
         )
 
     def disparity(self, left: Image, right: Image) -> Depth:
-        """Disparity [h, w], px, of rectified grey images; 0 where no match is certain."""
+        """Disparity [h, w], px, of rectified gray images; 0 where no match is certain."""
         import cv2
 
         # the matcher leaves out as many columns as it tries disparities: give it those, and believe no match in them
@@ -239,7 +239,7 @@ class StereoRig:
         return np.where((found > 0) & (found <= column), found, np.float32(0))
 
     def depth(self, left: Image, right: Image) -> tuple[Depth, Depth]:
-        """Depth and its standard deviation, metres [h, w], of rectified grey images; both 0 where not known."""
+        """Depth and its standard deviation, meters [h, w], of rectified gray images; both 0 where not known."""
         disparity = self.disparity(left, right)
         known = disparity > 0
         depth_m = np.where(known, self.camera.fx * self.baseline_m / np.where(known, disparity, 1), 0)
@@ -251,9 +251,9 @@ class StereoRig:
         )
 
     def disparity_sigma_px(self, left: Image) -> Depth:
-        """Standard deviation [h, w] of the disparities of a rectified grey left image.
+        """Standard deviation [h, w] of the disparities of a rectified gray left image.
 
-        The best that matching does, and the noise of the grey values over their gradient along the row (root mean
+        The best that matching does, and the noise of the gray values over their gradient along the row (root mean
         square over a block). On the simulated room, three sizes and noises, errors over this have a spread (by their
         median) of 0.93 to 1.23; 2 to 6 % are beyond 3, mostly at edges.
         """
@@ -271,10 +271,10 @@ class StereoRig:
 def disparity_sigma_m(
     depth_m: NDArray[np.floating], sigma_px: NDArray[np.floating] | float, focal_baseline: float
 ) -> NDArray[np.float64]:
-    """Standard deviation of a depth by that of its disparity: sigma_z = z^2 sigma_d / (f b), metres.
+    """Standard deviation of a depth by that of its disparity: sigma_z = z^2 sigma_d / (f b), meters.
 
     Args:
-        depth_m: metres. sigma_px: of the disparity, pixels. focal_baseline: f b, px m.
+        depth_m: meters. sigma_px: of the disparity, pixels. focal_baseline: f b, px m.
     """
     return np.square(np.asarray(depth_m, dtype=np.float64)) * sigma_px / focal_baseline
 
@@ -286,7 +286,7 @@ class RowCheck:
         self._differences: list[Array] = [np.zeros((0, 2))]
 
     def add(self, left: Image, right: Image) -> None:
-        """Match the features of a pair of rectified grey images, wherever in the image they are."""
+        """Match the features of a pair of rectified gray images, wherever in the image they are."""
         import cv2
 
         sift = cv2.SIFT.create(nfeatures=1000)

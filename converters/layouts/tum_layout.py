@@ -25,10 +25,10 @@ LAST_NS = 1 << 62  # about the year 2116
 
 
 class AssociationOptions(Config):
-    """Which depth image belongs to which colour image, and where the camera was."""
+    """Which depth image belongs to which color image, and where the camera was."""
 
     association: Literal["official", "nearest"] = "official"
-    """`official`: closest pairs first, each image once, as the dataset's associate.py. `nearest`: for each colour image
+    """`official`: closest pairs first, each image once, as the dataset's associate.py. `nearest`: for each color image
     the nearest depth image, which may be used twice, as most published loaders do."""
     max_difference_s: float = Field(0.0, ge=0.0)
     """Largest difference of their times; 0: 0.02 for `official`, 0.08 for `nearest`."""
@@ -37,7 +37,7 @@ class AssociationOptions(Config):
 
     @property
     def limit_ns(self) -> int:
-        """Largest difference of times of colour and depth."""
+        """Largest difference of times of color and depth."""
         default = 0.02 if self.association == "official" else 0.08
         return round((self.max_difference_s or default) * NANOSECONDS)
 
@@ -87,7 +87,7 @@ def read_list(path: Path) -> list[Listed]:
 def associate(
     color: list[Listed], depth: list[Listed], options: AssociationOptions
 ) -> list[tuple[Listed, Listed]]:
-    """Pairs of colour and depth, in order of the colour's time."""
+    """Pairs of color and depth, in order of the color's time."""
     limit = options.limit_ns
     times = [d.stamp_ns for d in depth]
     candidates = []
@@ -171,7 +171,7 @@ def frames_of(src: Path, options: AssociationOptions) -> tuple[list[FrameFiles],
         )
     warnings = []
     if len(pairs) < len(color):
-        warnings.append(f"{len(color) - len(pairs)} of {len(color)} colour images have no depth near in time")
+        warnings.append(f"{len(color) - len(pairs)} of {len(color)} color images have no depth near in time")
     truth = src / "groundtruth.txt"
     poses = Poses.read(truth) if truth.is_file() else None
     if poses is None:

@@ -1,4 +1,4 @@
-"""Which topics of a log are a robot's colour, depth and cameras, by type and name, and why."""
+"""Which topics of a log are a robot's color, depth and cameras, by type and name, and why."""
 
 from __future__ import annotations
 

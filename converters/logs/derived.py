@@ -1,4 +1,4 @@
-"""Depth that a log does not hold as images: of a stereo pair whose left eye is the colour camera, or of a LiDAR."""
+"""Depth that a log does not hold as images: of a stereo pair whose left eye is the color camera, or of a LiDAR."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Picture:
-    """What is written of a frame: encoded colour; depth in units of the log with sigma [h, w] in metres; or a sweep."""
+    """What is written of a frame: encoded color; depth in units of the log with sigma [h, w] in meters; or a sweep."""
 
     color: bytes
     color_format: str
@@ -45,7 +45,7 @@ class Picture:
 
 
 class Derived(Protocol):
-    """A source of depth. camera: of the recording; T_color_camera [4, 4]: where it is in the log's colour camera."""
+    """A source of depth. camera: of the recording; T_color_camera [4, 4]: where it is in the log's color camera."""
 
     camera: PinholeCamera
     T_color_camera: Array
@@ -53,16 +53,16 @@ class Derived(Protocol):
     words: str
 
     def picture(self, color: Any, partner: Any, color_ns: int, partner_ns: int) -> Picture:
-        """Of a colour message and that which goes with it."""
+        """Of a color message and that which goes with it."""
         ...
 
     def depth_m(self, picture: Picture) -> Array:
-        """Depth [h, w] in metres of a picture, 0 = none."""
+        """Depth [h, w] in meters of a picture, 0 = none."""
         ...
 
 
 class Stereo:
-    """Colour is the left image, and is rectified."""
+    """Color is the left image, and is rectified."""
 
     scale = STEREO_SCALE_M
     words = "stereo"
@@ -87,14 +87,14 @@ class Stereo:
 
 
 class Sweeps:
-    """Points of a LiDAR as of the time of the colour image; they are drawn when the recording is read."""
+    """Points of a LiDAR as of the time of the color image; they are drawn when the recording is read."""
 
     scale = 0.001  # no depth image is written
     words = "lidar, drawn on reading"
     T_color_camera = np.eye(4)
 
     def __init__(self, lidar: Lidar, camera: RosCamera, undistort: bool, where: tuple[str, str]) -> None:
-        """where: of colour and points, for the line of an error."""
+        """where: of color and points, for the line of an error."""
         self.lidar, self.camera, self._where = lidar, camera.camera, where
         self._maps = camera.maps() if undistort else None
 

@@ -93,7 +93,7 @@ def _robots(src: Path) -> Iterator[Source]:
 
 
 def namespaces(log: Log) -> list[str]:
-    """Namespaces of a log that each have colour and depth, if that is what keeps from choosing; else none."""
+    """Namespaces of a log that each have color and depth, if that is what keeps from choosing; else none."""
     chooser = Chooser(log)
     if chooser.color().topic and chooser.depth().topic:
         return []
@@ -195,7 +195,7 @@ def _robot(log: Log, source: Source) -> tuple[RobotLog | None, dict[str, Any]]:
         robot_log = RobotLog(log, space, settings)
         out["frames"] = len(robot_log.pairs)
         moved = robot_log.T_color_depth is not None
-        out["depth"] = "moved into the colour camera" if moved else "registered to colour already"
+        out["depth"] = "moved into the color camera" if moved else "registered to color already"
         if robot_log.derived:
             out["depth"] = robot_log.derived.words
         out["warnings"] = robot_log.warnings

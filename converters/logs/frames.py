@@ -16,7 +16,7 @@ from duagc.pipeline.geometry import se3
 Array = NDArray[np.float64]
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 FARTHEST_M = 1e8  # also from the origin of a map of the earth
-SAME = 1e-6  # metres and radians up to which a transform has not changed
+SAME = 1e-6  # meters and radians up to which a transform has not changed
 
 
 class Transforms:
@@ -107,5 +107,5 @@ def pose_matrix(position: Any, orientation: Any, where: str) -> Array:
         raise DuagError(f"{where}: quaternion wxyz {q.tolist()}, expected one of length 1")
     t = np.array([position.x, position.y, position.z], dtype=np.float64)
     if not np.abs(t).max() < FARTHEST_M:
-        raise DuagError(f"{where}: position {t.tolist()}, expected metres, less than {FARTHEST_M:g}")
+        raise DuagError(f"{where}: position {t.tolist()}, expected meters, less than {FARTHEST_M:g}")
     return np.asarray(se3.from_quat_translation(q, t))

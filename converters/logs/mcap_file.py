@@ -20,7 +20,7 @@ from duagc.converters.logs.mcap_chunks import Chunks
 from duagc.converters.logs.rosbag_file import (
     LARGEST_CHUNK,
     check_definitions,
-    deserialised,
+    deserialized,
     reading,
     reason,
     ros_header_ns,
@@ -200,7 +200,7 @@ class _Ros:
     def __init__(self, schema: Schema, encoding: str) -> None:
         self.schema, self.encoding, self.type = schema, encoding, ros_type(schema.name)
         self._of_ros = foxglove.plain_name(schema.name) not in foxglove.ROS_TYPES
-        self._deserialise: Any = None
+        self._deserialize: Any = None
 
     def _store(self) -> Any:
         """Understood when the first message is read: definitions that nobody needs may be beyond the parser."""
@@ -230,15 +230,15 @@ class _Ros:
         return store
 
     def read(self, data: bytes, where: str) -> Any:
-        if self._deserialise is None:
+        if self._deserialize is None:
             try:
                 store = self._store()
             except Exception as error:  # whatever a broken definition provokes in the parser
                 raise DuagError(
                     f"{where}: the definition of {self.type} cannot be read ({reason(error)})"
                 ) from error
-            self._deserialise = store.deserialize_cdr if self.encoding == "cdr" else store.deserialize_ros1
-        message = deserialised(self._deserialise, data, self.type, where)
+            self._deserialize = store.deserialize_cdr if self.encoding == "cdr" else store.deserialize_ros1
+        message = deserialized(self._deserialize, data, self.type, where)
         return foxglove.as_ros(foxglove.plain_name(self.schema.name), message, where)
 
     def header_ns(self, data: bytes, where: str) -> int:

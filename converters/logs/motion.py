@@ -38,24 +38,24 @@ class Imu:
     T_color_imu: Array
 
     def prior(self) -> MotionPrior:
-        """How the colour camera turned."""
+        """How the color camera turned."""
         return GyroPrior(self.stamps_ns.tolist(), self.values[:, :3] @ self.T_color_imu[:3, :3].T)
 
 
 @dataclass(frozen=True)
 class CameraPoses:
-    """Poses of a body that holds the colour camera: it is the body that moves evenly between two of them."""
+    """Poses of a body that holds the color camera: it is the body that moves evenly between two of them."""
 
     body: Poses
     T_body_color: Array
 
     def at(self, stamp_ns: int, max_gap_s: float) -> Array | None:
-        """Pose [4, 4] of the colour camera at a time; None where there is none near."""
+        """Pose [4, 4] of the color camera at a time; None where there is none near."""
         T = self.body.at(stamp_ns, max_gap_s)
         return None if T is None else T @ self.T_body_color
 
     def prior(self) -> MotionPrior:
-        """How the colour camera moved."""
+        """How the color camera moved."""
         return OdometryPrior(self.body.stamps_ns.tolist(), self.body.T_world_body @ self.T_body_color)
 
 
@@ -123,7 +123,7 @@ class _PoseReadings:
 
 
 class MotionReader:
-    """Topics of motion for one robot's colour camera: `take` has who wants their messages, all to be given once."""
+    """Topics of motion for one robot's color camera: `take` has who wants their messages, all to be given once."""
 
     def __init__(
         self,
@@ -134,7 +134,7 @@ class MotionReader:
         time_ns: Callable[[Entry], int],
     ) -> None:
         """Args:
-        color_frame: of the colour camera. time_ns: the time of a message by the clock that the options choose.
+        color_frame: of the color camera. time_ns: the time of a message by the clock that the options choose.
 
         Raises:
             DuagError: a topic that was asked for is not there, or the file of true poses cannot be read.
@@ -189,7 +189,7 @@ class MotionReader:
         return T
 
     def truth(self) -> CameraPoses | None:
-        """True poses of the colour camera, by a topic or a file; None if none were asked for."""
+        """True poses of the color camera, by a topic or a file; None if none were asked for."""
         if self._truth_file:
             found, body = self._truth_file, ""
         elif self._truth:
@@ -200,7 +200,7 @@ class MotionReader:
         return CameraPoses(replace(found, stamps_ns=stamps), self._body_camera("truth", body))
 
     def odometry(self) -> CameraPoses | None:
-        """Poses of the colour camera by another odometry; None if none was asked for."""
+        """Poses of the color camera by another odometry; None if none was asked for."""
         if not self._odometry:
             return None
         found, body = self._odometry.result()

@@ -14,13 +14,13 @@ class LogOptions(AssociationOptions, StereoOptions):
     """Topics, times and cameras; whatever is empty is found by type and name."""
 
     color: str = ""
-    """Topic of the colour images."""
+    """Topic of the color images."""
     depth_from: Literal["image", "stereo", "lidar"] = "image"
-    """Where depth comes from: depth images, a stereo pair with colour as its left eye, or points of a LiDAR."""
+    """Where depth comes from: depth images, a stereo pair with color as its left eye, or points of a LiDAR."""
     depth: str = ""
     """Topic of the depth images; of the right images, or of the points, by `depth_from`."""
     color_info: str = ""
-    """Topic of the colour camera's CameraInfo."""
+    """Topic of the color camera's CameraInfo."""
     depth_info: str = ""
     """Topic of the depth camera's CameraInfo, or the right camera's."""
     imu: str = ""
@@ -31,7 +31,7 @@ class LogOptions(AssociationOptions, StereoOptions):
     """Topic of true poses (Odometry, PoseStamped, TransformStamped), or a transform that changes as "/tf PARENT CHILD",
     for evaluation; none if empty."""
     truth_file: str = ""
-    """File of true poses as of TUM, `time x y z qx qy qz qw` in seconds and metres, instead of a topic."""
+    """File of true poses as of TUM, `time x y z qx qy qz qw` in seconds and meters, instead of a topic."""
     truth_offset_s: float = Field(default=0.0, allow_inf_nan=False)
     """Seconds to add to the times of true poses, if their clock is another one; see `truth_lag_s` in recording.json."""
     truth_frame: str = ""
@@ -40,18 +40,18 @@ class LogOptions(AssociationOptions, StereoOptions):
     """Namespaces of several robots in one log, separated by commas, for example "/acl_jackal,/sparkal1"; they name the
     robots, and stand for {namespace} in the names of other topics."""
     registered: Literal["auto", "yes", "no"] = "auto"
-    """Whether depth is seen from the colour camera; auto: by name of the topic, frame and camera."""
+    """Whether depth is seen from the color camera; auto: by name of the topic, frame and camera."""
     T_color_depth: str = ""
     """Extrinsics "x y z qw qx qy qz" (m) of a depth camera, right camera or LiDAR that /tf_static does not know;
     x_color = T x_depth."""
     T_color_imu: str = ""
     """Extrinsics of the IMU, likewise, where /tf_static does not know them."""
     T_odometry_color: str = ""
-    """Pose of the colour camera in the body that the odometry is of, likewise."""
+    """Pose of the color camera in the body that the odometry is of, likewise."""
     T_truth_color: str = ""
-    """Pose of the colour camera in the body that the true poses are of, likewise."""
+    """Pose of the color camera in the body that the true poses are of, likewise."""
     depth_scale: float = Field(default=0.001, gt=0)
-    """Metres per unit of 16-bit depth."""
+    """Meters per unit of 16-bit depth."""
     range_sigma_m: float = Field(default=0.03, gt=0)
     """Standard deviation of the LiDAR's ranges."""
     time_source: Literal["header", "log", "publish"] = "header"
@@ -64,4 +64,4 @@ class LogOptions(AssociationOptions, StereoOptions):
     pieces: bool = False
     """All logs of the folder belong to one robot, or to several in different namespaces."""
     undistort: bool = True
-    """Take the distortion out of colour."""
+    """Take the distortion out of color."""

@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
 RECTIFIED = ("image_rect", "image_rect_color", "rect")
 SAME_CAMERA_PX = 1.0  # up to which a camera has not changed
-OUT_SCALE = 0.0005  # metres per unit of depth that was registered or came as floats
+OUT_SCALE = 0.0005  # meters per unit of depth that was registered or came as floats
 
 
 class _Cameras:
@@ -60,7 +60,7 @@ class _Cameras:
 
 
 class RobotLog:
-    """Colour, depth, cameras and true poses of one robot.
+    """Color, depth, cameras and true poses of one robot.
 
     Raises (on construction):
         DuagError: a topic is missing or more than one could be meant; a camera or an extrinsic is unknown.
@@ -84,7 +84,7 @@ class RobotLog:
         if not chooser.images:
             where = f" below {self.namespace}" if self.namespace else ""
             video = video_words(self.log, self.namespace)
-            raise DuagError(f"{self.name}: found no topic of images{where}, expected colour and depth{video}")
+            raise DuagError(f"{self.name}: found no topic of images{where}, expected color and depth{video}")
         self.depth = chooser.depth().required(self.log, "depth")
         self.color = chooser.color().required(self.log, "color")
         self.color_camera = self._camera(self.color, "color_info", chooser)
@@ -129,11 +129,11 @@ class RobotLog:
 
     @property
     def T_color_camera(self) -> Array:  # noqa: N802 (a transform)
-        """Where the camera of the recording is in the colour camera: turned, if that is rectified."""
+        """Where the camera of the recording is in the color camera: turned, if that is rectified."""
         return self.derived.T_color_camera if self.derived else np.eye(4)
 
     def depth_m(self, picture: Picture) -> Array:
-        """Depth [h, w] of a picture in metres, 0 = none."""
+        """Depth [h, w] of a picture in meters, 0 = none."""
         if self.derived:
             return self.derived.depth_m(picture)
         assert picture.depth is not None
@@ -166,14 +166,14 @@ class RobotLog:
 
     @cached_property
     def color_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-        """Where in the colour images every pixel of the recording's camera lies."""
+        """Where in the color images every pixel of the recording's camera lies."""
         return self.color_camera.maps() if self.settings.undistort else None
 
     @cached_property
     def depth_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Where in the depth images every pixel of their pinhole lies; None if they need not be undistorted.
 
-        Depth that is registered has the distortion of colour; that of another camera its own.
+        Depth that is registered has the distortion of color; that of another camera its own.
         """
         return self.color_maps if self.T_color_depth is None else self.depth_camera.maps()
 
@@ -188,7 +188,7 @@ class RobotLog:
             if (color.camera.width, color.camera.height) != (depth.camera.width, depth.camera.height):
                 raise DuagError(
                     f"{self.name}: {self.depth} is {depth.camera.width}x{depth.camera.height}, expected "
-                    f"{color.camera.width}x{color.camera.height} of colour that it is registered to"
+                    f"{color.camera.width}x{color.camera.height} of color that it is registered to"
                 )
             return None
         if s.T_color_depth:
@@ -201,7 +201,7 @@ class RobotLog:
         )
         if T is None:
             raise DuagError(
-                f"{self.name}: {self.depth} is seen from {depth.frame_id!r}, colour from {color.frame_id!r}, and "
+                f"{self.name}: {self.depth} is seen from {depth.frame_id!r}, color from {color.frame_id!r}, and "
                 f"/tf_static does not tie them{self.transforms.moving_words()}; expected --set T_color_depth="
                 "'x y z qw qx qy qz' or registered=yes"
             )
@@ -226,13 +226,13 @@ class RobotLog:
 
     @cached_property
     def odometry(self) -> CameraPoses | None:
-        """Poses of the colour camera by another odometry."""
+        """Poses of the color camera by another odometry."""
         self._seen  # noqa: B018
         return self._motion.odometry()
 
     @cached_property
     def truth(self) -> CameraPoses | None:
-        """True poses of the colour camera, for evaluation only."""
+        """True poses of the color camera, for evaluation only."""
         self._seen  # noqa: B018
         return self._motion.truth()
 
@@ -299,7 +299,7 @@ class RobotLog:
 
     @cached_property
     def pairs(self) -> dict[int, int]:
-        """Time of a colour image -> time of its depth image."""
+        """Time of a color image -> time of its depth image."""
         stamps = {topic: times.tolist() for topic, times in self._seen.items()}
         for topic, times in stamps.items():
             if times != sorted(times):
@@ -325,7 +325,7 @@ class RobotLog:
         alone = len(listed[self.color]) - len(found)
         if alone:
             self.warnings.append(
-                f"{alone} of {len(listed[self.color])} colour images have no depth near in time"
+                f"{alone} of {len(listed[self.color])} color images have no depth near in time"
             )
         if min(c.stamp_ns for c, _ in found) + self.shift_ns < 0:
             raise DuagError(f"{self.name}: clock_offset_s = {self.settings.clock_offset_s} leads before 1970")
@@ -339,7 +339,7 @@ class RobotLog:
         return RobotClock(robot, self.log, files, self.namespace, self._delays_ns, first, last, header)
 
     def frames(self) -> Iterator[tuple[int, Any, Any]]:
-        """Time, colour and depth message of every pair, in order of time; holds no more than it must."""
+        """Time, color and depth message of every pair, in order of time; holds no more than it must."""
         order = sorted(self.pairs)
         groups = [{self.color: time, self.depth: self.pairs[time]} for time in order]
         # to the end of the log, so that all its checksums are compared
@@ -348,7 +348,7 @@ class RobotLog:
 
     def sensors(self) -> dict[str, str]:
         """What the log says about its source."""
-        moved = "registered to colour by the converter" if self.T_color_depth is not None else "registered"
+        moved = "registered to color by the converter" if self.T_color_depth is not None else "registered"
         moved = self.derived.words if self.derived else moved
         return {"color_topic": self.color, "depth_topic": self.depth, "depth": moved}
 

@@ -86,7 +86,7 @@ class RosBag:
 
     def _read(self, connection: Any, raw: bytes) -> Any:
         where = f"{self.path}: {connection.topic}"
-        message = deserialised(self._reader.deserialize, raw, connection.msgtype, where)
+        message = deserialized(self._reader.deserialize, raw, connection.msgtype, where)
         return foxglove.as_ros(foxglove.plain_name(connection.msgtype), message, where)
 
     def close(self) -> None:
@@ -154,7 +154,7 @@ def check_definitions(found: Mapping[str, Any]) -> None:
                 raise ValueError(f"its {name} has no field {field} as ROS has it")
 
 
-def deserialised(read: Any, raw: bytes, kind: str, where: str) -> Any:
+def deserialized(read: Any, raw: bytes, kind: str, where: str) -> Any:
     """A message of ROS from its bytes, or an error that names its topic."""
     try:
         return read(raw, kind)

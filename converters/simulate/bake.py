@@ -1,4 +1,4 @@
-"""Light and texture of a scene, baked once: after it every surface has one colour at a point, whatever the view.
+"""Light and texture of a scene, baked once: after it every surface has one color at a point, whatever the view.
 
 The light is Lambert's: shining panels with soft shadows, plus an even light that corners get less of. All surfaces
 share one image (the atlas) with its halvings (mip levels). Tiles are separated by margins that repeat the tile's
@@ -29,10 +29,10 @@ SUN_REACH_M = 200.0
 
 @dataclass(frozen=True)
 class Atlas:
-    """Colours of all surfaces.
+    """Colors of all surfaces.
 
     levels: uint8 [h >> k, w >> k, 3] each, RGB. origin: texel of (s, t) = (0, 0) of every surface, [n, 2] (x, y),
-    where the centre of the first texel is 0. texel_m: size of a texel.
+    where the center of the first texel is 0. texel_m: size of a texel.
     """
 
     levels: list[NDArray[np.uint8]]
@@ -40,7 +40,7 @@ class Atlas:
     texel_m: float
 
     def sample(self, level: int, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Colours [n, 3] between the texels of one level; x, y [n] in texels of the finest level."""
+        """Colors [n, 3] between the texels of one level; x, y [n] in texels of the finest level."""
         n, row = len(x), 1024
         if n == 0:
             return np.zeros((0, 3), dtype=np.uint8)
@@ -101,7 +101,7 @@ def _pack(shapes: list[tuple[int, int]]) -> tuple[list[tuple[int, int]], int]:
 def _tile(
     scene: Scene, surface: Surface, shape: tuple[int, int], light: NDArray[np.float32], texel_m: float
 ) -> NDArray[np.uint8]:
-    """Lit colours of one surface, uint8 [h, w, 3]; `light` is its coarse grid of brightness."""
+    """Lit colors of one surface, uint8 [h, w, 3]; `light` is its coarse grid of brightness."""
     rng = random_streams.generator(scene.seed, "simulate.texture", scene=scene.name, surface=surface.name)
     albedo = surface.material(rng, *surface.size, texel_m)
     missing = (shape[0] - albedo.shape[0], shape[1] - albedo.shape[1])
@@ -160,7 +160,7 @@ def exposure(scene: Scene, points: Array, normals: Array, blocked: Blocked | Non
 
 
 def _sunlight(sun: Array, start: Array, normals: Array, blocked: Blocked | None) -> Array:
-    """Light of the sun, a vector towards it as long as it is strong, at points [n, 3], with a soft edge, [n]."""
+    """Light of the sun, a vector toward it as long as it is strong, at points [n, 3], with a soft edge, [n]."""
     strength = float(np.linalg.norm(sun))
     total = np.zeros(len(start))
     for across in ((0.01, 0.0), (-0.01, 0.0), (0.0, 0.01), (0.0, -0.01)):
@@ -236,7 +236,7 @@ def _meets(solid: Solid, start: Array, way: Array, reach: float) -> NDArray[np.b
 
 
 def surface_points(scene: Scene, atlas: Atlas, count: int) -> tuple[Array, Array, NDArray[np.uint8]]:
-    """About `count` points spread evenly over what can be seen of a scene: points, normals, colours, [n, 3] each."""
+    """About `count` points spread evenly over what can be seen of a scene: points, normals, colors, [n, 3] each."""
     rng = random_streams.generator(scene.seed, "simulate.points", scene=scene.name)
     areas = np.array([surface.size[0] * surface.size[1] for surface in scene.surfaces])
     points, normals, colors = [], [], []

@@ -113,7 +113,7 @@ def _shell(
 
 
 def _windows(rng: np.random.Generator, width: float, height: float) -> tex.Material:
-    """An outer wall with a window every few metres and pictures between."""
+    """An outer wall with a window every few meters and pictures between."""
     patches: list[tuple[tex.Material, float, float, float, float]] = []
     at = float(rng.uniform(0.5, 1.0))
     while at < width - 1.7:

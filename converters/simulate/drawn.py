@@ -44,8 +44,8 @@ def _landscape(rng: np.random.Generator, h: int, w: int, texel_m: float) -> Imag
         (1 - sky) * flat((h, w), (110, 158, 208)) + sky * flat((h, w), (238, 208, 166))
     )
     image *= (1 + 0.10 * cloud(rng, (h, w), 0.14 / texel_m, 4, 0.6, stretch=2.0))[..., None]
-    centre = (int(rng.uniform(0.15, 0.85) * w), int(rng.uniform(0.1, 0.35) * h))
-    cv2.circle(image, centre, max(2, int(0.07 * h)), (250, 232, 170), -1, cv2.LINE_AA)
+    center = (int(rng.uniform(0.15, 0.85) * w), int(rng.uniform(0.1, 0.35) * h))
+    cv2.circle(image, center, max(2, int(0.07 * h)), (250, 232, 170), -1, cv2.LINE_AA)
     rows = np.arange(h, dtype=np.float32)[:, None]
     for k in range(4):
         ridge = cloud(rng, (1, w), 0.28 / texel_m / (k + 1), 4, 0.6)[0]

@@ -206,12 +206,12 @@ def meeting_table(at: Place, rng: np.random.Generator, length: float = 2.4) -> N
 
 def copier(at: Place, rng: np.random.Generator) -> None:
     """A copying machine at the wall."""
-    grey = tex.plaster(tex.shaded(rng, (204, 204, 198), 0.05), 0.05)
+    gray = tex.plaster(tex.shaded(rng, (204, 204, 198), 0.05), 0.05)
     at.box(
         "body",
         (-0.35, -0.62, 0),
         (0.7, 0.6, 0.85),
-        grey,
+        gray,
         front=tex.front((186, 188, 190), 1, 4, (70, 72, 76)),
     )
     at.box("lid", (-0.35, -0.62, 0.87), (0.7, 0.6, 0.12), tex.plaster((84, 88, 96), 0.1))

@@ -42,7 +42,7 @@ def read(files: list[Path], up: str, cache: Path) -> None:
 
 @contextmanager
 def _started() -> Iterator[tuple[Process, int, int]]:
-    """The process, a pipe from it, and the number of the other end there; it is gone afterwards."""
+    """The process, a pipe from it, and the number of the other end there; it is gone afterward."""
     told, tell = os.pipe()
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join(os.path.abspath(entry) for entry in sys.path),

@@ -1,8 +1,8 @@
 """Textured meshes from a folder, put together into one scene.
 
 Every GLB, glTF, OBJ and PLY file of the folder is a part of the scene, in coordinates that all of them share. The
-world of the recording is x east, y north, z up; a file that is y up is turned about x. Colours come from the base
-colour texture of a part, or from the colours of its vertices; lamps, gloss and transparency are ignored, and both
+world of the recording is x east, y north, z up; a file that is y up is turned about x. Colors come from the base
+color texture of a part, or from the colors of its vertices; lamps, gloss and transparency are ignored, and both
 sides of a triangle look the same.
 """
 
@@ -31,8 +31,8 @@ class MeshScene:
     """A scene of n vertices and m triangles.
 
     vertices: float64 [n, 3], m, world. triangles: int32 [m, 3]. texels: float32 [m, 3, 2], where the corners of a
-    triangle lie in its texture (x right, y down; the centre of the first texel is 0). texture_of: int32 [m], index
-    into `textures`, or NO_TEXTURE for the colours of the vertices. colors: uint8 [n, 3] RGB. textures: per texture
+    triangle lie in its texture (x right, y down; the center of the first texel is 0). texture_of: int32 [m], index
+    into `textures`, or NO_TEXTURE for the colors of the vertices. colors: uint8 [n, 3] RGB. textures: per texture
     its mip levels, uint8 [h, w, 3] RGB each, the finest first.
     """
 
@@ -56,7 +56,7 @@ class MeshScene:
     def sample(
         self, triangle: NDArray[np.integer], weights: NDArray[np.float32], level: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Colours [k, 3], 0 to 255, of points on triangles.
+        """Colors [k, 3], 0 to 255, of points on triangles.
 
         Args:
             triangle: [k]. weights: of the second and the third corner, [k, 2].
@@ -94,7 +94,7 @@ def _between(corners: NDArray[np.float32], weights: NDArray[np.float32]) -> NDAr
 def _blended(
     levels: list[NDArray[np.uint8]], k: int, share: NDArray[np.float32], xy: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Colours [n, 3] between level k and, by `share` [n], the next one, at texels xy [n, 2] of the finest."""
+    """Colors [n, 3] between level k and, by `share` [n], the next one, at texels xy [n, 2] of the finest."""
     fine = _bilinear(levels, min(k, len(levels) - 1), xy)
     if k + 1 >= len(levels) or not share.any():
         return fine
@@ -102,7 +102,7 @@ def _blended(
 
 
 def _bilinear(levels: list[NDArray[np.uint8]], k: int, xy: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Colours [n, 3] between the texels of level k; a texture goes on periodically beyond its border."""
+    """Colors [n, 3] between the texels of level k; a texture goes on periodically beyond its border."""
     row = 1024  # OpenCV wants images no larger than 32767 pixels
     n = len(xy)
     maps = np.zeros((2, -(-n // row) * row), dtype=np.float32)
@@ -178,7 +178,7 @@ def read(folder: Path, up: str, cache: Path) -> MeshScene:
         up: the axis that is up in the files, "y" or "z".
         cache: an empty folder; everything is written there and read back when needed, so that processes share it.
     Raises:
-        DuagError: no folder, no mesh, a file that cannot be read, or one with neither texture nor colours.
+        DuagError: no folder, no mesh, a file that cannot be read, or one with neither texture nor colors.
     """
     mesh_process.read(mesh_files(folder), up, cache)
     return load(cache)
@@ -197,7 +197,7 @@ def load(cache: Path) -> MeshScene:
 def surface_points(
     scene: MeshScene, areas: Array, count: int, rng: np.random.Generator
 ) -> tuple[Array, Array, NDArray[np.uint8]]:
-    """`count` points spread evenly over the triangles: points (m), unit normals, colours, [n, 3] each.
+    """`count` points spread evenly over the triangles: points (m), unit normals, colors, [n, 3] each.
 
     A normal points to the side from which the corners run counter-clockwise.
     """

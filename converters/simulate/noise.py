@@ -1,11 +1,11 @@
-"""What a structured-light depth camera (a first Kinect) and a small colour sensor make of exact images.
+"""What a structured-light depth camera (a first Kinect) and a small color sensor make of exact images.
 
-Disparity between projector and camera is measured in eighths of a pixel, with an error that neighbouring pixels
+Disparity between projector and camera is measured in eighths of a pixel, with an error that neighboring pixels
 share; there is no depth where the projector does not reach, at grazing incidence, too near or too far; at a depth
 edge some pixels mix both sides.
 
 Source of the axial error: Nguyen, Izadi, Lovell, "Modeling Kinect sensor noise for improved 3D reconstruction and
-tracking", 3DIMPVT 2012, sigma(z) = 0.0012 + 0.0019 (z - 0.4)^2; it contains the quantisation. Focal length, base line
+tracking", 3DIMPVT 2012, sigma(z) = 0.0012 + 0.0019 (z - 0.4)^2; it contains the quantization. Focal length, base line
 and quantum are those of the sensor, whatever the size of the simulated image.
 """
 
@@ -25,7 +25,7 @@ CORRELATION_OF_WIDTH = 1.0 / 480  # sigma of the blur of the error, as a share o
 GRAZING_COSINE = (0.09, 0.30)  # never below the first, always above the second
 EDGE_STEP = 0.04  # relative step of depth within 3 x 3 pixels that makes a depth edge
 MIXED_SHARE = 0.35
-GREY_SIGMA = 0.01  # of full scale
+GRAY_SIGMA = 0.01  # of full scale
 
 
 def axial_sigma_m(depth_m: Array) -> Array:
@@ -34,7 +34,7 @@ def axial_sigma_m(depth_m: Array) -> Array:
 
 
 def depth_step_m(depth_m: Array) -> Array:
-    """Distance (m) between neighbouring measurable depths around depths (m) of any shape."""
+    """Distance (m) between neighboring measurable depths around depths (m) of any shape."""
     return DISPARITY_STEP_PX * depth_m**2 / (SENSOR_FOCAL_PX * BASELINE_M)
 
 
@@ -62,21 +62,21 @@ def kinect_depth(depth: Array, camera: PinholeCamera, rng: np.random.Generator) 
     return np.where(valid, measured, 0.0)
 
 
-def grey_noise(color: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """A colour image [h, w, 3] with independent noise of its brightness."""
-    noise = 255 * GREY_SIGMA * rng.standard_normal(color.shape[:2])
+def gray_noise(color: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """A color image [h, w, 3] with independent noise of its brightness."""
+    noise = 255 * GRAY_SIGMA * rng.standard_normal(color.shape[:2])
     return np.clip(np.rint(color + noise[..., None]), 0, 255).astype(np.uint8)
 
 
 def _unit_variance(white: Array, sigma_px: float) -> Array:
-    """White noise [h, w] blurred to neighbours, rescaled to unit variance."""
+    """White noise [h, w] blurred to neighbors, rescaled to unit variance."""
     size = 2 * int(np.ceil(4 * sigma_px)) + 1
     kernel = cv2.getGaussianKernel(size, sigma_px)
     return cv2.sepFilter2D(white, -1, kernel, kernel, borderType=cv2.BORDER_REFLECT_101) / np.sum(kernel**2)
 
 
 def _mixed(depth: Array, dice: Array) -> Array:
-    """Depth in which some pixels at depth edges lie between the nearest and the farthest of their neighbours."""
+    """Depth in which some pixels at depth edges lie between the nearest and the farthest of their neighbors."""
     window = np.ones((3, 3), dtype=np.uint8)
     near, far = cv2.erode(depth, window), cv2.dilate(depth, window)
     mixes = (far - near > EDGE_STEP * near) & (dice < MIXED_SHARE)
@@ -103,7 +103,7 @@ def _incidence_cosine(depth: Array, camera: PinholeCamera) -> Array:
 
 
 def _gentler_slope(field: Array, axis: int) -> Array:
-    """Of the differences to the two neighbours along an axis, the smaller one: it does not cross an edge."""
+    """Of the differences to the two neighbors along an axis, the smaller one: it does not cross an edge."""
     step = np.diff(field, axis=axis)
     before = np.concatenate([np.take(step, [0], axis), step], axis=axis)
     after = np.concatenate([step, np.take(step, [-1], axis)], axis=axis)

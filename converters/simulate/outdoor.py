@@ -13,7 +13,7 @@ from duagc.converters.simulate.scene import Flat, Scene
 from duagc.pipeline.base import random_streams
 
 SIZE_M = (44.0, 34.0, 16.0)
-SUN = (0.45, -0.38, 0.62)  # towards the sun, as long as it is strong
+SUN = (0.45, -0.38, 0.62)  # toward the sun, as long as it is strong
 EVEN_LIGHT = 0.62
 RENDERS = ((196, 178, 148), (172, 96, 74), (206, 200, 186), (152, 164, 172), (188, 150, 104), (148, 140, 128))
 HOUSE = (23.0, 11.5, 34.0, 22.5)
@@ -51,7 +51,7 @@ def outdoor(seed: int) -> Scene:
 
 
 def _facades(scene: Scene, rng: np.random.Generator) -> None:
-    """Houses side by side along the border, each of its own width, height, depth and colour."""
+    """Houses side by side along the border, each of its own width, height, depth and color."""
     w, d, _ = SIZE_M
     sides = {"south": (w, "back"), "north": (w, "front"), "west": (d, "right"), "east": (d, "left")}
     for side, (length, front) in sides.items():

@@ -261,7 +261,7 @@ def _shown(eye: Eye, paths: list[Array], sky: bool) -> float | None:
 
 
 def _error(team: list[_Member], robots: int) -> float:
-    """How far the overlaps of neighbours are from the one asked for, on average over the whole team."""
+    """How far the overlaps of neighbors are from the one asked for, on average over the whole team."""
     return float(sum(member.error for member in team) / max(robots - 1, 1))
 
 

@@ -45,7 +45,7 @@ class Preview:
             self._thumbs[robot, index] = np.asarray(small[..., ::-1], dtype=np.uint8)
 
     def write(self, path: Path, points: Array, colors: NDArray[np.uint8]) -> None:
-        """Write the sheet; `points` [n, 3] (m, world) and their colours [n, 3] are the scene for the map."""
+        """Write the sheet; `points` [n, 3] (m, world) and their colors [n, 3] are the scene for the map."""
         rows = [self._map(points, colors)] + [self._row(k) for k in range(len(self.names))]
         width = max(row.shape[1] for row in rows)
         sheet = [_line(self.title, width)]
@@ -99,15 +99,15 @@ class Preview:
             cv2.putText(
                 image, self.names[k][0], pixel(way[0, :2, 3] + 10 / scale), 0, 0.6, color, 2, cv2.LINE_AA
             )
-        metres = 10.0 ** np.floor(np.log10(200 / scale))
+        meters = 10.0 ** np.floor(np.log10(200 / scale))
         bottom = image.shape[0] - 14
-        cv2.line(image, (14, bottom), (14 + round(metres * scale), bottom), INK, 3)
-        cv2.putText(image, f"{metres:g} m", (14, bottom - 8), 0, 0.5, INK, 1, cv2.LINE_AA)
+        cv2.line(image, (14, bottom), (14 + round(meters * scale), bottom), INK, 3)
+        cv2.putText(image, f"{meters:g} m", (14, bottom - 8), 0, 0.5, INK, 1, cv2.LINE_AA)
         return image
 
 
 def _from_above(points: Array, colors: NDArray[np.uint8], low: Array, high: Array, scale: float) -> Image:
-    """Points seen from above, the highest of each place; places without one have the colour of their surroundings."""
+    """Points seen from above, the highest of each place; places without one have the color of their surroundings."""
     whole = tuple(max(1, int(n)) for n in scale * (high - low))
     scale = min(scale, float(np.sqrt(len(points) / np.prod(high - low) / POINTS_PER_PIXEL)))
     width, height = (max(1, int(n)) for n in scale * (high - low))

@@ -1,7 +1,7 @@
-"""Ray casting of textured meshes: exact depth at the pixel centres, colour averaged over the pixel.
+"""Ray casting of textured meshes: exact depth at the pixel centers, color averaged over the pixel.
 
-Rays meet triangles in Embree (Open3D's `RaycastingScene`), in float32. Colour is the mean of 2 x 2 rays per pixel (of
-two where these have nearly the same colour), each with a texture sample of its own (bilinear, between the two mip
+Rays meet triangles in Embree (Open3D's `RaycastingScene`), in float32. Color is the mean of 2 x 2 rays per pixel (of
+two where these have nearly the same color), each with a texture sample of its own (bilinear, between the two mip
 levels around the distance of the samples on the surface). Means are taken of the stored values (sRGB), as a Gaussian
 map blends them, and as in the procedural room.
 Where no ray hits there is a hole of the scan: depth 0, black; or, in a scene with a sky, the sky: depth 0.
@@ -17,7 +17,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 Array = NDArray[np.float64]
 
 OFFSETS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
-UNEVEN_GREY = 4.0  # of 255: where the first and the last of these differ less, the two others are left out
+UNEVEN_GRAY = 4.0  # of 255: where the first and the last of these differ less, the two others are left out
 SAMPLE_SPACING_PX = 0.5
 LEAST_COSINE = 0.1  # a texture seen at a more grazing angle is blurred no further
 
@@ -73,7 +73,7 @@ class MeshRenderer:
         self._texel_density = _texel_density(self.scene)
 
     def depth(self, T_world_camera: ArrayLike) -> tuple[Array, NDArray[np.int64]]:
-        """Depth (z, m, [h, w]; 0 = nothing) and triangle seen (-1 = nothing) at the pixel centres."""
+        """Depth (z, m, [h, w]; 0 = nothing) and triangle seen (-1 = nothing) at the pixel centers."""
         T = np.asarray(T_world_camera, dtype=np.float64)
         hit = self.caster.hits(T[:3, 3], self._directions(T, 0.0, 0.0))
         seen = np.isfinite(hit["t"])
@@ -83,14 +83,14 @@ class MeshRenderer:
         return depth.reshape(shape), triangle.reshape(shape)
 
     def render(self, T_world_camera: ArrayLike) -> View:
-        """Colour and depth from a camera pose T_world_camera [4, 4]."""
+        """Color and depth from a camera pose T_world_camera [4, 4]."""
         depth, triangle = self.depth(T_world_camera)
         T = np.asarray(T_world_camera, dtype=np.float64)
         directions = [self._directions(T, *offset) for offset in OFFSETS]
         _, colors = self.shade(T[:3, 3], np.concatenate(directions[::3]))
         one, other = colors.reshape(2, -1, 3)
         mean = 0.5 * (one + other)
-        uneven = np.flatnonzero(np.abs(one - other).max(axis=1) > UNEVEN_GREY)
+        uneven = np.flatnonzero(np.abs(one - other).max(axis=1) > UNEVEN_GRAY)
         _, more = self.shade(T[:3, 3], np.concatenate([each[uneven] for each in directions[1:3]]))
         mean[uneven] = 0.5 * mean[uneven] + 0.25 * more.reshape(2, -1, 3).sum(axis=0)
         return View(np.clip(np.rint(mean), 0, 255).astype(np.uint8).reshape(*depth.shape, 3), depth, triangle)
@@ -98,11 +98,11 @@ class MeshRenderer:
     def shade(
         self, origins: Array, directions: NDArray[np.float32]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """What rays [n, 3], one metre along z, half a pixel apart, meet: z [n], inf = nothing; colours [n, 3]."""
+        """What rays [n, 3], one meter along z, half a pixel apart, meet: z [n], inf = nothing; colors [n, 3]."""
         hit = self.caster.hits(origins, directions)
         t = hit["t"].copy()
         missed = np.flatnonzero(~np.isfinite(t))
-        hit["t"][missed], hit["triangle"][missed] = 0.0, 0  # another colour in the end
+        hit["t"][missed], hit["triangle"][missed] = 0.0, 0  # another color in the end
         index = hit["triangle"].view(np.int32)
         level = self._level(hit["t"], index, directions, hit["normals"])
         colors = self.scene.sample(index, hit["weights"], level)
@@ -110,7 +110,7 @@ class MeshRenderer:
         return t, colors
 
     def _directions(self, T_world_camera: Array, du: float, dv: float) -> NDArray[np.float32]:
-        """World directions [h * w, 3] of rays beside the pixel centres by (du, dv) px, one metre along z.
+        """World directions [h * w, 3] of rays beside the pixel centers by (du, dv) px, one meter along z.
 
         Column by column: a product of matrices so narrow takes twenty times as long.
         """
@@ -139,7 +139,7 @@ class MeshRenderer:
 
 
 def sky_color(directions: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Colours [n, 3], 0 to 255, of the sky in world directions [n, 3]: paler at the horizon, with a few clouds."""
+    """Colors [n, 3], 0 to 255, of the sky in world directions [n, 3]: paler at the horizon, with a few clouds."""
     d = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     height = np.clip(d[:, 2], 0.0, 1.0)[:, None]
     blue = np.array((214, 224, 234)) * (1 - height) ** 2 + np.array((92, 144, 206)) * (1 - (1 - height) ** 2)
@@ -155,7 +155,7 @@ def sky_color(directions: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def _texel_density(scene: MeshScene) -> NDArray[np.float32]:
-    """Texels per metre on every triangle, [m]; 0 without texture or without area."""
+    """Texels per meter on every triangle, [m]; 0 without texture or without area."""
     a, b, c = np.moveaxis(scene.texels.astype(np.float64), 1, 0)
     p, q = b - a, c - a
     texels2 = 0.5 * np.abs(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])

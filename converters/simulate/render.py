@@ -1,8 +1,8 @@
-"""Ray casting: exact depth at the pixel centres, colour averaged over the pixel's area.
+"""Ray casting: exact depth at the pixel centers, color averaged over the pixel's area.
 
 A flat surface seen by a pinhole camera has an inverse depth D = 1/z that is linear in the pixel (u, v), and so are
-s D and t D of its coordinates (s, t). Visibility is a maximum of D over surfaces, in float64, at pixel centres.
-Colour takes 2 x 2 samples of the surface at the centre, or, beside a border between surfaces, 4 x 4 samples of
+s D and t D of its coordinates (s, t). Visibility is a maximum of D over surfaces, in float64, at pixel centers.
+Color takes 2 x 2 samples of the surface at the center, or, beside a border between surfaces, 4 x 4 samples of
 whatever each of them hits; textures are read at the mip level whose texels are as large as the samples are apart.
 """
 
@@ -29,7 +29,7 @@ BORDER_OFFSETS = np.array(
 
 @dataclass(frozen=True)
 class View:
-    """What a camera sees: colour uint8 [h, w, 3] RGB; depth float64 [h, w], z in m, 0 = nothing; surface its index."""
+    """What a camera sees: color uint8 [h, w, 3] RGB; depth float64 [h, w], z in m, 0 = nothing; surface its index."""
 
     color: NDArray[np.uint8]
     depth: Array
@@ -42,10 +42,10 @@ class Eye(Protocol):
     camera: PinholeCamera
 
     def depth(self, T_world_camera: ArrayLike) -> tuple[Array, Any]:
-        """Depth (z, m, [h, w]; 0 = nothing) at the pixel centres, and what is seen there (-1 = nothing)."""
+        """Depth (z, m, [h, w]; 0 = nothing) at the pixel centers, and what is seen there (-1 = nothing)."""
 
     def render(self, T_world_camera: ArrayLike) -> View:
-        """Colour and depth from a camera pose T_world_camera [4, 4]."""
+        """Color and depth from a camera pose T_world_camera [4, 4]."""
 
 
 class Renderer:
@@ -73,14 +73,14 @@ class Renderer:
         self.v = np.arange(camera.height, dtype=np.float64)
 
     def depth(self, T_world_camera: ArrayLike) -> tuple[Array, NDArray[np.int16]]:
-        """Exact depth (z, m, [h, w]; 0 = nothing) and index of the surface seen (-1 = nothing) at pixel centres."""
+        """Exact depth (z, m, [h, w]; 0 = nothing) and index of the surface seen (-1 = nothing) at pixel centers."""
         inverse, surface = self._nearest(_Pose(self, T_world_camera))
         depth = np.zeros_like(inverse)
         np.divide(1.0, inverse, out=depth, where=inverse > 0)
         return depth, surface
 
     def render(self, T_world_camera: ArrayLike) -> View:
-        """Colour and exact depth from a camera pose T_world_camera [4, 4]."""
+        """Color and exact depth from a camera pose T_world_camera [4, 4]."""
         pose = _Pose(self, T_world_camera)
         inverse, surface = self._nearest(pose)
         depth = np.zeros_like(inverse)
@@ -98,7 +98,7 @@ class Renderer:
         return View(image, depth, surface)
 
     def _nearest(self, pose: "_Pose") -> tuple[Array, NDArray[np.int16]]:
-        """Greatest inverse depth and its surface at every pixel centre."""
+        """Greatest inverse depth and its surface at every pixel center."""
         nearest = np.zeros((self.camera.height, self.camera.width))
         surface = np.full(nearest.shape, -1, dtype=np.int16)
         u, v = self.u, self.v[:, None]
@@ -135,7 +135,7 @@ class Renderer:
     def _inside(
         self, pose: "_Pose", at: NDArray[np.int64], surface: NDArray[np.int64]
     ) -> NDArray[np.float32]:
-        """Mean colours [n, 3] of pixels that one surface fills; `at` are their flat indices."""
+        """Mean colors [n, 3] of pixels that one surface fills; `at` are their flat indices."""
         assert self.atlas is not None
         v, u = np.divmod(at, self.camera.width)
         x, y = np.empty((4, at.size), dtype=np.float32), np.empty((4, at.size), dtype=np.float32)
@@ -170,7 +170,7 @@ class Renderer:
         return xy[0], xy[1]
 
     def _filtered(self, x: NDArray[np.float32], y: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Mean colours [n, 3] of four samples each at texels x, y [4, n], half a pixel apart."""
+        """Mean colors [n, 3] of four samples each at texels x, y [4, n], half a pixel apart."""
         assert self.atlas is not None
         n = x.shape[1]
         step = np.maximum((x[1] - x[0]) ** 2 + (y[1] - y[0]) ** 2, (x[2] - x[0]) ** 2 + (y[2] - y[0]) ** 2)
@@ -197,7 +197,7 @@ class Renderer:
     def _mean_of_four(
         self, level: int, x: NDArray[np.float32], y: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Mean colours [n, 3] of four samples each at texels x, y [4, n]."""
+        """Mean colors [n, 3] of four samples each at texels x, y [4, n]."""
         assert self.atlas is not None
         samples = self.atlas.sample(level, x.ravel(), y.ravel()).reshape(4, -1, 3)
         total = np.add(samples[0], samples[1], dtype=np.uint16)
@@ -208,7 +208,7 @@ class Renderer:
     def _border(
         self, pose: "_Pose", at: NDArray[np.int64], surface: NDArray[np.int16]
     ) -> NDArray[np.float32]:
-        """Mean colours [n, 3] of pixels near a border: 4 x 4 samples, each of the nearest of the surfaces around."""
+        """Mean colors [n, 3] of pixels near a border: 4 x 4 samples, each of the nearest of the surfaces around."""
         assert self.atlas is not None
         v, u = np.divmod(at, self.camera.width)
         padded = np.pad(surface, 1, mode="edge").astype(np.int64)

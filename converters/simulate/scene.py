@@ -1,7 +1,7 @@
 """Scenes made of boxes, upright cylinders and spheres, and the surfaces that a camera sees of them.
 
-World frame: x east, y north, z up, metres; the floor is z = 0. A solid is what paths keep clear of and what casts
-shadows; its surfaces carry the texture. Surface coordinates (s, t) are metres, s to the right and t downwards for
+World frame: x east, y north, z up, meters; the floor is z = 0. A solid is what paths keep clear of and what casts
+shadows; its surfaces carry the texture. Surface coordinates (s, t) are meters, s to the right and t downwards for
 somebody who looks at the surface from its front.
 """
 
@@ -31,7 +31,7 @@ class Flat:
 
     @property
     def normal(self) -> Array:
-        """Unit normal, towards the side from which the surface is seen."""
+        """Unit normal, toward the side from which the surface is seen."""
         return np.cross(self.axis_t, self.axis_s)
 
     def points(self, s: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
@@ -53,7 +53,7 @@ class Side:
 
     @property
     def size(self) -> tuple[float, float]:
-        """Circumference and height, metres."""
+        """Circumference and height, meters."""
         return 2 * np.pi * self.radius, self.height
 
     def points(self, s: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
@@ -76,7 +76,7 @@ class Ball:
 
     @property
     def size(self) -> tuple[float, float]:
-        """Length of the equator and of a meridian, metres."""
+        """Length of the equator and of a meridian, meters."""
         return 2 * np.pi * self.radius, np.pi * self.radius
 
     def points(self, s: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
@@ -162,7 +162,7 @@ class Lamp:
 class Scene:
     """A room [0, size] with what stands in it.
 
-    even_light: strength of the light from everywhere. sun: vector towards the sun, as long as it is strong; a scene
+    even_light: strength of the light from everywhere. sun: vector toward the sun, as long as it is strong; a scene
     with a sun has a sky instead of a ceiling.
     """
 

@@ -12,7 +12,7 @@ from duagc.pipeline.base.errors import DuagError
 
 @dataclass(frozen=True)
 class Manner:
-    """texel_m: of the texture. step_m: way of a robot per frame. depth_scale_m: metres per unit of depth images.
+    """texel_m: of the texture. step_m: way of a robot per frame. depth_scale_m: meters per unit of depth images.
 
     sky: there is a sky above instead of a ceiling. solid: things are closed, and only their fronts can be seen.
     """

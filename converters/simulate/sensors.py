@@ -1,6 +1,6 @@
 """What sensors other than a perfect RGB-D camera make of a scene, all from its triangles and the exact poses.
 
-A camera that moves while it looks: every row has a time of its own (rolling shutter), and a colour is the mean over the
+A camera that moves while it looks: every row has a time of its own (rolling shutter), and a color is the mean over the
 time that the shutter is open (motion blur). The recorded pose is that of the middle row in the middle of that time;
 depth is that of this one moment. Velocities are those between the frame and the next one.
 """
@@ -67,7 +67,7 @@ class Rig:
         return float(2 ** (self.gain_stops * np.sin(2 * np.pi * time_s / periods + phases).mean()))
 
     def tint(self, seed: int, robot: str) -> tuple[Array, Array]:
-        """How a robot's camera sees colours: gain [3] (of image values) and black level [3] (0..1) by channel."""
+        """How a robot's camera sees colors: gain [3] (of image values) and black level [3] (0..1) by channel."""
         if self.camera_stops == 0:
             return np.ones(3), np.zeros(3)
         rng = random_streams.generator(seed, "simulate.tint", robot=robot)
@@ -91,7 +91,7 @@ class MovingCamera:
         self.movers = [(mover, mover.eye(eye.camera)) for mover in movers]
 
     def render(self, T_world_camera: Array, twist: Array, frame: int) -> tuple[View, NDArray[np.bool_]]:
-        """Colour and depth, and where nothing moves, [h, w].
+        """Color and depth, and where nothing moves, [h, w].
 
         Args:
             T_world_camera: [4, 4], of the middle of the exposure of the middle row.
@@ -117,7 +117,7 @@ class MovingCamera:
     def _trace(
         self, origins: Array, directions: NDArray[np.float32], frame: int
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-        """z, colour and whether it moves, of what rays meet first."""
+        """z, color and whether it moves, of what rays meet first."""
         t, colors = self.eye.shade(origins, directions)
         moving = np.zeros(len(t), dtype=np.bool_)
         for mover, eye in self.movers:
@@ -149,7 +149,7 @@ class MovingCamera:
 
 
 def _rays(camera: PinholeCamera, poses: Array, du: float, dv: float) -> tuple[Array, NDArray[np.float32]]:
-    """Origins and directions [h * w, 3] of rays beside the pixel centres; poses [h, 4, 4], one for every row."""
+    """Origins and directions [h * w, 3] of rays beside the pixel centers; poses [h, 4, 4], one for every row."""
     x = (np.arange(camera.width) + du - camera.cx) / camera.fx
     y = (np.arange(camera.height) + dv - camera.cy) / camera.fy
     ahead = poses[:, None, :3, 0] * x[:, None] + (poses[:, :3, 1] * y[:, None] + poses[:, :3, 2])[:, None]

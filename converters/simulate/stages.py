@@ -19,7 +19,7 @@ Points = tuple[Array, Array, NDArray[np.uint8]]
 
 ROOM = SCENES["room"][1]
 ROOM_POINTS = 200_000
-POINTS_PER_M2, MOST_POINTS = 2000, 2_000_000  # of meshes; the room has about as many on a square metre
+POINTS_PER_M2, MOST_POINTS = 2000, 2_000_000  # of meshes; the room has about as many on a square meter
 
 
 class Stage(walks.Terrain, Protocol):
@@ -31,7 +31,7 @@ class Stage(walks.Terrain, Protocol):
         """Paths T_world_camera [frames, 4, 4] of every robot, of no particular figure."""
 
     def points(self) -> Points:
-        """Points spread evenly over the surfaces: positions (m, world), unit normals, colours, [n, 3] each."""
+        """Points spread evenly over the surfaces: positions (m, world), unit normals, colors, [n, 3] each."""
 
     def store(self, folder: Path) -> "OnDisk":
         """Write what other processes need."""

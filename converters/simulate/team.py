@@ -82,8 +82,8 @@ def simulate(
     rig = rig or Rig()
     _check(robots, frames, scene, size, noise, overlap, workers, paradigm, preview)
     _check_rig(rig, movers, noise)
-    determinism.settle()
-    determinism.settle_opencv()
+    determinism.configure_determinism()
+    determinism.configure_opencv()
     from duagc.converters.simulate import paradigms, trajectories
     from duagc.converters.simulate.preview import Preview
     from duagc.converters.simulate.stages import MeshStage, set_up
@@ -121,7 +121,7 @@ def simulate(
         shared = np.mean(shares)
         if abs(shared - overlap) > OVERLAP_TOLERANCE:
             recording.warnings.append(
-                f"neighbours share {shared:.2f} of the view ({min(shares):.2f} to {max(shares):.2f}), "
+                f"neighbors share {shared:.2f} of the view ({min(shares):.2f} to {max(shares):.2f}), "
                 f"expected {overlap:.2f}"
             )
         if paradigm != "wander":
@@ -139,7 +139,7 @@ def simulate(
         if movers:
             assert isinstance(stage, MeshStage)
             walkers = walk(movers, stage.free_space(), stage.caster, ways, seed, Path(cache))
-        title = f"{scene_name}, {paradigm}, seed {seed}: neighbours share {shared:.2f} of the view"
+        title = f"{scene_name}, {paradigm}, seed {seed}: neighbors share {shared:.2f} of the view"
         sheet = Preview(title, names, ways, [mover.poses for mover in walkers])
         twists = [_twists(way) for way in ways]
         jobs = [_Job(names[k], i, ways[k][i], twists[k][i]) for k in range(robots) for i in range(frames)]
@@ -283,7 +283,7 @@ class _Artist:
         if self.noise == "kinect":
             rng = random_streams.generator(self.seed, "simulate.noise", robot=job.robot, frame=job.index)
             depth = _units(noise.kinect_depth(view.depth, self.camera, rng), self.depth_scale_m)
-            color = noise.grey_noise(color, rng)
+            color = noise.gray_noise(color, rng)
         elif self.rig.sensor == "stereo":
             depth, sigma_m = self._by_stereo(job, color)
         elif self.rig.sensor == "lidar":
@@ -316,8 +316,8 @@ class _Artist:
         right_pose = job.pose.copy()
         right_pose[:3, 3] += BASELINE_M * job.pose[:3, 0]
         right, _ = self._view(job, right_pose)
-        grey = [np.asarray(cv2.cvtColor(each, cv2.COLOR_RGB2GRAY), np.uint8) for each in (left, right.color)]
-        depth_m, sigma_m = self.stereo.depth(grey[0], grey[1])
+        gray = [np.asarray(cv2.cvtColor(each, cv2.COLOR_RGB2GRAY), np.uint8) for each in (left, right.color)]
+        depth_m, sigma_m = self.stereo.depth(gray[0], gray[1])
         return _units(depth_m.astype(np.float64), self.depth_scale_m), sigma_m
 
 
@@ -424,7 +424,7 @@ def _start_worker(
 ) -> None:
     """Set up the artist of a worker process."""
     global _artist
-    determinism.settle_opencv()
+    determinism.configure_opencv()
     _artist = _Artist(stored.open(), camera, noise, seed, rig, movers)
 
 
@@ -437,7 +437,7 @@ def _draw(job: _Job) -> _Images:
 def write_points(
     path: Path, points: NDArray[np.float64], normals: NDArray[np.float64], colors: NDArray[np.uint8]
 ) -> None:
-    """Write a binary .ply of points (m, world), unit normals and colours, [n, 3] each."""
+    """Write a binary .ply of points (m, world), unit normals and colors, [n, 3] each."""
     row = np.dtype([("points", "<f4", 3), ("normals", "<f4", 3), ("colors", "u1", 3)])
     rows = np.zeros(len(points), dtype=row)
     rows["points"], rows["normals"], rows["colors"] = points, normals, colors

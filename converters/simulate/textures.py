@@ -50,19 +50,19 @@ def cloud(
 
 
 def flat(shape: tuple[int, int], color: Color) -> Image:
-    """One colour everywhere."""
+    """One color everywhere."""
     return np.broadcast_to(np.array(color, dtype=np.float32), (*shape, 3)).copy()
 
 
 def shaded(rng: np.random.Generator, color: Color, spread: float) -> tuple[float, float, float]:
-    """A colour near `color`: brightness and, less, hue changed at random."""
+    """A color near `color`: brightness and, less, hue changed at random."""
     c = np.array(color, dtype=np.float64) * (1 + spread * rng.standard_normal())
     c = np.clip(c * (1 + 0.2 * spread * rng.standard_normal(3)), 4, 250)
     return float(c[0]), float(c[1]), float(c[2])
 
 
 def vivid(rng: np.random.Generator, saturation: float = 0.8) -> tuple[float, float, float]:
-    """A random colour, neither black nor white, at most that saturated (0 to 1)."""
+    """A random color, neither black nor white, at most that saturated (0 to 1)."""
     hue, value = rng.random(), rng.uniform(90, 235)
     dull = value * (1 - saturation * rng.uniform(0.4, 1.0))
     r, g, b = (value - (value - dull) * min(1.0, max(0.0, abs((hue * 6 + k) % 6 - 3) - 1)) for k in (0, 4, 2))
@@ -166,9 +166,9 @@ def plaster(color: Color = (206, 198, 180), contrast: float = 0.06) -> Material:
         image[..., 2] *= 1 - hue
         mark = [0.72 * c for c in color]
         for _ in range(rng.poisson(5 * width_m * height_m)):
-            centre = (int(rng.integers(0, w)), int(rng.integers(0, h)))
+            center = (int(rng.integers(0, w)), int(rng.integers(0, h)))
             radius = max(1, int(rng.uniform(0.006, 0.016) / texel_m))
-            cv2.circle(image, centre, radius, shaded(rng, mark, 0.08), -1, cv2.LINE_AA)
+            cv2.circle(image, center, radius, shaded(rng, mark, 0.08), -1, cv2.LINE_AA)
         return image
 
     return paint
@@ -186,9 +186,9 @@ def wallpaper(color: Color = (150, 172, 166), motif: Color = (104, 132, 126)) ->
             tint = shaded(rng, motif, 0.16)
             for spread in (-38, 0, 38):
                 a = np.deg2rad(turn + spread)
-                centre = (round(x + 0.8 * length * np.cos(a)), round(y + 0.8 * length * np.sin(a)))
+                center = (round(x + 0.8 * length * np.cos(a)), round(y + 0.8 * length * np.sin(a)))
                 axes = (max(1, round(0.62 * length)), max(1, round(0.2 * length)))
-                cv2.ellipse(image, centre, axes, turn + spread, 0, 360, tint, -1, cv2.LINE_AA)
+                cv2.ellipse(image, center, axes, turn + spread, 0, 360, tint, -1, cv2.LINE_AA)
         return image
 
     return paint
@@ -265,7 +265,7 @@ def front(color: Color, columns: int, rows: int, knob: Color = (206, 192, 150)) 
 
 
 def paint_onto(base: Material, patches: Sequence[tuple[Material, float, float, float, float]]) -> Material:
-    """`base` with patches `(material, left, top, width, height)` in metres laid over it, in their order."""
+    """`base` with patches `(material, left, top, width, height)` in meters laid over it, in their order."""
 
     def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
         image = base(rng, width_m, height_m, texel_m)
@@ -302,18 +302,18 @@ def foliage(rng: np.random.Generator, width_m: float, height_m: float, texel_m: 
     h, w = shape_of(width_m, height_m, texel_m)
     image = flat((h, w), (40, 62, 34))
     for _ in range(int(900 * width_m * height_m)):
-        centre = (int(rng.integers(0, w)), int(rng.integers(0, h)))
+        center = (int(rng.integers(0, w)), int(rng.integers(0, h)))
         axes = (
             max(2, round(rng.uniform(0.02, 0.05) / texel_m)),
             max(1, round(rng.uniform(0.008, 0.016) / texel_m)),
         )
         tint = shaded(rng, (72, 118, 58), 0.28)
-        cv2.ellipse(image, centre, axes, float(rng.uniform(0, 180)), 0, 360, tint, -1, cv2.LINE_AA)
+        cv2.ellipse(image, center, axes, float(rng.uniform(0, 180)), 0, 360, tint, -1, cv2.LINE_AA)
     return image
 
 
 def marbled(color: Color, vein: Color, wave_m: float = 0.12) -> Material:
-    """Glazed clay or a globe: two colours in large soft shapes with sharper borders."""
+    """Glazed clay or a globe: two colors in large soft shapes with sharper borders."""
 
     def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
         h, w = shape_of(width_m, height_m, texel_m)

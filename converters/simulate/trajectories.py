@@ -1,6 +1,6 @@
 """Smooth paths of a team through a room: clear of every surface, and overlapping in what the cameras see.
 
-A robot goes round the middle of the room on a slowly wavering loop and looks across it. Neighbouring robots go in
+A robot goes round the middle of the room on a slowly wavering loop and looks across it. Neighboring robots go in
 opposite directions, at different heights, and their paths are shifted along the loop until the asked share of
 what one sees is seen by the other.
 """

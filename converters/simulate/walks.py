@@ -51,7 +51,7 @@ VIEW_IMAGE = (80, 60)
 NEAR_M, MAX_NEAR_SHARE = 0.6, 0.25
 MAX_HOLE_SHARE, MAX_SKY_SHARE = 0.05, 0.5
 LEAST_MEDIAN_M = 1.0
-EDGE_GREY = 6.0  # of 255, between neighbouring pixels of VIEW_IMAGE
+EDGE_GRAY = 6.0  # of 255, between neighboring pixels of VIEW_IMAGE
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class FreeSpace:
     """Where a robot can stand.
 
     floor_m: height of the floor. cells: [n, 2], x and y (m) of the middles of free cells, all connected. clearance:
-    [n], m. graph: cost of the way between neighbouring cells. inside: [nx, ny], whether a cell of the whole grid is
+    [n], m. graph: cost of the way between neighboring cells. inside: [nx, ny], whether a cell of the whole grid is
     free. low: [2], middle (m) of its first cell; cell_m: its width.
     """
 
@@ -177,7 +177,7 @@ def space_between(
     if area < LEAST_FREE_M2:
         raise DuagError(
             f"found {area:.1f} m^2 of free floor {floor:.2f} m high in the scene, expected at least "
-            f"{LEAST_FREE_M2} m^2; is it a room in metres, and the right axis up (--up)?"
+            f"{LEAST_FREE_M2} m^2; is it a room in meters, and the right axis up (--up)?"
         )
     inside = parts == 1 + int(np.argmax(sizes))
     graph = _graph(inside, clearance, cell_m)
@@ -208,7 +208,7 @@ def _closed_in(caster: Caster, places: Array, floor: float, share: float) -> NDA
 
 
 def _graph(inside: NDArray[np.bool_], clearance: Array, cell_m: float) -> coo_array:
-    """Costs of steps between neighbouring cells of a grid; dear near obstacles."""
+    """Costs of steps between neighboring cells of a grid; dear near obstacles."""
     number = np.full(inside.shape, -1)
     number[inside] = np.arange(inside.sum())
     price = 1 + (0.45 / np.maximum(clearance, 0.1)) ** 4
@@ -334,7 +334,7 @@ def least_shown(eye: Eye, poses: Array, sky: bool) -> float | None:
         if np.median(depth[seen]) < LEAST_MEDIAN_M:
             return None
     for k in np.unique(np.linspace(0, len(poses) - 1, VIEWS).round().astype(np.int64)):
-        grey = eye.render(poses[k]).color.astype(np.float64).mean(axis=2)
-        edges = np.hypot(*np.gradient(grey)) > EDGE_GREY / 2
+        gray = eye.render(poses[k]).color.astype(np.float64).mean(axis=2)
+        edges = np.hypot(*np.gradient(gray)) > EDGE_GRAY / 2
         least = min(least, float(edges.mean()))
     return least

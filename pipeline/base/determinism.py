@@ -1,6 +1,6 @@
 """Settings of the numeric libraries that make results independent of threads and of the processor, and bounded.
 
-Call `settle()` before numpy, scipy or OpenCV is imported for the first time; child processes inherit the
+Call `configure_determinism()` before numpy, scipy or OpenCV is imported for the first time; child processes inherit the
 environment. One BLAS thread, because a product split over threads sums in another order; the AVX2 code paths of
 OpenBLAS, numpy and OpenCV on every machine, because their AVX-512 paths round differently. glibc gives the memory of an
 image back to the system as soon as it is freed, and clearing it again for the next one took a third of the time of a
@@ -28,7 +28,7 @@ _ENVIRONMENT = {
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 
 
-def settle() -> None:
+def configure_determinism() -> None:
     """Put the settings into the environment of this process and of its children."""
     os.environ.update(_ENVIRONMENT)
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # for this process the environment comes too late
@@ -37,7 +37,7 @@ def settle() -> None:
         mallopt(_M_MMAP_THRESHOLD, _OWN_MAPPING_BYTES)
 
 
-def settle_opencv() -> None:
+def configure_opencv() -> None:
     """Make OpenCV use the calling thread only; its parallel loops are not all order-preserving."""
     import cv2
 

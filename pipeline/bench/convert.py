@@ -154,5 +154,5 @@ def _main(said: str) -> None:
 if __name__ == "__main__":
     from duagc.pipeline.base import determinism
 
-    determinism.settle()
+    determinism.configure_determinism()
     _main(sys.argv[1])

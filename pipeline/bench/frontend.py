@@ -50,17 +50,17 @@ ABLATION: dict[str, dict[str, Any]] = {
         "tracking.registration.residuals": "gray",
         "tracking.recovery.residuals": "gray",
     },
-    "no local optimisation": {"keyframes.local_optimisation": False},
+    "no local optimization": {"keyframes.local_optimization": False},
     "no loops": {"keyframes.loops.enabled": False},
-    "neither": {"keyframes.local_optimisation": False, "keyframes.loops.enabled": False},
+    "neither": {"keyframes.local_optimization": False, "keyframes.loops.enabled": False},
 }
 FRAME_PARTS = {"pyramid": ("tracking.RgbdPyramid", "build"), "registration": ("tracking", "register")}
-KEYFRAME_PARTS = {"seeding": ("mapping.Mapper", "_seed"), "optimisation": ("mapping.Mapper", "_optimise")}
+KEYFRAME_PARTS = {"seeding": ("mapping.Mapper", "_seed"), "optimization": ("mapping.Mapper", "_optimize")}
 COUNTED = {
     "frame": ("tracking.Tracker", "track"),
-    "step": ("align", "linearise_at"),
+    "step": ("align", "linearize_at"),
     "keyframe": ("mapping.Mapper", "add_keyframe"),
-    "draw": ("mapping.Mapper", "_optimise"),
+    "draw": ("mapping.Mapper", "_optimize"),
 }
 
 
@@ -200,7 +200,7 @@ def measure(log: Path, folder: Path, config: FrontendConfig, seed: int, threads:
     frame = outer.calls["frame"]
     times: dict[str, Any] = {"frame": summary(frame) | {"parts_cpu_ms": shares(frame, inner.of("frame"))}}
     times["frame"] |= steps.summary("steps")
-    times["pose_optimisation_cpu_s"] = sum(outer.calls["poses"].cpu_s)
+    times["pose_optimization_cpu_s"] = sum(outer.calls["poses"].cpu_s)
     if config.mapping_enabled:
         keyframe = outer.calls["keyframe"]
         times["keyframe"] = summary(keyframe) | {"parts_cpu_ms": shares(keyframe, inner.of("keyframe"))}

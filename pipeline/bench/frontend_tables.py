@@ -71,7 +71,7 @@ def _tracking_cells(row: dict[str, Any]) -> list[Any]:
         ),
         *(f"{frame['cpu_ms']:.1f}", f"{frame['cpu_ms_p95']:.1f}", _quarters(frame)),
         *(_work(frame, "steps", 1.0), _model(row["times"].get("model"))),
-        *(_number(row["times"].get("pose_optimisation_cpu_s"), 1, 1), f"{row['peak_memory_mb']:.0f}"),
+        *(_number(row["times"].get("pose_optimization_cpu_s"), 1, 1), f"{row['peak_memory_mb']:.0f}"),
     ]
 
 

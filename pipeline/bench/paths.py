@@ -32,7 +32,7 @@ def run(
     """Plan every combination, and measure it as `simulate` does.
 
     Returns:
-        Rows with scene, paradigm, robots, asked; then `refused` (why), or shared (mean of all neighbours),
+        Rows with scene, paradigm, robots, asked; then `refused` (why), or shared (mean of all neighbors),
         shared_from and shared_to, speed_m_s (slowest, fastest robot), of_usual_speed (likewise), clearance_m,
         robots_apart_m; and cpu_s.
     """

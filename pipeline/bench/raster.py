@@ -50,7 +50,7 @@ PEAK_S = 0.1  # per instruction set, number of threads and scene; the best count
 
 # Floating-point operations per pair, counted in the source; a multiply-add counts as two, min, compare as one. What the
 # four pixels of a row of a block share counts a quarter.
-LOG2_ALPHA = 10  # pixel - centre 2, e = M d 4, log2 opacity - |e|^2 4
+LOG2_ALPHA = 10  # pixel - center 2, e = M d 4, log2 opacity - |e|^2 4
 ALPHA = 17  # 2^t and 1 - 2^t 15: three to split off the exponent, five multiply-adds, two for the rest; two clamps
 REPLAY = LOG2_ALPHA + ALPHA + 3  # transmittance before, from that behind by a division; weight
 E_AGAIN = 3  # e for the sums
@@ -60,7 +60,7 @@ SCREEN_MOMENTS = E_AGAIN + 9 + 23 / 4  # thirteen, of w^2
 DEPTH_MOMENTS = E_AGAIN + 5 + 8 / 4  # five
 SWEEP = OWN + MOMENTS + 4 * 2  # weight times the four cotangents
 FLOPS = {
-    "forward": ALPHA + 3 + 4 * 2,  # weight, transmittance, closed?; three colours and depth
+    "forward": ALPHA + 3 + 4 * 2,  # weight, transmittance, closed?; three colors and depth
     "backward": REPLAY + SWEEP,
     "backward_fisher": REPLAY + SWEEP + (1 + SCREEN_MOMENTS) + (2 + DEPTH_MOMENTS) + (1 + 4 * 2),
     "gauss_newton": REPLAY + 4 * 3 + 13 + SCREEN_MOMENTS + DEPTH_MOMENTS + (1 + 2 * 2) + 2 * 2,
@@ -389,7 +389,7 @@ def make_room(n: int, seed: int = 0) -> Gaussians:
 
 
 def view_of_room() -> np.ndarray:
-    """T_camera_map [4, 4]: from the origin towards the far corner."""
+    """T_camera_map [4, 4]: from the origin toward the far corner."""
     forward = np.array([3.7, 0.4, 3.6])
     z = forward / np.linalg.norm(forward)
     x = np.cross([0.0, 1.0, 0.0], z)

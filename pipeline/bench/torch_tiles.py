@@ -21,18 +21,18 @@ def tensors_of(room: Gaussians) -> dict[str, Any]:
 
 
 def draw(parameters: dict[str, Any], camera: PinholeCamera, T_camera_map: np.ndarray) -> Any:
-    """Colour and depth [H, W, 4] by the reference's formulas, tile by tile, in float32; differentiable."""
+    """Color and depth [H, W, 4] by the reference's formulas, tile by tile, in float32; differentiable."""
     import torch
 
     T = torch.tensor(T_camera_map, dtype=torch.float32)
     sigma = reference.sigma_of(parameters["quats_wxyz"], parameters["log_scales"])
-    order, z, centres, conics = reference.project(parameters["means"], sigma, T[:3, :3], T[:3, 3], camera)
+    order, z, centers, conics = reference.project(parameters["means"], sigma, T[:3, :3], T[:3, 3], camera)
     opacities = torch.sigmoid(parameters["opacity_logits"][order])
     values = torch.cat([parameters["colors"][order], z[:, None]], dim=1)
     with torch.no_grad():
         reach = 2 * torch.log(255 * opacities).clamp(min=0)
         extent = torch.sqrt(reach[:, None] * torch.linalg.inv(conics).diagonal(dim1=1, dim2=2))
-        low, high = centres - extent, centres + extent
+        low, high = centers - extent, centers + extent
         size = torch.tensor([camera.width, camera.height])
         seen = torch.nonzero(((low < size) & (high >= 0)).all(dim=1) & (reach > 0))[:, 0]
     tiles = []
@@ -46,7 +46,7 @@ def draw(parameters: dict[str, Any], camera: PinholeCamera, T_camera_map: np.nda
                 torch.arange(y, y + height), torch.arange(x, x + width), indexing="ij"
             )
             pixels = torch.stack([columns, rows], -1).reshape(-1, 2).to(torch.float32)
-            weights, _ = reference.blend(pixels, centres[i], conics[i], opacities[i])
+            weights, _ = reference.blend(pixels, centers[i], conics[i], opacities[i])
             tiles.append((weights @ values[i]).reshape(height, width, 4))
     across = -(-camera.width // TILE_PX)
     strips = [torch.cat(tiles[i : i + across], dim=1) for i in range(0, len(tiles), across)]

@@ -1,6 +1,6 @@
 """Poses, landmarks and cameras adjusted together to what the views show.
 
-Residuals: where features fall in colour (Cauchy), their distance from the surface that the depth image has there, and
+Residuals: where features fall in color (Cauchy), their distance from the surface that the depth image has there, and
 point-to-plane distances between depth images that overlap (both Huber). Each is divided by its scale, the median
 absolute deviation. Landmarks are eliminated (Schur complement), the rest is solved densely by Gauss-Newton.
 """
@@ -24,10 +24,10 @@ Array = NDArray[np.float64]
 ROUNDS = 30
 SETTLED, SETTLED_OF_PRIOR = 2e-4, 0.01  # steps: of poses (m, rad), of the cameras' numbers in their priors
 CAUCHY, HUBER = 2.5, 1.5  # scales
-SAME_ERROR = 50.0  # neighbours err alike, and no model is exact: so many residuals count as one
+SAME_ERROR = 50.0  # neighbors err alike, and no model is exact: so many residuals count as one
 PRIOR = dict(zip(NAMES, (15, 15, 15, 15, 0.3, 0.5, 0.5, 0.01, 0.01, 0.01, 0.02, *[0.02] * 6), strict=True))
 """How far cameras may be from what the recording says: pixels at a width of 640, rad, s, 1/m."""
-NEIGHBOURS, MIN_OVERLAP = 4, 0.3  # views that the depth of a view is compared with
+NEIGHBORS, MIN_OVERLAP = 4, 0.3  # views that the depth of a view is compared with
 GATE_M, GATE_RELATIVE = 0.08, 0.05
 FEATURE_GATE_M = 0.15
 NOISE = RegistrationConfig()  # of depth: its shape
@@ -64,7 +64,7 @@ def adjust(parts: Sequence[Views], rig: Rig, calibrate: bool) -> Adjusted:
     total = int(ends[-1]) + size
     for _ in range(ROUNDS):
         H, g = np.zeros((total, total)), np.zeros(total)
-        steps = [_linearised(part, pair, rig, calibrate) for part, pair in zip(parts, pairs, strict=True)]
+        steps = [_linearized(part, pair, rig, calibrate) for part, pair in zip(parts, pairs, strict=True)]
         for step, a, b in zip(steps, ends[:-1], ends[1:], strict=True):
             at = np.r_[a:b, ends[-1] : total]
             S, force = step.H.copy(), step.g.copy()
@@ -108,8 +108,8 @@ def overlapping(views: Views) -> NDArray[np.int64]:
         order = [
             b for b in np.argsort(-share[a], kind="stable").tolist() if b != a and share[a, b] > MIN_OVERLAP
         ]
-        near, far = order[: NEIGHBOURS // 2 + 1], order[NEIGHBOURS // 2 + 1 :]
-        far = far[:: max(1, len(far) // max(NEIGHBOURS - len(near), 1))][: NEIGHBOURS - len(near)]
+        near, far = order[: NEIGHBORS // 2 + 1], order[NEIGHBORS // 2 + 1 :]
+        far = far[:: max(1, len(far) // max(NEIGHBORS - len(near), 1))][: NEIGHBORS - len(near)]
         found |= {(min(a, b), max(a, b)) for b in near + far}
     pairs = np.array(sorted(found), dtype=np.int64).reshape(-1, 2)
     return np.concatenate([pairs, pairs[:, ::-1]])
@@ -159,7 +159,7 @@ def _planes(views: Views, pairs: NDArray[np.int64], rig: Rig) -> _Planes:
     used = seen & (np.abs(z_there - q[..., 2]) < np.maximum(GATE_M, GATE_RELATIVE * q[..., 2]))
     surface = rays_there * z_there[..., None]
     sigma = _sigma(z_there)[..., None]
-    towards = (m * rays_there).sum(axis=-1)[..., None]
+    toward = (m * rays_there).sum(axis=-1)[..., None]
     # derivatives at the mean of both views' depths, with which the residual, their difference, does not vary
     between = np.sqrt(np.where(used, z_there / q[..., 2], 1.0))
     z_there_by, z_by = rig.depth_by(z_there / between, rays_there), rig.depth_by(z * between, rays)
@@ -168,7 +168,7 @@ def _planes(views: Views, pairs: NDArray[np.int64], rig: Rig) -> _Planes:
         used,
         -np.concatenate([normals, np.cross(p, normals)], axis=-1) / sigma,
         np.concatenate([m, np.cross(q, m)], axis=-1) / sigma,
-        (towards * z_there_by - (normals * rays).sum(axis=-1)[..., None] * z_by) / sigma,
+        (toward * z_there_by - (normals * rays).sum(axis=-1)[..., None] * z_by) / sigma,
     )
 
 
@@ -217,7 +217,7 @@ def _features(views: Views, rig: Rig) -> _Features:
 
 
 def _sigma(z: Array) -> Array:
-    """Shape of the noise of depth, metres, as the registration has it."""
+    """Shape of the noise of depth, meters, as the registration has it."""
     return np.asarray(NOISE.depth_sigma_base_m + NOISE.depth_sigma_slope_per_m * (z - 0.4) ** 2)
 
 
@@ -239,12 +239,12 @@ class _Step:
     _by_landmark: Array  # W^T, a sparse matrix
 
     def landmarks(self, x: Array) -> Array:
-        """Steps [m, 3] of the landmarks, metres, for a step of everything else."""
+        """Steps [m, 3] of the landmarks, meters, for a step of everything else."""
         right = self._force + np.asarray(self._by_landmark @ x).reshape(-1, 3)
         return np.clip(-(self._V_inverse @ right[..., None])[..., 0], -0.1, 0.1)
 
 
-def _linearised(views: Views, pairs: NDArray[np.int64], rig: Rig, calibrate: bool) -> _Step:
+def _linearized(views: Views, pairs: NDArray[np.int64], rig: Rig, calibrate: bool) -> _Step:
     from scipy import sparse
 
     count, cameras = 6 * len(views.T_map_camera), len(NAMES) if calibrate else 0

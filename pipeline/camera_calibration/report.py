@@ -110,7 +110,7 @@ def toml(found: Calibration) -> str:
             lines += ["", *(f"# {_known(name, values[name])}" for name in OPTIONS[option])]
         lines.append(f"{option} = {json.dumps(value)}")
     later = _known("delay_s", values["delay_s"])
-    return "\n".join([*lines, "", f"# {later}: colour is so much later than depth; no option takes it", ""])
+    return "\n".join([*lines, "", f"# {later}: color is so much later than depth; no option takes it", ""])
 
 
 def check_out(out: Path, force: bool, recording: dict[str, Any], folder: Path) -> None:

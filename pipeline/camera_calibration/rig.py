@@ -1,6 +1,6 @@
-"""A colour and a depth camera: what is not as a recording has it.
+"""A color and a depth camera: what is not as a recording has it.
 
-In a recording depth is registered to a pinhole colour camera. Here the camera that took the colour images has a lens,
+In a recording depth is registered to a pinhole color camera. Here the camera that took the color images has a lens,
 is turned against the registered depth and took its images later; the depth has a smooth error in 1/z.
 """
 
@@ -27,7 +27,7 @@ class Rig:
     """Both cameras.
 
     camera: of the recording, to which depth is registered. lens: [7], focal lengths and principal point in pixels,
-    radial distortion k1 k2 k3 as OpenCV defines it. R_color_depth: [3, 3]. delay_s: colour was taken so much later.
+    radial distortion k1 k2 k3 as OpenCV defines it. R_color_depth: [3, 3]. delay_s: color was taken so much later.
     depth_error: [6], 1/m, see `geometry.depth_error`.
     """
 
@@ -58,7 +58,7 @@ class Rig:
         )
 
     def project(self, points_color: Array) -> tuple[Array, Array, Array]:
-        """Pixels [n, 2] of points [n, 3] of the colour camera; derivatives by point [n, 2, 3] and lens [n, 2, 7]."""
+        """Pixels [n, 2] of points [n, 3] of the color camera; derivatives by point [n, 2, 3] and lens [n, 2, 7]."""
         fx, fy, cx, cy, k1, k2, k3 = self.lens
         z = points_color[:, 2]
         x, y = points_color[:, 0] / z, points_color[:, 1] / z
@@ -85,7 +85,7 @@ class Rig:
         return np.stack([fx * x * g + cx, fy * y * g + cy], axis=-1), by_ray @ ray_by_point, by_lens
 
     def depth(self, inverse: Array, rays: Array) -> Array:
-        """True depth [...], metres, of a measured inverse depth at rays [..., 3]."""
+        """True depth [...], meters, of a measured inverse depth at rays [..., 3]."""
         terms = depth_error.terms(inverse, rays[..., 0], rays[..., 1])
         return np.asarray(1 / np.maximum(inverse + terms @ self.depth_error, 1 / depth_error.FARTHEST_M))
 

@@ -73,7 +73,7 @@ class Tracked:
 def track_log(path: Path, robot: str, config: FrontendConfig) -> Tracked:
     """Poses of a log by the front end, without a map.
 
-    That depth and colour contradict each other is what is to be calibrated: no frame is lost for it.
+    That depth and color contradict each other is what is to be calibrated: no frame is lost for it.
     """
     failure = config.tracking.failure.model_copy(update={"doubtful_gray_of_usual": math.inf})
     tracking = config.tracking.model_copy(update={"failure": failure})
@@ -230,10 +230,10 @@ def _matched(
     """Pairs of views, and their matches that are roughly where the poses put them."""
     rays = [camera.rays_at(*p.T) for p in pixels]
     scale = camera.width / 640
-    axes, centres = T[:, :3, 2], T[:, :3, 3]
+    axes, centers = T[:, :3, 2], T[:, :3, 3]
     for a in range(len(T)):
         for b in range(a + 1, len(T)):
-            if axes[a] @ axes[b] < MAX_TURN or np.linalg.norm(centres[a] - centres[b]) > MAX_WAY_M:
+            if axes[a] @ axes[b] < MAX_TURN or np.linalg.norm(centers[a] - centers[b]) > MAX_WAY_M:
                 continue
             found = matches(descriptors[a], descriptors[b], RATIO)
             if len(found) < MIN_MATCHES:
@@ -263,7 +263,7 @@ def _line_distance(rays_a: Array, rays_b: Array, T_b_a: Array) -> Array:
 
 
 def look_up(views: Views, view: NDArray[np.int64], u: Array, v: Array) -> Array:
-    """Inverse depth of views at pixels, between neighbours of one surface; NaN where there is none."""
+    """Inverse depth of views at pixels, between neighbors of one surface; NaN where there is none."""
     height, width = views.inverse_depth.shape[1:]
     inside = (u >= 1) & (u < width - 2) & (v >= 1) & (v < height - 2)
     u, v = np.where(inside, u, 1), np.where(inside, v, 1)

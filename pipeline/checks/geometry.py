@@ -1,4 +1,4 @@
-"""Whether depth, intrinsics, colour and motion belong together."""
+"""Whether depth, intrinsics, color and motion belong together."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Image = NDArray[np.float32]
 
 # --- intrinsics
 
-OFF_CENTRE = 0.1  # of the image's width or height
+OFF_CENTER = 0.1  # of the image's width or height
 SQUARE = 0.05
 VIEWS_DEG = (15.0, 150.0)
 
@@ -39,7 +39,7 @@ SENSOR_M = 14.0  # no camera with its own light sees farther
 FAST_M_PER_S = 4.0
 MEASURED_AFAR = ("stereo", "lidar", "render", "simulat")  # words about a sensor that may see farther
 
-# --- colour edges
+# --- color edges
 
 STEP = 0.06  # relative step of depth that is an edge
 EDGE_PIXELS = 200
@@ -51,14 +51,14 @@ CLEARLY = 1.15  # ratio of two mean gradients
 
 def check_camera(robot: str, camera: PinholeCamera) -> Iterator[Finding]:
     """Findings about the intrinsics alone."""
-    for axis, centre, size in (("cx", camera.cx, camera.width), ("cy", camera.cy, camera.height)):
-        if abs(centre - (size - 1) / 2) > OFF_CENTRE * size:
+    for axis, center, size in (("cx", camera.cx, camera.width), ("cy", camera.cy, camera.height)):
+        if abs(center - (size - 1) / 2) > OFF_CENTER * size:
             yield Finding(
                 Severity.WARNING,
                 "intrinsics",
                 robot,
-                f"{axis} = {centre:.1f} px in an image of {camera.width}x{camera.height}",
-                f"within {OFF_CENTRE:.0%} of its middle, {(size - 1) / 2:.1f}",
+                f"{axis} = {center:.1f} px in an image of {camera.width}x{camera.height}",
+                f"within {OFF_CENTER:.0%} of its middle, {(size - 1) / 2:.1f}",
                 "see whether cx and cy are exchanged, or the calibration is of another resolution",
             )
     if abs(camera.fx / camera.fy - 1) > SQUARE:
@@ -147,7 +147,7 @@ def check_moves(robot: str, found: list[Move]) -> Iterator[Finding]:
             robot,
             f"{len(registered)} of {len(found)} pairs of near frames could be registered",
             f"{FEW_REGISTERED:.0%} or more",
-            "tracking will be lost; see whether colour and depth are of one time and place, and the rate is enough",
+            "tracking will be lost; see whether color and depth are of one time and place, and the rate is enough",
         )
     residuals = [move.residual for move in registered if np.isfinite(move.residual)]
     if residuals and np.median(residuals) > RESIDUAL:
@@ -167,7 +167,7 @@ def check_scale(
     """Compare lengths by registration with those of another sensor.
 
     Args:
-        sensor: its name in words. lengths: metres moved between two times (ns), None where it does not know.
+        sensor: its name in words. lengths: meters moved between two times (ns), None where it does not know.
     """
     ratios = []
     for move in found:
@@ -198,7 +198,7 @@ def check_range(
             robot,
             f"half of the depth is beyond {middle:.3g} m",
             f"{NEAR_M:g} to {FAR_M:g} m",
-            "depth_scale must be metres per unit: 0.001 for millimetres",
+            "depth_scale must be meters per unit: 0.001 for millimeters",
         )
     elif high > SENSOR_M and not any(word in sensors.lower() for word in MEASURED_AFAR):
         yield Finding(
@@ -207,7 +207,7 @@ def check_range(
             robot,
             f"depth reaches {high:.1f} m (99 %)",
             f"at most {SENSOR_M:g} m, unless from stereo, a LiDAR or a simulator",
-            "see whether depth_scale is metres per unit",
+            "see whether depth_scale is meters per unit",
         )
     speeds = [
         np.linalg.norm(move.T_first_second[:3, 3]) / ((move.second_ns - move.first_ns) * 1e-9)
@@ -221,13 +221,13 @@ def check_range(
             robot,
             f"the camera moves at {np.median(speeds):.1f} m/s (median)",
             f"at most {FAST_M_PER_S:g} m/s",
-            "see whether depth_scale is metres per unit, and the times are right",
+            "see whether depth_scale is meters per unit, and the times are right",
         )
 
 
 @dataclass(frozen=True)
 class Edges:
-    """Mean grey gradient under the edges of depth, relative to that of the images.
+    """Mean gray gradient under the edges of depth, relative to that of the images.
 
     by_frames: [2 * SHIFTS + 1] with the depth of -SHIFTS ... SHIFTS frames later. by_pixels: [2 * SHIFT_PX + 1] with
     the depth moved by -SHIFT_PX ... SHIFT_PX px to the right. windows: how many frames it is the mean of.
@@ -239,7 +239,7 @@ class Edges:
 
 
 def edges_of(log: RgbdLog) -> Edges | None:
-    """How well edges of depth fall on edges of grey; None if the log is short or has no edges."""
+    """How well edges of depth fall on edges of gray; None if the log is short or has no edges."""
     frames = len(log)
     if frames < 2 * SHIFTS + 2:
         return None
@@ -263,7 +263,7 @@ def edges_of(log: RgbdLog) -> Edges | None:
 
 
 def _gradient(color: NDArray[np.uint8]) -> Image:
-    """Size of the grey gradient, relative to its mean over the image."""
+    """Size of the gray gradient, relative to its mean over the image."""
     import cv2
 
     gray = cv2.GaussianBlur(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 0.8)
@@ -285,7 +285,7 @@ def _depth_edges(depth_m: Image) -> NDArray[np.bool_]:
 
 
 def check_edges(robot: str, edges: Edges | None) -> Iterator[Finding]:
-    """Findings about depth that is not of the time, or not of the place, of its colour."""
+    """Findings about depth that is not of the time, or not of the place, of its color."""
     if edges is None or edges.windows < WINDOWS // 2:
         return
     frames, pixels = (int(np.argmax(a)) for a in (edges.by_frames, edges.by_pixels))
@@ -295,18 +295,18 @@ def check_edges(robot: str, edges: Edges | None) -> Iterator[Finding]:
             Severity.WARNING,
             "depth in time",
             robot,
-            f"edges of colour fit the depth {abs(shift)} frames {'later' if shift > 0 else 'earlier'} better by "
+            f"edges of color fit the depth {abs(shift)} frames {'later' if shift > 0 else 'earlier'} better by "
             f"{edges.by_frames[frames] / edges.by_frames[SHIFTS] - 1:.0%}",
             "best fit at its own time",
-            "colour and depth are of different times; correct the times of one of them",
+            "color and depth are of different times; correct the times of one of them",
         )
     elif edges.by_pixels[pixels] > CLEARLY * edges.by_pixels[SHIFT_PX] and abs(pixels - SHIFT_PX) > 2:
         yield Finding(
             Severity.WARNING,
             "depth in place",
             robot,
-            f"edges of colour fit the depth {pixels - SHIFT_PX:+d} px to the right better by "
+            f"edges of color fit the depth {pixels - SHIFT_PX:+d} px to the right better by "
             f"{edges.by_pixels[pixels] / edges.by_pixels[SHIFT_PX] - 1:.0%}",
             "best fit where it is",
-            "register the depth to the colour camera",
+            "register the depth to the color camera",
         )

@@ -1,4 +1,4 @@
-"""What the images show: repeated ones, depth that is missing or saturated, colours in the wrong order."""
+"""What the images show: repeated ones, depth that is missing or saturated, colors in the wrong order."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ MANY_REPEATED = 0.4  # of all images
 LITTLE_DEPTH = 0.2  # of the pixels
 SATURATED = 65535
 MUCH_SATURATED = 0.005
-BINS = 8  # of a colour histogram, per channel
-SWAPPED_RATIO = 0.5  # distance of colours after exchanging red and blue, relative to before
+BINS = 8  # of a color histogram, per channel
+SWAPPED_RATIO = 0.5  # distance of colors after exchanging red and blue, relative to before
 DIFFERENT_COLORS = 0.15  # squared Hellinger distance
 
 
@@ -99,7 +99,7 @@ class Sight:
 
     @staticmethod
     def of(frames: Iterator[RgbdFrame], scale: float) -> Sight:
-        """From frames, of which every 4th row and column counts. scale: metres per unit."""
+        """From frames, of which every 4th row and column counts. scale: meters per unit."""
         depths, counts = [], np.zeros(BINS**3)
         for frame in frames:
             depths.append(frame.depth[::4, ::4].ravel())
@@ -138,16 +138,16 @@ def check_sight(robot: str, sight: Sight) -> Iterator[Finding]:
 
 
 def check_colors(sights: Mapping[str, Sight]) -> Iterator[Finding]:
-    """Robots whose colours agree far better with red and blue exchanged: one of them has them in the wrong order."""
+    """Robots whose colors agree far better with red and blue exchanged: one of them has them in the wrong order."""
     for a, b in combinations(sorted(sights), 2):
         as_is = _distance(sights[a].colors, sights[b].colors)
         swapped = _distance(sights[a].colors, sights[b].colors.transpose(2, 1, 0))
         if as_is > DIFFERENT_COLORS and swapped < SWAPPED_RATIO * as_is:
             yield Finding(
                 Severity.WARNING,
-                "colour order",
+                "color order",
                 b,
-                f"its colours are those of {a} with red and blue exchanged",
+                f"its colors are those of {a} with red and blue exchanged",
                 "the same order in all logs",
                 "see whether the source is RGB or BGR",
             )

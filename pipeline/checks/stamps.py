@@ -67,7 +67,7 @@ def check_stamps(robot: str, topic: str, stamps_ns: Sequence[int]) -> Iterator[F
 
 
 def check_pairs(robot: str, pairing: Pairing) -> Iterator[Finding]:
-    """Findings about which depth belongs to which colour."""
+    """Findings about which depth belongs to which color."""
     frames, alone = len(pairing.pairs), len(pairing.color_alone)
     if alone:
         few = frames < FEW_PAIRS * (frames + alone)
@@ -75,8 +75,8 @@ def check_pairs(robot: str, pairing: Pairing) -> Iterator[Finding]:
             Severity.WARNING if few else Severity.NOTE,
             "pairs",
             robot,
-            f"{alone} of {frames + alone} colour images have no depth within {TOLERANCE_NS / 1e6:g} ms",
-            "depth for every colour image",
+            f"{alone} of {frames + alone} color images have no depth within {TOLERANCE_NS / 1e6:g} ms",
+            "depth for every color image",
             "they are left out" + ("; see whether the cameras have one clock" if few else ""),
         )
     offsets = np.array([depth - color for color, depth in pairing.pairs], dtype=np.int64)
@@ -86,7 +86,7 @@ def check_pairs(robot: str, pairing: Pairing) -> Iterator[Finding]:
             Severity.WARNING,
             "pairs",
             robot,
-            f"depth is {typical / 1e6:+.1f} ms from its colour (median)",
+            f"depth is {typical / 1e6:+.1f} ms from its color (median)",
             f"within {LATE_NS / 1e6:g} ms",
-            "at 1 m/s this displaces depth by a centimetre or more; correct the times of one of them",
+            "at 1 m/s this displaces depth by a centimeter or more; correct the times of one of them",
         )

@@ -25,7 +25,7 @@ NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's shar
 
 def main() -> None:
     """Entry point: one line and exit code 1 for whatever a user can fix."""
-    determinism.settle()
+    determinism.configure_determinism()
     try:
         app()
     except DuagError as error:

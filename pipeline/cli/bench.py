@@ -166,7 +166,7 @@ def bench_reference(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """A team's error beside what its images allow: all keyframes optimised in one place.
+    """A team's error beside what its images allow: all keyframes optimized in one place.
 
     From the run's poses and from the true ones. A run of one robot is also cut in parts. Needs ground truth.
 
@@ -179,7 +179,7 @@ def bench_reference(
     from duagc.pipeline.recording import Recording
     from duagc.pipeline.runs.folder import RunFolder
 
-    determinism.settle_opencv()
+    determinism.configure_opencv()
     run = RunFolder(run_folder)
     source = Recording(run.recording if recording is None else recording)
     result = pose_reference.run(run, source, load(RunConfig, run.config_file, []).frontend)
@@ -266,7 +266,7 @@ def bench_paths(
 ) -> None:
     """Plan paths for every combination, without images: the overlap reached, speed, distances, processor time.
 
-    Lists are separated by commas. A cell of the table has the overlap asked for that was met worst, what neighbours
+    Lists are separated by commas. A cell of the table has the overlap asked for that was met worst, what neighbors
     share then, and how fast the slowest and the fastest robot go, of the scene's usual speed.
 
     Example: `duagc bench paths --scenes scans/house --robots 3`

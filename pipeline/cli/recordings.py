@@ -31,9 +31,7 @@ def simulate(
     ] = "auto",
     width: Annotated[int, typer.Option(min=32, help="Pixels.")] = 480,
     height: Annotated[int, typer.Option(min=32, help="Pixels.")] = 360,
-    overlap: Annotated[
-        float, typer.Option(min=0, max=1, help="Share of the view that neighbours see.")
-    ] = 0.6,
+    overlap: Annotated[float, typer.Option(min=0, max=1, help="Share of the view that neighbors see.")] = 0.6,
     noise: Annotated[str, typer.Option(help="none or kinect.")] = "none",
     seed: Annotated[int, typer.Option(help="Seed of scene, paths and noise.")] = 0,
     sensor: Annotated[
@@ -162,7 +160,7 @@ def info(
     ] = False,
     preview: Annotated[
         Path | None,
-        typer.Option(help="Write a PNG of some colour and depth images of every robot.", show_default=False),
+        typer.Option(help="Write a PNG of some color and depth images of every robot.", show_default=False),
     ] = None,
 ) -> None:
     """Say what is in a recording, a run or a log; of a log of another program also what would be converted and why.
@@ -200,7 +198,7 @@ def check(
     from duagc.pipeline.base import determinism
     from duagc.pipeline.checks import check
 
-    determinism.settle_opencv()
+    determinism.configure_opencv()
     report = check.check(path)
     print(json.dumps(report.plain(), indent=2) if as_json else check.format_report(report))
     if not report.sound:
@@ -241,7 +239,7 @@ def calibrate(
     from duagc.pipeline.config.run import RunConfig
     from duagc.pipeline.recording import Recording
 
-    determinism.settle_opencv()
+    determinism.configure_opencv()
     if out is not None:
         report.check_out(out, force, Recording(path).description, path)
     found = calibrate_recording(path, load(RunConfig, config, overrides or []).frontend, robots or [], views)

@@ -31,7 +31,7 @@ class ClosureConfig(Config):
 
 
 class PoseConsensusConfig(Config):
-    """The decentralised solver of the team's keyframe poses."""
+    """The decentralized solver of the team's keyframe poses."""
 
     relaxation: float = Field(default=0.9, gt=0.0, lt=1.0)
     """Share of the way that an edge variable goes to what arrived (0.5 is the textbook's, slower)."""
@@ -47,15 +47,15 @@ class PoseConsensusConfig(Config):
     """Packets after which the allowed change shrinks: factor 1 + 2 / max(1, received / penalty_decay)."""
     adaptive: bool = True
     """Adapt the penalties; if not, the first ones stay."""
-    relinearise_rad: float = Field(default=1e-2, ge=0.0)
-    """The factorisation is kept until rotations moved this much in sum."""
+    relinearize_rad: float = Field(default=1e-2, ge=0.0)
+    """The factorization is kept until rotations moved this much in sum."""
     step_limit_rad: float = Field(default=0.3, gt=0.0)
     """A step that turns some keyframe more than this is shortened; nonlinearity makes longer ones worthless."""
     tolerance: float = Field(default=2e-6, gt=0.0)
     """An end is settled when its steps and edge variables change less than this (m, rad)."""
     wire: Literal["fixed", "float32", "float64"] = "fixed"
     """Poses in a packet: rotations in float32 and translations in steps of 7.5 nm, wherever the world has its origin;
-    all in float32, which is 15 um a kilometre from there; or not rounded at all."""
+    all in float32, which is 15 um a kilometer from there; or not rounded at all."""
     robust: bool = True
     """Weigh closures by graduated non-convexity, truncated least squares; if not, `keep` decides alone."""
     truncation: float = Field(default=7.5, gt=0.0)
@@ -82,21 +82,21 @@ class PoseConsensusConfig(Config):
 
 
 class ColorConfig(Config):
-    """How differently the cameras of a team see colours."""
+    """How differently the cameras of a team see colors."""
 
     enabled: bool = True
-    """Find gain and offset of each channel between robots and read neighbours' colours by them; if not, all cameras
+    """Find gain and offset of each channel between robots and read neighbors' colors by them; if not, all cameras
     count as alike."""
     min_matches: int = Field(default=100, ge=3)
-    """Two robots with fewer matched Gaussians say nothing of each other's colours."""
+    """Two robots with fewer matched Gaussians say nothing of each other's colors."""
     splats_per_sample: float = Field(default=30.0, ge=1.0)
     """Matched Gaussians that say together what one would say alone: those that share a pixel make up for each other."""
     sigma_floor: float = Field(default=0.003, gt=0.0)
-    """Least standard deviation of what two robots find: of the log of the gain, and of colours."""
+    """Least standard deviation of what two robots find: of the log of the gain, and of colors."""
     prior_gain: float = Field(default=0.5, gt=0.0)
     """Standard deviation of a camera's gain (its log) before anything was compared."""
     prior_offset: float = Field(default=0.2, gt=0.0)
-    """The same of its offset; colours are 0..1."""
+    """The same of its offset; colors are 0..1."""
 
 
 class MatchingConfig(Config):
@@ -112,11 +112,11 @@ class MatchingConfig(Config):
     beta_log_covariance: float = Field(default=0.1, ge=0.0)
     """Weight of the squared Log-Euclidean distance of the covariances."""
     beta_color: float = Field(default=1.0, ge=0.0)
-    """Weight of the squared distance of the colour coefficients."""
+    """Weight of the squared distance of the color coefficients."""
     beta_opacity: float = Field(default=0.5, ge=0.0)
     """Weight of the squared difference of the opacity logits."""
     percentile: float = Field(default=90.0, ge=0.0, le=100.0)
-    """tau_G is this percentile, over the own map, of d_G to the nearest neighbour within the radius."""
+    """tau_G is this percentile, over the own map, of d_G to the nearest neighbor within the radius."""
     candidates: int = Field(default=16, ge=1)
     """Nearest Gaussians within the radius that are compared, from either side."""
     thickness_floor_m: float = Field(default=1e-3, gt=0.0)

@@ -14,7 +14,7 @@ class PlacesConfig(Config):
     """Place descriptors and candidates for closures."""
 
     features_per_place: int = Field(default=80, ge=4)
-    """Descriptors of one keyframe that a neighbour gets to recognise the place (128 bytes each)."""
+    """Descriptors of one keyframe that a neighbor gets to recognize the place (128 bytes each)."""
     features_per_keyframe: int = Field(default=400, ge=4)
     """Descriptors with 3-D points of one keyframe, for verification."""
     ratio: float = Field(default=0.8, gt=0.0, lt=1.0)
@@ -22,9 +22,9 @@ class PlacesConfig(Config):
     min_score: int = Field(default=8, ge=1)
     """Matches from which a pair of keyframes is a candidate."""
     candidates_per_keyframe: int = Field(default=3, ge=1)
-    """Best candidates tried for each keyframe of the neighbour."""
+    """Best candidates tried for each keyframe of the neighbor."""
     max_requested_keyframes: int = Field(default=24, ge=1)
-    """Most keyframes whose sample is requested from one neighbour."""
+    """Most keyframes whose sample is requested from one neighbor."""
     keyframes_per_request: int = Field(default=6, ge=1)
     """Keyframes asked for at once; what came of them decides about the next."""
     worth_nats: float = Field(default=1.0, ge=0.0)
@@ -45,13 +45,13 @@ class VerificationConfig(Config):
     hypotheses: int = Field(default=500, ge=1)
     """Three-point hypotheses per candidate."""
     inlier_m: float = Field(default=0.05, gt=0.0)
-    """Distance below which a match agrees with a hypothesis, at one metre of depth; grows with depth."""
+    """Distance below which a match agrees with a hypothesis, at one meter of depth; grows with depth."""
     min_inliers: int = Field(default=12, ge=4)
     """Matches that must agree."""
     min_inlier_share: float = Field(default=0.25, ge=0.0, le=1.0)
     """Share of the matches that must agree."""
     samples: int = Field(default=2000, ge=50)
-    """Points with normal and intensity of the neighbour's keyframe used by the registration."""
+    """Points with normal and intensity of the neighbor's keyframe used by the registration."""
     max_refinement_m: float = Field(default=0.15, gt=0.0)
     """Largest translation by which the registration may change what RANSAC found."""
     registration: PeerRegistrationConfig = PeerRegistrationConfig()
@@ -70,7 +70,7 @@ class InjectionConfig(Config):
     false_matches: float = Field(default=0.0, ge=0.0, le=1.0)
     """Share of the matched Gaussians of a pair of robots whose partners are exchanged."""
     pose_dropouts: float = Field(default=0.0, ge=0.0, lt=1.0)
-    """Chance that a robot says nothing of its poses to a neighbour in a round."""
+    """Chance that a robot says nothing of its poses to a neighbor in a round."""
 
 
 class ExchangeConfig(Config):

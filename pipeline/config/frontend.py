@@ -15,7 +15,7 @@ def is_held_out(frame_index: int) -> bool:
 
 
 class LoopConfig(Config):
-    """Recognising places of the robot's own path."""
+    """Recognizing places of the robot's own path."""
 
     enabled: bool = True
     min_gap: int = 3
@@ -35,7 +35,7 @@ class LoopConfig(Config):
     hypotheses: int = 300
     """Three-point samples of RANSAC."""
     inlier_m: float = 0.05
-    """Distance below which a match agrees with a motion, at one metre of depth; grows with depth."""
+    """Distance below which a match agrees with a motion, at one meter of depth; grows with depth."""
     min_inliers: int = 15
     """Matches that must agree on one motion."""
     min_inlier_share: float = 0.3
@@ -57,22 +57,22 @@ class KeyframeConfig(Config):
     """A frame that moved by more than this fraction of the median depth becomes a keyframe."""
     max_rotation_rad: float = 0.5
     """A frame that turned by more than this becomes a keyframe."""
-    neighbours: int = 4
+    neighbors: int = 4
     """Earlier keyframes that a new one is registered to, besides the one it was tracked against."""
-    neighbour_overlap: float = 0.5
+    neighbor_overlap: float = 0.5
     """Least overlap, predicted and found, of such a registration."""
     huber_sigmas: float = 3.0
     """Registrations that disagree by more than this with the refined poses count linearly."""
-    local_optimisation: bool = True
-    """Optimise all keyframe poses jointly on the images; without, only the registrations made in tracking count."""
-    optimisation_rounds: int = 10
+    local_optimization: bool = True
+    """Optimize all keyframe poses jointly on the images; without, only the registrations made in tracking count."""
+    optimization_rounds: int = 10
     """Rounds over all keyframes at most; they end when no pose moves by more than 0.1 mm and 0.1 mrad, and look again
     only at pairs that moved by as much."""
-    optimisation_overlap: float = 0.3
+    optimization_overlap: float = 0.3
     """Least overlap, at the present poses, of two keyframes that are compared."""
-    optimisation_candidates: int = 24
+    optimization_candidates: int = 24
     """Earlier keyframes, those that look at the nearest places, whose overlap with one is computed."""
-    optimisation_neighbours: int = 8
+    optimization_neighbors: int = 8
     """Earlier keyframes that a keyframe is compared with at most, those with most overlap."""
     loops: LoopConfig = LoopConfig()
 
@@ -81,32 +81,32 @@ class FailureConfig(Config):
     """Tests of whether what the camera shows can be true."""
 
     max_frames_without_depth: int = 15
-    """Frames in a row that are tracked by colour alone, because their depth is missing or stuck."""
+    """Frames in a row that are tracked by color alone, because their depth is missing or stuck."""
     min_view_without_depth: float = 0.6
-    """Share of the last such frame's samples that must be seen: colour alone is poor where little is shared."""
+    """Share of the last such frame's samples that must be seen: color alone is poor where little is shared."""
     max_way_without_depth_m: float = 0.12
-    """Distance from the last frame with depth up to which colour alone is followed: it errs by up to a quarter
+    """Distance from the last frame with depth up to which color alone is followed: it errs by up to a quarter
     of it."""
     sigma_of_way_without_depth: float = 0.07
     """Standard deviation of that error per axis, as a share of the distance; counted in the information."""
     doubtful_gray_of_usual: float = 1.75
-    """A frame whose grey residual is larger than this many times the usual one is also registered by colour alone."""
+    """A frame whose gray residual is larger than this many times the usual one is also registered by color alone."""
     max_contradiction_m: float = 0.01
     """Largest distance between that answer and the usual one."""
     max_contradiction_of_way: float = 0.5
     """The same as a share of the way from the last sound frame; the larger limit holds."""
     max_frames_without_color: int = 3
-    """Frames in a row that are tracked by depth alone, because their colour is stuck; walls do not hold it long."""
+    """Frames in a row that are tracked by depth alone, because their color is stuck; walls do not hold it long."""
     stuck_share: float = 0.99
     """An image is stuck if this share of its measured pixels has the very values of the image before."""
     stuck_gray_change: float = 0.08
-    """Change of a grey value of the coarsest image, in standard deviations of that image, that counts as one."""
+    """Change of a gray value of the coarsest image, in standard deviations of that image, that counts as one."""
     stuck_gray_share: float = 0.02
-    """Share of changed grey values from which a stuck depth image no longer belongs to the colour."""
+    """Share of changed gray values from which a stuck depth image no longer belongs to the color."""
     stuck_depth_change: float = 0.01
     """Relative change of a depth of the coarsest image that counts as one."""
     stuck_depth_share: float = 0.1
-    """Share of changed depths from which a stuck colour image no longer belongs to the depth."""
+    """Share of changed depths from which a stuck color image no longer belongs to the depth."""
     intruder_gate_m: float = 0.15
     """A point nearer by this than what a keyframe saw there stands in space that was free."""
     intruder_gate_relative: float = 0.1
@@ -142,7 +142,7 @@ class MotionPriorConfig(Config):
     """Plus this for every second: the bias."""
 
 
-class RelocalisationConfig(Config):
+class RelocalizationConfig(Config):
     """Finding a lost camera again by features of its image."""
 
     features: int = 400
@@ -160,7 +160,7 @@ class RelocalisationConfig(Config):
     hypotheses: int = 300
     """Three-point samples of RANSAC."""
     inlier_m: float = 0.05
-    """Distance below which a match agrees with a motion, at one metre of depth; grows with depth."""
+    """Distance below which a match agrees with a motion, at one meter of depth; grows with depth."""
     min_inliers: int = 10
     """Matches that must agree on one motion."""
     min_inlier_share: float = 0.25
@@ -172,7 +172,7 @@ class RelocalisationConfig(Config):
     max_conflict: float = 0.1
     """Largest fraction of a keyframe's seen samples in space that the frame saw to be free, to be believed."""
     max_gray_rms: float = 0.03
-    """Largest grey residual of a place that is believed, plus `max_gray_rms_of_usual` times the usual one: that of the
+    """Largest gray residual of a place that is believed, plus `max_gray_rms_of_usual` times the usual one: that of the
     frames tracked before. Rooms built alike agree in shape, not in their pictures."""
     max_gray_rms_of_usual: float = 2.0
     confirmations: int = 1
@@ -196,17 +196,17 @@ class TrackingConfig(Config):
     """Pixels between samples of a keyframe, per pyramid level, finest first."""
     max_extrapolation_s: float = 0.2
     """Longest gap in time over which the last velocity is believed."""
-    equalise_from_gain: float = 1.2
+    equalize_from_gain: float = 1.2
     """A frame that failed is tried again with brightness and contrast brought to those of the keyframe if the contrast
     differs by more than this factor."""
     max_keyframe_gain: float = 1.5
-    """A frame brighter or darker than its keyframe by more than this factor, or with a grey residual that would not be
-    believed of a place found again, becomes a keyframe only below `relocalisation.min_overlap`, and only if little of
+    """A frame brighter or darker than its keyframe by more than this factor, or with a gray residual that would not be
+    believed of a place found again, becomes a keyframe only below `relocalization.min_overlap`, and only if little of
     it is saturated."""
     max_saturated: float = 0.1
     """Share of black and white pixels up to which that is so."""
     failure: FailureConfig = FailureConfig()
-    relocalisation: RelocalisationConfig = RelocalisationConfig()
+    relocalization: RelocalizationConfig = RelocalizationConfig()
     prior: MotionPriorConfig = MotionPriorConfig()
 
 

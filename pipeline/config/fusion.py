@@ -9,16 +9,16 @@ from duagc.pipeline.config.training import LearningRates, MapLossConfig
 
 
 class RefineConfig(Config):
-    """Training of the fused map on the robot's own images and on what its neighbours' maps show."""
+    """Training of the fused map on the robot's own images and on what its neighbors' maps show."""
 
     steps_per_view: int = Field(default=9, ge=0)
     """Steps for each own view; 0: the fused map stays as fusion left it."""
     steps_max: int = Field(default=600, ge=0)
     """Most steps on own views."""
     peer_share: float = Field(default=0.25, ge=0.0, le=1.0)
-    """Steps on views of neighbours' maps for every step on an own view; 0: none, and only own Gaussians are trained."""
+    """Steps on views of neighbors' maps for every step on an own view; 0: none, and only own Gaussians are trained."""
     peer_views: int = Field(default=40, ge=1)
-    """Most views of neighbours' maps."""
+    """Most views of neighbors' maps."""
     support_views: int = Field(default=40, ge=0)
     """Most tracked frames between keyframes that take part."""
     rate: float = Field(default=0.15, gt=0.0)
@@ -33,9 +33,9 @@ class FusionConfig(Config):
     """From evidence to a robot's fused map."""
 
     coverage: Literal["all", "overlap"] = "all"
-    """Take over what only neighbours saw (all), or only fuse what is matched (overlap)."""
-    association: Literal["neighbours", "members"] = "neighbours"
-    """Whose values carry the variance of where a robot happened to put its splats: only the neighbours', so that a
+    """Take over what only neighbors saw (all), or only fuse what is matched (overlap)."""
+    association: Literal["neighbors", "members"] = "neighbors"
+    """Whose values carry the variance of where a robot happened to put its splats: only the neighbors', so that a
     robot estimates its own splat at its own place, or every member's alike, so that all robots end with one and the
     same Gaussian, as method and paper have it (see `docs/consensus.md` for what that costs)."""
     spacing_per_sigma: float = Field(default=1.8, ge=0.0)
@@ -43,17 +43,17 @@ class FusionConfig(Config):
     standard deviation of 0.55 cells."""
     scatter_position_m: float = Field(default=0.01, gt=0.0)
     """Standard deviation by which two robots' splats of one place are expected to differ across the surface. What is
-    expected counts as much as `scatter_support` matched Gaussians, the rest is measured (association = neighbours)."""
+    expected counts as much as `scatter_support` matched Gaussians, the rest is measured (association = neighbors)."""
     scatter_log_covariance: float = Field(default=1.0, gt=0.0)
     """The same for a coordinate of vec log Sigma."""
     scatter_color: float = Field(default=0.07, gt=0.0)
-    """The same for colour channels, 0..1."""
+    """The same for color channels, 0..1."""
     scatter_opacity: float = Field(default=0.5, gt=0.0)
     """The same for opacity logits."""
     scatter_support: int = Field(default=50, ge=1)
     """Matched Gaussians that the expectation is worth."""
     explained_m: float = Field(default=0.10, ge=0.0)
-    """A neighbour's Gaussian this far behind a surface that an own keyframe measured still counts as explained..."""
+    """A neighbor's Gaussian this far behind a surface that an own keyframe measured still counts as explained..."""
     explained_relative: float = Field(default=0.03, ge=0.0)
     """... plus this share of its depth."""
     explained_px: int = Field(default=4, ge=0)
@@ -66,4 +66,4 @@ class FusionConfig(Config):
     """Take over only Gaussians on whose position their owner's pixels said something."""
     refine: RefineConfig = RefineConfig()
     max_added: int | None = Field(default=None, ge=0)
-    """At most so many Gaussians of neighbours are taken over, those of most position information first."""
+    """At most so many Gaussians of neighbors are taken over, those of most position information first."""

@@ -15,7 +15,7 @@ class InformationConfig(Config):
     """Keyframes that count: all; the last `window_length`; for each Gaussian the last `window_length` that saw it."""
     window_length: int = 10
     color_sigma_floor: float = 0.01
-    """Least standard deviation of a colour channel (0..1), whatever the residuals say."""
+    """Least standard deviation of a color channel (0..1), whatever the residuals say."""
     depth_sigma_base_m: float = 0.0012
     """Depth noise at 0.4 m; sigma(z) = base + quadratic (z - 0.4)^2, times a factor. Defaults: Kinect v1."""
     depth_sigma_quadratic_per_m: float = 0.0019

@@ -17,13 +17,13 @@ class SeedingConfig(Config):
     cell_sizes_px: tuple[int, ...] = (8, 4, 2)
     """Sides of the quadtree's cells, coarse to fine, each half of the one before."""
     detail: float = 0.02
-    """Standard deviation of grey (0..1) in a cell above which it is split; raised until the budget holds."""
+    """Standard deviation of gray (0..1) in a cell above which it is split; raised until the budget holds."""
     min_alpha: float = 0.6
     """Rendered opacity below which a pixel is not explained."""
     color_error: float = 0.1
-    """Mean colour error (0..1), smoothed over a cell, above which a pixel is not explained."""
+    """Mean color error (0..1), smoothed over a cell, above which a pixel is not explained."""
     worst_color_error: float = 0.02
-    """Root mean square colour error (0..1) of a cell up to which no disc is added where images are drawn worst."""
+    """Root mean square color error (0..1) of a cell up to which no disc is added where images are drawn worst."""
     depth_error_m: float = 0.04
     """Depth error above which a pixel is not explained, plus depth_error_relative times the depth."""
     depth_error_relative: float = 0.02
@@ -38,7 +38,7 @@ class SeedingConfig(Config):
 
 
 class MappingConfig(Config):
-    """How the map is grown and optimised."""
+    """How the map is grown and optimized."""
 
     max_gaussians: int = 60_000
     """Hard cap. When a keyframe would exceed it, the Gaussians whose removal changes the keyframes least go first."""
@@ -47,13 +47,13 @@ class MappingConfig(Config):
     keyframe_share: float = 0.12
     """Share of the cap that any later keyframe may add."""
     window: int = 8
-    """Keyframes optimised together: the newest and those that see most of what it sees."""
+    """Keyframes optimized together: the newest and those that see most of what it sees."""
     candidates: int = 24
     """Most older keyframes, by the places they look at, whose overlap with a new one is computed."""
     random_keyframes: int = 2
     """Older keyframes added to the window by lot, against forgetting."""
     iterations: int = 24
-    """Optimisation steps (one view each) at a keyframe; every second one is on the newest keyframe."""
+    """Optimization steps (one view each) at a keyframe; every second one is on the newest keyframe."""
     iterations_level: int = 0
     """Image pyramid level of these steps: 0 full size, 1 half size."""
     final_iterations: int = 90
@@ -71,7 +71,7 @@ class MappingConfig(Config):
     stable_steps: int = 0
     """Steps after which a Gaussian is stable: frozen until the final refinement; 0: never."""
     depth: DepthKind | Literal["auto"] = "auto"
-    """Depth of a Gaussian at a pixel: that of its centre (`blended`), or of its disc along the ray (`ray_plane`).
+    """Depth of a Gaussian at a pixel: that of its center (`blended`), or of its disc along the ray (`ray_plane`).
     `auto`: `ray_plane` where the measured noise of the depth images is below `exact_depth_m`."""
     exact_depth_m: float = Field(default=0.002, ge=0.0)
     """Depth that agrees this well from frame to frame tells the surface of every single Gaussian."""

@@ -37,7 +37,7 @@ class LinkConfig(Config):
     enabled: bool = True
     """False: nobody talks to anybody, whatever the topology."""
     topology: Literal["full", "ring", "chain", "star", "none", "range", "listed"] = "full"
-    """Who can talk to whom: laid over the robots in alphabetical order (the centre of the star is the first), by
+    """Who can talk to whom: laid over the robots in alphabetical order (the center of the star is the first), by
     distance (`range`, needs range_m and waypoints), or as `windows` say (`listed`)."""
     windows: tuple[LinkWindow, ...] = ()
     """Links of topology `listed`, each with the time in which it exists."""
@@ -64,7 +64,7 @@ class LinkConfig(Config):
     queue_ns: int = Field(default=1_000_000_000, ge=0)
     """A packet that would wait longer than this for the link is dropped by its sender's radio."""
     budget_bytes: int = Field(default=150_000, ge=2_400)
-    """Most that one robot sends to one neighbour in one round, headers included."""
+    """Most that one robot sends to one neighbor in one round, headers included."""
 
     @model_validator(mode="after")
     def _consistent(self) -> "LinkConfig":
@@ -91,10 +91,10 @@ class TransportConfig(Config):
     retransmit_after_rounds: int = Field(default=4, ge=1)
     """An unacknowledged packet of a reliable message is sent again after so many rounds."""
     contact_lost_after_rounds: int = Field(default=64, ge=1)
-    """A neighbour not heard for so long gets one small beacon per round and nothing else."""
+    """A neighbor not heard for so long gets one small beacon per round and nothing else."""
     silent_after_rounds: int = Field(default=200, ge=1)
-    """A neighbour not heard for so long is given up; the agent ends without it."""
+    """A neighbor not heard for so long is given up; the agent ends without it."""
     max_message_bytes: int = Field(default=1 << 28, ge=1)
     """A message that claims to be larger is refused."""
     max_open_messages: int = Field(default=4096, ge=1)
-    """Incomplete messages kept per neighbour; further ones are refused until some are complete."""
+    """Incomplete messages kept per neighbor; further ones are refused until some are complete."""

@@ -27,7 +27,7 @@ class PoseGraphConfig(Config):
     seed: int = 0
     """Of the losses; nothing else is random."""
     max_rounds: int = Field(default=5000, ge=1)
-    """A round is one burst of every robot to every neighbour; the run ends here whatever has been agreed."""
+    """A round is one burst of every robot to every neighbor; the run ends here whatever has been agreed."""
     consensus: PoseConsensusConfig = PoseConsensusConfig(
         tolerance=1e-5,
         wire="float32",

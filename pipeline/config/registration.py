@@ -9,7 +9,7 @@ class RegistrationConfig(Config):
     """Joint point-to-plane and photometric registration."""
 
     residuals: Literal["joint", "depth", "gray"] = "joint"
-    """Which residuals count: both, point-to-plane only, or grey values only (for comparisons)."""
+    """Which residuals count: both, point-to-plane only, or gray values only (for comparisons)."""
     iterations: tuple[int, ...] = (4, 5, 6)
     """Gauss-Newton steps per pyramid level, finest first."""
     depth_gate_m: float = 0.1
@@ -28,16 +28,16 @@ class RegistrationConfig(Config):
     """See depth_sigma_base_m (Nguyen, Izadi and Lovell 2012)."""
     depth_sigma_floor: float = 0.05
     """Smallest estimated scale of the depth noise at the finest level, as a multiple of sigma(z). Four times more at
-    each coarser one, where edges are blurred: without noise the depth would else outweigh the grey values so far
+    each coarser one, where edges are blurred: without noise the depth would else outweigh the gray values so far
     that the way to the minimum becomes a narrow valley, which takes hundreds of steps."""
     gray_sigma_floor: float = 0.002
-    """Smallest estimated noise of grey values (about half a step of 8 bits)."""
+    """Smallest estimated noise of gray values (about half a step of 8 bits)."""
     gray_sigma_of_depth: float = 0.03
-    """Smallest estimated noise of grey values as a multiple of the scale of the depth noise. A camera with poor depth
-    also has depth registered to colour only to a pixel, and texture turns that pixel into a grey error that is the
-    same in all frames; without this the many sharp grey values overrule the depth (RedKitchen: 2.7 cm, with it 2.3)."""
+    """Smallest estimated noise of gray values as a multiple of the scale of the depth noise. A camera with poor depth
+    also has depth registered to color only to a pixel, and texture turns that pixel into a gray error that is the
+    same in all frames; without this the many sharp gray values overrule the depth (RedKitchen: 2.7 cm, with it 2.3)."""
     min_gradient: float = 0.0
-    """Grey gradient (1/px) below which a sample's grey value is not used."""
+    """Gray gradient (1/px) below which a sample's gray value is not used."""
     min_samples: int = 100
     """Fewer agreeing samples are LOW_OVERLAP."""
     min_overlap: float = 0.3
@@ -47,7 +47,7 @@ class RegistrationConfig(Config):
     max_depth_scale: float = 8.0
     """Largest estimated scale of the depth noise, as a multiple of sigma(z); more is RESIDUAL."""
     max_gray_rms: float = 0.15
-    """Largest weighted grey residual; more is RESIDUAL."""
+    """Largest weighted gray residual; more is RESIDUAL."""
     max_gain: float = 2.0
     """The gain must lie between 1 / max_gain and max_gain; else RESIDUAL (covered lens, other scene)."""
     max_sigma_m: float = 0.03

@@ -7,22 +7,22 @@ from typing import Literal, TypeAlias
 from duagc.pipeline.config.base import Config
 
 DepthKind: TypeAlias = Literal["blended", "ray_plane"]
-"""Depth of a Gaussian at a pixel: that of its centre, or of its mean along the ray (a flat disc: of its plane)."""
+"""Depth of a Gaussian at a pixel: that of its center, or of its mean along the ray (a flat disc: of its plane)."""
 
 
 class LossConfig(Config):
     """Weights of the mapping loss; every term is a mean over its pixels."""
 
     color_huber: float = 0.1
-    """Colour residual (0..1) where the loss turns from quadratic to linear; the slope beyond is 1."""
+    """Color residual (0..1) where the loss turns from quadratic to linear; the slope beyond is 1."""
     depth_weight: float = 1.0
-    """Weight of one metre of depth error against one unit of colour."""
+    """Weight of one meter of depth error against one unit of color."""
     depth_huber_m: float = 0.02
-    """Depth residual in metres where the loss turns from quadratic to linear; the slope beyond is 1."""
+    """Depth residual in meters where the loss turns from quadratic to linear; the slope beyond is 1."""
     alpha_weight: float = 0.04
     """Weight of missing opacity (1 - alpha) where a surface was measured."""
     surface_weight: float = 0.0
-    """Weight of one metre between a Gaussian's own depth and the measured one, by its share in the pixel."""
+    """Weight of one meter between a Gaussian's own depth and the measured one, by its share in the pixel."""
 
 
 class SurfaceLossConfig(LossConfig):
@@ -49,7 +49,7 @@ class LearningRates(Config):
     """Step lengths of Adam: about the change of a parameter per step while its gradient keeps its sign."""
 
     means: float = 2e-3
-    """Metres."""
+    """Meters."""
     quats_wxyz: float = 2e-2
     """Of a unit quaternion."""
     log_scales: float = 0.08

@@ -1,1 +1,1 @@
-"""What a robot computes with its neighbours: common frame, corrected keyframes, matches. Arrays only, no messages."""
+"""What a robot computes with its neighbors: common frame, corrected keyframes, matches. Arrays only, no messages."""

@@ -126,7 +126,7 @@ class Link:
     def largest_recent_change(self) -> float:
         """The same over the last arrivals; infinite before there were so many.
 
-        A neighbour that has not heard since says nearly the same again: the less arrives, the less a single small
+        A neighbor that has not heard since says nearly the same again: the less arrives, the less a single small
         change means.
         """
         return float(self.changes.max())

@@ -1,12 +1,12 @@
-"""How the cameras of a team see the same colours, from matched Gaussians alone.
+"""How the cameras of a team see the same colors, from matched Gaussians alone.
 
-Every robot keeps the colours of its own camera; there is no right one. Per channel, a camera shows the colour s of a
+Every robot keeps the colors of its own camera; there is no right one. Per channel, a camera shows the color s of a
 surface as c = (s - b) / a: gain (exposure, white balance) and offset. Of every pair of robots their matched Gaussians
-tell the ratio of the gains and the colours that correspond; over the team these make one linear problem. Everybody who
+tell the ratio of the gains and the colors that correspond; over the team these make one linear problem. Everybody who
 holds the same evidence and pair lists solves the same problem, so nothing more is sent, and what a robot reads from a
-neighbour it puts into its own colours (`ColorMap`).
+neighbor it puts into its own colors (`ColorMap`).
 
-Two robots' splats of one place differ in colour by noise in both, so a regression of one on the other would find a gain
+Two robots' splats of one place differ in color by noise in both, so a regression of one on the other would find a gain
 below one between equal cameras. The gain here is the ratio of the spreads (reduced major axis), which is the same
 whoever is asked; exact if noise grows with the gain. It lies between the two regressions, ratio * r and ratio / r with
 r the correlation, and counts as spread evenly between them (Frisch 1934): that is most of its standard deviation.
@@ -28,15 +28,15 @@ Array = NDArray[np.float64]
 Pairs = Mapping[tuple[str, str], NDArray[np.int64]]
 _ROUNDS = 20  # of reweighting
 _TUNING = 3.0  # standard deviations at which a pair counts a quarter
-_LEAST_SPREAD = 1e-3  # of colours; below it there is no contrast to compare
+_LEAST_SPREAD = 1e-3  # of colors; below it there is no contrast to compare
 _LEAST_CORRELATION = 0.05
 
 
 @dataclass(frozen=True)
 class ColorMap:
-    """How one camera's colours c look to another: gain * c + offset, by channel [3]; their standard deviations.
+    """How one camera's colors c look to another: gain * c + offset, by channel [3]; their standard deviations.
 
-    sigma_gain: relative. sigma_offset: of the other camera's colour in the middle of the colours that were compared.
+    sigma_gain: relative. sigma_offset: of the other camera's color in the middle of the colors that were compared.
     matches: pairs of Gaussians behind it, of these two robots. Where nothing was compared it is the identity.
     """
 
@@ -52,15 +52,15 @@ class ColorMap:
         return bool(np.all(self.gain == 1) and np.all(self.offset == 0))
 
     def to_other(self, colors: NDArray[np.floating]) -> Array:
-        """Colours [n, 3] as the other camera shows them."""
+        """Colors [n, 3] as the other camera shows them."""
         return np.asarray(self.gain * colors + self.offset, dtype=np.float64)
 
     def from_other(self, colors: NDArray[np.floating]) -> Array:
-        """The way back: colours [n, 3] of the other camera as this one shows them."""
+        """The way back: colors [n, 3] of the other camera as this one shows them."""
         return np.asarray((colors - self.offset) / self.gain, dtype=np.float64)
 
     def of(self, evidence: Evidence) -> Evidence:
-        """Evidence in the other camera's colours; every bit is kept by the identity."""
+        """Evidence in the other camera's colors; every bit is kept by the identity."""
         if self.is_identity:
             return evidence
         theta, information = evidence.theta.copy(), evidence.information.copy()
@@ -71,9 +71,9 @@ class ColorMap:
 
 @dataclass(frozen=True)
 class TeamColors:
-    """Every robot's way from its own colours c to common ones, scale * c + shift, by name, [3] each.
+    """Every robot's way from its own colors c to common ones, scale * c + shift, by name, [3] each.
 
-    The common colours have no meaning but that everybody computes the same: those in which nobody's gain and offset
+    The common colors have no meaning but that everybody computes the same: those in which nobody's gain and offset
     is far from one and zero. Covariances [r, r, 3] between robots, in order of name, of log scale and of shift.
     """
 
@@ -85,7 +85,7 @@ class TeamColors:
     matches: dict[tuple[str, str], int]
 
     def to_common(self, robot: str) -> ColorMap:
-        """From a robot's colours to the common ones."""
+        """From a robot's colors to the common ones."""
         i = self.robots.index(robot)
         return ColorMap(
             self.scale[robot],
@@ -96,7 +96,7 @@ class TeamColors:
         )
 
     def between(self, robot: str, other: str) -> ColorMap:
-        """From a robot's colours to another's."""
+        """From a robot's colors to another's."""
         i, j = self.robots.index(robot), self.robots.index(other)
         scale = self.scale[other]
         return ColorMap(
@@ -110,8 +110,8 @@ class TeamColors:
 
 @dataclass(frozen=True)
 class _Compared:
-    """Two robots' colours of the same places, by channel [3]: log of the ratio of spreads, other over own, and its
-    variance; the middle of either's colours, and the variance of their difference in units of the geometric mean."""
+    """Two robots' colors of the same places, by channel [3]: log of the ratio of spreads, other over own, and its
+    variance; the middle of either's colors, and the variance of their difference in units of the geometric mean."""
 
     log_ratio: Array
     variance: Array
@@ -125,7 +125,7 @@ def team_colors(evidence: Mapping[str, Evidence], pairs: Pairs, config: ColorCon
 
     Args:
         evidence: of every robot. pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians; those that
-            `evidence` lacks, or whose colours one of the two knows nothing of, are left out.
+            `evidence` lacks, or whose colors one of the two knows nothing of, are left out.
     """
     robots = tuple(sorted(evidence))
     matches: dict[tuple[str, str], int] = {}
@@ -160,7 +160,7 @@ def team_colors(evidence: Mapping[str, Evidence], pairs: Pairs, config: ColorCon
 
 
 def _colors_of(own: Evidence, other: Evidence, ids: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Colours [m, 3] of matched Gaussians of which both robots know something."""
+    """Colors [m, 3] of matched Gaussians of which both robots know something."""
     i, j = rows_by_id(ids[:, 0], own.ids), rows_by_id(ids[:, 1], other.ids)
     here = (i >= 0) & (j >= 0)
     i, j = i[here], j[here]
@@ -169,7 +169,7 @@ def _colors_of(own: Evidence, other: Evidence, ids: NDArray[np.int64]) -> tuple[
 
 
 def _compare(own: Array, other: Array, config: ColorConfig) -> _Compared:
-    """Compare matched colours [m, 3]; continuous in them, and the same with the two exchanged."""
+    """Compare matched colors [m, 3]; continuous in them, and the same with the two exchanged."""
     middle = [np.median(x, axis=0) for x in (own, other)]
     spread = [
         MAD_TO_SIGMA * np.median(np.abs(x - m), axis=0) for x, m in zip((own, other), middle, strict=True)

@@ -1,11 +1,11 @@
 """Exact elimination to separators along a tree of robots: one Gauss-Newton step of the whole team per exchange.
 
-Every robot has its own keyframes and copies of neighbours' keyframes, as in edge-ADMM: a *variable* is named
-(owner, keyframe), and several robots may have it. Each robot linearises its own factors. From the leaves to the root,
+Every robot has its own keyframes and copies of neighbors' keyframes, as in edge-ADMM: a *variable* is named
+(owner, keyframe), and several robots may have it. Each robot linearizes its own factors. From the leaves to the root,
 a robot adds what its children sent, eliminates every variable that nobody outside its subtree has, and sends the rest
 up: a dense quadratic form over the variables that its subtree shares with others. The root solves; the answer comes
 down, and every robot finds its eliminated variables from the shared ones. This is the multifrontal method with robots
-as fronts: the step is that of the centralised solver, up to rounding.
+as fronts: the step is that of the centralized solver, up to rounding.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _ANCHOR = 1e6  # of the largest diagonal entry, on the root's first keyframe; on
 class Block:
     """Quadratic form that is left of a subtree: 1/2 d' H d + g' d over its shared variables, H [6 b, 6 b], g [6 b].
 
-    H is None if it is that of the last block: nothing below was linearised anew.
-    cost: the subtree's |r|^2 at the linearisation point. largest_step: largest component of its last step (m, rad).
+    H is None if it is that of the last block: nothing below was linearized anew.
+    cost: the subtree's |r|^2 at the linearization point. largest_step: largest component of its last step (m, rad).
     reweighted: some weight below has changed since the last block. unsure: some weight below is not final.
     """
 
@@ -48,7 +48,7 @@ class Step:
     """The root's answer to the blocks of one exchange.
 
     accepted: the last step lowered the cost; else everybody goes back to where it was before. finished: this is the
-    last message. fresh: everybody linearises anew. damping: for the next blocks. delta: [s, 6], steps of the variables
+    last message. fresh: everybody linearizes anew. damping: for the next blocks. delta: [s, 6], steps of the variables
     shared with the parent.
     """
 
@@ -83,7 +83,7 @@ class Front:
         self._solve: Callable[[Array], Array] | None = None
         self._coupling = self._rest = np.zeros((0, 0))
 
-    def factorise(self, H_own: sparse.csc_matrix, children: Mapping[int, Array]) -> Array:
+    def factorize(self, H_own: sparse.csc_matrix, children: Mapping[int, Array]) -> Array:
         """Add the children's blocks [6 b, 6 b] to the own one, eliminate; returns H [6 s, 6 s] over the shared ones."""
         own = H_own.tocoo()
         slots = _lanes(self.own_slots)
@@ -98,7 +98,7 @@ class Front:
         H = sparse.coo_matrix((np.concatenate(values), index), shape=shape).tocsc()
         e = 6 * self.eliminated
         across, kept = H[:e, e:].toarray(), H[e:, e:].toarray()
-        self._solve = pose_factors.factorised(H[:e, :e].tocsc()) if e else None
+        self._solve = pose_factors.factorized(H[:e, :e].tocsc()) if e else None
         self._coupling = self._solve(across) if self._solve is not None and across.size else across
         S = kept - across.T @ self._coupling
         return 0.5 * (S + S.T)

@@ -1,9 +1,9 @@
 """What a robot's own pixels say about its Gaussians, in the flat chart of method section 1, and how it turns.
 
-theta [13] = mean 3 (m), vec log Sigma 6 (`geometry.spd` order), colour 3 (RGB 0..1), opacity logit 1.
+theta [13] = mean 3 (m), vec log Sigma 6 (`geometry.spd` order), color 3 (RGB 0..1), opacity logit 1.
 
 information [31] is block diagonal in that chart: the upper triangles, row by row, of the 3x3 of the mean (xx, xy, xz,
-yy, yz, zz; 1/m^2) and of the 6x6 of vec log Sigma (21), the diagonal of the colour (3), and the opacity (1). The cross
+yy, yz, zz; 1/m^2) and of the 6x6 of vec log Sigma (21), the diagonal of the color (3), and the opacity (1). The cross
 terms between mean and covariance, which the Fisher sums of the information stage still hold, are dropped: fusion
 works per block. The blocks are then conditional, not marginal, information. Zero is no information.
 """
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 MEAN, LOG_COVARIANCE, COLOR, OPACITY = slice(0, 3), slice(3, 9), slice(9, 12), 12
 """Places in theta."""
 COLOR_INFORMATION = slice(27, 30)
-"""Places of the colour in the packed information."""
+"""Places of the color in the packed information."""
 SHAPE_FLOOR = 0.1
 """Least standard deviation of a coordinate of vec log Sigma: 5 % of a scale."""
 LEAST_DEVIATION_M = 1e-4
@@ -94,7 +94,7 @@ def theta_of(gaussians: Gaussians) -> Array:
 
 @dataclass(frozen=True)
 class Evidence:
-    """A robot's own evidence on n of its Gaussians. It never contains what came from a neighbour.
+    """A robot's own evidence on n of its Gaussians. It never contains what came from a neighbor.
 
     owner: the robot. ids: int64 [n]. anchors: int32 [n], index of the owner's keyframe. theta: float64 [n, 13], in
     the frame of the anchor (or of the world, after `in_world`). information: float64 [n, 31], likewise.

@@ -4,13 +4,13 @@ The distance of two Gaussians in the flat chart is, with Delta the difference of
 
     d_G^2 = |Delta mean|^2 / l^2 + 0.1 |Delta log Sigma|_F^2 + 1.0 |Delta c|^2 + 0.5 Delta alpha^2
 
-with colours as degree-0 spherical-harmonic coefficients and l = delta, the search radius: (6) adds square metres to
+with colors as degree-0 spherical-harmonic coefficients and l = delta, the search radius: (6) adds square meters to
 squares without a unit, which would make the position count for nothing within 5 cm (l = 1 m gives (6) as printed).
 How thin a Gaussian is says nothing where it is as thin as the mapper lets it be: against one that is thicker, that
 component of log Sigma, e e' with e the axis, is left out; two at the floor are equally thin. Tilts stay in.
 
-Two cameras may see colours differently. So the Gaussians are first matched without their colours, which is enough to
-tell gain and offset (`consensus.colors`), and the other robot's colours are compared as the own camera would show them.
+Two cameras may see colors differently. So the Gaussians are first matched without their colors, which is enough to
+tell gain and offset (`consensus.colors`), and the other robot's colors are compared as the own camera would show them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from duagc.pipeline.geometry import spd
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Pairs = Mapping[tuple[str, str], Index]
-SH_C0 = 0.28209479177387814  # colour = 0.5 + SH_C0 * coefficient
+SH_C0 = 0.28209479177387814  # color = 0.5 + SH_C0 * coefficient
 _CHUNK = 200_000  # pairs per pass, for memory
 _FLOOR_SLACK = 1e-3  # of a log-scale: float32 and rotations
 
@@ -93,16 +93,16 @@ def gaussian_distance(a: Evidence, i: Index, b: Evidence, j: Index, config: Matc
 
 
 def threshold(own: Evidence, config: MatchingConfig) -> float:
-    """tau_G of a map: what its own neighbours differ by; 0 if no two are within the radius."""
+    """tau_G of a map: what its own neighbors differ by; 0 if no two are within the radius."""
     if len(own) < 2:
         return 0.0
     means = own.theta[:, MEAN]
-    distance, neighbour = cKDTree(means).query(means, k=2)
+    distance, neighbor = cKDTree(means).query(means, k=2)
     near = np.flatnonzero(distance[:, 1] <= config.radius_m)
     if not len(near):
         return 0.0
     # of coinciding Gaussians the query may name the Gaussian itself second
-    other = np.where(neighbour[near, 1] == near, neighbour[near, 0], neighbour[near, 1])
+    other = np.where(neighbor[near, 1] == near, neighbor[near, 0], neighbor[near, 1])
     chart = _Chart.of(own.theta, config)
     return float(np.percentile(_distances(chart, near, chart, other, config), config.percentile))
 
@@ -112,7 +112,7 @@ def match(own: Evidence, peer: Evidence, config: MatchingConfig) -> Index:
 
     Args:
         own: all evidence of the computing robot, in the world frame; tau_G is taken over it.
-        peer: evidence of the other robot, in the world frame, in its own camera's colours.
+        peer: evidence of the other robot, in the world frame, in its own camera's colors.
     Returns:
         int64 [m, 2], ids of (own, peer), ascending; each id at most once.
     """
@@ -126,7 +126,7 @@ def match(own: Evidence, peer: Evidence, config: MatchingConfig) -> Index:
 
 
 def _match(own: Evidence, peer: Evidence, config: MatchingConfig) -> Index:
-    """`match` of evidence in the same colours, not empty."""
+    """`match` of evidence in the same colors, not empty."""
     i, j = _candidates(own.theta[:, MEAN], peer.theta[:, MEAN], config)
     d = _distances(_Chart.of(own.theta, config), i, _Chart.of(peer.theta, config), j, config)
     close = d < threshold(own, config)
@@ -143,9 +143,9 @@ def _candidates(means_own: Array, means_peer: Array, config: MatchingConfig) -> 
     found = []
     for a, b, turned in ((means_own, means_peer, False), (means_peer, means_own, True)):
         k = min(config.candidates, len(b))
-        distance, neighbour = cKDTree(b).query(a, k=[*range(1, k + 1)], distance_upper_bound=config.radius_m)
+        distance, neighbor = cKDTree(b).query(a, k=[*range(1, k + 1)], distance_upper_bound=config.radius_m)
         row, rank = np.nonzero(np.isfinite(distance))
-        column = neighbour[row, rank]
+        column = neighbor[row, rank]
         own, peer = (column, row) if turned else (row, column)
         found.append(own * len(means_peer) + peer)
     key = np.sort(np.concatenate(found))

@@ -8,7 +8,7 @@ poses. For every copied keyframe there is one edge variable y at each end of the
     3. on arrival sets                 y <- y + relaxation (m - y);
 
 a packet that does not arrive changes nothing. At a fixed point x agrees at both ends and the forces W (x - y) of
-the two ends cancel, so that x minimises the sum of all robots' costs: the centralised optimum, whatever the
+the two ends cancel, so that x minimizes the sum of all robots' costs: the centralized optimum, whatever the
 penalties and the losses on the way were. Source: `docs/consensus.md`; paper eqs. (8), (10), (11), (14), corrected.
 
 On the product group the edge variable is kept as its *offset* d = x - y, a vector of the tangent at x: a step delta
@@ -51,10 +51,10 @@ _STEADY = 1e-3  # m, rad: a link that moves less has left its start behind
 
 
 class PoseAgent:
-    """One robot's side of the pose consensus: own keyframes, copies of the neighbours', and what packets brought.
+    """One robot's side of the pose consensus: own keyframes, copies of the neighbors', and what packets brought.
 
     Robots have names that sort; the lower name of a pair decides on penalties. Nobody is held during the iteration;
-    results may be expressed in any frame afterwards (`docs/consensus.md`, gauge).
+    results may be expressed in any frame afterward (`docs/consensus.md`, gauge).
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class PoseAgent:
         self.loop_weights = RobustWeights(kept, config)
         self.T_world_map = np.eye(4)
         self.links: dict[str, Link] = {}
-        self.rounds = self.factorisations = 0
+        self.rounds = self.factorizations = 0
         self.step_change = np.inf
         self._copies_start: dict[str, Array] = {}
         self._started = False
@@ -113,17 +113,17 @@ class PoseAgent:
         keep: ArrayLike | None = None,
         T_world_keyframe_peer: Mapping[int, ArrayLike] | None = None,
     ) -> SharedKeyframes:
-        """Join a neighbour, either with the closures that this end holds or with the keyframes that it shares.
+        """Join a neighbor, either with the closures that this end holds or with the keyframes that it shares.
 
         Args:
-            peer: the neighbour's name.
+            peer: the neighbor's name.
             closures_held: all closures of the pair, if this end holds them.
-            shared: what the neighbour's `add_link` returned, if it holds them.
+            shared: what the neighbor's `add_link` returned, if it holds them.
             keep: bool per closure, start of the robust weights (default: all).
             T_world_keyframe_peer: start of the copies by peer keyframe index, in this robot's idea of the world
                 frame; default: from the first kept closure that names it.
         Returns:
-            What the neighbour needs for its own `add_link` (with `shared`: the same again).
+            What the neighbor needs for its own `add_link` (with `shared`: the same again).
         """
         if self._started:
             raise ValueError(f"{self.robot}: a link to {peer} cannot be added after the first step")
@@ -175,7 +175,7 @@ class PoseAgent:
         return out
 
     def _start(self) -> None:
-        """Lay out the variables: own keyframes, then copies by neighbour; factors over all of them."""
+        """Lay out the variables: own keyframes, then copies by neighbor; factors over all of them."""
         self._started = True
         poses, parts, count = [self.T_map_keyframe], [self._factors], len(self.T_map_keyframe)
         for link in self.links.values():
@@ -215,14 +215,14 @@ class PoseAgent:
         g, jacobians = pose_factors.gradient(self._factors, self._weights, self._x)
         for peer, link in self.links.items():
             g[link.slots] += force_before[peer]
-        if self._solve is None or self._moved_rad > self.config.relinearise_rad:
+        if self._solve is None or self._moved_rad > self.config.relinearize_rad:
             diagonal = np.zeros_like(g)
             for link in self.links.values():
                 diagonal[link.slots] += link.penalty()
             diagonal += 1e-9 * diagonal.max()  # a variable that nothing holds stays where it is
             H = pose_factors.curvature_matrix(self._factors, jacobians, diagonal)
-            self._solve, self._moved_rad = pose_factors.factorised(H), 0.0
-            self.factorisations += 1
+            self._solve, self._moved_rad = pose_factors.factorized(H), 0.0
+            self.factorizations += 1
         delta = -self._solve(g.ravel()).reshape(-1, 6)
         turn_rad = float(np.linalg.norm(delta[:, 3:], axis=1).max())
         if turn_rad > self.config.step_limit_rad:
@@ -239,7 +239,7 @@ class PoseAgent:
         return self.step_change
 
     def outgoing(self, peer: str) -> PosePacket:
-        """What to send to a neighbour after a step."""
+        """What to send to a neighbor after a step."""
         if not self._started:
             self._start()
         link = self.links[peer]
@@ -258,7 +258,7 @@ class PoseAgent:
         )
 
     def receive(self, peer: str, packet: PosePacket) -> bool:
-        """Use a neighbour's packet; False if it was of another version or brought nothing newer."""
+        """Use a neighbor's packet; False if it was of another version or brought nothing newer."""
         if not self._started:
             self._start()
         link = self.links[peer]
@@ -399,7 +399,7 @@ class PoseAgent:
 
     @property
     def agreed(self) -> bool:
-        """This end and, by their last packets, all neighbours are settled."""
+        """This end and, by their last packets, all neighbors are settled."""
         return self.settled and all(link.peer_converged for link in self.links.values())
 
     @property
@@ -412,11 +412,11 @@ class PoseAgent:
         return self._x[: len(self.T_map_keyframe)].copy()
 
     def weights(self, peer: str) -> Array:
-        """Weight [m] of every closure held with a neighbour, in the order given."""
+        """Weight [m] of every closure held with a neighbor, in the order given."""
         return self.links[peer].robust.weights.copy()
 
     def refuted(self, peer: str) -> bool:
-        """Whether the closures held with a neighbour join nobody any more: final weights, too few of which count.
+        """Whether the closures held with a neighbor join nobody any more: final weights, too few of which count.
 
         It takes `closures.min_support` to join two robots, and as many to keep them joined.
         """
@@ -429,7 +429,7 @@ class PoseAgent:
 
         primal: largest |2 x_peer - y_peer - y| over links, the disagreement (m, rad). dual: largest change of a force
         in the last step, over the root of the metric (no unit). cost: own factors, weighted. step: largest component
-        of the last step (m, rad). penalties: (translation, rotation) per neighbour. versions, weights: per neighbour.
+        of the last step (m, rad). penalties: (translation, rotation) per neighbor. versions, weights: per neighbor.
         """
         changes = [link.largest_change() for link in self.links.values()]
         return {
@@ -442,7 +442,7 @@ class PoseAgent:
             "weights": {
                 peer: link.robust.weights.tolist() for peer, link in self.links.items() if link.holds
             },
-            "factorisations": self.factorisations,
+            "factorizations": self.factorizations,
         }
 
 

@@ -1,4 +1,4 @@
-"""One robot's node in the elimination along a tree of robots: what it makes of the messages of its neighbours there.
+"""One robot's node in the elimination along a tree of robots: what it makes of the messages of its neighbors there.
 
 One exchange is a block up and a step down every link of the tree: a Gauss-Newton step of the whole team, damped after
 Levenberg and Marquardt where it would not lower the cost. A matrix is sent again only where rotations below moved (or
@@ -52,7 +52,7 @@ class TreePlace:
 class TreeGraph:
     """What one robot knows of the team's graph.
 
-    variables: own keyframes, then copies of neighbours' keyframes. poses: [v, 4, 4], where they start; a copy must
+    variables: own keyframes, then copies of neighbors' keyframes. poses: [v, 4, 4], where they start; a copy must
     start where its owner starts, to the last bit but a few, because every step moves both alike. shared: variables
     that others have too, with the mask of all robots that have them as far as their owner knows; 0 for copies.
     trusted: factors of weight one. doubted: groups of factors with robust weights.
@@ -77,14 +77,14 @@ class TreeNode:
         self.exchange, self.finished = 0, False
         self.outbox: list[tuple[int, Message]] = []
         self.largest_step = 0.0
-        self.factorisations = 0
+        self.factorizations = 0
         self._factors = Factors.concatenate([graph.trusted, *(factors for factors, _ in graph.doubted)])
         self._front: Front | None = None
         self._fronts: dict[int, dict[Variable, int]] = {}
         self._blocks: dict[int, Block] = {}
         self._matrices: dict[int, Array] = {}  # by child: the last one that came
         self._damping = self._damped = 0.0
-        self._moved_rad = self._step_before = np.inf  # since the last linearisation; of the exchange before
+        self._moved_rad = self._step_before = np.inf  # since the last linearization; of the exchange before
         self._cost: float | None = None  # at the root: of the last accepted poses
         self._sent = -1  # exchange whose block went up
 
@@ -156,7 +156,7 @@ class TreeNode:
         reweighted = self._weigh()
         weights, blocks = self._weights(), self._blocks.values()
         g, jacobians = pose_factors.gradient(self._factors, weights, self.poses)
-        H = self._relinearised(front, jacobians, reweighted)
+        H = self._relinearized(front, jacobians, reweighted)
         block = Block(
             H,
             front.eliminate(g, {child: b.g for child, b in self._blocks.items()}),
@@ -170,9 +170,9 @@ class TreeNode:
         else:
             self.outbox.append((self.place.parent, (self.exchange, block)))
 
-    def _relinearised(self, front: Front, jacobians: tuple[Array, Array], reweighted: bool) -> Array | None:
+    def _relinearized(self, front: Front, jacobians: tuple[Array, Array], reweighted: bool) -> Array | None:
         """The eliminated matrix, or None if the last one still holds: here, and everywhere below."""
-        moved = self._moved_rad > self.config.relinearise_rad
+        moved = self._moved_rad > self.config.relinearize_rad
         stale = moved or reweighted or self._damping != self._damped
         if stale:
             anchor = 0 if self.place.parent is None else None
@@ -180,8 +180,8 @@ class TreeNode:
             self._moved_rad, self._damped = 0.0, self._damping
         if not stale and all(block.H is None for block in self._blocks.values()):
             return None
-        self.factorisations += 1
-        return front.factorise(self._H_own, self._matrices)
+        self.factorizations += 1
+        return front.factorize(self._H_own, self._matrices)
 
     def _decide_step(self, block: Block) -> None:
         """At the root: was the last step good, and what comes next."""

@@ -1,6 +1,6 @@
 """Kinds of weights: what a robot tells of how sure it is, in full, in part, or by a rule of thumb.
 
-    block               the information itself: 3x3 of the mean, 6x6 of vec log Sigma, diagonals of colour and opacity
+    block               the information itself: 3x3 of the mean, 6x6 of vec log Sigma, diagonals of color and opacity
     diagonal            its diagonal in the common frame: (12) of the paper
     scalar              one number per block, the mean of its diagonal: Theorem 6
     observation_count   the same for all coordinates, times the views that saw the Gaussian (Table 14)
@@ -22,7 +22,7 @@ from duagc.pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]
 UNIT_SIGMA_M, UNIT_SIGMA_SHAPE, UNIT_SIGMA_COLOR, UNIT_SIGMA_OPACITY = 0.01, 1.0, 0.07, 0.5
-"""Standard deviations of a weight of one: mean, coordinates of vec log Sigma, colours, opacity logits."""
+"""Standard deviations of a weight of one: mean, coordinates of vec log Sigma, colors, opacity logits."""
 
 
 def told(

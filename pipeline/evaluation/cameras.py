@@ -1,4 +1,4 @@
-"""How the robots' cameras see the same colours, as the robots found out (docs/consensus.md, "Colours")."""
+"""How the robots' cameras see the same colors, as the robots found out (docs/consensus.md, "Colors")."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ VALUES = ("gain", "offset", "sigma_gain", "sigma_offset")
 
 
 def section(robot: RobotRun) -> dict[str, Any]:
-    """What this robot's camera makes of a colour c of the first robot of its component: gain * c + offset."""
+    """What this robot's camera makes of a color c of the first robot of its component: gain * c + offset."""
     first = robot.component[0]
     names = [f"{value}_{channel}" for value in VALUES for channel in CHANNELS]
     told = peer_colors(robot.folder / "fused.mcap", robot.robot).get(first)

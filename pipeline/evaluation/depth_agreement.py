@@ -27,13 +27,13 @@ MIN_VIEW = 0.3
 MIN_POINTS = 200
 MIN_PAIRS = 10
 SAME_SURFACE = 0.05
-"""Relative difference up to which neighbouring depths are interpolated."""
+"""Relative difference up to which neighboring depths are interpolated."""
 
 
 def depth_agreement(
     depths_m: Sequence[Depth], camera: PinholeCamera, trajectories: Mapping[str, Array]
 ) -> tuple[int, dict[str, float | Absent]]:
-    """Median over pairs of views of the median absolute difference of predicted and measured depth, metres.
+    """Median over pairs of views of the median absolute difference of predicted and measured depth, meters.
 
     All trajectories are judged on the same pairs: those of which each view shows enough of the other under all of them.
     No gate: what is hidden counts too, and the median bears it.
@@ -52,7 +52,7 @@ def depth_agreement(
 
 @dataclass(frozen=True)
 class PairMedians:
-    """pairs: of views that are judged under all trajectories. of: their medians [pairs], metres, by trajectory."""
+    """pairs: of views that are judged under all trajectories. of: their medians [pairs], meters, by trajectory."""
 
     pairs: list[tuple[int, int]]
     of: dict[str, Array]

@@ -1,7 +1,7 @@
 """How well matched features of views meet under a trajectory: a measure that needs no ground truth.
 
 Pairs of views are chosen and their matches sifted by the images alone (descriptors, then the one motion that
-the matched points agree on), so no trajectory is favoured. A feature of one view, at the depth measured there, is
+the matched points agree on), so no trajectory is favored. A feature of one view, at the depth measured there, is
 moved into the other by the poses and compared with the pixel of its partner. The front end uses features only to find
 places, so this is evidence that it did not fit. It also judges the ground truth.
 """
@@ -26,7 +26,7 @@ FEATURES = 600
 """The strongest of a view that have depth."""
 RATIO = 0.8
 INLIER_M = 0.05
-"""Distance at one metre of depth below which a match agrees with the motion of a pair; grows with depth."""
+"""Distance at one meter of depth below which a match agrees with the motion of a pair; grows with depth."""
 HYPOTHESES = 200
 MIN_MATCHES = 15
 MIN_SHARE = 0.5

@@ -21,7 +21,7 @@ from duagc.schemas import topics
 
 
 def trajectory(recording: Recording, robot: str) -> Trajectory | Absent:
-    """T_gt_camera of the robot's colour camera, in the ground-truth world that all robots share."""
+    """T_gt_camera of the robot's color camera, in the ground-truth world that all robots share."""
     path = recording.groundtruth(robot)
     if path is None:
         return Absent(f"the recording has no ground truth of {robot}")
@@ -35,7 +35,7 @@ def trajectory(recording: Recording, robot: str) -> Trajectory | Absent:
 def exact_depths(
     recording: Recording, robot: str, stamps_ns: Collection[int]
 ) -> dict[int, NDArray[np.float32]] | Absent:
-    """Exact depth images [h, w] in metres by time stamp, for those of the wanted stamps that have one."""
+    """Exact depth images [h, w] in meters by time stamp, for those of the wanted stamps that have one."""
     path, topic = recording.groundtruth(robot), topics.GROUNDTRUTH_DEPTH.of(robot)
     if path is None:
         return Absent(f"the recording has no ground truth of {robot}")
@@ -62,7 +62,7 @@ def knows_rotations(recording: Recording, robot: str) -> bool:
 
 
 def _depth_scale(path: Path, topic: str) -> float:
-    """Metres per unit of a depth topic, from the metadata of its channel."""
+    """Meters per unit of a depth topic, from the metadata of its channel."""
     from mcap.reader import make_reader
 
     with path.open("rb") as stream:
@@ -74,11 +74,11 @@ def _depth_scale(path: Path, topic: str) -> float:
     except ValueError:
         scale = 0.0
     if not scale > 0.0:
-        raise DuagError(f"{path}: {topic}: {DEPTH_SCALE_KEY} is {text!r}, expected metres per unit")
+        raise DuagError(f"{path}: {topic}: {DEPTH_SCALE_KEY} is {text!r}, expected meters per unit")
     return scale
 
 
-NEIGHBOURS = 8
+NEIGHBORS = 8
 PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4", "uint": "<u4"}
 
 
@@ -86,7 +86,7 @@ PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4", "uint
 class Surface:
     """Geometry of the scene in the ground-truth world: points on the surfaces, each standing for a disc.
 
-    points: float64 [n, 3], metres. normals: float64 [n, 3], unit length.
+    points: float64 [n, 3], meters. normals: float64 [n, 3], unit length.
     """
 
     points: NDArray[np.float64]
@@ -102,7 +102,7 @@ class Surface:
 
         tree = cKDTree(self.points)
         radius_m = float(np.quantile(tree.query(self.points, k=2)[0][:, 1], 0.95))
-        _, index = tree.query(queries, k=min(NEIGHBOURS, len(self.points)))
+        _, index = tree.query(queries, k=min(NEIGHBORS, len(self.points)))
         index = index.reshape(len(queries), -1)
         offset = queries[:, None, :] - self.points[index]
         across = np.sum(offset * self.normals[index], axis=2)

@@ -40,7 +40,7 @@ class MapErrors:
 
 
 def position_sigma_m(gaussian_map: GaussianMap, normals: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Predicted standard deviation (m) of every Gaussian's centre along unit directions [n, 3], and where it exists.
+    """Predicted standard deviation (m) of every Gaussian's center along unit directions [n, 3], and where it exists.
 
     sigma^2 = n^T F^-1 n with F the position block of the Fisher information: everything else of the Gaussian and all
     poses held fixed. It does not exist where F is singular (condition above 1e12).

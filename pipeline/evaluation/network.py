@@ -163,8 +163,8 @@ class Session:
 
     @cached_property
     def closures(self) -> list[Any]:
-        """Every duagc.v1.ClosureDecision: candidates for closures between robots and what became of them."""
-        return self._log("consensus.mcap", topics.CLOSURE_DECISION)
+        """Every duagc.v1.LoopClosureDecision: candidates for closures between robots and what became of them."""
+        return self._log("consensus.mcap", topics.LOOP_CLOSURE_DECISION)
 
     def closure_counts(self) -> dict[str, int]:
         """Closures between robots that counted in the end, and candidates that were measured and did not."""
@@ -233,7 +233,7 @@ class Session:
         gaps = {
             "gap_to_oracle_sigma": gap if isinstance(gap, Absent) else gap.sigma,
             "gap_to_oracle_sigma_p99": gap if isinstance(gap, Absent) else gap.sigma_p99,
-            "gap_to_oracle_m": gap if isinstance(gap, Absent) else gap.metres,
+            "gap_to_oracle_m": gap if isinstance(gap, Absent) else gap.meters,
             "gap_to_oracle_rad": gap if isinstance(gap, Absent) else gap.radians,
         }
         together = {m.robot for m in self.agent_rounds if len(m.members) > 1}

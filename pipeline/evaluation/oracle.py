@@ -1,4 +1,4 @@
-"""How far the robots are from the centralised answer: the same objective, solved in one place.
+"""How far the robots are from the centralized answer: the same objective, solved in one place.
 
 The objective is rebuilt from what the run recorded: registrations between own keyframes from every frontend.mcap,
 closures with their information and final robust weights from consensus.mcap, noise floors from config.toml; for the
@@ -47,14 +47,14 @@ NO_INFORMATION = Absent("consensus.mcap does not hold the information of the clo
 
 @dataclass(frozen=True)
 class Gap:
-    """Largest difference of a keyframe pose from the centralised answer: metres, radians.
+    """Largest difference of a keyframe pose from the centralized answer: meters, radians.
 
     sigma, sigma_p99: of the coordinates of matched Gaussians in their standard deviations, the largest and the 99th
     percentile of each Gaussian's largest; absent where nothing was matched. The largest tells of fusion's own
     decisions: where members contradict each other, rounding on the wire may tip them.
     """
 
-    metres: float
+    meters: float
     radians: float
     sigma: float | Absent
     sigma_p99: float | Absent
@@ -76,7 +76,7 @@ def gap_to_oracle(
     """Largest gap over all components of two robots or more.
 
     Args:
-        decisions: every duagc.v1.ClosureDecision of the run. pairs: ids of matched Gaussians [n, 2] by robots.
+        decisions: every duagc.v1.LoopClosureDecision of the run. pairs: ids of matched Gaussians [n, 2] by robots.
     Raises:
         DuagError: the settings of the run are not what they should be.
     """
@@ -101,7 +101,7 @@ def gap_to_oracle(
     if not found:
         return NOBODY
     return Gap(
-        max(gap.metres for gap in found),
+        max(gap.meters for gap in found),
         max(gap.radians for gap in found),
         _largest([gap.sigma for gap in found]),
         _largest([gap.sigma_p99 for gap in found]),
@@ -119,13 +119,13 @@ def _gap(
     central: Mapping[str, Array],
     pairs: Mapping[tuple[str, str], NDArray[np.int64]],
 ) -> Gap:
-    """The gap of one component whose centralised poses are known."""
-    metres, radians = pose_gap(poses, central)
+    """The gap of one component whose centralized poses are known."""
+    meters, radians = pose_gap(poses, central)
     among = {key: ids for key, ids in pairs.items() if key[0] in members and key[1] in members}
     gaps = np.concatenate([_gaussian_gaps(run, name, members, central, among) for name in members])
     if not len(gaps):
-        return Gap(metres, radians, NO_MATCHES, NO_MATCHES)
-    return Gap(metres, radians, float(gaps.max()), float(np.percentile(gaps, 99)))
+        return Gap(meters, radians, NO_MATCHES, NO_MATCHES)
+    return Gap(meters, radians, float(gaps.max()), float(np.percentile(gaps, 99)))
 
 
 def pose_gap(poses: Mapping[str, Array], central: Mapping[str, Array]) -> tuple[float, float]:
@@ -180,7 +180,7 @@ def solve_component(
     closures: Sequence[WeightedClosure],
     config: PoseConsensusConfig,
 ) -> dict[str, Array] | Absent:
-    """Keyframe poses [n, 4, 4] of every robot by the centralised answer.
+    """Keyframe poses [n, 4, 4] of every robot by the centralized answer.
 
     The central solver starts from the robots' own answer and goes downhill from there, so that the gap is that to the
     minimum whose basin the robots are in. Its answer is moved so that the first keyframe of the lowest-named robot is
@@ -197,7 +197,7 @@ def solve_component(
     weights = np.concatenate([np.ones(own_factors), [c.weight for c in closures]])
     solution = solve_central(team.factors, team.T_start, weights)
     if not solution.converged:
-        return Absent(f"the centralised solver did not converge in {solution.iterations} steps")
+        return Absent(f"the centralized solver did not converge in {solution.iterations} steps")
     root = team.first[min(T_world_keyframe)]
     gauge = team.T_start[root] @ se3.inverse(solution.poses[root])
     return {

@@ -1,8 +1,8 @@
 """What the maps show where cameras stood: own, fused, refined, and if asked own trained longer, on the same pixels.
 
 Every robot's maps are drawn at its own held-out views, at those of the robots that share its world (`peers`), and both
-together are the views of the team (`team`). A map has the colours of its own robot's camera; at peers' views it is
-drawn in the colours of the camera that took the view.
+together are the views of the team (`team`). A map has the colors of its own robot's camera; at peers' views it is
+drawn in the colors of the camera that took the view.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ def in_world(robot: RobotRun, kind: str, gaussians: Gaussians) -> Gaussians:
 
 
 def in_colors_of(colors: ColorMap | None, gaussians: Gaussians) -> Gaussians:
-    """A map of a robot in a peer's colours, by how those look to the robot; None: as if both cameras were alike."""
+    """A map of a robot in a peer's colors, by how those look to the robot; None: as if both cameras were alike."""
     if colors is None or colors.is_identity:
         return gaussians
     return gaussians.replace(colors=colors.from_other(gaussians.colors).astype(np.float32))

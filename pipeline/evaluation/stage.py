@@ -59,7 +59,7 @@ PROTOCOL = {
     "ssim": "one scale, 11x11 Gaussian window of sigma 1.5, windows inside the image",
     "ms_ssim": "five scales, weights of Wang et al. 2003",
     "oracle": "same factors and final closure weights solved in one place, from the robots' answer downhill",
-    "depth": "blended depth / alpha where alpha >= 0.5, of a Gaussian as its map says: that of its centre or of its "
+    "depth": "blended depth / alpha where alpha >= 0.5, of a Gaussian as its map says: that of its center or of its "
     "plane; mean over pixels with both depths, then over views",
     "own_unrefined": "the own map before its final refinement, seen as the own map",
     "own_longer": "if asked for, the own map trained again as the refined one was, alone; seen as the own map",

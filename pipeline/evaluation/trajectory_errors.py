@@ -58,7 +58,7 @@ def squared_errors_m2(pairs: Paired, T_gt_frame: Array) -> Array:
 
 
 def ate_rmse_m(pairs: Paired) -> float | Absent:
-    """Root mean squared position error after the robot's own SE(3) alignment, all paired frames, metres."""
+    """Root mean squared position error after the robot's own SE(3) alignment, all paired frames, meters."""
     T_gt_frame = alignment([pairs])
     if isinstance(T_gt_frame, Absent):
         return T_gt_frame
@@ -76,7 +76,7 @@ def rpe(pairs: Paired) -> tuple[float, float] | Absent:
 
 @dataclass(frozen=True)
 class TeamError:
-    """One alignment T_gt_world [4, 4] for all robots of a component; pooled RMSE and that of each robot, metres."""
+    """One alignment T_gt_world [4, 4] for all robots of a component; pooled RMSE and that of each robot, meters."""
 
     T_gt_world: Array
     ate_rmse_m: float

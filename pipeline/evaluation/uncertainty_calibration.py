@@ -47,7 +47,7 @@ def _mean_of_remaining(error_sorted_m: Array) -> Array:
 
 
 def nll(sigma_m: Array, error_m: Array) -> float:
-    """Mean negative log-likelihood of the errors under N(0, sigma^2), in nats, errors in metres; lower is better."""
+    """Mean negative log-likelihood of the errors under N(0, sigma^2), in nats, errors in meters; lower is better."""
     return float(np.mean(0.5 * np.log(2.0 * np.pi * sigma_m**2) + 0.5 * (error_m / sigma_m) ** 2))
 
 
@@ -96,7 +96,7 @@ def ece_paper(uncertainty: Array, error_m: Array) -> float:
 
 
 def reliability(sigma_m: Array, error_m: Array) -> list[tuple[float, float]]:
-    """(predicted, observed) root mean square error in metres of ten bins of equal count by predicted uncertainty."""
+    """(predicted, observed) root mean square error in meters of ten bins of equal count by predicted uncertainty."""
     order = np.argsort(sigma_m, kind="stable")
     rms = [
         (float(np.sqrt(np.mean(sigma_m[order[b]] ** 2))), float(np.sqrt(np.mean(error_m[order[b]] ** 2))))

@@ -46,7 +46,7 @@ class ViewScore:
 
 
 def surface_depth(render: Render) -> NDArray[np.float32]:
-    """Depth [h, w] in metres of what was rendered: blended depth / alpha where alpha >= 0.5, else 0."""
+    """Depth [h, w] in meters of what was rendered: blended depth / alpha where alpha >= 0.5, else 0."""
     covered = render.alpha >= MIN_ALPHA
     depth = np.zeros(render.alpha.shape, dtype=np.float32)
     depth[covered] = render.depth[covered] / render.alpha[covered]
@@ -66,8 +66,8 @@ def score_view(
     Args:
         render: of the map, at the pose of the frame, black background, no exposure fitted.
         color: [h, w, 3] RGB. depth_m: recorded depth [h, w], 0 where there is none.
-        exact_m: exact depth [h, w] in metres, or Absent.
-        layer_m: depth of one layer per pixel (`Rasterizer.layer_depth`), [h, w] in metres, or Absent.
+        exact_m: exact depth [h, w] in meters, or Absent.
+        layer_m: depth of one layer per pixel (`Rasterizer.layer_depth`), [h, w] in meters, or Absent.
         common: [h, w], pixels that the maps that this one is compared with cover, too; None: there are none.
     """
     image = color.astype(np.float64) / 255.0

@@ -1,6 +1,6 @@
 """One robot's agent: a tick per round, from delivered packets to packets sent.
 
-    meet        places, candidates, closures with every neighbour          meeting.py
+    meet        places, candidates, closures with every neighbor          meeting.py
     frames      relative frames of all pairs, flooded; who knows the same pairs places the team alike    frames.py
     poses       rounds of a solver until everybody holds still              solvers.py
     tell        evidence of every robot to every robot, agreed poses         sharing.py, knowledge.py
@@ -9,7 +9,7 @@
 The steps overlap: evidence hangs on keyframes and travels while the poses still move. Two conditions must hold in the
 whole component before an agent goes on: that everybody has decided on all its links and knows all frames (before
 poses), and that everybody holds still (after). Each is found by counting hops: an agent for which it holds itself says
-one more than the least of its neighbours, and whoever reaches the size of the team knows that it holds everywhere.
+one more than the least of its neighbors, and whoever reaches the size of the team knows that it holds everywhere.
 
 A link may turn out to be false during the pose rounds: the graduated weights leave too few of its closures. The end
 that holds them parts it for good, and whoever hears of that places the team again, without the link. The set of
@@ -25,13 +25,13 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
+from duagc.pipeline.exchange.neighbor import Neighbor
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.exchange import injection
 from duagc.pipeline.exchange.loop_closing import HigherEnd, LowerEnd, Meeting, OwnPlaces, Send
 from duagc.pipeline.exchange.map_alignment import Frames
-from duagc.pipeline.exchange.neighbour import Neighbour
 from duagc.pipeline.exchange.sharing import Sharing
 from duagc.pipeline.exchange.solvers import AdmmSolver, EliminationSolver, LinkStart, PoseSolver, SolverStart
 from duagc.pipeline.exchange.wire import places_wire, state_wire
@@ -57,14 +57,14 @@ class Agent:
         self,
         data: RobotData,
         team: Sequence[str],
-        neighbours: Sequence[str],
+        neighbors: Sequence[str],
         config: ExchangeConfig,
         seed: int,
     ) -> None:
         """Start with nothing but own data.
 
         Args:
-            team: names of all robots that may exist. neighbours: those that this robot has a radio link to.
+            team: names of all robots that may exist. neighbors: those that this robot has a radio link to.
             config: the same at all robots. seed: of this run.
         """
         self.data, self.config, self.seed = data, config, seed
@@ -75,7 +75,7 @@ class Agent:
             self.identity = Identity.simulated(seed, self.team, data.robot)
         self.places = OwnPlaces(data, config)
         self._messages = 0
-        self.neighbours = {self.team.index(name): self._neighbour(name) for name in sorted(neighbours)}
+        self.neighbors = {self.team.index(name): self._neighbor(name) for name in sorted(neighbors)}
         self.round = -1
         self.refused: Counter[str] = Counter()
         self.sharing = Sharing(data, self.team, config, seed, self._send)
@@ -83,21 +83,21 @@ class Agent:
         self.frames = Frames(self.own, self.team, config.consensus.closures.margin)
         self.frames_hops = self.still_hops = 0
         self.poses: PoseSolver | None = None
-        self.links: dict[int, LinkStart] = {}  # joined neighbours as the solver has them
+        self.links: dict[int, LinkStart] = {}  # joined neighbors as the solver has them
         self.agreed = self.done = self.converged = False
         self.rounds_to_agreement: int | None = None
 
-    def _neighbour(self, name: str) -> Neighbour:
+    def _neighbor(self, name: str) -> Neighbor:
         index = self.team.index(name)
         transport = Transport(
             self.own, index, name, self.config.transport, self._new_id, identity=self.identity
         )
-        return Neighbour(index, name, transport)
+        return Neighbor(index, name, transport)
 
     # --- one round
 
     def tick(self, round_index: int, now_ns: int, delivered: Sequence[bytes]) -> list[Outgoing]:
-        """Handle what was delivered, compute, and send at most one burst to each neighbour.
+        """Handle what was delivered, compute, and send at most one burst to each neighbor.
 
         Args:
             round_index: counts from 0. now_ns: time of this round. delivered: packets, in order of arrival.
@@ -106,10 +106,10 @@ class Agent:
         for data in delivered:
             self._take(data)
         self._watch()
-        for neighbour in self._living():
-            if neighbour.transport.last_heard is not None and not neighbour.greeted:
-                neighbour.greeted = True
-                self._send(neighbour, Kind.HELLO, self.places.digest)
+        for neighbor in self._living():
+            if neighbor.transport.last_heard is not None and not neighbor.greeted:
+                neighbor.greeted = True
+                self._send(neighbor, Kind.HELLO, self.places.digest)
         self._hear_of_partings()
         self._settle_frames()
         self._settle_poses()
@@ -117,10 +117,10 @@ class Agent:
         if self.agreed:
             self.sharing.match(self.others)
         self._finish()
-        return [packet for neighbour in self._living() for packet in self._burst(neighbour)]
+        return [packet for neighbor in self._living() for packet in self._burst(neighbor)]
 
-    def _living(self) -> list[Neighbour]:
-        return [n for n in self.neighbours.values() if not n.gone]
+    def _living(self) -> list[Neighbor]:
+        return [n for n in self.neighbors.values() if not n.gone]
 
     @property
     def others(self) -> list[int]:
@@ -131,23 +131,23 @@ class Agent:
         """Own map frame where it was placed before the pose rounds."""
         return self.frames.T_world_first(self.own) @ se3.inverse(self.data.T_map_keyframe[0])
 
-    def _joined(self) -> list[Neighbour]:
-        return [n for n in self.neighbours.values() if n.joined]
+    def _joined(self) -> list[Neighbor]:
+        return [n for n in self.neighbors.values() if n.joined]
 
     def _watch(self) -> None:
-        """Give up neighbours that were silent for too long; do not wait for them any more.
+        """Give up neighbors that were silent for too long; do not wait for them any more.
 
         A link that died while the poses were sought would leave its two ends with different last words of each other
-        for ever, so the rest of the team begins again without it. If nobody is left, or a neighbour has agreed
+        for ever, so the rest of the team begins again without it. If nobody is left, or a neighbor has agreed
         already, what there is stays.
         """
         died = 0
-        for neighbour in self._living():
-            heard = neighbour.transport.last_heard
+        for neighbor in self._living():
+            heard = neighbor.transport.last_heard
             silent = self.round - (0 if heard is None else heard)
             if silent > self.config.transport.silent_after_rounds and not self.done:
-                died |= pair_bit(self.own, neighbour.index) if neighbour.joined else 0
-                neighbour.gone = True
+                died |= pair_bit(self.own, neighbor.index) if neighbor.joined else 0
+                neighbor.gone = True
         others = self._joined()
         settled = self.agreed or any(n.state is not None and n.state.agreed for n in others)
         if died and others and not settled:
@@ -159,23 +159,23 @@ class Agent:
         """Parse and handle one packet; what cannot be used is counted with its reason and has no other effect."""
         try:
             packet = parse(data) if self.identity is None else self.identity.open(data)
-            neighbour = self._addressed(packet)
-            arrival = neighbour.transport.receive(packet, self.round)
+            neighbor = self._addressed(packet)
+            arrival = neighbor.transport.receive(packet, self.round)
             if arrival is not None:
-                self._handle(neighbour, arrival)
+                self._handle(neighbor, arrival)
         except ValueError as error:
             self.refused[str(error)] += 1
 
-    def _addressed(self, packet: Packet) -> Neighbour:
+    def _addressed(self, packet: Packet) -> Neighbor:
         if packet.receiver != self.own:
             raise MalformedError("addressed to another robot")
-        if packet.sender not in self.neighbours:
-            raise MalformedError("from a robot that is no neighbour")
-        if self.neighbours[packet.sender].gone:
-            raise MalformedError("from a neighbour that was given up")
-        return self.neighbours[packet.sender]
+        if packet.sender not in self.neighbors:
+            raise MalformedError("from a robot that is no neighbor")
+        if self.neighbors[packet.sender].gone:
+            raise MalformedError("from a neighbor that was given up")
+        return self.neighbors[packet.sender]
 
-    def _handle(self, n: Neighbour, arrival: Arrival) -> None:
+    def _handle(self, n: Neighbor, arrival: Arrival) -> None:
         payload, team = arrival.payload, len(self.team)
         if arrival.kind is Kind.STATE:
             self._take_state(n, payload)
@@ -200,11 +200,11 @@ class Agent:
             owner = self.knowledge.take_evidence(n.index, arrival.message, payload, arrival.complete)
             if owner is not None:
                 for provider, message in self.knowledge.forget_incoming(owner):
-                    self.neighbours[provider].transport.accept_rest(message, self.round)
+                    self.neighbors[provider].transport.accept_rest(message, self.round)
                 n.transport.accept_rest(arrival.message, self.round)
 
-    def _meet(self, n: Neighbour, lower: bool) -> Meeting:
-        """The meeting with a neighbour; it begins when it is known which end this robot is."""
+    def _meet(self, n: Neighbor, lower: bool) -> Meeting:
+        """The meeting with a neighbor; it begins when it is known which end this robot is."""
         if n.meeting is None:
             end = LowerEnd if lower else HigherEnd
             n.meeting = end(self.data.robot, n.name, self.places, self.config, self.seed)
@@ -214,10 +214,10 @@ class Agent:
     def _held_pairs(self) -> set[tuple[int, int]]:
         """Pairs of this robot that nobody else may speak for."""
         return {
-            _pair(self.own, n.index) for n in self.neighbours.values() if not isinstance(n.meeting, HigherEnd)
+            _pair(self.own, n.index) for n in self.neighbors.values() if not isinstance(n.meeting, HigherEnd)
         }
 
-    def _take_state(self, n: Neighbour, payload: bytes) -> None:
+    def _take_state(self, n: Neighbor, payload: bytes) -> None:
         n.state, poses = state_wire.read_state(payload, len(self.team))
         if (
             poses
@@ -227,9 +227,9 @@ class Agent:
         ):
             self.poses.take_state(self.links[n.index], poses)
 
-    def _take_tree(self, n: Neighbour, payload: bytes) -> None:
+    def _take_tree(self, n: Neighbor, payload: bytes) -> None:
         """A message of the solver. One of a start that is still to come here waits for it."""
-        parted, rest = state_wire.read_labelled(payload, len(self.team))
+        parted, rest = state_wire.read_labeled(payload, len(self.team))
         if self.poses is not None and parted == self.frames.parted:
             self.poses.take_message(n.index, rest)
         elif parted & self.frames.parted == self.frames.parted:
@@ -243,26 +243,26 @@ class Agent:
         self._messages += 1
         return self._messages
 
-    def _sender(self, neighbour: Neighbour) -> Send:
+    def _sender(self, neighbor: Neighbor) -> Send:
         def send(kind: Kind, payload: bytes) -> None:
-            message = self._send(neighbour, kind, payload)
+            message = self._send(neighbor, kind, payload)
             if kind is Kind.CLOSURES:
-                neighbour.verdict_message = message
+                neighbor.verdict_message = message
 
         return send
 
-    def _send(self, neighbour: Neighbour, kind: Kind, payload: bytes) -> int:
+    def _send(self, neighbor: Neighbor, kind: Kind, payload: bytes) -> int:
         """Queue one reliable message; returns its id."""
         message = Message(self._new_id(), kind, payload)
-        neighbour.transport.send(message)
+        neighbor.transport.send(message)
         return message.id
 
-    def _burst(self, neighbour: Neighbour) -> list[Outgoing]:
-        finished = self.done and neighbour.state is not None and neighbour.state.done
-        states = [] if finished else self._states(neighbour)
-        return neighbour.transport.burst(self.round, states, self.config.link.budget_bytes)
+    def _burst(self, neighbor: Neighbor) -> list[Outgoing]:
+        finished = self.done and neighbor.state is not None and neighbor.state.done
+        states = [] if finished else self._states(neighbor)
+        return neighbor.transport.burst(self.round, states, self.config.link.budget_bytes)
 
-    def _states(self, neighbour: Neighbour) -> list[Message]:
+    def _states(self, neighbor: Neighbor) -> list[Message]:
         """The state of this round, with the poses of this round if there are any."""
         direct = {n.index for n in self._joined()}
         state = state_wire.write_state(
@@ -278,12 +278,12 @@ class Agent:
         )
         payloads = [state]
         missing = injection.poses_are_missing(
-            self.config.injection, self.seed, self.data.robot, neighbour.name, self.round
+            self.config.injection, self.seed, self.data.robot, neighbor.name, self.round
         )
-        speaks = neighbour.index in self.links and not missing and not self._all_agreed()
+        speaks = neighbor.index in self.links and not missing and not self._all_agreed()
         if self.poses is not None and speaks:
             room_bytes = MAX_PAYLOAD_BYTES - len(state)
-            parts = self.poses.states(self.links[neighbour.index], room_bytes)
+            parts = self.poses.states(self.links[neighbor.index], room_bytes)
             payloads = [state + part for part in parts] or payloads
         return [Message(self._new_id(), Kind.STATE, payload) for payload in payloads]
 
@@ -293,7 +293,7 @@ class Agent:
     # --- parted links
 
     def _hear_of_partings(self) -> None:
-        """Take over what joined neighbours know of parted links. Once poses are agreed there is nothing to hear."""
+        """Take over what joined neighbors know of parted links. Once poses are agreed there is nothing to hear."""
         known = self.frames.parted
         for n in self._joined():
             if n.state is not None:
@@ -305,7 +305,7 @@ class Agent:
         """Begin again with frames, without the links of this mask; forget what depended on them."""
         undecided = self.frames.placement.undecided
         self.frames.part(known)
-        for n in self.neighbours.values():
+        for n in self.neighbors.values():
             if not n.parted and known & pair_bit(self.own, n.index):
                 n.parted = True
                 reason = undecided.get((min(self.data.robot, n.name), max(self.data.robot, n.name)))
@@ -320,8 +320,8 @@ class Agent:
         self.frames_hops = self.still_hops = 0
         self.poses, self.links = None, {}
 
-    def _same_links(self, n: Neighbour) -> bool:
-        """Whether a neighbour's last state is about the team with the same links."""
+    def _same_links(self, n: Neighbor) -> bool:
+        """Whether a neighbor's last state is about the team with the same links."""
         state = n.state
         return state is not None and (state.links, state.parted) == (self.frames.links, self.frames.parted)
 
@@ -330,7 +330,7 @@ class Agent:
     def _settle_frames(self) -> None:
         """Tell frames on, and count how far around everybody has decided and knows the same ones.
 
-        To have decided is also that the neighbours have what this robot knows: when everybody has, nothing new comes.
+        To have decided is also that the neighbors have what this robot knows: when everybody has, nothing new comes.
         """
         joined = self._joined()
         for n in joined:
@@ -348,7 +348,7 @@ class Agent:
             return
         self.frames_hops = 0
         told = not any(n.transport.is_open(m) for n in joined for m in n.frames_told.values())
-        if told and all(n.decided for n in self.neighbours.values()):
+        if told and all(n.decided for n in self.neighbors.values()):
             hops = [n.state.frames_hops if n.state and self._same_links(n) else 0 for n in joined]
             self.frames_hops = min([EVERYWHERE - 1, *hops]) + 1
         if self.frames_hops >= len(self.team):
@@ -372,8 +372,8 @@ class Agent:
             self.refused.update(self.poses.refused)
             self.poses.refused.clear()
             for receiver, payload in self.poses.messages():
-                labelled = state_wire.write_labelled(self.frames.parted, len(self.team), payload)
-                self._send(self.neighbours[receiver], Kind.TREE, labelled)
+                labeled = state_wire.write_labeled(self.frames.parted, len(self.team), payload)
+                self._send(self.neighbors[receiver], Kind.TREE, labeled)
         if self.agreed:
             return
         refuted = sum(pair_bit(self.own, n.index) for n in joined if self.poses.refuted(n.name))
@@ -392,7 +392,7 @@ class Agent:
             self.knowledge.anchors_bytes[self.own] = state_wire.write_anchors(anchors)
 
     def _start_poses(self) -> None:
-        """Give the solver the own map where it was placed, and the joined neighbours."""
+        """Give the solver the own map where it was placed, and the joined neighbors."""
         self.links = {n.index: self._link_start(n) for n in self._joined()}
         start = SolverStart(
             self.data.robot,
@@ -414,8 +414,8 @@ class Agent:
                     self.poses.take_message(n.index, payload)
             n.early.clear()
 
-    def _link_start(self, n: Neighbour) -> LinkStart:
-        """A joined neighbour; closures start with weight if they fit to where both robots were placed."""
+    def _link_start(self, n: Neighbor) -> LinkStart:
+        """A joined neighbor; closures start with weight if they fit to where both robots were placed."""
         assert n.meeting is not None
         meeting = n.meeting.joined
         assert meeting is not None
@@ -440,7 +440,7 @@ class Agent:
     # --- end
 
     def _finish(self) -> None:
-        """Done when nothing is missing, nothing is unacknowledged and no neighbour lacks what only passes here."""
+        """Done when nothing is missing, nothing is unacknowledged and no neighbor lacks what only passes here."""
         if self.done:
             return
         if self.frames_hops == EVERYWHERE and not self._joined():
@@ -459,7 +459,7 @@ class Agent:
             self.converged = self.done
 
     @staticmethod
-    def _supplied(n: Neighbour, everyone: list[int]) -> bool:
+    def _supplied(n: Neighbor, everyone: list[int]) -> bool:
         return n.state is not None and all(n.state.sources[m] == state_wire.COMPLETE for m in everyone)
 
 

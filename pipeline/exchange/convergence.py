@@ -1,7 +1,7 @@
 """Whether the keyframes of two robots see the same surfaces when one map is laid into the other.
 
 Closures say that two places look alike. Laid into each other by what they say, the maps must agree everywhere else too:
-where own keyframes see what a neighbour's samples stand on, they must see it at the same depth. A place that only looks
+where own keyframes see what a neighbor's samples stand on, they must see it at the same depth. A place that only looks
 like another does not pass that.
 """
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 STRIDE_PX = 4  # of the own depth images
 GATE_M, GATE_RELATIVE = 0.1, 0.05  # same surface: the larger of the two, the second by the depth
 MIN_TOLD = 50  # samples that a keyframe must be able to judge
-KEYFRAMES = 24  # own keyframes that are asked about one of the neighbour's, the nearest
+KEYFRAMES = 24  # own keyframes that are asked about one of the neighbor's, the nearest
 
 
 def coarse_depth(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -34,11 +34,11 @@ def agreement(
     samples: Sequence[NDArray[np.floating]],
     T_ownmap_peer: Array,
 ) -> float:
-    """Share of a neighbour's samples that own keyframes see where the samples say, of all that they can judge.
+    """Share of a neighbor's samples that own keyframes see where the samples say, of all that they can judge.
 
     Args:
         coarse_m: `coarse_depth` of the own keyframes. camera: of the whole images.
-        T_ownmap_keyframe: [n, 4, 4], own keyframes. samples: [m, 3] of every keyframe of the neighbour that is known,
+        T_ownmap_keyframe: [n, 4, 4], own keyframes. samples: [m, 3] of every keyframe of the neighbor that is known,
             in its camera frame. T_ownmap_peer: [k, 4, 4], these keyframes where they lie in the own map.
     Returns:
         0 to 1; 0 if no own keyframe can judge anything.

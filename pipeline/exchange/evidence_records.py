@@ -1,4 +1,4 @@
-"""Evidence as records on the wire: made from a robot's own map, ranked, cut to the space a neighbour saw."""
+"""Evidence as records on the wire: made from a robot's own map, ranked, cut to the space a neighbor saw."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from duagc.pipeline.splat.gaussians import Gaussians
 Array = NDArray[np.float64]
 Records = NDArray[Any]
 
-# what a receiver expects before it is told: standard deviations of position (m), log-covariance, colour, opacity logit
+# what a receiver expects before it is told: standard deviations of position (m), log-covariance, color, opacity logit
 PRIOR_SIGMA = np.repeat([0.05, 1.0, 0.1, 2.0], [3, 6, 3, 1])
-# places of the diagonal in the 31 numbers of information: upper triangles of 3x3 and 6x6, then colour and opacity
+# places of the diagonal in the 31 numbers of information: upper triangles of 3x3 and 6x6, then color and opacity
 DIAGONAL = np.array([0, 3, 5, 6, 12, 17, 21, 24, 26, 27, 28, 29, 30])
 VOXEL_BITS = 20  # per axis; voxels beyond +-2^19 share those at the border
 

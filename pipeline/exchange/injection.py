@@ -59,7 +59,7 @@ def false_matches(
 
 
 def poses_are_missing(config: InjectionConfig, seed: int, robot: str, peer: str, round_index: int) -> bool:
-    """Whether a robot says nothing of its poses to a neighbour in this round."""
+    """Whether a robot says nothing of its poses to a neighbor in this round."""
     if config.pose_dropouts == 0.0:
         return False
     rng = random_streams.generator(seed, "injection.poses", robot=robot, peer=peer, round=round_index)

@@ -21,7 +21,7 @@ Records = NDArray[Any]
 
 @dataclass
 class Incoming:
-    """Evidence of one owner on its way in from one neighbour: its chunks so far, by message."""
+    """Evidence of one owner on its way in from one neighbor: its chunks so far, by message."""
 
     owner: int
     provider: int
@@ -56,7 +56,7 @@ class Knowledge:
         self.incoming.pop((provider, message), None)
         owner, body, records = evidence_wire.read_evidence(self.kind, payload, self.team)
         if owner == self.own:
-            raise MalformedError("evidence: a neighbour speaks for this robot")
+            raise MalformedError("evidence: a neighbor speaks for this robot")
         if owner not in self.evidence:
             self.evidence[owner], self.bodies[owner] = records, body
             self.evidence_bytes[owner] = payload
@@ -70,10 +70,10 @@ class Knowledge:
         return keys
 
     def sources(self, direct: set[int], living: set[int]) -> NDArray[np.uint8]:
-        """Where the evidence of each owner comes from: COMPLETE, a neighbour, or NOBODY.
+        """Where the evidence of each owner comes from: COMPLETE, a neighbor, or NOBODY.
 
         Args:
-            direct: neighbours that will send their own evidence themselves. living: neighbours not given up.
+            direct: neighbors that will send their own evidence themselves. living: neighbors not given up.
         """
         out = np.full(self.team, state_wire.NOBODY, np.uint8)
         for owner in range(self.team):
@@ -91,7 +91,7 @@ class Knowledge:
         """Take agreed poses, if they are news; returns their owner."""
         anchors = state_wire.read_anchors(payload, self.team)
         if anchors.owner == self.own:
-            raise MalformedError("anchors: a neighbour speaks for this robot")
+            raise MalformedError("anchors: a neighbor speaks for this robot")
         if anchors.owner not in self.anchors:
             self.anchors[anchors.owner], self.anchors_bytes[anchors.owner] = anchors, payload
         return anchors.owner
@@ -101,7 +101,7 @@ class Knowledge:
         pairs = state_wire.read_pairs(payload, self.team)
         key = (pairs.lower, pairs.higher)
         if pairs.lower == self.own:
-            raise MalformedError("pairs: a neighbour speaks for this robot")
+            raise MalformedError("pairs: a neighbor speaks for this robot")
         if key not in self.pairs:
             self.pairs[key], self.pairs_bytes[key] = pairs, payload
         return key

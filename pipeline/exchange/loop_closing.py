@@ -67,7 +67,7 @@ class OwnPlaces:
         return self._features
 
     def agreement(self, samples: Sequence[NDArray[np.floating]], T_first_peer: Array) -> float:
-        """How well own depth images agree with a neighbour's samples [m, 3], keyframes at T_first_peer [k, 4, 4]."""
+        """How well own depth images agree with a neighbor's samples [m, 3], keyframes at T_first_peer [k, 4, 4]."""
         assert len(self.features) == len(self._coarse_depths)  # which reads the images
         return agreement(self._coarse_depths, self.data.camera, self.T_first_keyframe, samples, T_first_peer)
 
@@ -99,13 +99,13 @@ class OwnPlaces:
         return drift(factors_of(self.data.odometry), self.data.keyframes, self.config.consensus.closures)
 
     def book(self) -> PlaceBook:
-        """What a neighbour gets to recognise places."""
+        """What a neighbor gets to recognize places."""
         most = self.config.places.features_per_place
         compact = [f.descriptors[:most] for f in self.features]
         return PlaceBook(compact, self.T_first_keyframe, self.drift)
 
     def sample(self, keyframe: int) -> KeyframeSample:
-        """What a neighbour gets to verify closures with one keyframe."""
+        """What a neighbor gets to verify closures with one keyframe."""
         reference = Reference.sample(self.pyramid(keyframe), self.config.verification.samples)
         return KeyframeSample(keyframe, self.features[keyframe], reference)
 
@@ -182,7 +182,7 @@ class LowerEnd(Meeting):
         super().__init__(own, peer, places_, config, seed)
         self.book: PlaceBook | None = None
         self.planner: Planner | None = None
-        self.waiting: dict[int, list[Candidate]] = {}  # by keyframe of the neighbour
+        self.waiting: dict[int, list[Candidate]] = {}  # by keyframe of the neighbor
         self.samples: dict[int, NDArray[np.floating]] = {}  # until decided: points [m, 3] of its keyframes
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:

@@ -44,7 +44,7 @@ class Frames:
         frames = state_wire.read_frames(payload, len(self.team))
         pair = (frames.lower, frames.higher)
         if pair in held and pair not in self.pairs:
-            raise MalformedError("frame: a neighbour speaks for this robot")
+            raise MalformedError("frame: a neighbor speaks for this robot")
         if pair not in self.pairs:
             self.pairs[pair], self.payloads[pair] = frames, payload
             self._placement = None

@@ -1,6 +1,6 @@
-"""Recognising places: which pairs of keyframes may show the same place, and which of them are worth a closer look.
+"""Recognizing places: which pairs of keyframes may show the same place, and which of them are worth a closer look.
 
-A closer look costs the neighbour's sample of a keyframe, some 80 kB. What it brings is the expected information about
+A closer look costs the neighbor's sample of a keyframe, some 80 kB. What it brings is the expected information about
 where the two robots are to each other, in nats:
 
     P(closure | score) (P(apart) gain of two strangers + P(joined) gain beside the closures that are there)
@@ -49,9 +49,9 @@ def scored(
     """Pairs of keyframes with at least `min_score` matches, best first; and those that come nearest for the rest.
 
     Args:
-        own: all features of each own keyframe. peer: the compact descriptors of each keyframe of the neighbour.
+        own: all features of each own keyframe. peer: the compact descriptors of each keyframe of the neighbor.
     Returns:
-        Candidates; for every keyframe of the neighbour that resembles no own one enough, the pair that comes nearest.
+        Candidates; for every keyframe of the neighbor that resembles no own one enough, the pair that comes nearest.
     """
     candidates: list[Candidate] = []
     unlike: list[Candidate] = []
@@ -64,7 +64,7 @@ def scored(
 
 
 class Planner:
-    """What to ask of a neighbour next, given what came of what was asked before."""
+    """What to ask of a neighbor next, given what came of what was asked before."""
 
     def __init__(
         self,
@@ -78,7 +78,7 @@ class Planner:
         self.config, self.min_support = config, closures.min_support
         self.drift_own, self.drift_peer = drift_own, drift_peer
         self.variance = 2 * np.array([closures.sigma_floor_m**2, closures.sigma_floor_rad**2])
-        self.left: dict[int, list[Candidate]] = {}  # by keyframe of the neighbour, best first
+        self.left: dict[int, list[Candidate]] = {}  # by keyframe of the neighbor, best first
         for c in candidates:
             self.left.setdefault(c.peer_keyframe, []).append(c)
         self.asked = 0
@@ -90,7 +90,7 @@ class Planner:
         self._outcomes.append((candidate, float(closure)))
 
     def next(self) -> list[Candidate]:
-        """The next candidates to look at, those of some keyframes of the neighbour; none if nothing is worth it."""
+        """The next candidates to look at, those of some keyframes of the neighbor; none if nothing is worth it."""
         chosen: list[Candidate] = []
         for _ in range(
             min(self.config.keyframes_per_request, self.config.max_requested_keyframes - self.asked)
@@ -118,7 +118,7 @@ class Planner:
         return out
 
     def worth(self, peer_keyframe: int, assumed: Sequence[tuple[Candidate, float]]) -> float:
-        """Expected information (nats) of a closer look at a keyframe of the neighbour.
+        """Expected information (nats) of a closer look at a keyframe of the neighbor.
 
         Args:
             assumed: candidates before it, each with the probability that it is a closure.

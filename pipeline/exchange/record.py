@@ -33,7 +33,7 @@ class RawAlternative:
 
     maps_and_information: every Gaussian (14 float32) with the part of its information that fusion needs (31 float32),
     and every factor of the pose graph (40 bytes): the least that would allow the same fusion. maps_only: without the
-    information, which allows to look at the neighbours' maps and not to fuse them.
+    information, which allows to look at the neighbors' maps and not to fuse them.
     """
 
     maps_and_information: int
@@ -252,19 +252,19 @@ class ConsensusRecorder:
 
     @staticmethod
     def _agent(agent: Agent) -> Any:
-        neighbours = agent.neighbours.values()
+        neighbors = agent.neighbors.values()
         return schemas.new(
             "AgentRound",
             frame_id=map_frame(agent.team[agent.frames.root]),
             robot=agent.data.robot,
             root=agent.team[agent.frames.root],
             members=[agent.team[i] for i in agent.frames.members],
-            joined_links=sum(n.joined for n in neighbours),
-            undecided_links=sum(not n.decided for n in neighbours),
+            joined_links=sum(n.joined for n in neighbors),
+            undecided_links=sum(not n.decided for n in neighbors),
             evidence_owners=len(agent.knowledge.evidence),
             pair_lists=len(agent.knowledge.pairs),
-            open_messages=sum(n.transport.open_messages for n in neighbours),
-            parted_links=sum(n.parted for n in neighbours),
+            open_messages=sum(n.transport.open_messages for n in neighbors),
+            revoked_links=sum(n.parted for n in neighbors),
             agreed=agent.agreed,
             done=agent.done,
             packets_refused=sum(agent.refused.values()),
@@ -284,9 +284,9 @@ class ConsensusRecorder:
             cost=values["cost"],
             step=values["step"],
             largest_change=largest,
-            settled=agent.poses.settled,
+            converged=agent.poses.settled,
             agreed=agent.agreed,
-            factorisations=values["factorisations"],
+            factorizations=values["factorizations"],
         )
         for peer, (translation, rotation) in sorted(values["penalties"].items()):
             message.links.add(
@@ -302,7 +302,7 @@ class ConsensusRecorder:
         """Record what became of every candidate."""
         for c in result.closures:
             message = schemas.new(
-                "ClosureDecision",
+                "LoopClosureDecision",
                 robot=c.robot,
                 peer=c.peer,
                 own_keyframe=c.own_keyframe,
@@ -320,4 +320,4 @@ class ConsensusRecorder:
             if c.information is not None:
                 message.information.extend(c.information.ravel().tolist())
             pack_stamp(message, now_ns)
-            self.writer.write(topics.CLOSURE_DECISION.of(c.robot), message, now_ns)
+            self.writer.write(topics.LOOP_CLOSURE_DECISION.of(c.robot), message, now_ns)

@@ -47,7 +47,7 @@ def replay_agent_of(
     data: RobotData, config: ExchangeConfig, *, seed: int, exchange_path: Path
 ) -> tuple[AgentResult, SentPackets]:
     """`replay_agent` on data in memory."""
-    determinism.settle_opencv()
+    determinism.configure_opencv()
     session = read_session(exchange_path)
     waiting: list[Delivery] = []
     recorded, recomputed = hashlib.sha256(), hashlib.sha256()
@@ -56,8 +56,8 @@ def replay_agent_of(
             recorded.update(p.data)
         if p.receiver == data.robot:
             waiting.extend((at_ns, p.sender, p.sequence, p.data) for at_ns in p.deliver_ns)
-    neighbours = link_model.neighbours(config.link, session.team)[data.robot]
-    agent = Agent(data, session.team, neighbours, config, seed)
+    neighbors = link_model.neighbors(config.link, session.team)[data.robot]
+    agent = Agent(data, session.team, neighbors, config, seed)
     for round_index in range(session.rounds):
         now_ns = round_index * config.period_ns
         for out in agent.tick(round_index, now_ns, due(waiting, now_ns)):

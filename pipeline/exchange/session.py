@@ -55,7 +55,7 @@ def run_session_of(
     consensus_path: Path,
 ) -> dict[str, AgentResult]:
     """`run_session` on data in memory, one entry per robot."""
-    determinism.settle_opencv()
+    determinism.configure_opencv()
     agents = team_of(data, config, seed)
     model = LinkModel(config.link, seed)
     waiting: dict[str, list[Delivery]] = {robot: [] for robot in agents}
@@ -101,7 +101,7 @@ def team_of(data: Sequence[RobotData], config: ExchangeConfig, seed: int) -> dic
     names = sorted(d.robot for d in data)
     if len(set(names)) != len(names) or len(names) > MAX_TEAM:
         raise DuagError(f"team of {len(names)}: expected different names and at most {MAX_TEAM} robots")
-    linked = link_model.neighbours(config.link, names)
+    linked = link_model.neighbors(config.link, names)
     by_name = {d.robot: d for d in data}
     return {name: Agent(by_name[name], names, linked[name], config, seed) for name in names}
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from duagc.pipeline.exchange.neighbor import Neighbor
 from numpy.typing import NDArray
 
 from duagc.pipeline.exchange.agent import Agent
 from duagc.pipeline.exchange.evidence_records import to_evidence
-from duagc.pipeline.exchange.neighbour import Neighbour
 from duagc.pipeline.exchange.verification import Verdict
 from duagc.pipeline.exchange.wire.state_wire import PairList
 from duagc.pipeline.geometry import se3
@@ -64,9 +64,9 @@ def _active(agent: Agent, pairs: PairList) -> bool:
     """Whether a pair list counts: at the end that made it, only when the other end is known to have it."""
     if pairs.lower != agent.own or agent.done:
         return True
-    neighbour = agent.neighbours.get(pairs.higher)
-    message = None if neighbour is None else neighbour.pairs_told.get((pairs.lower, pairs.higher))
-    return neighbour is not None and message is not None and not neighbour.transport.is_open(message)
+    neighbor = agent.neighbors.get(pairs.higher)
+    message = None if neighbor is None else neighbor.pairs_told.get((pairs.lower, pairs.higher))
+    return neighbor is not None and message is not None and not neighbor.transport.is_open(message)
 
 
 def _gauge(agent: Agent) -> Array:
@@ -79,7 +79,7 @@ def _gauge(agent: Agent) -> Array:
 
 def _closures(agent: Agent) -> Iterator[ClosureRecord]:
     """Every candidate that this robot decided on, with the reason for what became of it."""
-    for n in agent.neighbours.values():
+    for n in agent.neighbors.values():
         for t in n.meeting.tried if n.meeting else ():
             r = t.result
             weight = None if r.closure is None else _weight(agent, n, r.closure)
@@ -109,7 +109,7 @@ def _closures(agent: Agent) -> Iterator[ClosureRecord]:
             )
 
 
-def _weight(agent: Agent, n: Neighbour, closure: Closure) -> float | None:
+def _weight(agent: Agent, n: Neighbor, closure: Closure) -> float | None:
     """Robust weight of a closure at the end, or when its link was parted; None if it took no part."""
     if n.meeting is None or n.meeting.joined is None:
         return None

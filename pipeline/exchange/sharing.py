@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from duagc.pipeline.exchange.neighbor import Neighbor
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.exchange import injection
 from duagc.pipeline.exchange.evidence_records import best_first, match_pairs, own_records, seen_voxels, within
 from duagc.pipeline.exchange.knowledge import Knowledge
-from duagc.pipeline.exchange.neighbour import Neighbour
 from duagc.pipeline.exchange.wire import evidence_wire, state_wire
 from duagc.pipeline.exchange.wire.state_wire import PairList
 from duagc.pipeline.network.packets import Kind
@@ -35,9 +35,9 @@ class Sharing:
         team: Sequence[str],
         config: ExchangeConfig,
         seed: int,
-        send: Callable[[Neighbour, Kind, bytes], int],
+        send: Callable[[Neighbor, Kind, bytes], int],
     ) -> None:
-        """team: sorted. send: queues a reliable message for a neighbour and returns its id."""
+        """team: sorted. send: queues a reliable message for a neighbor and returns its id."""
         self.data, self.team, self.config, self.seed, self._send = data, list(team), config, seed, send
         self.own = self.team.index(data.robot)
         self.kind = EVIDENCE_WIRES[config.evidence_wire]
@@ -72,8 +72,8 @@ class Sharing:
 
     # --- telling others
 
-    def tell(self, joined: Sequence[Neighbour], members: Sequence[int], T_world_map: Array | None) -> None:
-        """Everything that a neighbour lacks.
+    def tell(self, joined: Sequence[Neighbor], members: Sequence[int], T_world_map: Array | None) -> None:
+        """Everything that a neighbor lacks.
 
         Args:
             members: of the component. T_world_map: own map frame in the common one once poses are agreed, else None.
@@ -93,7 +93,7 @@ class Sharing:
                 if pair[0] != n.index and pair not in n.pairs_told:
                     n.pairs_told[pair] = self._send(n, Kind.PAIRS, k.pairs_bytes[pair])
 
-    def _tell_evidence(self, n: Neighbour, members: Sequence[int], T_world_map: Array | None) -> None:
+    def _tell_evidence(self, n: Neighbor, members: Sequence[int], T_world_map: Array | None) -> None:
         if n.state is None:
             return
         for owner in [self.own, *sorted(self.knowledge.evidence)]:
@@ -113,8 +113,8 @@ class Sharing:
             if payload is not None:
                 n.evidence_sent[owner] = self._send(n, self.kind, payload)
 
-    def _overlapping(self, n: Neighbour, owner: int, T_world_map: Array | None) -> bytes | None:
-        """Evidence of an owner in the space that a neighbour saw; None until that can be told."""
+    def _overlapping(self, n: Neighbor, owner: int, T_world_map: Array | None) -> bytes | None:
+        """Evidence of an owner in the space that a neighbor saw; None until that can be told."""
         k = self.knowledge
         if n.voxels is None or T_world_map is None:
             return None

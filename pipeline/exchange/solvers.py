@@ -25,10 +25,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LinkStart:
-    """A joined neighbour as the solver gets it.
+    """A joined neighbor as the solver gets it.
 
     shared: keyframes that both ends have. closures, keep, T_world_keyframe: at the end that holds the closures; which
-    of them the weights begin with, and where the neighbour's keyframes start, [n, 4, 4].
+    of them the weights begin with, and where the neighbor's keyframes start, [n, 4, 4].
     """
 
     index: int
@@ -41,7 +41,7 @@ class LinkStart:
 
 @dataclass(frozen=True)
 class SolverStart:
-    """What a robot knows when the pose rounds begin: registrations between own keyframes, places, neighbours."""
+    """What a robot knows when the pose rounds begin: registrations between own keyframes, places, neighbors."""
 
     robot: str
     index: int
@@ -60,17 +60,17 @@ class PoseSolver(Protocol):
     def advance(self) -> None:
         """One round of computation."""
 
-    def states(self, neighbour: LinkStart, room_bytes: int) -> list[bytes]:
-        """What goes to a neighbour in this round, never again; each fits into `room_bytes`."""
+    def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
+        """What goes to a neighbor in this round, never again; each fits into `room_bytes`."""
 
-    def take_state(self, neighbour: LinkStart, payload: bytes) -> None:
-        """Use what a neighbour sent in a round. Raises ValueError."""
+    def take_state(self, neighbor: LinkStart, payload: bytes) -> None:
+        """Use what a neighbor sent in a round. Raises ValueError."""
 
     def messages(self) -> list[tuple[int, bytes]]:
         """Reliable messages that are to be sent now, by receiver."""
 
     def take_message(self, sender: int, payload: bytes) -> None:
-        """Keep a neighbour's reliable message for the next round."""
+        """Keep a neighbor's reliable message for the next round."""
 
     @property
     def settled(self) -> bool:
@@ -85,10 +85,10 @@ class PoseSolver(Protocol):
         """Own keyframes [n, 4, 4] in the common frame."""
 
     def weights(self, peer: str) -> Array:
-        """Robust weight of every closure held with a neighbour, in the order given."""
+        """Robust weight of every closure held with a neighbor, in the order given."""
 
     def refuted(self, peer: str) -> bool:
-        """Whether the closures held with a neighbour join nobody any more: final weights, too few of which count."""
+        """Whether the closures held with a neighbor join nobody any more: final weights, too few of which count."""
 
     def residuals(self) -> dict[str, Any]:
         """What a round looked like, for the record; keys as `PoseAgent.residuals`."""
@@ -112,13 +112,13 @@ class AdmmSolver:
     def advance(self) -> None:
         self.agent.step()
 
-    def states(self, neighbour: LinkStart, room_bytes: int) -> list[bytes]:
-        packet = self.agent.outgoing(neighbour.name)
-        return write_poses_in_parts(packet, room_bytes, self.own < neighbour.index)
+    def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
+        packet = self.agent.outgoing(neighbor.name)
+        return write_poses_in_parts(packet, room_bytes, self.own < neighbor.index)
 
-    def take_state(self, neighbour: LinkStart, payload: bytes) -> None:
-        poses = read_poses(payload, neighbour.shared.keyframes, neighbour.index < self.own)
-        self.agent.receive(neighbour.name, poses)
+    def take_state(self, neighbor: LinkStart, payload: bytes) -> None:
+        poses = read_poses(payload, neighbor.shared.keyframes, neighbor.index < self.own)
+        self.agent.receive(neighbor.name, poses)
 
     def messages(self) -> list[tuple[int, bytes]]:
         return []
@@ -190,10 +190,10 @@ class EliminationSolver:
         self.refused += refused
         self.node.advance()
 
-    def states(self, neighbour: LinkStart, room_bytes: int) -> list[bytes]:
+    def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
         return []
 
-    def take_state(self, neighbour: LinkStart, payload: bytes) -> None:
+    def take_state(self, neighbor: LinkStart, payload: bytes) -> None:
         raise ValueError("state: poses, where elimination sends messages")
 
     def messages(self) -> list[tuple[int, bytes]]:
@@ -234,5 +234,5 @@ class EliminationSolver:
             "penalties": dict.fromkeys(self._links, (0.0, 0.0)),
             "versions": dict.fromkeys(self._links, self.node.exchange),
             "weights": {peer: robust.weights.tolist() for peer, robust in self._held.items()},
-            "factorisations": self.node.factorisations,
+            "factorizations": self.node.factorizations,
         }

@@ -21,7 +21,7 @@ class Verdict(Enum):
     """What became of a candidate."""
 
     KEPT = "kept"
-    UNLIKE = "the neighbour's keyframe resembles no own one"
+    UNLIKE = "the neighbor's keyframe resembles no own one"
     NOT_ASKED_FOR = "enough matches, but a closer look was not worth it"
     FEW_MATCHES = "too few matches between all features of the two keyframes"
     FEW_INLIERS = "too few matches agree on one motion"
@@ -59,7 +59,7 @@ def verify(
 
     Args:
         own, own_pyramid: all features and the images of the own keyframe.
-        peer, peer_reference: features and registration samples of the neighbour's keyframe, as it sent them.
+        peer, peer_reference: features and registration samples of the neighbor's keyframe, as it sent them.
         ratio: of the ratio test. rng: the stream of this pair of keyframes.
     Returns:
         The verdict, and the closure T_own_peer with its information if the verdict is KEPT.

@@ -32,7 +32,7 @@ from duagc.pipeline.experiments.gaussian_consensus import (
     optimum,
     total_weights,
 )
-from duagc.pipeline.network.link_model import LinkModel, neighbours
+from duagc.pipeline.network.link_model import LinkModel, neighbors
 from duagc.pipeline.network.packets import EVIDENCE_HEAD_BYTES, HEADER_BYTES, MAX_PAYLOAD_BYTES, Kind, parse
 from duagc.pipeline.network.transport import Message, Transport
 
@@ -110,7 +110,7 @@ class Team:
             spread = W.inverse().diagonal()
             weights[name] = W
             theta[name] = truth + np.sqrt(np.where(spread > 0, spread, 1.0)) * rng.normal(size=shape)
-        return Team(names, neighbours(link, names), theta, weights)
+        return Team(names, neighbors(link, names), theta, weights)
 
     def per_coordinate(self) -> Team:
         """The same with the diagonals of the weights, as (12) has them."""

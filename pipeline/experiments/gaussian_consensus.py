@@ -9,7 +9,7 @@ everybody take that sum (`fusion.fuse`). Here robots keep their evidence to them
 
 admm has the minimum as its fixed point, whatever is lost on the way; (12) ends somewhere else as soon as there are
 more than two robots. rho_j = max(W_i, W_j, f) per coordinate, f a share of the median of what is known: both ends
-compute it from the same rounded diagonals, and neighbours that know nothing still pass on what others know.
+compute it from the same rounded diagonals, and neighbors that know nothing still pass on what others know.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Shares:
 
         Args:
             members: by robot, the tracks that it has evidence of, ascending.
-            linked: by robot, its neighbours.
+            linked: by robot, its neighbors.
         """
         tracks = 1 + max((int(m[-1]) for m in members.values() if len(m)), default=-1)
         names = sorted(linked)
@@ -93,10 +93,10 @@ def _connected(group: NDArray[np.bool_], names: list[str], linked: Mapping[str, 
         while queue and not any(name in before for name in missing):
             next_queue = []
             for name in queue:
-                for neighbour in sorted(linked[name]):
-                    if neighbour not in before:
-                        before[neighbour] = name
-                        next_queue.append(neighbour)
+                for neighbor in sorted(linked[name]):
+                    if neighbor not in before:
+                        before[neighbor] = name
+                        next_queue.append(neighbor)
             queue = next_queue
         reached = [name for name in missing if name in before]
         if not reached:
@@ -110,10 +110,10 @@ def _connected(group: NDArray[np.bool_], names: list[str], linked: Mapping[str, 
 
 @dataclass(frozen=True)
 class GaussianPacket:
-    """What one robot tells a neighbour in one round, of the tracks that they share, in their order.
+    """What one robot tells a neighbor in one round, of the tracks that they share, in their order.
 
     sequence: counts up; a value is not replaced by an older one. first: place of the first row among the shared
-    tracks. weights: float32 [m, 13], None once the neighbour has them. has_weights: the sender has all of the
+    tracks. weights: float32 [m, 13], None once the neighbor has them. has_weights: the sender has all of the
     receiver's. values: [m, 13] in the wire's precision, None before that.
     """
 
@@ -146,7 +146,7 @@ class GaussianPacket:
 
 @dataclass
 class _Link:
-    """One end of a link: own rows that are shared, penalty and edge variable, or the neighbour's last value."""
+    """One end of a link: own rows that are shared, penalty and edge variable, or the neighbor's last value."""
 
     rows: Index
     own_weights: NDArray[np.float32]
@@ -154,7 +154,7 @@ class _Link:
     heard: Index  # sequence of the last value, by row
     peer_has_weights: bool = False
     penalty: Array | None = None  # known when all of the peer's weights are
-    edge: Array | None = None  # admm: y; paper: the neighbour's x as last heard, its own start before
+    edge: Array | None = None  # admm: y; paper: the neighbor's x as last heard, its own start before
 
 
 class GaussianAgent:
@@ -167,7 +167,7 @@ class GaussianAgent:
 
         Args:
             theta: [n, 13], common frame; of tracks that are only passed on, anything. weights: zero there.
-            links: by neighbour, own rows of the tracks that both hold, in an order that both have.
+            links: by neighbor, own rows of the tracks that both hold, in an order that both have.
         """
         self.config = config
         self._own = weights
@@ -190,7 +190,7 @@ class GaussianAgent:
         """The values now, [n, 13]."""
 
     def outgoing(self, peer: str) -> GaussianPacket:
-        """What to tell a neighbour in this round."""
+        """What to tell a neighbor in this round."""
         link = self._links[peer]
         self._sequence += 1
         values: NDArray[np.floating] | None = None
@@ -201,7 +201,7 @@ class GaussianAgent:
         return GaussianPacket(self._sequence, 0, weights, link.edge is not None, values)
 
     def receive(self, peer: str, packet: GaussianPacket) -> None:
-        """Take a packet of a neighbour, or a part of one; where a later value came before, it is not used."""
+        """Take a packet of a neighbor, or a part of one; where a later value came before, it is not used."""
         link = self._links[peer]
         link.peer_has_weights |= packet.has_weights
         if packet.weights is not None and link.edge is None:
@@ -217,7 +217,7 @@ class GaussianAgent:
         link.edge[part] += np.where(news, share * (packet.values.astype(np.float64) - link.edge[part]), 0.0)
 
     def _begin(self, link: _Link) -> None:
-        """The neighbour's weights are here: the link takes part from now on."""
+        """The neighbor's weights are here: the link takes part from now on."""
         largest = np.maximum(link.own_weights.astype(np.float64), link.peer_weights)
         floor = np.array([_median(column[column > 0]) for column in largest.T])
         link.penalty = np.maximum(largest, self.config.penalty_floor * floor)
@@ -225,7 +225,7 @@ class GaussianAgent:
         self._inverse = None
 
     def step(self) -> None:
-        """New values from own evidence and what arrived; nothing moves without a neighbour."""
+        """New values from own evidence and what arrived; nothing moves without a neighbor."""
         before = self.x
         self.x = self._admm() if self.config.mode == "admm" else self._average()
         moved = np.abs(self.x - before) * np.sqrt(self._diagonal)

@@ -1,6 +1,6 @@
 """What a team's error could be: its poses beside those that all images together ask for, and beside the truth.
 
-All keyframes of all robots are optimised in one place by the images themselves, as a front end does with its own, from
+All keyframes of all robots are optimized in one place by the images themselves, as a front end does with its own, from
 the run's poses and from the true ones; other frames keep their place beside their keyframe. A reference trajectory has
 errors of its own, and own alignments hide what a common one shows: where every answer of the images, even begun at the
 truth, ends with the same error under one alignment, the exchange does not make it. Ground truth is read here alone.
@@ -39,7 +39,7 @@ NOTHING = Features(np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32))
 
 @dataclass(frozen=True)
 class View:
-    """A keyframe as `bundle.optimise` wants it; no features, because it looks for no loops."""
+    """A keyframe as `bundle.optimize` wants it; no features, because it looks for no loops."""
 
     reference: Reference
     coarsest: Level
@@ -88,10 +88,10 @@ def run(run_folder: RunFolder, recording: Recording, config: FrontendConfig) -> 
         answers: dict[str, Poses] = {"the run": {r.run.robot: r.pairs.estimated for r in robots}}
         truth = {r.run.robot: r.pairs.true for r in robots}
         team = _Team(run_folder, robots, config)
-        answers["images, from the run"] = team.optimised(answers["the run"], "joint")
-        answers["images, from the truth"] = team.optimised(truth, "joint")
-        answers["depth alone, from the run"] = team.optimised(answers["the run"], "depth")
-        answers["depth alone, from the truth"] = team.optimised(truth, "depth")
+        answers["images, from the run"] = team.optimized(answers["the run"], "joint")
+        answers["images, from the truth"] = team.optimized(truth, "joint")
+        answers["depth alone, from the run"] = team.optimized(answers["the run"], "depth")
+        answers["depth alone, from the truth"] = team.optimized(truth, "depth")
         pairs, agreement = _agreement(robots, answers | {"the truth": truth})
     finally:
         for robot in robots:
@@ -165,14 +165,14 @@ class _Team:
         color = frame.color * np.float32(1 / 255)
         return RgbdPyramid.build(color, frame.usable_depth, robot.log.camera, levels, frame.depth_sigma)
 
-    def optimised(self, start: Poses, residuals: Literal["joint", "depth"]) -> Poses:
+    def optimized(self, start: Poses, residuals: Literal["joint", "depth"]) -> Poses:
         """Where all images together put everybody, from a start."""
         T = np.array([start[robot.run.robot][row] for robot, row in self.where])
         T = se3.inverse(T[0]) @ T
         tracked = [KeyframePair(a, b, se3.inverse(T[a]) @ T[b], np.eye(6)) for a, b in sorted(self.ends)]
         registration = self.config.tracking.registration.model_copy(update={"residuals": residuals})
         settings = self.config.keyframes
-        found, _ = bundle.optimise(T, self.views, self.images, tracked, settings, registration)
+        found, _ = bundle.optimize(T, self.views, self.images, tracked, settings, registration)
         out, placed = {}, iter(found.T_map_keyframe)
         for robot in self.robots:
             new = {row: next(placed) for row in robot.keyframes}
@@ -231,7 +231,7 @@ def _agreement(
 
 
 def format_table(result: dict[str, Any]) -> str:
-    """One line per trajectory, millimetres."""
+    """One line per trajectory, millimeters."""
     cuts = list(result["rows"][0]["cut_ate_rmse_m"])
     head = ["poses", "one alignment", "own alignments", *(f"cut in {n}" for n in cuts)]
     head += [f"depth images {kind} ({pairs} pairs)" for kind, pairs in result["views"].items() if pairs]

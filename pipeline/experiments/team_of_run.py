@@ -17,7 +17,7 @@ from duagc.pipeline.evaluation.oracle import section_of
 from duagc.pipeline.experiments.consensus_modes import Team
 from duagc.pipeline.experiments.gaussian_consensus import COORDINATES
 from duagc.pipeline.fusion.fuse import association_covariance
-from duagc.pipeline.network.link_model import neighbours
+from duagc.pipeline.network.link_model import neighbors
 from duagc.pipeline.posegraph.factors import inflated
 from duagc.pipeline.runs.folder import RunFolder
 
@@ -53,7 +53,7 @@ def team_of_run(run: RunFolder, topology: str) -> Team:
         for block in ("position", "shape", "color", "opacity"):
             getattr(whole, block)[found.track[mine]] = getattr(part, block)
         weights[name] = whole
-    return Team(names, neighbours(LinkConfig.model_validate({"topology": topology}), names), theta, weights)
+    return Team(names, neighbors(LinkConfig.model_validate({"topology": topology}), names), theta, weights)
 
 
 def _with_sampling(e: Evidence, config: FusionConfig) -> Evidence:

@@ -1,7 +1,7 @@
-"""Joint optimisation of keyframe poses by the images themselves.
+"""Joint optimization of keyframe poses by the images themselves.
 
-`optimise` minimises the sum of the photometric and point-to-plane costs of all pairs of keyframes that see the same
-surfaces. The cost of a pair is expanded to a quadratic at the present poses (`registration.linearise`), and quadratics
+`optimize` minimizes the sum of the photometric and point-to-plane costs of all pairs of keyframes that see the same
+surfaces. The cost of a pair is expanded to a quadratic at the present poses (`registration.linearize`), and quadratics
 are solved together; a registration of each pair by itself would settle into its own minimum first, and pairs with
 little overlap find wrong ones. A pair is expanded again only when the motion between its keyframes has changed. The
 quadratics at the answer are the factors of the robot's pose graph.
@@ -29,7 +29,7 @@ from duagc.pipeline.registration import (
     Registration,
     RegistrationConfig,
     RgbdPyramid,
-    linearise,
+    linearize,
 )
 from duagc.pipeline.registration.features import Features
 
@@ -57,7 +57,7 @@ Images = Callable[[int, int], RgbdPyramid]
 stays bounded."""
 
 
-def optimise(
+def optimize(
     T_map_keyframes: Array,
     views: Sequence[View],
     images: Images,
@@ -73,16 +73,16 @@ def optimise(
     Returns:
         The poses, and one factor per pair of keyframes: sum of factors = the joint cost at the answer, to second order.
     """
-    neighbourhood = Neighbourhood(views, config)
+    neighborhood = Neighborhood(views, config)
     costs = _Costs(views, images, tracked, config, registration)
     refined = refine(T_map_keyframes, tracked, config.huber_sigmas)
     coarse_rounds = COARSE_ROUNDS if _far(T_map_keyframes, tracked) else 0
     factors = list(tracked)
     ends: list[Ends] = []
-    for index in range(config.optimisation_rounds):
+    for index in range(config.optimization_rounds):
         T = refined.T_map_keyframe
-        if index in (0, coarse_rounds, config.optimisation_rounds // 2):
-            ends = _in_order({(pair.first, pair.second) for pair in tracked} | set(neighbourhood.pairs(T)))
+        if index in (0, coarse_rounds, config.optimization_rounds // 2):
+            ends = _in_order({(pair.first, pair.second) for pair in tracked} | set(neighborhood.pairs(T)))
         costs.expand(ends, T, level=max(0, coarse_rounds - index))
         factors = costs.factors(ends)
         refined = refine(T, factors, config.huber_sigmas)
@@ -115,7 +115,7 @@ class _Costs:
     ) -> None:
         self._views, self._registration = views, registration
         self._images = images
-        self._min_overlap = 0.8 * config.optimisation_overlap
+        self._min_overlap = 0.8 * config.optimization_overlap
         self._tracked = {(pair.first, pair.second): pair for pair in tracked}
         self._found: dict[Ends, KeyframePair | None] = {}  # None: the images cannot be compared
         self._where: dict[Ends, tuple[Array, int]] = {}  # motion and level of the last expansion
@@ -135,7 +135,7 @@ class _Costs:
             if target != loaded:
                 loaded, pyramid = target, self._images(target, level + 1)
             assert pyramid is not None
-            result = self._linearised(reference, target, pyramid, T, level)
+            result = self._linearized(reference, target, pyramid, T, level)
             if self._comparable(result):
                 self._exposures[reference, target] = result.exposure
                 results[reference, target] = result
@@ -151,16 +151,16 @@ class _Costs:
         motion = se3.inverse(T[pair[0]]) @ T[pair[1]]
         return float(np.max(se3.distance(self._where[pair][0], motion))) >= SETTLED
 
-    def _linearised(
+    def _linearized(
         self, reference: int, target: int, pyramid: RgbdPyramid, T: Array, level: int
     ) -> Registration:
         samples, config = self._views[reference].reference, self._registration
         T_reference_target = se3.inverse(T[reference]) @ T[target]
         known = self._exposures.get((reference, target))
         if known is None:
-            # gain and offset first: with wrong ones the weights of the grey values are wrong
-            known = linearise(samples, pyramid, T_reference_target, config=config, level=level).exposure
-        return linearise(samples, pyramid, T_reference_target, known, config, level)
+            # gain and offset first: with wrong ones the weights of the gray values are wrong
+            known = linearize(samples, pyramid, T_reference_target, config=config, level=level).exposure
+        return linearize(samples, pyramid, T_reference_target, known, config, level)
 
     def _comparable(self, result: Registration) -> bool:
         """Whether two views show enough of the same surfaces at a pose, and agree there."""
@@ -188,7 +188,7 @@ def _factor(
     return KeyframePair(first, second, T_first_second @ se3.exp(step), information)
 
 
-class Neighbourhood:
+class Neighborhood:
     """Which keyframes see each other.
 
     Overlaps are computed only where the balls around what two views see meet, and with no more than so many of them,
@@ -197,13 +197,13 @@ class Neighbourhood:
 
     def __init__(self, views: Sequence[View], config: KeyframeConfig) -> None:
         self._views, self._config = views, config
-        self._centres, self._radii = np.zeros((len(views), 3)), np.zeros(len(views))  # camera frames
+        self._centers, self._radii = np.zeros((len(views), 3)), np.zeros(len(views))  # camera frames
         for k, view in enumerate(views):
             coarsest: ReferenceLevel = view.reference.levels[-1]
             if len(coarsest):
                 points = coarsest.points.astype(np.float64)
-                self._centres[k] = np.median(points, axis=0)
-                self._radii[k] = np.quantile(np.linalg.norm(points - self._centres[k], axis=1), 0.9)
+                self._centers[k] = np.median(points, axis=0)
+                self._radii[k] = np.quantile(np.linalg.norm(points - self._centers[k], axis=1), 0.9)
 
     def pairs(self, T: Array) -> list[Ends]:
         """Pairs of keyframes whose overlap, either way, reaches the limit; the best few of each later one."""
@@ -212,11 +212,11 @@ class Neighbourhood:
     def before(self, second: int, T: Array) -> list[int]:
         """Earlier keyframes that overlap with one at the poses T [k, 4, 4], most overlap first; the best few."""
         config, views = self._config, self._views
-        centres = np.einsum("nij,nj->ni", T[: second + 1, :3, :3], self._centres[: second + 1])
-        centres += T[: second + 1, :3, 3]
-        distance = np.linalg.norm(centres[:second] - centres[second], axis=1)
+        centers = np.einsum("nij,nj->ni", T[: second + 1, :3, :3], self._centers[: second + 1])
+        centers += T[: second + 1, :3, 3]
+        distance = np.linalg.norm(centers[:second] - centers[second], axis=1)
         meeting = np.flatnonzero(distance < self._radii[:second] + self._radii[second])
-        nearest = meeting[np.argsort(distance[meeting], kind="stable")[: config.optimisation_candidates]]
+        nearest = meeting[np.argsort(distance[meeting], kind="stable")[: config.optimization_candidates]]
         found = []
         for first in sorted(nearest.tolist()):
             T_first_second = se3.inverse(T[first]) @ T[second]
@@ -225,6 +225,6 @@ class Neighbourhood:
                 overlap(views[first].reference.levels[-1], views[second].coarsest, T_first_second),
                 overlap(views[second].reference.levels[-1], views[first].coarsest, T_second_first),
             )
-            if share >= config.optimisation_overlap:
+            if share >= config.optimization_overlap:
                 found.append((-share, -first))
-        return [-first for _, first in sorted(found)[: config.optimisation_neighbours]]
+        return [-first for _, first in sorted(found)[: config.optimization_neighbors]]

@@ -1,6 +1,6 @@
-"""Following a camera whose depth is missing or stuck, by its colour alone.
+"""Following a camera whose depth is missing or stuck, by its color alone.
 
-What colour says of the way that a camera went is off by a share of that way, because depth and colour of a real
+What color says of the way that a camera went is off by a share of that way, because depth and color of a real
 camera do not fit together to the pixel. Against a keyframe this error is there at once, as large as the way from it:
 5 cm in RedKitchen. So such frames are registered to the last one that had both images, from which the way is short.
 """
@@ -33,7 +33,7 @@ OPEN_DIRECTION = 1e-4  # 1/m^2, 1/rad^2: a standard deviation of 100 m says noth
 
 @dataclass(frozen=True)
 class SoundFrame:
-    """A frame whose depth and colour were both sound.
+    """A frame whose depth and color were both sound.
 
     T_keyframe_camera: [4, 4]. information: [6, 6] of it; None: it is the keyframe. strides: of its samples.
     """
@@ -55,13 +55,13 @@ class SoundFrame:
         limits: FailureConfig,
         prior_information: Array | None,
     ) -> Registration:
-        """Register the colour of a later frame to this one.
+        """Register the color of a later frame to this one.
 
         Args:
             T_keyframe_guess: where it should be, [4, 4]; prior_information: [6, 6] of that, None: unknown.
         Returns:
             The registration with T_reference_target and information in the keyframe; overlap and view are shares of
-            this frame. JUMP if it is too far from here for colour alone, LOW_OVERLAP if too little is shared.
+            this frame. JUMP if it is too far from here for color alone, LOW_OVERLAP if too little is shared.
         """
         T_here_guess = se3.inverse(self.T_keyframe_camera) @ T_keyframe_guess
         result = register(
@@ -88,7 +88,7 @@ class SoundFrame:
     def agrees(
         self, T_keyframe_camera: Array, by_color: Array, limits: FailureConfig, contradicted: bool
     ) -> bool:
-        """Whether colour alone puts a frame where colour and depth together do: both T_keyframe_camera, [4, 4].
+        """Whether color alone puts a frame where color and depth together do: both T_keyframe_camera, [4, 4].
 
         If the two images are of different times, or something moves before the camera, the answers differ by as
         much as the camera moves. Those of a sound camera differ by a share of it; once the two have `contradicted`,

@@ -61,11 +61,11 @@ class StuckImages:
         same_depth = before is not None and self._same(finest.inverse_depth, before.inverse_depth)
         same_color = before is not None and self._same(finest.gray, before.gray)
         if not same_depth:
-            self._depth_came = _normalised(coarsest.gray)
+            self._depth_came = _normalized(coarsest.gray)
         if not same_color:
             self._color_came = coarsest.inverse_depth
         if same_depth:
-            changed = np.abs(_normalised(coarsest.gray) - self._depth_came) > self.config.stuck_gray_change
+            changed = np.abs(_normalized(coarsest.gray) - self._depth_came) > self.config.stuck_gray_change
             if changed.mean() > self.config.stuck_gray_share:
                 return Reason.STUCK_DEPTH
         if same_color and _depth_changed(coarsest.inverse_depth, self._color_came, self.config):
@@ -100,8 +100,8 @@ class Pace:
         return float(np.median(self._intervals_s)) if self._intervals_s else 0.0
 
 
-def _normalised(gray: Image) -> Image:
-    """Grey values without their mean and spread: what is left does not depend on the exposure."""
+def _normalized(gray: Image) -> Image:
+    """Gray values without their mean and spread: what is left does not depend on the exposure."""
     return (gray - gray.mean()) / max(float(gray.std()), 1e-3)
 
 

@@ -46,7 +46,7 @@ class Refined:
 
     @cached_property
     def _factors(self) -> Any:
-        """Factorisation of the normal matrix."""
+        """Factorization of the normal matrix."""
         from scipy.sparse.linalg import splu
 
         return splu(self.normal_matrix)

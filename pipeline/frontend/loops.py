@@ -1,4 +1,4 @@
-"""Loops inside one robot's path: places recognised by features, believed only if registrations both ways agree."""
+"""Loops inside one robot's path: places recognized by features, believed only if registrations both ways agree."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def find_loops(
             T_first_second = se3.inverse(T_map_keyframes[first]) @ T_map_keyframes[second]
             seen = overlap(views[first].reference.levels[-1], views[second].coarsest, T_first_second)
             if seen >= config.known_overlap:
-                continue  # the joint optimisation compares them anyway
+                continue  # the joint optimization compares them anyway
             pair = _verified(views, images, first, second, config, registration, seed, robot)
             if pair is not None:
                 found.append(pair)

@@ -1,7 +1,7 @@
 """Mapping: one robot's Gaussian map, grown keyframe by keyframe from RGB-D images with known poses.
 
 At a keyframe the map is rendered, discs are seeded where it does not explain the image, and the Gaussians of a
-window of keyframes are optimised by Adam on a robust colour and depth loss. `finish` refines the map over all
+window of keyframes are optimized by Adam on a robust color and depth loss. `finish` refines the map over all
 keyframes. Everything is elementwise or summed in a fixed order: the same input gives the same bits on any number of
 threads. See docs/mapping.md.
 """
@@ -36,7 +36,7 @@ from duagc.pipeline.splat.seeding import seed_discs, unexplained, worst_drawn
 
 @dataclass(frozen=True)
 class MappingStats:
-    """What a keyframe did to the map; losses are those of its own view before and after the optimisation."""
+    """What a keyframe did to the map; losses are those of its own view before and after the optimization."""
 
     inserted: int
     pruned: int
@@ -58,7 +58,7 @@ class Mapper:
     ) -> None:
         """Args:
         seed: of the run; the window's lots and the order of the refinement are drawn from it.
-        depth_noise_m: standard deviation of the depth images, metres, for `config.depth` = auto; None: nobody knows.
+        depth_noise_m: standard deviation of the depth images, meters, for `config.depth` = auto; None: nobody knows.
         threads: of the rasterizer; changes no bit of the map.
         """
         self.config, self.seed = config, seed
@@ -93,14 +93,14 @@ class Mapper:
         mask: NDArray[np.bool_] | None = None,
         depth_sigma_m: Image | None = None,
     ) -> MappingStats:
-        """Seed what the map does not explain of a new keyframe and optimise the window around it.
+        """Seed what the map does not explain of a new keyframe and optimize the window around it.
 
         Args:
             keyframe_index: 0, 1, 2, ... in order of arrival.
-            color: RGB [H, W, 3]. depth_m: metres [H, W], 0 where there is none. Both are kept, not copied.
+            color: RGB [H, W, 3]. depth_m: meters [H, W], 0 where there is none. Both are kept, not copied.
             T_map_camera: pose of the camera in the map frame.
             mask: bool [H, W], False where a pixel neither seeds nor counts in a loss; None = all count.
-            depth_sigma_m: [H, W], standard deviation of the depth, metres; None: not known pixel by pixel.
+            depth_sigma_m: [H, W], standard deviation of the depth, meters; None: not known pixel by pixel.
         """
         if keyframe_index != len(self._views):
             raise ValueError(f"keyframe {keyframe_index} added after {len(self._views)} keyframes")
@@ -113,7 +113,7 @@ class Mapper:
         )
         before = self._loss(view, self.config.iterations_level)
         for other in self._window(view):
-            self._optimise(other, self.config.iterations_level, self.config.rates)
+            self._optimize(other, self.config.iterations_level, self.config.rates)
         pruned += self._prune_degenerate()
         after = self._loss(view, self.config.iterations_level)
         return MappingStats(inserted, pruned, len(self._gaussians), before, after)
@@ -159,7 +159,7 @@ class Mapper:
         self._support.append((view, T_keyframe_camera))
 
     def finish(self) -> MappingStats:
-        """Refine geometry and colour over all views: `final_iterations` steps for each keyframe, at full size.
+        """Refine geometry and color over all views: `final_iterations` steps for each keyframe, at full size.
 
         The views come in random order, each once before any comes again. In the first half, what contributes
         nothing is replaced `densify_rounds` times by discs where the keyframes are drawn worst.
@@ -187,10 +187,10 @@ class Mapper:
             elif step == steps // 2:
                 pruned += self._keep(self._contributions(self._views)[0] >= config.min_contribution)
             rates = config.rates.times(falling(step, steps, config.final_rate_decay))
-            self._optimise(views[order[position]], 0, rates)
+            self._optimize(views[order[position]], 0, rates)
         pruned += self._prune_degenerate()
         if config.exposure and self._views:
-            self._centre_exposures(views)
+            self._center_exposures(views)
         return MappingStats(inserted, pruned, len(self._gaussians), before, self._mean_loss())
 
     # --- one view -----------------------------------------------------------------------------------------------
@@ -225,7 +225,7 @@ class Mapper:
     def _mean_loss(self) -> float:
         return float(np.mean([self._loss(view, 0) for view in self._views])) if self._views else 0.0
 
-    def _optimise(self, view: View, level: int, rates: LearningRates) -> None:
+    def _optimize(self, view: View, level: int, rates: LearningRates) -> None:
         """One Adam step of all Gaussians in one view."""
         loss, gradients = self._view_gradients(view, level)
         if self.config.exposure and view is not self._views[0]:
@@ -238,7 +238,7 @@ class Mapper:
             opacity_logits=np.clip(stepped.opacity_logits, np.float32(-6), np.float32(6)),
         )
 
-    def _centre_exposures(self, views: Sequence[View]) -> None:
+    def _center_exposures(self, views: Sequence[View]) -> None:
         """Give the map the keyframes' mean exposure, so that (0, 0) is the best guess for an image that has none.
 
         Nothing that is drawn in an exposure changes, but for what shines through from the background.
@@ -273,9 +273,9 @@ class Mapper:
         return len(new), pruned
 
     def _as_drawn(self, view: View, color: Image, render: Render) -> Image:
-        """The view's colours in the map's exposure; where the mask forbids a pixel, those of the render."""
+        """The view's colors in the map's exposure; where the mask forbids a pixel, those of the render."""
         color = (color - np.float32(view.exposure[1])) * np.float32(np.exp(-view.exposure[0]))
-        # errors are smoothed: a masked pixel must not speak through its neighbours
+        # errors are smoothed: a masked pixel must not speak through its neighbors
         return color if view.mask is None else np.where(view.mask[..., None], color, render.color)
 
     def _discs(
@@ -390,12 +390,12 @@ class Mapper:
     def _covisible(self, newest: View, count: int) -> list[View]:
         """A view, the keyframe before it, and the older ones that see most of what it sees, best first.
 
-        `count` in all, ties to the later. Only the `candidates` keyframes whose centre of view is nearest are compared.
+        `count` in all, ties to the later. Only the `candidates` keyframes whose center of view is nearest are compared.
         """
         older = self._views[: newest.index]
         if len(older) > self.config.candidates:
-            centres = np.stack([view.centre_map for view in older])
-            distance = np.linalg.norm(centres - newest.centre_map, axis=1)
+            centers = np.stack([view.center_map for view in older])
+            distance = np.linalg.norm(centers - newest.center_map, axis=1)
             distance[-1] = 0.0
             nearest = np.sort(np.argsort(distance, kind="stable")[: self.config.candidates])
             older = [older[k] for k in nearest]

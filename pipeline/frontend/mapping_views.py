@@ -18,7 +18,7 @@ Bytes = NDArray[np.uint8]
 
 @dataclass
 class View:
-    """A keyframe as the mapper keeps it: colours as bytes, depth in metres, 0 also where a mask forbids the pixel.
+    """A keyframe as the mapper keeps it: colors as bytes, depth in meters, 0 also where a mask forbids the pixel.
 
     mask, half_mask: pixels that may be used; None = all. certainty, half_certainty: factors of the depth residuals
     (`splat.losses.depth_certainty`); None = all 1. depth_sigma_m: standard deviation of the depth; None = not told.
@@ -78,7 +78,7 @@ class View:
         )
 
     @property
-    def centre_map(self) -> NDArray[np.float64]:
+    def center_map(self) -> NDArray[np.float64]:
         """The point [3] that the camera looks at: on its axis, at the median depth."""
         return self.T_map_camera[:3, 3] + self.median_depth_m * self.T_map_camera[:3, 2]
 
@@ -133,7 +133,7 @@ def overlap(
 
 
 def _from_bytes(color: Bytes) -> Image:
-    """Colours 0..1."""
+    """Colors 0..1."""
     return color * np.float32(1 / 255)
 
 

@@ -3,7 +3,7 @@
 Tracking registers a frame to one keyframe, whose depth image has the noise of one view. The map is made of all
 keyframes. Drawn where a frame was tracked, with the depth of one layer per pixel, it is a better reference
 where the sensor is poor, and a worse one where depth is exact and the map is not. What decides is the information of
-either registration. Keyframes stay where their joint optimisation put them.
+either registration. Keyframes stay where their joint optimization put them.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class ModelTracker:
 
 
 def _sigma_m(information: Array) -> float:
-    """Standard deviation of a position, metres, from the information [6, 6] of a pose; infinite if not determined."""
+    """Standard deviation of a position, meters, from the information [6, 6] of a pose; infinite if not determined."""
     values = np.linalg.eigvalsh(information)
     if not values[0] > 1e-12 * values[-1]:
         return np.inf

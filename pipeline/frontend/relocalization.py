@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
-from duagc.pipeline.config.frontend import RelocalisationConfig
+from duagc.pipeline.config.frontend import RelocalizationConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import RgbdPyramid
 from duagc.pipeline.registration.features import Features, extract_from_gray, matches, ransac
@@ -16,7 +16,7 @@ from duagc.pipeline.registration.features import Features, extract_from_gray, ma
 Array = NDArray[np.float64]
 
 
-def features_of(pyramid: RgbdPyramid, config: RelocalisationConfig) -> Features:
+def features_of(pyramid: RgbdPyramid, config: RelocalizationConfig) -> Features:
     """The strongest features of a view, from the finest image that is not wider than `max_width_px`."""
     narrow = [level for level in pyramid.levels if level.camera.width <= config.max_width_px]
     level = narrow[0] if narrow else pyramid.levels[-1]
@@ -27,7 +27,7 @@ def features_of(pyramid: RgbdPyramid, config: RelocalisationConfig) -> Features:
 
 
 def guesses(
-    view: Features, keyframes: Sequence[Features], frame_index: int, config: RelocalisationConfig
+    view: Features, keyframes: Sequence[Features], frame_index: int, config: RelocalizationConfig
 ) -> Iterator[tuple[int, Array]]:
     """Keyframes that the view may show, the best first, each with the motion that its matched features agree on.
 
@@ -54,14 +54,14 @@ def guesses(
             config.inlier_m,
             config.hypotheses,
             # the draws only choose which samples are tried: the same in every run
-            random_streams.generator(0, "relocalisation", frame=frame_index, keyframe=k),
+            random_streams.generator(0, "relocalization", frame=frame_index, keyframe=k),
         )
         if agree.sum() >= max(config.min_inliers, config.min_inlier_share * len(pairs)):
             yield k, T_keyframe_camera
 
 
 def supports(
-    view: Features, keyframe: Features, T_keyframe_camera: Array, config: RelocalisationConfig
+    view: Features, keyframe: Features, T_keyframe_camera: Array, config: RelocalizationConfig
 ) -> bool:
     """Whether enough matched features of a view are, at a pose, where the keyframe has them."""
     pairs = matches(keyframe.descriptors, view.descriptors, config.ratio)

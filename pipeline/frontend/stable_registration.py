@@ -32,7 +32,7 @@ def settle(
     Args:
         guess: T_keyframe_camera [4, 4]. first: of the first registration; those that follow are the usual ones.
     """
-    gain, offset = _equalising(pyramid, keyframe, config.equalise_from_gain)
+    gain, offset = _equalizing(pyramid, keyframe, config.equalize_from_gain)
     if gain != 1:
         pyramid = pyramid.with_exposure(gain, offset)
     result = register(keyframe.reference, pyramid, guess, first)
@@ -47,8 +47,8 @@ def settle(
     return replace(result, outcome=Outcome.JUMP) if result.ok else result
 
 
-def _equalising(pyramid: RgbdPyramid, keyframe: TrackedKeyframe, from_gain: float) -> tuple[float, float]:
-    """Gain and offset that give a view the mean and spread of grey values of a keyframe; (1, 0) if nearly so.
+def _equalizing(pyramid: RgbdPyramid, keyframe: TrackedKeyframe, from_gain: float) -> tuple[float, float]:
+    """Gain and offset that give a view the mean and spread of gray values of a keyframe; (1, 0) if nearly so.
 
     No more than fivefold: a black image does not become one that shows something.
     """
@@ -60,7 +60,7 @@ def _equalising(pyramid: RgbdPyramid, keyframe: TrackedKeyframe, from_gain: floa
 
 
 def _with_exposure(result: Registration, gain: float, offset: float) -> Registration:
-    """A registration of an equalised view, gain * grey + offset, with the exposure of the view as it was."""
+    """A registration of an equalized view, gain * gray + offset, with the exposure of the view as it was."""
     if gain == 1:
         return result
     a, b = result.exposure

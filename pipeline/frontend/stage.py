@@ -1,6 +1,6 @@
 """The front-end stage: from one robot's sensor log to its odometry, keyframes and Gaussian map.
 
-Passes over the log: all frames are tracked; the keyframe poses are optimised together, loops included; the map is grown
+Passes over the log: all frames are tracked; the keyframe poses are optimized together, loops included; the map is grown
 at the poses found; the other frames are registered to it where that pays. Frames hang on keyframes.
 The stage is offline in this sense; times in the log are those of the recording all the same.
 """
@@ -116,7 +116,7 @@ def _refine(
     """Keyframe poses from all that their images say together, and the factors that say the same."""
     keyframes, settings = tracker.keyframes, config.keyframes
     start = np.array([keyframe.T_map_keyframe for keyframe in keyframes])
-    if len(keyframes) < 2 or not (settings.local_optimisation or settings.loops.enabled):
+    if len(keyframes) < 2 or not (settings.local_optimization or settings.loops.enabled):
         return refine(start, tracker.pairs, settings.huber_sigmas), tracker.pairs
 
     def images(index: int, levels: int) -> RgbdPyramid:
@@ -129,9 +129,9 @@ def _refine(
     if settings.loops.enabled:
         tracked = refine(start, pairs, settings.huber_sigmas).T_map_keyframe
         pairs += loops.find_loops(tracked, keyframes, images, settings.loops, registration, seed, log.robot)
-    if not settings.local_optimisation:
+    if not settings.local_optimization:
         return refine(start, pairs, settings.huber_sigmas), pairs
-    return bundle.optimise(start, keyframes, images, pairs, settings, registration)
+    return bundle.optimize(start, keyframes, images, pairs, settings, registration)
 
 
 def _keyframe_messages(robot: str, keyframes: Sequence[TrackedKeyframe], refined: Refined) -> list[Keyframe]:
@@ -248,7 +248,7 @@ def _map(
 
 
 def depth_noise_m(frames: Sequence[TrackedFrame]) -> float | None:
-    """Noise of the depth images, metres: the median over the frames of what is left between two registered ones."""
+    """Noise of the depth images, meters: the median over the frames of what is left between two registered ones."""
     rms_m = [
         frame.rms_depth_m
         for frame in frames
@@ -300,7 +300,7 @@ def _support(
         frame
         for frame in frames
         if frame.status is not Status.LOST
-        and frame.reason is Reason.NONE  # its depth and its colour belong together
+        and frame.reason is Reason.NONE  # its depth and its color belong together
         and frame.frame_index not in taken
         and not is_held_out(frame.frame_index)
     ]
@@ -369,7 +369,7 @@ def _write(
 def _settle_opencv() -> None:
     from duagc.pipeline.base import determinism
 
-    determinism.settle_opencv()
+    determinism.configure_opencv()
 
 
 class _Clock:

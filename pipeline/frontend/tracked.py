@@ -22,7 +22,7 @@ class Status(Enum):
 
     OK = "ok"
     LOST = "lost"
-    RELOCALISED = "relocalised"
+    RELOCALizED = "relocalized"
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class TrackedFrame:
 
     keyframe_index: the keyframe that it hangs on. T_keyframe_camera: [4, 4]; the last known one if lost.
     information: [6, 6] of T_keyframe_camera, right tangent (translation m, rotation rad); zero if lost. reason: why
-    it is lost, or why only its colour or only its depth was used.
+    it is lost, or why only its color or only its depth was used.
     """
 
     frame_index: int
@@ -71,7 +71,7 @@ class TrackedFrame:
 
 @dataclass(frozen=True)
 class TrackedKeyframe:
-    """A keyframe as it was tracked. exposure: (gain, offset) of its grey values relative to keyframe 0.
+    """A keyframe as it was tracked. exposure: (gain, offset) of its gray values relative to keyframe 0.
 
     features: by which a lost camera is found here. coarsest: the coarsest image of its pyramid.
     """
@@ -87,7 +87,7 @@ class TrackedKeyframe:
     exposure: tuple[float, float] = (1.0, 0.0)
 
     @cached_property
-    def centre_map(self) -> Array:
+    def center_map(self) -> Array:
         """The middle [3] of what it sees, in the map as tracked."""
         points = self.reference.levels[-1].points.astype(np.float64)
         middle = np.median(points, axis=0) if len(points) else np.zeros(3)

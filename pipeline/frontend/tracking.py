@@ -44,9 +44,9 @@ FEATURES_TO_SAY = 3  # times the inliers needed: a keyframe with fewer features 
 
 @dataclass(frozen=True)
 class _Found:
-    """A registration of a frame to a keyframe. without: why only its colour, or only its depth, was used.
+    """A registration of a frame to a keyframe. without: why only its color, or only its depth, was used.
 
-    doubted: it looked unlike the keyframe, and colour alone was asked, which agrees.
+    doubted: it looked unlike the keyframe, and color alone was asked, which agrees.
     """
 
     keyframe_index: int
@@ -91,7 +91,7 @@ class Tracker:
         self._unconfirmed: _Unconfirmed | None = None
         self._gray_rms: list[float] = []  # of the last frames that were followed
         self._obstruction = Obstruction(config.tracking.failure)
-        self._contradiction = False  # of depth and colour, which nothing has cleared up
+        self._contradiction = False  # of depth and color, which nothing has cleared up
         self._without_depth = self._without_color = 0  # frames in a row without a usable image
         self._sound: SoundFrame | None = None  # the last frame with both, nothing before it
 
@@ -109,9 +109,9 @@ class Tracker:
 
         Args:
             stamp_ns: time of the frame, increasing.
-            image: colour [h, w, 3] or grey [h, w], 0..1. depth_m: [h, w], metres, 0 = unknown.
+            image: color [h, w, 3] or gray [h, w], 0..1. depth_m: [h, w], meters, 0 = unknown.
             mask: bool [h, w], False where a pixel must not be used; its depth counts as unknown. None = all may.
-            depth_sigma_m: [h, w], standard deviation of the depth, metres; None: that of the sensor model.
+            depth_sigma_m: [h, w], standard deviation of the depth, meters; None: that of the sensor model.
         """
         if mask is not None:
             depth_m = np.where(mask, depth_m, 0)
@@ -141,7 +141,7 @@ class Tracker:
         return self._follow_by_color(stamp_ns, pyramid, without)
 
     def _follow_by_color(self, stamp_ns: int, pyramid: RgbdPyramid, without: Reason) -> _Found | Reason:
-        """Follow a frame without depth by its colour alone, for a while, if it looks as frames did before."""
+        """Follow a frame without depth by its color alone, for a while, if it looks as frames did before."""
         tracking = self.config.tracking
         enough = self._without_depth > tracking.failure.max_frames_without_depth
         if enough or self._lost or self._obstruction.standing or self._sound is None:
@@ -152,7 +152,7 @@ class Tracker:
         return found if result.ok and self._looks_as_usual(result) else without
 
     def _follow_by_depth(self, stamp_ns: int, pyramid: RgbdPyramid) -> _Found | Reason:
-        """Follow a frame whose colour is stuck by its depth alone, for a few frames: walls do not hold it long."""
+        """Follow a frame whose color is stuck by its depth alone, for a few frames: walls do not hold it long."""
         self._without_color += 1
         tracking = self.config.tracking
         if (
@@ -185,7 +185,7 @@ class Tracker:
     def _accept(self, frame_index: int, stamp_ns: int, pyramid: RgbdPyramid, found: _Found) -> TrackedFrame:
         """Take over the pose of a frame; it becomes a keyframe if it sees much that is new."""
         keyframe_index, result = found.keyframe_index, found.result
-        status = Status.RELOCALISED if self._lost else Status.OK
+        status = Status.RELOCALizED if self._lost else Status.OK
         elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
         followed = keyframe_index == self._current and not self._lost and elapsed_s > 0
         step = se3.inverse(self._T_keyframe_camera) @ result.T_reference_target
@@ -232,7 +232,7 @@ class Tracker:
         tracking = self.config.tracking
         if not self._long_lost(stamp_ns):
             return self._find_near(stamp_ns, pyramid)
-        view = features_of(pyramid, tracking.relocalisation)
+        view = features_of(pyramid, tracking.relocalization)
         if self._unconfirmed is not None:
             found = self._confirm(stamp_ns, pyramid, view)
             if found is not None:
@@ -241,7 +241,7 @@ class Tracker:
         place = near if isinstance(near, _Found) else self._find_place(frame_index, stamp_ns, pyramid, view)
         if place is None:
             return near if isinstance(near, Reason) else Reason.UNCONFIRMED
-        if tracking.relocalisation.confirmations == 0:
+        if tracking.relocalization.confirmations == 0:
             return place
         self._unconfirmed = _Unconfirmed(place, stamp_ns, 0)
         return Reason.UNCONFIRMED
@@ -280,7 +280,7 @@ class Tracker:
                         return undisputed
                     why_not = undisputed
                 reason = reason if reason is not Reason.NONE else why_not
-        view = features_of(pyramid, tracking.relocalisation) if view is None else view
+        view = features_of(pyramid, tracking.relocalization) if view is None else view
         for guess in starts:
             found = _Found(self._current, settle(keyframe, pyramid, guess, tracking, tracking.recovery))
             if found.result.ok and self._believable(stamp_ns, pyramid, found, view):
@@ -291,9 +291,9 @@ class Tracker:
         return reason
 
     def _undisputed(self, stamp_ns: int, pyramid: RgbdPyramid, found: _Found) -> _Found | Reason:
-        """The same, if it looks as usual or colour alone, where that can tell, puts the camera there too.
+        """The same, if it looks as usual or color alone, where that can tell, puts the camera there too.
 
-        If the two contradict each other, depth of another time holds the camera back: then colour alone is believed,
+        If the two contradict each other, depth of another time holds the camera back: then color alone is believed,
         unless it says that the camera moved less, or something stands before it.
         """
         tracking = self.config.tracking
@@ -323,7 +323,7 @@ class Tracker:
         """The first keyframe, in the order of matching features, that the frame can be registered to."""
         config = self.config.tracking
         features = [keyframe.features for keyframe in self.keyframes]
-        for index, guess in guesses(view, features, frame_index, config.relocalisation):
+        for index, guess in guesses(view, features, frame_index, config.relocalization):
             found = _Found(index, settle(self.keyframes[index], pyramid, guess, config, config.registration))
             if found.result.ok and self._believable(stamp_ns, pyramid, found, view):
                 return self._by_latest(stamp_ns, pyramid, view, found)
@@ -336,7 +336,7 @@ class Tracker:
         its end: by an early keyframe the camera would jump by all of that (5 cm in RedKitchen). A later keyframe that
         is not believed, but has the camera elsewhere, leaves it open where the camera is.
         """
-        config, limits = self.config.tracking, self.config.tracking.relocalisation
+        config, limits = self.config.tracking, self.config.tracking.relocalization
         T_map_camera = self.keyframes[found.keyframe_index].T_map_keyframe @ found.result.T_reference_target
         tried = 0
         for keyframe in reversed(self.keyframes[found.keyframe_index + 1 :]):
@@ -366,7 +366,7 @@ class Tracker:
         reach_m = self.config.tracking.failure.max_speed_m_s * (stamp_ns - before.stamp_ns) * 1e-9
         if not result.ok or moved_m > reach_m or not self._believable(stamp_ns, pyramid, found, view):
             return None
-        if before.agreed + 1 >= self.config.tracking.relocalisation.confirmations:
+        if before.agreed + 1 >= self.config.tracking.relocalization.confirmations:
             return found
         self._unconfirmed = _Unconfirmed(found, stamp_ns, before.agreed + 1)
         return Reason.UNCONFIRMED
@@ -385,7 +385,7 @@ class Tracker:
             min(result.overlap, result.view) >= tracking.failure.min_overlap_unlike
             and moved_m <= tracking.failure.slack_m
             and turned_rad <= tracking.failure.slack_rad
-            and result.conflict <= tracking.relocalisation.max_conflict
+            and result.conflict <= tracking.relocalization.max_conflict
         )
 
     def _tells_enough(self, pyramid: RgbdPyramid, found: _Found) -> bool:
@@ -405,27 +405,27 @@ class Tracker:
         (`view`) must be where the keyframe has them. Where a keyframe has too few features to say, only a camera that
         was lost for a moment and is where it was expected is believed.
         """
-        failure, relocalisation = self.config.tracking.failure, self.config.tracking.relocalisation
+        failure, relocalization = self.config.tracking.failure, self.config.tracking.relocalization
         keyframe, T = self.keyframes[found.keyframe_index], found.result.T_reference_target
         T_map_expected = self.keyframes[self._current].T_map_keyframe @ self._predicted(stamp_ns)[0]
         moved_m, turned_rad = se3.distance(T_map_expected, keyframe.T_map_keyframe @ T)
         elapsed_s = max((stamp_ns - self._stamp_ns) * 1e-9, 0.0)
         intruding, told = intruders(pyramid.levels[-1], keyframe.coarsest, T, failure)
         if (
-            found.result.overlap < relocalisation.min_overlap
-            or found.result.conflict > relocalisation.max_conflict
+            found.result.overlap < relocalization.min_overlap
+            or found.result.conflict > relocalization.max_conflict
             or found.result.rms_gray > self._largest_gray_rms()
             or intruding > failure.max_intruders * told
             or moved_m > failure.max_speed_m_s * elapsed_s + failure.slack_m
         ):
             return False
-        if len(keyframe.features) >= FEATURES_TO_SAY * relocalisation.min_inliers:
-            return supports(view, keyframe.features, T, relocalisation)
+        if len(keyframe.features) >= FEATURES_TO_SAY * relocalization.min_inliers:
+            return supports(view, keyframe.features, T, relocalization)
         expected = moved_m <= failure.slack_m and turned_rad <= failure.slack_rad
         return bool(expected) and not self._long_lost(stamp_ns)
 
     def _largest_gray_rms(self) -> float:
-        config = self.config.tracking.relocalisation
+        config = self.config.tracking.relocalization
         # depth of another time looks 2.5 times as bad as usual where it is 4 cm off: then nothing is added
         added = 0.0 if self._contradiction else config.max_gray_rms
         return added + config.max_gray_rms_of_usual * self._usual_gray_rms()
@@ -464,11 +464,11 @@ class Tracker:
         if self._looks_as_usual(result):
             return True
         config = self.config.tracking
-        leaving = min(result.overlap, result.view) < config.relocalisation.min_overlap
+        leaving = min(result.overlap, result.view) < config.relocalization.min_overlap
         return leaving and saturated_share(pyramid.levels[0]) <= config.max_saturated
 
     def _looks_as_usual(self, result: Registration) -> bool:
-        """Whether a frame is exposed as what it was registered to, and its grey values fit as usual."""
+        """Whether a frame is exposed as what it was registered to, and its gray values fit as usual."""
         largest = self.config.tracking.max_keyframe_gain
         return 1 / largest < result.exposure[0] < largest and result.rms_gray <= self._largest_gray_rms()
 
@@ -492,7 +492,7 @@ class Tracker:
         T_map_keyframe = self.keyframes[previous].T_map_keyframe @ result.T_reference_target
         new = len(self.keyframes)
         self.pairs.append(KeyframePair(previous, new, result.T_reference_target, result.information))
-        self._register_to_neighbours(pyramid, previous, T_map_keyframe, new)
+        self._register_to_neighbors(pyramid, previous, T_map_keyframe, new)
         self._add_keyframe(frame_index, stamp_ns, pyramid, previous, T_map_keyframe, result)
         self._current, self._T_keyframe_camera = new, np.eye(4)
         self._sound = SoundFrame(pyramid, self.config.tracking.strides, np.eye(4), None)
@@ -500,27 +500,27 @@ class Tracker:
             TrackedFrame.by(frame_index, stamp_ns, new, result, status), T_keyframe_camera=np.eye(4)
         )
 
-    def _register_to_neighbours(
+    def _register_to_neighbors(
         self, pyramid: RgbdPyramid, previous: int, T_map_keyframe: Array, new: int
     ) -> None:
         """Register a new keyframe to the earlier ones that see most of it, the one it was tracked from excepted."""
         limits = self.config.keyframes
         # where it was tracked from looks at nearly the same place
-        centres = np.array([keyframe.centre_map for keyframe in self.keyframes])
-        distance = np.linalg.norm(centres - centres[previous], axis=1)
-        nearest = np.sort(np.argsort(distance, kind="stable")[: limits.optimisation_candidates])
+        centers = np.array([keyframe.center_map for keyframe in self.keyframes])
+        distance = np.linalg.norm(centers - centers[previous], axis=1)
+        nearest = np.sort(np.argsort(distance, kind="stable")[: limits.optimization_candidates])
         candidates = []
         for keyframe in (self.keyframes[k] for k in nearest):
             T_keyframe_new = se3.inverse(keyframe.T_map_keyframe) @ T_map_keyframe
             overlap = predicted_overlap(keyframe.reference, pyramid, T_keyframe_new)
-            if keyframe.keyframe_index != previous and overlap >= limits.neighbour_overlap:
+            if keyframe.keyframe_index != previous and overlap >= limits.neighbor_overlap:
                 candidates.append((-overlap, -keyframe.keyframe_index, T_keyframe_new))
         candidates.sort(key=lambda candidate: candidate[:2])
-        for _, negative_index, guess in candidates[: limits.neighbours]:
+        for _, negative_index, guess in candidates[: limits.neighbors]:
             result = register(
                 self.keyframes[-negative_index].reference, pyramid, guess, self.config.tracking.registration
             )
-            if result.ok and result.overlap >= limits.neighbour_overlap:
+            if result.ok and result.overlap >= limits.neighbor_overlap:
                 self.pairs.append(
                     KeyframePair(-negative_index, new, result.T_reference_target, result.information)
                 )
@@ -549,7 +549,7 @@ class Tracker:
                 previous,
                 T_map_keyframe,
                 Reference.from_pyramid(pyramid, self.config.tracking.strides),
-                features_of(pyramid, self.config.tracking.relocalisation),
+                features_of(pyramid, self.config.tracking.relocalization),
                 pyramid.levels[-1],
                 (gain, offset),
             )

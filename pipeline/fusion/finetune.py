@@ -1,9 +1,9 @@
-"""A fused map trained again on what the robot saw, and on what its neighbours' maps show, at the corrected poses.
+"""A fused map trained again on what the robot saw, and on what its neighbors' maps show, at the corrected poses.
 
 Consensus moves keyframes and fusion moves Gaussians; nobody asks the images whether the result still draws them. Some
-steps of the mapper's own kind do: colour and depth loss of the robot's keyframes and frames between them, never of
+steps of the mapper's own kind do: color and depth loss of the robot's keyframes and frames between them, never of
 held-out ones. Own images alone would teach the map to look right from where the robot stood and from nowhere else, so
-every few steps comes a view of a neighbour's map from where the neighbour stood (`peer_views`); own images, which are
+every few steps comes a view of a neighbor's map from where the neighbor stood (`peer_views`); own images, which are
 no copies, have the last word. Without such views only the robot's own Gaussians move: the few own views that see one
 taken over, from afar or through a door, know less of it than its owner's many. The information is that of before: what
 is learned here comes from the same pixels and is not counted again.
@@ -31,7 +31,7 @@ from duagc.pipeline.splat.optimizer import falling
 
 @dataclass(frozen=True)
 class View:
-    """An own image: colour uint8 [H, W, 3], depth (m, 0 = none) [H, W], T_world_camera [4, 4], pixels that count.
+    """An own image: color uint8 [H, W, 3], depth (m, 0 = none) [H, W], T_world_camera [4, 4], pixels that count.
 
     depth_sigma_m: [H, W], standard deviation of the depth; None: not known pixel by pixel.
     """
@@ -49,7 +49,7 @@ _TRAINED = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
 
 
 def steps_of(config: RefineConfig, own_views: int, peer_views: int) -> tuple[int, int]:
-    """How many steps the training takes on own views and on those of neighbours' maps."""
+    """How many steps the training takes on own views and on those of neighbors' maps."""
     steps = min(config.steps_per_view * own_views, config.steps_max)
     return steps, round(config.peer_share * steps) if peer_views else 0
 
@@ -68,11 +68,11 @@ def refine(
     peer_views: Sequence[View] = (),
 ) -> Gaussians:
     """The map after some steps, each on one view: own ones in random order, each once before any comes again, and
-    neighbours' likewise, evenly spread among the first.
+    neighbors' likewise, evenly spread among the first.
 
     Args:
         gaussians: in the world frame of the views. trained: [n], which of them may change.
-        views: own images. peer_views: as neighbours' maps show them.
+        views: own images. peer_views: as neighbors' maps show them.
         thickness_floor_m: none becomes thinner than this, or than it was.
         depth: as the map was made. threads: changes no bit.
     Returns:

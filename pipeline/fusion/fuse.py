@@ -1,16 +1,16 @@
 """One robot's fused map from everybody's evidence: method sections 3 and 4, mode `evidence`.
 
-In the flat chart theta = (mean, vec log Sigma, colour, opacity logit) the fused value of a track is, block by block,
+In the flat chart theta = (mean, vec log Sigma, color, opacity logit) the fused value of a track is, block by block,
 
     theta* = (sum W_eff)^-1 sum W_eff theta,        W_eff = (W^-1 + Sigma_assoc)^-1 = (I + W Sigma_assoc)^-1 W,
 
 which is the paper's (12) and, as the chart is flat, its log-Euclidean mean (13). Sigma_assoc is the variance of where
 on the surface a robot happened to put its splat: spacing^2 / 12 along the surface, and what the matched splats of two
-robots were measured to differ by across it, in shape, colour and opacity. `association` says whose values carry it: by
-default the neighbours', and the own splat counts with its stiffness among its own (`Evidence.of_splats`), because what
+robots were measured to differ by across it, in shape, color and opacity. `association` says whose values carry it: by
+default the neighbors', and the own splat counts with its stiffness among its own (`Evidence.of_splats`), because what
 makes a picture is not where one splat is but what they are together. A thickness that the mapper holds at its floor is
 held here too. Every robot's evidence counts once, however often it arrived and through whom. Where no member of a track
-knows anything, the own value stays. The result is a continuous function of the evidence. Everything is fused in colours
+knows anything, the own value stays. The result is a continuous function of the evidence. Everything is fused in colors
 common to the team (`consensus.colors`), and each robot's map has those of its own camera.
 """
 
@@ -46,9 +46,9 @@ from duagc.pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-# Information of the own mean (1/m^2) and shape, which decides where nobody knows more. Matches are within centimetres,
-# so that of `neighbours` is no claim; where all robots shall end with the same Gaussian it is next to nothing.
-PRIOR = {"neighbours": (100.0, 0.1), "members": (1e-2, 1e-4)}
+# Information of the own mean (1/m^2) and shape, which decides where nobody knows more. Matches are within centimeters,
+# so that of `neighbors` is no claim; where all robots shall end with the same Gaussian it is next to nothing.
+PRIOR = {"neighbors": (100.0, 0.1), "members": (1e-2, 1e-4)}
 _NEAR_M = 0.05  # points closer to a camera than this are not judged by it
 
 
@@ -61,7 +61,7 @@ class FusedMap:
     `consensus.evidence`, world frame, the sum over members.
     robots: names. source: int32 [n], index into robots: whose Gaussian it was. source_ids: int64 [n], its id there.
     members: int32 [n], robots whose evidence is in it. matched: own Gaussians fused with others. added: taken over.
-    colors: from every other robot's colours to the receiver's, which are those of the map.
+    colors: from every other robot's colors to the receiver's, which are those of the map.
     """
 
     gaussians: Gaussians
@@ -150,20 +150,20 @@ def weighted_move(
     total = np.add.reduceat(weights, first, axis=0)
     pull = np.add.reduceat((weights @ values[..., None])[..., 0], first, axis=0)
     trace = np.maximum(np.trace(weights, axis1=-2, axis2=-1), 0.0)
-    centre = _weighted_move_diagonal(trace[:, None], values, first)
+    center = _weighted_move_diagonal(trace[:, None], values, first)
     size = np.diff(np.append(first, len(values)))
-    apart = values - np.repeat(centre, size, axis=0)
+    apart = values - np.repeat(center, size, axis=0)
     if free is not None:
         total, pull = free @ total @ free, (free @ pull[..., None])[..., 0]
         apart = (np.repeat(free, size, axis=0) @ apart[..., None])[..., 0]
-    right = np.stack([pull, (total @ centre[..., None])[..., 0]], axis=-1)
+    right = np.stack([pull, (total @ center[..., None])[..., 0]], axis=-1)
     solved = np.linalg.solve(total + prior * np.eye(total.shape[-1]), right)
-    move, centre = solved[..., 0], solved[..., 1]  # the centre as far as anybody knows its directions
+    move, center = solved[..., 0], solved[..., 1]  # the center as far as anybody knows its directions
     known = trace / (trace + prior)  # who knows nothing does not stake out where the others may go
     reach = np.maximum.reduceat(known * np.linalg.norm(apart, axis=1), first)
-    beyond = np.linalg.norm(move - centre, axis=1)
+    beyond = np.linalg.norm(move - center, axis=1)
     share = np.minimum(1.0, reach / np.where(beyond > 0, beyond, 1.0))
-    return np.asarray(centre + share[:, None] * (move - centre), dtype=np.float64)
+    return np.asarray(center + share[:, None] * (move - center), dtype=np.float64)
 
 
 def _weighted_move_diagonal(weights: Array, values: Array, first: Index) -> Array:
@@ -176,7 +176,7 @@ def _weighted_move_diagonal(weights: Array, values: Array, first: Index) -> Arra
 @dataclass(frozen=True)
 class Scatter:
     """How far two robots' splats of one place lie apart, standard deviations: of the mean across the surface (m), of
-    coordinates of vec log Sigma, of colours (0..1), of opacity logits. Measured by the receiver on its own tracks, but
+    coordinates of vec log Sigma, of colors (0..1), of opacity logits. Measured by the receiver on its own tracks, but
     where all robots shall end with the same Gaussian: there what is expected stands.
 
     It is no estimation error: each robot cut the surface into splats of its own, which make up for each other.
@@ -242,7 +242,7 @@ class _Spread:
         scatter = Scatter.of(rows, delta, reference, first, config)
         share = np.full(len(delta), 0.5)  # of the variance of a difference: both members' alike
         assigned = association_covariance(rows.theta[:, LOG_COVARIANCE], config.spacing_per_sigma)
-        if config.association == "neighbours":
+        if config.association == "neighbors":
             share[:] = 1.0
             share[reference] = 0.0  # where a robot put its own splat is no estimate
             assigned[reference] = 0.0
@@ -301,10 +301,10 @@ def fuse(
         T_map_keyframe: [k, 4, 4], its keyframes in its own map, by anchor.
         evidence: by robot, in anchor frames, the receiver's own included (of all its Gaussians, by id).
         own_splats: how stiff the receiver's splats are (`Evidence.of_splats`), in anchor frames, of all its Gaussians;
-            for `association = neighbours`.
+            for `association = neighbors`.
         T_world_keyframe: by robot, [k, 4, 4] by anchor, for every robot in `evidence`.
         pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians.
-        depth_images: (own keyframe index, depth [H, W] in metres, 0 invalid), read once; for `coverage = all`.
+        depth_images: (own keyframe index, depth [H, W] in meters, 0 invalid), read once; for `coverage = all`.
         camera: of these depth images.
         matching: as the pairs were found; for splitting tracks that hold two Gaussians of one robot, and for what the
             pairs tell of the robots' cameras.
@@ -336,7 +336,7 @@ def fuse(
     sums = pack_information(rows.position, rows.shape, rows.color, rows.opacity)
     if len(first):
         taking_part, mine = rows.take(member), np.flatnonzero(found.robot == me)
-        if config.association == "neighbours":
+        if config.association == "neighbors":
             splats = in_world(common.of(own_splats.select(found.row[mine])), T_world_keyframe[robot], weights)
             taking_part = taking_part.with_rows(mine, _Rows.of([splats]))
         move[representative] = _moves(taking_part, reference, first, config, matching.thickness_floor_m)
@@ -437,7 +437,7 @@ def _to_add(
     camera: PinholeCamera,
     config: FusionConfig,
 ) -> Index:
-    """Which of the neighbours' Gaussians to take over: those in space that no own keyframe saw."""
+    """Which of the neighbors' Gaussians to take over: those in space that no own keyframe saw."""
     position = np.trace(unpack_symmetric(sums[foreign, :6], 3), axis1=-2, axis2=-1)
     if config.added_need_information:
         foreign, position = foreign[position > 0], position[position > 0]

@@ -1,10 +1,10 @@
-"""What a robot's own images say about Gaussians that it took over from neighbours: how opaque they are.
+"""What a robot's own images say about Gaussians that it took over from neighbors: how opaque they are.
 
-A neighbour's splat that hangs before what the own camera saw, or reaches over its edge, is contradicted by own pixels;
+A neighbor's splat that hangs before what the own camera saw, or reaches over its edge, is contradicted by own pixels;
 its owner's pixels could not tell. Both are evidence on the opacity. The owner's came with the splat, the own pixels
 have said nothing on it yet; so its logit a goes where
 
-    sum over own pixels |colour drawn - colour seen|^2 / (2 sigma^2)  +  1/2 W (a - a_owner)^2
+    sum over own pixels |color drawn - color seen|^2 / (2 sigma^2)  +  1/2 W (a - a_owner)^2
 
 is least, by some Gauss-Newton steps on all of them, the own map held fixed. What no own pixel sees stays as it is.
 """

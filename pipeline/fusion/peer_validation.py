@@ -1,19 +1,19 @@
-"""What a robot's own images say against its neighbours' maps, before anything of them is used.
+"""What a robot's own images say against its neighbors' maps, before anything of them is used.
 
-A signature says who made a Gaussian, not that it is true, and a robot that met the wrong neighbour must not end worse
-than alone. So every neighbour's map is drawn where the robot's own keyframes stood, and compared with what they saw:
+A signature says who made a Gaussian, not that it is true, and a robot that met the wrong neighbor must not end worse
+than alone. So every neighbor's map is drawn where the robot's own keyframes stood, and compared with what they saw:
 
-    e_p = |colour drawn - colour seen|^2,    blame of a Gaussian = (sum of its weights times e) / (sum of its weights),
+    e_p = |color drawn - color seen|^2,    blame of a Gaussian = (sum of its weights times e) / (sum of its weights),
 
-over pixels at which the neighbour's surface lies in front of the measured one or on it; what lies behind is hidden and
-says nothing. Colours are those that the own camera would show (`consensus.colors`, by the matches of this pair alone).
-A Gaussian is contradicted if its pixels are drawn worse than by one grey for everything: blame above the variance of
-the own images. So is a neighbour as a whole if its map does not explain some of the variance of the pixels that it was
-judged on; honest ones explain two thirds and more, one colour for everything nothing. What no own keyframe saw cannot
+over pixels at which the neighbor's surface lies in front of the measured one or on it; what lies behind is hidden and
+says nothing. Colors are those that the own camera would show (`consensus.colors`, by the matches of this pair alone).
+A Gaussian is contradicted if its pixels are drawn worse than by one gray for everything: blame above the variance of
+the own images. So is a neighbor as a whole if its map does not explain some of the variance of the pixels that it was
+judged on; honest ones explain two thirds and more, one color for everything nothing. What no own keyframe saw cannot
 be judged.
 
 Matches are checked, too, because the lower-named robot of a pair speaks for it: two Gaussians that are not where each
-other are, or differ more than neighbours in the own map do, are none.
+other are, or differ more than neighbors in the own map do, are none.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from duagc.pipeline.splat.gaussians import Gaussians
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 NOTHING: Index = np.zeros((0, 2), np.int64)
-COVERED = 0.5  # opacity from which on a pixel shows a neighbour's surface
+COVERED = 0.5  # opacity from which on a pixel shows a neighbor's surface
 EXPLAINED = 0.3  # of the variance of own pixels, that a map must explain to be used at all
-LEAST_GREY = 0.01  # of images that show next to nothing, where errors of maps and poses count for more
+LEAST_GRAY = 0.01  # of images that show next to nothing, where errors of maps and poses count for more
 LEAST_PX = 4.0  # weight, in pixels, from which on a Gaussian is judged
-LEAST_SHARE = 0.01  # of the own pixels, from which on a neighbour is judged as a whole
+LEAST_SHARE = 0.01  # of the own pixels, from which on a neighbor is judged as a whole
 PASSES = 2  # what hid behind a contradicted Gaussian is judged in the second
 LARGEST = 2.0  # times the largest Gaussian of the own map: no mapper makes a larger one
 # on what makes a match; far enough that rounding tips none of an honest robot
@@ -53,56 +53,65 @@ RADIUS_SLACK, DISTANCE_SLACK = 2.0, 1.5
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """What was found against one neighbour's map.
+class PeerMapReport:
+    """The check of one peer's map against own images.
 
-    gaussians: how many it sent. too_large, contradicted: how many of them are not used, by reason. pairs, refused: its
-    matches with this robot, and how many of them are none. judged_px, own_px: own pixels on which its map was judged,
-    of how many. error: mean squared error of its colours there. variance: of the own ones, at least LEAST_GREY.
+    Attributes:
+        peer: name of the robot that sent the map.
+        gaussians: Gaussians that it sent.
+        too_large: of them, not used because no mapper makes any that large.
+        contradicted: of them, not used because own images contradict them.
+        matches: of the peer with this robot.
+        rejected_matches: of them, found to be false.
+        compared_px: own pixels on which the map was compared.
+        own_px: all own pixels.
+        color_mse: mean squared error of the map's colors on the compared pixels, colors 0..1.
+        color_variance: of the own colors there, at least LEAST_GRAY.
     """
 
-    neighbour: str
+    peer: str
     gaussians: int
     too_large: int
     contradicted: int
-    pairs: int
-    refused: int
-    judged_px: int
+    matches: int
+    rejected_matches: int
+    compared_px: int
     own_px: int
-    error: float
-    variance: float
+    color_mse: float
+    color_variance: float
 
     @property
     def trusted(self) -> bool:
-        """Whether its map shows what the own images show, as far as anybody can tell."""
-        return self.judged_px < LEAST_SHARE * self.own_px or self.error <= (1 - EXPLAINED) * self.variance
+        """Whether the map explains own images, or too few pixels of them see it to decide."""
+        explains = self.color_mse <= (1 - EXPLAINED) * self.color_variance
+        return explains or self.compared_px < LEAST_SHARE * self.own_px
 
     @property
     def reason(self) -> str:
-        """Why nothing of its map is used; empty if it is."""
+        """Why nothing of the map is used; empty if it is used."""
         if self.trusted:
             return ""
         return (
-            f"it contradicts own images: squared error {self.error:.4f} on {self.judged_px} common pixels, "
-            f"whose variance is {self.variance:.4f}"
+            f"it contradicts own images: squared error {self.color_mse:.4f} on {self.compared_px} common pixels, "
+            f"whose variance is {self.color_variance:.4f}"
         )
 
 
 @dataclass(frozen=True)
-class Believed:
-    """What may be used of the neighbours' maps.
+class ValidatedPeers:
+    """What may be used of the neighbors' maps.
 
     evidence: by name, in anchor frames; empty of who is not trusted. contradicted: by name, which of these Gaussians
-    own images contradict. pairs: of matched Gaussians. doubts: one per neighbour, in order of name.
+    own images contradict. pairs: of matched Gaussians. reports: one per neighbor, in order of name.
     """
 
     evidence: dict[str, Evidence]
     contradicted: dict[str, NDArray[np.bool_]]
     pairs: dict[tuple[str, str], Index]
-    doubts: tuple[Doubt, ...]
+    reports: tuple[PeerMapReport, ...]
 
 
-def believed(
+def validate_peer_maps(
     own: Evidence,
     evidence: Mapping[str, Evidence],
     T_world_keyframe: Mapping[str, Array],
@@ -114,14 +123,14 @@ def believed(
     depth_of: Mapping[str, DepthKind],
     weights: WeightKind = "block",
     threads: int = 1,
-) -> Believed:
-    """Hold every neighbour's map against the robot's own keyframes.
+) -> ValidatedPeers:
+    """Hold every neighbor's map against the robot's own keyframes.
 
     Args:
-        own: the robot's own evidence. evidence: of the neighbours, by name. Both in anchor frames.
+        own: the robot's own evidence. evidence: of the neighbors, by name. Both in anchor frames.
         T_world_keyframe: by name, [k, 4, 4] by anchor. pairs: as they came, (robot a, robot b) -> ids [m, 2].
         views: own keyframes at their corrected poses. camera: of the views.
-        matching: as the pairs were found. depth_of: as the neighbours' maps were made, by name. threads: changes no
+        matching: as the pairs were found. depth_of: as the neighbors' maps were made, by name. threads: changes no
             bit.
     """
     own_colors = _Spread()
@@ -129,18 +138,18 @@ def believed(
         own_colors.add(view.color[... if view.mask is None else view.mask])
     world = {own.owner: in_world(own, T_world_keyframe[own.owner], weights)}
     largest = LARGEST * _sizes_m(world[own.owner]).max(initial=0.0)
-    kept, contradicted, doubts = {}, {}, []
+    kept, contradicted, reports = {}, {}, []
     for name in sorted(evidence):
         told = evidence[name]
         there = in_world(told, T_world_keyframe[name], weights)
         possible = _sizes_m(there) <= largest
         told, there = told.select(possible), there.select(possible)
-        judge = _Judge(views, camera, config, depth_of[name], threads)
+        judge = _PeerMapCheck(views, camera, config, depth_of[name], threads)
         pair = _near(world[own.owner], there, _between(pairs, own.owner, name), matching)
         against = judge.contradicted(
             _in_colors_of(world[own.owner], there, pair, matching), own_colors.variance
         )
-        doubt = Doubt(
+        report = PeerMapReport(
             name,
             len(possible),
             int(np.sum(~possible)),
@@ -152,11 +161,13 @@ def believed(
             judge.error,
             judge.own.variance,
         )
-        used = slice(None) if doubt.trusted else slice(0, 0)
+        used = slice(None) if report.trusted else slice(0, 0)
         kept[name], contradicted[name], world[name] = told.select(used), against[used], there.select(used)
-        doubts.append(doubt)
+        reports.append(report)
     true = _true_pairs(world, pairs, DISTANCE_SLACK * threshold(world[own.owner], matching), matching)
-    return Believed(kept, contradicted, true, tuple(_with_pairs(d, own.owner, pairs, true) for d in doubts))
+    return ValidatedPeers(
+        kept, contradicted, true, tuple(_with_pairs(d, own.owner, pairs, true) for d in reports)
+    )
 
 
 def _sizes_m(evidence: Evidence) -> Array:
@@ -199,20 +210,20 @@ def _true_pairs(
     return true
 
 
-def _with_pairs(doubt: Doubt, own: str, pairs: Pairs, true: Pairs) -> Doubt:
-    """How many matches of the neighbour with this robot there are, and how many of them are none."""
-    count = len(_between(pairs, own, doubt.neighbour))
-    return replace(doubt, pairs=count, refused=count - len(_between(true, own, doubt.neighbour)))
+def _with_pairs(report: PeerMapReport, own: str, pairs: Pairs, true: Pairs) -> PeerMapReport:
+    """How many matches of the neighbor with this robot there are, and how many of them are none."""
+    count = len(_between(pairs, own, report.peer))
+    return replace(report, matches=count, rejected_matches=count - len(_between(true, own, report.peer)))
 
 
 class _Spread:
-    """How much colours 0..255 differ, summed as they come."""
+    """How much colors 0..255 differ, summed as they come."""
 
     def __init__(self) -> None:
         self.pixels, self._sum, self._squares = 0, np.zeros(3), np.zeros(3)
 
     def add(self, colors: NDArray[np.uint8]) -> None:
-        """Colours [..., 3]."""
+        """Colors [..., 3]."""
         c = colors.reshape(-1, 3).astype(np.float32) * np.float32(1 / 255)
         self.pixels += len(c)
         self._sum += c.sum(axis=0, dtype=np.float64)
@@ -220,13 +231,13 @@ class _Spread:
 
     @property
     def variance(self) -> float:
-        """Mean over the channels, of colours 0..1; at least LEAST_GREY."""
+        """Mean over the channels, of colors 0..1; at least LEAST_GRAY."""
         n = max(self.pixels, 1)
-        return max(float(np.mean(self._squares / n - (self._sum / n) ** 2)), LEAST_GREY)
+        return max(float(np.mean(self._squares / n - (self._sum / n) ** 2)), LEAST_GRAY)
 
 
-class _Judge:
-    """Draws a map at own keyframes. own, error: own colours at the judged pixels, mean squared error there, of the
+class _PeerMapCheck:
+    """Draws a map at own keyframes. own, error: own colors at the judged pixels, mean squared error there, of the
     first drawing."""
 
     def __init__(
@@ -241,14 +252,14 @@ class _Judge:
         self.rasterizer = Rasterizer(threads=threads)
         self.own, self.error = _Spread(), 0.0
 
-    def contradicted(self, world: Evidence, grey: float) -> NDArray[np.bool_]:
+    def contradicted(self, world: Evidence, gray: float) -> NDArray[np.bool_]:
         """Which Gaussians [n] own images contradict."""
         gaussians = gaussians_of(world.ids, world.anchors, world.theta)
         against = np.zeros(len(world), bool)
         for turn in range(PASSES):
             rows = np.flatnonzero(~against)
             blame = self._blame(gaussians.select(rows), first=turn == 0)
-            against[rows[blame > grey]] = True
+            against[rows[blame > gray]] = True
         return against
 
     def _blame(self, gaussians: Gaussians, first: bool) -> Array:

@@ -1,7 +1,7 @@
-"""What neighbours' maps show from where the neighbours stood: views to train on that no own camera took.
+"""What neighbors' maps show from where the neighbors stood: views to train on that no own camera took.
 
-A robot has its neighbours' whole maps and the poses of their keyframes, both by packets. What a neighbour's map draws
-from there stands in for the images that the neighbour took and never sent. From such views the fused map learns what
+A robot has its neighbors' whole maps and the poses of their keyframes, both by packets. What a neighbor's map draws
+from there stands in for the images that the neighbor took and never sent. From such views the fused map learns what
 two robots saw from different sides, which neither robot's own images can tell.
 """
 
@@ -25,7 +25,7 @@ from duagc.pipeline.kernels import Rasterizer
 
 Array = NDArray[np.float64]
 COVERED = 0.9
-"""Opacity from which on a pixel of a neighbour's map counts as seen by it."""
+"""Opacity from which on a pixel of a neighbor's map counts as seen by it."""
 
 
 def peer_views(
@@ -39,14 +39,14 @@ def peer_views(
     *,
     colors: Mapping[str, ColorMap],
 ) -> list[View]:
-    """Colour and depth of every neighbour's map at its keyframes and half way between them, as the own camera sees.
+    """Color and depth of every neighbor's map at its keyframes and half way between them, as the own camera sees.
 
     Args:
-        evidence: of the neighbours, by name, in anchor frames. T_world_keyframe: by name, [k, 4, 4] by anchor.
-        camera: the robot's own; what the neighbour's map does not cover counts as not seen.
+        evidence: of the neighbors, by name, in anchor frames. T_world_keyframe: by name, [k, 4, 4] by anchor.
+        camera: the robot's own; what the neighbor's map does not cover counts as not seen.
         most: so many views in all, evenly spread.
         depth_of: as the maps were made, by name. threads: changes no bit.
-        colors: from every neighbour's colours to the own.
+        colors: from every neighbor's colors to the own.
     """
     rasterizer = Rasterizer(threads=threads)
     shown = [name for name in sorted(evidence) if len(evidence[name])]

@@ -22,7 +22,7 @@ from duagc.pipeline.consensus.weighting import own_stiffness
 from duagc.pipeline.fusion.finetune import View, refine
 from duagc.pipeline.fusion.fuse import FusedMap, fuse
 from duagc.pipeline.fusion.opacity_update import weigh_by_own_pixels
-from duagc.pipeline.fusion.peer_validation import Doubt, believed
+from duagc.pipeline.fusion.peer_validation import PeerMapReport, validate_peer_maps
 from duagc.pipeline.fusion.peer_views import peer_views
 from duagc.pipeline.geometry.trajectory import Trajectory, write_tum
 from duagc.pipeline.messages import (
@@ -55,7 +55,7 @@ def run_fusion(
     *,
     seed: int = 0,
     threads: int = 1,
-) -> tuple[Doubt, ...]:
+) -> tuple[PeerMapReport, ...]:
     """Write fused.mcap, fused.ply, refined.ply, trajectory.tum and odometry.tum of one robot.
 
     Args:
@@ -66,7 +66,7 @@ def run_fusion(
         moving: as the front end looked for what moves.
         seed: of the run. threads: of the rasterizer; changes no bit.
     Returns:
-        What own images say against every neighbour's map.
+        What own images say against every neighbor's map.
     """
     own = load(source)
     frames = _frames(source)
@@ -74,7 +74,7 @@ def run_fusion(
     stamp_ns = frames[-1].stamp_ns
     met = len(result.component) > 1
     views = training_views(source, frames, hung, config.refine, moving) if met else []
-    trust = believed(
+    validated = validate_peer_maps(
         result.own_evidence,
         result.evidence,
         result.T_world_keyframe_of,
@@ -91,17 +91,17 @@ def run_fusion(
         own.robot,
         own.gaussians,
         own.T_map_keyframe,
-        {own.robot: result.own_evidence, **trust.evidence},
+        {own.robot: result.own_evidence, **validated.evidence},
         own_stiffness(own.robot, own.gaussians, own.information, own.T_map_keyframe, weights),
         result.T_world_keyframe_of,
-        trust.pairs,
+        validated.pairs,
         _depth_images(own),
         own.camera,
         config,
         matching,
         own.depth,
         weights,
-        contradicted=trust.contradicted,
+        contradicted=validated.contradicted,
     )
     refined = None
     if met:
@@ -119,7 +119,7 @@ def run_fusion(
         )
         if config.refine.steps_per_view:
             shown = peer_views(
-                {name: e.select(~trust.contradicted[name]) for name, e in trust.evidence.items()},
+                {name: e.select(~validated.contradicted[name]) for name, e in validated.evidence.items()},
                 result.T_world_keyframe_of,
                 own.camera,
                 config.refine.peer_views if config.refine.peer_share else 0,
@@ -143,12 +143,12 @@ def run_fusion(
             )
     write_ply(folder / "fused.ply", fused.gaussians)
     write_ply(folder / "refined.ply", fused.gaussians if refined is None else refined)
-    _write_log(folder / "fused.mcap", result, fused, refined, trust.doubts, stamp_ns, own.depth)
+    _write_log(folder / "fused.mcap", result, fused, refined, validated.reports, stamp_ns, own.depth)
     stamps = np.array([f.stamp_ns for f in frames], dtype=np.int64)
     before = np.array([f.T_map_camera for f in frames])
     write_tum(folder / "odometry.tum", Trajectory(stamps, before))
     write_tum(folder / "trajectory.tum", Trajectory(stamps, hung))
-    return trust.doubts
+    return validated.reports
 
 
 def training_views(
@@ -202,7 +202,7 @@ def _write_log(
     result: AgentResult,
     fused: FusedMap,
     refined: Gaussians | None,
-    doubts: Sequence[Doubt],
+    reports: Sequence[PeerMapReport],
     stamp_ns: int,
     depth: DepthKind,
 ) -> None:
@@ -236,12 +236,17 @@ def _write_log(
             )
             pack_stamp(message, stamp_ns)
             log.write(topics.PEER_COLORS.of(robot), message, stamp_ns, stamp_ns)
-        for doubt in doubts:
-            log.write(topics.NEIGHBOUR_DOUBT.of(robot), _doubt(robot, doubt, stamp_ns), stamp_ns, stamp_ns)
+        for report in reports:
+            log.write(
+                topics.PEER_MAP_REPORT.of(robot),
+                _peer_map_report(robot, report, stamp_ns),
+                stamp_ns,
+                stamp_ns,
+            )
 
 
 def peer_colors(path: Path, robot: str) -> dict[str, ColorMap]:
-    """From every neighbour's colours to the robot's, by name, of its fused.mcap; empty if that holds none."""
+    """From every neighbor's colors to the robot's, by name, of its fused.mcap; empty if that holds none."""
     found = [record.message() for record in read_log(path, (topics.PEER_COLORS.of(robot),))]
     return {
         m.peer: ColorMap(
@@ -251,10 +256,10 @@ def peer_colors(path: Path, robot: str) -> dict[str, ColorMap]:
     }
 
 
-def _doubt(robot: str, doubt: Doubt, stamp_ns: int) -> Any:
-    """duagc.v1.NeighbourDoubt."""
+def _peer_map_report(robot: str, report: PeerMapReport, stamp_ns: int) -> Any:
+    """duagc.v1.PeerMapReport."""
     message = schemas.new(
-        "NeighbourDoubt", robot=robot, used=doubt.trusted, reason=doubt.reason, **vars(doubt)
+        "PeerMapReport", robot=robot, used=report.trusted, reason=report.reason, **vars(report)
     )
     pack_stamp(message, stamp_ns)
     return message

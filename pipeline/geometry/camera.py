@@ -1,4 +1,4 @@
-"""Pinhole cameras. The centre of the first pixel is (0, 0); x right, y down, z forward."""
+"""Pinhole cameras. The center of the first pixel is (0, 0); x right, y down, z forward."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """Intrinsics in pixels of an undistorted camera; cx, cy count from the centre of the first pixel."""
+    """Intrinsics in pixels of an undistorted camera; cx, cy count from the center of the first pixel."""
 
     width: int
     height: int
@@ -49,7 +49,7 @@ class PinholeCamera:
         return self.rays_at(*np.meshgrid(np.arange(self.width), np.arange(self.height)))
 
     def rays_at(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
-        """Rays [..., 3] with z = 1, camera frame, of pixels: columns u [...] and rows v [...], between centres, too."""
+        """Rays [..., 3] with z = 1, camera frame, of pixels: columns u [...] and rows v [...], between centers, too."""
         x, y = (np.asarray(u) - self.cx) / self.fx, (np.asarray(v) - self.cy) / self.fy
         return np.stack([x, y, np.ones(np.shape(x))], axis=-1)
 

@@ -39,7 +39,7 @@ def sym_rotation(R: ArrayLike) -> Array:
 
 
 def log_covariance(quats_wxyz: ArrayLike, log_scales: ArrayLike) -> Array:
-    """vec log Sigma [..., 6] of Sigma = R diag(exp 2 s) R^T, scales in metres."""
+    """vec log Sigma [..., 6] of Sigma = R diag(exp 2 s) R^T, scales in meters."""
     R = so3.from_quat_wxyz(quats_wxyz)
     s = np.asarray(log_scales, dtype=np.float64)
     return sym_to_vec((R * (2.0 * s)[..., None, :]) @ np.swapaxes(R, -1, -2))

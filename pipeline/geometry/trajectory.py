@@ -28,7 +28,7 @@ class Trajectory:
 
     @property
     def positions(self) -> Array:
-        """Metres, [n, 3]."""
+        """Meters, [n, 3]."""
         return self.poses[:, :3, 3]
 
 
@@ -85,15 +85,15 @@ def associate(a: Trajectory, b: Trajectory, tolerance_ns: int) -> tuple[NDArray[
         j, i = associate(b, a, tolerance_ns)
         return i, j
     after = np.clip(np.searchsorted(b.stamps_ns, a.stamps_ns), 1, max(len(b) - 1, 1))
-    neighbours = np.minimum(np.stack([after - 1, after]), len(b) - 1)
-    gaps = np.abs(b.stamps_ns[neighbours] - a.stamps_ns)
-    nearest = neighbours[np.argmin(gaps, axis=0), np.arange(len(a))]
+    neighbors = np.minimum(np.stack([after - 1, after]), len(b) - 1)
+    gaps = np.abs(b.stamps_ns[neighbors] - a.stamps_ns)
+    nearest = neighbors[np.argmin(gaps, axis=0), np.arange(len(a))]
     close = np.flatnonzero(np.min(gaps, axis=0) <= tolerance_ns)
     return close, nearest[close]
 
 
 def align(points_a: ArrayLike, points_b: ArrayLike) -> Array:
-    """T_a_b [4, 4] that minimises sum |a - T_a_b b|^2 over paired points [n, 3] (Horn; no scale).
+    """T_a_b [4, 4] that minimizes sum |a - T_a_b b|^2 over paired points [n, 3] (Horn; no scale).
 
     Raises:
         DuagError: fewer than three pairs, or points on one line: the rotation is not determined.
@@ -111,7 +111,7 @@ def align(points_a: ArrayLike, points_b: ArrayLike) -> Array:
 
 
 def ate_rmse_m(positions_true: ArrayLike, positions_estimated: ArrayLike) -> float:
-    """Absolute trajectory error after SE(3) alignment: root of the mean squared distance, metres."""
+    """Absolute trajectory error after SE(3) alignment: root of the mean squared distance, meters."""
     true, estimated = np.asarray(positions_true), np.asarray(positions_estimated)
     T = align(true, estimated)
     return float(np.sqrt(np.mean(np.sum((true - se3.transform(T, estimated)) ** 2, axis=1))))

@@ -30,14 +30,14 @@ from duagc.schemas import topics
 CORRELATION_VIEWS = 8
 MEDIAN_PX = 5
 NEAR_M = 0.05  # points closer to a camera than this are not judged by it
-FLOOR_TOLERANCE = 1e-3  # of a log-scale; float32 logs of metres are good to 1e-6
+FLOOR_TOLERANCE = 1e-3  # of a log-scale; float32 logs of meters are good to 1e-6
 _UPPER = np.triu_indices(9)
 _ROWS_AT_A_TIME = 1024  # 9x9 matrices of as many stay in the cache
 
 
 @dataclass(frozen=True)
 class View:
-    """One keyframe: colour uint8 [H, W, 3] RGB, depth float32 [H, W] m, pose of the camera in the map.
+    """One keyframe: color uint8 [H, W, 3] RGB, depth float32 [H, W] m, pose of the camera in the map.
 
     mask: bool [H, W], pixels that may be used; None = all. depth_sigma_m: [H, W] standard deviation of the depth as the
     log tells it; None: that of the sensor model.
@@ -52,10 +52,10 @@ class View:
 
 @dataclass(frozen=True)
 class Noise:
-    """Noise of the images: colour sigma (0..1) and depth sigma(z) = factor (base + quadratic (z - 0.4)^2), m.
+    """Noise of the images: color sigma (0..1) and depth sigma(z) = factor (base + quadratic (z - 0.4)^2), m.
 
     from_log: depth sigma = factor times what the log tells of every pixel.
-    color_pixels, depth_pixels: how many neighbouring pixels say together what one would say alone.
+    color_pixels, depth_pixels: how many neighboring pixels say together what one would say alone.
     """
 
     color_sigma: float
@@ -69,7 +69,7 @@ class Noise:
     def depth_sigma_m(
         self, depth_m: NDArray, told_m: NDArray[np.float32] | None = None
     ) -> NDArray[np.float64]:
-        """Standard deviation of measured depths, metres; told_m: what the log tells, if it does."""
+        """Standard deviation of measured depths, meters; told_m: what the log tells, if it does."""
         if told_m is not None:
             # where there is no depth any number will do
             return self.depth_factor * np.where(told_m > 0, told_m, 1.0).astype(np.float64)
@@ -210,7 +210,7 @@ def estimate_noise(
     Only pixels that the map covers (alpha above 0.9) count, in every `every`-th block of 4x4 px in both
     directions; such blocks are what the rasterizer can leave out. The residuals hold the map's errors beside the
     sensor's, so that a poor map does not call itself certain. Depth residuals are taken in units of the configured
-    sigma(z); their spread is the factor on it. Without such pixels the colour is at its floor and the factor is 1.
+    sigma(z); their spread is the factor on it. Without such pixels the color is at its floor and the factor is 1.
     """
     rasterizer = Rasterizer(threads=threads)
     unit = Noise(1.0, 1.0, config.depth_sigma_base_m, config.depth_sigma_quadratic_per_m)
@@ -257,7 +257,7 @@ def with_correlation(
 ) -> tuple[Noise, float]:
     """The noise with its pixels per sample, and how many Gaussians a pixel draws; from some of the views.
 
-    Residuals of neighbouring pixels are alike, because a map's errors are: n pixels then say as much as n / m that are
+    Residuals of neighboring pixels are alike, because a map's errors are: n pixels then say as much as n / m that are
     independent, with m the sum of the residuals' autocorrelation over the window (the effective sample size of a mean).
     Residuals beyond four times their robust spread count as that much.
     """
@@ -324,10 +324,10 @@ class _Autocorrelation:
 def surface_deviation(
     gaussians: Gaussians, camera: PinholeCamera, views: Sequence[View], gate_m: float
 ) -> NDArray[np.float64]:
-    """How far every Gaussian's mean is from the surface that the depth images show, metres [n].
+    """How far every Gaussian's mean is from the surface that the depth images show, meters [n].
 
-    Splats that overlap make up for each other's places: where a sum of them is drawn to a millimetre, each may be a
-    centimetre off, and no pixel tells. What tells is the depth image itself: the median, over the views that measured a
+    Splats that overlap make up for each other's places: where a sum of them is drawn to a millimeter, each may be a
+    centimeter off, and no pixel tells. What tells is the depth image itself: the median, over the views that measured a
     surface within the gate, of the mean's distance from the tangent plane at its pixel (of the depth's median over
     5 x 5 px, or the sensor's noise would pass for the map's deviation). Not the root mean square: at an edge some views
     look past a Gaussian at another surface. The median over all Gaussians counts as half a view more; a Gaussian that
@@ -361,7 +361,7 @@ def surface_deviation(
 def _from_tangent_planes(
     points_camera: NDArray[np.float64], depth_m: NDArray[np.float32], camera: PinholeCamera
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Rows of the points whose pixel and its neighbours two pixels off were measured, and their distances, metres."""
+    """Rows of the points whose pixel and its neighbors two pixels off were measured, and their distances, meters."""
     rows = np.flatnonzero(points_camera[:, 2] > NEAR_M)
     u, v = np.rint(camera.project(points_camera[rows])).astype(np.int64).T
     inside = (u >= 2) & (u < camera.width - 2) & (v >= 2) & (v < camera.height - 2)
@@ -400,7 +400,7 @@ def sum_information(
     """One sweep over the views at the current Gaussians; the newest view is the last.
 
     Where the map or the depth image has a hole the depth brings nothing, where a view's mask forbids a pixel neither
-    does colour; a Gaussian that no view saw keeps zero.
+    does color; a Gaussian that no view saw keeps zero.
     """
     rasterizer = Rasterizer(threads=threads)
     total = FisherSums(len(gaussians))

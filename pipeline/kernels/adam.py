@@ -1,4 +1,4 @@
-"""The steps of `splat.optimiser.Adam`, compiled."""
+"""The steps of `splat.optimizer.Adam`, compiled."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _CONSTANTS = np.array([BETA_1, 1 - BETA_1, BETA_2, 1 - BETA_2, EPSILON], np.floa
 
 
 class CompiledAdam(Adam):
-    """`splat.optimiser.Adam` on all cores asked for; the same bits as that, for any number of threads."""
+    """`splat.optimizer.Adam` on all cores asked for; the same bits as that, for any number of threads."""
 
     def __init__(self, n: int = 0, isa: str = "auto", threads: int = 1) -> None:
         super().__init__(n)
         self.isa, self.threads = isa, threads
 
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, rates: LearningRates) -> Gaussians:
-        """The Gaussians after one step; those without any gradient of colour or opacity are untouched."""
+        """The Gaussians after one step; those without any gradient of color or opacity are untouched."""
         if len(gaussians) != len(self):
             raise ValueError(f"gaussians are {len(gaussians)}, expected {len(self)}, as many as have a state")
         names = list(self._first)

@@ -35,7 +35,7 @@ def rasterize(
     xi: torch.Tensor | None = None,
     rasterizer: Rasterizer | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Colour [H, W, 3], depth [H, W] and alpha [H, W] of n Gaussians, as `Rasterizer.forward` draws them.
+    """Color [H, W, 3], depth [H, W] and alpha [H, W] of n Gaussians, as `Rasterizer.forward` draws them.
 
     Contiguous tensors are read where they are; the images are not copied either. Several forwards may come before
     their backwards: one that is no longer the rasterizer's last is drawn once more in its backward, at the cost of

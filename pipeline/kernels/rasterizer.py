@@ -30,7 +30,7 @@ from duagc.pipeline.splat.gaussians import Gaussians
 MAX_SIDE_PX = 16384
 MAX_THREADS = 1024
 MAX_GAUSSIANS = 2**30
-LARGEST_LOG_SCALE = 40.0  # of metres; as in visibility.h
+LARGEST_LOG_SCALE = 40.0  # of meters; as in visibility.h
 SAME_LAYER = 0.05  # relative difference of depth
 ROTATION_TOLERANCE = 1e-4  # of R^T R - I; a pose read from six decimals passes
 
@@ -87,7 +87,7 @@ class Rasterizer:
         """Draw the Gaussians (frame map) into the camera at T_camera_map [4, 4].
 
         background: RGB seen where the Gaussians let light through; its depth is 0. depth: of a Gaussian at a pixel,
-        that of its centre ("blended") or its mean along the pixel's ray ("ray_plane": of a flat disc, that of its
+        that of its center ("blended") or its mean along the pixel's ray ("ray_plane": of a flat disc, that of its
         plane). mask: bool [H, W]; where it is False nothing is drawn, all images are 0, and no derivative or
         information is taken later.
         Raises ValueError, naming the argument, for what no camera or Gaussian can be.
@@ -233,7 +233,7 @@ class Rasterizer:
     ) -> None:
         """Add the `gauss_newton` information of the last view, sum over pixels of J^T R^-1 J, to `sums`.
 
-        inv_var_color: float32 [H, W], 1/sigma^2 of every colour channel; 0 leaves the pixel out.
+        inv_var_color: float32 [H, W], 1/sigma^2 of every color channel; 0 leaves the pixel out.
         inv_var_depth: float32 [H, W], 1/sigma^2 of the depth as drawn, 1/m^2; 0 leaves it out.
         residual: float32 [H, W], not negative; summed by weight into sums.residual.
         """
@@ -272,7 +272,7 @@ class Rasterizer:
     def full_fisher(self, inv_var_color: Image, inv_var_depth: Image) -> NDArray[np.float64]:
         """J^T R^-1 J [n, 14, 14] of the last view with all its cross terms; for validation, not for speed.
 
-        Columns: mean 3, quaternion 4, log-scale 3, colour 3, logit 1. The images as in `fisher`.
+        Columns: mean 3, quaternion 4, log-scale 3, color 3, logit 1. The images as in `fisher`.
         """
         gaussians, size = self._last_forward()
         color = _checked_image("inv_var_color", inv_var_color, size)
@@ -291,7 +291,7 @@ class Rasterizer:
         return weights, pixels
 
     def layer_depth(self, tolerance: float = SAME_LAYER) -> Image:
-        """Depth [H, W] of the surface that stops the light of each pixel of the last view, metres.
+        """Depth [H, W] of the surface that stops the light of each pixel of the last view, meters.
 
         The median Gaussian is the one at which half of the light is stopped; the result is the mean depth, by
         blending weight, of the Gaussians within `tolerance` (relative) of its depth. At an edge, where the blended

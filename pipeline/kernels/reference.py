@@ -1,20 +1,20 @@
 """What the compiled rasterizer computes, written down in float64 for small scenes; the tests compare the two.
 
 One Gaussian: Sigma = R(q) diag(exp 2s) R(q)^T (paper eq. (1)), opacity o = sigmoid(logit). In a camera with rotation W
-and centre p of the Gaussian in the camera frame, J the derivative of the projection at p:
+and center p of the Gaussian in the camera frame, J the derivative of the projection at p:
 
     screen covariance   C = J W Sigma W^T J^T + BLUR I
-    alpha at a pixel    a = min(o exp(-d^T C^-1 d / 2), ALPHA_MAX), d = pixel - centre; nothing if o exp(..) < 1/255
+    alpha at a pixel    a = min(o exp(-d^T C^-1 d / 2), ALPHA_MAX), d = pixel - center; nothing if o exp(..) < 1/255
     weight              w_i = a_i prod_{j nearer} (1 - a_j); a Gaussian that would take the product below
                         TRANSMITTANCE_MIN closes the pixel and is not drawn
-    colour = sum w c + (1 - sum w) background,  depth = sum w z,  alpha = sum w
+    color = sum w c + (1 - sum w) background,  depth = sum w z,  alpha = sum w
 
-z is the depth of the centre ("blended"), or z + k^T C^-1 d with k = J W Sigma W^T e_z, the covariance of screen
+z is the depth of the center ("blended"), or z + k^T C^-1 d with k = J W Sigma W^T e_z, the covariance of screen
 position and depth ("ray_plane"): in the affine approximation the mean depth of the Gaussian along the ray of the
 pixel, which for a flat disc is where the ray meets its plane.
 
 Derivatives come from automatic differentiation. Information comes from the Jacobian of every pixel: each pixel is
-drawn from its own copy of the screen numbers (centre, C^-1, depth, ...), so that one differentiation per channel gives
+drawn from its own copy of the screen numbers (center, C^-1, depth, ...), so that one differentiation per channel gives
 the rows of all pixels, and each Gaussian's screen numbers depend on its own parameters only.
 """
 
@@ -109,7 +109,7 @@ class ReferenceRasterizer:
         sums: FisherSums,
         residual: ArrayLike | None = None,
     ) -> None:
-        """Add sum over pixels of J^T R^-1 J in (mean, vec log Sigma, colour, logit); see `Rasterizer.fisher`."""
+        """Add sum over pixels of J^T R^-1 J in (mean, vec log Sigma, color, logit); see `Rasterizer.fisher`."""
         p = self._parameters
         log_covariances = _tensor(self._log_covariances).requires_grad_()
         screen = self._project(_matrix_exp(log_covariances))
@@ -239,16 +239,16 @@ class ReferenceRasterizer:
         # T_map_camera exp(xi): the camera sees exp(-xi) p; first order is exact for derivatives at xi = 0
         turn = torch.eye(3, dtype=torch.float64) - _hat(w)
         W, t = turn @ self._T[:3, :3], turn @ self._T[:3, 3] - v
-        order, z, centres, conics = project(p["means"], sigma, W, t, camera)
+        order, z, centers, conics = project(p["means"], sigma, W, t, camera)
         self._order = order.numpy()
         places = (W @ p["means"][..., None])[order, :, 0] + t[order]
-        JW, self._from_clamp = _linearised(places, W[order], camera)
+        JW, self._from_clamp = _linearized(places, W[order], camera)
         along_z = JW @ sigma[order] @ W[order, 2, :, None]  # k, covariance of screen position and depth
         slopes = (conics @ along_z)[..., 0]
         if self._depth == "blended":
             slopes = torch.zeros_like(slopes)
         return Screen(
-            centres, conics, z, slopes, torch.sigmoid(p["opacity_logits"])[order], p["colors"][order]
+            centers, conics, z, slopes, torch.sigmoid(p["opacity_logits"])[order], p["colors"][order]
         )
 
     def _image(self, values: Any) -> NDArray[np.float64]:
@@ -324,7 +324,7 @@ class ReferenceRasterizer:
     def _terms(self, channels: _Channels) -> NDArray[np.float64]:
         """The Jacobian [c, m, n, 14 and pose 6] with every product of the chain rule taken as positive.
 
-        Through screen numbers that know no long and short directions: M centre, M^-T C^-1 M^-1 (which is 1) and
+        Through screen numbers that know no long and short directions: M center, M^-T C^-1 M^-1 (which is 1) and
         M^-T slope, with C^-1 = M^T M.
         """
         M = np.swapaxes(np.linalg.cholesky(self._screen.conics.detach().numpy()), 1, 2)
@@ -354,11 +354,11 @@ class ReferenceRasterizer:
 class Screen(NamedTuple):
     """k Gaussians as the camera sees them, nearest first; each array may have the pixels [m] in front.
 
-    centres: [k, 2], px. conics: C^-1 [k, 2, 2], 1/px^2. depths: [k], m. slopes: [k, 2], m/px, of the depth over the
+    centers: [k, 2], px. conics: C^-1 [k, 2, 2], 1/px^2. depths: [k], m. slopes: [k, 2], m/px, of the depth over the
     screen; zero unless "ray_plane". opacities: [k]. colors: [k, 3].
     """
 
-    centres: Any
+    centers: Any
     conics: Any
     depths: Any
     slopes: Any
@@ -387,7 +387,7 @@ _Channels = Callable[[Painting], Any]  # to values [c, m]
 def project(means: Any, covariances: Any, W: Any, t: Any, camera: PinholeCamera) -> tuple[Any, Any, Any, Any]:
     """Gaussians in front of the camera (rotation W, translation t of T_camera_map), nearest first.
 
-    Returns their indices [k], depths z [k], centres [k, 2] in pixels and inverse screen covariances [k, 2, 2].
+    Returns their indices [k], depths z [k], centers [k, 2] in pixels and inverse screen covariances [k, 2, 2].
     W and t may be one for each Gaussian, [n, 3, 3] and [n, 3].
     """
     import torch
@@ -396,16 +396,16 @@ def project(means: Any, covariances: Any, W: Any, t: Any, camera: PinholeCamera)
     z = places.detach()[:, 2]
     order = torch.argsort(z, stable=True)
     order = order[z[order] >= NEAR_M]
-    JW, _ = _linearised(places[order], W.expand(len(means), 3, 3)[order], camera)
+    JW, _ = _linearized(places[order], W.expand(len(means), 3, 3)[order], camera)
     C = JW @ covariances[order] @ JW.mT + BLUR_PX2 * torch.eye(2, dtype=z.dtype)
     small = C.detach().diagonal(dim1=-2, dim2=-1).amax(-1) <= LARGEST_PX2
     order = order[small]
     x, y, z = places[order].unbind(-1)
-    centres = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
-    return order, z, centres, torch.linalg.inv(C[small])
+    centers = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
+    return order, z, centers, torch.linalg.inv(C[small])
 
 
-def _linearised(places: Any, W: Any, camera: PinholeCamera) -> tuple[Any, Any]:
+def _linearized(places: Any, W: Any, camera: PinholeCamera) -> tuple[Any, Any]:
     """J W [k, 2, 3] of places [k, 3] in the camera, and how far [k], relatively, they are from where J is clamped."""
     import torch
 
@@ -425,22 +425,22 @@ def _linearised(places: Any, W: Any, camera: PinholeCamera) -> tuple[Any, Any]:
 
 
 def paint(pixels: Any, screen: Screen, background: Any) -> Painting:
-    """Colour, depth and alpha of pixels [m, 2]."""
-    weights, gates = blend(pixels, screen.centres, screen.conics, screen.opacities)
+    """Color, depth and alpha of pixels [m, 2]."""
+    weights, gates = blend(pixels, screen.centers, screen.conics, screen.opacities)
     total = weights.sum(-1)
     color = (weights[..., None] * screen.colors).sum(-2) + (1 - total)[:, None] * background
-    along_ray = screen.depths + (screen.slopes * (pixels[:, None] - screen.centres)).sum(-1)
+    along_ray = screen.depths + (screen.slopes * (pixels[:, None] - screen.centers)).sum(-1)
     return Painting(color, (weights * along_ray).sum(-1), total, weights, gates, along_ray)
 
 
-def blend(pixels: Any, centres: Any, conics: Any, opacities: Any) -> tuple[Any, tuple[Any, Any]]:
+def blend(pixels: Any, centers: Any, conics: Any, opacities: Any) -> tuple[Any, tuple[Any, Any]]:
     """Blending weights [m, k] of k Gaussians, nearest first, at pixels [m, 2].
 
     Also what the thresholds decide on: alpha before its clamp and the light left after each Gaussian, [m, k] both.
     """
     import torch
 
-    x, y = (pixels[:, None] - centres).unbind(-1)
+    x, y = (pixels[:, None] - centers).unbind(-1)
     power = conics[..., 0, 0] * x * x + 2 * conics[..., 0, 1] * x * y + conics[..., 1, 1] * y * y
     raw = opacities * torch.exp(-0.5 * power)
     alpha = torch.where(raw.detach() >= ALPHA_MIN, raw.clamp(max=ALPHA_MAX), torch.zeros_like(raw))
@@ -454,7 +454,7 @@ def blend(pixels: Any, centres: Any, conics: Any, opacities: Any) -> tuple[Any, 
 def view_loss(
     drawn: Painting, color: Any, depth_m: Any, certainty: Any, loss: LossWeights, exposure: Any
 ) -> tuple[Any, Any, Any, Any]:
-    """The loss of m pixels and its means of colour, depth and surface, as `Rasterizer.view_gradients` defines them.
+    """The loss of m pixels and its means of color, depth and surface, as `Rasterizer.view_gradients` defines them.
 
     color [m, 3], depth_m [m]: measured. certainty [m]: factor of the depth residuals. exposure: a, b [2].
     """

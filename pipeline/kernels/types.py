@@ -25,7 +25,7 @@ MaybeNone: TypeAlias = Any
 
 @dataclass(frozen=True)
 class Render:
-    """One view. color: [H, W, 3], RGB; depth: [H, W], metres, blended sum of weight * z, not divided by alpha;
+    """One view. color: [H, W, 3], RGB; depth: [H, W], meters, blended sum of weight * z, not divided by alpha;
     alpha: [H, W], sum of the weights. float32 (float64 from the reference). All zero where a mask is False."""
 
     color: NDArray[np.floating]
@@ -39,7 +39,7 @@ class Gradients:
 
     All five are None if only the pose was asked for (parameters=False). pose: [6] float64, by the right tangent
     (translation m, rotation rad) of T_map_camera. fisher_diagonal: [n, 14], sum over pixels of the squared per-pixel
-    derivative, order mean 3, quaternion 4, log-scale 3, colour 3, logit 1.
+    derivative, order mean 3, quaternion 4, log-scale 3, color 3, logit 1.
     """
 
     means: NDArray[np.floating] | MaybeNone
@@ -59,7 +59,7 @@ class FisherSums:
     observations: uint32 [n], views in which a pixel of non-zero precision saw the Gaussian. Over the pixels of
     non-zero precision: weight: float64 [n], sum of the blending weights; residual: float64 [n], sum of weight times
     the residual image, in its unit, so that residual / weight is the mean residual that the Gaussian answers for.
-    diagonal: float64 [n, 14] or None, of the information in (mean 3, quaternion 4 as given, log-scale 3, colour 3,
+    diagonal: float64 [n, 14] or None, of the information in (mean 3, quaternion 4 as given, log-scale 3, color 3,
     logit 1), the vector of paper eq. (3); summed on request only.
     """
 
@@ -92,9 +92,9 @@ class FisherSums:
 class LossWeights:
     """Weights of the loss of one view; the loss itself is `splat.losses.rgbd_loss`.
 
-    color_huber: colour residual (0..1) where the loss turns from quadratic to linear of slope 1. depth_huber_m: the
-    same of depth, metres. depth_weight: of one metre of depth against one unit of colour. alpha_weight: of missing
-    opacity where a depth was measured. surface_weight: of one metre between the depth of single Gaussians, by their
+    color_huber: color residual (0..1) where the loss turns from quadratic to linear of slope 1. depth_huber_m: the
+    same of depth, meters. depth_weight: of one meter of depth against one unit of color. alpha_weight: of missing
+    opacity where a depth was measured. surface_weight: of one meter between the depth of single Gaussians, by their
     blending weight, and the measured one.
     """
 
@@ -121,7 +121,7 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class ViewLoss:
-    """Loss of one view: value, the weighted sum of its terms; color (0..1), depth and surface (metres), the means of
+    """Loss of one view: value, the weighted sum of its terms; color (0..1), depth and surface (meters), the means of
     those terms before their weights; d_exposure, the derivatives of value by the exposure (a, b). The surface term is
     not measured where its weight is 0, and then 0."""
 

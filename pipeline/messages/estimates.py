@@ -27,7 +27,7 @@ from duagc.pipeline.messages.parts import (
 )
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
 
-_STATUS = {"ok": 1, "lost": 2, "relocalised": 3}
+_STATUS = {"ok": 1, "lost": 2, "relocalized": 3}
 _STATUS_NAME = {number: name for name, number in _STATUS.items()}
 
 
@@ -38,8 +38,8 @@ class Odometry:
     stamp_ns: time of the frame. frame_index: position in the log, from 0. held_out: tracked but never mapped.
     keyframe_index: keyframe it was tracked against. T_map_camera, T_keyframe_camera: [4, 4].
     information: [6, 6] of T_keyframe_camera, right tangent (translation m, rotation rad); zero when lost.
-    status: "ok", "lost" or "relocalised". overlap: share of the reference seen, 0..1.
-    rms_depth_m, rms_color: residuals, metres and image units. reason: why it is lost, or tracked by one
+    status: "ok", "lost" or "relocalized". overlap: share of the reference seen, 0..1.
+    rms_depth_m, rms_color: residuals, meters and image units. reason: why it is lost, or tracked by one
     image alone, else "".
     """
 
@@ -289,7 +289,7 @@ class GaussianInformation:
     kind: which approximation. window: which views were summed, in words. ids: int64 [n].
     geometry: float32 [n, 45], upper triangle, row-major, of the 9x9 over (mean 3, vec log covariance 6).
     color: float32 [n, 3], diagonal over RGB. opacity: float32 [n], over the logit. observations: uint32 [n], views.
-    color_sigma: noise of a colour channel, image units. depth_sigma: noise of depth, as a formula of z in metres.
+    color_sigma: noise of a color channel, image units. depth_sigma: noise of depth, as a formula of z in meters.
     deviation_m: float32 [n], how far the mean is from the surface that the robot's depth images measured; the sums
     hold everything but one Gaussian fixed and do not know of it. color_pixels_per_sample, depth_pixels_per_sample:
     pixels that say together what one would say alone, because their residuals are alike; the sums are divided by them.

@@ -22,7 +22,7 @@ def map_frame(robot: str) -> str:
 
 
 def camera_frame(robot: str) -> str:
-    """Name of the frame of a robot's colour camera: x right, y down, z forward."""
+    """Name of the frame of a robot's color camera: x right, y down, z forward."""
     return f"{robot}/camera"
 
 

@@ -134,7 +134,7 @@ _NUMBER_TYPES = {7: "float32", 8: "float64"}  # foxglove.PackedElementField.Nume
 
 
 def pack_points(stamp_ns: int, frame_id: str, points_m: ArrayLike) -> Any:
-    """foxglove.PointCloud of points [n, 3], float32 metres."""
+    """foxglove.PointCloud of points [n, 3], float32 meters."""
     fields = [{"name": name, "offset": 4 * k, "type": 7} for k, name in enumerate("xyz")]
     data = pack_array(points_m, "float32")
     pose = {"orientation": {"w": 1.0}}
@@ -142,7 +142,7 @@ def pack_points(stamp_ns: int, frame_id: str, points_m: ArrayLike) -> Any:
 
 
 def unpack_points(m: Any, where: str) -> Array:
-    """Points [n, 3] in metres, in the frame of the message, of a foxglove.PointCloud; not finite ones are left out.
+    """Points [n, 3] in meters, in the frame of the message, of a foxglove.PointCloud; not finite ones are left out.
 
     `where` begins the line of an error.
     """

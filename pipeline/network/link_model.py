@@ -38,7 +38,7 @@ class Fate:
         return bool(self.deliver_ns)
 
 
-def neighbours(config: LinkConfig, robots: Sequence[str]) -> dict[str, tuple[str, ...]]:
+def neighbors(config: LinkConfig, robots: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """The robots that each robot has a radio link to at any time, in either direction, sorted.
 
     Args:

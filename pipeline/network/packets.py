@@ -41,7 +41,7 @@ class Kind(IntEnum):
     ACK = 1  # chunks received, per message
     STATE = 2  # where the sender stands, and its poses of this round if it has any
     FRAME = 3  # what the closures of two robots say of their relative frame; flooded
-    DESCRIPTORS = 4  # compact descriptors of every keyframe, to recognise places
+    DESCRIPTORS = 4  # compact descriptors of every keyframe, to recognize places
     REQUEST = 5  # keyframes whose sample is wanted
     SAMPLE = 6  # one keyframe: features with 3-D points, and points for registration
     CLOSURES = 7  # verdict on the pair: shared keyframes, metric, relative frame
@@ -113,7 +113,7 @@ def chunk_count(kind: Kind, total_bytes: int) -> int:
     return max(1, -(-total_bytes // chunk_bytes(kind)))
 
 
-def serialise(packet: Packet) -> bytes:
+def serialize(packet: Packet) -> bytes:
     """Bytes of a packet: header, with its CRC over all else, and payload."""
     if len(packet.payload) > MAX_PAYLOAD_BYTES:
         raise ValueError(f"payload of {len(packet.payload)} bytes, at most {MAX_PAYLOAD_BYTES} fit")
@@ -142,7 +142,7 @@ def parse(data: bytes) -> Packet:
     """Read one packet.
 
     Raises:
-        MalformedError: anything is not as `serialise` writes it; the text says what.
+        MalformedError: anything is not as `serialize` writes it; the text says what.
     """
     if not HEADER_BYTES <= len(data) <= MAX_PACKET_BYTES:
         raise MalformedError(f"{len(data)} bytes, expected {HEADER_BYTES} to {MAX_PACKET_BYTES}")

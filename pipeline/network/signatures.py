@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.network.packets import MalformedError, Packet, parse, serialise
+from duagc.pipeline.network.packets import MalformedError, Packet, parse, serialize
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
@@ -50,7 +50,7 @@ class Identity:
 
     def seal(self, packet: Packet) -> bytes:
         """Bytes of an own packet with its signature."""
-        data = serialise(packet)
+        data = serialize(packet)
         return data + self._private.sign(data)
 
     def open(self, sealed: bytes) -> Packet:

@@ -1,4 +1,4 @@
-"""Reliable messages to one neighbour: cutting, bursts within a budget, selective acknowledgement, reassembly.
+"""Reliable messages to one neighbor: cutting, bursts within a budget, selective acknowledgement, reassembly.
 
 A burst holds, in this order: acknowledgements, the state of this round, then the open messages by kind and id,
 what is overdue before what is new. Nothing here looks into a payload, save that evidence is handed on chunk by chunk.
@@ -25,7 +25,7 @@ from duagc.pipeline.network.packets import (
     Packet,
     chunk_bytes,
     chunk_count,
-    serialise,
+    serialize,
 )
 from duagc.pipeline.network.signatures import SIGNATURE_BYTES, Identity
 
@@ -96,7 +96,7 @@ def _priority(entry: _Open) -> tuple[bool, int, int]:
 
 
 class Transport:
-    """One end of the link to one neighbour."""
+    """One end of the link to one neighbor."""
 
     def __init__(
         self,
@@ -113,7 +113,7 @@ class Transport:
         """
         self.own, self.peer, self.peer_name, self.config = own, peer, peer_name, config
         self.new_id = new_id
-        self._seal = serialise if identity is None else identity.seal
+        self._seal = serialize if identity is None else identity.seal
         self._overhead_bytes = HEADER_BYTES + (0 if identity is None else SIGNATURE_BYTES)
         self.sequence = 0
         self.last_heard: int | None = None
@@ -155,14 +155,14 @@ class Transport:
         return not self._open
 
     def in_contact(self, round_index: int) -> bool:
-        """Whether the neighbour was heard lately."""
+        """Whether the neighbor was heard lately."""
         return (
             self.last_heard is not None
             and round_index - self.last_heard <= self.config.contact_lost_after_rounds
         )
 
     def burst(self, round_index: int, states: list[Message], budget_bytes: int) -> list[Outgoing]:
-        """All packets of this round for this neighbour.
+        """All packets of this round for this neighbor.
 
         Args:
             states: fire-and-forget messages, one packet each. budget_bytes: most that may be sent, headers included.
@@ -260,7 +260,7 @@ class Transport:
     # --- incoming
 
     def receive(self, packet: Packet, round_index: int) -> Arrival | None:
-        """Take one parsed packet from this neighbour.
+        """Take one parsed packet from this neighbor.
 
         Returns:
             A complete message, or a chunk of evidence not seen before; None if there is nothing to act on.
@@ -334,7 +334,7 @@ class Transport:
             self._to_acknowledge[message] = _News(0, last, round_index + self._repeats())
 
     def _take_acknowledgements(self, payload: bytes) -> None:
-        """Mark what the neighbour says it has; what it says about anything else has no effect."""
+        """Mark what the neighbor says it has; what it says about anything else has no effect."""
         position = 0
         while position < len(payload):
             if position + _ACK_HEAD.size > len(payload):

@@ -1,4 +1,4 @@
-"""A pose graph solved in one place: a robot's own, or the team's, which the decentralised solver must reach."""
+"""A pose graph solved in one place: a robot's own, or the team's, which the decentralized solver must reach."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def solve_central(
     iterations: int = 100,
     tolerance: float = 1e-10,
 ) -> CentralSolution:
-    """Minimise sum w |r|^2 by Levenberg-Marquardt; pose 0 is held, which only fixes the gauge.
+    """Minimize sum w |r|^2 by Levenberg-Marquardt; pose 0 is held, which only fixes the gauge.
 
     Args:
         factors: relative poses between the n variables; the graph must be connected.
@@ -52,7 +52,7 @@ def solve_central(
         scale = undamped.diagonal().reshape(-1, 6)
         diagonal = damping * scale + 1e-12 * scale.max()
         diagonal[0] += 1e6 * scale.max()
-        solve = pose_factors.factorised(pose_factors.curvature_matrix(factors, jacobians, diagonal))
+        solve = pose_factors.factorized(pose_factors.curvature_matrix(factors, jacobians, diagonal))
         delta = -solve(g.ravel()).reshape(-1, 6)
         candidate = pose_factors.retract(T, delta)
         candidate_value = pose_factors.cost(factors, candidate, w)

@@ -162,7 +162,7 @@ def cost(factors: Factors, T: Array, weights: ArrayLike = 1.0) -> float:
     return float(np.sum(np.asarray(weights) * squared_residuals(factors, T)))
 
 
-def linearised(factors: Factors, T: Array) -> tuple[Array, Array, Array]:
+def linearized(factors: Factors, T: Array) -> tuple[Array, Array, Array]:
     """Residuals [m, 6] and their derivatives [m, 6, 6] by the product-group tangents of poses i and j."""
     e, qw, baseline = _errors(factors, T)
     Ri_t = np.swapaxes(T[factors.i, :3, :3], -1, -2)
@@ -179,7 +179,7 @@ def linearised(factors: Factors, T: Array) -> tuple[Array, Array, Array]:
 
 def gradient(factors: Factors, weights: Array, T: Array) -> tuple[Array, tuple[Array, Array]]:
     """Half the gradient J' r [n, 6] of the weighted cost, and the weighted Jacobians for `curvature_matrix`."""
-    r, Ji, Jj = linearised(factors, T)
+    r, Ji, Jj = linearized(factors, T)
     root = np.sqrt(weights)
     r, Ji, Jj = r * root[:, None], Ji * root[:, None, None], Jj * root[:, None, None]
     g = np.zeros((len(T), 6))
@@ -212,7 +212,7 @@ def curvature_matrix(factors: Factors, jacobians: tuple[Array, Array], diagonal:
     return sparse.coo_matrix((np.concatenate(values), coordinates), shape=(size, size)).tocsc()
 
 
-def factorised(H: sparse.csc_matrix) -> Callable[[Array], Array]:
+def factorized(H: sparse.csc_matrix) -> Callable[[Array], Array]:
     """Solver of H x = b for a symmetric positive definite sparse H."""
     lu = sparse_linalg.splu(
         H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}

@@ -62,7 +62,7 @@ class RobotGraph:
     """All that one robot is told.
 
     keyframes: how many. odometry: factors between own keyframes that are trusted: consecutive ones. loops: all other
-    own factors. closures: by neighbour, from this robot's side.
+    own factors. closures: by neighbor, from this robot's side.
     """
 
     name: str
@@ -332,7 +332,7 @@ def _indices(edges: Edges) -> dict[str, dict[int, int]]:
 
 
 def _consecutive(edges: Edges) -> NDArray[np.bool_]:
-    """Edges between neighbouring keyframes of one robot: its odometry."""
+    """Edges between neighboring keyframes of one robot: its odometry."""
     at = _indices(edges)
     pairs = zip(edges.i, edges.j, strict=True)
     return np.array([a == b and abs(at[a][p] - at[b][q]) == 1 for (a, p), (b, q) in pairs], dtype=bool)

@@ -98,7 +98,7 @@ def drift(odometry: Factors, keyframes: int, config: ClosureConfig) -> Array:
         keyframes: how many there are.
     Returns:
         [keyframes, 2], not falling: translation m^2 and rotation rad^2 per axis, from keyframe 0 to keyframe k along
-        the surest earlier keyframe. One that nothing ties to an earlier one counts with one square metre and one
+        the surest earlier keyframe. One that nothing ties to an earlier one counts with one square meter and one
         square radian.
     """
     covariance = np.linalg.inv(odometry.information + np.eye(6))  # the identity is that weak prior

@@ -1,4 +1,4 @@
-"""Where the depth of a frame comes from: the colour camera's own, another camera's, or a LiDAR's."""
+"""Where the depth of a frame comes from: the color camera's own, another camera's, or a LiDAR's."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True)
 class DepthImage:
-    """Depth [h, w], metres along z of the colour camera, 0 = unknown, and its standard deviation where the log has it.
+    """Depth [h, w], meters along z of the color camera, 0 = unknown, and its standard deviation where the log has it.
 
-    sigma_m: [h, w], metres, 0 where the depth is unknown; None: the sensor's noise is not told.
+    sigma_m: [h, w], meters, 0 where the depth is unknown; None: the sensor's noise is not told.
     """
 
     depth_m: NDArray[np.float32]
@@ -34,7 +34,7 @@ class DepthImage:
 
 
 class DepthSource(Protocol):
-    """One topic of a log, read as depth images of the colour camera. scale: metres per unit of the source."""
+    """One topic of a log, read as depth images of the color camera. scale: meters per unit of the source."""
 
     topic: str
     scale: float
@@ -59,15 +59,15 @@ def depth_source(log: LogFile, robot: str, camera: PinholeCamera) -> DepthSource
 
 
 class Registered:
-    """Depth images that are registered to colour, and those of their standard deviation if there are any."""
+    """Depth images that are registered to color, and those of their standard deviation if there are any."""
 
     def __init__(self, log: LogFile, robot: str, camera: PinholeCamera) -> None:
         self.topic, self.camera = topic_table.DEPTH.of(robot), camera
-        self.scale = _metres(log, self.topic, DEPTH_SCALE_KEY)
+        self.scale = _meters(log, self.topic, DEPTH_SCALE_KEY)
         self._log, self._sigma_topic = log, topic_table.DEPTH_SIGMA.of(robot)
         self._sigma_at = log.entries_by_time(self._sigma_topic)
         if self._sigma_at:
-            self._sigma_scale = _metres(log, self._sigma_topic, DEPTH_SCALE_KEY)
+            self._sigma_scale = _meters(log, self._sigma_topic, DEPTH_SCALE_KEY)
 
     def read(self, record: Record) -> DepthImage:
         depth_m = _depth_image(record, self.scale, self.camera)
@@ -84,11 +84,11 @@ class Registered:
 
 
 class OtherCamera:
-    """Depth images of a camera of its own, registered by its calibration and its pose in the colour camera."""
+    """Depth images of a camera of its own, registered by its calibration and its pose in the color camera."""
 
     def __init__(self, log: LogFile, robot: str, camera: PinholeCamera) -> None:
         self.topic, self.camera = topic_table.RAW_DEPTH.of(robot), camera
-        self.scale = _metres(log, self.topic, DEPTH_SCALE_KEY)
+        self.scale = _meters(log, self.topic, DEPTH_SCALE_KEY)
         calibration = topic_table.RAW_DEPTH_CALIBRATION.of(robot)
         self.depth_camera = constant(log, calibration, messages.unpack_calibration)
         transform = topic_table.RAW_DEPTH_TRANSFORM.of(robot)
@@ -109,7 +109,7 @@ class Lidar:
         transform = topic_table.LIDAR_TRANSFORM.of(robot)
         self.T_camera_lidar = np.array(constant(log, transform, transform_rows))
         told = RANGE_SIGMA_KEY in log.channels[self.topic].metadata
-        self._range_sigma_m = _metres(log, self.topic, RANGE_SIGMA_KEY) if told else None
+        self._range_sigma_m = _meters(log, self.topic, RANGE_SIGMA_KEY) if told else None
 
     def read(self, record: Record) -> DepthImage:
         points = messages.unpack_points(record.proto(), _where(record))
@@ -144,7 +144,7 @@ def transform_rows(message: Any) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in messages.unpack_transform(message).tolist())
 
 
-def _metres(log: LogFile, topic: str, key: str) -> float:
+def _meters(log: LogFile, topic: str, key: str) -> float:
     """A length in the metadata of a channel."""
     text = log.channels[topic].metadata.get(key)
     try:
@@ -153,7 +153,7 @@ def _metres(log: LogFile, topic: str, key: str) -> float:
         scale = math.nan
     if not (math.isfinite(scale) and scale > 0):
         where = f"{log.path}: {topic}: channel metadata {key}"
-        raise DuagError(f"{where} is {text!r}, expected metres, for example '0.001'")
+        raise DuagError(f"{where} is {text!r}, expected meters, for example '0.001'")
     return scale
 
 

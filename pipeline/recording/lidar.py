@@ -1,6 +1,6 @@
 """Sweeps of a LiDAR as depth images of a camera beside it, with the standard deviation of every pixel.
 
-Neighbouring beams that meet one surface are joined to triangles, as the LiDAR sees them. Drawn from the camera with a
+Neighboring beams that meet one surface are joined to triangles, as the LiDAR sees them. Drawn from the camera with a
 z-buffer they say two things: which points the camera cannot see, because a nearer surface hides them, and how deep the
 surface is between the points. Pixels that a visible point falls on have exactly its depth; between the points the
 depth is interpolated, and less certain the more it changes there.
@@ -19,7 +19,7 @@ Indices = NDArray[np.int64]
 Image = NDArray[np.float32]
 NEAREST_M = 0.05
 LONGEST_SIDE = 0.06  # of a triangle as the LiDAR sees it, in focal lengths: rings may be 3 degrees apart
-SAME_SURFACE = 0.05  # relative step of range between neighbouring beams that is always one surface
+SAME_SURFACE = 0.05  # relative step of range between neighboring beams that is always one surface
 LEAST_SLOPE_RAD = np.radians(
     10.0
 )  # else: the angle between the beam and the surface; at less there is an edge
@@ -33,10 +33,10 @@ def lidar_depth(
     """Depth of a sweep as the camera would see it, and its standard deviation.
 
     Args:
-        points_lidar: [n, 3], metres, of one sweep, all as of one time. T_camera_lidar: [4, 4].
+        points_lidar: [n, 3], meters, of one sweep, all as of one time. T_camera_lidar: [4, 4].
         range_sigma_m: standard deviation of a range.
     Returns:
-        Depth along z and sigma, float32 [camera.height, camera.width], metres; both 0 where nothing is known.
+        Depth along z and sigma, float32 [camera.height, camera.width], meters; both 0 where nothing is known.
     """
     points, rays = _before(points_lidar, T_camera_lidar, camera)
     pixels, inverse = camera.project(points), 1 / points[:, 2]
@@ -71,7 +71,7 @@ def _before(points_lidar: Array, T_camera_lidar: Array, camera: PinholeCamera) -
 
 
 def _surfaces(rays: Array) -> Indices:
-    """Triangles [t, 3] of neighbouring beams that meet one surface."""
+    """Triangles [t, 3] of neighboring beams that meet one surface."""
     from scipy.spatial import Delaunay, QhullError
 
     beams, ranges = rays[:, :2] / rays[:, 2:], np.linalg.norm(rays, axis=1)

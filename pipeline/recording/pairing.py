@@ -1,4 +1,4 @@
-"""Which depth image belongs to which colour image, by their times."""
+"""Which depth image belongs to which color image, by their times."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 TOLERANCE_NS = 20_000_000
-"""Colour and depth farther apart are not of one frame: a robot moves by some centimetres in this time."""
+"""Color and depth farther apart are not of one frame: a robot moves by some centimeters in this time."""
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """pairs: (time of colour, time of depth) of every frame in order, ns. color_alone, depth_alone: times without."""
+    """pairs: (time of color, time of depth) of every frame in order, ns. color_alone, depth_alone: times without."""
 
     pairs: tuple[tuple[int, int], ...]
     color_alone: tuple[int, ...]
@@ -21,7 +21,7 @@ class Pairing:
 
     @property
     def largest_offset_ns(self) -> int:
-        """Largest time between the colour and the depth of a frame."""
+        """Largest time between the color and the depth of a frame."""
         return max((abs(color - depth) for color, depth in self.pairs), default=0)
 
 

@@ -1,4 +1,4 @@
-"""What some frames of a robot show: reach of the depth as numbers, colour and depth as one picture."""
+"""What some frames of a robot show: reach of the depth as numbers, color and depth as one picture."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def reach(frames: Sequence[RgbdFrame]) -> dict[str, Any]:
 
 
 def write_preview(logs: Sequence[Path], out: Path) -> None:
-    """Write a PNG: of every robot a line of text, a row of colour and a row of depth, evenly spread over its log.
+    """Write a PNG: of every robot a line of text, a row of color and a row of depth, evenly spread over its log.
 
     Args:
         logs: of robots with a camera. out: must not exist.
@@ -73,11 +73,11 @@ def _tile(image: Picture) -> Picture:
 
 
 def _painted(depth_m: NDArray[np.float32], near: float, far: float) -> Picture:
-    """Depth as colours; black where there is none."""
+    """Depth as colors; black where there is none."""
     import cv2
 
-    grey = np.rint(255 * np.clip((depth_m - near) / (far - near), 0, 1)).astype(np.uint8)
-    painted = cv2.applyColorMap(grey, cv2.COLORMAP_TURBO)[:, :, ::-1]
+    gray = np.rint(255 * np.clip((depth_m - near) / (far - near), 0, 1)).astype(np.uint8)
+    painted = cv2.applyColorMap(gray, cv2.COLORMAP_TURBO)[:, :, ::-1]
     return np.where(depth_m[..., None] > 0, painted, 0).astype(np.uint8)
 
 

@@ -1,4 +1,4 @@
-"""Depth of another sensor as a depth image of the colour camera. Arrays in, arrays out."""
+"""Depth of another sensor as a depth image of the color camera. Arrays in, arrays out."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
-SAME_SURFACE = 0.03  # relative step of depth up to which neighbours are one surface
+SAME_SURFACE = 0.03  # relative step of depth up to which neighbors are one surface
 ONE_LAYER = 0.01  # relative depth behind the nearest sample of a pixel up to which samples are averaged
 NEAREST_M = 0.05
 MOST_SAMPLES = 64_000_000  # of a depth image that is registered; each takes twelve bytes
@@ -34,9 +34,9 @@ def register_depth(
     see stays 0.
 
     Args:
-        depth_m: [h, w], metres along z of the depth camera, 0 = unknown. T_camera_depth: [4, 4].
+        depth_m: [h, w], meters along z of the depth camera, 0 = unknown. T_camera_depth: [4, 4].
     Returns:
-        float32 [camera.height, camera.width], metres along z of `camera`, 0 = unknown.
+        float32 [camera.height, camera.width], meters along z of `camera`, 0 = unknown.
     """
     known = depth_m > 0
     inverse = np.where(known, 1 / np.where(known, depth_m, 1), 0).astype(np.float64)
@@ -54,7 +54,7 @@ def register_depth(
 
 
 def _between(inverse: Array, a: float, b: float) -> Array:
-    """Inverse depth a px right of and b px below every pixel, 0 where its four neighbours are not one surface."""
+    """Inverse depth a px right of and b px below every pixel, 0 where its four neighbors are not one surface."""
     corners = np.stack([inverse[:-1, :-1], inverse[:-1, 1:], inverse[1:, :-1], inverse[1:, 1:]])
     lowest, highest = corners.min(axis=0), corners.max(axis=0)
     weights = np.array([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])

@@ -1,4 +1,4 @@
-"""Colour and depth of one robot, frame by frame."""
+"""Color and depth of one robot, frame by frame."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from duagc.schemas import topics as topic_table
 
 @dataclass(frozen=True)
 class RgbdFrame:
-    """One colour image with its depth.
+    """One color image with its depth.
 
-    index: position in the log. stamp_ns: when the colour was taken. color: uint8 [H, W, 3], RGB.
-    depth: float32 [H, W], metres along z, 0 where nothing was measured. mask: bool [H, W], True = usable, False = a
+    index: position in the log. stamp_ns: when the color was taken. color: uint8 [H, W, 3], RGB.
+    depth: float32 [H, W], meters along z, 0 where nothing was measured. mask: bool [H, W], True = usable, False = a
     moving object or otherwise to be ignored; None = all usable. depth_offset_ns: how much later the depth was taken.
-    depth_sigma: float32 [H, W], standard deviation of the depth in metres, 0 where there is no depth; None = not told.
+    depth_sigma: float32 [H, W], standard deviation of the depth in meters, 0 where there is no depth; None = not told.
     """
 
     index: int
@@ -45,12 +45,12 @@ class RgbdFrame:
 
 
 class RgbdLog:
-    """Colour and depth of one robot: a frame is a colour image and the depth nearest to it, if that is near enough.
+    """Color and depth of one robot: a frame is a color image and the depth nearest to it, if that is near enough.
 
     Images without a partner are no frames; `pairing` has their times. Depth may be registered already, or of another
-    camera, or a LiDAR's (`depth_sources`). Masks belong to the colour image of the same publish time.
+    camera, or a LiDAR's (`depth_sources`). Masks belong to the color image of the same publish time.
 
-    `robot`, `camera`, `depth_scale` (metres per unit). Reads what is asked for and keeps no more than a few frames.
+    `robot`, `camera`, `depth_scale` (meters per unit). Reads what is asked for and keeps no more than a few frames.
     """
 
     def __init__(self, path: Path) -> None:
@@ -101,7 +101,7 @@ class RgbdLog:
         """The entry of every mask by its publish time.
 
         Raises:
-            DuagError: a mask is of no colour image.
+            DuagError: a mask is of no color image.
         """
         at = self._log.entries_by_time(self._mask_topic)
         if at:

@@ -181,7 +181,7 @@ def _robot_table(robots: Mapping[str, Any]) -> list[str]:
     rows = [names]
     for robot, row in robots.items():
         color = row["topics"][topic_table.COLOR.of(robot)]
-        depth = " ".join(f"{metres:.2f}" for metres in row["depth_m"] or ())
+        depth = " ".join(f"{meters:.2f}" for meters in row["depth_m"] or ())
         rate = f"{color['rate_hz']:.2f}" if color["rate_hz"] else "-"
         seconds = f"{(row['end_ns'] - row['start_ns']) * 1e-9:.2f}"
         size, share = f"{row['bytes'] / 1e6:.1f}", f"{row['with_depth']:.0%}"
@@ -198,7 +198,7 @@ def _robot_lines(robot: str, row: Mapping[str, Any]) -> list[str]:
     c = row["camera"]
     lines = [
         f"  {robot}: camera {c['width']}x{c['height']}, focal length {c['fx']:g} {c['fy']:g} px, "
-        f"centre {c['cx']:g} {c['cy']:g} px, depth in {row['depth_scale_m']:g} m",
+        f"center {c['cx']:g} {c['cy']:g} px, depth in {row['depth_scale_m']:g} m",
         f"    ground truth: {row['groundtruth'] or 'none'}",
     ]
     try:

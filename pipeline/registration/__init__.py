@@ -6,7 +6,7 @@ robots with the about 2000 samples that a peer sent.
 """
 
 from duagc.pipeline.config.registration import RegistrationConfig
-from duagc.pipeline.registration.align import Outcome, Registration, linearise, register
+from duagc.pipeline.registration.align import Outcome, Registration, linearize, register
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
 from duagc.pipeline.registration.reference import Reference, ReferenceLevel
 
@@ -18,6 +18,6 @@ __all__ = [
     "Registration",
     "RegistrationConfig",
     "RgbdPyramid",
-    "linearise",
+    "linearize",
     "register",
 ]

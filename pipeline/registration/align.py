@@ -1,8 +1,8 @@
 """Motion between two RGB-D views by joint point-to-plane and photometric Gauss-Newton.
 
-The residuals (`residuals.py`) are minimised together over the right tangent (translation, rotation) of
+The residuals (`residuals.py`) are minimized together over the right tangent (translation, rotation) of
 T_reference_target and an affine brightness (gain, offset), from the coarsest pyramid level to the finest.
-Point-to-plane alone slides along walls, grey values alone know no scale; together they hold all six directions
+Point-to-plane alone slides along walls, gray values alone know no scale; together they hold all six directions
 (Steinbruecker et al. 2011; Kerl et al. 2013; Park et al. 2017).
 
 Directions that the images do not determine (a bare wall) stay where the guess or its prior has them and carry zero
@@ -21,7 +21,7 @@ from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 from duagc.pipeline.registration.reference import Reference
-from duagc.pipeline.registration.residuals import Linearisation, linearise_at
+from duagc.pipeline.registration.residuals import Linearization, linearize_at
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ class Registration:
     rotation rad), zero if nothing was measured. overlap: fraction of the samples that the target sees on the same
     surface, of those it could tell. view: fraction of the samples inside the target image. conflict: fraction of
     the told samples that stand in free space. rms_depth_m, rms_gray: weighted residuals. exposure: (gain, offset)
-    with target grey = gain * reference grey + offset. samples: how many agree. overstated: factor by which the
+    with target gray = gain * reference gray + offset. samples: how many agree. overstated: factor by which the
     normal matrix was divided to give the information. condition: ratio of the largest to the smallest eigenvalue
     of the information before weak directions were taken out, rotations scaled by the median depth. weak: [m, 6],
     directions in the right tangent that the images do not determine; the information is zero along them.
@@ -90,29 +90,29 @@ def register(
 
     Args:
         reference: samples per level; at least as many levels as `pyramid`.
-        pyramid: the target view. `without_depth`, grey values alone are used, and every sample inside the image
+        pyramid: the target view. `without_depth`, gray values alone are used, and every sample inside the image
             counts as seen: overlap is then the view.
         T_reference_target_guess: where to start, [4, 4].
         config: limits and noise.
-        prior_information: [6, 6] in the right tangent of the guess; pulls towards it, is not part of the
+        prior_information: [6, 6] in the right tangent of the guess; pulls toward it, is not part of the
             information returned.
     Returns:
         The motion with an outcome; if that is not OK, the motion is the best found and must not be trusted.
     """
     config = config or RegistrationConfig()
     guess = _orthonormal(np.asarray(T_reference_target_guess, dtype=np.float64))
-    T, exposure, system = _minimise(reference, pyramid, guess, config, prior_information, _ALL_DIRECTIONS)
+    T, exposure, system = _minimize(reference, pyramid, guess, config, prior_information, _ALL_DIRECTIONS)
     found = _Determined.by(system, config)
     if len(found.weak) and system.agreeing >= config.min_samples:
         # once more without the weak directions: what was found along them is noise
-        T, exposure, system = _minimise(
+        T, exposure, system = _minimize(
             reference, pyramid, guess, config, prior_information, found.projection
         )
         found = _Determined.by(system, config).without(found)
     return _judge(system, found, T, guess, exposure, config, prior_information)
 
 
-def linearise(
+def linearize(
     reference: Reference,
     pyramid: RgbdPyramid,
     T_reference_target: Array,
@@ -120,7 +120,7 @@ def linearise(
     config: RegistrationConfig | None = None,
     level: int = 0,
 ) -> Registration:
-    """The cost of a pair near one pose, as a quadratic: for whoever minimises the costs of many pairs together.
+    """The cost of a pair near one pose, as a quadratic: for whoever minimizes the costs of many pairs together.
 
     Args:
         reference, pyramid: as for `register`. level: the one that is used, 0 = finest.
@@ -132,7 +132,7 @@ def linearise(
     config = config or RegistrationConfig()
     T = _orthonormal(np.asarray(T_reference_target, dtype=np.float64))
     start = np.array(exposure)
-    system = linearise_at(reference, pyramid, level, T, start, config)
+    system = linearize_at(reference, pyramid, level, T, start, config)
     found = _Determined.by(system, config)
     step = _step(system, T, T, None, found.projection)
     return _judge(system, found, T @ se3.exp(step[:6]), T, start + step[6:], config, None)
@@ -141,14 +141,14 @@ def linearise(
 _ALL_DIRECTIONS = np.eye(6)
 
 
-def _minimise(
+def _minimize(
     reference: Reference,
     pyramid: RgbdPyramid,
     guess: Array,
     config: RegistrationConfig,
     prior_information: Array | None,
     projection: Array,
-) -> tuple[Array, Array, Linearisation]:
+) -> tuple[Array, Array, Linearization]:
     """Pose, (gain, offset) and residuals at the minimum, from the coarsest level to the finest.
 
     projection: [6, 6] P; the images count only along P x of a step x.
@@ -157,7 +157,7 @@ def _minimise(
     levels = min(len(pyramid.levels), len(config.iterations), len(reference.levels))
     for index in reversed(range(levels)):
         for _ in range(config.iterations[index]):
-            system = linearise_at(reference, pyramid, index, T, exposure, config)
+            system = linearize_at(reference, pyramid, index, T, exposure, config)
             if system.agreeing < config.min_samples:
                 break
             step = _step(system, T, guess, prior_information, projection)
@@ -165,7 +165,7 @@ def _minimise(
             exposure = exposure + step[6:]
             if np.max(np.abs(step[:6])) < (SETTLED if index == 0 else SETTLED_COARSE):
                 break
-    return T, exposure, linearise_at(reference, pyramid, 0, T, exposure, config)
+    return T, exposure, linearize_at(reference, pyramid, 0, T, exposure, config)
 
 
 def _orthonormal(T: Array) -> Array:
@@ -174,7 +174,7 @@ def _orthonormal(T: Array) -> Array:
 
 
 def _step(
-    system: Linearisation, T: Array, guess: Array, prior_information: Array | None, projection: Array
+    system: Linearization, T: Array, guess: Array, prior_information: Array | None, projection: Array
 ) -> Array:
     """Gauss-Newton step [8], slightly damped, limited to 0.3 m and 0.3 rad."""
     H, gradient = system.normal_equations()
@@ -214,7 +214,7 @@ class _Determined:
     condition: float
 
     @staticmethod
-    def by(system: Linearisation, config: RegistrationConfig) -> _Determined:
+    def by(system: Linearization, config: RegistrationConfig) -> _Determined:
         H, _ = system.normal_equations()
         overstated = _overstatement(system, H)
         # the brightness was estimated with the pose: its uncertainty is the pose's too (Schur complement)
@@ -245,13 +245,13 @@ class _Determined:
         )
 
 
-def _lever(system: Linearisation) -> Array:
+def _lever(system: Linearization) -> Array:
     """Scales of the tangent [6] by which a rotation counts as the displacement at the median depth."""
     return np.array([1.0, 1.0, 1.0, *[1.0 / max(system.median_depth_m, 0.1)] * 3])
 
 
 def _judge(
-    system: Linearisation,
+    system: Linearization,
     found: _Determined,
     T: Array,
     guess: Array,
@@ -297,15 +297,15 @@ def _judge(
     )
 
 
-def _overstatement(system: Linearisation, H: Array) -> float:
+def _overstatement(system: Linearization, H: Array) -> float:
     """By which factor the normal matrix overstates the information, at least 1: the larger of two estimates.
 
-    Correlation. Neighbouring residuals share noise, calibration and model errors. If they did not, the outer
+    Correlation. Neighboring residuals share noise, calibration and model errors. If they did not, the outer
     products of the gradients summed over image tiles would have the expectation H; their ratio to H, averaged over
     the eight directions, is the factor (cluster-robust covariance, reduced to one number so that weak directions
     stay weak).
 
-    Tension. Depth and grey values, each alone, would put the target elsewhere; at the joint minimum their
+    Tension. Depth and gray values, each alone, would put the target elsewhere; at the joint minimum their
     gradients g cancel, and chi^2 = g^T (H_depth^-1 + H_gray^-1) g, the squared distance between the two answers in
     units of their covariance, should be 6. What exceeds it is calibration error that no image noise explains
     (Birge ratio).

@@ -1,6 +1,6 @@
 """Features of a view with known depth, their matches between two views, and the motion that matches agree on.
 
-Descriptors are RootSIFT (Arandjelovic and Zisserman 2012), the square root of the L1-normalised SIFT, quantised to
+Descriptors are RootSIFT (Arandjelovic and Zisserman 2012), the square root of the L1-normalized SIFT, quantized to
 one byte. Products of bytes summed over 128 dimensions stay below 2^24, so float32 matrix products of them are exact
 and do not depend on the order of the sum.
 """
@@ -26,7 +26,7 @@ SCALE = 512.0  # RootSIFT entries are at most 1 and mostly below 0.5; larger one
 class Features:
     """Keypoints of one keyframe with known depth, strongest response first.
 
-    descriptors: uint8 [n, 128]. points: float32 [n, 3], metres, camera frame.
+    descriptors: uint8 [n, 128]. points: float32 [n, 3], meters, camera frame.
     """
 
     descriptors: Descriptors
@@ -53,7 +53,7 @@ def extract(
 def extract_from_gray(
     gray: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera, most: int
 ) -> Features:
-    """`extract` from a grey image [h, w]."""
+    """`extract` from a gray image [h, w]."""
     import cv2
 
     keypoints, sift = cv2.SIFT.create(nfeatures=2 * most).detectAndCompute(gray, None)
@@ -82,7 +82,7 @@ def root_sift(sift: NDArray[np.float32]) -> Descriptors:
 
 
 def matches(ours: Descriptors, theirs: Descriptors, ratio: float) -> NDArray[np.int64]:
-    """Mutual nearest neighbours that pass the ratio test among ours.
+    """Mutual nearest neighbors that pass the ratio test among ours.
 
     Args:
         ours: uint8 [n, 128], at least two. theirs: uint8 [m, 128].
@@ -111,7 +111,7 @@ def _matches(squared: NDArray[np.float32], ratio: float) -> NDArray[np.int64]:
 
 
 def fit(points_a: Array, points_b: Array) -> Array:
-    """T_a_b [..., 4, 4] that minimises sum |a - T_a_b b|^2 over paired points [..., n, 3] (Kabsch, batched)."""
+    """T_a_b [..., 4, 4] that minimizes sum |a - T_a_b b|^2 over paired points [..., n, 3] (Kabsch, batched)."""
     mean_a, mean_b = points_a.mean(axis=-2, keepdims=True), points_b.mean(axis=-2, keepdims=True)
     R = so3.project(np.swapaxes(points_a - mean_a, -1, -2) @ (points_b - mean_b))
     return se3.from_rotation_translation(R, mean_a[..., 0, :] - (R @ mean_b[..., 0, :, None])[..., 0])
@@ -123,8 +123,8 @@ def ransac(
     """The motion that most matched points agree on.
 
     Args:
-        points_a, points_b: paired points [n, 3], n >= 3, camera frames, metres.
-        inlier_m: largest distance at one metre of depth; it grows with depth as the noise of a depth camera does.
+        points_a, points_b: paired points [n, 3], n >= 3, camera frames, meters.
+        inlier_m: largest distance at one meter of depth; it grows with depth as the noise of a depth camera does.
         hypotheses: three-point samples drawn.
     Returns:
         T_a_b [4, 4], fitted to its inliers, and the inliers [n].

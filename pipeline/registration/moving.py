@@ -27,7 +27,7 @@ class _View:
     T_map_camera: Array
     inverse_depth: Image
     nearest: Image  # largest inverse depth of 3x3 pixels
-    centre_map: Array
+    center_map: Array
 
 
 class FreeSpace:
@@ -41,7 +41,7 @@ class FreeSpace:
         self._views: list[_View] = []
 
     def add(self, depth_m: Image, T_map_camera: Array) -> None:
-        """Take a view. depth_m: [h, w], metres, 0 = unknown or masked."""
+        """Take a view. depth_m: [h, w], meters, 0 = unknown or masked."""
         if self.config.enabled:
             self._views.append(self._view(depth_m, T_map_camera))
 
@@ -75,19 +75,19 @@ class FreeSpace:
         for _ in range(self.config.halvings):
             level = level.halved()
         small = level.inverse_depth
-        centre = np.zeros(3)
+        center = np.zeros(3)
         v, u = np.nonzero(small)
         if len(v):
-            centre = np.median(_points(self._small, u, v, 1 / small[v, u].astype(np.float64)), axis=0)
+            center = np.median(_points(self._small, u, v, 1 / small[v, u].astype(np.float64)), axis=0)
         T = np.array(T_map_camera, dtype=np.float64)
-        return _View(T, small, largest_of_3x3(small), se3.transform(T, centre[None])[0])
+        return _View(T, small, largest_of_3x3(small), se3.transform(T, center[None])[0])
 
     def _nearest(self, view: _View) -> list[_View]:
         """The views that look at the nearest places, itself excepted."""
         others = [o for o in self._views if not np.array_equal(o.T_map_camera, view.T_map_camera)]
         if len(others) <= self.config.views:
             return others
-        distance = np.linalg.norm(np.array([o.centre_map for o in others]) - view.centre_map, axis=1)
+        distance = np.linalg.norm(np.array([o.center_map for o in others]) - view.center_map, axis=1)
         return [others[k] for k in np.argsort(distance, kind="stable")[: self.config.views]]
 
     def _regions(self, found: Mask) -> Mask:
@@ -133,7 +133,7 @@ def _points(camera: PinholeCamera, u: NDArray[np.int64], v: NDArray[np.int64], z
 
 
 def largest_of_3x3(image: Image) -> Image:
-    """Maximum over every pixel's 3x3 neighbourhood."""
+    """Maximum over every pixel's 3x3 neighborhood."""
     padded = np.pad(image, 1)
     rows = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
     return np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])

@@ -30,8 +30,8 @@ class Places:
         """
         # what all features have in common tells no places apart
         total = sum((d.sum(axis=0, dtype=np.int64) for d in views), np.zeros(DIMENSIONS, dtype=np.int64))
-        centre = np.rint(total / max(sum(map(len, views)), 1)).astype(np.float32)
-        self._has = np.stack([_words(d.astype(np.float32) - centre) for d in views])
+        center = np.rint(total / max(sum(map(len, views)), 1)).astype(np.float32)
+        self._has = np.stack([_words(d.astype(np.float32) - center) for d in views])
 
     def alike(self, view: int, among: int, most: int) -> list[int]:
         """Those of the first `among` views that share most words with a view; at most so many, ascending.
@@ -45,12 +45,12 @@ class Places:
         return sorted(np.argsort(-score, kind="stable")[:most].tolist())
 
 
-def _words(centred: NDArray[np.float32]) -> NDArray[np.float32]:
+def _words(centered: NDArray[np.float32]) -> NDArray[np.float32]:
     """Which words descriptors [n, 128] have, [TABLES * WORDS], 0 or 1."""
     has = np.zeros((TABLES, WORDS), dtype=np.float32)
-    if len(centred):
+    if len(centered):
         for table, directions in enumerate(_DIRECTIONS):
-            along = centred @ directions
+            along = centered @ directions
             nearest = np.abs(along).argmax(axis=1)
             positive = along[np.arange(len(along)), nearest] > 0
             has[table, 2 * nearest + positive] = 1

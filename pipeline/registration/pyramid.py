@@ -1,4 +1,4 @@
-"""Image pyramids of an RGB-D frame: grey value, inverse depth, their gradients and surface normals.
+"""Image pyramids of an RGB-D frame: gray value, inverse depth, their gradients and surface normals.
 
 Depth is kept as inverse depth (1/m, 0 = unknown) because the inverse depth of a plane is affine in the pixel
 coordinates: averages over a block, bilinear interpolation and finite differences are then exact on planes.
@@ -17,8 +17,8 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 
 Image = NDArray[np.floating]
 
-GREY_OF_RGB = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601 luma
-SAME_SURFACE = np.float32(0.05)  # relative difference of depth up to which neighbours count as one surface
+GRAY_OF_RGB = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # ITU-R BT.601 luma
+SAME_SURFACE = np.float32(0.05)  # relative difference of depth up to which neighbors count as one surface
 NORMAL_WINDOWS = (5, 3)  # pixels; the smaller one is used where the larger touches an edge or a hole
 
 
@@ -39,7 +39,7 @@ class Level:
 
     @cached_property
     def gradients(self) -> tuple[Image, Image]:
-        """Derivatives of the grey value by u and v, 1/px, [h, w] each; zero on the border."""
+        """Derivatives of the gray value by u and v, 1/px, [h, w] each; zero on the border."""
         gu, gv = np.zeros_like(self.gray), np.zeros_like(self.gray)
         gu[:, 1:-1] = 0.5 * (self.gray[:, 2:] - self.gray[:, :-2])
         gv[1:-1] = 0.5 * (self.gray[2:] - self.gray[:-2])
@@ -47,7 +47,7 @@ class Level:
 
     @cached_property
     def channels(self) -> Image:
-        """(grey, d/du, d/dv, inverse depth or NaN, and sigma where known) for interpolation, [h * w, 4 or 5].
+        """(gray, d/du, d/dv, inverse depth or NaN, and sigma where known) for interpolation, [h * w, 4 or 5].
 
         NaN makes every value that touches an unknown depth unknown, and fails every gate.
         """
@@ -80,9 +80,9 @@ class Level:
     def halved(self) -> Level:
         """The next coarser level: blocks of 2x2 pixels become one.
 
-        The grey value is the mean. The inverse depth is the mean over the nearest surface in the block (members
+        The gray value is the mean. The inverse depth is the mean over the nearest surface in the block (members
         within 5 % of the nearest pixel), unknown if fewer than two pixels show it; sigma is their mean too, as errors
-        of neighbours are much the same.
+        of neighbors are much the same.
         """
         camera = self.camera.halved()
         blocks = _blocks(self.inverse_depth, camera)
@@ -106,13 +106,13 @@ class RgbdPyramid:
     levels: tuple[Level, ...]
 
     def without_depth(self) -> RgbdPyramid:
-        """The grey values alone, of a frame without a depth image."""
+        """The gray values alone, of a frame without a depth image."""
         return self._changed(
             lambda level: Level(level.camera, level.gray, np.zeros_like(level.inverse_depth), has_depth=False)
         )
 
     def with_exposure(self, gain: float, offset: float) -> RgbdPyramid:
-        """The same with grey values gain * grey + offset."""
+        """The same with gray values gain * gray + offset."""
         g, o = np.float32(gain), np.float32(offset)
         return self._changed(lambda level: replace(level, gray=g * level.gray + o))
 
@@ -130,13 +130,13 @@ class RgbdPyramid:
         """Build the pyramid of a frame.
 
         Args:
-            image: colour float32 [h, w, 3] or grey [h, w], 0..1.
-            depth_m: float32 [h, w], metres along z; 0, negative or not finite means unknown.
+            image: color float32 [h, w, 3] or gray [h, w], 0..1.
+            depth_m: float32 [h, w], meters along z; 0, negative or not finite means unknown.
             camera: intrinsics of both images.
             levels: number of resolutions.
-            depth_sigma_m: [h, w], metres; None: not known pixel by pixel.
+            depth_sigma_m: [h, w], meters; None: not known pixel by pixel.
         """
-        gray = image @ GREY_OF_RGB if image.ndim == 3 else np.asarray(image, dtype=np.float32)
+        gray = image @ GRAY_OF_RGB if image.ndim == 3 else np.asarray(image, dtype=np.float32)
         shape = (camera.height, camera.width)
         if gray.shape != shape or depth_m.shape != shape:
             raise ValueError(f"images of {gray.shape} and {depth_m.shape}, camera of {shape}")
@@ -160,7 +160,7 @@ def _fit_planes(values: Image, window: int) -> tuple[NDArray, NDArray, NDArray, 
     """Least-squares plane of `values` in a square window around every pixel.
 
     Returns:
-        Slopes along u and v (per px), value at the centre, and where the window has no unknown value and no step.
+        Slopes along u and v (per px), value at the center, and where the window has no unknown value and no step.
     """
     import cv2
 

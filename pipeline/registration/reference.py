@@ -20,8 +20,8 @@ MARGIN = 2  # pixels at the border that are not sampled
 class ReferenceLevel:
     """Samples for one pyramid level.
 
-    points: float32 [n, 3], metres, reference camera frame. normals: float32 [n, 3], unit length, same frame.
-    intensities: float32 [n], grey value 0..1 of that level's image at the sample. depth_sigmas: float32 [n], metres;
+    points: float32 [n, 3], meters, reference camera frame. normals: float32 [n, 3], unit length, same frame.
+    intensities: float32 [n], gray value 0..1 of that level's image at the sample. depth_sigmas: float32 [n], meters;
     None: not known sample by sample.
     """
 
@@ -56,7 +56,7 @@ class Reference:
     def sample(pyramid: RgbdPyramid, count: int = 2000) -> Reference:
         """At most about `count` samples, the same points and normals at every level, for sending to another robot.
 
-        Two thirds are the pixels of strongest grey gradient in the tiles of a grid, one third is spread evenly
+        Two thirds are the pixels of strongest gray gradient in the tiles of a grid, one third is spread evenly
         over a coarser grid, so that weakly textured surfaces still hold the geometry. No random draws.
         """
         finest = pyramid.levels[0]
@@ -65,7 +65,7 @@ class Reference:
         strength = np.where(known, np.sqrt(gu * gu + gv * gv), np.float32(-1))
         textured = round(count * GRADIENT_SHARE)
         chosen = np.union1d(
-            _strongest_of_tiles(strength, textured), _centres_of_tiles(known, count - textured)
+            _strongest_of_tiles(strength, textured), _centers_of_tiles(known, count - textured)
         )
         v, u = np.divmod(chosen, finest.camera.width)
         samples = _samples(finest, v, u)
@@ -117,8 +117,8 @@ def _strongest_of_tiles(score: Samples, count: int) -> NDArray[np.int64]:
     return index[tiles, best][values[tiles, best] >= 0]
 
 
-def _centres_of_tiles(known: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
-    """Flat index of the known pixel nearest to the centre of every tile that has one."""
+def _centers_of_tiles(known: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
+    """Flat index of the known pixel nearest to the center of every tile that has one."""
     values, side, index = _tiles(np.where(known, np.float32(0), np.float32(-1)), count)
     offset = np.arange(side) - (side - 1) / 2
     distance = (offset[:, None] ** 2 + offset**2).ravel()

@@ -1,9 +1,9 @@
-"""The residuals of a registration at one pose: point-to-plane distances and grey differences with their weights.
+"""The residuals of a registration at one pose: point-to-plane distances and gray differences with their weights.
 
 For a sample p (reference frame) with normal n and intensity I, seen by the target at q = T_reference_target^-1 p,
 
     depth residual   r_d = m . (x z(u) - q),             m = R^T n, u = project(q), x the ray and z the depth there
-    grey residual    r_g = gray(u) - (gain I + offset)   gain, offset: affine brightness between the views
+    gray residual    r_g = gray(u) - (gain I + offset)   gain, offset: affine brightness between the views
 
 are each divided by their noise and weighted by Huber's function at a scale from the median absolute deviation.
 """
@@ -59,7 +59,7 @@ class Residuals:
 
 
 @dataclass(frozen=True)
-class Linearisation:
+class Linearization:
     """Residuals at one pose and level, and what was seen of the samples."""
 
     depth: Residuals
@@ -77,14 +77,14 @@ class Linearisation:
         return H_depth + H_gray, g_depth + g_gray
 
 
-def linearise_at(
+def linearize_at(
     reference: Reference,
     pyramid: RgbdPyramid,
     index: int,
     T_reference_target: Array,
     exposure: Array,
     config: RegistrationConfig,
-) -> Linearisation:
+) -> Linearization:
     """Residuals of all samples of level `index` at one pose. Samples without a partner have none."""
     samples, level = reference.levels[index], pyramid.levels[index]
     camera = level.camera
@@ -132,7 +132,7 @@ def linearise_at(
     floor = max(config.gray_sigma_floor, config.gray_sigma_of_depth * depth.scale)
     images = gray, gu, gv
     photometric = _gray_residuals(camera, images, intensities, q, exposure, floor, (u, v), config)
-    return Linearisation(
+    return Linearization(
         depth.nothing() if config.residuals == "gray" else depth,
         photometric.nothing() if config.residuals == "depth" else photometric,
         overlap=len(agreeing) / max(total, 1),
@@ -145,7 +145,7 @@ def linearise_at(
 
 
 def _interpolate(level: Level, u: Floats, v: Floats) -> tuple[Floats, ...]:
-    """Grey value, its two derivatives, inverse depth (NaN where unknown) and sigma if known, at pixels inside."""
+    """Gray value, its two derivatives, inverse depth (NaN where unknown) and sigma if known, at pixels inside."""
     width = level.camera.width
     u0, v0 = u.astype(np.int32), v.astype(np.int32)
     a, b = (u - u0)[:, None], (v - v0)[:, None]
@@ -171,7 +171,7 @@ def _normals_agree(
 
 
 def _depth_sigma(z: Floats, config: RegistrationConfig) -> Floats:
-    """Noise of a depth z, metres, up to the scale that is estimated."""
+    """Noise of a depth z, meters, up to the scale that is estimated."""
     base, slope = np.float32(config.depth_sigma_base_m), np.float32(config.depth_sigma_slope_per_m)
     return base + slope * (z - np.float32(0.4)) ** 2
 
@@ -203,7 +203,7 @@ def _gray_residuals(
     pixels: tuple[Floats, Floats],
     config: RegistrationConfig,
 ) -> Residuals:
-    """Grey difference; dq = -v - w x q, so the derivative is -d by v and -(q x d) by w with d = d gray / d q."""
+    """Gray difference; dq = -v - w x q, so the derivative is -d by v and -(q x d) by w with d = d gray / d q."""
     gray, gu, gv = images
     if config.min_gradient > 0:
         keep = np.flatnonzero(gu * gu + gv * gv >= np.float32(config.min_gradient) ** 2)

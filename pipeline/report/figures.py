@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
-# Okabe-Ito: told apart with every common colour blindness; dark enough on white.
+# Okabe-Ito: told apart with every common color blindness; dark enough on white.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F6000", "#444444")
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 INK, FAINT, GRID = "#22303c", "#6b7a87", "#e3e8ec"
@@ -43,7 +43,7 @@ _STYLE: dict[Any, Any] = {
 
 
 def color_of(index: int) -> str:
-    """Colour of the robot (or other series) number `index`."""
+    """Color of the robot (or other series) number `index`."""
     return COLORS[index % len(COLORS)]
 
 
@@ -88,10 +88,10 @@ def _legend_above(axes: Any, entries: int) -> None:
 
 @_styled
 def top_view(ways: Sequence[Mapping[str, Any]]) -> Figure:
-    """Ways seen from above, metres.
+    """Ways seen from above, meters.
 
     Args:
-        ways: per robot "robot", "index" (which gives the colour), "before", "after" and "true" [n, 2] in metres; "true"
+        ways: per robot "robot", "index" (which gives the color), "before", "after" and "true" [n, 2] in meters; "true"
             may be None.
     """
     drawn = np.concatenate([way["after"] for way in ways])
@@ -114,8 +114,8 @@ def top_view(ways: Sequence[Mapping[str, Any]]) -> Figure:
     axes.plot([], [], linestyle="none", marker="o", color=INK, label="start")
     axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("metres")
-    axes.set_ylabel("metres")
+    axes.set_xlabel("meters")
+    axes.set_ylabel("meters")
     return figure
 
 
@@ -187,7 +187,7 @@ def stacked(x: Array, parts: Mapping[str, Array], x_label: str, y_label: str) ->
 
 @_styled
 def bars(names: Sequence[str], parts: Mapping[str, Sequence[float]], x_label: str) -> Figure:
-    """Horizontal stacked bars: one bar per name, one colour per part."""
+    """Horizontal stacked bars: one bar per name, one color per part."""
     from matplotlib.ticker import MaxNLocator
 
     figure, axes = _figure(5.4, 1.1 + 0.34 * max(1, len(names)))
@@ -206,7 +206,7 @@ def bars(names: Sequence[str], parts: Mapping[str, Sequence[float]], x_label: st
 
 @_styled
 def reliability(bins: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:
-    """Predicted against observed error per decile, millimetres, both axes logarithmic; the diagonal is right."""
+    """Predicted against observed error per decile, millimeters, both axes logarithmic; the diagonal is right."""
     from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
     figure, axes = _figure(5.4, 4.0)

@@ -21,13 +21,13 @@ def bytes_text(count: float) -> str:
     return f"{count:.0f} B" if float(count).is_integer() else f"{count:.1f} B"
 
 
-def metres_text(value_m: float) -> str:
-    """Metres, or millimetres below a tenth of a metre."""
+def meters_text(value_m: float) -> str:
+    """Meters, or millimeters below a tenth of a meter."""
     if abs(value_m) < 0.1:
-        millimetres = 1e3 * abs(value_m)
-        if 0.0 < millimetres < 1e-3:
+        millimeters = 1e3 * abs(value_m)
+        if 0.0 < millimeters < 1e-3:
             return "< 0.001 mm"
-        return f"{1e3 * value_m:.1f} mm" if millimetres >= 1.0 else f"{1e3 * value_m:.3g} mm"
+        return f"{1e3 * value_m:.1f} mm" if millimeters >= 1.0 else f"{1e3 * value_m:.3g} mm"
     return f"{value_m:.3f} m"
 
 
@@ -41,7 +41,7 @@ def text(name: str, value: Any) -> str:
         return value
     unit = unit_of(name)
     if unit == "m":
-        return metres_text(value)
+        return meters_text(value)
     if unit == "rad":
         return f"{np.degrees(value):.3g}°"
     if unit == "B":
@@ -62,7 +62,7 @@ TEAM = {
     "ate_rmse_m_mean_of_robots": ("Mean robot ATE", "each robot aligned by itself: blind to errors between robots"),
     "robots": ("Robots", "robots in this run"),
     "robots_in_largest_component": ("Largest component", "robots that agree on one common world"),
-    "inter_robot_closures": ("Closures between robots", "places that two robots recognised, counted in the end"),
+    "inter_robot_closures": ("Closures between robots", "places that two robots recognized, counted in the end"),
     "inter_robot_closures_rejected": ("Closures rejected", "measured, then refused by geometry or outvoted"),
 }  # fmt: skip
 
@@ -95,7 +95,7 @@ VIEW_SETS = {
 }  # fmt: skip
 
 COMPARISON = {
-    "psnr_db": ("PSNR", "likeness of colours; what a map does not cover is black and counts"),
+    "psnr_db": ("PSNR", "likeness of colors; what a map does not cover is black and counts"),
     "depth_l1_common_m": ("Depth L1", "mean depth error over pixels that own, fused and refined map cover"),
     "depth_l1_layer_m": ("one layer", "the same over what the map itself covers, drawn as one surface"),
     "depth_completeness": ("Covered", "share of recorded depth pixels that the map covers"),
@@ -103,7 +103,7 @@ COMPARISON = {
 
 RENDERING = {
     "views": ("Views", "rendered and compared with the image taken there"),
-    "psnr_db": ("PSNR", "likeness of colours; higher is better"),
+    "psnr_db": ("PSNR", "likeness of colors; higher is better"),
     "ssim": ("SSIM", "likeness of structure at one scale; 1 is equal"),
     "ms_ssim": ("MS-SSIM", "likeness of structure over five scales; 1 is equal, always kinder than SSIM"),
     "lpips": ("LPIPS", "perceptual distance by a trained network"),
@@ -134,10 +134,10 @@ CONSENSUS = {
     "solver": ("Solver", "how the robots reach agreement"),
     "converged": ("Converged", "every robot agreed with its component before the last allowed round"),
     "rounds_to_tolerance": ("Rounds to tolerance", "until no pose moved by more than the tolerance"),
-    "gap_to_oracle_sigma": ("Gap to oracle, Gaussians", "largest difference from the centralised answer"),
+    "gap_to_oracle_sigma": ("Gap to oracle, Gaussians", "largest difference from the centralized answer"),
     "gap_to_oracle_sigma_p99": ("Gap to oracle, 99 %", "of the matched Gaussians differ by less"),
-    "gap_to_oracle_m": ("Gap to oracle, position", "largest difference of a keyframe from the centralised answer"),
-    "gap_to_oracle_rad": ("Gap to oracle, rotation", "largest turn of a keyframe from the centralised answer"),
+    "gap_to_oracle_m": ("Gap to oracle, position", "largest difference of a keyframe from the centralized answer"),
+    "gap_to_oracle_rad": ("Gap to oracle, rotation", "largest turn of a keyframe from the centralized answer"),
 }  # fmt: skip
 
 CALIBRATION = {

@@ -114,7 +114,7 @@ def _cameras(metrics: dict[str, Any]) -> list[str]:
             )
             said.append(
                 f"By the robots' own estimate {name}'s camera has {gains} times the red, green and blue of the first "
-                "robot's; peers' views are compared in the colours of the camera that took them."
+                "robot's; peers' views are compared in the colors of the camera that took them."
             )
     return said
 
@@ -263,7 +263,7 @@ def _agreement_content(session: Session, metrics: dict[str, Any], reasons: dict[
         }
         for title, name, level in (
             ("Largest change of a pose in a round", "change", tolerance),
-            ("Largest disagreement between neighbours (primal residual)", "primal", None),
+            ("Largest disagreement between neighbors (primal residual)", "primal", None),
         )
         if series[name]
     ]
@@ -319,9 +319,9 @@ def _uncertainty_lead(run: RunFolder) -> str:
     if not kinds:
         return "The fused maps carry no information about their Gaussians."
     return (
-        "Fused maps coloured by the predicted standard deviation of each Gaussian's centre "
+        "Fused maps colored by the predicted standard deviation of each Gaussian's center "
         f"({', '.join(sorted(kinds))} Fisher information, poses held "
-        "fixed); grey where some direction is not determined by any view."
+        "fixed); gray where some direction is not determined by any view."
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[Any]
-NOTHING = (236, 239, 242)  # where there is no value: the light grey of the page
+NOTHING = (236, 239, 242)  # where there is no value: the light gray of the page
 
 
 def svg_uri(svg: str) -> str:
@@ -31,14 +31,14 @@ def jpeg_uri(rgb: Image, width: int) -> str:
 
 
 def to_uint8(color: Image) -> NDArray[np.uint8]:
-    """8-bit RGB of colours in 0..1, clamped."""
+    """8-bit RGB of colors in 0..1, clamped."""
     return np.rint(np.clip(color, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def colored(
     values: Image, low: float, high: float, valid: Image, palette: str = "viridis"
 ) -> NDArray[np.uint8]:
-    """8-bit RGB [h, w, 3] of a scalar image [h, w]: `low` to `high` over a palette, grey where not valid."""
+    """8-bit RGB [h, w, 3] of a scalar image [h, w]: `low` to `high` over a palette, gray where not valid."""
     import matplotlib as mpl
 
     span = high - low if high > low else 1.0
@@ -55,7 +55,7 @@ def scale_uri(palette: str) -> str:
 
 
 def color_by(values: Image, low: float, high: float, palette: str = "viridis") -> NDArray[np.float32]:
-    """Colours float32 [n, 3] in 0..1 of scalars [n], clamped to `low`..`high`."""
+    """Colors float32 [n, 3] in 0..1 of scalars [n], clamped to `low`..`high`."""
     import matplotlib as mpl
 
     unit = np.clip((values - low) / (high - low if high > low else 1.0), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""The pictures of a report: maps rendered beside the images of some views, and coloured by their uncertainty."""
+"""The pictures of a report: maps rendered beside the images of some views, and colored by their uncertainty."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ VIEWS_PER_ROBOT = 2
 COLOR_ERROR_END = 0.3
 DEPTH_ERROR_END_M = 0.05
 NO_EXACT = Absent("not needed for a picture")
-UNDETERMINED_GREY = 0.75
+UNDETERMINED_GRAY = 0.75
 
 
 def rendered_views(run: RunFolder, source: Recording) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Renders beside images, and the fused map coloured by its uncertainty, for a few held-out views per robot, and
+    """Renders beside images, and the fused map colored by its uncertainty, for a few held-out views per robot, and
     beside the image of a peer."""
     from duagc.pipeline.kernels import Rasterizer
 
@@ -67,7 +67,7 @@ def _own_views(
 def _peer_views(
     robot: RobotRun, peer: RobotRun, log: RgbdLog, rasterizer: Rasterizer
 ) -> Iterator[dict[str, Any]]:
-    """The robot's maps at a frame of a peer, in the colours of the peer's camera."""
+    """The robot's maps at a frame of a peer, in the colors of the peer's camera."""
     alike = peer_colors(robot.folder / "fused.mcap", robot.robot).get(peer.robot)
     poses = poses_by_stamp(peer.trajectory)
     kind, final = _final(robot)
@@ -127,7 +127,7 @@ def _view(
         *((f"{kind} map", pictures.to_uint8(renders[kind].color)) for kind in kinds),
         ("recorded depth", depth_picture(frame.depth)),
         *((f"depth, {kind} map", depth_picture(depths[kind])) for kind in kinds),
-        (f"colour error, {kinds[-1]} map", color_error_picture(renders[kinds[-1]])),
+        (f"color error, {kinds[-1]} map", color_error_picture(renders[kinds[-1]])),
         *((f"depth error, {kind} map", depth_error_picture(depths[kind])) for kind in kinds),
     ]
     return {
@@ -137,14 +137,14 @@ def _view(
         "scales": [
             _scale("viridis", f"{low:.2f} m", f"{high:.2f} m", "depth"),
             _scale("magma", "0", f"{1e3 * DEPTH_ERROR_END_M:.0f} mm and more", "depth error"),
-            _scale("magma", "0", f"{COLOR_ERROR_END:g} of white and more", "colour error"),
+            _scale("magma", "0", f"{COLOR_ERROR_END:g} of white and more", "color error"),
         ],
     }
 
 
 def _view_numbers(render: Render, frame: RgbdFrame) -> str:
     score = score_view(render, frame.color, frame.depth, NO_EXACT)
-    depth = labels.NONE if isinstance(score.depth_l1_m, Absent) else labels.metres_text(score.depth_l1_m)
+    depth = labels.NONE if isinstance(score.depth_l1_m, Absent) else labels.meters_text(score.depth_l1_m)
     return f"{score.psnr_db:.1f} dB, depth {depth}"
 
 
@@ -173,15 +173,15 @@ def _information_view(
         shown.append({"caption": "uncertainty", "uri": _uri(pictures.to_uint8(render.color))})
     scale = _scale(
         "plasma",
-        labels.metres_text(low_m),
-        labels.metres_text(high_m),
-        "standard deviation of a centre, log scale",
+        labels.meters_text(low_m),
+        labels.meters_text(high_m),
+        "standard deviation of a center, log scale",
     )
     return {"pictures": shown, "scales": [scale]}
 
 
 def position_sigma_m(geometry: NDArray[np.float32]) -> Array:
-    """Standard deviation of every centre, metres [n]: sqrt trace F^-1; infinite where a direction is not determined."""
+    """Standard deviation of every center, meters [n]: sqrt trace F^-1; infinite where a direction is not determined."""
     F = position_information(geometry)
     values = np.linalg.eigvalsh(F) if len(F) else np.zeros((0, 3))
     determined = (values[:, 0] > 0) & (values[:, 2] < 1e12 * values[:, 0])
@@ -191,9 +191,9 @@ def position_sigma_m(geometry: NDArray[np.float32]) -> Array:
 
 
 def sigma_colors(sigma_m: Array) -> tuple[NDArray[np.float32], float, float]:
-    """Colours [n, 3] on a logarithmic scale over the middle 90 %, grey where infinite, and the ends of the scale."""
+    """Colors [n, 3] on a logarithmic scale over the middle 90 %, gray where infinite, and the ends of the scale."""
     known = np.isfinite(sigma_m)
-    colors = np.full((len(sigma_m), 3), UNDETERMINED_GREY, dtype=np.float32)
+    colors = np.full((len(sigma_m), 3), UNDETERMINED_GRAY, dtype=np.float32)
     if not known.any():
         return colors, 1.0, 1.0
     low, high = np.percentile(np.log10(sigma_m[known]), [5, 95])

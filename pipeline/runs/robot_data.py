@@ -56,7 +56,7 @@ class RobotData:
 
     T_map_keyframe: [n, 4, 4] by keyframe index. odometry: from the keyframe that each was tracked against, refined,
     with its marginal information. registrations: the measurements behind it, independent of each other. images: gives
-    colour uint8 RGB [h, w, 3] and depth float32 [h, w] (m, 0 = unknown) of a keyframe. information: of the Gaussians,
+    color uint8 RGB [h, w, 3] and depth float32 [h, w] (m, 0 = unknown) of a keyframe. information: of the Gaussians,
     in the map frame, by the same ids. depth: of a Gaussian at a pixel, as the map was made.
     """
 

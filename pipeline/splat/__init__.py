@@ -1,1 +1,1 @@
-"""Gaussians and what one does with them: files, losses, optimisation."""
+"""Gaussians and what one does with them: files, losses, optimization."""

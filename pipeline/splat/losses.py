@@ -1,6 +1,6 @@
 """Losses between a render and an RGB-D image, with their cotangents, and the image metrics of the evaluation.
 
-Colours are float32 RGB in 0..1 [H, W, 3], depths float32 metres [H, W] with 0 = not measured. The rasterizer's
+Colors are float32 RGB in 0..1 [H, W, 3], depths float32 meters [H, W] with 0 = not measured. The rasterizer's
 depth is blended, D = sum(w z), and its alpha is A = sum(w); the depth residual used here is D - A z_measured: the
 blended depth against the measured one weighted by the opacity. It is zero exactly when D / A is the measured depth,
 has no division by a small A, and its gradient neither rewards nor punishes opacity as such.
@@ -64,11 +64,11 @@ def rgbd_loss(
     mask: NDArray[np.bool_] | None = None,
     certainty: Image | None = None,
 ) -> Loss:
-    """Robust colour and depth loss of one view.
+    """Robust color and depth loss of one view.
 
     Args:
         render: what the rasterizer drew.
-        color: measured colour, compared with exp(a) * rendered + b.
+        color: measured color, compared with exp(a) * rendered + b.
         depth_m: measured depth, 0 where there is none.
         config: weights and Huber widths.
         exposure: (a, b) of this image: log gain and offset.
@@ -118,7 +118,7 @@ def rgbd_loss(
 def depth_certainty(depth_sigma_m: Image, huber_m: float) -> Image:
     """Factor [H, W] of depth residuals with a standard deviation [H, W] each: min(1, huber_m / sigma), 1 where unknown.
 
-    Up to the Huber width a residual counts in metres, as without a sigma; a less certain one in units of its sigma,
+    Up to the Huber width a residual counts in meters, as without a sigma; a less certain one in units of its sigma,
     so that it turns linear where that many sigmas are.
     """
     least = np.maximum(depth_sigma_m, np.float32(huber_m))
@@ -126,7 +126,7 @@ def depth_certainty(depth_sigma_m: Image, huber_m: float) -> Image:
 
 
 def psnr(rendered: NDArray, reference: NDArray, mask: NDArray[np.bool_] | None = None) -> float:
-    """Peak signal-to-noise ratio in dB of colours in 0..1, the render clipped to that range first.
+    """Peak signal-to-noise ratio in dB of colors in 0..1, the render clipped to that range first.
 
     mask [H, W] selects the pixels that count. Equal images give infinity.
     """
@@ -173,7 +173,7 @@ def _clipped(rendered: NDArray, reference: NDArray) -> tuple[NDArray[np.float64]
 
 
 def ssim(rendered: NDArray, reference: NDArray) -> float:
-    """Single-scale SSIM of colours [H, W, 3] in 0..1, the mean over channels and window positions.
+    """Single-scale SSIM of colors [H, W, 3] in 0..1, the mean over channels and window positions.
 
     11x11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, no padding. Source: Wang, Bovik, Sheikh,
     Simoncelli, IEEE TIP 2004.
@@ -211,9 +211,9 @@ def halve(image: NDArray) -> NDArray:
 
 
 def depth_error(render: Rendered, depth_m: Image, min_alpha: float = 0.5) -> tuple[float, float]:
-    """Depth L1 in metres over measured pixels that the map covers, and the share that it covers.
+    """Depth L1 in meters over measured pixels that the map covers, and the share that it covers.
 
-    The rendered depth is normalised, D / A, and counts where A >= min_alpha. NaN if nothing is covered.
+    The rendered depth is normalized, D / A, and counts where A >= min_alpha. NaN if nothing is covered.
     """
     measured = depth_m > 0
     covered = measured & (render.alpha >= min_alpha)

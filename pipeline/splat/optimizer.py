@@ -82,14 +82,14 @@ class Adam:
         self._steps = self._steps[index]
 
     def extend(self, n: int) -> None:
-        """Add n Gaussians at the end that were never optimised."""
+        """Add n Gaussians at the end that were never optimized."""
         new = _zeros(n)
         self._first = {name: np.concatenate([moments, new[name]]) for name, moments in self._first.items()}
         self._second = {name: np.concatenate([moments, new[name]]) for name, moments in self._second.items()}
         self._steps = np.concatenate([self._steps, np.zeros(n, np.int32)])
 
     def step(self, gaussians: Gaussians, gradients: GaussianGradients, rates: LearningRates) -> Gaussians:
-        """The Gaussians after one step; those without any gradient of colour or opacity are untouched.
+        """The Gaussians after one step; those without any gradient of color or opacity are untouched.
 
         Source: Kingma and Ba, ICLR 2015, algorithm 1, with beta_2 = 0.99 (few steps per Gaussian).
         """

@@ -1,8 +1,8 @@
 """Gaussians as an INRIA-style .ply, the file that every splat viewer reads.
 
 binary_little_endian 1.0, one `element vertex N`, all `property float`, in this order: x y z nx ny nz f_dc_0..2
-opacity scale_0..2 rot_0..3 (degree 0: no f_rest). Scales are logarithms of metres, opacity is a logit, rot is a
-unit quaternion wxyz, colour = 0.5 + 0.28209479 f_dc, normals are zero; x right, y down, z forward, metres, in the
+opacity scale_0..2 rot_0..3 (degree 0: no f_rest). Scales are logarithms of meters, opacity is a logit, rot is a
+unit quaternion wxyz, color = 0.5 + 0.28209479 f_dc, normals are zero; x right, y down, z forward, meters, in the
 frame of the Gaussians that were given. ids and anchors are not part of the format.
 """
 
@@ -74,7 +74,7 @@ def read_ply(path: str | Path) -> Gaussians:
     if len(table) and np.abs(norms - 1.0).max() > 1e-3:
         raise DuagError(f"{path.name}: rot_0..3 has length {norms.min():.3g}..{norms.max():.3g}, expected 1")
     if len(table) and table[:, 10:13].max() > np.log(1e4):
-        raise DuagError(f"{path.name}: scale_0..2 reach {table[:, 10:13].max():.3g}, expected log of metres")
+        raise DuagError(f"{path.name}: scale_0..2 reach {table[:, 10:13].max():.3g}, expected log of meters")
     return Gaussians(
         ids=np.arange(len(table), dtype=np.int64),
         anchors=np.zeros(len(table), np.int32),

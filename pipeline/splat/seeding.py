@@ -1,6 +1,6 @@
 """New Gaussians from one RGB-D image: flat, footprint-sized discs where the map does not explain what was seen.
 
-The image is cut into square cells of a quadtree: a cell with detail in colour, or with more than one surface, is
+The image is cut into square cells of a quadtree: a cell with detail in color, or with more than one surface, is
 split down to the finest size. Each remaining cell becomes one disc on the surface.
 """
 
@@ -29,7 +29,7 @@ def unexplained(
     config: SeedingConfig,
     depth_sigma_m: Image | None = None,
 ) -> NDArray[np.bool_]:
-    """Measured pixels [H, W] whose opacity, depth or colour the rendered map does not explain.
+    """Measured pixels [H, W] whose opacity, depth or color the rendered map does not explain.
 
     depth_sigma_m: where known, depth within three of these is explained.
     """
@@ -48,7 +48,7 @@ def unexplained(
 def worst_drawn(
     render: Rendered, color: Image, depth_m: Image, count: int, config: SeedingConfig
 ) -> NDArray[np.bool_]:
-    """Pixels [H, W] of the `count` finest cells with the largest squared colour error, of those measured throughout."""
+    """Pixels [H, W] of the `count` finest cells with the largest squared color error, of those measured throughout."""
     side = config.cell_sizes_px[-1]
     h, w = (length // side for length in depth_m.shape)
 
@@ -73,7 +73,7 @@ def _mean_of_channels(rgb: NDArray) -> NDArray:
 
 @dataclass(frozen=True)
 class Cells:
-    """Leaves of the quadtree: pixel centre uv [n, 2], side [n] px, depth [n] m, colour [n, 3], detail [n]."""
+    """Leaves of the quadtree: pixel center uv [n, 2], side [n] px, depth [n] m, color [n, 3], detail [n]."""
 
     uv: NDArray[np.float64]
     side_px: NDArray[np.float64]
@@ -95,7 +95,7 @@ def seed_discs(
     """At most `budget` discs for the wanted pixels, in the map frame.
 
     Args:
-        color, depth_m: the image, RGB 0..1 [H, W, 3] and metres [H, W].
+        color, depth_m: the image, RGB 0..1 [H, W, 3] and meters [H, W].
         wanted: pixels [H, W] to be explained.
         T_map_camera: pose of the camera.
         first_id: ids count up from here, in the order of the cells (coarse to fine, row by row).
@@ -137,7 +137,7 @@ def quadtree(
 ) -> Cells:
     """Leaves that hold wanted pixels, at most `budget` of them.
 
-    A leaf takes part if at least half of its pixels are wanted; its depth, position and colour are means over its
+    A leaf takes part if at least half of its pixels are wanted; its depth, position and color are means over its
     wanted pixels within 5 % of the nearest one, so that a leaf on an edge belongs to the front surface. The detail
     threshold rises by steps of sqrt(2) until the leaves fit the budget; if the coarsest cells alone do not, every
     second, third, ... is taken.
@@ -172,7 +172,7 @@ class _Grid:
 
     side: int
     filled: NDArray[np.bool_]  # at least half of its pixels are wanted
-    detail: NDArray[np.float64]  # standard deviation of grey; infinite where two surfaces meet
+    detail: NDArray[np.float64]  # standard deviation of gray; infinite where two surfaces meet
     u: NDArray[np.float64]
     v: NDArray[np.float64]
     z: NDArray[np.float64]
@@ -205,9 +205,9 @@ def _grid(color: Image, depth_m: Image, wanted: NDArray[np.bool_], side: int) ->
     pixel = np.arange(side * side)[:, None]
     u = side * (cells % columns) + pixel % side
     v = side * (cells // columns) + pixel // side
-    grey = _mean_of_channels(rgb)
-    mean = (weight * grey).sum(axis=0)
-    detail = np.sqrt(np.maximum((weight * grey * grey).sum(axis=0) - mean * mean, 0.0))
+    gray = _mean_of_channels(rgb)
+    mean = (weight * gray).sum(axis=0)
+    detail = np.sqrt(np.maximum((weight * gray * gray).sum(axis=0) - mean * mean, 0.0))
 
     def everywhere(values: NDArray) -> NDArray[np.float64]:
         image = np.zeros((rows * columns, *values.shape[1:]))
@@ -245,7 +245,7 @@ def _leaves(grids: list[_Grid], threshold: float) -> list[NDArray[np.bool_]]:
 def surface_normals(
     depth_m: Image, cells: Cells, camera: PinholeCamera, radius_px: int = 4
 ) -> NDArray[np.float64]:
-    """Unit normals [n, 3] in the camera frame, facing the camera, at the cells' centres.
+    """Unit normals [n, 3] in the camera frame, facing the camera, at the cells' centers.
 
     A plane n . X = 1 has inverse depth 1 / z = n . ray, affine in the pixel: fit that affine function over the
     pixels of a (2 radius + 1)^2 window within 5 % of the cell's inverse depth. Where it is not determined the

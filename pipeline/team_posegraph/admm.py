@@ -10,19 +10,19 @@ from duagc.pipeline.consensus.pose_admm import PoseAgent
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses_in_parts
 from duagc.pipeline.network.packets import MAX_PAYLOAD_BYTES
 from duagc.pipeline.posegraph.loop_closures import holder
-from duagc.pipeline.team_posegraph.agent import GraphAgent, Neighbour
+from duagc.pipeline.team_posegraph.agent import GraphAgent, Neighbor
 
 Array = NDArray[np.float64]
-_STARTED = b"\0"  # told until all neighbours have said the same: poses sent before would be wasted
+_STARTED = b"\0"  # told until all neighbors have said the same: poses sent before would be wasted
 
 
 class AdmmAgent(GraphAgent):
-    """A robot that iterates with its neighbours until all of them hold still."""
+    """A robot that iterates with its neighbors until all of them hold still."""
 
     poses: PoseAgent
 
     def start(self) -> None:
-        self._started: set[int] = set()  # neighbours that were heard after their own start
+        self._started: set[int] = set()  # neighbors that were heard after their own start
         c = self.config.consensus
         self.poses = PoseAgent(
             self.graph.name,
@@ -33,7 +33,7 @@ class AdmmAgent(GraphAgent):
             keep_loops=self.keep_loops,
         )
         self.poses.set_frame(self.T_world_map[self.own])
-        for n in self.neighbours.values():
+        for n in self.neighbors.values():
             if holder(self.graph.name, n.name, n.closures) == self.graph.name:
                 assert n.told is not None
                 copies = self.T_world_map[n.index] @ n.told.T_map_keyframe
@@ -50,21 +50,21 @@ class AdmmAgent(GraphAgent):
             if self.first_round is None:
                 self.first_round = self.round
 
-    def states(self, neighbour: Neighbour) -> list[bytes]:
+    def states(self, neighbor: Neighbor) -> list[bytes]:
         if not self._everybody_started():
             return [_STARTED]
-        packet = self.poses.outgoing(neighbour.name)
-        return write_poses_in_parts(packet, MAX_PAYLOAD_BYTES, self.own < neighbour.index)
+        packet = self.poses.outgoing(neighbor.name)
+        return write_poses_in_parts(packet, MAX_PAYLOAD_BYTES, self.own < neighbor.index)
 
-    def take_state(self, neighbour: Neighbour, payload: bytes) -> None:
-        self._started.add(neighbour.index)
+    def take_state(self, neighbor: Neighbor, payload: bytes) -> None:
+        self._started.add(neighbor.index)
         if payload != _STARTED:
-            shared = self.poses.links[neighbour.name].keyframes
-            poses = read_poses(payload, shared, neighbour.index < self.own)
-            self.poses.receive(neighbour.name, poses)
+            shared = self.poses.links[neighbor.name].keyframes
+            poses = read_poses(payload, shared, neighbor.index < self.own)
+            self.poses.receive(neighbor.name, poses)
 
     def _everybody_started(self) -> bool:
-        return self._started == set(self.neighbours)
+        return self._started == set(self.neighbors)
 
     @property
     def T_world_keyframe(self) -> Array:  # noqa: N802 (a transform)
@@ -72,10 +72,10 @@ class AdmmAgent(GraphAgent):
 
     @property
     def settled(self) -> bool:
-        return bool(self.T_world_map) and (not self.neighbours or self.poses.agreed)
+        return bool(self.T_world_map) and (not self.neighbors or self.poses.agreed)
 
     def kept(self) -> tuple[Array, dict[str, Array]]:
-        if not self.T_world_map or not self.neighbours:
+        if not self.T_world_map or not self.neighbors:
             return super().kept()
         held = {peer: link.robust.weights for peer, link in self.poses.links.items() if link.holds}
         return self.poses.loop_weights.weights, held

@@ -2,8 +2,8 @@
 
 Before the iteration every robot solves its own graph in its own frame; then
 
-    1. rosters are flooded: who is neighbour of whom;
-    2. neighbours tell each other where the keyframes that their closures name lie in their own maps;
+    1. rosters are flooded: who is neighbor of whom;
+    2. neighbors tell each other where the keyframes that their closures name lie in their own maps;
     3. the lower name of a pair decides which closures agree (with robust weights; else all of them) on which relative
        frame, tells the other end, and floods the frame;
     4. who knows the frames of all pairs of its component chains them along the best supported tree, from the lowest
@@ -46,8 +46,8 @@ _UNLIMITED = 1 << 40  # bytes per round and link: what a solver sends is counted
 
 
 @dataclass
-class Neighbour:
-    """What a robot knows about one neighbour. closures: of the pair, from this robot's side."""
+class Neighbor:
+    """What a robot knows about one neighbor. closures: of the pair, from this robot's side."""
 
     name: str
     index: int
@@ -63,14 +63,14 @@ class Neighbour:
 
     @property
     def peer_keyframes(self) -> NDArray[np.int32]:
-        """The neighbour's keyframes that the closures name, ascending."""
+        """The neighbor's keyframes that the closures name, ascending."""
         return np.unique([c.peer_keyframe for c in self.closures]).astype(np.int32)
 
 
 class GraphAgent:
     """Set-up of one robot; a solver adds what follows it.
 
-    precision: of the keyframes that neighbours tell each other in the set-up.
+    precision: of the keyframes that neighbors tell each other in the set-up.
     """
 
     precision = "float32"
@@ -82,8 +82,8 @@ class GraphAgent:
         self.T_map_keyframe, self.keep_loops = own_start(
             graph.odometry, graph.loops, graph.keyframes, config.consensus
         )
-        self.neighbours = {
-            self.team.index(peer): Neighbour(
+        self.neighbors = {
+            self.team.index(peer): Neighbor(
                 peer,
                 self.team.index(peer),
                 Transport(self.own, self.team.index(peer), peer, _TRANSPORT, self._new_id),
@@ -118,7 +118,7 @@ class GraphAgent:
             self.advance()
         return [
             out
-            for n in self.neighbours.values()
+            for n in self.neighbors.values()
             for out in n.transport.burst(self.round, self._states(n), _UNLIMITED)
         ]
 
@@ -140,19 +140,19 @@ class GraphAgent:
         """One round of the solver."""
         raise NotImplementedError
 
-    def states(self, neighbour: Neighbour) -> list[bytes]:
-        """What the solver sends to a neighbour in this round, never again; at most one packet each."""
+    def states(self, neighbor: Neighbor) -> list[bytes]:
+        """What the solver sends to a neighbor in this round, never again; at most one packet each."""
         return []
 
-    def take_state(self, neighbour: Neighbour, payload: bytes) -> None:
-        """Use what a neighbour's solver sent in a round."""
+    def take_state(self, neighbor: Neighbor, payload: bytes) -> None:
+        """Use what a neighbor's solver sent in a round."""
 
-    def take_message(self, neighbour: Neighbour, code: int, payload: bytes) -> None:
-        """Use a message of a neighbour's solver."""
+    def take_message(self, neighbor: Neighbor, code: int, payload: bytes) -> None:
+        """Use a message of a neighbor's solver."""
         raise MalformedError(f"unknown message {code}")
 
     def kept(self) -> tuple[Array, dict[str, Array]]:
-        """Robust weights of own loops, and of the closures that this robot holds, by neighbour; before the start of the
+        """Robust weights of own loops, and of the closures that this robot holds, by neighbor; before the start of the
         solver none of these."""
         return self.keep_loops.astype(np.float64), {}
 
@@ -162,22 +162,22 @@ class GraphAgent:
         self._messages += 1
         return self._messages
 
-    def send(self, neighbours: Sequence[Neighbour], payload: bytes) -> None:
+    def send(self, neighbors: Sequence[Neighbor], payload: bytes) -> None:
         """Queue one reliable message."""
         message = Message(self._new_id(), Kind.POSE_GRAPH, payload)
-        for n in neighbours:
+        for n in neighbors:
             n.transport.send(message)
 
-    def _states(self, n: Neighbour) -> list[Message]:
+    def _states(self, n: Neighbor) -> list[Message]:
         payloads = self.states(n) if self.T_world_map else []
         if n.transport.last_heard is None and not payloads:
-            payloads = [b""]  # a beacon: nobody sends much to a neighbour that was never heard
+            payloads = [b""]  # a beacon: nobody sends much to a neighbor that was never heard
         return [Message(self._new_id(), Kind.STATE, payload) for payload in payloads]
 
     def _take(self, packet: Packet) -> None:
-        if packet.receiver != self.own or packet.sender not in self.neighbours:
-            raise MalformedError("not addressed to this robot, or from no neighbour")
-        n = self.neighbours[packet.sender]
+        if packet.receiver != self.own or packet.sender not in self.neighbors:
+            raise MalformedError("not addressed to this robot, or from no neighbor")
+        n = self.neighbors[packet.sender]
         arrival = n.transport.receive(packet, self.round)
         if arrival is None:
             return
@@ -189,7 +189,7 @@ class GraphAgent:
         else:
             raise MalformedError(f"{arrival.kind.name} is not for a pose graph")
 
-    def _handle(self, n: Neighbour, payload: bytes) -> None:
+    def _handle(self, n: Neighbor, payload: bytes) -> None:
         code = payload[0]
         if code == Code.ROSTER:
             roster = wire.read_roster(payload, len(self.team))
@@ -206,15 +206,15 @@ class GraphAgent:
         else:
             self.take_message(n, code, payload)
 
-    def _pass_on(self, source: Neighbour, payload: bytes) -> None:
-        self.send([n for n in self.neighbours.values() if n is not source], payload)
+    def _pass_on(self, source: Neighbor, payload: bytes) -> None:
+        self.send([n for n in self.neighbors.values() if n is not source], payload)
 
     # --- set-up
 
     def _begin(self) -> None:
-        mask = sum(1 << index for index in self.neighbours)
+        mask = sum(1 << index for index in self.neighbors)
         self._rosters[self.own] = Roster(self.own, mask)
-        everyone = list(self.neighbours.values())
+        everyone = list(self.neighbors.values())
         self.send(everyone, wire.write_roster(self._rosters[self.own]))
         self.drift = drift(self.graph.odometry, self.graph.keyframes, self.config.consensus.closures)
         for n in everyone:
@@ -224,13 +224,13 @@ class GraphAgent:
 
     def _set_up(self) -> None:
         """Decide on pairs of which this is the lower end; start once all is known."""
-        for n in self.neighbours.values():
+        for n in self.neighbors.values():
             if self.own < n.index and n.told is not None and n.keep is None:
                 self._decide(n, n.told)
         members = self._component()
-        if members is None or any(n.keep is None or n.told is None for n in self.neighbours.values()):
+        if members is None or any(n.keep is None or n.told is None for n in self.neighbors.values()):
             return
-        pairs = [(a, b) for a in members for b in members if a < b and self._rosters[a].neighbours >> b & 1]
+        pairs = [(a, b) for a in members for b in members if a < b and self._rosters[a].neighbors >> b & 1]
         if any(pair not in self._frames for pair in pairs):
             return
         self.T_world_map = self._chain(members, [self._frames[pair] for pair in pairs])
@@ -245,7 +245,7 @@ class GraphAgent:
             if not border <= set(self._rosters):
                 return None
             reached |= border
-            masks = [self._rosters[a].neighbours for a in border]
+            masks = [self._rosters[a].neighbors for a in border]
             border = {b for b in range(len(self.team)) if any(mask >> b & 1 for mask in masks)} - reached
         return sorted(reached)
 
@@ -257,15 +257,15 @@ class GraphAgent:
         chained = chain_frames(pairs, names)
         return {m: chained[self.team[m]] for m in members}
 
-    def peer_in_own_map(self, n: Neighbour) -> tuple[Array, Array]:
-        """What the neighbour told, by its keyframe index: T_map_keyframe in its map, and drift; zero where unnamed."""
+    def peer_in_own_map(self, n: Neighbor) -> tuple[Array, Array]:
+        """What the neighbor told, by its keyframe index: T_map_keyframe in its map, and drift; zero where unnamed."""
         assert n.told is not None
         size = int(n.told.keyframes[-1]) + 1
         T, grown = np.tile(np.eye(4), (size, 1, 1)), np.zeros((size, 2))
         T[n.told.keyframes], grown[n.told.keyframes] = n.told.T_map_keyframe, n.told.drift
         return T, grown
 
-    def _decide(self, n: Neighbour, told: NamedKeyframes) -> None:
+    def _decide(self, n: Neighbor, told: NamedKeyframes) -> None:
         """Which closures of a pair agree, and on which frame; tell the other end and everybody."""
         c = self.config.consensus
         T_peer, drift_peer = self.peer_in_own_map(n)
@@ -280,7 +280,7 @@ class GraphAgent:
             T = robust_frame(self.T_map_keyframe[i] @ T_own_peer @ se3.inverse(T_peer[j]), c.closures)
         payload = wire.write_frame(PairFrame(self.own, n.index, support, T))
         self._frames[self.own, n.index] = wire.read_frame(payload, len(self.team))  # as everybody reads it
-        self.send(list(self.neighbours.values()), payload)
+        self.send(list(self.neighbors.values()), payload)
         self.send([n], wire.write_verdict(n.keep))
 
     def _check_plausible(self) -> None:
@@ -288,7 +288,7 @@ class GraphAgent:
         if not self.config.consensus.robust:
             return
         T_own = self.T_world_map[self.own] @ self.T_map_keyframe
-        for n in self.neighbours.values():
+        for n in self.neighbors.values():
             T_peer, drift_peer = self.peer_in_own_map(n)
             T_peer = self.T_world_map[n.index] @ T_peer
             assert n.keep is not None

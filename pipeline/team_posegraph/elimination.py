@@ -15,13 +15,13 @@ from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph.files import RobotGraph
 from duagc.pipeline.posegraph.loop_closures import closure_factors, holder, spanning_tree
 from duagc.pipeline.posegraph.robust import RobustWeights
-from duagc.pipeline.team_posegraph.agent import GraphAgent, Neighbour
+from duagc.pipeline.team_posegraph.agent import GraphAgent, Neighbor
 
 Array = NDArray[np.float64]
 
 
 class EliminationAgent(GraphAgent):
-    """A node of the tree. Keyframes of neighbours are told exactly: copies must start where their owners are."""
+    """A node of the tree. Keyframes of neighbors are told exactly: copies must start where their owners are."""
 
     precision = "float64"
 
@@ -46,7 +46,7 @@ class EliminationAgent(GraphAgent):
         )
 
     def _graph(self) -> TreeGraph:
-        """Own keyframes, then copies by neighbour, and factors over them: as in edge-ADMM."""
+        """Own keyframes, then copies by neighbor, and factors over them: as in edge-ADMM."""
         c = self.config.consensus
         variables: list[Variable] = [(self.own, k) for k in range(self.graph.keyframes)]
         poses = [self.T_world_map[self.own] @ self.T_map_keyframe]
@@ -54,7 +54,7 @@ class EliminationAgent(GraphAgent):
         self._loop_weights = RobustWeights(self.keep_loops.astype(np.float64), c)
         doubted = [(self.graph.loops, self._loop_weights)]
         self._held: dict[str, RobustWeights] = {}
-        for n in self.neighbours.values():
+        for n in self.neighbors.values():
             if holder(self.graph.name, n.name, n.closures) != self.graph.name:
                 for k in n.own_keyframes.tolist():
                     masks[self.own, k] |= 1 << n.index
@@ -71,10 +71,10 @@ class EliminationAgent(GraphAgent):
         shared |= dict.fromkeys(variables[self.graph.keyframes :], 0)
         return TreeGraph(variables, np.concatenate(poses), shared, self.graph.odometry, doubted)
 
-    def take_message(self, neighbour: Neighbour, code: int, payload: bytes) -> None:
+    def take_message(self, neighbor: Neighbor, code: int, payload: bytes) -> None:
         if code not in list(elimination_wire.Code):
             raise MalformedError(f"unknown message {code}")
-        self._arrived.append((neighbour.index, payload))
+        self._arrived.append((neighbor.index, payload))
 
     def advance(self) -> None:
         assert self._node is not None
@@ -83,7 +83,7 @@ class EliminationAgent(GraphAgent):
         self._node.advance()
         for receiver, message in self._node.outbox:
             payload = elimination_wire.write_message(message, self.config.elimination_wire)
-            self.send([self.neighbours[receiver]], payload)
+            self.send([self.neighbors[receiver]], payload)
         self._node.outbox.clear()
 
     # --- results

@@ -1,7 +1,7 @@
 """The printed iteration (8), (10), (11), (14) on the wire, to compare with: not a solver to use.
 
 Every closure is a constraint with a multiplier at either end. Per round a robot takes one Riemannian gradient step
-with Armijo backtracking on its augmented Lagrangian, neighbours' poses held at what last arrived, sends its keyframes,
+with Armijo backtracking on its augmented Lagrangian, neighbors' poses held at what last arrived, sends its keyframes,
 and adds penalty times residual to its multipliers. As printed the residual vanishes only if the measurement is the
 identity; here it is that of the measured relative pose, whitened. Even so the multipliers grow until closures hold as
 if they were exact, so that noisy cycles have no fixed point and the limit, if any, is not the least-squares optimum.
@@ -19,7 +19,7 @@ from duagc.pipeline.network.packets import MAX_PAYLOAD_BYTES
 from duagc.pipeline.posegraph import factors as pose_factors
 from duagc.pipeline.posegraph.factors import Factors, retract
 from duagc.pipeline.posegraph.loop_closures import closure_factors
-from duagc.pipeline.team_posegraph.agent import GraphAgent, Neighbour
+from duagc.pipeline.team_posegraph.agent import GraphAgent, Neighbor
 
 Array = NDArray[np.float64]
 _ARMIJO = 1e-4
@@ -31,11 +31,11 @@ class PaperAgent(GraphAgent):
     """A robot with a multiplier per closure."""
 
     def start(self) -> None:
-        """Own keyframes, then what each neighbour told of its own."""
+        """Own keyframes, then what each neighbor told of its own."""
         poses = [self.T_world_map[self.own] @ self.T_map_keyframe]
         count, parts, c = self.graph.keyframes, [], self.config.consensus
         self._slots: dict[int, NDArray[np.int64]] = {}
-        for n in self.neighbours.values():
+        for n in self.neighbors.values():
             assert n.told is not None
             slots = self._slots[n.index] = count + np.arange(len(n.told.keyframes))
             copies = slots[np.searchsorted(n.told.keyframes, [k.peer_keyframe for k in n.closures])]
@@ -74,9 +74,9 @@ class PaperAgent(GraphAgent):
         return 0.5 * pose_factors.cost(self._own, x) + float((self._multipliers * r).sum()) + penalty
 
     def _gradient(self) -> Array:
-        """Of the Lagrangian by the own keyframes; zero for the neighbours'."""
+        """Of the Lagrangian by the own keyframes; zero for the neighbors'."""
         g, _ = pose_factors.gradient(self._own, np.ones(len(self._own)), self._x)
-        r, Ji, Jj = pose_factors.linearised(self._between, self._x)
+        r, Ji, Jj = pose_factors.linearized(self._between, self._x)
         pull = (self._multipliers + self.config.paper_penalty * r)[..., None]
         np.add.at(g, self._between.i, (np.swapaxes(Ji, -1, -2) @ pull)[..., 0])
         np.add.at(g, self._between.j, (np.swapaxes(Jj, -1, -2) @ pull)[..., 0])
@@ -85,8 +85,8 @@ class PaperAgent(GraphAgent):
 
     # --- packets
 
-    def states(self, neighbour: Neighbour) -> list[bytes]:
-        named = neighbour.own_keyframes
+    def states(self, neighbor: Neighbor) -> list[bytes]:
+        named = neighbor.own_keyframes
         T = self._x[named]
         self._sent += 1
         nothing = np.zeros(2, dtype=np.float32)
@@ -94,12 +94,12 @@ class PaperAgent(GraphAgent):
         packet = PosePacket(self._sent, 0, named, quats, t, nothing, None, self.settled)
         return write_poses_in_parts(packet, MAX_PAYLOAD_BYTES, decides=False)
 
-    def take_state(self, neighbour: Neighbour, payload: bytes) -> None:
-        packet = read_poses(payload, neighbour.peer_keyframes, from_decider=False)
-        if packet.sequence >= self._newest[neighbour.index]:
-            self._newest[neighbour.index] = packet.sequence
-            at = np.searchsorted(neighbour.peer_keyframes, packet.keyframes)
-            self._x[self._slots[neighbour.index][at]] = se3.from_quat_translation(
+    def take_state(self, neighbor: Neighbor, payload: bytes) -> None:
+        packet = read_poses(payload, neighbor.peer_keyframes, from_decider=False)
+        if packet.sequence >= self._newest[neighbor.index]:
+            self._newest[neighbor.index] = packet.sequence
+            at = np.searchsorted(neighbor.peer_keyframes, packet.keyframes)
+            self._x[self._slots[neighbor.index][at]] = se3.from_quat_translation(
                 packet.quats_wxyz, packet.translations
             )
 
@@ -114,7 +114,7 @@ class PaperAgent(GraphAgent):
         """The paper's primal residual is small, and so is the step."""
         if not self.T_world_map:
             return False
-        if not self.neighbours:
+        if not self.neighbors:
             return True
         raw = np.linalg.solve(
             self._between.whitening, pose_factors.residuals(self._between, self._x)[..., None]
@@ -124,5 +124,5 @@ class PaperAgent(GraphAgent):
     def kept(self) -> tuple[Array, dict[str, Array]]:
         """The printed iteration has no robust weights: everything counts."""
         return np.ones(len(self.graph.loops)), {
-            n.name: np.ones(len(n.closures)) for n in self.neighbours.values()
+            n.name: np.ones(len(n.closures)) for n in self.neighbors.values()
         }

@@ -1,6 +1,6 @@
 """`duagc posegraph`: let a team solve its graph, and compare with the graph solved in one place.
 
-The centralised optimum is computed here, for the comparison; no agent sees it, nor another robot's factors.
+The centralized optimum is computed here, for the comparison; no agent sees it, nor another robot's factors.
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ def _kept(component: _Component, agents: dict[str, GraphAgent]) -> NDArray[np.bo
     """Which doubtful factors count, in the order of the team's graph; closures that nobody holds yet do not."""
     members = [agents[name] for name in component.robots]
     pairs = [
-        (agent.graph.name, n.name, len(n.closures)) for agent in members for n in agent.neighbours.values()
+        (agent.graph.name, n.name, len(n.closures)) for agent in members for n in agent.neighbors.values()
     ]
     held = {(a, b): np.zeros(count) for a, b, count in pairs if a < b}
     loops = []
@@ -232,7 +232,7 @@ def _raw_bytes(members: list[GraphAgent]) -> int:
     """What it takes to send every robot's graph once to every other robot, each closure from one end."""
     total = 0
     for agent in members:
-        closures = sum(len(n.closures) for n in agent.neighbours.values() if agent.own < n.index)
+        closures = sum(len(n.closures) for n in agent.neighbors.values() if agent.own < n.index)
         share = RAW_FACTOR_BYTES * (len(agent.own_factors()) + closures)
         total += share + HEADER_BYTES * -(-share // MAX_PAYLOAD_BYTES)
     return total * (len(members) - 1)

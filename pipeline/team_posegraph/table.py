@@ -36,7 +36,7 @@ def format_result(result: dict[str, Any]) -> str:
 def _component(c: dict[str, Any]) -> list[str]:
     lines = [
         f"{'cost':<28}{c['cost']:.8g}",
-        f"{'centralised optimum':<28}{c['optimum']:.8g}  (gap {_gap(c['gap'])}, {c['distance_rms_m']:.2g} m rms)",
+        f"{'centralized optimum':<28}{c['optimum']:.8g}  (gap {_gap(c['gap'])}, {c['distance_rms_m']:.2g} m rms)",
         f"{'rounds':<28}{c['rounds']}"
         + (f"  in {c['exchanges']} exchanges" if c["exchanges"] is not None else ""),
     ]

@@ -19,18 +19,18 @@ Array = NDArray[np.float64]
 class Code(IntEnum):
     """First byte of a message of kind POSE_GRAPH."""
 
-    ROSTER = 1  # flooded: one robot's neighbours
-    KEYFRAMES = 2  # to a neighbour: own keyframes that the pair's closures name, in the own map
+    ROSTER = 1  # flooded: one robot's neighbors
+    KEYFRAMES = 2  # to a neighbor: own keyframes that the pair's closures name, in the own map
     VERDICT = 3  # lower to higher name: which closures the iteration starts with
     FRAME = 4  # flooded: relative frame of two robots and how many closures agree on it
 
 
 @dataclass(frozen=True)
 class Roster:
-    """One robot and a bit mask of its neighbours."""
+    """One robot and a bit mask of its neighbors."""
 
     robot: int
-    neighbours: int
+    neighbors: int
 
 
 @dataclass(frozen=True)
@@ -59,17 +59,17 @@ _FRAME = struct.Struct("<BHHI")
 
 def write_roster(roster: Roster) -> bytes:
     """Bytes of ROSTER."""
-    return _ROSTER.pack(Code.ROSTER, roster.robot, roster.neighbours)
+    return _ROSTER.pack(Code.ROSTER, roster.robot, roster.neighbors)
 
 
 def read_roster(data: bytes, team: int) -> Roster:
     """From ROSTER."""
     reader = Reader(data, "roster")
-    _, robot, neighbours = reader.fields(_ROSTER)
+    _, robot, neighbors = reader.fields(_ROSTER)
     reader.done()
-    if robot >= team or neighbours >> team or neighbours >> robot & 1:
-        raise MalformedError("roster: names a robot outside the team, or its own as neighbour")
-    return Roster(robot, neighbours)
+    if robot >= team or neighbors >> team or neighbors >> robot & 1:
+        raise MalformedError("roster: names a robot outside the team, or its own as neighbor")
+    return Roster(robot, neighbors)
 
 
 def write_keyframes(named: NamedKeyframes, precision: str) -> bytes:

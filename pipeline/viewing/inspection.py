@@ -73,7 +73,7 @@ class Inspector:
         if stands:
             m = stands[-1]
             facts |= {"members": list(m.members), "root": m.root, "joined_links": m.joined_links}
-            facts |= {"undecided_links": m.undecided_links, "parted_links": m.parted_links}
+            facts |= {"undecided_links": m.undecided_links, "revoked_links": m.revoked_links}
             facts |= {"evidence_owners": m.evidence_owners, "pair_lists": m.pair_lists}
             facts |= {"open_messages": m.open_messages, "packets_refused": m.packets_refused}
             facts |= {"agreed": m.agreed, "done": m.done}
@@ -86,7 +86,7 @@ class Inspector:
                 "dual": m.dual,
                 "cost": m.cost,
                 "step": m.step,
-                "settled": m.settled,
+                "converged": m.converged,
                 "links": {
                     link.peer: {
                         "penalty_translation": link.penalty_translation,
@@ -124,7 +124,7 @@ class Inspector:
         """Every candidate for a closure by the pair of robots, with what became of it and why."""
         out: Facts = {}
         for robot in self.run.robots:
-            for m in self._consensus(topics.CLOSURE_DECISION, robot):
+            for m in self._consensus(topics.LOOP_CLOSURE_DECISION, robot):
                 facts = {
                     "keyframes": f"{m.own_keyframe} and {m.peer_keyframe}",
                     "descriptors": m.score,
@@ -200,7 +200,7 @@ class Inspector:
     # --- one Gaussian
 
     def gaussian(self, robot: str, gaussian_id: int) -> Facts:
-        """One Gaussian of a robot's own map: its value, who matched it, how its evidence travelled, what fusion did.
+        """One Gaussian of a robot's own map: its value, who matched it, how its evidence traveled, what fusion did.
 
         Raises:
             DuagError: no such robot, or no such Gaussian in its map.

@@ -46,7 +46,7 @@ TIME, ROUND = (
 )  # timelines of a run: time of the recording, then of the session; rounds of the session
 LOG_TIME = "message_log_time"  # timeline that Rerun gives to a log
 VIEWER_MEMORY = "4GiB"
-LARGEST_LOG_SCALE = float(np.log(1e3))  # a kilometre: beyond it numbers overflow and the picture is the same
+LARGEST_LOG_SCALE = float(np.log(1e3))  # a kilometer: beyond it numbers overflow and the picture is the same
 
 
 def view(path: Path, save: Path | None = None, screenshot: Path | None = None) -> None:
@@ -219,8 +219,8 @@ def _log_keyframes(
                 ),
             )
             stream.log(f"{entity}/image", rr.Image(frame.color).compress(jpeg_quality=85))
-            millimetres = np.rint(np.minimum(frame.depth, 65.0) * 1000.0).astype(np.uint16)
-            stream.log(f"{entity}/depth", rr.DepthImage(millimetres, meter=1000.0))
+            millimeters = np.rint(np.minimum(frame.depth, 65.0) * 1000.0).astype(np.uint16)
+            stream.log(f"{entity}/depth", rr.DepthImage(millimeters, meter=1000.0))
     stream.reset_time()
 
 
@@ -314,11 +314,11 @@ def _blueprint(run: RunFolder) -> rrb.Blueprint:
                     *(
                         rrb.Spatial3DView(
                             origin=f"/{world}",
-                            contents=[*scene, f"/{world}/maps/{first}/{colouring}"],
+                            contents=[*scene, f"/{world}/maps/{first}/{coloring}"],
                             name=name,
                             eye_controls=eye,
                         )
-                        for colouring, name in (("fused", "Fused map"), ("uncertainty", "Uncertainty"))
+                        for coloring, name in (("fused", "Fused map"), ("uncertainty", "Uncertainty"))
                     )
                 ),
                 rrb.Vertical(*images),
@@ -348,7 +348,7 @@ def _closed_panels() -> list[Any]:
 def recording_to_rrd(logs: Sequence[Path], out: Path) -> Path:
     """Write logs as one .rrd file: what Rerun reads from MCAP by itself, and depth as depth images with their unit.
 
-    Rerun takes a depth image of Foxglove's schema for a grey image. Here its bytes become a depth image beside it.
+    Rerun takes a depth image of Foxglove's schema for a gray image. Here its bytes become a depth image beside it.
     """
     import rerun as rr
     from rerun.chunk import Chunk, DeriveLens, LazyChunkStream, McapReader
@@ -361,9 +361,9 @@ def recording_to_rrd(logs: Sequence[Path], out: Path) -> Path:
     for path in logs:
         with open_rgbd(path) as log:
             robots.append(log.robot)
-            topic, units_per_metre = topics.DEPTH.of(log.robot), 1.0 / log.depth_scale
+            topic, units_per_meter = topics.DEPTH.of(log.robot), 1.0 / log.depth_scale
         depth, rest = McapReader(path).stream().split(content=topic)
-        meter = Chunk.from_columns(topic, indexes=[], columns=rr.DepthImage.columns(meter=[units_per_metre]))
+        meter = Chunk.from_columns(topic, indexes=[], columns=rr.DepthImage.columns(meter=[units_per_meter]))
         streams += [
             depth.lenses(lenses, output_mode="forward_unmatched"),
             rest,
@@ -379,7 +379,7 @@ def recording_to_rrd(logs: Sequence[Path], out: Path) -> Path:
 
 
 def _recording_blueprint(robots: Sequence[str]) -> rrb.Blueprint:
-    """Colour, depth and points of every robot; the views name the frames of the log, which no entity path tells."""
+    """Color, depth and points of every robot; the views name the frames of the log, which no entity path tells."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -391,7 +391,7 @@ def _recording_blueprint(robots: Sequence[str]) -> rrb.Blueprint:
         rows.append(
             rrb.Horizontal(
                 rrb.Spatial2DView(
-                    origin=color, contents=[color], name=f"{robot}: colour", spatial_information=image_plane
+                    origin=color, contents=[color], name=f"{robot}: color", spatial_information=image_plane
                 ),
                 rrb.Spatial2DView(
                     origin=depth, contents=[depth], name=f"{robot}: depth", spatial_information=image_plane

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from duagc.converters.datasets.seven_scenes import Options
-from duagc.converters.simulate.noise import grey_noise, kinect_depth
+from duagc.converters.simulate.noise import gray_noise, kinect_depth
 from duagc.converters.simulate.stages import Stage, set_up
 from duagc.pipeline.base import determinism, random_streams
 from duagc.pipeline.camera_calibration.rig import DEPTH, NAMES, ROTATION
@@ -34,7 +34,7 @@ WIDE = PinholeCamera(840, 640, 610.0, 610.0, 419.5, 319.5)  # sees what the lens
 
 
 def rays_of_the_lens() -> np.ndarray:
-    """Directions (x, y) [480, 640, 2] of the pixels of the true colour camera."""
+    """Directions (x, y) [480, 640, 2] of the pixels of the true color camera."""
     u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
     K = np.array([[TRUE["fx"], 0, TRUE["cx"]], [0, TRUE["fy"], TRUE["cy"]], [0, 0, 1]])
     lens = np.array([TRUE["k1"], TRUE["k2"], 0, 0, TRUE["k3"]])
@@ -65,7 +65,7 @@ def write_sequence(folder: Path, stage: Stage) -> np.ndarray:
         velocity = se3.log(se3.inverse(way[before]) @ way[after]) * 30 / (after - before)
         rng = random_streams.generator(0, "test.recovery", frame=k)
         color = color_eye.render(T @ se3.exp(TRUE["delay_s"] * velocity) @ turned).color
-        color = grey_noise(cv2.remap(color, columns, rows, cv2.INTER_LINEAR), rng)
+        color = gray_noise(cv2.remap(color, columns, rows, cv2.INTER_LINEAR), rng)
         depth = kinect_depth(measured(depth_eye.render(T).depth), DEPTH_CAMERA, rng)
         stem = folder / f"frame-{k:06d}"
         cv2.imwrite(f"{stem}.color.png", color[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
@@ -82,22 +82,22 @@ def command(*arguments: object) -> str:
 
 
 def errors(folder: Path, stage: Stage, way: np.ndarray) -> tuple[float, float]:
-    """Median errors of a recording's depth (m) and grey values, against what its camera would have seen."""
-    depths, greys = [], []
+    """Median errors of a recording's depth (m) and gray values, against what its camera would have seen."""
+    depths, grays = [], []
     with open_rgbd(Recording(folder).log("alpha")) as log:
         eye = stage.eye(log.camera)
         for k in range(0, FRAMES, EVERY):
             frame, exact = log.frame(k), eye.render(way[k] @ T_DEPTH_COLOR)
             known = (frame.depth > 0) & (exact.depth > 0)
             depths.append(np.median(np.abs(frame.depth - exact.depth)[known]))
-            greys.append(np.abs(frame.color.astype(float) - exact.color)[20:-20, 20:-20].mean())
-    return float(np.median(depths)), float(np.median(greys))
+            grays.append(np.abs(frame.color.astype(float) - exact.color)[20:-20, 20:-20].mean())
+    return float(np.median(depths)), float(np.median(grays))
 
 
 @pytest.mark.slow
 def test_cameras_that_were_put_wrong_are_found_and_put_right(tmp_path: Path) -> None:
     """Within four standard deviations as the command states them; the corrected recording is nearer to the truth."""
-    determinism.settle_opencv()
+    determinism.configure_opencv()
     with tempfile.TemporaryDirectory() as cache:
         stage = set_up("room", "auto", 0, Path(cache), as_meshes=False)
         way = write_sequence(tmp_path / "walk", stage)
@@ -108,8 +108,8 @@ def test_cameras_that_were_put_wrong_are_found_and_put_right(tmp_path: Path) -> 
             value, sigma = (found["values"][name][key] for key in ("value", "sigma"))
             assert abs(value - TRUE[name]) < 4 * sigma, (name, value, sigma)
         command("convert", "7scenes", tmp_path / "walk", "--options", file, "--out", tmp_path / "right")
-        depth, grey = errors(tmp_path / "right", stage, way)
-        depth_before, grey_before = errors(tmp_path / "raw", stage, way)
-        print(f"depth {1e3 * depth_before:.1f} -> {1e3 * depth:.1f} mm, grey {grey_before:.2f} -> {grey:.2f}")
+        depth, gray = errors(tmp_path / "right", stage, way)
+        depth_before, gray_before = errors(tmp_path / "raw", stage, way)
+        print(f"depth {1e3 * depth_before:.1f} -> {1e3 * depth:.1f} mm, gray {gray_before:.2f} -> {gray:.2f}")
         assert depth < 0.4 * depth_before
-        assert grey < 0.4 * grey_before
+        assert gray < 0.4 * gray_before

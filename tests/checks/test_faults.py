@@ -111,7 +111,7 @@ def swapped(**names: str) -> Change:
 
 
 def stuck(records: list[Record]) -> Iterator[tuple[Record, Any, int]]:
-    """Ten colour images in a row are the same."""
+    """Ten color images in a row are the same."""
     colors = [record for record in records if record.topic == COLOR]
     for record, message, publish_ns in nothing(records):
         if record.topic == COLOR and colors[5].log_time_ns < record.log_time_ns < colors[15].log_time_ns:
@@ -166,8 +166,8 @@ FAULTS: dict[str, tuple[Change, dict[str, Any], str, str]] = {
     "scale x5, no truth": (nothing, {"scale": 5, "truth": False}, "warning", "depth scale"),
     "late depth": (late_depth, {}, "warning", "depth in time"),
     "unregistered depth": (unregistered, {}, "warning", "depth in place"),
-    "red and blue": (blue, {"alone": False}, "warning", "colour order"),
-    "centre swapped": (swapped(cx="cy", cy="cx"), {}, "warning", "intrinsics"),
+    "red and blue": (blue, {"alone": False}, "warning", "color order"),
+    "center swapped": (swapped(cx="cy", cy="cx"), {}, "warning", "intrinsics"),
     "size for focal length": (swapped(fx="height"), {}, "warning", "intrinsics"),
     "stuck": (stuck, {}, "warning", "repeats"),
     "times twice": (twice, {}, "warning", "times"),

@@ -44,8 +44,8 @@ def test_the_consistent_group_is_found_among_outliers():
     found = consistent(closures, own, peer, grown, grown, CONFIG)
     np.testing.assert_array_equal(found.keep, truth)
     assert found.support == 8
-    metres, radians = se3.distance(found.T_ownmap_peermap, T_own_peer)
-    assert metres < 0.02
+    meters, radians = se3.distance(found.T_ownmap_peermap, T_own_peer)
+    assert meters < 0.02
     assert radians < 0.01
     assert [reason == "consistent" for reason in found.reasons] == truth.tolist()
 
@@ -71,7 +71,7 @@ def test_one_closure_alone_is_not_enough():
 
 
 def test_long_odometry_between_closures_forgives_more():
-    """The same disagreement is an outlier between neighbours and drift between far keyframes."""
+    """The same disagreement is an outlier between neighbors and drift between far keyframes."""
     own = np.tile(np.eye(4), (101, 1, 1))
     offset = se3.exp(np.array([0.1, 0, 0, 0, 0, 0]))
     near = [Closure(0, 0, np.eye(4), 1e6 * np.eye(6)), Closure(0, 1, offset, 1e6 * np.eye(6))]
@@ -105,8 +105,8 @@ def test_robust_frame_ignores_a_minority():
     T = random_poses(rng, 1)[0]
     good = T @ se3.exp(0.01 * rng.normal(size=(20, 6)))
     frame = robust_frame(np.concatenate([random_poses(rng, 12, 3.0), good]), CONFIG)
-    metres, radians = se3.distance(frame, T)
-    assert metres < 0.02
+    meters, radians = se3.distance(frame, T)
+    assert meters < 0.02
     assert radians < 0.02
 
 

@@ -58,7 +58,7 @@ def test_fronts_take_the_step_of_the_whole_graph(tree, damping):
         fronts[a] = Front(variables, {c: shared[c] for c in children}, shared[a])
         gradient, jacobians = pose_factors.gradient(own, np.ones(len(own)), T[poses])
         H_own = damped(own, jacobians, len(poses), damping, 0 if a == 0 else None)
-        H[a] = fronts[a].factorise(H_own, {c: H[c] for c in children})
+        H[a] = fronts[a].factorize(H_own, {c: H[c] for c in children})
         g[a] = fronts[a].eliminate(gradient, {c: g[c] for c in children})
     assert shared[0] == []
     steps = np.full((len(T), 6), np.nan)

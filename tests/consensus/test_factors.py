@@ -23,7 +23,7 @@ def scattered(seed, n=6, m=9):
 
 def test_derivatives_match_finite_differences():
     factors, poses = scattered(0)
-    _, Ji, Jj = pose_factors.linearised(factors, poses)
+    _, Ji, Jj = pose_factors.linearized(factors, poses)
     h = 1e-6  # central differences: error h^2 and 1e-16 / h, relative to residuals of about 1e2
     for k in range(6):
         for J, ends in ((Ji, factors.i), (Jj, factors.j)):

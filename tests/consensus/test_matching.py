@@ -59,7 +59,7 @@ def test_matches_do_not_depend_on_the_order_of_rows_or_on_the_world():
     np.testing.assert_array_equal(match(a.in_world(T), b.in_world(T), CONFIG), pairs)
 
 
-def test_matches_do_not_depend_on_how_a_camera_sees_colours():
+def test_matches_do_not_depend_on_how_a_camera_sees_colors():
     """As a bravo whose every channel is darker and whose black is not black; compared as if alike, half is lost."""
     a, b = (
         replace(e, information=np.ones((len(e), 31))) for e in (surface("alpha", 9), surface("bravo", 10))

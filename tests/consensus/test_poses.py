@@ -1,4 +1,4 @@
-"""Pose consensus against the centralised optimum: losses, gauge, handshake, robust weights, replay."""
+"""Pose consensus against the centralized optimum: losses, gauge, handshake, robust weights, replay."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ FINE = PLAIN.model_copy(update={"wire": "float64", "tolerance": 1e-9})
 
 
 def assert_same_poses(actual, expected, atol):
-    """Equal up to the gauge, translations in metres and rotation entries alike."""
+    """Equal up to the gauge, translations in meters and rotation entries alike."""
     np.testing.assert_allclose(from_first(actual), from_first(expected), atol=atol)
 
 
@@ -65,7 +65,7 @@ def test_a_team_agrees_however_far_away_its_world_has_its_origin():
     assert_same_poses(team_poses(agents), best.poses, atol=5e-6)
 
 
-def test_a_neighbour_that_hears_nothing_does_not_make_an_end_hold_still():
+def test_a_neighbor_that_hears_nothing_does_not_make_an_end_hold_still():
     """It says nearly the same again and again; a few such arrivals change little, and mean nothing."""
     agents = make_team(1, robots=2).agents(PLAIN)
     deaf, other = agents["alpha"], agents["bravo"]
@@ -149,8 +149,8 @@ def test_a_cut_link_leaves_both_ends_near_their_odometry():
     assert talk(agents, 30, loss=1.0) == 30
     assert not any(agent.agreed or agent.settled for agent in agents.values())
     for r, agent in agents.items():
-        metres, _ = se3.distance(agent.T_world_keyframe, start[r])
-        assert metres.max() < 0.5
+        meters, _ = se3.distance(agent.T_world_keyframe, start[r])
+        assert meters.max() < 0.5
 
 
 def test_penalties_agree_once_packets_pass():
@@ -231,7 +231,7 @@ def test_graduated_weights_go_from_convex_to_truncated():
 
 
 def test_overconfident_odometry_does_not_freeze_the_team():
-    """Floors bound every claim: odometry that claims micrometres still yields to closures."""
+    """Floors bound every claim: odometry that claims micrometers still yields to closures."""
     world = make_team(16, robots=2)
     sure = {r: Factors(f.i, f.j, f.T_i_j, 1e6 * f.information) for r, f in world.odometry.items()}
     config = PoseConsensusConfig()
@@ -261,7 +261,7 @@ def test_links_are_checked():
         PoseAgent("bravo", world.maps["bravo"], world.odometry["bravo"], PLAIN).add_link("alpha", blind)
 
 
-def test_records_name_every_neighbour():
+def test_records_name_every_neighbor():
     world = make_team(18, robots=3)
     agents = world.agents(PoseConsensusConfig(closures=ClosureConfig(min_support=1)))
     talk(agents, 20)

@@ -24,10 +24,10 @@ EXACT = ClosureConfig(sigma_floor_m=0, sigma_floor_rad=0, min_support=1, frame_s
 POSE_GRAPHS = Path(__file__).resolve().parents[3] / "shared" / "data" / "pose_graphs"
 
 
-def random_poses(rng: np.random.Generator, n: int, metres: float = 1.0) -> Array:
+def random_poses(rng: np.random.Generator, n: int, meters: float = 1.0) -> Array:
     """Poses [n, 4, 4] with any rotation."""
     quats = rng.normal(size=(n, 4))
-    return se3.from_quat_translation(quats, metres * rng.normal(size=(n, 3)))
+    return se3.from_quat_translation(quats, meters * rng.normal(size=(n, 3)))
 
 
 def random_information(rng: np.random.Generator, n: int) -> Array:
@@ -82,7 +82,7 @@ class TeamWorld:
 def make_team(
     seed: int, robots: int = 3, keyframes: int = 8, closures: int = 3, ring: bool = False
 ) -> TeamWorld:
-    """Robots on one looping path, with noise of centimetres, each map in an arbitrary frame of its own."""
+    """Robots on one looping path, with noise of centimeters, each map in an arbitrary frame of its own."""
     rng = np.random.default_rng(seed)
     names = ["alpha", "bravo", "charlie", "delta", "echo"][:robots]
     truth = {name: random_poses(rng, keyframes) for name in names}

@@ -14,7 +14,7 @@ HALF_M = np.array([4.0, 3.0, 2.5])
 def render(
     camera: PinholeCamera, T_world_camera: np.ndarray, distortion: tuple[float, ...] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colour uint8 [H, W, 3] and exact z-depth (m) [H, W] as a camera with this distortion sees the room."""
+    """Color uint8 [H, W, 3] and exact z-depth (m) [H, W] as a camera with this distortion sees the room."""
     u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
     K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     points = np.stack([u, v], -1).reshape(-1, 1, 2)

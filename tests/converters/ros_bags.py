@@ -118,13 +118,13 @@ class Ros:
             self._fill(bag, rows, self.store.serialize_cdr)
         return out
 
-    def _fill(self, bag: Any, rows: list[tuple[str, int, Any]], serialise: Callable[..., Any]) -> None:
+    def _fill(self, bag: Any, rows: list[tuple[str, int, Any]], serialize: Callable[..., Any]) -> None:
         connections: dict[tuple[str, str], Any] = {}
         for topic, log_ns, message in rows:
             kind = message.__msgtype__
             if (topic, kind) not in connections:
                 connections[topic, kind] = bag.add_connection(topic, kind, typestore=self.store)
-            bag.write(connections[topic, kind], log_ns, serialise(message, kind))
+            bag.write(connections[topic, kind], log_ns, serialize(message, kind))
 
 
 def scene(
@@ -133,7 +133,7 @@ def scene(
     late_ns: int = 3_000_000,
     poses: list[np.ndarray] | None = None,
 ) -> list[tuple[str, int, Any]]:
-    """Distorted colour, depth of its own camera a little later, CameraInfo once, static tf, odometry of the base."""
+    """Distorted color, depth of its own camera a little later, CameraInfo once, static tf, odometry of the base."""
     T_base_color = se3.from_rotation_translation(so3.exp([-1.2, 1.2, -1.2]), [0.1, 0.0, 0.3])
     frames = f"{prefix.strip('/')}_color", f"{prefix.strip('/')}_depth", f"{prefix.strip('/')}_base"
     rows: list[tuple[str, int, Any]] = [

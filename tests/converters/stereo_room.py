@@ -27,7 +27,7 @@ def cast(origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def _texture() -> np.ndarray:
-    """Grey bitmap of noise at several scales, 8 m on a side."""
+    """Gray bitmap of noise at several scales, 8 m on a side."""
     draw, size = np.random.default_rng(3), 8 * TEXELS_PER_M
     image = np.zeros((size, size), np.float32)
     for coarse, weight in ((1, 0.5), (2, 1.0), (4, 1.5), (12, 2.0), (40, 2.0)):
@@ -52,7 +52,7 @@ def rays_of(camera: PinholeCamera, distortion: tuple[float, ...] = ()) -> np.nda
 def render(
     camera: PinholeCamera, T_world_camera: np.ndarray, distortion: tuple[float, ...] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colour uint8 [h, w, 3] and exact z-depth [h, w] in metres."""
+    """Color uint8 [h, w, 3] and exact z-depth [h, w] in meters."""
     rays = rays_of(camera, distortion) @ T_world_camera[:3, :3].T
     depth, side = cast(T_world_camera[:3, 3], rays)
     hit = T_world_camera[:3, 3] + rays * depth[..., None]

@@ -45,7 +45,7 @@ def test_topics_rates_and_choices_are_shown(tmp_path: Path) -> None:
     robot = content["robots"]["alpha"]
     assert robot["problem"] is None
     assert robot["frames"] == FRAMES
-    assert robot["depth"] == "moved into the colour camera"
+    assert robot["depth"] == "moved into the color camera"
     assert robot["choices"]["color_info"]["topic"] == "/camera/color/camera_info"
     assert robot["choices"]["depth"]["why"] == "the only images that are depth"
     assert robot["others"]["imu"] == ["/imu/data"]
@@ -133,7 +133,7 @@ def test_what_is_not_decided_lists_its_candidates(tmp_path: Path) -> None:
         ("", r"found no \[robots.NAME\]"),
         ("[robots]\n", r"found no \[robots.NAME\]"),
         ("x = ", "not valid TOML"),
-        ('colour = "/a"\n[robots.a]\nlogs = ["a.mcap"]\n', "colour is no option; expected perhaps color"),
+        ('color = "/a"\n[robots.a]\nlogs = ["a.mcap"]\n', "color is no option; expected perhaps color"),
         (
             '[robots.a]\nlogs = ["a.mcap"]\ndept = "/a"\n',
             r"\[robots.a\] dept is no option; expected perhaps depth",
@@ -239,7 +239,7 @@ def test_depth_that_is_aligned_goes_before_raw_depth(tmp_path: Path) -> None:
     assert robot["choices"]["depth"]["topic"] == "/camera/aligned_depth_to_color/image_raw"
     assert robot["choices"]["depth_info"]["topic"] == "/camera/aligned_depth_to_color/camera_info"
     assert robot["choices"]["color"]["topic"] == "/camera/color/image_raw"
-    assert robot["depth"] == "registered to colour already"
+    assert robot["depth"] == "registered to color already"
     assert robot["problem"] is None
 
 

@@ -250,7 +250,7 @@ def test_times_of_publication(tmp_path: Path) -> None:
 
 
 def test_compressed_images_of_foxglove(tmp_path: Path) -> None:
-    """JPEG colour keeps its bytes; a gray PNG of 16 bits is depth, whatever its format says."""
+    """JPEG color keeps its bytes; a gray PNG of 16 bits is depth, whatever its format says."""
     r, rows = Ros(2), []
     jpegs = []
     for topic, ns, m in scene(r):
@@ -432,7 +432,7 @@ KITCHEN = Path(__file__).parents[3] / "shared" / "data" / "redkitchen"
 
 @pytest.mark.skipif(not KITCHEN.is_dir(), reason="the real images are not there")
 def test_real_images_in_a_log_are_those_of_the_dataset(tmp_path: Path) -> None:
-    """RedKitchen as a log of Foxglove's: the same colours, and depth as 7-Scenes' own converter registers it."""
+    """RedKitchen as a log of Foxglove's: the same colors, and depth as 7-Scenes' own converter registers it."""
     color = PinholeCamera(640, 480, 525, 525, 320, 237.8)
     depth = PinholeCamera(640, 480, 585, 585, 320, 240)
     r, start = Ros(2), 10**18
@@ -494,7 +494,7 @@ def test_broken_json_of_ros_is_one_line(change: Callable[[dict[str, Any]], Any],
 
 
 def test_webp_comes_out_as_png(tmp_path: Path) -> None:
-    """Colour as WebP without loss gives the pixels; one that is cut short is left out and told."""
+    """Color as WebP without loss gives the pixels; one that is cut short is left out and told."""
     r, rows, pixels = Ros(2), [], []
     for topic, ns, m in scene(r):
         if topic.endswith("color/image_raw"):
@@ -515,7 +515,7 @@ def test_webp_comes_out_as_png(tmp_path: Path) -> None:
         assert len(found) == len(kept)
         assert all(np.array_equal(f.color, p) for f, p in zip(found.frames(), kept, strict=True))
     warnings = json.loads((tmp_path / "rec" / "recording.json").read_text())["warnings"]
-    assert any("1 frames have colour or depth that is cut short" in text for text in warnings)
+    assert any("1 frames have color or depth that is cut short" in text for text in warnings)
 
 
 @pytest.mark.parametrize("others", [True, False])

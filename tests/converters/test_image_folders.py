@@ -80,7 +80,7 @@ def make_tum_files(
     distortion: tuple[float, ...],
     marker_of: Callable[[np.ndarray], np.ndarray] = lambda T: T,
 ) -> Path:
-    """Six colour images at 30 Hz, depth 15 ms later; the last depth is 50 ms late; poses at 100 Hz."""
+    """Six color images at 30 Hz, depth 15 ms later; the last depth is 50 ms late; poses at 100 Hz."""
     start = 1305031452.0
     rgb, depth = ["# color images", "# file: 'x.bag'", "# timestamp filename"], ["# depth maps", "#", "#"]
     for i in range(6):
@@ -225,7 +225,7 @@ def test_what_is_in_the_recording_is_what_was_rendered(made: dict[str, tuple[Pat
 
 @pytest.mark.parametrize("name", ["replica", "replica-multiagent", "icl-nuim", "scannetpp"])
 def test_lossless_is_lossless(made: dict[str, tuple[Path, Path]], name: str) -> None:
-    """Where nothing has to be resampled, colour is the file's bytes and depth its numbers."""
+    """Where nothing has to be resampled, color is the file's bytes and depth its numbers."""
     src, recording = made[name]
     color_file = sorted([*src.rglob("frame*.jpg"), *src.rglob("rgb/*.png"), *src.rglob("*.JPG")])[0]
     depth_file = sorted([*src.rglob("depth0*.png"), *src.rglob("depth/*.png"), *src.rglob("*depths/*.png")])[
@@ -245,7 +245,7 @@ def test_times_and_warnings(made: dict[str, tuple[Path, Path]]) -> None:
     with open_rgbd(made["tum"][1] / "alpha.mcap") as log:
         assert len(log) == 5
         assert log.frame(1).stamp_ns == 33_333_000
-    assert "1 of 6 colour images have no depth" in told("tum")
+    assert "1 of 6 color images have no depth" in told("tum")
     assert "1 lines of groundtruth.txt hold no pose" in told("tum")
     with open_rgbd(made["scannet"][1] / "alpha.mcap") as log:
         assert log.frame(3).stamp_ns == 10 * 10**9 // 30

@@ -25,7 +25,7 @@ from tests.converters.ros_bags import Ros, odometry
 
 COLOR = PinholeCamera(160, 120, 95.0, 95.2, 80.4, 59.1)
 INFRA = PinholeCamera(160, 120, 94.3073, 94.37165, 81.588, 59.915)  # the dataset's, at a quarter of its size
-DISTORTION = (-0.055, 0.066, -0.0004, 0.0007, -0.021)  # of a D455's colour camera
+DISTORTION = (-0.055, 0.066, -0.0004, 0.0007, -0.021)  # of a D455's color camera
 START_NS = 1_665_777_600_123_456_789
 STEP_NS = 400_000_000
 FRAMES = 3
@@ -178,7 +178,7 @@ def test_frames_and_poses_are_those_of_the_fixture(recording: Path, robot: str) 
             assert np.percentile(error, 95) < 0.01
             inner = np.s_[20:-20, 20:-20]
             error_of_color = np.abs(frame.color[inner].astype(int) - color[inner])
-            assert np.median(error_of_color) <= 6  # JPEG halves the colours, and the grid is some pixels wide
+            assert np.median(error_of_color) <= 6  # JPEG halves the colors, and the grid is some pixels wide
 
 
 def test_depth_that_is_taken_as_registered_does_not_fit() -> None:
@@ -206,7 +206,7 @@ def test_the_imu_turns_as_the_camera_does(recording: Path) -> None:
 def test_what_is_known_and_what_is_not_is_told(recording: Path) -> None:
     description = json.loads((recording / "recording.json").read_text())
     warnings = "\n".join(description["warnings"])
-    assert "thoth: extrinsics of depth and colour are published, and the same as those of hathor" in warnings
+    assert "thoth: extrinsics of depth and color are published, and the same as those of hathor" in warnings
     assert "acl_jackal: extrinsics" not in warnings
     assert "acl_jackal: true poses are of the body" in warnings
     assert description["checks"]["acl_jackal"]["reprojection_median_m"] < 0.02

@@ -89,7 +89,7 @@ def test_an_index_that_leads_to_another_topic_is_refused(tmp_path: Path, contain
         registry.convert("ros", bag, tmp_path / "rec")
 
 
-def test_colour_that_is_too_fine_for_the_depth_is_refused(tmp_path: Path) -> None:
+def test_color_that_is_too_fine_for_the_depth_is_refused(tmp_path: Path) -> None:
     """Depth is drawn in steps of the other camera's pixels: a wrong CameraInfo would ask for all memory."""
     r = Ros(1)
     wrong = {
@@ -266,7 +266,7 @@ def test_infrared_images_are_not_taken_for_depth(tmp_path: Path) -> None:
 
 
 def test_depth_that_is_too_far_is_told(tmp_path: Path) -> None:
-    """Registered depth is kept in half millimetres, up to 32.8 m; what lies beyond is left out, and counted."""
+    """Registered depth is kept in half millimeters, up to 32.8 m; what lies beyond is left out, and counted."""
     r = Ros(2)
     rows = []
     for topic, log_ns, message in scene(r):
@@ -362,7 +362,7 @@ def test_real_bags_are_refused_for_the_right_reason(
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real bags are not there")
 def test_a_real_bag_converts_when_told_that_times_differ(tmp_path: Path) -> None:
-    """Colour and depth are 100 ms apart; the extrinsics are those that the camera's own software recorded."""
+    """Color and depth are 100 ms apart; the extrinsics are those that the camera's own software recorded."""
     source = REAL / "realsense_single_depth_color.bag"
     registry.convert("ros", source, tmp_path / "rec", options=["max_difference_s=0.2"])
     with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
@@ -372,7 +372,7 @@ def test_a_real_bag_converts_when_told_that_times_differ(tmp_path: Path) -> None
     assert 0.2 < np.median(frame.depth[frame.depth > 0]) < 5
 
 
-def test_frames_whose_colour_is_cut_short_are_left_out(tmp_path: Path) -> None:
+def test_frames_whose_color_is_cut_short_are_left_out(tmp_path: Path) -> None:
     """Told, not fatal: a camera that was unplugged for a moment must not cost the rest of the log."""
     r = Ros(1)
     rows = []
@@ -387,7 +387,7 @@ def test_frames_whose_colour_is_cut_short_are_left_out(tmp_path: Path) -> None:
     description = json.loads((tmp_path / "rec" / "recording.json").read_text())
     assert description["robots"]["alpha"]["frames"] == FRAMES - 1
     assert any(
-        "1 frames have colour or depth that is cut short" in warning for warning in description["warnings"]
+        "1 frames have color or depth that is cut short" in warning for warning in description["warnings"]
     )
 
 

@@ -1,4 +1,4 @@
-"""Images and cameras as ROS holds them: every encoding of colour and depth, every lens, and broken ones."""
+"""Images and cameras as ROS holds them: every encoding of color and depth, every lens, and broken ones."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def decoded(message: Any) -> np.ndarray:
 
 
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "rgba8", "bgra8", "mono8"])
-def test_colour_encodings(encoding: str) -> None:
+def test_color_encodings(encoding: str) -> None:
     card = gray_card()
     alpha = np.full((12, 16, 1), 255, np.uint8)
     pixels = {
@@ -110,12 +110,12 @@ def test_depth_of_sixteen_bits_and_of_floats(big: bool) -> None:
     assert np.array_equal(
         ros_images.depth_m(sixteen, "here", 0.001), raw.astype(np.float32) * np.float32(0.001)
     )
-    metres = raw.astype(np.float32) / 1000
-    metres[0, :4] = [np.nan, np.inf, -1.0, 0.0]
-    floats = Ros(2).image(1, "d", metres, "32FC1", big=big)
+    meters = raw.astype(np.float32) / 1000
+    meters[0, :4] = [np.nan, np.inf, -1.0, 0.0]
+    floats = Ros(2).image(1, "d", meters, "32FC1", big=big)
     got = ros_images.depth_m(floats, "here", 0.001)
     assert (got[0, :4] == 0).all()
-    assert np.array_equal(got[1:], metres[1:])
+    assert np.array_equal(got[1:], meters[1:])
 
 
 def rvl(raw: np.ndarray) -> bytes:
@@ -164,12 +164,12 @@ def test_compressed_depth() -> None:
     ):
         got = ros_images.depth_m(r.compressed(1, "d", data, text), "here", 0.001)
         assert np.array_equal(got, raw.astype(np.float32) * np.float32(0.001)), text
-    metres = raw / 1000.0
+    meters = raw / 1000.0
     a, b = 100.0 * 101.0, 1 - 100.0 * 101.0 / 10.0
-    inverse = np.where(raw > 0, np.rint(a / np.where(raw > 0, metres, 1.0) + b), 0).astype(np.uint16)
+    inverse = np.where(raw > 0, np.rint(a / np.where(raw > 0, meters, 1.0) + b), 0).astype(np.uint16)
     data = struct.pack("<iff", 0, a, b) + cv2.imencode(".png", inverse)[1].tobytes()
     got = ros_images.depth_m(r.compressed(1, "d", data, "32FC1; compressedDepth png"), "here", 0.001)
-    assert np.abs(got - metres).max() < 3e-4
+    assert np.abs(got - meters).max() < 3e-4
     jpeg = cv2.imencode(".jpg", (raw >> 8).astype(np.uint8))[1].tobytes()
     for data, message in ((jpeg, "depth as JPEG"), (head + b"\0" * 40, "broken RVL"), (b"123", "3 bytes")):
         with pytest.raises(DuagError, match=message):

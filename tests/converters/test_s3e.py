@@ -209,10 +209,10 @@ def matrix(name: str, values: np.ndarray) -> str:
     return f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [{data}]\n"
 
 
-def write_calibration(file: Path, name: str, transposed: bool = False, metres: bool = False) -> None:
+def write_calibration(file: Path, name: str, transposed: bool = False, meters: bool = False) -> None:
     T, right = T_right_left_of(name), RIGHTS[name]
     R = T[:3, :3].T if transposed else T[:3, :3]
-    t = np.array(BASELINES_MM[name]) / (1000 if metres else 1)
+    t = np.array(BASELINES_MM[name]) / (1000 if meters else 1)
     eye = np.c_[LEFT.matrix(), np.zeros(3)]
     text = f"%YAML:1.0\n---\nCamera.fx: {LEFT.fx}\nCamera.width: {LEFT.width}\nCamera.bf: {LEFT.fx * 0.36}\n"
     text += matrix("Tic", T_IMU_LEFT) + f"LEFT.height: {LEFT.height}\nLEFT.width: {LEFT.width}\n"
@@ -356,7 +356,7 @@ def test_bags_without_cameras_are_refused(dataset: Path, tmp_path: Path) -> None
     ("fault", "message"),
     [
         ("transposed", "matched features lie .* px apart in rows"),
-        ("metres", "last column of RIGHT.P is"),
+        ("meters", "last column of RIGHT.P is"),
         ("other", "matched features lie .* px apart in rows"),
         ("cut", "bob.yaml: "),
         ("missing", "bob.yaml: No such file"),
@@ -394,7 +394,7 @@ def test_files_of_positions(tmp_path: Path) -> None:
     np.testing.assert_array_equal(fixes.positions[0], [744073.32, -0.041, -0.296])
     for broken in ("1e99 2 3 4 5 6 7 8\n", "1 1e999 3 4 5 6 7 8\n"):
         file.write_text(broken)
-        with pytest.raises(DuagError, match=r"alpha_gt.txt:1: .* expected (a time in seconds|metres)"):
+        with pytest.raises(DuagError, match=r"alpha_gt.txt:1: .* expected (a time in seconds|meters)"):
             read_fixes(file)
     for broken in ("1 2 3\n", "1661000000.5 a b c 0 0 0 1\n", "1 2 3 4 5 6 7 8 9\n"):
         file.write_text(broken)

@@ -21,14 +21,14 @@ from duagc.pipeline.recording import Recording, content_digest, open_rgbd, read_
 
 ROOM_HALF_M = np.array([1.6, 1.3, 1.1])
 BOX_HALF_M = np.array([0.25, 0.3, 0.2])
-BOX_CENTRE_M = np.array([0.1, 0.5, 0.1])
+BOX_CENTER_M = np.array([0.1, 0.5, 0.1])
 REAL = Path(__file__).parents[3] / "shared" / "data" / "redkitchen"
 FRAMES = 7
 T_DEPTH_COLOR = se3.from_rotation_translation(np.eye(3), [Options().baseline_m, 0, 0])
 
 
 def render(camera: PinholeCamera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colour uint8 [H, W, 3] and exact z-depth [H, W] of a box in a room, seen from inside the room."""
+    """Color uint8 [H, W, 3] and exact z-depth [H, W] of a box in a room, seen from inside the room."""
     return render_rays(camera.rays(), T_world_camera)
 
 
@@ -40,7 +40,7 @@ def render_rays(rays_camera: np.ndarray, T_world_camera: np.ndarray) -> tuple[np
         to_walls = np.where(rays > 0, (ROOM_HALF_M - origin) / rays, (-ROOM_HALF_M - origin) / rays).min(
             axis=1
         )
-        a, b = ((BOX_CENTRE_M + s * BOX_HALF_M - origin) / rays for s in (-1, 1))
+        a, b = ((BOX_CENTER_M + s * BOX_HALF_M - origin) / rays for s in (-1, 1))
     enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
     z = np.where((enter < leave) & (enter > 0), enter, to_walls)
     points = origin + z[:, None] * rays
@@ -53,7 +53,7 @@ def depth_pose(index: int) -> np.ndarray:
     """T_world_depth of frame `index`: an arc around the box, looking at it (z forward, y down)."""
     angle = -0.3 + 0.05 * index
     position = np.array([0.9 * np.sin(angle), -0.8 * np.cos(angle), -0.1])
-    z = BOX_CENTRE_M - position
+    z = BOX_CENTER_M - position
     z /= np.linalg.norm(z)
     x = np.cross(z, [0, 0, 1.0])
     x /= np.linalg.norm(x)
@@ -127,14 +127,14 @@ def test_one_sequence_becomes_two_robots(sequence: Path, tmp_path: Path) -> None
         assert check["reprojection_median_m"] < 0.001 * check["median_depth_m"]
 
 
-def test_depth_is_registered_to_colour(sequence: Path, tmp_path: Path) -> None:
-    """Against the depth that the colour camera would have measured."""
+def test_depth_is_registered_to_color(sequence: Path, tmp_path: Path) -> None:
+    """Against the depth that the color camera would have measured."""
     convert(sequence, tmp_path / "rec")
     for frame in open_rgbd(Recording(tmp_path / "rec").log("alpha")).frames():
         _, exact = render(Options().color_camera(), depth_pose(frame.index) @ T_DEPTH_COLOR)
         seen = frame.depth > 0
         error = np.abs(frame.depth - exact)[seen]
-        assert np.median(error) < 0.0005  # the millimetre of the source, twice rounded
+        assert np.median(error) < 0.0005  # the millimeter of the source, twice rounded
         assert np.mean(error > 0.005) < 0.01  # borders of the box, one pixel wide
         assert seen[60:-60, 80:-80].mean() > 0.97  # the rest is hidden from the depth camera by the box
         v, u = 240, 560
@@ -313,7 +313,7 @@ def test_planes_stay_planes(slope: float) -> None:
     depth = slanted(options.depth_camera(), slope)
     depth[(depth < 0.3) | (depth > 4)] = 0
     out = Registration(options.depth_camera(), options.color_camera(), options.baseline_m)(depth)
-    # the plane in the colour camera, which sits baseline_m further along x
+    # the plane in the color camera, which sits baseline_m further along x
     rays = options.color_camera().rays()[:, :, 0]
     exact = (1.2 + slope * options.baseline_m) / (1 - slope * rays)
     seen = out > 0
@@ -375,9 +375,7 @@ def make_rig_sequence(folder: Path) -> Path:
     turned = np.concatenate([xy[:, 0], np.ones((len(xy), 1))], axis=1) @ so3.exp(
         np.array([0.012, -0.008, 0.02])
     )
-    rays = (turned / turned[:, 2:]).reshape(
-        480, 640, 3
-    )  # of the colour pixels, as the depth camera is turned
+    rays = (turned / turned[:, 2:]).reshape(480, 640, 3)  # of the color pixels, as the depth camera is turned
     x, y = (u - 320) / 585, (v - 240) / 585
     for index in range(3):
         pose = depth_pose(index)
@@ -393,11 +391,11 @@ def make_rig_sequence(folder: Path) -> Path:
 
 
 def errors_of(recording: Path, camera: PinholeCamera) -> tuple[float, float]:
-    """Share of pixels of another colour than the room's, and median error of depth in metres, all frames."""
+    """Share of pixels of another color than the room's, and median error of depth in meters, all frames."""
     colors, depths = [], []
     for frame in open_rgbd(Recording(recording).log("alpha")).frames():
         color, depth = render(camera, depth_pose(frame.index) @ T_DEPTH_COLOR)
-        inside = np.s_[30:-30, 30:-30]  # what the colour camera did not see is at the border
+        inside = np.s_[30:-30, 30:-30]  # what the color camera did not see is at the border
         off = np.abs(frame.color[inside].astype(float) - color[inside][..., ::-1]).max(axis=-1)
         colors.append(np.mean(off > 20))
         depths.append(np.abs(frame.depth - depth)[frame.depth > 0])
@@ -417,7 +415,7 @@ def test_lens_rotation_and_depth_error_are_undone(tmp_path: Path) -> None:
     assert camera.fx == camera.fy == 515
     colors, depths = errors_of(tmp_path / "rec", camera)
     assert colors < 0.04, "edges of the pattern, blurred by half a pixel"
-    assert depths < 0.0005, "the millimetre of the source, rounded twice"
+    assert depths < 0.0005, "the millimeter of the source, rounded twice"
     colors, depths = errors_of(tmp_path / "as_if_ideal", camera)
     assert colors > 0.1
     assert depths > 0.005
@@ -448,7 +446,7 @@ def reference_line(sequence: str, number: int, T_world_color: np.ndarray) -> str
 
 
 def reference_file(path: Path, sequences: tuple[str, ...] = ("seq-01", "seq-02"), skip: int = 4) -> Path:
-    """Backwards, one frame not found, and the other sequences a metre away."""
+    """Backwards, one frame not found, and the other sequences a meter away."""
     lines = []
     for sequence in sequences:
         offset = se3.from_rotation_translation(np.eye(3), [int(sequence[-1]) - 1.0, 0, 0])
@@ -479,7 +477,7 @@ def test_poses_of_others_are_the_truth(sequence: Path, tmp_path: Path) -> None:
 
 
 def test_poses_of_others_are_those_of_the_camera_of_the_recording(tmp_path: Path) -> None:
-    """They are the colour camera's as it is; the recording's camera is turned as the depth camera is."""
+    """They are the color camera's as it is; the recording's camera is turned as the depth camera is."""
     source = make_rig_sequence(tmp_path / "seq-01")
     T_color_camera = se3.from_rotation_translation(Options(**RIG).lens().turned()[:3, :3], np.zeros(3))
     assert np.abs(T_color_camera - np.eye(4)).max() > 0.005
@@ -507,7 +505,7 @@ def test_the_sequence_of_other_poses_is_named_by_the_folder_or_the_user(
     with pytest.raises(DuagError, match="found reference_sequence alone"):
         convert(kitchen, tmp_path / "rec", reference_sequence="seq-03")
     convert(kitchen, tmp_path / "rec", reference_poses=str(path), reference_sequence="seq-02")
-    assert abs(poses_of(Recording(tmp_path / "rec"), "alpha")[0, 0, 3] - 0.7) < 0.3, "a metre along x"
+    assert abs(poses_of(Recording(tmp_path / "rec"), "alpha")[0, 0, 3] - 0.7) < 0.3, "a meter along x"
     reference_file(path, ("seq-01",))
     convert(kitchen, tmp_path / "only", reference_poses=str(path))
     assert len(poses_of(Recording(tmp_path / "only"), "alpha")) == FRAMES - 1

@@ -1,4 +1,4 @@
-"""The simulator: exact depth, colours that do not depend on the view, clear and overlapping paths, sensor noise."""
+"""The simulator: exact depth, colors that do not depend on the view, clear and overlapping paths, sensor noise."""
 
 import json
 from collections.abc import Iterator
@@ -63,14 +63,14 @@ def test_depth_ends_on_a_surface_and_passes_through_none(room, renderer, ways):
         assert (depth > 0).all()
         assert (surface >= 0).all()
         sight = rays * depth[::4, ::4, None]
-        assert np.abs(room.clearance(se3.transform(T, sight.reshape(-1, 3)))).max() < 1e-9  # float64, metres
+        assert np.abs(room.clearance(se3.transform(T, sight.reshape(-1, 3)))).max() < 1e-9  # float64, meters
         on_the_way = np.linspace(0.02, 0.995, 12)[:, None, None, None] * sight
         assert room.clearance(se3.transform(T, on_the_way.reshape(-1, 3))).min() > 0
 
 
 @pytest.mark.parametrize(("i", "j"), [(0, 1), (0, 25), (70, 110)])
-def test_views_agree_on_depth_and_colour(room, atlas, ways, i, j):
-    """A point seen in view i is, in view j, at the depth and of the colour that view j has there."""
+def test_views_agree_on_depth_and_color(room, atlas, ways, i, j):
+    """A point seen in view i is, in view j, at the depth and of the color that view j has there."""
     camera, T_i, T_j = camera_of((480, 360)), ways[0][i], ways[0][j]
     renderer = Renderer(room, atlas, camera)
     one, other = renderer.render(T_i), renderer.render(T_j)
@@ -92,7 +92,7 @@ def test_views_agree_on_depth_and_colour(room, atlas, ways, i, j):
     assert np.median(difference) < 1.0  # of 255
 
 
-def test_colour_is_the_mean_over_the_pixel(room, atlas, renderer, ways):
+def test_color_is_the_mean_over_the_pixel(room, atlas, renderer, ways):
     """The same view at five times the size, averaged in blocks, is the view."""
     camera = renderer.camera.scaled(5 * SIZE[0], 5 * SIZE[1])
     for T in (ways[0][20], ways[1][90]):
@@ -127,12 +127,12 @@ def test_paths_are_smooth_clear_and_long(room, ways):
         assert steps.max() < 0.025
         assert np.rad2deg(turns.max()) < 1.3
         positions = way[:, :3, 3]
-        assert np.abs(np.diff(positions, n=2, axis=0)).max() < 1e-3  # metres per frame^2: no corners
+        assert np.abs(np.diff(positions, n=2, axis=0)).max() < 1e-3  # meters per frame^2: no corners
         assert room.clearance(positions).min() > 0.5
 
 
 @pytest.mark.parametrize("overlap", [0.5, 0.7])
-def test_neighbours_share_as_much_of_the_view_as_asked(room, camera, overlap):
+def test_neighbors_share_as_much_of_the_view_as_asked(room, camera, overlap):
     small = Renderer(room, None, camera.scaled(*trajectories.OVERLAP_IMAGE))
     one, other = trajectories.plan(room, 2, 150, overlap, camera)
     assert trajectories.shared_view(small, one, other) == pytest.approx(overlap, abs=0.04)
@@ -161,8 +161,8 @@ def test_kinect_noise_has_the_published_size(camera):
         steps = 8 * noise.SENSOR_FOCAL_PX * noise.BASELINE_M / measured[measured > 0]
         assert np.abs(steps - np.rint(steps)).max() < 1e-6
         field = np.where(measured > 0, measured - exact, 0)
-        neighbours = np.mean(field[:, 1:] * field[:, :-1]) / np.mean(field**2)
-        assert 0.3 < neighbours < 0.95
+        neighbors = np.mean(field[:, 1:] * field[:, :-1]) / np.mean(field**2)
+        assert 0.3 < neighbors < 0.95
 
 
 def test_kinect_noise_has_holes_where_the_sensor_is_blind(camera, renderer, ways):
@@ -182,9 +182,9 @@ def test_kinect_noise_has_holes_where_the_sensor_is_blind(camera, renderer, ways
         assert 0.0 < holes < 0.15
 
 
-def test_grey_noise_is_one_percent():
-    grey = np.full((200, 200, 3), 128, dtype=np.uint8)
-    noisy = noise.grey_noise(grey, random_streams.generator(0, "test")).astype(float) - 128
+def test_gray_noise_is_one_percent():
+    gray = np.full((200, 200, 3), 128, dtype=np.uint8)
+    noisy = noise.gray_noise(gray, random_streams.generator(0, "test")).astype(float) - 128
     assert np.std(noisy) == pytest.approx(2.55, rel=0.05)
 
 

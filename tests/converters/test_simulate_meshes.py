@@ -1,4 +1,4 @@
-"""The simulator on textured meshes: a box room with a table, whose depth and colours are known by other formulas."""
+"""The simulator on textured meshes: a box room with a table, whose depth and colors are known by other formulas."""
 
 import json
 import shutil
@@ -159,7 +159,7 @@ def write_obj(path: Path, quads: list[Quad]) -> None:
 
 
 def write_ply(path: Path, quads: list[Quad], colors: bool = True) -> None:
-    """Vertices every 25 mm, coloured; z up."""
+    """Vertices every 25 mm, colored; z up."""
     points, paints, faces = [], [], []
     for quad in quads:
         n, m = (round(size / 0.025) + 1 for size in quad.size)
@@ -213,7 +213,7 @@ def some_poses() -> np.ndarray:
 
 
 def true_view(origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth, quad and colour of rays [n, 3] through the room, in float64."""
+    """Depth, quad and color of rays [n, 3] through the room, in float64."""
     nearest, index = np.full(len(directions), np.inf), np.full(len(directions), -1)
     color = np.zeros((len(directions), 3))
     for k, quad in enumerate(QUADS):
@@ -228,7 +228,7 @@ def true_view(origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, n
     return nearest, index, color
 
 
-def test_depth_and_colour_are_those_of_the_room(stage):
+def test_depth_and_color_are_those_of_the_room(stage):
     camera = camera_of((240, 180))
     eye = MeshRenderer(stage.caster, camera)
     for T in some_poses():
@@ -238,13 +238,13 @@ def test_depth_and_colour_are_those_of_the_room(stage):
         window = np.ones((3, 3), dtype=np.uint8)
         inside = cv2.dilate(quad, window) == cv2.erode(quad, window)
         assert inside.mean() > 0.9
-        assert np.abs(view.depth - depth)[inside].max() < 5e-6  # float32 rays over a few metres
+        assert np.abs(view.depth - depth)[inside].max() < 5e-6  # float32 rays over a few meters
         error = np.abs(view.color - color.reshape(view.color.shape))[inside]
         assert np.percentile(error, 99) < 6  # of 255; filtering dampens the shortest waves by some
-        assert error.mean() < 2.0  # between vertices 25 mm apart the colours are straight lines
+        assert error.mean() < 2.0  # between vertices 25 mm apart the colors are straight lines
 
 
-def test_colour_is_the_mean_over_the_pixel(stage):
+def test_color_is_the_mean_over_the_pixel(stage):
     """The same view at five times the size, averaged in blocks, is the view."""
     camera = camera_of((160, 120))
     T = some_poses()[1]
@@ -257,7 +257,7 @@ def test_colour_is_the_mean_over_the_pixel(stage):
     assert np.abs(large.depth[2::5, 2::5] - view.depth).max() < 5e-6
 
 
-def test_points_lie_on_the_surfaces_and_have_their_colours(stage):
+def test_points_lie_on_the_surfaces_and_have_their_colors(stage):
     points, normals, colors = stage.points()
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0)
     assert stage.clearance(points).max() < 1e-5
@@ -357,7 +357,7 @@ def one_quad(folder: Path, image: np.ndarray) -> meshes.MeshScene:
 
 
 def test_a_far_texture_is_blurred_to_its_mean(tmp_path):
-    """A checkerboard of single texels, seen from where a pixel holds many of them, is even grey."""
+    """A checkerboard of single texels, seen from where a pixel holds many of them, is even gray."""
     board = ((np.indices((512, 512)).sum(axis=0) % 2) * 200).astype(np.uint8)
     scene = one_quad(tmp_path, np.repeat(board[..., None], 3, axis=2))
     T = look_at(np.array([[3.0, 2.0, 1.3]]), np.array([[0.0, 2.0, 1.3]]))[0]
@@ -418,8 +418,8 @@ def small(folder: Path) -> None:
     ("make", "message"),
     [
         (nothing, "found no mesh, expected files"),
-        (plain_glb, "neither a texture nor colours"),
-        (plain_ply, "neither a texture nor colours"),
+        (plain_glb, "neither a texture nor colors"),
+        (plain_ply, "neither a texture nor colors"),
         (torn_ply, "torn.ply: .*cannot be read"),
         (torn_glb, "torn.glb: .*cannot be read"),
         (words, "words.obj: .*cannot be read"),

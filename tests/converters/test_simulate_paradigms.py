@@ -57,7 +57,7 @@ def test_paths_are_smooth_clear_and_overlap_as_asked(room, paradigm, robots, ove
         assert np.ptp(steps) < 0.06 * room.step_m  # nobody pauses or hurries
         assert turns.max() < walks.MAX_TURN_RAD + 1e-3
         position = way[:, :3, 3]
-        assert np.abs(np.diff(position, n=2, axis=0)).max() < 2e-3  # metres per frame^2: no corners
+        assert np.abs(np.diff(position, n=2, axis=0)).max() < 2e-3  # meters per frame^2: no corners
         assert room.clearance(position).min() > walks.MIN_CLEARANCE_M - 0.05
         assert np.abs(way[:, 2, 0]).max() < 1e-9  # upright
     assert paradigms.least_apart(ways) >= figures.APART_M
@@ -88,7 +88,7 @@ def test_an_overlap_that_cannot_be_is_the_nearest_one_and_said(tmp_path):
     kind = {"frames": 4, "size": (32, 32), "overlap": 1.0, "paradigm": "crossing", "workers": 1}
     simulate(tmp_path / "rec", scene=str(folder_of(tmp_path / "flat", "obj")), **kind)
     (warning,) = json.loads((tmp_path / "rec" / "recording.json").read_text())["warnings"]
-    assert re.fullmatch(r"neighbours share 0\.\d\d of the view \(.*\), expected 1\.00", warning)
+    assert re.fullmatch(r"neighbors share 0\.\d\d of the view \(.*\), expected 1\.00", warning)
 
 
 def test_a_survey_says_what_was_reached(room, monkeypatch):
@@ -218,7 +218,7 @@ def test_arguments_out_of_range_are_refused(tmp_path, bad):
 
 
 def test_where_a_figure_fits_nowhere_is_said(room, monkeypatch):
-    """Of the free floor a patch of half a metre is left."""
+    """Of the free floor a patch of half a meter is left."""
     space = room.free_space()
     patch = np.zeros_like(space.inside)
     row, column = np.argwhere(space.inside)[space.inside.sum() // 2]

@@ -40,7 +40,7 @@ def movers(stage: MeshStage, tmp_path_factory: pytest.TempPathFactory) -> list[M
 
 
 def alike(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether colours are equal but for the two rays that a plain camera leaves out where the others agree."""
+    """Whether colors are equal but for the two rays that a plain camera leaves out where the others agree."""
     difference = np.abs(one.astype(int) - other)
     return bool(difference.max() <= 12 and np.percentile(difference, 98) <= 4)
 
@@ -112,9 +112,9 @@ def test_lidar_points_lie_on_surfaces(stage):
 
 
 def test_gain_changes_the_light():
-    grey = np.full((4, 4, 3), 60, dtype=np.uint8)
-    assert with_gain(grey, 1.0).mean() == 60
-    assert with_gain(grey, 2.0).mean() == pytest.approx(60 * 2 ** (1 / 2.2), abs=1)
+    gray = np.full((4, 4, 3), 60, dtype=np.uint8)
+    assert with_gain(gray, 1.0).mean() == 60
+    assert with_gain(gray, 2.0).mean() == pytest.approx(60 * 2 ** (1 / 2.2), abs=1)
 
 
 def test_cameras_differ_by_channel(tmp_path):

@@ -28,7 +28,7 @@ def rig(options: StereoOptions = OPTIONS) -> StereoRig:
 
 
 def pair(T_world_left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colour images of both cameras."""
+    """Color images of both cameras."""
     left, _ = render(LEFT, T_world_left, D_LEFT)
     right, _ = render(RIGHT, right_of(T_world_left, T_RIGHT_LEFT), D_RIGHT)
     return left, right
@@ -44,7 +44,7 @@ def rectified(stereo: StereoRig, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def truth_of(stereo: StereoRig, T_world_left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What the rectified camera sees: colour and exact depth."""
+    """What the rectified camera sees: color and exact depth."""
     T = T_world_left.copy()
     T[:3, :3] = T[:3, :3] @ stereo.R_rectified_left.T
     return render(stereo.camera, T)

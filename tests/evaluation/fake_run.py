@@ -1,6 +1,6 @@
 """A small recording and a finished run of it, written with the real writers; every number in it is known.
 
-A textured wall two metres ahead, seen by robots that move along curved ways. The maps are what the images were
+A textured wall two meters ahead, seen by robots that move along curved ways. The maps are what the images were
 rendered from, the corrected ways are the true ones, so that the ideal values of most metrics are known.
 """
 
@@ -40,7 +40,7 @@ CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 FRAMES = 21
 INTERVAL_NS = 40_000_000
 WALL_Z_M = 2.0
-SIGMA_M = (0.001, 0.008)  # of the centres across the wall, as the information says, and as it is
+SIGMA_M = (0.001, 0.008)  # of the centers across the wall, as the information says, and as it is
 DRIFT_M = 0.02  # of the last pose of the odometry
 HEADER_BYTES = 34
 T_GT_WORLD = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, -0.2, 0.9]))
@@ -66,7 +66,7 @@ def way(robot: int) -> np.ndarray:
 
 
 def wall(seed: int = 0) -> Gaussians:
-    """Gaussians on the wall, world frame, smooth colours, centres off by `sigma_m` across it."""
+    """Gaussians on the wall, world frame, smooth colors, centers off by `sigma_m` across it."""
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.arange(-2.4, 3.6, 0.06), np.arange(-2.0, 2.4, 0.06))
     n = x.size
@@ -86,7 +86,7 @@ def wall(seed: int = 0) -> Gaussians:
 
 
 def sigma_m(n: int) -> np.ndarray:
-    """Standard deviation of every centre across the wall, spread over SIGMA_M."""
+    """Standard deviation of every center across the wall, spread over SIGMA_M."""
     share = np.random.default_rng(7).random(n)
     return SIGMA_M[0] * (SIGMA_M[1] / SIGMA_M[0]) ** share
 
@@ -360,7 +360,7 @@ def _write_consensus(path: Path, team: list[str], joined: bool) -> None:
         ):
             if joined:
                 closure = schemas.new(
-                    "ClosureDecision",
+                    "LoopClosureDecision",
                     robot=team[0],
                     peer=team[1],
                     own_keyframe=i,
@@ -377,4 +377,4 @@ def _write_consensus(path: Path, team: list[str], joined: bool) -> None:
                     T_own_peer = se3.inverse(way(0)[KEYFRAMES[i]]) @ way(1)[KEYFRAMES[i]] @ wrong
                     closure.pose_own_peer.CopyFrom(pack_pose(T_own_peer))
                     closure.information.extend(np.diag([1e6] * 6).ravel().tolist())
-                log.write(topics.CLOSURE_DECISION.of(team[0]), closure, 10**9)
+                log.write(topics.LOOP_CLOSURE_DECISION.of(team[0]), closure, 10**9)

@@ -1,4 +1,4 @@
-"""The agreement of features sees wrong poses, favours no trajectory, and says when it knows nothing."""
+"""The agreement of features sees wrong poses, favors no trajectory, and says when it knows nothing."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ TRUTH = np.array([pose(x=-0.4 + 0.1 * k, z=-0.9, yaw=0.3 - 0.05 * k) for k in ra
 
 @pytest.fixture(scope="module")
 def views() -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Colour and depth of the room with a texture fine enough for features."""
+    """Color and depth of the room with a texture fine enough for features."""
     colors, depths = [], []
     for T in TRUTH:
         depth = render(T, camera=CAMERA)[1]
@@ -33,7 +33,7 @@ def test_exact_poses_agree_and_wrong_ones_do_not(views) -> None:
     assert pairs >= MIN_PAIRS
     assert values["true"] < 0.5  # the positions of features
     assert values["moved"] == pytest.approx(values["true"], rel=1e-6)
-    # every second view turned by 20 mrad, 5.2 px at the centre: three of five pairs see it
+    # every second view turned by 20 mrad, 5.2 px at the center: three of five pairs see it
     assert 4.5 < values["turned"] < 8
 
 

@@ -1,4 +1,4 @@
-"""The gap to the centralised answer: zero at the answer, whatever the gauge, and as large as what was moved."""
+"""The gap to the centralized answer: zero at the answer, whatever the gauge, and as large as what was moved."""
 
 import numpy as np
 import pytest
@@ -34,33 +34,33 @@ def agreed():
 
 
 def gap_of_component(poses, odometry, closures, config=CONFIG):
-    """Metres and radians between the robots' poses and the centralised answer."""
+    """Meters and radians between the robots' poses and the centralized answer."""
     central = solve_component(poses, odometry, closures, config)
     assert not isinstance(central, Absent)
     return pose_gap(poses, central)
 
 
-def test_robots_that_agreed_are_at_the_centralised_answer(agreed):
+def test_robots_that_agreed_are_at_the_centralized_answer(agreed):
     poses, odometry, closures = agreed
-    metres, radians = gap_of_component(poses, odometry, closures)
+    meters, radians = gap_of_component(poses, odometry, closures)
     # they stop when nothing moves by more than the tolerance, a little before they are there
-    assert metres < 1e-6
+    assert meters < 1e-6
     assert radians < 1e-6
 
 
 def test_the_gauge_does_not_count(agreed):
     poses, odometry, closures = agreed
     T = se3.exp(np.array([3.0, -2.0, 1.0, 0.3, 0.8, -0.4]))
-    metres, _ = gap_of_component({name: T @ p for name, p in poses.items()}, odometry, closures)
-    assert metres < 1e-6
+    meters, _ = gap_of_component({name: T @ p for name, p in poses.items()}, odometry, closures)
+    assert meters < 1e-6
 
 
 def test_a_moved_keyframe_is_the_gap(agreed):
     poses, odometry, closures = agreed
     moved = {name: p.copy() for name, p in poses.items()}
     moved["bravo"][3] = moved["bravo"][3] @ se3.exp(np.array([0.01, 0.0, 0.0, 0.0, 0.002, 0.0]))
-    metres, radians = gap_of_component(moved, odometry, closures)
-    assert metres == pytest.approx(0.01, abs=1e-5)
+    meters, radians = gap_of_component(moved, odometry, closures)
+    assert meters == pytest.approx(0.01, abs=1e-5)
     assert radians == pytest.approx(0.002, abs=1e-5)
 
 

@@ -104,7 +104,7 @@ def metrics(fake) -> dict:
     return evaluate(fake.run, fake.recording, progress=False)
 
 
-def test_peers_views_are_compared_in_the_colours_of_their_camera(metrics, tmp_path):
+def test_peers_views_are_compared_in_the_colors_of_their_camera(metrics, tmp_path):
     dark = make(tmp_path, gain=0.6)
     seen = evaluate(dark.run, dark.recording, progress=False)
     for kind in ("own", "fused", "refined"):

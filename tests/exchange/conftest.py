@@ -24,7 +24,7 @@ HALF_M = np.array([2.0, 1.3, 2.4])  # half the edges of the room
 
 @lru_cache(maxsize=1)
 def textures() -> Array:
-    """Colour of the six walls, [6, 256, 256, 3], smooth noise with edges."""
+    """Color of the six walls, [6, 256, 256, 3], smooth noise with edges."""
     rng = random_streams.generator(0, "textures")
     walls = np.zeros((6, 256, 256, 3))
     for cells, weight in ((8, 0.3), (32, 0.4), (128, 0.3)):
@@ -34,7 +34,7 @@ def textures() -> Array:
 
 
 def view(T_world_camera: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Colour and depth of the room from inside."""
+    """Color and depth of the room from inside."""
     rays = CAMERA.rays() @ T_world_camera[:3, :3].T
     origin = T_world_camera[:3, 3]
     with np.errstate(divide="ignore"):

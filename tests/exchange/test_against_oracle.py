@@ -53,7 +53,7 @@ def team(make_robot: Any, robots: int, link: dict[str, Any]) -> list[RobotData]:
 def oracle_poses(
     data: list[RobotData], results: dict[str, AgentResult], config: PoseConsensusConfig
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The robots' poses, and the centralised answer to the same factors, closures and final weights."""
+    """The robots' poses, and the centralized answer to the same factors, closures and final weights."""
     poses = {d.robot: results[d.robot].T_world_keyframe for d in data}
     odometry = {d.robot: with_floor(factors_of(d.registrations), config) for d in data}
     closures = [
@@ -100,7 +100,7 @@ def fused_theta(
 def gaps(
     data: list[RobotData], results: dict[str, AgentResult], config: ExchangeConfig
 ) -> tuple[float, float, np.ndarray]:
-    """Metres and radians of poses, and of every matched Gaussian [m, 13] in standard deviations, from the oracle."""
+    """Meters and radians of poses, and of every matched Gaussian [m, 13] in standard deviations, from the oracle."""
     poses, central = oracle_poses(data, results, config.consensus)
     exact = {d.robot: Evidence.from_map(d.robot, d.gaussians, d.information, d.T_map_keyframe) for d in data}
     found = []
@@ -131,10 +131,10 @@ def test_the_team_is_at_the_oracle(
     data = team(make_robot, robots, link)
     config = unrounded(**link)
     results = meet(data, tmp_path, config)
-    metres, radians, gap_sigma = gaps(data, results, config)
+    meters, radians, gap_sigma = gaps(data, results, config)
     rounds = max(r.rounds for r in results.values())
-    print(f"{robots} robots, {link}: {rounds} rounds, {metres:.1e} m, {gap_sigma.max():.1e} sigma")
-    assert metres < 1e-9
+    print(f"{robots} robots, {link}: {rounds} rounds, {meters:.1e} m, {gap_sigma.max():.1e} sigma")
+    assert meters < 1e-9
     assert radians < 1e-9
     assert len(gap_sigma) > 10
     assert gap_sigma.max() < 1e-6
@@ -162,11 +162,11 @@ def test_on_the_default_wire_the_team_is_near_the_oracle(
     data = team(make_robot, robots, link)
     config = ExchangeConfig(link=LinkConfig(**link), max_rounds=20_000)
     results = meet(data, tmp_path, config)
-    metres, radians, gap_sigma = gaps(data, results, config)
+    meters, radians, gap_sigma = gaps(data, results, config)
     print(
         f"{robots} robots, {link}: {max(r.rounds_to_agreement or 0 for r in results.values())} rounds, "
-        f"{metres:.1e} m, {radians:.1e} rad, {np.percentile(gap_sigma.max(axis=1), 99):.1e} sigma at 99 %"
+        f"{meters:.1e} m, {radians:.1e} rad, {np.percentile(gap_sigma.max(axis=1), 99):.1e} sigma at 99 %"
     )
-    assert metres < 1e-6
+    assert meters < 1e-6
     assert radians < 1e-6
     assert np.percentile(gap_sigma.max(axis=1), 99) < 0.05

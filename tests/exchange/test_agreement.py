@@ -25,7 +25,7 @@ def judged(own: RobotData, T_own: np.ndarray, peer: RobotData, T_peer: np.ndarra
 def test_maps_agree_where_they_lie_and_nowhere_else(make_robot: Any) -> None:
     (own, T_own), (peer, T_peer) = make_robot("alpha", 0.0), make_robot("bravo", 0.6)
     assert judged(own, T_own, peer, T_peer, np.eye(4)) > 0.95
-    # an odometry of centimetres is no contradiction
+    # an odometry of centimeters is no contradiction
     assert judged(own, T_own, peer, T_peer, se3.exp([0.03, 0.0, 0.02, 0.0, 0.01, 0.0])) > 0.9
     for off in ([0.5, 0, 0, 0, 0, 0], [0, 0, 1.0, 0, 0, 0], [0, 0.6, 0, 0.4, 0, 0]):
         assert judged(own, T_own, peer, T_peer, se3.exp(np.array(off, float))) < 0.5

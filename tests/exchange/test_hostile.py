@@ -23,7 +23,7 @@ from duagc.pipeline.network.packets import (
     Packet,
     parse,
     payload_bytes,
-    serialise,
+    serialize,
 )
 from duagc.pipeline.network.signatures import SIGNATURE_BYTES, Identity
 from duagc.pipeline.runs.robot_data import AgentResult, RobotData
@@ -122,7 +122,7 @@ def forged(rng: np.random.Generator, heard: list[bytes]) -> bytes:
         changes["sender"] = int(rng.integers(1 << 16))
     if rng.random() < 0.3:
         changes["kind"] = Kind(int(rng.integers(1, len(Kind) + 1)))
-    return serialise(dataclasses.replace(packet, **changes)) + data[end:]
+    return serialize(dataclasses.replace(packet, **changes)) + data[end:]
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +183,7 @@ def test_forgeries_that_nothing_betrays_crash_and_hang_nobody(team: list[RobotDa
 def test_a_signature_holds_for_one_sender_and_one_seed() -> None:
     alpha = Identity.simulated(1, NAMES, "alpha")
     bravo = Identity.simulated(1, NAMES, "bravo")
-    packet = parse(serialise(PACKET))
+    packet = parse(serialize(PACKET))
     sealed = alpha.seal(packet)
     assert bravo.open(sealed) == packet
     assert alpha.seal(packet) == sealed

@@ -12,7 +12,7 @@ from duagc.pipeline.config.base import dump, load
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.network import LinkConfig, LinkWindow
 from duagc.pipeline.network import link_model
-from duagc.pipeline.network.link_model import Fate, LinkModel, neighbours
+from duagc.pipeline.network.link_model import Fate, LinkModel, neighbors
 
 TEAM = ["delta", "alpha", "charlie", "bravo"]
 MS = 1_000_000
@@ -28,7 +28,7 @@ def fates(
 
 def test_topologies() -> None:
     def linked(**changes: object) -> dict[str, tuple[str, ...]]:
-        return neighbours(LinkConfig(**changes), TEAM)  # type: ignore[arg-type]
+        return neighbors(LinkConfig(**changes), TEAM)  # type: ignore[arg-type]
 
     assert linked(topology="full")["alpha"] == ("bravo", "charlie", "delta")
     assert linked(topology="chain") == {
@@ -41,7 +41,7 @@ def test_topologies() -> None:
     assert linked(topology="star")["charlie"] == ("alpha",)
     assert set(linked(topology="none").values()) == {()}
     assert set(linked(enabled=False).values()) == {()}
-    assert neighbours(LinkConfig(topology="ring"), ["a", "b"]) == {"a": ("b",), "b": ("a",)}
+    assert neighbors(LinkConfig(topology="ring"), ["a", "b"]) == {"a": ("b",), "b": ("a",)}
     # listed: a partitioned team, one of the links in one direction only
     windows = [
         {"sender": "alpha", "receiver": "bravo"},
@@ -144,13 +144,13 @@ def test_range_follows_the_waypoints() -> None:
         {"robot": "bravo", "position_m": (100, 0, 0), "time_ns": 1000},
     )
     config = LinkConfig(topology="range", range_m=30.0, waypoints=waypoints)  # type: ignore[arg-type]
-    assert neighbours(config, ["alpha", "bravo"]) == {"alpha": ("bravo",), "bravo": ("alpha",)}
+    assert neighbors(config, ["alpha", "bravo"]) == {"alpha": ("bravo",), "bravo": ("alpha",)}
     got = {t: LinkModel(config, 0).fate("alpha", "bravo", 0, t, 100).reason for t in (0, 299, 301, 5000)}
     assert got == {0: "", 299: "", 301: link_model.FAR, 5000: link_model.FAR}
     with pytest.raises(DuagError, match="none of charlie, expected one for each robot"):
-        neighbours(config, ["alpha", "bravo", "charlie"])
+        neighbors(config, ["alpha", "bravo", "charlie"])
     with pytest.raises(DuagError, match="robot 'bravo', expected one of alpha"):
-        neighbours(config, ["alpha"])
+        neighbors(config, ["alpha"])
 
 
 def test_links_survive_a_configuration_file(tmp_path: Path) -> None:

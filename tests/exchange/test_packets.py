@@ -16,7 +16,7 @@ from duagc.pipeline.network.packets import (
     chunk_bytes,
     chunk_count,
     parse,
-    serialise,
+    serialize,
 )
 
 
@@ -33,7 +33,7 @@ def packets_of(kind: Kind, size: int) -> list[Packet]:
 @settings(max_examples=60, deadline=None)
 def test_a_message_comes_back_from_its_packets(kind: Kind, size: int) -> None:
     packets = packets_of(kind, size)
-    wire = [serialise(p) for p in packets]
+    wire = [serialize(p) for p in packets]
     assert all(len(w) <= MAX_PACKET_BYTES for w in wire)
     assert [parse(w) for w in wire] == packets
     assert sum(len(p.payload) for p in packets) == size
@@ -42,7 +42,7 @@ def test_a_message_comes_back_from_its_packets(kind: Kind, size: int) -> None:
 @given(data=st.data())
 @settings(max_examples=200, deadline=None)
 def test_every_mutation_is_refused(data: st.DataObject) -> None:
-    good = serialise(packets_of(Kind.PAIRS, 300)[0])
+    good = serialize(packets_of(Kind.PAIRS, 300)[0])
     place = data.draw(st.integers(0, len(good) - 1))
     flip = data.draw(st.integers(1, 255))
     bad = good[:place] + bytes([good[place] ^ flip]) + good[place + 1 :]
@@ -52,7 +52,7 @@ def test_every_mutation_is_refused(data: st.DataObject) -> None:
 
 @pytest.mark.parametrize("size", [0, 1, 33, 100, 333, 335, 5000])
 def test_a_wrong_length_is_refused(size: int) -> None:
-    good = serialise(packets_of(Kind.PAIRS, 300)[0])
+    good = serialize(packets_of(Kind.PAIRS, 300)[0])
     with pytest.raises(MalformedError):
         parse((good + bytes(5000))[:size])
 
@@ -70,4 +70,4 @@ def test_a_wrong_length_is_refused(size: int) -> None:
 def test_a_header_that_contradicts_itself_is_refused(change: dict[str, int], reason: str) -> None:
     packet = dataclasses.replace(packets_of(Kind.PAIRS, 2000)[0], **change)
     with pytest.raises(MalformedError, match=reason):
-        parse(serialise(packet))
+        parse(serialize(packet))

@@ -105,7 +105,7 @@ def test_two_robots_with_false_closures_only_end_as_if_they_had_not_met(
     results = meet(team, NAMES[:2], tmp_path, link=link, consensus=STRICT, solver=solver)
     rounds = [r.message() for r in read_log(tmp_path / "consensus.mcap", ["/alpha/consensus/agent"])]
     assert any(m.joined_links for m in rounds), "the test needs them to be joined first"
-    assert rounds[-1].parted_links == 1
+    assert rounds[-1].revoked_links == 1
     for name in NAMES[:2]:
         assert is_alone(results[name], team[name][0])
         again, sent = replay_agent_of(
@@ -159,7 +159,7 @@ def test_a_false_link_is_parted_and_the_others_stay(
             "off the way by bravo" in c.detail for c in false if "when the link was parted" in c.detail
         )
     rounds = [r.message() for r in read_log(tmp_path / "consensus.mcap", ["/alpha/consensus/agent"])]
-    assert rounds[-1].parted_links == 1
+    assert rounds[-1].revoked_links == 1
 
 
 def more_false_than_true(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Recognising places and verifying closures on rendered views of a known room."""
+"""Recognizing places and verifying closures on rendered views of a known room."""
 
 from dataclasses import replace
 from typing import Any

@@ -78,7 +78,7 @@ def test_keyframes_that_are_not_shared_are_refused():
         read_poses(write_poses(packet, 0, 6, True), packet.keyframes[:5], True)
 
 
-def test_fixed_translations_are_as_fine_a_thousand_kilometres_away():
+def test_fixed_translations_are_as_fine_a_thousand_kilometers_away():
     far = np.array([[999_999.123456789, -999_999.0, 0.0], [-STEP_M, STEP_M, 3 * STEP_M]])
     T = poses(np.random.default_rng(5), 2)
     T[:, :3, 3] = far

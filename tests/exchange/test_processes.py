@@ -23,10 +23,10 @@ CONFIG = ExchangeConfig(link=LinkConfig(topology="chain", loss_probability=0.3))
 
 
 def live(pipe: Connection, place: int) -> None:
-    """A robot's whole life: it makes its own data, and knows its name, its neighbours and the settings."""
-    determinism.settle_opencv()
+    """A robot's whole life: it makes its own data, and knows its name, its neighbors and the settings."""
+    determinism.configure_opencv()
     data, _ = robot(NAMES[place], 0.6 * place, keyframes=4)
-    agent = Agent(data, NAMES, link_model.neighbours(CONFIG.link, NAMES)[NAMES[place]], CONFIG, seed=0)
+    agent = Agent(data, NAMES, link_model.neighbors(CONFIG.link, NAMES)[NAMES[place]], CONFIG, seed=0)
     while (heard := pipe.recv()) is not None:
         round_index, now_ns, packets = heard
         sent = [(out.receiver, out.packet) for out in agent.tick(round_index, now_ns, packets)]

@@ -22,7 +22,7 @@ from duagc.pipeline.exchange.replay import replay_agent_of
 from duagc.pipeline.exchange.session import run_session_of
 from duagc.pipeline.exchange.session_result import result_of
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.network.packets import Kind, Packet, chunk_bytes, parse, serialise
+from duagc.pipeline.network.packets import Kind, Packet, chunk_bytes, parse, serialize
 from duagc.pipeline.recording import content_digest, read_log
 from duagc.pipeline.runs.robot_data import AgentResult, RobotData, Step
 
@@ -165,7 +165,7 @@ def test_the_log_accounts_for_every_byte(lossy_chain: Any) -> None:
 
 def test_every_candidate_has_a_verdict_with_a_reason(lossy_chain: Any) -> None:
     results, folder, _ = lossy_chain
-    topics = [f"/{name}/consensus/closure" for name in NAMES]
+    topics = [f"/{name}/consensus/loop_closure" for name in NAMES]
     decisions = [r.message() for r in read_log(folder / "consensus.mcap", topics)]
     assert len(decisions) == sum(len(r.closures) for r in results.values()) > 10
     assert all(d.verdict for d in decisions)
@@ -406,7 +406,7 @@ def test_a_robot_without_a_map_keeps_nobody_waiting(team: Any, tmp_path: Path) -
     assert results["bravo"].rounds < 20
 
 
-def test_a_neighbour_that_falls_silent_ends_the_session(team: Any) -> None:
+def test_a_neighbor_that_falls_silent_ends_the_session(team: Any) -> None:
     """Whoever it met has gone: the agent stops waiting, keeps what it has, and does not call that agreement."""
     config = ExchangeConfig(transport=TransportConfig(silent_after_rounds=15))
     agents = {n: Agent(team[n][0], NAMES[:2], set(NAMES[:2]) - {n}, config, seed=0) for n in NAMES[:2]}
@@ -448,13 +448,13 @@ def test_hostile_packets_change_nothing(team: Any) -> None:
     sequences = itertools.count()
     for round_index in range(4):
         packets = [
-            serialise(dataclasses.replace(r, sequence=next(sequences))) if isinstance(r, Packet) else r
+            serialize(dataclasses.replace(r, sequence=next(sequences))) if isinstance(r, Packet) else r
             for r in rubbish
         ]
         for out in agent.tick(round_index, round_index, packets):
             assert parse(out.packet).sender == 0
     assert sum(agent.refused.values()) > 200
-    assert not agent.neighbours[1].decided
+    assert not agent.neighbors[1].decided
     assert result_of(agent).component == ("alpha",)
 
 

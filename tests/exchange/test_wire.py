@@ -171,7 +171,7 @@ def test_final_poses_and_voxels_come_back_bit_for_bit() -> None:
         assert np.array_equal(state_wire.read_voxels(state_wire.write_voxels(1, keys), TEAM)[1], keys)
 
 
-def test_a_sample_comes_back_within_its_quantisation() -> None:
+def test_a_sample_comes_back_within_its_quantization() -> None:
     before = sample()
     after = places_wire.read_sample(places_wire.write_sample(before), 3)
     assert np.array_equal(after.features.descriptors, before.features.descriptors)

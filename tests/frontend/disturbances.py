@@ -23,7 +23,7 @@ WRONG_M, WRONG_RAD = 0.05, np.deg2rad(3.0)
 
 @dataclass(frozen=True)
 class Shot:
-    """One frame: colour uint8 [h, w, 3], depth float32 [h, w] m. disturbed: not what the camera saw. foreign: of
+    """One frame: color uint8 [h, w, 3], depth float32 [h, w] m. disturbed: not what the camera saw. foreign: of
     another place, so that any pose is wrong."""
 
     index: int
@@ -102,13 +102,13 @@ def dropped(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
 
 @first(20)
 def frozen(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
-    """For 20 frames the depth image is stuck while the colour moves on."""
+    """For 20 frames the depth image is stuck while the color moves on."""
     return replace(shots[k], depth=shots[0].depth)
 
 
 @first(20)
 def frozen_color(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
-    """For 20 frames the colour image is stuck while the depth moves on."""
+    """For 20 frames the color image is stuck while the depth moves on."""
     return replace(shots[k], color=shots[0].color)
 
 
@@ -126,7 +126,7 @@ def depthless(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
 
 @first(10)
 def blurred(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
-    """For 10 frames the colour is smeared over a sixteenth of the image's width, in another direction each."""
+    """For 10 frames the color is smeared over a sixteenth of the image's width, in another direction each."""
     length = shots[k].color.shape[1] // 16 | 1
     line = np.zeros((length, length), dtype=np.float32)
     end = (length // 2 * np.array([np.cos(k), np.sin(k)])).round().astype(int)
@@ -160,7 +160,7 @@ def hunting(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
 
 @first(20)
 def dark(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
-    """For 20 frames the light is off: the depth camera goes on, the colour is noise."""
+    """For 20 frames the light is off: the depth camera goes on, the color is noise."""
     color = shots[k].color // 40 + rng.integers(0, 4, shots[k].color.shape, dtype=np.uint8)
     return replace(shots[k], color=color)
 

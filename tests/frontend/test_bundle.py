@@ -1,4 +1,4 @@
-"""Joint optimisation of keyframes by their images, and loops: truth found, contradictions refused, bits repeated."""
+"""Joint optimization of keyframes by their images, and loops: truth found, contradictions refused, bits repeated."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from duagc.pipeline.config.frontend import KeyframeConfig, LoopConfig, RelocalisationConfig
+from duagc.pipeline.config.frontend import KeyframeConfig, LoopConfig, RelocalizationConfig
 from duagc.pipeline.frontend import bundle, loops
-from duagc.pipeline.frontend.bundle import Neighbourhood, optimise
+from duagc.pipeline.frontend.bundle import Neighborhood, optimize
 from duagc.pipeline.frontend.keyframe_graph import KeyframePair, refine
 from duagc.pipeline.frontend.loops import find_loops
 from duagc.pipeline.frontend.relocalization import features_of
@@ -44,7 +44,7 @@ class View:
     @staticmethod
     def of(pyramid: RgbdPyramid) -> "View":
         reference = Reference.from_pyramid(pyramid, STRIDES)
-        return View(reference, pyramid.levels[-1], features_of(pyramid, RelocalisationConfig()))
+        return View(reference, pyramid.levels[-1], features_of(pyramid, RelocalizationConfig()))
 
 
 class Walk:
@@ -81,10 +81,10 @@ def noisy() -> Walk:
     return Walk([pose(x=-0.5 + 0.12 * k, z=-0.9 + 0.03 * k, yaw=0.3 - 0.06 * k) for k in range(8)], rng)
 
 
-def test_joint_optimisation_is_better_than_the_registrations_alone(noisy: Walk) -> None:
+def test_joint_optimization_is_better_than_the_registrations_alone(noisy: Walk) -> None:
     start = noisy.chained(noisy.pairs)
     before = refine(start, noisy.pairs, 3.0)
-    after, factors = optimise(start, noisy.views, noisy.images, noisy.pairs, CONFIG, REGISTRATION)
+    after, factors = optimize(start, noisy.views, noisy.images, noisy.pairs, CONFIG, REGISTRATION)
     assert len(factors) > 2 * len(noisy.pairs)
     assert noisy.error_m(after.T_map_keyframe) < 0.7 * noisy.error_m(before.T_map_keyframe)
     # more images, more information
@@ -94,20 +94,20 @@ def test_joint_optimisation_is_better_than_the_registrations_alone(noisy: Walk) 
 
 def test_poor_start_ends_where_the_good_one_does(noisy: Walk) -> None:
     rng = np.random.default_rng(2)
-    good = optimise(noisy.truth, noisy.views, noisy.images, noisy.pairs, CONFIG, REGISTRATION)[0]
+    good = optimize(noisy.truth, noisy.views, noisy.images, noisy.pairs, CONFIG, REGISTRATION)[0]
     spoilt = [
         KeyframePair(
             p.first, p.second, p.T_first_second @ se3.exp(0.005 * rng.standard_normal(6)), p.information
         )
         for p in noisy.pairs
     ]
-    poor = optimise(noisy.chained(spoilt), noisy.views, noisy.images, spoilt, CONFIG, REGISTRATION)[0]
+    poor = optimize(noisy.chained(spoilt), noisy.views, noisy.images, spoilt, CONFIG, REGISTRATION)[0]
     assert noisy.error_m(noisy.chained(spoilt)) > 0.008
     assert se3.distance(good.T_map_keyframe, poor.T_map_keyframe)[0].max() < 1e-3  # of 9 mm
 
 
-def test_factors_say_what_the_optimisation_found(noisy: Walk) -> None:
-    found, factors = optimise(noisy.truth, noisy.views, noisy.images, noisy.pairs, CONFIG, REGISTRATION)
+def test_factors_say_what_the_optimization_found(noisy: Walk) -> None:
+    found, factors = optimize(noisy.truth, noisy.views, noisy.images, noisy.pairs, CONFIG, REGISTRATION)
     weighted = [
         KeyframePair(f.first, f.second, f.T_first_second, w * f.information)
         for f, w in zip(factors, found.weights, strict=True)
@@ -120,7 +120,7 @@ def test_keyframe_that_shows_nothing_keeps_what_tracking_said(noisy: Walk) -> No
     dark = RgbdPyramid.build(np.zeros((240, 320), np.float32), np.zeros((240, 320), np.float32), CAMERA)
     views = [*noisy.views[:7], View.of(dark)]
     images = [*noisy.pyramids[:7], dark]
-    found, factors = optimise(
+    found, factors = optimize(
         noisy.truth, views, lambda k, levels: images[k], noisy.pairs, CONFIG, REGISTRATION
     )
     of_dark = [f for f in factors if 7 in (f.first, f.second)]
@@ -131,7 +131,7 @@ def test_keyframe_that_shows_nothing_keeps_what_tracking_said(noisy: Walk) -> No
 
 def test_equal_input_gives_equal_bits(noisy: Walk) -> None:
     a, b = (
-        optimise(noisy.truth, noisy.views, noisy.images, noisy.pairs, CONFIG, REGISTRATION)[0]
+        optimize(noisy.truth, noisy.views, noisy.images, noisy.pairs, CONFIG, REGISTRATION)[0]
         for _ in range(2)
     )
     np.testing.assert_array_equal(a.T_map_keyframe, b.T_map_keyframe)
@@ -162,7 +162,7 @@ def test_loop_is_found_and_closes_the_drift(circle: Walk) -> None:
         truth = se3.inverse(circle.truth[loop.first]) @ circle.truth[loop.second]
         assert se3.distance(truth, loop.T_first_second)[0] < 5e-3
     assert circle.error_m(start) > 0.07
-    closed, _ = optimise(start, circle.views, circle.images, [*wrong, *loops], CONFIG, REGISTRATION)
+    closed, _ = optimize(start, circle.views, circle.images, [*wrong, *loops], CONFIG, REGISTRATION)
     # association is projective, rounds converge as ICP does: ten of them end at 6 mm, forty at 2
     assert circle.error_m(closed.T_map_keyframe) < 0.01 < 0.2 * circle.error_m(start)
 
@@ -197,8 +197,8 @@ def test_known_overlaps_and_foreign_places_are_no_loops(circle: Walk) -> None:
 
 
 def test_overlapping_pairs_are_those_that_see_each_other(circle: Walk) -> None:
-    config = KeyframeConfig(optimisation_neighbours=3)
-    pairs = Neighbourhood(circle.views, config).pairs(circle.truth)
+    config = KeyframeConfig(optimization_neighbors=3)
+    pairs = Neighborhood(circle.views, config).pairs(circle.truth)
     assert (0, 16) in pairs
     assert (0, 8) not in pairs
     assert all(first < second for first, second in pairs)
@@ -222,17 +222,17 @@ def test_work_per_keyframe_does_not_grow_with_the_path(noisy: Walk, monkeypatch:
         steps = [se3.inverse(noisy.truth[a]) @ noisy.truth[b] for a, b in pairwise(order)]
         tracked = [KeyframePair(k, k + 1, step, 1e4 * np.eye(6)) for k, step in enumerate(steps)]
         counts.update(images=0, overlaps=0, costs=0)
-        optimise(
+        optimize(
             noisy.truth[order],
             [noisy.views[k] for k in order],
             counted("images", lambda k, levels: noisy.pyramids[order[k]]),
             tracked,
-            KeyframeConfig(optimisation_candidates=8, optimisation_neighbours=3, optimisation_rounds=3),
+            KeyframeConfig(optimization_candidates=8, optimization_neighbors=3, optimization_rounds=3),
             REGISTRATION,
         )
         return {name: count / length for name, count in counts.items()}
 
-    monkeypatch.setattr(bundle, "linearise", counted("costs", bundle.linearise))
+    monkeypatch.setattr(bundle, "linearize", counted("costs", bundle.linearize))
     monkeypatch.setattr(bundle, "overlap", counted("overlaps", bundle.overlap))
     short, long = work(20), work(40)
     assert long["overlaps"] > 8  # the limit is reached: many more keyframes see the place
@@ -250,8 +250,8 @@ def test_a_pair_that_did_not_move_is_not_looked_at_again(noisy: Walk) -> None:
     rounds = []
     for limit in (3, 30):
         read.clear()
-        config = KeyframeConfig(optimisation_rounds=limit)
-        optimise(noisy.truth, noisy.views, images, noisy.pairs, config, REGISTRATION)
+        config = KeyframeConfig(optimization_rounds=limit)
+        optimize(noisy.truth, noisy.views, images, noisy.pairs, config, REGISTRATION)
         rounds.append(len(read) / len(noisy.views))
     assert rounds[0] <= 3
     assert rounds[1] < 30

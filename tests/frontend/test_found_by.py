@@ -33,13 +33,13 @@ def run() -> Undisturbed:
 
 @pytest.fixture(scope="module")
 def misfit() -> Undisturbed:
-    """Depth that does not fit the colour, by two pixels: what a poor calibration does."""
+    """Depth that does not fit the color, by two pixels: what a poor calibration does."""
     shots = [replace(shot, depth=np.roll(shot.depth, 2, axis=1)) for shot in filmed(0, START + 8)]
     return Undisturbed(Tracker(CAMERA, CONFIG), shots, (START,))
 
 
-def test_colour_alone_goes_on_from_the_last_frame_with_depth(misfit: Undisturbed) -> None:
-    """Against the keyframe, colour and depth that do not fit together are centimetres apart; the pose must not jump."""
+def test_color_alone_goes_on_from_the_last_frame_with_depth(misfit: Undisturbed) -> None:
+    """Against the keyframe, color and depth that do not fit together are centimeters apart; the pose must not jump."""
     tracker, shot = misfit.tracker(START), misfit.shots[START]
     keyframe = tracker.keyframes[-1]
     guess = se3.inverse(keyframe.T_map_keyframe) @ misfit.poses[START]
@@ -51,7 +51,7 @@ def test_colour_alone_goes_on_from_the_last_frame_with_depth(misfit: Undisturbed
     assert apart_m > 0.005
 
 
-def test_colour_alone_is_followed_for_a_short_way(run: Undisturbed) -> None:
+def test_color_alone_is_followed_for_a_short_way(run: Undisturbed) -> None:
     """The way counts from the last frame with depth; the frames are 22 mm apart."""
     short = FrontendConfig.model_validate(
         {"tracking": {"strides": (2, 1, 1, 1), "failure": {"max_way_without_depth_m": 0.05}}}
@@ -62,7 +62,7 @@ def test_colour_alone_is_followed_for_a_short_way(run: Undisturbed) -> None:
         assert all(row.frame.reason is Reason.NO_DEPTH for row in rows)
 
 
-def test_colour_alone_says_how_little_it_knows(run: Undisturbed) -> None:
+def test_color_alone_says_how_little_it_knows(run: Undisturbed) -> None:
     """Its standard deviation holds a share of the way."""
     rows = [row for row in run.disturbed(START, d.depthless, frames=5) if row.good]
     T_sound = run.poses[START - 1]
@@ -73,7 +73,7 @@ def test_colour_alone_says_how_little_it_knows(run: Undisturbed) -> None:
         assert np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[0]) > 0.99 * share * way_m
 
 
-def test_colour_alone_knows_no_more_than_the_frame_it_went_on_from(run: Undisturbed) -> None:
+def test_color_alone_knows_no_more_than_the_frame_it_went_on_from(run: Undisturbed) -> None:
     tracker, shot = run.tracker(START), run.shots[START]
     assert tracker._sound is not None
     tracker._sound = replace(tracker._sound, information=1e2 * np.eye(6))  # 10 cm, 0.1 rad
@@ -82,7 +82,7 @@ def test_colour_alone_knows_no_more_than_the_frame_it_went_on_from(run: Undistur
     assert np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[0]) > 0.099
 
 
-def test_colour_alone_must_look_as_before(run: Undisturbed) -> None:
+def test_color_alone_must_look_as_before(run: Undisturbed) -> None:
     """Without depth, and darker by more than a keyframe may be: nothing is known any more."""
     tracker, shot = run.tracker(START), run.shots[START]
     darker = (0.6 * shot.color.astype(np.float32)).astype(np.uint8)
@@ -129,7 +129,7 @@ def _found_by_the_first(run: Undisturbed, tracker: Tracker) -> tuple[_Found, _Fo
     result = register(tracker.keyframes[0].reference, pyramid, run.poses[START])
     assert result.ok
     place = _Found(0, result)
-    view = features_of(pyramid, CONFIG.tracking.relocalisation)
+    view = features_of(pyramid, CONFIG.tracking.relocalization)
     return place, tracker._by_latest(shot.stamp_ns, pyramid, view, place)
 
 

@@ -81,7 +81,7 @@ def test_a_covered_lens_is_lost_and_found_again(run: Undisturbed, start: int) ->
         assert (row.frame.status, row.frame.reason) == (Status.LOST, Reason.NO_DEPTH)
         np.testing.assert_array_equal(row.frame.information, 0)
     assert_found_again(rows, within=4)
-    assert next(row for row in after(rows) if row.good).frame.status is Status.RELOCALISED
+    assert next(row for row in after(rows) if row.good).frame.status is Status.RELOCALizED
 
 
 @pytest.mark.parametrize("start", STARTS)
@@ -137,7 +137,7 @@ def test_dropped_frames_change_nothing(run: Undisturbed, start: int) -> None:
 
 
 @pytest.mark.parametrize("start", STARTS)
-def test_stuck_depth_is_noticed_and_the_colour_goes_on(run: Undisturbed, start: int) -> None:
+def test_stuck_depth_is_noticed_and_the_color_goes_on(run: Undisturbed, start: int) -> None:
     rows = run.disturbed(start, d.frozen)
     assert not any(row.wrong for row in rows)
     for row in during(rows)[1:]:  # the first of them is in fact the right one
@@ -157,7 +157,7 @@ def test_without_depth_the_camera_goes_on_for_a_while(run: Undisturbed, start: i
 
 
 @pytest.mark.parametrize("start", STARTS)
-def test_stuck_colour_is_noticed(run: Undisturbed, start: int) -> None:
+def test_stuck_color_is_noticed(run: Undisturbed, start: int) -> None:
     rows = run.disturbed(start, d.frozen_color)
     assert not any(row.wrong for row in rows)
     assert all(row.frame.reason is Reason.STUCK_COLOR for row in during(rows)[8:])
@@ -180,7 +180,7 @@ def test_nothing_else_makes_it_silently_wrong(run: Undisturbed, disturbance: d.D
     assert rows[-1].good
 
 
-def test_depth_of_another_time_contradicts_the_colour(run: Undisturbed) -> None:
+def test_depth_of_another_time_contradicts_the_color(run: Undisturbed) -> None:
     """Stuck, but noisy, so that no value repeats; or late."""
     for disturbance in (d.noisy_stuck, d.late_depth):
         rows = during(run.disturbed(STARTS[0], disturbance, 8))
@@ -191,7 +191,7 @@ def test_after_a_pause_two_frames_must_agree(run: Undisturbed) -> None:
     rows = run.disturbed(STARTS[0], d.paused)
     first, second = rows[0].frame, rows[1].frame
     assert (first.status, first.reason) == (Status.LOST, Reason.UNCONFIRMED)
-    assert second.status is Status.RELOCALISED
+    assert second.status is Status.RELOCALizED
 
 
 def test_a_slow_camera_does_not_pause(run: Undisturbed) -> None:
@@ -266,7 +266,7 @@ def test_red_kitchen_is_never_silently_wrong(
     """A real sensor: nine disturbances, bravo's from the hardest places.
 
     At 20 the depth sticks while the image is burnt out, from 60 the mirrored room could pass for a fast motion, from
-    140 depth and colour do not fit together by 5 cm, and tracking has erred by as much since the first keyframe.
+    140 depth and color do not fit together by 5 cm, and tracking has erred by as much since the first keyframe.
     """
     if not (RED_KITCHEN / f"{robot}.mcap").is_file():
         pytest.skip("needs recordings/redkitchen")

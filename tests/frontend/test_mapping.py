@@ -26,7 +26,7 @@ QUICK = MappingConfig(max_gaussians=1500, iterations=10, final_iterations=5)
 
 
 def shot(T_map_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colour and depth of three textured walls, each n . X = -d in the map."""
+    """Color and depth of three textured walls, each n . X = -d in the map."""
     rays = CAMERA.rays() @ T_map_camera[:3, :3].T
     origin = T_map_camera[:3, 3]
     with np.errstate(divide="ignore"):
@@ -263,7 +263,7 @@ def test_exposure_is_found() -> None:
         mapper.add_keyframe(k, dimmed, depth, POSES[k])
     mapper.finish()
     assert np.allclose(np.mean(list(mapper.exposures.values()), axis=0), 0.0, atol=1e-6)
-    gains = [np.exp(a) * 0.5 + b for a, b in mapper.exposures.values()]  # at mid grey
+    gains = [np.exp(a) * 0.5 + b for a, b in mapper.exposures.values()]  # at mid gray
     assert gains[1] / gains[0] == pytest.approx(0.8, abs=0.02)
     assert gains[2] / gains[0] == pytest.approx(1.0, abs=0.02)
 
@@ -287,7 +287,7 @@ def test_keyframes_come_in_order(index: int) -> None:
 
 
 def test_masked_pixels_neither_seed_nor_count() -> None:
-    """A red card in front of the wall is not in the map where it is masked, and its colours change no bit."""
+    """A red card in front of the wall is not in the map where it is masked, and its colors change no bit."""
     masks = [np.ones((CAMERA.height, CAMERA.width), bool) for _ in range(2)]
     masks[0][10:30, 20:44] = False
     masks[1][10:30, 24:48] = False
@@ -305,7 +305,7 @@ def test_masked_pixels_neither_seed_nor_count() -> None:
 
     red, black = mapped(255), mapped(0)
     assert same(red.gaussians, black.gaussians)
-    assert red.gaussians.means[:, 2].min() > 0.9  # nothing at half a metre
+    assert red.gaussians.means[:, 2].min() > 0.9  # nothing at half a meter
     psnr_db, l1_m, completeness = drawn(red, POSES[1])
     assert psnr_db > 20
     assert l1_m < 0.05

@@ -37,7 +37,7 @@ def gaussians() -> Gaussians:
 
 
 def tracked(sigma_m: float) -> TrackedFrame:
-    """The frame, a few millimetres and milliradians from where it is."""
+    """The frame, a few millimeters and milliradians from where it is."""
     information = np.diag([sigma_m**-2.0] * 6)
     T = T_KEYFRAME_FRAME @ OFF
     return TrackedFrame(1, 10, 0, T, information, Status.OK, 0.9, 0.001, 0.01, Reason.NONE)

@@ -55,7 +55,7 @@ def beams(rings: int, columns: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
-    """A room filmed by a stereo rig with a LiDAR on top, grey values and ranges with noise."""
+    """A room filmed by a stereo rig with a LiDAR on top, gray values and ranges with noise."""
     room = build("room", 0)
     eye, wide = Renderer(room, bake.bake(room, 0.02), CAMERA), Renderer(room, None, WIDE)
     poses = trajectories.plan(room, 1, 160, 0.6, CAMERA)[0][:FRAMES]
@@ -91,7 +91,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
 
 
 def followed(walk: Walk, kind: str, out: Path, mapping: bool) -> tuple[list, list, float]:
-    """Tracked frames, the final map if there is one, and the ATE in metres."""
+    """Tracked frames, the final map if there is one, and the ATE in meters."""
     config = FrontendConfig(mapping_enabled=mapping)
     quick = config.mapping.model_copy(update={"final_iterations": 5, "max_gaussians": 20_000})
     run_frontend(walk.logs[kind], out, config.model_copy(update={"mapping": quick}))

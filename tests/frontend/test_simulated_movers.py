@@ -22,16 +22,16 @@ def test_what_moves_is_not_in_the_map(tmp_path: Path) -> None:
     quick = config.mapping.model_copy(update={"final_iterations": 5, "max_gaussians": 20_000})
     run_frontend(sensor_log, tmp_path / "frontend.mcap", config.model_copy(update={"mapping": quick}))
     messages = {record.topic: record.message() for record in read_log(tmp_path / "frontend.mcap")}
-    centres = messages["/alpha/map"].gaussians.means
+    centers = messages["/alpha/map"].gaussians.means
     first = frames[0]  # the map's frame is that of this camera
     assert first.mask is not None
     hidden = ~first.mask
     assert hidden.mean() > 0.02
-    ahead = centres[:, 2] > 0.1
-    pixels = np.rint(camera.project(centres[ahead])).astype(int)
+    ahead = centers[:, 2] > 0.1
+    pixels = np.rint(camera.project(centers[ahead])).astype(int)
     inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
     u, v = pixels[inside].T
-    z = centres[ahead][inside, 2]
+    z = centers[ahead][inside, 2]
     near = hidden[v, u] & (np.abs(z - first.depth[v, u]) < 0.1)
     assert len(z) > 200
     assert near.sum() <= 0.002 * len(z)

@@ -166,11 +166,11 @@ def test_a_missing_log_is_named(tmp_path: Path) -> None:
 
 def test_what_moves_is_not_mapped(tmp_path: Path) -> None:
     """A ball crosses the room, never twice at one place: depth alone keeps it out, without that it leaves a trail."""
-    centres = [np.array([-0.5 + 0.15 * k, -0.3, 0.5]) for k in range(FRAMES)]
+    centers = [np.array([-0.5 + 0.15 * k, -0.3, 0.5]) for k in range(FRAMES)]
     with RecordingWriter(tmp_path / "room") as recording, recording.robot("alpha", CAMERA, 0.0005) as robot:
         for k in range(FRAMES):
             gray, room = render(walk(k))
-            depth, shows = with_ball(room, walk(k), centres[k])
+            depth, shows = with_ball(room, walk(k), centers[k])
             image = np.repeat(np.where(shows, 0.9, gray)[..., None], 3, axis=2)
             png = cv2.imencode(".png", np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8))[1].tobytes()
             robot.add_frame(k * FRAME_NS, png, "png", np.rint(depth / 0.0005).astype(np.uint16))
@@ -188,7 +188,7 @@ def test_what_moves_is_not_mapped(tmp_path: Path) -> None:
         run_frontend(tmp_path / "room" / "alpha.mcap", out, config)
         gaussians = messages(out, topics.MAP)[0].gaussians
         points = se3.transform(walk(0), gaussians.means.astype(np.float64))
-        away = np.linalg.norm(points[:, None] - np.array(centres), axis=2).min(axis=1)
+        away = np.linalg.norm(points[:, None] - np.array(centers), axis=2).min(axis=1)
         left[enabled] = int(np.count_nonzero(away < 1.1 * RADIUS_M))
     assert left[False] > 100
     assert left[True] < 0.05 * left[False]

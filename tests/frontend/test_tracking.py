@@ -44,7 +44,7 @@ def walked() -> tuple[Tracker, list[TrackedFrame], list[np.ndarray]]:
     return tracker, frames, truth
 
 
-def test_walk_is_tracked_to_less_than_a_millimetre(walked) -> None:
+def test_walk_is_tracked_to_less_than_a_millimeter(walked) -> None:
     tracker, frames, truth = walked
     assert [f.status for f in frames] == [Status.OK] * STEPS
     assert ate_rmse_m(np.array(truth)[:, :3, 3], positions(tracker, frames)) < 1e-3
@@ -97,7 +97,7 @@ def test_failed_images_are_lost_and_the_camera_is_found_again(spoil) -> None:
     for frame in frames[5:8]:
         np.testing.assert_array_equal(frame.information, 0)
         np.testing.assert_array_equal(frame.T_keyframe_camera, frames[4].T_keyframe_camera)
-    assert status[8] is Status.RELOCALISED
+    assert status[8] is Status.RELOCALizED
     assert status[9:] == [Status.OK] * 3
     truth = np.array([walk(0.5 * k)[:3, 3] for k in range(12)])
     seen = [k for k in range(12) if not 5 <= k < 8]
@@ -260,7 +260,7 @@ def test_refine_withstands_a_wrong_pair() -> None:
     assert plain.contradiction > robust.contradiction > 1
     clean = refine(truth, pairs[:3] + pairs[4:], 1.0)
     np.testing.assert_allclose(clean.T_map_keyframe, truth, atol=1e-8)
-    # the contradiction shows in the covariance: the first pose's neighbour is known worse than by one pair alone
+    # the contradiction shows in the covariance: the first pose's neighbor is known worse than by one pair alone
     assert robust.covariance([1])[0, 0] > 1e-4 / len(pairs)
 
 
@@ -269,7 +269,7 @@ def test_the_rule_of_held_out_frames() -> None:
 
 
 def test_refine_solves_thousands_of_keyframes() -> None:
-    """A long walk with neighbours and a few closed loops: sparse work, the exact answer."""
+    """A long walk with neighbors and a few closed loops: sparse work, the exact answer."""
     rng = np.random.default_rng(2)
     k = 2000
     truth = chain(k, rng)

@@ -1,4 +1,4 @@
-"""What a robot takes over from its neighbours: what its own keyframes and its own map do not explain, once."""
+"""What a robot takes over from its neighbors: what its own keyframes and its own map do not explain, once."""
 
 import numpy as np
 
@@ -31,7 +31,7 @@ def wall(opacity_logits):
     )
 
 
-def test_neighbours_unmatched_gaussians_fill_only_unseen_space():
+def test_neighbors_unmatched_gaussians_fill_only_unseen_space():
     """An own keyframe at the origin measured a wall 2 m away on the left half of its image, nothing on the right."""
     world = World(12, robots=2)
     depth = np.zeros((CAMERA.height, CAMERA.width), np.float32)
@@ -45,9 +45,9 @@ def test_neighbours_unmatched_gaussians_fill_only_unseen_space():
     theta = np.zeros((6, 13))
     theta[:, MEAN], theta[:, LOG_COVARIANCE] = points, -8 * np.array([1, 1, 1, 0, 0, 0])
     rng = np.random.default_rng(13)
-    neighbour = Evidence("bravo", np.arange(6), np.zeros(6), theta, information(rng, 6))
+    neighbor = Evidence("bravo", np.arange(6), np.zeros(6), theta, information(rng, 6))
     given = {
-        "evidence": {"alpha": world.evidence["alpha"], "bravo": neighbour},
+        "evidence": {"alpha": world.evidence["alpha"], "bravo": neighbor},
         "pairs": {},
         "T_world_keyframe": {"alpha": np.tile(np.eye(4), (3, 1, 1)), "bravo": np.eye(4)[None]},
     }
@@ -79,7 +79,7 @@ def test_neighbours_unmatched_gaussians_fill_only_unseen_space():
 
 
 def test_the_own_map_explains_where_depth_is_missing():
-    """A wall of own splats at 2 m without depth: a neighbour's splats at and before it are no news."""
+    """A wall of own splats at 2 m without depth: a neighbor's splats at and before it are no news."""
     own = wall(np.full(40 * 40, 4.0))
     n = len(own)
     theta = np.zeros((3, 13))
@@ -102,7 +102,7 @@ def test_the_own_map_explains_where_depth_is_missing():
 
 
 def test_a_surface_that_the_own_map_hardly_draws_is_not_explained():
-    """Where own splats are thin, a neighbour's on the measured wall fill it, and only there."""
+    """Where own splats are thin, a neighbor's on the measured wall fill it, and only there."""
     own = wall(np.where(WALL[:, 0] < 0, 4.0, -4.0))
     n = len(own)
     theta = np.zeros((2, 13))
@@ -131,7 +131,7 @@ def test_a_surface_that_the_own_map_hardly_draws_is_not_explained():
     assert fused.source_ids[n:].tolist() == [1]
 
 
-def test_what_two_neighbours_share_is_taken_over_once():
+def test_what_two_neighbors_share_is_taken_over_once():
     world = World(14)
     pair = {("bravo", "charlie"): world.pairs["bravo", "charlie"]}
     fused = world.fuse("alpha", pairs=pair)  # bravo's, with what charlie says about them

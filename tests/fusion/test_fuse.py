@@ -22,7 +22,7 @@ from tests.fusion.worlds import (
 )
 
 
-def test_fused_means_minimise_the_sum_of_all_members():
+def test_fused_means_minimize_the_sum_of_all_members():
     """Against the normal equations written out, one place at a time, where these stay among their members."""
     world = World(0)
     fused = world.fuse("alpha", ALIKE)
@@ -43,14 +43,14 @@ def test_fused_means_minimise_the_sum_of_all_members():
                     + 0.5 * ALIKE.scatter_log_covariance**2 * np.eye(6)
                 )
             )
-        # float32 maps: 6e-8 of a few metres, and of log-scales of about five
+        # float32 maps: 6e-8 of a few meters, and of log-scales of about five
         for actual, values, W, atol in (
             (fused.gaussians.means[k], means, weights, 2e-6),
             (shapes[k], forms, form_weights, 5e-5),
         ):
             expected = np.linalg.solve(sum(W), sum(w @ v for w, v in zip(W, values, strict=True)))
-            centre = np.mean(values, axis=0)
-            if np.linalg.norm(expected - centre) < 0.99 * np.linalg.norm(values - centre, axis=1).max():
+            center = np.mean(values, axis=0)
+            if np.linalg.norm(expected - center) < 0.99 * np.linalg.norm(values - center, axis=1).max():
                 np.testing.assert_allclose(actual, expected, atol=atol)
                 compared += 1
         color = [1 / (1 / e.color_information()[k] + 0.5 * ALIKE.scatter_color**2) for e in there.values()]
@@ -92,12 +92,12 @@ def tinted(world, **cameras):
     return maps, evidence
 
 
-def test_every_robot_keeps_its_own_colours_and_the_maps_agree():
-    """Against the same team with equal cameras: all else is fused alike, and colours, put into one camera's, too."""
+def test_every_robot_keeps_its_own_colors_and_the_maps_agree():
+    """Against the same team with equal cameras: all else is fused alike, and colors, put into one camera's, too."""
     world = World(20)
     rng = np.random.default_rng(20)
     shared = rng.uniform(size=(N, 3))
-    for k, name in enumerate(world.names):  # splats of one place have nearly one colour
+    for k, name in enumerate(world.names):  # splats of one place have nearly one color
         world.evidence[name].theta[:, COLOR] = shared + 0.01 * np.random.default_rng(k).normal(size=(N, 3))
         colors = world.evidence[name].theta[:, COLOR].astype(np.float32)
         world.maps[name] = world.maps[name].replace(colors=colors)
@@ -172,7 +172,7 @@ def test_zero_information_moves_nothing():
     np.testing.assert_array_equal(fused.information, expected.information)
 
 
-def test_where_neighbours_know_nothing_every_bit_stays():
+def test_where_neighbors_know_nothing_every_bit_stays():
     world = World(6)
     blind = {n: world.without_information(n) for n in ("bravo", "charlie")}
     T_world = world.T_world | {"alpha": world.T_map["alpha"]}  # alpha is the root and did not move
@@ -225,7 +225,7 @@ def test_turning_the_world_turns_the_fused_map():
 
 
 def test_unknown_directions_keep_the_own_value():
-    """One axis known to both, one to the neighbour only, one to nobody."""
+    """One axis known to both, one to the neighbor only, one to nobody."""
     weights = np.array([np.diag([1.0, 0.0, 0.0]), np.diag([3.0, 2.0, 0.0])])
     values = np.array([[0.0, 0.0, 0.0], [4.0, 5.0, 6.0]])
     move = weighted_move(weights, values, np.array([0]), 1e-12)
@@ -283,7 +283,7 @@ def test_tilted_discs_do_not_slide_to_where_their_planes_cross():
 
 
 def test_a_fused_value_never_leaves_its_members():
-    """Farther from their weighted centre than all of them; hostile weights: rank one, contradicting each other."""
+    """Farther from their weighted center than all of them; hostile weights: rank one, contradicting each other."""
     rng = np.random.default_rng(16)
     for d in (3, 6):
         axes, values = rng.normal(size=(4000, d, 1)), rng.normal(size=(4000, d))
@@ -293,9 +293,9 @@ def test_a_fused_value_never_leaves_its_members():
         move = weighted_move(weights, values, first, 1e-9)
         groups = values.reshape(-1, 4, d)
         trace = np.trace(weights, axis1=1, axis2=2).reshape(-1, 4, 1)
-        centre = (trace * groups).sum(axis=1) / trace.sum(axis=1)
-        reach = np.linalg.norm(groups - centre[:, None], axis=-1).max(axis=1)
-        assert np.all(np.linalg.norm(move - centre, axis=1) <= reach * (1 + 1e-6))
+        center = (trace * groups).sum(axis=1) / trace.sum(axis=1)
+        reach = np.linalg.norm(groups - center[:, None], axis=-1).max(axis=1)
+        assert np.all(np.linalg.norm(move - center, axis=1) <= reach * (1 + 1e-6))
 
 
 def test_a_thickness_at_the_floor_stays_there():

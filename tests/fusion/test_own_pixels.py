@@ -30,7 +30,7 @@ def views(mask=None) -> list[View]:
 
 
 def with_taken_over(information: float) -> FusedMap:
-    """The wall, and three white discs of a neighbour's: before it, behind the cameras, before it again."""
+    """The wall, and three white discs of a neighbor's: before it, behind the cameras, before it again."""
     own = wall()
     means = np.array([[0.3, 0.0, 1.5], [0.0, 0.0, -2.0], [-0.3, 0.1, 1.6]])
     quats, scales = np.tile([1.0, 0, 0, 0], (3, 1)), np.tile(np.log([0.08, 0.08, 0.001]), (3, 1))

@@ -117,7 +117,7 @@ def test_no_steps_change_nothing(spoilt: tuple[Gaussians, list[View]]) -> None:
     assert refine(gaussians, ALL, [], CAMERA, RefineConfig(), 1e-3, "blended", seed=0) is gaussians
 
 
-def test_a_neighbours_map_is_drawn_with_the_depth_that_it_was_made_with() -> None:
+def test_a_neighbors_map_is_drawn_with_the_depth_that_it_was_made_with() -> None:
     true, poses = wall(), np.array(POSES[:1])
     tilted = true.replace(quats_wxyz=np.tile(np.float32([0.9689, 0.0, 0.2474, 0.0]), (400, 1)))
     evidence = Evidence.from_map("zulu", tilted.replace(anchors=np.zeros(400, np.int32)), None, poses)
@@ -132,7 +132,7 @@ def test_a_neighbours_map_is_drawn_with_the_depth_that_it_was_made_with() -> Non
     assert np.abs(seen["blended"] - seen["ray_plane"]).max() > 0.01
 
 
-def test_a_neighbours_map_shows_what_it_would_from_where_the_neighbour_stood() -> None:
+def test_a_neighbors_map_shows_what_it_would_from_where_the_neighbor_stood() -> None:
     true, T_world_map = wall(), se3.exp(np.array([0.3, -0.2, 0.1, 0.02, 0.1, 0.05]))
     poses, anchors = np.array(POSES[:3]), np.arange(400) % 3
     scattered = true.means + [0, 0, 0.02] * np.random.default_rng(2).normal(
@@ -168,7 +168,7 @@ def test_a_neighbours_map_shows_what_it_would_from_where_the_neighbour_stood() -
     assert peer_views({}, {}, CAMERA, 40, {}, colors=ALIKE) == []
 
 
-def test_neighbours_views_teach_what_own_ones_do_not_see(spoilt: tuple[Gaussians, list[View]]) -> None:
+def test_neighbors_views_teach_what_own_ones_do_not_see(spoilt: tuple[Gaussians, list[View]]) -> None:
     gaussians, views = spoilt
     half = np.zeros((48, 64), bool)
     half[:, :20] = True
@@ -190,7 +190,7 @@ def test_steps_are_shared_out() -> None:
     assert steps_of(config, 40, 0) == (100, 0)
 
 
-def test_made_up_colours_of_a_neighbour_do_little_to_own_views(spoilt: tuple[Gaussians, list[View]]) -> None:
+def test_made_up_colors_of_a_neighbor_do_little_to_own_views(spoilt: tuple[Gaussians, list[View]]) -> None:
     """Robust loss, a fifth of the steps, and own images last."""
     gaussians, views = spoilt
     own, hostile = views[::2], [replace(v, color=255 - v.color) for v in views[1::2]]

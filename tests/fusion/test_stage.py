@@ -183,7 +183,7 @@ def test_frames_and_gaussians_move_with_their_keyframes(robot, tmp_path):
     np.testing.assert_allclose(fused.information.geometry[:, trace].sum(axis=1), told, rtol=1e-5)
 
 
-def test_what_only_a_neighbour_saw_is_taken_over(robot, tmp_path):
+def test_what_only_a_neighbor_saw_is_taken_over(robot, tmp_path):
     """A Gaussian of alpha behind bravo's cameras, and one on the wall that they measured."""
     theta = np.zeros((2, 13))
     theta[:, :3] = [[0, 0, -3.0], [0, 0, 2.0]]
@@ -201,7 +201,7 @@ def test_what_only_a_neighbour_saw_is_taken_over(robot, tmp_path):
     np.testing.assert_allclose(told.sigma_gain, np.sqrt(2) * ColorConfig().prior_gain)
 
 
-def test_a_neighbour_that_contradicts_own_images_is_left_out(robot, tmp_path):
+def test_a_neighbor_that_contradicts_own_images_is_left_out(robot, tmp_path):
     """A white wall where bravo saw a dark one, and one more Gaussian where bravo never looked."""
     x, y = np.meshgrid(np.arange(-1.4, 1.4, 0.05), np.arange(-1.1, 1.1, 0.05))
     theta = np.zeros((x.size + 1, 13))
@@ -212,9 +212,9 @@ def test_a_neighbour_that_contradicts_own_images_is_left_out(robot, tmp_path):
     other = Evidence("alpha", ids, np.zeros(len(ids)), theta, np.ones((len(ids), 31)))
     fused = fuse_files(robot, result_of(robot, robot.T_map_keyframe, alpha=other), tmp_path)[GaussianMap]
     assert len(fused.gaussians) == N
-    (record,) = read_log(tmp_path / "fused.mcap", topics=[topics.NEIGHBOUR_DOUBT.of("bravo")])
+    (record,) = read_log(tmp_path / "fused.mcap", topics=[topics.PEER_MAP_REPORT.of("bravo")])
     said = record.message()
-    assert (said.neighbour, said.gaussians, said.used) == ("alpha", len(ids), False)
+    assert (said.peer, said.gaussians, said.used) == ("alpha", len(ids), False)
     assert "contradicts own images" in said.reason
 
 

@@ -50,7 +50,7 @@ def reason(line: str) -> str:
 def main() -> int:
     from duagc.pipeline.base import determinism
 
-    determinism.settle()  # before OpenCV is imported: it reads its limit of pixels then
+    determinism.configure_determinism()  # before OpenCV is imported: it reads its limit of pixels then
     from tests.fuzz import seeds
     from tests.fuzz.cases import cases
     from tests.fuzz.readers import READERS

@@ -94,7 +94,7 @@ def ros_bag(version: int, container: str) -> Callable[[Path], Path]:
 
 
 def compressed_bag(root: Path) -> Path:
-    """Colour as JPEG, depth as PNG and RVL in turns, with the headers that `image_transport` writes."""
+    """Color as JPEG, depth as PNG and RVL in turns, with the headers that `image_transport` writes."""
     root.mkdir(parents=True)
     r = Ros(2)
     rows = []

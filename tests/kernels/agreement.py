@@ -36,7 +36,7 @@ FAMILIES = {
     "means": slice(0, 3),
     "quaternions": slice(3, 7),
     "log-scales": slice(7, 10),
-    "colours": slice(10, 13),
+    "colors": slice(10, 13),
     "opacity": slice(13, 14),
 }
 IMAGE_BAR = 1e-5
@@ -130,7 +130,7 @@ def information_outputs(rasterizer: Any, scene: Scene, n: int, floors: bool) -> 
         out[f"block {name}"] = (blocks[:, rows, columns], INFORMATION_BAR, 0.0)
     for i, block in enumerate(blocks):  # one at a time too: a weak Gaussian must not hide behind a strong one
         out[f"block of {i}"] = (block, INFORMATION_BAR, 0.0)
-    out["information of colour"] = (sums.color, INFORMATION_BAR, 0.0)
+    out["information of color"] = (sums.color, INFORMATION_BAR, 0.0)
     out["information of opacity"] = (sums.opacity, INFORMATION_BAR, 0.0)
     out["observations"] = (sums.observations.astype(np.float64), 0.0, 0.0)
     out["weight"], out["residual"] = (sums.weight, IMAGE_BAR, 0.0), (sums.residual, IMAGE_BAR, 0.0)

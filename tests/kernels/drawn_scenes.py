@@ -20,7 +20,7 @@ Kind = tuple[str, str, str]
 
 
 def log_scales_of(shape: str, rng: np.random.Generator) -> np.ndarray:
-    """Log of metres, [3], in any order."""
+    """Log of meters, [3], in any order."""
     s = rng.normal(-1.6, 0.5, 3)
     if shape == "needle":
         s = np.array([rng.uniform(-1, 1), *rng.uniform(-8, -4, 2)])
@@ -46,7 +46,7 @@ def place_of(place: str, camera: PinholeCamera, rng: np.random.Generator) -> np.
         uv = step * rng.integers(0, size // step + 1) - rng.choice([0.0, 0.5])
     elif place == "near":
         z = rng.uniform(0.02, 0.3)
-    elif place == "at the edge":  # around the edge of the image, and beyond where J is linearised
+    elif place == "at the edge":  # around the edge of the image, and beyond where J is linearized
         uv = size / 2 + size * rng.choice([-1, 1], 2) * rng.uniform(0.4, 1.0, 2)
     elif place == "behind":
         z = rng.choice([-1.0, 0.005]) * rng.uniform(0.1, 1.9)
@@ -83,7 +83,7 @@ def made_scene(seed: int, kinds: Sequence[Kind], camera: PinholeCamera, turned: 
 
 
 def crowded_scene(seed: int, n: int, camera: PinholeCamera) -> Scene:
-    """n Gaussians with their centres in one pixel, so faint that many of them count."""
+    """n Gaussians with their centers in one pixel, so faint that many of them count."""
     rng = np.random.default_rng(seed)
     kinds = [("plain", "plain", "faint")] * n
     scene = made_scene(seed, kinds, camera)

@@ -19,7 +19,7 @@ def evaluate(rasterizer, kind):
     """Everything a rasterizer can say about one view of one scene."""
     scene = make_scene(kind)
     of_color, of_depth = scene.image(4, low=0.0), scene.image(5, low=0.0)
-    of_color[:3], of_depth[2:5] = 0.0, 0.0  # pixels left out: of colour, of both, of depth
+    of_color[:3], of_depth[2:5] = 0.0, 0.0  # pixels left out: of color, of both, of depth
     sums = FisherSums(len(scene.gaussians))
     render = rasterizer.forward(scene.gaussians, scene.camera, scene.T_camera_map, scene.background)
     gradients = rasterizer.backward(scene.image(1, 3), scene.image(2), scene.image(3), pose=True, fisher=True)

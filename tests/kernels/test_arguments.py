@@ -211,7 +211,7 @@ def test_any_size_of_image(isa, size):
 
 @pytest.mark.parametrize("isa", available_isas())
 def test_extremes_stay_finite(isa):
-    """Sizes from nothing to a planet, any distance, opacities at both ends, and centres at the camera's edge."""
+    """Sizes from nothing to a planet, any distance, opacities at both ends, and centers at the camera's edge."""
     rng, n = np.random.default_rng(7), 400
     gaussians = random_gaussians(n, 7).replace(
         means=rng.normal(size=(n, 3)) * 10.0 ** rng.uniform(-3, 12, (n, 1)),

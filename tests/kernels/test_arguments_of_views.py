@@ -59,7 +59,7 @@ def test_masks_that_cannot_be(mask):
         differentiated(mask=mask)
 
 
-@pytest.mark.parametrize("depth", ["centre", "", "BLENDED", None, 1, b"blended", ["blended"]])
+@pytest.mark.parametrize("depth", ["center", "", "BLENDED", None, 1, b"blended", ["blended"]])
 def test_kinds_of_depth_that_do_not_exist(depth):
     with pytest.raises(REFUSED, match=r"depth .*ray_plane"):
         Rasterizer().forward(random_gaussians(5, 0), CAMERA, np.eye(4), depth=depth)
@@ -124,7 +124,7 @@ def test_residuals_that_cannot_be(residual):
 
 
 @pytest.mark.parametrize("color", COLORS.values(), ids=COLORS)
-def test_colour_images_that_cannot_be(color):
+def test_color_images_that_cannot_be(color):
     with pytest.raises(REFUSED, match="color"):
         differentiated(color=color)
 
@@ -311,7 +311,7 @@ def test_any_size_of_anything(isa, size, n, depth):
 @pytest.mark.parametrize("isa", available_isas())
 @pytest.mark.parametrize("depth", ["blended", "ray_plane"])
 def test_extremes_stay_finite(isa, depth):
-    """Sizes from nothing to a planet, any distance, opacities at both ends, and centres at the camera's edge."""
+    """Sizes from nothing to a planet, any distance, opacities at both ends, and centers at the camera's edge."""
     rng, n = np.random.default_rng(7), 400
     gaussians = random_gaussians(n, 7).replace(
         means=rng.normal(size=(n, 3)) * 10.0 ** rng.uniform(-2, 3, (n, 1)),

@@ -83,30 +83,30 @@ def test_a_point_is_seen_through_the_variance_of_a_square_pixel(rasterizer, offs
 # ---------------------------------------------------------------- depth along the ray
 
 
-def slanted_disc(normal_camera, centre_camera=(0.3, -0.2, 2.0), scale_m=0.4):
+def slanted_disc(normal_camera, center_camera=(0.3, -0.2, 2.0), scale_m=0.4):
     """One opaque disc at a slant to a camera at the origin of the map."""
     normal = np.asarray(normal_camera) / np.linalg.norm(normal_camera)
     tangent = np.cross(normal, [0.0, 1.0, 0.0])
     tangent /= np.linalg.norm(tangent)
     axes = np.stack([tangent, np.cross(normal, tangent), normal], axis=1)
     gaussians = random_gaussians(1, 0).replace(
-        means=[centre_camera],
+        means=[center_camera],
         quats_wxyz=so3.to_quat_wxyz(axes)[None],
         log_scales=[[np.log(scale_m), np.log(0.7 * scale_m), -9.0]],
         opacity_logits=[2.0],
     )
-    return gaussians, normal, np.array(centre_camera)
+    return gaussians, normal, np.array(center_camera)
 
 
 @pytest.mark.parametrize("normal", [(0, 0, -1), (0.5, 0.2, -1), (-0.8, 0.6, -1)])
 def test_ray_plane_depth_of_a_disc_is_where_the_ray_meets_its_plane(rasterizer, normal):
-    """n.(z ray) = n.p: depth and slope at the centre; beyond, affine, so the error grows with the square."""
-    gaussians, normal, centre = slanted_disc(normal)
+    """n.(z ray) = n.p: depth and slope at the center; beyond, affine, so the error grows with the square."""
+    gaussians, normal, center = slanted_disc(normal)
     camera = PinholeCamera(121, 101, 200.0, 210.0, 30.0, 71.0)
     render = rasterizer.forward(gaussians, camera, np.eye(4), depth="ray_plane")
     depth = render.depth / render.alpha
-    plane = (normal @ centre) / (camera.rays() @ normal)
-    u, v = camera.project(centre)  # both whole: a pixel lies on the centre
+    plane = (normal @ center) / (camera.rays() @ normal)
+    u, v = camera.project(center)  # both whole: a pixel lies on the center
     i, j = round(float(v)), round(float(u))
     assert depth[i, j] == pytest.approx(2.0, rel=1e-6)
     by_u, by_v = (depth[i, j + 1] - depth[i, j - 1]) / 2, (depth[i + 1, j] - depth[i - 1, j]) / 2
@@ -121,7 +121,7 @@ def test_ray_plane_depth_of_a_disc_is_where_the_ray_meets_its_plane(rasterizer, 
     assert (error <= curvature * distance[near] ** 2 + 3e-3 * slope * distance[near] + 2e-6).all()
 
 
-def test_ray_plane_depth_of_a_ball_is_that_of_its_centre_on_the_axis(rasterizer):
+def test_ray_plane_depth_of_a_ball_is_that_of_its_center_on_the_axis(rasterizer):
     """A ball on the optical axis has no covariance of position and depth."""
     gaussians = random_gaussians(1, 0).replace(means=[[0, 0, 2.0]], log_scales=[[-2.0] * 3])
     camera = PinholeCamera(11, 9, 20.0, 20.0, 5.0, 4.0)
@@ -412,7 +412,7 @@ def backward_of(rasterizer, loss) -> Gradients:
 
 
 def measured_images(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """A colour and a depth image with holes, near what is drawn, so that residuals lie on both sides of the widths."""
+    """A color and a depth image with holes, near what is drawn, so that residuals lie on both sides of the widths."""
     reference, rng = ReferenceRasterizer(), np.random.default_rng(11)
     render = draw(reference, scene)
     color = render.color + rng.normal(scale=0.15, size=render.color.shape)

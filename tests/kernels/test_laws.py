@@ -56,7 +56,7 @@ def test_pose_gradient_is_by_the_right_tangent_of_the_camera_in_the_map(plain):
     np.testing.assert_allclose(pose, differences, rtol=1e-4, atol=1e-4 * np.abs(differences).max())
 
 
-def test_centre_of_a_pixel_is_an_integer():
+def test_center_of_a_pixel_is_an_integer():
     gaussians = random_gaussians(1, 0).replace(
         means=[[0.0, 0.0, 2.0]], log_scales=[[-5.0] * 3], opacity_logits=[3.0]
     )

@@ -16,7 +16,7 @@ Row = tuple[int, int, Array]
 
 
 def helix(n: int, turn: int = 8) -> Array:
-    """True poses [n, 4, 4]: so many per turn, one metre above each other."""
+    """True poses [n, 4, 4]: so many per turn, one meter above each other."""
     angle = 2 * np.pi * np.arange(n) / turn
     t = np.stack([2 * np.cos(angle), 2 * np.sin(angle), np.arange(n) / turn], axis=1)
     w = np.stack([0 * angle, 0 * angle, angle + np.pi / 2], axis=1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.posegraph import settings
-from duagc.pipeline.network.packets import parse, serialise
+from duagc.pipeline.network.packets import parse, serialize
 from duagc.pipeline.posegraph.files import read_team
 from duagc.pipeline.team_posegraph import network
 from tests.posegraph.graphs import helix_edges, write_g2o
@@ -33,7 +33,7 @@ def test_changed_payloads_crash_nobody(tmp_path, solver):
                     for _ in range(int(rng.integers(1, 4))):
                         payload[int(rng.integers(len(payload)))] = int(rng.integers(256))
                     waiting[out.receiver].append(
-                        serialise(dataclasses.replace(packet, payload=bytes(payload)))
+                        serialize(dataclasses.replace(packet, payload=bytes(payload)))
                     )
                     changed += 1
                 else:

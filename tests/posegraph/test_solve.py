@@ -196,7 +196,7 @@ def test_the_command_on_a_teams_files(tmp_path):
     assert set(result["rounds_to"]) >= {"1e-4", "1e-6"}
     assert abs(result["cost"] / result["optimum"] - 1) < 1e-6
     text = duagc("posegraph", folder, "--solver", "elimination").stdout
-    assert "centralised optimum" in text
+    assert "centralized optimum" in text
     assert "all agents hold still" in text
     assert "Examples" in duagc("posegraph", "--help").stdout
 

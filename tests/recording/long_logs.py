@@ -1,6 +1,6 @@
 """Long logs by repetition: `python -m tests.recording.long_logs RECORDING OUT --kind bag --gigabytes 20`.
 
-The frames of a recording (colour as it is, depth as raw 16UC1) are written at 30 Hz forwards and backwards, again and
+The frames of a recording (color as it is, depth as raw 16UC1) are written at 30 Hz forwards and backwards, again and
 again, with an IMU at 200 Hz where the kind of log has messages for it. No more is held than those frames.
 """
 
@@ -43,7 +43,7 @@ Message = Callable[[int], bytes]  # the bytes of a message, by the time of its h
 
 @dataclass
 class Seed:
-    """What is repeated. colors: JPEG or PNG; depths: uint16 [H, W], in millimetres."""
+    """What is repeated. colors: JPEG or PNG; depths: uint16 [H, W], in millimeters."""
 
     camera: PinholeCamera
     colors: list[bytes]
@@ -74,7 +74,7 @@ def patched(data: bytes) -> Message:
 
 def ros_messages(seed: Seed, ros: Ros, packed: bool) -> dict[str, tuple[str, list[Message]]]:
     """By topic: type and the messages that are repeated. packed: depth as compressedDepth."""
-    serialise: Any = ros.store.serialize_ros1 if ros.version == 1 else ros.store.serialize_cdr
+    serialize: Any = ros.store.serialize_ros1 if ros.version == 1 else ros.store.serialize_cdr
     text = "jpeg" if seed.colors[0].startswith(b"\xff\xd8") else "png"
     still = ros.make("geometry_msgs/msg/Vector3", x=0.01, y=0.02, z=9.81)
     imu = ros.make(
@@ -106,7 +106,7 @@ def ros_messages(seed: Seed, ros: Ros, packed: bool) -> dict[str, tuple[str, lis
         ]
     out: dict[str, tuple[str, list[Message]]] = {}
     for topic, rows in found.items():
-        encoded = [bytes(serialise(m, m.__msgtype__)) for m in rows]
+        encoded = [bytes(serialize(m, m.__msgtype__)) for m in rows]
         timed = [lambda at, d=d: d for d in encoded] if topic == STATIC else [patched(d) for d in encoded]
         out[topic] = rows[0].__msgtype__, timed
     return out

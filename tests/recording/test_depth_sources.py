@@ -1,4 +1,4 @@
-"""Depth of another camera or a LiDAR, as the colour camera would see it."""
+"""Depth of another camera or a LiDAR, as the color camera would see it."""
 
 from pathlib import Path
 
@@ -17,11 +17,11 @@ from tests.recording.logs import CALIBRATION, COLOR, png
 WIDE = PinholeCamera(64, 48, 56.0, 56.0, 31.5, 23.5)
 DEPTH_CAMERA = PinholeCamera(60, 44, 50.0, 51.0, 29.0, 22.5)
 T_CAMERA_DEPTH = se3.exp([0.025, -0.004, 0.01, 0.01, -0.02, 0.015])
-WALL = (np.array([0.2, -0.1, -1.0]), 2.0)  # n . X = -d in the colour camera
+WALL = (np.array([0.2, -0.1, -1.0]), 2.0)  # n . X = -d in the color camera
 
 
 def plane_depth(camera: PinholeCamera, T_plane_camera: np.ndarray) -> np.ndarray:
-    """Depth image of the wall, given in the colour camera, from a camera at T_plane_camera."""
+    """Depth image of the wall, given in the color camera, from a camera at T_plane_camera."""
     n, d = WALL
     rays = camera.rays() @ T_plane_camera[:3, :3].T
     return -(d + T_plane_camera[:3, 3] @ n) / (rays @ n)
@@ -33,7 +33,7 @@ def test_depth_of_another_camera_is_exact_on_a_wall() -> None:
     truth = plane_depth(WIDE, np.eye(4))
     inner = seen[6:-6, 6:-6]
     assert (inner > 0).all()  # no gaps
-    # a sample falls up to half a pixel beside the centre, where the wall is up to 0.2 / 56 / 2 of its depth away
+    # a sample falls up to half a pixel beside the center, where the wall is up to 0.2 / 56 / 2 of its depth away
     np.testing.assert_allclose(inner, truth[6:-6, 6:-6], rtol=3e-3)
     assert abs(float(np.mean(inner - truth[6:-6, 6:-6]))) < 5e-4
 

@@ -1,4 +1,4 @@
-"""Colour, depth and masks, frame by frame."""
+"""Color, depth and masks, frame by frame."""
 
 from pathlib import Path
 from typing import Any
@@ -149,8 +149,8 @@ def test_images_without_a_partner_are_no_frames(tmp_path: Path) -> None:
     assert f"{DEPTH}: 1 images have none of {COLOR} within 20 ms and are no frames" in warnings
 
 
-def test_colour_and_depth_may_come_at_their_own_rates(tmp_path: Path) -> None:
-    """Colour at 30 Hz, depth at 10 Hz and 7 ms late: every third colour image has its nearest depth."""
+def test_color_and_depth_may_come_at_their_own_rates(tmp_path: Path) -> None:
+    """Color at 30 Hz, depth at 10 Hz and 7 ms late: every third color image has its nearest depth."""
     path = tmp_path / "alpha.mcap"
     events = [(k * FRAME_NS, topics.COLOR, k) for k in range(9)]
     events += [(3 * k * FRAME_NS + 7_000_000, topics.DEPTH, k) for k in range(3)]

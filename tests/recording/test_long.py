@@ -55,7 +55,7 @@ def write_bag(path: Path, frames: int) -> None:
 def peak_mb(code: str) -> float:
     """Largest memory of a process that runs some code."""
     before = "import resource; from pathlib import Path; "
-    before += "from duagc.pipeline.base import determinism; determinism.settle(); "
+    before += "from duagc.pipeline.base import determinism; determinism.configure_determinism(); "
     after = "; print('PEAK', resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
     root = Path(__file__).parents[2]
     arguments = [sys.executable, "-c", before + code + after]

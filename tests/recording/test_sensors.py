@@ -41,7 +41,7 @@ def test_pixels_that_are_hit_have_exactly_the_depth_of_the_point() -> None:
     at = pixels[inside][hit]
     assert (sigma[at[:, 1], at[:, 0]] == 0).all()
     close = np.isclose(depth[at[:, 1], at[:, 0]], truth[at[:, 1], at[:, 0]], rtol=0.02)
-    assert close.mean() > 0.98  # a point may lie half a pixel beside the centre, beyond the edge of the box
+    assert close.mean() > 0.98  # a point may lie half a pixel beside the center, beyond the edge of the box
     filled = depth > 0
     assert filled.mean() > 0.55
     assert np.median(np.abs(depth - truth)[filled]) < 1e-4  # between the points walls are exact
@@ -62,7 +62,7 @@ def test_sigma_says_what_the_error_is(rings: int, columns: int) -> None:
 
 
 def test_what_the_camera_cannot_see_is_hidden() -> None:
-    """A LiDAR half a metre to the right looks behind the box; those points do not shine through it."""
+    """A LiDAR half a meter to the right looks behind the box; those points do not shine through it."""
     T_camera_lidar = se3.from_rotation_translation(R_CAMERA_LIDAR, [0.6, -0.1, 0.0])
     T = path(1)[0]
     depth, _, truth, points = seen(T, T_camera_lidar, 0.0, rings=32)

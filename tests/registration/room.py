@@ -23,7 +23,7 @@ def render(
     depth_sigma_m: float = 0.004,
     gray_sigma: float = 0.02,
 ) -> tuple[Image, Image]:
-    """Grey image [h, w] in 0..1 and depth [h, w] in metres; independent pixel noise if a generator is given."""
+    """Gray image [h, w] in 0..1 and depth [h, w] in meters; independent pixel noise if a generator is given."""
     origin, rays = T_world_camera[:3, 3], camera.rays() @ T_world_camera[:3, :3].T
     with np.errstate(divide="ignore", invalid="ignore"):
         # inside the room the nearest far side is hit; the box is hit if the last entry comes before the first exit
@@ -53,7 +53,7 @@ def texture(points_world: NDArray[np.float64], seed: int) -> NDArray[np.float64]
 def pose(
     x: float = 0.0, y: float = 0.0, z: float = -0.8, yaw: float = 0.0, pitch: float = 0.0
 ) -> NDArray[np.float64]:
-    """T_world_camera [4, 4]: position in metres, yaw about the camera's y and pitch about its x in radians."""
+    """T_world_camera [4, 4]: position in meters, yaw about the camera's y and pitch about its x in radians."""
     T = se3.exp(np.array([0, 0, 0, 0, yaw, 0])) @ se3.exp(np.array([0, 0, 0, pitch, 0, 0]))
     T[:3, 3] = x, y, z
     return T

@@ -39,7 +39,7 @@ def reference(start) -> Reference:
 
 
 def test_inverse_depth_and_normals_are_exact_on_planes_at_every_level():
-    # straight at the far wall, 2.5 m away, whose normal is (0, 0, -1); the box begins below the centre
+    # straight at the far wall, 2.5 m away, whose normal is (0, 0, -1); the box begins below the center
     for level in pyramid(pose(z=-0.5)).levels:
         h, w = level.camera.height, level.camera.width
         wall = slice(4, h // 2), slice(w // 3, -w // 3)
@@ -101,7 +101,7 @@ def test_reference_is_plain_arrays(reference, end):
 
 
 def test_information_matches_the_scatter_over_noise_draws():
-    # the grey floor models calibration errors that this scene does not have
+    # the gray floor models calibration errors that this scene does not have
     config = RegistrationConfig(gray_sigma_floor=0.002)
     chi2 = []
     for seed in range(12):

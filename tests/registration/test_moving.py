@@ -14,13 +14,13 @@ RADIUS_M = 0.2
 
 
 def with_ball(
-    depth: np.ndarray, T_world_camera: np.ndarray, centre_world: np.ndarray
+    depth: np.ndarray, T_world_camera: np.ndarray, center_world: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The depth image with a ball in the room, and the pixels that show it."""
-    centre = se3.transform(se3.inverse(T_world_camera), centre_world[None])[0]
+    center = se3.transform(se3.inverse(T_world_camera), center_world[None])[0]
     rays = CAMERA.rays()
-    b, a = rays @ centre, (rays**2).sum(axis=-1)
-    inside = b * b - a * (centre @ centre - RADIUS_M**2)
+    b, a = rays @ center, (rays**2).sum(axis=-1)
+    inside = b * b - a * (center @ center - RADIUS_M**2)
     z = np.where(inside > 0, (b - np.sqrt(np.maximum(inside, 0))) / a, np.inf)
     shows = (z > 0) & (z < depth)
     return np.where(shows, z, depth).astype(np.float32), shows
@@ -31,12 +31,12 @@ def ball_at(k: int) -> np.ndarray:
 
 
 def scene(
-    centres: list[np.ndarray], config: MovingConfig = CONFIG, noise: np.random.Generator | None = None
+    centers: list[np.ndarray], config: MovingConfig = CONFIG, noise: np.random.Generator | None = None
 ) -> tuple[FreeSpace, list[np.ndarray], list[np.ndarray]]:
     """The set of all views, their depth images and where they show the ball."""
     free, depths, shown = FreeSpace(CAMERA, config), [], []
-    for T, centre in zip(POSES, centres, strict=True):
-        depth, shows = with_ball(render(T, noise)[1], T, centre)
+    for T, center in zip(POSES, centers, strict=True):
+        depth, shows = with_ball(render(T, noise)[1], T, center)
         free.add(depth, T)
         depths.append(depth)
         shown.append(shows)

@@ -136,7 +136,7 @@ def test_figures_stay_the_same_and_leave_the_settings_alone():
     assert mpl.rcParams["svg.hashsalt"] == before
 
 
-def test_colours_of_a_scalar_image():
+def test_colors_of_a_scalar_image():
     values = np.array([[0.0, 1.0, 2.0, 5.0]])
     rgb = pictures.colored(values, 0.0, 2.0, values < 4)
     assert rgb.shape == (1, 4, 3)
@@ -145,7 +145,7 @@ def test_colours_of_a_scalar_image():
     assert rgb[0, 2].tolist() == [253, 231, 37]
 
 
-def test_undetermined_gaussians_are_grey():
+def test_undetermined_gaussians_are_gray():
     colors, low, high = sigma_colors(np.array([0.001, 0.01, np.inf]))
     assert colors[2].tolist() == [0.75] * 3
     assert 0.001 < low < high < 0.01

@@ -72,7 +72,7 @@ def test_topics_are_distinct_and_their_schemas_exist() -> None:
 
 
 @pytest.mark.parametrize(
-    "topic", ["", "/", "/alpha/camera/colour", "alpha/map", "/Alpha/map", "/a b/map", "/a/b/map"]
+    "topic", ["", "/", "/alpha/camera/colors", "alpha/map", "/Alpha/map", "/a b/map", "/a/b/map"]
 )
 def test_other_topics_are_not_found(topic: str) -> None:
     assert topics.find(topic) is None

@@ -31,7 +31,7 @@ def test_certainty_is_one_up_to_the_huber_width() -> None:
 
 
 def views(seed: int = 0, h: int = 5, w: int = 7) -> tuple[Drawn, np.ndarray, np.ndarray]:
-    """A render and a measured colour and depth; every third depth is missing."""
+    """A render and a measured color and depth; every third depth is missing."""
     r = np.random.default_rng(seed)
     alpha = r.uniform(0.3, 1.0, (h, w)).astype(np.float32)
     z = r.uniform(1.0, 3.0, (h, w)).astype(np.float32)

@@ -65,7 +65,7 @@ def test_what_a_view_does_not_touch_stays(adam_of: type[Adam]) -> None:
 
 
 @pytest.mark.parametrize("adam_of", [Adam, CompiledAdam])
-def test_a_gaussian_does_not_depend_on_its_neighbours(adam_of: type[Adam]) -> None:
+def test_a_gaussian_does_not_depend_on_its_neighbors(adam_of: type[Adam]) -> None:
     gaussians, order = some(6), np.array([4, 0, 5, 2])
     all_of_them, some_of_them = adam_of(6), adam_of(6)
     some_of_them.select(order)

@@ -21,7 +21,7 @@ def plane(normal: tuple[float, float, float], distance_m: float) -> np.ndarray:
 
 
 def stripes() -> np.ndarray:
-    """Left half flat grey, right half one-pixel stripes."""
+    """Left half flat gray, right half one-pixel stripes."""
     color = np.full((CAMERA.height, CAMERA.width, 3), 0.5, np.float32)
     color[:, 32::2] = 0.1
     return color

@@ -2,8 +2,8 @@
 
     mean                 float32, m, frame of the anchor
     vec log Sigma        int16 in steps of 2^-10 (0.1 % of a variance)
-    colour               int16 in steps of 2^-13;  opacity logit  int16 in steps of 2^-10
-    information          float16 Cholesky factors of the 3x3 and the 6x6 block, float16 roots of colour and opacity
+    color               int16 in steps of 2^-13;  opacity logit  int16 in steps of 2^-10
+    information          float16 Cholesky factors of the 3x3 and the 6x6 block, float16 roots of color and opacity
 
 A factor instead of the matrix: whatever its entries are rounded to, the product with its transpose is positive
 semidefinite, and a direction without information stays without.

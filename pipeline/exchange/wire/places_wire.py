@@ -28,7 +28,7 @@ def read_digest(data: bytes) -> bytes:
 
 @dataclass(frozen=True)
 class PlaceBook:
-    """What a robot tells its neighbour to let it recognise places.
+    """What a robot tells its neighbor to let it recognize places.
 
     descriptors: one array per keyframe. T_first_keyframe: [n, 4, 4], as seen from its
     first keyframe. drift: [n, 2], accumulated variance of its
@@ -158,7 +158,7 @@ _INT16 = 32767
 
 
 def write_sample(sample: KeyframeSample) -> bytes:
-    """Bytes of SAMPLE; points in steps of the largest coordinate / 32767, normals in bytes, grey in bytes."""
+    """Bytes of SAMPLE; points in steps of the largest coordinate / 32767, normals in bytes, gray in bytes."""
     levels = sample.reference.levels
     feature_scale, feature_points = _shorts(sample.features.points)
     sample_scale, sample_points = _shorts(levels[0].points)

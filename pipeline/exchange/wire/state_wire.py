@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 MAX_KEYFRAMES = 100_000
 MAX_COORDINATE = 1e6  # m, or units of theta; beyond it positions lose their meaning
-ROTATION_TOLERANCE = 1e-6  # of R R' = 1 in a pose that a neighbour sent
+ROTATION_TOLERANCE = 1e-6  # of R R' = 1 in a pose that a neighbor sent
 
 
 class Reader:
@@ -85,13 +85,13 @@ def pose_bytes(T: Array) -> bytes:
 
 @dataclass(frozen=True)
 class State:
-    """Where an agent stands, as it tells its neighbours in every round.
+    """Where an agent stands, as it tells its neighbors in every round.
 
     links: pairs of robots whose relative frame it knows. parted: those of them that it knows to have been parted; what
     else is told holds for the team without them. Both are bit masks over the pairs of the team (`pair_bit`).
     frames_hops, still_hops: how many hops around it everybody has decided on all links, and holds still; 0 = not
     itself. agreed: its poses are final. done: it needs nothing more. sources: uint8 [team], for each owner of
-    evidence where it comes from: a neighbour's index, COMPLETE or NOBODY.
+    evidence where it comes from: a neighbor's index, COMPLETE or NOBODY.
     """
 
     links: int
@@ -152,12 +152,12 @@ def read_state(data: bytes, team: int) -> tuple[State, bytes]:
     return state, data[reader.position :]
 
 
-def write_labelled(parted: int, team: int, payload: bytes) -> bytes:
+def write_labeled(parted: int, team: int, payload: bytes) -> bytes:
     """Bytes of TREE: a message of the solver, for the team without these links."""
     return _pairs_bytes(parted, team) + payload
 
 
-def read_labelled(data: bytes, team: int) -> tuple[int, bytes]:
+def read_labeled(data: bytes, team: int) -> tuple[int, bytes]:
     """From TREE: the parted links, and the message."""
     reader = Reader(data, "elimination")
     return _read_pairs(reader, team), data[reader.position :]

@@ -1,4 +1,4 @@
-// One step of Adam (splat.optimiser.Adam, the same bits): every element goes its own way.
+// One step of Adam (splat.optimizer.Adam, the same bits): every element goes its own way.
 #pragma once
 
 #include "frame.h"

@@ -1,6 +1,6 @@
 // Front to back: alpha blending of the Gaussians of every block.
 //
-// Per pixel: weight_i = alpha_i T_i with T_i = prod_{j<i} (1 - alpha_j); colour = sum weight_i c_i + T_end background.
+// Per pixel: weight_i = alpha_i T_i with T_i = prod_{j<i} (1 - alpha_j); color = sum weight_i c_i + T_end background.
 // A block walks its own list with all its pixels in registers. The alphas of a few Gaussians are computed side by side: each
 // is a chain of thirty dependent operations, and one after the other they would leave the processor waiting.
 #pragma once
@@ -13,7 +13,7 @@ constexpr float ALPHA_MAX = 0.999f, REST_MIN = 0.001f;  // of alpha, of 1 - alph
 constexpr float TRANSMITTANCE_MIN = 1e-4f;  // a Gaussian that would take a pixel below this closes the pixel, unblended
 constexpr int ABREAST = 4;                  // Gaussians whose alpha is computed side by side
 
-// e = M d, d = pixel - centre.
+// e = M d, d = pixel - center.
 struct Whitened {
     Vec x, y;
     Whitened(const Splat& s, Vec pixel_x, Vec pixel_y) {

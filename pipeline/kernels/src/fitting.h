@@ -1,7 +1,7 @@
 // Forward, loss and backward of one view in one pass over the tiles: what a block just blended is still near when its
 // derivatives are taken, and no image is written or read back.
 //
-// Per pixel, with h the Huber function of slope 1 in its tail: h(e^a colour + b - measured colour), and where a depth z was
+// Per pixel, with h the Huber function of slope 1 in its tail: h(e^a color + b - measured color), and where a depth z was
 // measured h(depth - alpha z), 1 - alpha, and the sum over Gaussians of weight h(z_i - z) with z_i the depth of each; every term a
 // mean over its pixels (splat.losses.rgbd_loss, but for the last). Residuals of depth are multiplied by the pixel's certainty.
 #pragma once
@@ -17,7 +17,7 @@ struct Huber {
         : slope(max(min(residual * Vec(1.0f / delta), Vec(1.0f)), Vec(-1.0f))), value(slope * fnma(Vec(0.5f * delta), slope, residual)) {}
 };
 
-// Pixels that count for the colour, and for the depth.
+// Pixels that count for the color, and for the depth.
 struct PixelCounts {
     size_t color = 0, depth = 0;
     PixelCounts(const View& view, const float* depth_image) {

@@ -54,10 +54,10 @@ private:
     size_t capacity_ = 0;
 };
 
-// Depth of a Gaussian at a pixel: that of its centre, or its mean along the ray of the pixel.
+// Depth of a Gaussian at a pixel: that of its center, or its mean along the ray of the pixel.
 enum class DepthKind { blended, ray_plane };
 
-// Pinhole camera at its pose; pixel centres are the integers. R, t: T_camera_map, R row by row.
+// Pinhole camera at its pose; pixel centers are the integers. R, t: T_camera_map, R row by row.
 struct View {
     float R[9], t[3];
     float fx, fy, cx, cy;
@@ -73,21 +73,21 @@ struct GaussianArrays {
     const float *means, *quats_wxyz, *log_scales, *colors, *opacity_logits;
 };
 
-// A Gaussian on the screen, one cache line. With e = M d, M = [M11 M12; 0 M22] and d = pixel - centre,
+// A Gaussian on the screen, one cache line. With e = M d, M = [M11 M12; 0 M22] and d = pixel - center,
 // log2 alpha = log2_opacity - |e|^2: a sum of squares, in which nothing cancels even for long needles.
 struct alignas(64) Splat {
-    float u, v;                // centre, px
+    float u, v;                // center, px
     float M11, M12, M22;       // 1/px
     float log2_opacity;
-    float r, g, b, z;          // colour, depth in metres
-    float slope_x, slope_y;    // of the depth along e, metres; set only for ray_plane
+    float r, g, b, z;          // color, depth in meters
+    float slope_x, slope_y;    // of the depth along e, meters; set only for ray_plane
     float spare[4];
 };
 
 // What the ellipse alpha >= 1/255 of a Gaussian covers. With X, Y half its width and height, t = dy / Y, and c the
 // correlation of x and y on the screen, its sides are at dx = X (c t +- sqrt(1 - c^2) sqrt(1 - t^2)).
 struct alignas(32) Footprint {
-    float blocks_u, v;                 // centre: in blocks of 4 px, in px
+    float blocks_u, v;                 // center: in blocks of 4 px, in px
     float per_pixel;                   // 1 / Y
     float skew;                        // c
     float wide_skew, wide_upright;     // X c and X sqrt(1 - c^2), in blocks
@@ -194,7 +194,7 @@ struct FisherArrays {
     uint32_t* observations;              // [n]
 };
 
-// The loss of a view against the measured colour [h, w, 3] and depth [h, w], metres, 0 where there is none.
+// The loss of a view against the measured color [h, w, 3] and depth [h, w], meters, 0 where there is none.
 struct Loss {
     const float *color, *depth_m;
     const float* certainty;  // factor of the residuals of depth, per pixel; null: 1

@@ -1,4 +1,4 @@
-// Information with all its cross terms, mean 3, quaternion 4, log-scale 3, colour 3, logit 1, of every Gaussian: to check what
+// Information with all its cross terms, mean 3, quaternion 4, log-scale 3, color 3, logit 1, of every Gaussian: to check what
 // the diagonals leave out. Written to be read, not to be fast.
 #pragma once
 
@@ -6,7 +6,7 @@
 
 namespace KERNEL_ISA {
 
-// Behind the sums of information: of w2 times x and y, and per colour channel of weight times the derivative by ln alpha times
+// Behind the sums of information: of w2 times x and y, and per color channel of weight times the derivative by ln alpha times
 // 1, x, y, x^2, x y, y^2.
 constexpr int FULL_X = INFORMATION_ROW, FULL_Y = FULL_X + 1, FULL_COLOR = FULL_Y + 1, FULL_SUMS = FULL_COLOR + 3 * monomials(2);
 constexpr int FULL_ROW = 64;
@@ -62,7 +62,7 @@ inline Status full_tile(Frame& frame, int index, const float* inv_var_color, con
     return over_precisions<FULL_ROW>(frame, index, inv_var_color, inv_var_depth, nullptr, full_block<KIND>);
 }
 
-// Gram matrix of the terms of the geometry, then of 1, which the logit moves, then of the colours.
+// Gram matrix of the terms of the geometry, then of 1, which the logit moves, then of the colors.
 template <DepthKind KIND>
 struct FullGram {
     static constexpr int GEOMETRY = SCREEN_TERMS<KIND>, TERMS = GEOMETRY + 4;

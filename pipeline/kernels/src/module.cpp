@@ -146,7 +146,7 @@ static nb::tuple bandwidth(int threads, double seconds) {
     return nb::make_tuple(read, copied);
 }
 
-// Shapes are checked by pipeline.kernels.optimiser, the only caller. The lists have an array for each kind of parameter.
+// Shapes are checked by pipeline.kernels.optimizer, the only caller. The lists have an array for each kind of parameter.
 static void adam(const std::string& isa, const std::vector<Inputs>& values, const std::vector<Inputs>& gradients,
                  const std::vector<Floats>& first, const std::vector<Floats>& second, const std::vector<Floats>& out, const Inputs& rates,
                  const Inputs& constants, const Inputs& d_colors, const Inputs& d_logits, const Array<int32_t>& steps,

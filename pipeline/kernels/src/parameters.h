@@ -5,7 +5,7 @@
 
 namespace KERNEL_ISA {
 
-// Sixteen neighbours of the visible ones; the last group repeats its first.
+// Sixteen neighbors of the visible ones; the last group repeats its first.
 struct Members {
     size_t first;
     int lanes;
@@ -92,7 +92,7 @@ struct ScreenGram {
     }
 };
 
-// Derivatives of the coefficients of the terms by the centre in the map frame, and the cotangents Y of Sigma in own axes that
+// Derivatives of the coefficients of the terms by the center in the map frame, and the cotangents Y of Sigma in own axes that
 // belong to those of the shape.
 template <DepthKind KIND>
 struct ScreenDerivatives {
@@ -100,22 +100,22 @@ struct ScreenDerivatives {
     Vec Y[SHAPE_TERMS<KIND>][6];
     ScreenDerivatives(const View& view, const Splat16& s) {
         const Vec zero(0.0f), one(1.0f);
-        Vec centre[3];
-        auto clear = [&] { centre[0] = centre[1] = centre[2] = zero; };
+        Vec center[3];
+        auto clear = [&] { center[0] = center[1] = center[2] = zero; };
         clear();
-        add_centre_from_moments(s, one, zero, centre);
-        to_map_frame(view, centre, by_mean[0]);
+        add_center_from_moments(s, one, zero, center);
+        to_map_frame(view, center, by_mean[0]);
         clear();
-        add_centre_from_moments(s, zero, one, centre);
-        to_map_frame(view, centre, by_mean[1]);
+        add_center_from_moments(s, zero, one, center);
+        to_map_frame(view, center, by_mean[1]);
         for (int k = 0; k < 3; k++) {
             Vec Q[6], d_J[6];
             const Symmetric2 c = whitened_cotangent(k == 0 ? one : zero, k == 1 ? one : zero, k == 2 ? one : zero);
             own_axes_cotangent(s, c, Q, Y[k]);
             jacobian_cotangent(s, Q, d_J);
             clear();
-            add_centre_from_jacobian(s, d_J, jacobian_along_itself(s, Y[k]), centre);
-            to_map_frame(view, centre, by_mean[2 + k]);
+            add_center_from_jacobian(s, d_J, jacobian_along_itself(s, Y[k]), center);
+            to_map_frame(view, center, by_mean[2 + k]);
         }
         clear();
         if constexpr (KIND == DepthKind::ray_plane) {
@@ -124,16 +124,16 @@ struct ScreenDerivatives {
                 Vec own[6], d_J[6], along_J(0.0f), turn[2];
                 for (int i = 0; i < 6; i++) own[i] = d_J[i] = zero;
                 clear();
-                depth.add_cotangents(s, k == 2 ? one : zero, k == 0 ? one : zero, k == 1 ? one : zero, own, d_J, along_J, centre, turn);
-                add_centre_from_jacobian(s, d_J, along_J, centre);
+                depth.add_cotangents(s, k == 2 ? one : zero, k == 0 ? one : zero, k == 1 ? one : zero, own, d_J, along_J, center, turn);
+                add_center_from_jacobian(s, d_J, along_J, center);
                 if (k < 2) {
-                    to_map_frame(view, centre, by_mean[5 + k]);
+                    to_map_frame(view, center, by_mean[5 + k]);
                     for (int i = 0; i < 6; i++) Y[3 + k][i] = own[i];
                 }
             }
         }
-        centre[2] += one;
-        to_map_frame(view, centre, by_mean[SCREEN_TERMS<KIND> - 1]);
+        center[2] += one;
+        to_map_frame(view, center, by_mean[SCREEN_TERMS<KIND> - 1]);
     }
 };
 
@@ -171,7 +171,7 @@ inline void set_depth_slopes(Frame& frame, const GaussianArrays& gaussians) {
 
 // ---------------------------------------------------------------- gradients
 
-// Diagonal of the information in mean 3, quaternion 4, log-scale 3, colour 3, logit 1; of_color: that of the colours.
+// Diagonal of the information in mean 3, quaternion 4, log-scale 3, color 3, logit 1; of_color: that of the colors.
 template <DepthKind KIND>
 inline void diagonal_information(const View& view, const Splat16& s, Vec transparency, const Vec* info, const Vec* of_color, Vec* diagonal) {
     constexpr int TERMS = SCREEN_TERMS<KIND>, SHAPE = SHAPE_TERMS<KIND>;
@@ -208,19 +208,19 @@ inline void gradient_group(const Frame& frame, const GaussianArrays& gaussians, 
     Vec sums[ROW_OF<D, KIND>];
     group.reduce<ROW_OF<D, KIND>>(frame, sums);
 
-    Vec Q[6], Y[6], d_J[6], centre[3] = {Vec(0.0f), Vec(0.0f), Vec(0.0f)}, turn[2];
+    Vec Q[6], Y[6], d_J[6], center[3] = {Vec(0.0f), Vec(0.0f), Vec(0.0f)}, turn[2];
     own_axes_cotangent(s, whitened_cotangent(sums[SUM_WXX], sums[SUM_WXY], sums[SUM_WYY]), Q, Y);
     jacobian_cotangent(s, Q, d_J);
     Vec along_J = jacobian_along_itself(s, Y);
     if constexpr (KIND == DepthKind::ray_plane)
-        RayDepth(s).add_cotangents(s, sums[SUM_Z], sums[SUM_ZX], sums[SUM_ZY], Y, d_J, along_J, centre, turn);
-    add_centre_from_jacobian(s, d_J, along_J, centre);
-    add_centre_from_moments(s, sums[SUM_WX], sums[SUM_WY], centre);
-    centre[2] += sums[SUM_Z];
+        RayDepth(s).add_cotangents(s, sums[SUM_Z], sums[SUM_ZX], sums[SUM_ZY], Y, d_J, along_J, center, turn);
+    add_center_from_jacobian(s, d_J, along_J, center);
+    add_center_from_moments(s, sums[SUM_WX], sums[SUM_WY], center);
+    center[2] += sums[SUM_Z];
     if (out.pose) {
         Vec by_pose[6];
         alignas(64) float lanes[LANES];
-        pose_cotangent(s, centre, d_J, by_pose);
+        pose_cotangent(s, center, d_J, by_pose);
         if constexpr (KIND == DepthKind::ray_plane) add_turn_of_depth(turn, by_pose);
         for (int k = 0; k < 6; k++) {
             store(lanes, by_pose[k]);
@@ -229,7 +229,7 @@ inline void gradient_group(const Frame& frame, const GaussianArrays& gaussians, 
     }
     if constexpr (D != Derivatives::POSE) {
         Vec mean[3], quat[4], log_scale[3];
-        to_map_frame(frame.view, centre, mean);
+        to_map_frame(frame.view, center, mean);
         quaternion_cotangent(s, Y, quat);
         log_scale_cotangent(s, Y, log_scale);
         const Vec transparency = sigmoid(-group.parameters.logit), logit = sums[SUM_W] * transparency;

@@ -2,7 +2,7 @@
 //
 // With J the derivative of the projection, W the rotation to the camera, R the Gaussian's axes and S its scales:
 //   axes = W R,   P = J axes (2x3),   U = P S,   covariance on the screen C = U U^T + BLUR I.
-// The pixel loops work in e = M d, d = pixel - centre, with M^T M = C^-1 log2(e)/2, so that alpha = opacity 2^-|e|^2.
+// The pixel loops work in e = M d, d = pixel - center, with M^T M = C^-1 log2(e)/2, so that alpha = opacity 2^-|e|^2.
 // No 3x3 covariance is ever formed; the way back needs only the symmetric Y = P^T G P, G the cotangent of C: it is the
 // cotangent of Sigma in the Gaussian's own axes.
 //
@@ -16,15 +16,15 @@ namespace KERNEL_ISA {
 
 using namespace raster;
 
-constexpr float NEAR_M = 0.01f;              // Gaussians whose centre is nearer are not drawn
+constexpr float NEAR_M = 0.01f;              // Gaussians whose center is nearer are not drawn
 constexpr float BLUR_PX2 = 1.0f / 12;        // low-pass added to the screen covariance: the variance of a square pixel
-constexpr float FIELD_MARGIN = 1.3f;         // J is linearised no further out than this times the half field
+constexpr float FIELD_MARGIN = 1.3f;         // J is linearized no further out than this times the half field
 constexpr float LARGEST_PX2 = 1e12f;         // Gaussians with more variance on the screen are not drawn
 constexpr float SQRT_HALF_LOG2_E = 0.84932180f;  // sqrt(log2(e) / 2)
 constexpr float LOG2_ALPHA_MIN = -7.99435344f;  // log2(1/255): fainter contributions are skipped
 
 struct Splat16 {
-    Vec x, y, z, inverse_z;          // centre, camera frame
+    Vec x, y, z, inverse_z;          // center, camera frame
     Vec slope_x, slope_y;            // x/z, y/z
     Vec inside_x, inside_y;          // 1 where the slope of J is not clamped
     Vec quat[4], inverse_norm;       // unit quaternion wxyz, 1/length as given
@@ -52,7 +52,7 @@ inline void rotation_of_quaternion(const Vec* q, Vec* R) {
     R[8] = one - two * (x * x + y * y);
 }
 
-// Sixteen centres: in the camera frame, as slopes x/z, y/z, on the screen.
+// Sixteen centers: in the camera frame, as slopes x/z, y/z, on the screen.
 struct CameraPoint16 {
     Vec x, y, z, inverse_z, slope_x, slope_y, u, v;
     CameraPoint16(const View& view, const Vec* mean) {
@@ -143,13 +143,13 @@ inline Symmetric2 whitened_cotangent(Vec w_xx, Vec w_xy, Vec w_yy) {
     return {factor * w_xx, factor * w_xy, factor * w_yy};
 }
 
-// Adds what the first moments sum w e mean for the centre in the camera frame: d ln alpha / d centre = 2 ln2 M^T e.
-inline void add_centre_from_moments(const Splat16& s, Vec w_x, Vec w_y, Vec* d_centre) {
+// Adds what the first moments sum w e mean for the center in the camera frame: d ln alpha / d center = 2 ln2 M^T e.
+inline void add_center_from_moments(const Splat16& s, Vec w_x, Vec w_y, Vec* d_center) {
     const Vec factor(2.0f * LN_2);
     const Vec x = factor * (s.M11 * w_x) * s.J00, y = factor * fma(s.M12, w_x, s.M22 * w_y) * s.J11;
-    d_centre[0] += x;
-    d_centre[1] += y;
-    d_centre[2] = fnma(x, s.slope_x, fnma(y, s.slope_y, d_centre[2]));
+    d_center[0] += x;
+    d_center[1] += y;
+    d_center[2] = fnma(x, s.slope_x, fnma(y, s.slope_y, d_center[2]));
 }
 
 // Q = W N (2x3), and Y = P^T G P = N^T Q as (00, 11, 22, 01, 02, 12). G itself is never formed: along a needle it would
@@ -189,12 +189,12 @@ inline Vec jacobian_along_itself(const Splat16& s, const Vec* Y) {
     return along_J;
 }
 
-// Adds what a cotangent of J means for the centre in the camera frame. All of J goes as 1/z; along_J: <d_J, J>.
-inline void add_centre_from_jacobian(const Splat16& s, const Vec* d_J, Vec along_J, Vec* d_centre) {
+// Adds what a cotangent of J means for the center in the camera frame. All of J goes as 1/z; along_J: <d_J, J>.
+inline void add_center_from_jacobian(const Splat16& s, const Vec* d_J, Vec along_J, Vec* d_center) {
     const Vec d_slope_x = -(s.J00 * d_J[2]) * s.inside_x, d_slope_y = -(s.J11 * d_J[5]) * s.inside_y;
-    d_centre[0] += d_slope_x * s.inverse_z;
-    d_centre[1] += d_slope_y * s.inverse_z;
-    d_centre[2] = fnma(s.inverse_z, fma(d_slope_x, s.slope_x, fma(d_slope_y, s.slope_y, along_J)), d_centre[2]);
+    d_center[0] += d_slope_x * s.inverse_z;
+    d_center[1] += d_slope_y * s.inverse_z;
+    d_center[2] = fnma(s.inverse_z, fma(d_slope_x, s.slope_x, fma(d_slope_y, s.slope_y, along_J)), d_center[2]);
 }
 
 // The depth along the ray is z + g . e with g = 2 ln2 M k = 2 ln2 N S^2 a.
@@ -208,7 +208,7 @@ inline void depth_slopes(const Splat16& s, Vec* g) {
 }
 
 // What the depth along the ray adds on the way back. With q = C^-1 d and m = C^-1 k
-//   d(k^T C^-1 d) = q . dk - m^T dC q - m . d(centre),
+//   d(k^T C^-1 d) = q . dk - m^T dC q - m . d(center),
 // and as k and C hold the same Sigma, cotangents come in pairs, with y = P^T q = 2 ln2 N^T e and r = a - P^T m:
 //   of Sigma in own axes   (y r^T + r y^T) / 2
 //   of J                   q (axes S^2 r)^T - m (axes S^2 y)^T, with <d_J, J> = 2 b q . m - g . e, b the blur
@@ -223,7 +223,7 @@ struct RayDepth {
     }
 
     // Adds the cotangents of sum f v z(pixel) except that of z itself, from Z = sum f v and (X, Y) = sum f v e.
-    void add_cotangents(const Splat16& s, Vec sum, Vec sum_x, Vec sum_y, Vec* Y, Vec* d_J, Vec& along_J, Vec* d_centre, Vec* turn) const {
+    void add_cotangents(const Splat16& s, Vec sum, Vec sum_x, Vec sum_y, Vec* Y, Vec* d_J, Vec& along_J, Vec* d_center, Vec* turn) const {
         const Vec two_ln2(2.0f * LN_2), half(0.5f);
         const Vec q[2] = {two_ln2 * (s.M11 * sum_x), two_ln2 * fma(s.M12, sum_x, s.M22 * sum_y)};
         const Vec m[2] = {s.M11 * g[0], fma(s.M12, g[0], s.M22 * g[1])};
@@ -245,9 +245,9 @@ struct RayDepth {
         }
         along_J += fnma(g[0], sum_x, fnma(g[1], sum_y, Vec(2.0f * BLUR_PX2) * fma(q[0], m[0], q[1] * m[1])));
         const Vec by_u = -(sum * m[0]) * s.J00, by_v = -(sum * m[1]) * s.J11;
-        d_centre[0] += by_u;
-        d_centre[1] += by_v;
-        d_centre[2] = fnma(by_u, s.slope_x, fnma(by_v, s.slope_y, d_centre[2]));
+        d_center[0] += by_u;
+        d_center[1] += by_v;
+        d_center[2] = fnma(by_u, s.slope_x, fnma(by_v, s.slope_y, d_center[2]));
         turn[0] = -in_camera(s, S2y, 1);
         turn[1] = in_camera(s, S2y, 0);
     }
@@ -281,11 +281,11 @@ private:
     }
 };
 
-// W^T d: a cotangent of the centre from the camera frame to the map frame.
-inline void to_map_frame(const View& view, const Vec* d_centre, Vec* d_mean) {
+// W^T d: a cotangent of the center from the camera frame to the map frame.
+inline void to_map_frame(const View& view, const Vec* d_center, Vec* d_mean) {
     const float* W = view.R;
     for (int k = 0; k < 3; k++)
-        d_mean[k] = fma(Vec(W[k]), d_centre[0], fma(Vec(W[3 + k]), d_centre[1], Vec(W[6 + k]) * d_centre[2]));
+        d_mean[k] = fma(Vec(W[k]), d_center[0], fma(Vec(W[3 + k]), d_center[1], Vec(W[6 + k]) * d_center[2]));
 }
 
 // Cotangents of the log-scales: 2 s_k^2 Y_kk.
@@ -311,8 +311,8 @@ inline void quaternion_cotangent(const Splat16& s, const Vec* Y, Vec* d_quat) {
 
 // Cotangent of the right tangent (translation, rotation) of T_map_camera: the camera frame sees p' = p - v - w x p
 // and axes' = axes - w x axes.
-inline void pose_cotangent(const Splat16& s, const Vec* d_centre, const Vec* d_J, Vec* d_pose) {
-    const Vec *g = d_centre, n02 = s.J00 * d_J[2], n20 = fma(s.J02, d_J[0], s.J12 * d_J[3]);
+inline void pose_cotangent(const Splat16& s, const Vec* d_center, const Vec* d_J, Vec* d_pose) {
+    const Vec *g = d_center, n02 = s.J00 * d_J[2], n20 = fma(s.J02, d_J[0], s.J12 * d_J[3]);
     const Vec n12 = s.J11 * d_J[5], n21 = fma(s.J02, d_J[1], s.J12 * d_J[4]);
     const Vec n10 = s.J11 * d_J[3], n01 = s.J00 * d_J[1];
     for (int k = 0; k < 3; k++) d_pose[k] = -g[k];

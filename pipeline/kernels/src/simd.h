@@ -444,7 +444,7 @@ inline Float4 fma_exact(Float4 a, Float4 b, Float4 c) {
     std::memcpy(&word, &sum, sizeof word);
     const Long4 inexact = (Long4)(error < 0.0) | (Long4)(error > 0.0);
     const Long4 toward_zero = (Long4)(error > 0.0) ^ (Long4)(sum > 0.0);
-    const Long4 step = inexact & ~word & 1;            // only an even neighbour moves
+    const Long4 step = inexact & ~word & 1;            // only an even neighbor moves
     word += (step ^ toward_zero) - toward_zero;        // -step where the true value is nearer to zero
     Double4 odd;
     std::memcpy(&odd, &word, sizeof odd);

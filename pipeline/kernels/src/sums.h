@@ -3,7 +3,7 @@
 // A block is walked from its last item to its first in batches of sixteen, in two steps.
 //   Replay: lanes are pixels. alpha as in front, the transmittance before each Gaussian from the one behind it, and a few
 //   numbers per pixel and item.
-//   Sums: lanes are Gaussians, after a transposition. The numbers times monomials of e = M (pixel - centre), added up over the
+//   Sums: lanes are Gaussians, after a transposition. The numbers times monomials of e = M (pixel - center), added up over the
 //   sixteen pixels without a sum across lanes, and added to the Gaussian's row of this tile.
 #pragma once
 
@@ -18,7 +18,7 @@ constexpr int BATCH = 16;  // items
 enum GradientSum { SUM_W, SUM_WX, SUM_WY, SUM_WXX, SUM_WXY, SUM_WYY, SUM_R, SUM_G, SUM_B, SUM_Z, SUM_ZX, SUM_ZY };
 
 // Sums of information. w2: square of the derivative by ln alpha, over channels; Z: its product with depth's own; ZZ: the
-// square of that. The empirical information squares the three colours one by one; to J^T R^-1 J they are all the same, and its
+// square of that. The empirical information squares the three colors one by one; to J^T R^-1 J they are all the same, and its
 // other two count by-products.
 enum InformationSum {
     INFO_XX, INFO_XY, INFO_YY, INFO_XXX, INFO_XXY, INFO_XYY, INFO_YYY,

@@ -133,7 +133,7 @@ NO_INLINE static void gradient_block(const Sweep& sweep, const Block& block, uin
         transpose16(f);
         if constexpr (Term::ACTIVE) transpose16(d);
         for (int half = 0; half < PARTS; half++) {
-            constexpr int FIRST = D == Derivatives::POSE ? SUM_Z : SUM_R;  // the pose does not move colours
+            constexpr int FIRST = D == Derivatives::POSE ? SUM_Z : SUM_R;  // the pose does not move colors
             Wide totals[SUM_Z + 1 - FIRST];
             sum_products([&](int p) ALWAYS_INLINE { return part(f[p], half); }, v.planes + (FIRST - SUM_R), totals);
             set_parts(sums + FIRST, half, totals);
@@ -190,12 +190,12 @@ inline Status gradient_tile(Frame& frame, int index, const float* d_color, const
 
 // ---------------------------------------------------------------- information
 
-// Precisions 1/sigma^2 of colour and depth in one block, the pixels that have one, and the residual.
+// Precisions 1/sigma^2 of color and depth in one block, the pixels that have one, and the residual.
 struct Precisions {
-    alignas(64) float planes[4][LANES];  // colour, depth, used, used times residual
+    alignas(64) float planes[4][LANES];  // color, depth, used, used times residual
 };
 
-// Rows of J^T R^-1 J: each colour channel and depth has its own "behind", for their derivatives are squared one by one.
+// Rows of J^T R^-1 J: each color channel and depth has its own "behind", for their derivatives are squared one by one.
 template <DepthKind KIND>
 NO_INLINE static void information_block(const Sweep& sweep, const Block& block, uint32_t count, const Precisions& v, Replay pass) {
     const Vec of_color = load(v.planes[0]), of_depth = load(v.planes[1]);

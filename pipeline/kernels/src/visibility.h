@@ -42,11 +42,11 @@ inline Parameters16 gather_parameters(const GaussianArrays& gaussians, const uin
     return p;
 }
 
-// Sixteen neighbours in the caller's arrays; behind the last Gaussian, copies of the first of them.
-struct Neighbours16 {
+// Sixteen neighbors in the caller's arrays; behind the last Gaussian, copies of the first of them.
+struct Neighbors16 {
     Parameters16 p;
     Vec color[3];
-    Neighbours16(const GaussianArrays& gaussians, size_t first) {
+    Neighbors16(const GaussianArrays& gaussians, size_t first) {
         if (first + LANES <= gaussians.count) {
             load_rows3(gaussians.means + 3 * first, p.mean);
             load_rows4(gaussians.quats_wxyz + 4 * first, p.quat);
@@ -63,10 +63,10 @@ struct Neighbours16 {
     }
 };
 
-constexpr float LARGEST_LOG_SCALE = 40.0f;  // of metres; the square of a scale beyond would overflow
+constexpr float LARGEST_LOG_SCALE = 40.0f;  // of meters; the square of a scale beyond would overflow
 
 // All numbers finite, all quaternions of a length whose square is neither 0 nor infinite.
-inline bool usable(const Neighbours16& g) {
+inline bool usable(const Neighbors16& g) {
     const Vec zero(0.0f);
     Vec sum = g.p.logit * zero, norm2 = zero, largest = g.p.log_scale[0];
     for (int k = 0; k < 3; k++) {
@@ -78,7 +78,7 @@ inline bool usable(const Neighbours16& g) {
            0xffffu;
 }
 
-// Some part of a box around the centre may lie on the screen.
+// Some part of a box around the center may lie on the screen.
 inline Mask on_screen(const View& view, Vec u, Vec v, Vec extent_x, Vec extent_y) {
     const Vec zero(0.0f);
     return (u + extent_x >= zero) & (u - extent_x <= Vec(view.width - 1.0f)) & (v + extent_y >= zero) &
@@ -91,7 +91,7 @@ inline Vec exp_bound(Vec x) {
     return scale_by_power(Vec(1.5f), t + Vec(12582912.0f));
 }
 
-// False where a bound from centre and largest scale alone keeps a Gaussian off the screen: most of a map lies elsewhere.
+// False where a bound from center and largest scale alone keeps a Gaussian off the screen: most of a map lies elsewhere.
 // |row of J| = f/z sqrt(1 + slope^2), so a variance is at most (s f/z)^2 (1 + limit^2) + blur, and alpha >= 1/255 reaches
 // no further than sqrt(2 ln 255) = 3.33 standard deviations.
 inline Mask may_be_seen(const View& view, const Parameters16& p) {
@@ -125,7 +125,7 @@ struct TileRange {
 inline void footprint_columns(const View& view, const Splat16& s, Vec extent_x, Vec extent_y, Vec* columns) {
     const Vec one(1.0f), quarter(0.25f), per_length = one / sqrt(fma(s.M12, s.M12, s.M22 * s.M22));
     const Vec skew = -s.M12 * per_length, upright = s.M22 * per_length;
-    const Vec rounding = (max(s.u, -s.u) + max(s.v, -s.v)) * Vec(1.0f / (1 << 22));  // of centres far from the screen
+    const Vec rounding = (max(s.u, -s.u) + max(s.v, -s.v)) * Vec(1.0f / (1 << 22));  // of centers far from the screen
     columns[0] = quarter * s.u;
     columns[1] = s.v;
     columns[2] = one / extent_y;
@@ -137,7 +137,7 @@ inline void footprint_columns(const View& view, const Splat16& s, Vec extent_x, 
 }
 
 // Writes the splats and footprints from `first` on, and the keys of those that are drawn; returns how many are.
-inline uint32_t project_group(Frame& frame, const Neighbours16& g, size_t first, uint32_t lanes, uint64_t* keys) {
+inline uint32_t project_group(Frame& frame, const Neighbors16& g, size_t first, uint32_t lanes, uint64_t* keys) {
     const View& view = frame.view;
     const Splat16 s = project16(view, g.p.mean, g.p.quat, g.p.log_scale);
     const Vec log2_opacity = log2_sigmoid(g.p.logit), zero(0.0f);
@@ -176,7 +176,7 @@ __attribute__((flatten)) inline bool project_chunk(Frame& frame, const GaussianA
     uint32_t drawn = 0;
     bool all_usable = true;
     for (size_t first = begin; first < end; first += LANES) {
-        const Neighbours16 g(gaussians, first);
+        const Neighbors16 g(gaussians, first);
         const uint32_t lanes = end - first < LANES ? (1u << (end - first)) - 1 : 0xffffu;
         all_usable &= usable(g);
         if (any(may_be_seen(frame.view, g.p))) drawn += project_group(frame, g, first, lanes, keys + drawn);

@@ -1,4 +1,4 @@
-"""What an agent keeps about one neighbour."""
+"""What an agent keeps about one neighbor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Pair = tuple[int, int]
 
 
 @dataclass
-class Neighbour:
+class Neighbor:
     """One end of a radio link."""
 
     index: int
@@ -50,6 +50,6 @@ class Neighbour:
 
     @property
     def joined(self) -> bool:
-        """Whether the two robots share a frame, and the neighbour knows it."""
+        """Whether the two robots share a frame, and the neighbor knows it."""
         met = self.meeting is not None and self.meeting.joined is not None
         return met and not self.gone and not self.parted and self.decided

@@ -1,4 +1,4 @@
-"""Neighbours whose maps contradict own images, in whole or in part, whose Gaussians or matches are impossible."""
+"""Neighbors whose maps contradict own images, in whole or in part, whose Gaussians or matches are impossible."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from duagc.pipeline.config.consensus import MatchingConfig
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Evidence, theta_of
 from duagc.pipeline.fusion.finetune import View
-from duagc.pipeline.fusion.peer_validation import Believed, believed
+from duagc.pipeline.fusion.peer_validation import ValidatedPeers, validate_peer_maps
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -18,7 +18,7 @@ from tests.fusion.test_refine import wall as speckled
 
 
 def wall() -> Gaussians:
-    """Discs on a wall whose colours change smoothly, so that it matters little which of them is in front."""
+    """Discs on a wall whose colors change smoothly, so that it matters little which of them is in front."""
     discs = speckled()
     return discs.replace(colors=0.5 + 0.4 * np.sin(1.5 * discs.means[:, [0, 1, 0]] + [0, 0, 1]))
 
@@ -40,39 +40,39 @@ def views() -> list[View]:
 
 
 def map_of(robot: str, change=lambda theta: None, discs=()) -> Evidence:
-    """The wall as a robot tells of it, with small errors, changed; and discs (centre, size, colour) beside it."""
+    """The wall as a robot tells of it, with small errors, changed; and discs (center, size, color) beside it."""
     rng = np.random.default_rng(len(robot))
     theta = theta_of(wall())
     theta[:, MEAN] += rng.normal(0, 0.002, (N, 3))
     theta[:, COLOR] += rng.normal(0, 0.02, (N, 3))
     change(theta)
     more = np.zeros((len(discs), 13))
-    for row, (centre, size_m, color) in zip(more, discs, strict=True):
-        row[MEAN], row[COLOR], row[OPACITY] = centre, color, 6.0
+    for row, (center, size_m, color) in zip(more, discs, strict=True):
+        row[MEAN], row[COLOR], row[OPACITY] = center, color, 6.0
         row[LOG_COVARIANCE] = 2 * np.log(size_m) * np.array([1, 1, 1, 0, 0, 0])
     theta = np.concatenate([theta, more])
     ids = 10 + np.arange(len(theta))
     return Evidence(robot, ids, np.zeros(len(theta), np.int32), theta, np.ones((len(theta), 31)))
 
 
-def told(views: list[View], bravo: Evidence, pairs=None, threads: int = 1) -> Believed:
+def told(views: list[View], bravo: Evidence, pairs=None, threads: int = 1) -> ValidatedPeers:
     ids = 10 + np.arange(N)
     pairs = {("alpha", "bravo"): np.stack([ids, ids], axis=1)} if pairs is None else pairs
-    return believed(
+    return validate_peer_maps(
         map_of("alpha"), {"bravo": bravo}, HERE, pairs, views, CAMERA, FusionConfig(), MatchingConfig(),
         {"bravo": "blended"}, threads=threads,
     )  # fmt: skip
 
 
-def test_an_honest_neighbour_is_believed(views):
-    trust = told(views, map_of("bravo"))
-    (doubt,) = trust.doubts
-    assert doubt.trusted
-    assert doubt.reason == ""
-    assert (doubt.too_large, doubt.contradicted, doubt.refused) == (0, 0, 0)
-    assert doubt.error < 0.1 * doubt.variance
-    assert doubt.judged_px > 0.5 * doubt.own_px
-    assert len(trust.evidence["bravo"]) == len(trust.pairs["alpha", "bravo"]) == doubt.pairs == N
+def test_an_honest_neighbor_is_believed(views):
+    validated = told(views, map_of("bravo"))
+    (report,) = validated.reports
+    assert report.trusted
+    assert report.reason == ""
+    assert (report.too_large, report.contradicted, report.rejected_matches) == (0, 0, 0)
+    assert report.color_mse < 0.1 * report.color_variance
+    assert report.compared_px > 0.5 * report.own_px
+    assert len(validated.evidence["bravo"]) == len(validated.pairs["alpha", "bravo"]) == report.matches == N
 
 
 def repaint(color):
@@ -83,16 +83,16 @@ def repaint(color):
 
 
 @pytest.mark.parametrize("color", [lambda c: 1 - c, np.zeros_like, lambda c: c[::-1]])
-def test_made_up_colours_leave_a_neighbour_out(views, color):
-    trust = told(views, map_of("bravo", repaint(color)))
-    (doubt,) = trust.doubts
-    assert not doubt.trusted
-    assert "contradicts own images" in doubt.reason
-    assert len(trust.evidence["bravo"]) == len(trust.pairs["alpha", "bravo"]) == 0
+def test_made_up_colors_leave_a_neighbor_out(views, color):
+    validated = told(views, map_of("bravo", repaint(color)))
+    (report,) = validated.reports
+    assert not report.trusted
+    assert "contradicts own images" in report.reason
+    assert len(validated.evidence["bravo"]) == len(validated.pairs["alpha", "bravo"]) == 0
 
 
 def test_another_camera_is_no_lie(views):
-    assert told(views, map_of("bravo", repaint(lambda c: 0.6 * c + 0.05))).doubts[0].trusted
+    assert told(views, map_of("bravo", repaint(lambda c: 0.6 * c + 0.05))).reports[0].trusted
 
 
 def test_discs_before_own_cameras_are_contradicted_and_the_rest_is_believed(views):
@@ -102,44 +102,44 @@ def test_discs_before_own_cameras_are_contradicted_and_the_rest_is_believed(view
         ((-0.62, 0, 1.0), 0.15, (1, 1, 1)),
         ((0, 0, -3), 0.05, (0, 0, 0)),
     ]
-    trust = told(views, map_of("bravo", discs=discs))
-    assert trust.doubts[0].trusted
-    assert trust.contradicted["bravo"][N:].tolist() == [True, True, False]
-    assert np.mean(trust.contradicted["bravo"][:N]) < 0.05  # those that share pixels with them
+    validated = told(views, map_of("bravo", discs=discs))
+    assert validated.reports[0].trusted
+    assert validated.contradicted["bravo"][N:].tolist() == [True, True, False]
+    assert np.mean(validated.contradicted["bravo"][:N]) < 0.05  # those that share pixels with them
 
 
 def test_what_lies_behind_own_surfaces_is_not_judged(views):
-    trust = told(views, map_of("bravo", discs=[((0, 0, 4), 0.1, (0, 0, 0))]))
-    assert not trust.contradicted["bravo"].any()
+    validated = told(views, map_of("bravo", discs=[((0, 0, 4), 0.1, (0, 0, 0))]))
+    assert not validated.contradicted["bravo"].any()
 
 
 def test_gaussians_of_impossible_size_are_left_out(views):
     """Also those that no rasterizer can draw."""
     discs = [((0, 0, 4), 1.0, (0, 0, 0)), ((0, 0, 4), 1e13, (0, 0, 0)), ((0, 0, 4), 1e30, (0, 0, 0))]
-    trust = told(views, map_of("bravo", discs=discs))
-    assert trust.doubts[0].too_large == 3
-    assert len(trust.evidence["bravo"]) == N
+    validated = told(views, map_of("bravo", discs=discs))
+    assert validated.reports[0].too_large == 3
+    assert len(validated.evidence["bravo"]) == N
 
 
 def test_matches_far_apart_unlike_or_of_nothing_are_refused(views):
     ids = 10 + np.arange(N)
     wrong = np.stack([ids, np.roll(ids, 1)], axis=1)
-    trust = told(views, map_of("bravo"), {("alpha", "bravo"): wrong})
-    assert trust.doubts[0].refused > 0.95 * N
-    assert told(views, map_of("bravo"), {("alpha", "bravo"): wrong + 10_000}).doubts[0].refused == N
+    validated = told(views, map_of("bravo"), {("alpha", "bravo"): wrong})
+    assert validated.reports[0].rejected_matches > 0.95 * N
+    assert told(views, map_of("bravo"), {("alpha", "bravo"): wrong + 10_000}).reports[0].rejected_matches == N
     white = map_of("bravo", lambda theta: theta.__setitem__((slice(0, 20), COLOR), 2.0))
-    assert told(views, white).doubts[0].refused == 20
+    assert told(views, white).reports[0].rejected_matches == 20
 
 
-def test_a_neighbour_that_shares_no_view_is_not_judged(views):
+def test_a_neighbor_that_shares_no_view_is_not_judged(views):
     away = map_of("bravo", lambda theta: theta.__setitem__((slice(None), 2), -5.0))
-    doubt = told(views, replace(away, theta=away.theta)).doubts[0]
-    assert doubt.trusted
-    assert doubt.judged_px == doubt.contradicted == 0
+    report = told(views, replace(away, theta=away.theta)).reports[0]
+    assert report.trusted
+    assert report.compared_px == report.contradicted == 0
 
 
 def test_threads_do_not_show(views):
     bravo = map_of("bravo", discs=[((0.2, 0.1, 0.8), 0.05, (0, 0, 0))])
     one, three = told(views, bravo), told(views, bravo, threads=3)
-    assert one.doubts == three.doubts
+    assert one.reports == three.reports
     np.testing.assert_array_equal(one.contradicted["bravo"], three.contradicted["bravo"])
