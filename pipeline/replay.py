@@ -11,7 +11,7 @@ from pathlib import Path
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file
-from duagc.pipeline.config.base import load
+from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.runner import agent_input, fuse_robot, prepare_robot, threads_per_worker
 from duagc.pipeline.runs.digest import ROBOT_RESULTS, digest_file
@@ -48,7 +48,7 @@ def replay(
     """
     from duagc.pipeline.recording import Recording
 
-    config = load(RunConfig, RunFolder(run).config_file)
+    config = load_config(RunConfig, RunFolder(run).config_file)
     logs = Recording(recording)
     known = RunFolder(run).robots
     check_file(run / "exchange.mcap", "the log of the exchange")

@@ -19,7 +19,7 @@ from duagc.pipeline.base import determinism
 from duagc.pipeline.base.atomic_folder import new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.workers import worker_pool
-from duagc.pipeline.config.base import dump
+from duagc.pipeline.config.base import dump_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.runs.digest import digest_file, result_files
 from duagc.pipeline.runs.folder import SCHEMA
@@ -125,7 +125,7 @@ def run(
     with new_folder(out, force) as folder:
         check_ground_truth(recording)
         timing = Timing()
-        (folder / "config.toml").write_text(dump(config))
+        (folder / "config.toml").write_text(dump_config(config))
         logs = {robot: recording.log(robot) for robot in recording.robots}
         for log in logs.values():
             if (found := content_digest(log)) != (told := recording.digest(log.name)):

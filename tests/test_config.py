@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.config.base import Config, dump, load
+from duagc.pipeline.config.base import Config, dump_config, load_config
 
 
 class Link(Config):
@@ -29,15 +29,15 @@ class Whole(Config):
 
 def test_dump_and_load_round_trip(tmp_path: Path) -> None:
     config = Whole(seed=7, link=Link(loss_probability=0.25))
-    text = dump(config)
+    text = dump_config(config)
     assert "# Per packet, independent." in text
     (tmp_path / "c.toml").write_text(text)
-    assert load(Whole, tmp_path / "c.toml") == config
+    assert load_config(Whole, tmp_path / "c.toml") == config
 
 
 def test_overrides_win_over_the_file(tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text("seed = 3\n[link]\nloss_probability = 0.5\n")
-    config = load(Whole, tmp_path / "c.toml", ["link.loss_probability=0.75", "link.name=wire"])
+    config = load_config(Whole, tmp_path / "c.toml", ["link.loss_probability=0.75", "link.name=wire"])
     assert config == Whole(seed=3, link=Link(loss_probability=0.75, name="wire"))
 
 
@@ -52,7 +52,7 @@ def test_overrides_win_over_the_file(tmp_path: Path) -> None:
 )
 def test_errors_name_the_setting(override: str, expected: str) -> None:
     with pytest.raises(DuagError) as caught:
-        load(Whole, overrides=[override])
+        load_config(Whole, overrides=[override])
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -61,6 +61,6 @@ def test_broken_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     path.write_text("seed = = 3")
     with pytest.raises(DuagError, match=r"c\.toml: not valid TOML"):
-        load(Whole, path)
+        load_config(Whole, path)
     with pytest.raises(DuagError, match=r"absent\.toml"):
-        load(Whole, tmp_path / "absent.toml")
+        load_config(Whole, tmp_path / "absent.toml")

@@ -71,7 +71,7 @@ def test_the_estimator_knows_no_ground_truth(part: Part) -> None:
             assert word not in text, f"{path.relative_to(ROOT)} mentions {word}"
 
 
-@pytest.mark.parametrize("folder", [*SOURCES, "tests", "duagc", "examples"])
+@pytest.mark.parametrize("folder", [*SOURCES, "tests", "examples"])
 def test_nothing_is_imported_by_a_bare_name(folder: str) -> None:
     """From a checkout `import pipeline` works as well, and gives a second copy of every class."""
     for path in modules(ROOT / folder):

@@ -8,7 +8,7 @@ import pytest
 
 from duagc.converters.simulate.team import simulate
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.config.base import load
+from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.evaluation import evaluate
 from duagc.pipeline.evaluation.network import Session
@@ -34,7 +34,7 @@ def quiet(line: str) -> None:
 
 
 def make_run(recording: Path, out: Path, *overrides: str, workers: int = 2) -> Path:
-    run(recording, out, load(RunConfig, overrides=[*SMALL, *overrides]), workers=workers, say=quiet)
+    run(recording, out, load_config(RunConfig, overrides=[*SMALL, *overrides]), workers=workers, say=quiet)
     return out
 
 
@@ -103,7 +103,7 @@ def test_a_changed_log_is_mentioned(folder: Path, recording: Path) -> None:
     shutil.copy(changed / "alpha.mcap", changed / "bravo.mcap")  # a sound log, but another one
     said: list[str] = []
     with pytest.raises(DuagError, match="is the log of alpha, expected that of bravo"):
-        run(changed, folder / "run_changed", load(RunConfig, overrides=SMALL), say=said.append)
+        run(changed, folder / "run_changed", load_config(RunConfig, overrides=SMALL), say=said.append)
     assert [line for line in said if "warning" in line and "bravo.mcap" in line]
 
 
@@ -209,7 +209,7 @@ def test_every_candidate_of_a_run_can_be_asked_for_with_its_reason(finished: Pat
 
 
 def test_the_exchange_of_a_run_can_be_repeated_under_faults(finished: Path, recording: Path) -> None:
-    settings = load(RunConfig, finished / "config.toml", [])
+    settings = load_config(RunConfig, finished / "config.toml", [])
     checks = ["frames", "names", "closures", "silence", "solver"]
     result = team_faults.run(
         RunFolder(finished), Recording(recording), settings.exchange, settings.seed, checks, 1
@@ -228,7 +228,7 @@ def test_the_exchange_of_a_run_can_be_repeated_under_faults(finished: Path, reco
 
 
 def test_what_the_images_allow_is_told_beside_the_error_of_the_team(finished: Path, recording: Path) -> None:
-    config = load(RunConfig, finished / "config.toml", []).frontend
+    config = load_config(RunConfig, finished / "config.toml", []).frontend
     result = pose_reference.run(RunFolder(finished), Recording(recording), config)
     metrics = json.loads((finished / "metrics.json").read_text())
     told = metrics["team"]["ate_rmse_m"]
@@ -246,7 +246,7 @@ def test_what_the_images_allow_is_told_beside_the_error_of_the_team(finished: Pa
 
 def test_a_signed_packet_can_be_asked_for(finished: Path, recording: Path, tmp_path: Path) -> None:
     """The signature is no part of what a packet says. Of the run only the exchange is done again."""
-    settings = load(RunConfig, finished / "config.toml", ["exchange.transport.signatures=ed25519"])
+    settings = load_config(RunConfig, finished / "config.toml", ["exchange.transport.signatures=ed25519"])
     logs = Recording(recording)
     (tmp_path / "robots").symlink_to(finished / "robots")
     run_session(

@@ -139,7 +139,7 @@ def bench_team(
 
     Example: `duagc bench team outputs/redkitchen --checks frames --seeds 100`
     """
-    from duagc.pipeline.config.base import load
+    from duagc.pipeline.config.base import load_config
     from duagc.pipeline.config.run import RunConfig
     from duagc.pipeline.experiments import team_faults
     from duagc.pipeline.recording import Recording
@@ -152,7 +152,7 @@ def bench_team(
                 f"{name!r} is not one of {', '.join(team_faults.CHECKS)}", param_hint="--checks"
             )
     run = RunFolder(run_folder)
-    settings = load(RunConfig, run.config_file, overrides or [])
+    settings = load_config(RunConfig, run.config_file, overrides or [])
     source = Recording(run.recording if recording is None else recording)
     result = team_faults.run(run, source, settings.exchange, settings.seed, chosen, seeds)
     print(json.dumps(result, indent=2) if as_json else team_faults.format_table(result))
@@ -173,7 +173,7 @@ def bench_reference(
     Example: `duagc bench reference outputs/redkitchen`
     """
     from duagc.pipeline.base import determinism
-    from duagc.pipeline.config.base import load
+    from duagc.pipeline.config.base import load_config
     from duagc.pipeline.config.run import RunConfig
     from duagc.pipeline.experiments import pose_reference
     from duagc.pipeline.recording import Recording
@@ -182,7 +182,7 @@ def bench_reference(
     determinism.configure_opencv()
     run = RunFolder(run_folder)
     source = Recording(run.recording if recording is None else recording)
-    result = pose_reference.run(run, source, load(RunConfig, run.config_file, []).frontend)
+    result = pose_reference.run(run, source, load_config(RunConfig, run.config_file, []).frontend)
     print(json.dumps(result, indent=2) if as_json else pose_reference.format_table(result))
 
 
@@ -215,10 +215,10 @@ def bench_frontend(
 
     from duagc.converters.simulate.team import simulate as simulate_recording
     from duagc.pipeline.bench import frontend, frontend_tables
-    from duagc.pipeline.config.base import load
+    from duagc.pipeline.config.base import load_config
     from duagc.pipeline.config.run import RunConfig
 
-    settings = load(RunConfig, config, overrides or [])
+    settings = load_config(RunConfig, config, overrides or [])
     chosen = () if caps == "none" else tuple(_counts("--caps", caps))
     if plot is not None:
         if not chosen:

@@ -235,14 +235,16 @@ def calibrate(
     from duagc.pipeline.base import determinism
     from duagc.pipeline.camera_calibration import report
     from duagc.pipeline.camera_calibration.calibrate import calibrate as calibrate_recording
-    from duagc.pipeline.config.base import load
+    from duagc.pipeline.config.base import load_config
     from duagc.pipeline.config.run import RunConfig
     from duagc.pipeline.recording import Recording
 
     determinism.configure_opencv()
     if out is not None:
         report.check_out(out, force, Recording(path).description, path)
-    found = calibrate_recording(path, load(RunConfig, config, overrides or []).frontend, robots or [], views)
+    found = calibrate_recording(
+        path, load_config(RunConfig, config, overrides or []).frontend, robots or [], views
+    )
     print(json.dumps(report.plain(found), indent=2) if as_json else report.format_calibration(found))
     if out is not None:
         report.write(found, out)

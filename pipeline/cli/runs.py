@@ -62,12 +62,12 @@ def run(
     `duagc run recordings/redkitchen --out outputs/redkitchen`,
     `duagc run recordings/room --out outputs/lossy --set exchange.link.loss_probability=0.3`
     """
-    from duagc.pipeline.config.base import load
+    from duagc.pipeline.config.base import load_config
     from duagc.pipeline.config.run import RunConfig
     from duagc.pipeline.runner import run as run_stages
 
     run_stages(
-        recording, out, load(RunConfig, config, overrides or []), workers=workers, force=force, say=say
+        recording, out, load_config(RunConfig, config, overrides or []), workers=workers, force=force, say=say
     )
     _print_outputs(out)
 

@@ -22,7 +22,7 @@ class Config(BaseModel):
 Model = TypeVar("Model", bound=Config)
 
 
-def load(model: type[Model], path: Path | None = None, overrides: Sequence[str] = ()) -> Model:
+def load_config(model: type[Model], path: Path | None = None, overrides: Sequence[str] = ()) -> Model:
     """Read a configuration.
 
     Args:
@@ -69,7 +69,7 @@ def _apply(values: dict[str, Any], override: str) -> None:
         values[keys[-1]] = text.strip()
 
 
-def dump(config: Config) -> str:
+def dump_config(config: Config) -> str:
     """TOML text of a configuration, every setting with its documentation as a comment."""
     import tomlkit
 

@@ -25,13 +25,13 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from duagc.pipeline.exchange.neighbor import Neighbor
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.exchange import injection
 from duagc.pipeline.exchange.loop_closing import HigherEnd, LowerEnd, Meeting, OwnPlaces, Send
 from duagc.pipeline.exchange.map_alignment import Frames
+from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.sharing import Sharing
 from duagc.pipeline.exchange.solvers import AdmmSolver, EliminationSolver, LinkStart, PoseSolver, SolverStart
 from duagc.pipeline.exchange.wire import places_wire, state_wire

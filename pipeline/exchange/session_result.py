@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from duagc.pipeline.exchange.neighbor import Neighbor
 from numpy.typing import NDArray
 
 from duagc.pipeline.exchange.agent import Agent
 from duagc.pipeline.exchange.evidence_records import to_evidence
+from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.verification import Verdict
 from duagc.pipeline.exchange.wire.state_wire import PairList
 from duagc.pipeline.geometry import se3

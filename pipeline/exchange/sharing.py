@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from duagc.pipeline.exchange.neighbor import Neighbor
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.exchange import injection
 from duagc.pipeline.exchange.evidence_records import best_first, match_pairs, own_records, seen_voxels, within
 from duagc.pipeline.exchange.knowledge import Knowledge
+from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.wire import evidence_wire, state_wire
 from duagc.pipeline.exchange.wire.state_wire import PairList
 from duagc.pipeline.network.packets import Kind

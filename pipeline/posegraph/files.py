@@ -104,7 +104,7 @@ class TeamGraph:
         return found
 
 
-def read_team(path: Path, robots: int | None = None, *, only_reference: bool = False) -> TeamGraph:
+def read_team_graph(path: Path, robots: int | None = None, *, only_reference: bool = False) -> TeamGraph:
     """Read a pose graph and give every robot its own.
 
     Args:

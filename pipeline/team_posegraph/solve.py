@@ -18,7 +18,7 @@ from duagc.pipeline.network.packets import HEADER_BYTES, MAX_PAYLOAD_BYTES
 from duagc.pipeline.posegraph import factors as pose_factors
 from duagc.pipeline.posegraph.central import CentralSolution, Team, solve_central, team_graph
 from duagc.pipeline.posegraph.factors import Factors
-from duagc.pipeline.posegraph.files import TeamGraph, read_team
+from duagc.pipeline.posegraph.files import TeamGraph, read_team_graph
 from duagc.pipeline.posegraph.initialization import chordal
 from duagc.pipeline.posegraph.robust import COUNTS
 from duagc.pipeline.team_posegraph.agent import GraphAgent
@@ -60,7 +60,7 @@ def solve(
     path: Path, config: PoseGraphConfig, robots: int | None = None, *, only_reference: bool = False
 ) -> dict[str, Any]:
     """Read, cut, let the team meet, compare; see `docs/posegraph.md` for the result."""
-    graph = read_team(path, robots, only_reference=only_reference)
+    graph = read_team_graph(path, robots, only_reference=only_reference)
     c2 = config.consensus.truncation**2 if config.consensus.robust else None
     components = [_component(graph, members, config) for members in graph.components()]
     if c2 is None:

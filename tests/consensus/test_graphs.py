@@ -8,7 +8,7 @@ from duagc.pipeline.config.consensus import ClosureConfig
 from duagc.pipeline.posegraph import factors as pose_factors
 from duagc.pipeline.posegraph.central import team_graph
 from duagc.pipeline.posegraph.factors import Factors
-from duagc.pipeline.posegraph.files import read_team
+from duagc.pipeline.posegraph.files import read_team_graph
 from tests.posegraph.graphs import KAPPA, TAU, g2o_line, helix, helix_edges, symbol, write_g2o, write_team
 
 EXACT = ClosureConfig(sigma_floor_m=0, sigma_floor_rad=0)
@@ -35,7 +35,7 @@ def chordal_cost(rows, T):
 @pytest.mark.parametrize("robots", [1, 3, 5])
 def test_no_factor_is_lost_however_a_graph_is_cut(tmp_path, robots):
     rows, T = helix_edges(40), helix(40)
-    team = read_team(write_g2o(tmp_path / "helix.g2o", rows), robots)
+    team = read_team_graph(write_g2o(tmp_path / "helix.g2o", rows), robots)
     assert len(team.robots) == robots
     sizes = [g.keyframes for g in team.robots.values()]
     assert sum(sizes) == 40
@@ -48,15 +48,15 @@ def test_no_factor_is_lost_however_a_graph_is_cut(tmp_path, robots):
 
 def test_a_teams_files_say_the_same_as_one_file_that_is_cut(tmp_path):
     rows, T = helix_edges(40), helix(40)
-    cut = read_team(write_g2o(tmp_path / "helix.g2o", rows), 4)
-    team = read_team(write_team(tmp_path / "team", rows, 4, 40))
+    cut = read_team_graph(write_g2o(tmp_path / "helix.g2o", rows), 4)
+    team = read_team_graph(write_team(tmp_path / "team", rows, 4, 40))
     assert list(team.robots) == ["a", "b", "c", "d"]
     costs = [team_cost(t, {r: T[10 * k : 10 * k + 10] for k, r in enumerate(t.robots)}) for t in (cut, team)]
     assert costs[0] == costs[1]
 
 
 def test_both_ends_know_the_same_closures(tmp_path):
-    team = read_team(write_g2o(tmp_path / "helix.g2o", helix_edges(40)), 4)
+    team = read_team_graph(write_g2o(tmp_path / "helix.g2o", helix_edges(40)), 4)
     assert team.pairs
     for a, b in team.pairs:
         for one, other in zip(team.robots[a].closures[b], team.robots[b].closures[a], strict=True):
@@ -67,7 +67,7 @@ def test_both_ends_know_the_same_closures(tmp_path):
 
 
 def test_consecutive_keyframes_are_odometry_and_the_rest_is_not(tmp_path):
-    team = read_team(write_g2o(tmp_path / "helix.g2o", helix_edges(40)), 2)
+    team = read_team_graph(write_g2o(tmp_path / "helix.g2o", helix_edges(40)), 2)
     for graph in team.robots.values():
         assert np.all(np.abs(graph.odometry.j - graph.odometry.i) == 1)
         assert np.all(np.abs(graph.loops.j - graph.loops.i) == 8)
@@ -75,7 +75,7 @@ def test_consecutive_keyframes_are_odometry_and_the_rest_is_not(tmp_path):
 
 def test_a_loop_that_alone_holds_a_robot_together_is_trusted(tmp_path):
     rows = [row for row in helix_edges(16) if row[:2] != (11, 12)]
-    team = read_team(write_g2o(tmp_path / "gap.g2o", rows), 1)
+    team = read_team_graph(write_g2o(tmp_path / "gap.g2o", rows), 1)
     (graph,) = team.robots.values()
     assert (4, 12) in zip(graph.odometry.i.tolist(), graph.odometry.j.tolist(), strict=True)
     assert len(graph.odometry) + len(graph.loops) == len(rows)
@@ -97,7 +97,7 @@ def test_kimera_tables_with_their_reference(tmp_path):
     (tmp_path / "reference_inliers.csv").write_text(
         "robot_src,pose_src,robot_dst,pose_dst,inlier\n" + "".join(flags)
     )
-    team, T = read_team(tmp_path), helix(20)
+    team, T = read_team_graph(tmp_path), helix(20)
     cost, count = team_cost(team, {"robot0": T[:10], "robot1": T[10:]})
     assert count == len(rows)
     np.testing.assert_allclose(cost, chordal_cost(rows, T), rtol=1e-9)
@@ -109,7 +109,7 @@ def test_kimera_tables_with_their_reference(tmp_path):
         if not true
     ]
     assert false == [(9, 0), (4, 2)]  # the first is not named by the reference at all
-    without = read_team(tmp_path, only_reference=True)
+    without = read_team_graph(tmp_path, only_reference=True)
     assert team_cost(without, {"robot0": T[:10], "robot1": T[10:]})[1] == count - 2
 
 
@@ -120,7 +120,7 @@ def test_edges_that_the_reference_names_false_by_number(tmp_path):
     (tmp_path / "gt_info.xml").write_text(
         f"<struct>\n <outlier_lc_indices>{false}</outlier_lc_indices>\n</struct>\n"
     )
-    team = read_team(path, 2)
+    team = read_team_graph(path, 2)
     (truth,) = team.closures_true.values()
     loops = np.concatenate(list(team.loops_true.values()))
     assert (~truth).sum() + (~loops).sum() == 1
@@ -128,14 +128,14 @@ def test_edges_that_the_reference_names_false_by_number(tmp_path):
 
 def test_robots_that_nothing_joins_are_components_of_their_own(tmp_path):
     rows = [(i, j, T) for i, j, T in helix_edges(40) if (i < 20) == (j < 20)]
-    team = read_team(write_g2o(tmp_path / "two.g2o", rows), 4)
+    team = read_team_graph(write_g2o(tmp_path / "two.g2o", rows), 4)
     assert team.components() == [("robot0", "robot1"), ("robot2", "robot3")]
 
 
 def test_a_graph_of_the_whole_team_in_its_folder_is_left_out(tmp_path):
     folder = write_team(tmp_path / "team", helix_edges(40), 2, 40)
     write_g2o(folder / "fullGraph.g2o", helix_edges(40))
-    team = read_team(folder)
+    team = read_team_graph(folder)
     assert list(team.robots) == ["a", "b"]
     assert team.ignored == ("fullGraph.g2o",)
 
@@ -164,7 +164,7 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path, text, robots, words):
     path = tmp_path / "graph.g2o"
     path.write_text(text)
     with pytest.raises(DuagError) as error:
-        read_team(path, robots)
+        read_team_graph(path, robots)
     message = str(error.value)
     assert "\n" not in message
     assert str(path) in message
@@ -173,18 +173,18 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path, text, robots, words):
 
 def test_a_folder_without_graphs_is_refused(tmp_path):
     with pytest.raises(DuagError, match="neither"):
-        read_team(tmp_path)
+        read_team_graph(tmp_path)
     with pytest.raises(DuagError, match="not found"):
-        read_team(tmp_path / "absent.g2o")
+        read_team_graph(tmp_path / "absent.g2o")
     (tmp_path / "robot0").mkdir()
     (tmp_path / "robot0" / "measurements.csv").write_text("a,b\n1,2\n")
     with pytest.raises(DuagError, match="no column robot_src"):
-        read_team(tmp_path)
+        read_team_graph(tmp_path)
     plain = tmp_path / "plain"
     plain.mkdir()
     write_g2o(plain / "0.g2o", helix_edges(8, 4))
     write_g2o(plain / "1.g2o", helix_edges(8, 4))
     with pytest.raises(DuagError, match="gtsam symbols"):
-        read_team(plain)
+        read_team_graph(plain)
     with pytest.raises(DuagError, match="no reference"):
-        read_team(plain / "0.g2o", 2, only_reference=True)
+        read_team_graph(plain / "0.g2o", 2, only_reference=True)

@@ -15,7 +15,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph import factors as pose_factors
 from duagc.pipeline.posegraph.central import CentralSolution, solve_central, team_graph
 from duagc.pipeline.posegraph.factors import Factors
-from duagc.pipeline.posegraph.files import read_team
+from duagc.pipeline.posegraph.files import read_team_graph
 from duagc.pipeline.posegraph.initialization import chordal
 from duagc.pipeline.posegraph.loop_closures import Closure, ClosureConfig, chain_frames, holder, robust_frame
 
@@ -165,7 +165,7 @@ def benchmark(name: str, robots: int | None = None) -> TeamWorld:
     path = POSE_GRAPHS / name
     if not path.exists():
         pytest.skip(f"needs {name} in ../shared/data/pose_graphs, which is not distributed with the project")
-    team = read_team(path, robots)
+    team = read_team_graph(path, robots)
     odometry = {r: Factors.concatenate([g.odometry, g.loops]) for r, g in team.robots.items()}
     maps = {
         r: solve_central(odometry[r], chordal(odometry[r], g.keyframes)).poses for r, g in team.robots.items()

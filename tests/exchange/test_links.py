@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.config.base import dump, load
+from duagc.pipeline.config.base import dump_config, load_config
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.network import LinkConfig, LinkWindow
 from duagc.pipeline.network import link_model
@@ -168,10 +168,10 @@ def test_links_survive_a_configuration_file(tmp_path: Path) -> None:
         loss_probability = 0.25
     """
     (tmp_path / "links.toml").write_text(text)
-    config = load(ExchangeConfig, tmp_path / "links.toml")
+    config = load_config(ExchangeConfig, tmp_path / "links.toml")
     assert config.link.windows[0] == LinkWindow(sender="alpha", receiver="bravo", until_ns=3_000_000_000)
-    (tmp_path / "again.toml").write_text(dump(config))
-    assert load(ExchangeConfig, tmp_path / "again.toml") == config
+    (tmp_path / "again.toml").write_text(dump_config(config))
+    assert load_config(ExchangeConfig, tmp_path / "again.toml") == config
 
 
 @pytest.mark.parametrize(

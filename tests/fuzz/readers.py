@@ -21,7 +21,7 @@ from duagc.converters.logs import describe
 from duagc.converters.simulate import mesh_process, meshes
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.checks import check
-from duagc.pipeline.config.base import load
+from duagc.pipeline.config.base import load_config
 from duagc.pipeline.geometry.trajectory import read_tum
 from duagc.pipeline.recording import Recording, format_info, info, open_rgbd, read_log, recovery
 from duagc.pipeline.runs import digest
@@ -165,9 +165,9 @@ def read_scene(src: Path, out: Path) -> None:
 
 def graph_reader(name: str, make: Callable[[Path], None], file: str, robots: int | None) -> Reader:
     def read(src: Path, out: Path) -> None:
-        from duagc.pipeline.posegraph.files import read_team
+        from duagc.pipeline.posegraph.files import read_team_graph
 
-        read_team(src / file, robots)
+        read_team_graph(src / file, robots)
 
     return Reader(name, make, read, any_special)
 
@@ -188,7 +188,7 @@ def _read(result: object) -> None:
 def read_config(src: Path, out: Path) -> None:
     from duagc.pipeline.config.run import RunConfig
 
-    load(RunConfig, src / "config.toml")
+    load_config(RunConfig, src / "config.toml")
 
 
 def read_gaussians(src: Path, out: Path) -> None:

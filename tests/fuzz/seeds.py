@@ -243,10 +243,10 @@ def make_csv(seed: Path) -> None:
 
 
 def make_config(seed: Path) -> None:
-    from duagc.pipeline.config.base import dump
+    from duagc.pipeline.config.base import dump_config
     from duagc.pipeline.config.run import RunConfig
 
-    (seed / "config.toml").write_text(dump(RunConfig()))
+    (seed / "config.toml").write_text(dump_config(RunConfig()))
 
 
 def make_gaussians(seed: Path) -> None:

@@ -7,14 +7,14 @@ import pytest
 
 from duagc.pipeline.config.posegraph import settings
 from duagc.pipeline.network.packets import parse, serialize
-from duagc.pipeline.posegraph.files import read_team
+from duagc.pipeline.posegraph.files import read_team_graph
 from duagc.pipeline.team_posegraph import network
 from tests.posegraph.graphs import helix_edges, write_g2o
 
 
 @pytest.mark.parametrize("solver", ["admm", "elimination", "paper"])
 def test_changed_payloads_crash_nobody(tmp_path, solver):
-    team = read_team(write_g2o(tmp_path / "helix.g2o", helix_edges(24)), 3)
+    team = read_team_graph(write_g2o(tmp_path / "helix.g2o", helix_edges(24)), 3)
     rng = np.random.default_rng(0)
     refused = changed = 0
     for _ in range(12):

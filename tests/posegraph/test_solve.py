@@ -7,7 +7,7 @@ import pytest
 
 from duagc.pipeline.config.posegraph import settings
 from duagc.pipeline.network.packets import MAX_PACKET_BYTES, parse
-from duagc.pipeline.posegraph.files import read_team
+from duagc.pipeline.posegraph.files import read_team_graph
 from duagc.pipeline.team_posegraph import network, solve
 from duagc.pipeline.team_posegraph.network import Traffic, meet
 from tests.posegraph.graphs import helix_edges, wild_edges, write_g2o, write_team
@@ -69,7 +69,7 @@ def test_two_runs_send_the_same_packets(helix_file):
     runs = []
     for _ in range(2):
         packets = []
-        team = read_team(helix_file, 3)
+        team = read_team_graph(helix_file, 3)
         _, traffic, rounds = record(team, settings("admm", loss=0.3, seed=4), packets)
         runs.append((packets, traffic.bytes, rounds))
     assert runs[0] == runs[1]
@@ -90,7 +90,7 @@ def record(team, config, packets):
 
 @pytest.mark.parametrize("solver", ["admm", "elimination", "paper"])
 def test_bytes_are_those_of_real_packets_with_their_headers(helix_file, solver):
-    team = read_team(helix_file, 3)
+    team = read_team_graph(helix_file, 3)
     config = settings(solver, max_rounds=40)
     agents = {
         name: network.SOLVERS[solver](team.robots[name], sorted(team.robots), config) for name in team.robots
@@ -124,7 +124,7 @@ def test_an_agent_is_told_its_own_graph_only(helix_file, monkeypatch):
         return original(graph, team, config)
 
     monkeypatch.setitem(network.SOLVERS, "admm", make)
-    team = read_team(helix_file, 4)
+    team = read_team_graph(helix_file, 4)
     meet(team, settings("admm"), lambda k, agents, traffic: None)
     for name, (graph, names) in told.items():
         assert graph is team.robots[name]
@@ -158,7 +158,7 @@ def test_robots_that_never_hear_each_other_keep_their_own_optimum(helix_file, so
         assert traffic.lost == traffic.packets
         alone[:] = [agent.T_world_keyframe for agent in agents.values()]
 
-    team = read_team(helix_file, 3)
+    team = read_team_graph(helix_file, 3)
     agents, _, rounds = meet(team, settings(solver, loss=1.0, max_rounds=12), watch)
     assert rounds == 12
     for T, agent in zip(alone, agents.values(), strict=True):
