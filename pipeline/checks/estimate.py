@@ -9,8 +9,8 @@ from typing import Any
 
 from duagc.pipeline.checks.findings import Finding, Severity
 
-# seconds per million pixels of a frame, whole runs on two idle cores: docs/results.md has RedKitchen with 112 s for 205
-# of them and the demo with about 60 s for 55; textures and speed decide how many keyframes there are
+# seconds per million pixels of a frame, whole runs on two idle cores: RedKitchen takes 118 s for 205 of them
+# (docs/results/runs.md) and the demo about 60 s for 55; textures and speed decide how many keyframes there are
 SECONDS_PER_MEGAPIXEL = (0.5, 1.2)
 BYTES_PER_ROBOT = 50_000_000  # maps at their cap of Gaussians with information; report and Rerun file
 BYTES_PER_FRAME = 25_000

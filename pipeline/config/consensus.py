@@ -21,7 +21,8 @@ class ClosureConfig(Config):
     drift_floor_rad: float = Field(default=0.003, ge=0.0)
     """The same for its rotation (rad)."""
     margin: float = Field(default=4.0, gt=0.0)
-    """Factor on the variances of the pairwise test; fitted on two public data sets (`docs/consensus.md`)."""
+    """Factor on the variances of the pairwise test; fitted on two public data sets
+    (`docs/explanation/pose-consensus.md`)."""
     min_support: int = Field(default=2, ge=1)
     """Closures that must agree before two robots are put into one frame: one alone cannot be checked."""
     frame_sigma_m: float = Field(default=0.1, gt=0.0)

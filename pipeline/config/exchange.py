@@ -91,7 +91,7 @@ class ExchangeConfig(Config):
     """100 bytes per Gaussian, rounded far below its uncertainty, or 188, or 364 bytes and not rounded at all."""
     weights: WeightKind = "block"
     """How sure a robot says it is of a Gaussian: its information, or one of the simpler kinds to compare with
-    (`docs/consensus.md`)."""
+    (`docs/explanation/information.md`)."""
     evidence_order: Literal["gain", "paper"] = "gain"
     """Which Gaussians go first: those that promise the receiver most information per byte, or by the paper's (4)."""
     overlap_voxel_m: float = Field(default=0.25, gt=0.0)

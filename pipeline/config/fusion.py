@@ -37,7 +37,7 @@ class FusionConfig(Config):
     association: Literal["neighbors", "members"] = "neighbors"
     """Whose values carry the variance of where a robot happened to put its splats: only the neighbors', so that a
     robot estimates its own splat at its own place, or every member's alike, so that all robots end with one and the
-    same Gaussian, as method and paper have it (see `docs/consensus.md` for what that costs)."""
+    same Gaussian, as method and paper have it (see `docs/explanation/fusion.md`)."""
     spacing_per_sigma: float = Field(default=1.8, ge=0.0)
     """Local spacing of splats, in units of their standard deviation along the surface: the mapper seeds discs with a
     standard deviation of 0.55 cells."""

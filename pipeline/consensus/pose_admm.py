@@ -9,7 +9,8 @@ poses. For every copied keyframe there is one edge variable y at each end of the
 
 a packet that does not arrive changes nothing. At a fixed point x agrees at both ends and the forces W (x - y) of
 the two ends cancel, so that x minimizes the sum of all robots' costs: the centralized optimum, whatever the
-penalties and the losses on the way were. Source: `docs/consensus.md`; paper eqs. (8), (10), (11), (14), corrected.
+penalties and the losses on the way were. Source: `docs/explanation/pose-consensus.md`; paper eqs. (8), (10),
+(11), (14), corrected.
 
 On the product group the edge variable is kept as its *offset* d = x - y, a vector of the tangent at x: a step delta
 adds delta to d, m is x (+) d, y is x (+) (-d), and an arrival subtracts relaxation (m (-) y) from d. Unlike the
@@ -54,7 +55,7 @@ class PoseAgent:
     """One robot's side of the pose consensus: own keyframes, copies of the neighbors', and what packets brought.
 
     Robots have names that sort; the lower name of a pair decides on penalties. Nobody is held during the iteration;
-    results may be expressed in any frame afterward (`docs/consensus.md`, gauge).
+    results may be expressed in any frame afterward (`docs/explanation/pose-consensus.md`, gauge).
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""How the robots' cameras see the same colors, as the robots found out (docs/consensus.md, "Colors")."""
+"""How the robots' cameras see the same colors, as the robots found out (docs/explanation/fusion.md, "Colors")."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """What an evaluation says: numbers, absent numbers with a reason, and the two files that hold them.
 
-`metrics.json` follows the contract of docs/evaluation.md. An absent value is null there, never zero, and the
+`metrics.json` follows the contract of docs/reference/metrics.md. An absent value is null there, never zero, and the
 top-level map `reasons` says why, by the path of the value: {"team.ate_rmse_m": "..."}.
 """
 

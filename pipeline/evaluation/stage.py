@@ -1,4 +1,4 @@
-"""Measure a finished run: metrics.json and metrics.parquet. docs/evaluation.md says what every number means."""
+"""Measure a finished run: metrics.json and metrics.parquet. docs/reference/metrics.md says what every number means."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors of trajectories, per robot and for the team (docs/evaluation.md, "Trajectories")."""
+"""Errors of trajectories, per robot and for the team (docs/reference/metrics.md, "Trajectories")."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

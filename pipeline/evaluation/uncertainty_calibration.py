@@ -1,4 +1,4 @@
-"""How well the predicted uncertainty of Gaussians fits their errors (docs/evaluation.md, "Calibration").
+"""How well the predicted uncertainty of Gaussians fits their errors (docs/reference/metrics.md, "Calibration").
 
 Every function takes one value per Gaussian: `sigma_m`, the predicted standard deviation of the error, and `error_m`,
 what was measured. Ties are broken by position in the array, so that the result depends on the input alone.

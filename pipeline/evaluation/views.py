@@ -1,4 +1,4 @@
-"""Renders beside images: the scores of one view, and the mean over a set of views (docs/evaluation.md, "Rendering")."""
+"""Renders against images: scores of one view, and means over sets of views (docs/reference/metrics.md, "Rendering")."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 At a keyframe the map is rendered, discs are seeded where it does not explain the image, and the Gaussians of a
 window of keyframes are optimized by Adam on a robust color and depth loss. `finish` refines the map over all
 keyframes. Everything is elementwise or summed in a fixed order: the same input gives the same bits on any number of
-threads. See docs/mapping.md.
+threads. See docs/explanation/mapping.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Closures between two robots: which of them agree, and the relative frame they agree on.
 
-Pairwise consistency only chooses the *start* (`docs/consensus.md`): used as a filter it loses good closures. The
-graduated weights of `duagc.pipeline.consensus.pose_admm` may let every closure back in, or throw it out.
+Pairwise consistency only chooses the *start* (`docs/explanation/pose-consensus.md`): used as a filter it loses good
+closures. The graduated weights of `duagc.pipeline.consensus.pose_admm` may let every closure back in, or throw it out.
 """
 
 from __future__ import annotations

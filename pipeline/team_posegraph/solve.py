@@ -59,7 +59,7 @@ class _Component:
 def solve(
     path: Path, config: PoseGraphConfig, robots: int | None = None, *, only_reference: bool = False
 ) -> dict[str, Any]:
-    """Read, cut, let the team meet, compare; see `docs/posegraph.md` for the result."""
+    """Read, cut, let the team meet, compare; see `docs/howto/pose-graph.md` for the result."""
     graph = read_team_graph(path, robots, only_reference=only_reference)
     c2 = config.consensus.truncation**2 if config.consensus.robust else None
     components = [_component(graph, members, config) for members in graph.components()]

@@ -1,4 +1,4 @@
-"""Every disturbance from many places of a log: the table of docs/lost-and-found.md. No test; it takes minutes.
+"""Every disturbance from many places of a log: the table of docs/results/relocalization.md. No test; it takes minutes.
 
 python -m tests.frontend.sweep_disturbances recordings/redkitchen/alpha.mcap --every 20
 """

@@ -1,4 +1,4 @@
-"""Public pose graphs at full size against their certified optima. Minutes, so marked slow; see `docs/posegraph.md`.
+"""Public pose graphs at full size against their certified optima. Minutes, so slow; `docs/results/pose-graphs.md`.
 
 Limits of rounds and bytes leave some room above what was measured; recalls and precisions are those that are claimed.
 """
