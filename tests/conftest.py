@@ -3,3 +3,5 @@
 from duagc.pipeline.base import determinism
 
 determinism.configure_determinism()
+
+pytest_plugins = ["tests.budget"]

@@ -1,0 +1,116 @@
+"""Processor time of every test, per folder, beside the budget of the folder.
+
+`make test` shall take at most eight minutes of processor time, so each folder has a share. A folder over its share is
+named in the summary; the session does not fail, because processor time depends on the machine and on its load.
+`pytest --cpu 25` also lists the 25 most expensive tests.
+"""
+
+from __future__ import annotations
+
+import resource
+from collections import defaultdict
+from collections.abc import Generator
+
+import pytest
+
+PROPERTY = "cpu_s"
+# Seconds of processor time without the tests marked slow, on a core of 2.6 GHz.
+BUDGET_S = {
+    "bench": 15,
+    "calibration": 15,
+    "checks": 20,
+    "consensus": 15,
+    "converters": 80,
+    "evaluation": 35,
+    "exchange": 70,
+    "frontend": 70,
+    "fusion": 40,
+    "fuzz": 10,
+    "geometry": 5,
+    "golden": 40,
+    "information": 10,
+    "kernels": 20,
+    "posegraph": 10,
+    "recording": 20,
+    "registration": 15,
+    "report": 10,
+    "schemas": 5,
+    "splat": 15,
+    "": 40,  # the files in tests/ itself
+}
+
+
+def processor_time_s() -> float:
+    """User and system time of this process and of the children it has waited for."""
+    return sum(
+        usage.ru_utime + usage.ru_stime
+        for usage in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    )
+
+
+class Meter:
+    """Attribute processor time to the phases of each test: setup, call and teardown.
+
+    A fixture of the session counts for the first test that asks for it.
+    """
+
+    def __init__(self) -> None:
+        self._mark_s = processor_time_s()
+
+    def pytest_runtest_logstart(self) -> None:
+        self._mark_s = processor_time_s()
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_makereport(self) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+        report = yield
+        now_s = processor_time_s()
+        report.user_properties = [*report.user_properties, (PROPERTY, now_s - self._mark_s)]
+        self._mark_s = now_s
+        return report
+
+
+class Summary:
+    """Print the processor time per folder and of the most expensive tests.
+
+    Args:
+        listed: how many tests to list.
+    """
+
+    def __init__(self, listed: int) -> None:
+        self._listed = listed
+        self._tests_s: dict[str, float] = defaultdict(float)
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self._tests_s[report.nodeid] += sum(float(s) for name, s in report.user_properties if name == PROPERTY)
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        folders_s: dict[str, float] = defaultdict(float)
+        for nodeid, seconds in self._tests_s.items():
+            folders_s[folder_of(nodeid)] += seconds
+        write = terminalreporter.write_line
+        terminalreporter.section("processor time")
+        if self._listed:
+            for nodeid in sorted(self._tests_s, key=self._tests_s.__getitem__, reverse=True)[: self._listed]:
+                write(f"{self._tests_s[nodeid]:8.2f} s  {nodeid}")
+            write("")
+        for folder in sorted(folders_s):
+            budget_s = BUDGET_S.get(folder, 0)
+            over = "  over budget" if folders_s[folder] > budget_s else ""
+            write(f"{folders_s[folder]:8.1f} s of {budget_s:4d} s  tests/{folder}{over}")
+        write(f"{sum(folders_s.values()):8.1f} s of {sum(BUDGET_S.values()):4d} s  all tests")
+
+
+def folder_of(nodeid: str) -> str:
+    """First folder below tests/ of a test, empty for a file in tests/ itself."""
+    parts = nodeid.partition("::")[0].split("/")
+    return parts[1] if len(parts) > 2 else ""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--cpu", type=int, default=0, metavar="N", help="list the N tests of most processor time")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(Meter(), "processor-time-meter")
+    if not hasattr(config, "workerinput"):  # a worker of pytest-xdist sends its reports to the process that prints
+        config.pluginmanager.register(Summary(config.getoption("cpu")), "processor-time-summary")
