@@ -81,7 +81,9 @@ class Summary:
         self._tests_s: dict[str, float] = defaultdict(float)
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        self._tests_s[report.nodeid] += sum(float(s) for name, s in report.user_properties if name == PROPERTY)
+        self._tests_s[report.nodeid] += sum(
+            float(s) for name, s in report.user_properties if name == PROPERTY
+        )
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         folders_s: dict[str, float] = defaultdict(float)
@@ -107,10 +109,14 @@ def folder_of(nodeid: str) -> str:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--cpu", type=int, default=0, metavar="N", help="list the N tests of most processor time")
+    parser.addoption(
+        "--cpu", type=int, default=0, metavar="N", help="list the N tests of most processor time"
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(Meter(), "processor-time-meter")
-    if not hasattr(config, "workerinput"):  # a worker of pytest-xdist sends its reports to the process that prints
+    if not hasattr(
+        config, "workerinput"
+    ):  # a worker of pytest-xdist sends its reports to the process that prints
         config.pluginmanager.register(Summary(config.getoption("cpu")), "processor-time-summary")

@@ -1,4 +1,4 @@
-"""Reads meshes into plain arrays, in a process of its own that `duagc.converters.simulate.mesh_process` starts.
+"""Reads meshes into plain arrays, in a process of its own that `duagc.converters.simulate.render.mesh_process` starts.
 
 The C++ libraries behind Open3D crash on some damaged meshes, wait at pipes, and unpack a small texture to any size.
 Here they have limits of memory and of processor time, which grow with the file, and the process ends with its parent.

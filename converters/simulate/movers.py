@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from duagc.converters.simulate import meshes, triangles
-from duagc.converters.simulate import textures as tex
-from duagc.converters.simulate.raycast import Caster, MeshRenderer
-from duagc.converters.simulate.scene import Scene
-from duagc.converters.simulate.walks import FreeSpace, route
+from duagc.converters.simulate.render import meshes, triangles
+from duagc.converters.simulate.render.raycast import Caster, MeshRenderer
+from duagc.converters.simulate.scenes import textures as tex
+from duagc.converters.simulate.scenes.scene import Scene
+from duagc.converters.simulate.trajectories.walks import FreeSpace, route
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.geometry.camera import PinholeCamera
 

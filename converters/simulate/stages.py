@@ -7,10 +7,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.simulate import bake, meshes, trajectories, triangles, walks
-from duagc.converters.simulate.raycast import Caster, MeshRenderer
-from duagc.converters.simulate.render import Eye, Renderer
-from duagc.converters.simulate.scene_settings import MESHES, SCENES, Manner, build
+from duagc.converters.simulate.render import bake, meshes, triangles
+from duagc.converters.simulate.render.raycast import Caster, MeshRenderer
+from duagc.converters.simulate.render.renderer import Eye, Renderer
+from duagc.converters.simulate.scenes.catalog import MESHES, SCENES, Manner, build
+from duagc.converters.simulate.trajectories import loops, walks
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.geometry.camera import PinholeCamera
 
@@ -96,7 +97,7 @@ class RoomStage:
         return MeshRenderer(Caster(triangles.unpainted(self.scene)), camera)
 
     def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
-        return trajectories.plan(self.scene, robots, frames, overlap, camera)
+        return loops.plan(self.scene, robots, frames, overlap, camera)
 
     def free_space(self) -> walks.FreeSpace:
         def closed(places: Array) -> NDArray[np.bool_]:

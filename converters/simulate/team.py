@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.converters.simulate.movers import Mover, walk
-from duagc.converters.simulate.paradigms import PARADIGMS
-from duagc.converters.simulate.scene_settings import SCENES
-from duagc.converters.simulate.sensors import (
+from duagc.converters.simulate.scenes.catalog import SCENES
+from duagc.converters.simulate.sensors.rig import (
     BASELINE_M,
     RANGE_SIGMA_M,
     SENSORS,
@@ -24,6 +23,7 @@ from duagc.converters.simulate.sensors import (
     Rig,
     with_gain,
 )
+from duagc.converters.simulate.trajectories.paradigms import PARADIGMS
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism, random_streams
 from duagc.pipeline.base.errors import DuagError
@@ -84,9 +84,9 @@ def simulate(
     _check_rig(rig, movers, noise)
     determinism.configure_determinism()
     determinism.configure_opencv()
-    from duagc.converters.simulate import paradigms, trajectories
     from duagc.converters.simulate.preview import Preview
     from duagc.converters.simulate.stages import MeshStage, set_up
+    from duagc.converters.simulate.trajectories import loops, paradigms
 
     camera = camera_of(size)
     names = robot_names(robots)
@@ -109,12 +109,12 @@ def simulate(
             ways = stage.wander(robots, frames, overlap, camera)
         else:
             ways = paradigms.plan(stage, paradigm, robots, frames, overlap, camera, seed)
-        small = stage.eye(camera.scaled(*trajectories.OVERLAP_IMAGE))
+        small = stage.eye(camera.scaled(*loops.OVERLAP_IMAGE))
         recording.checks["clearance_m"] = {
             name: float(stage.clearance(way[:, :3, 3]).min()) for name, way in zip(names, ways, strict=True)
         }
         recording.checks["shared_view"] = {
-            f"{names[i]}-{names[i + 1]}": trajectories.shared_view(small, ways[i], ways[i + 1])
+            f"{names[i]}-{names[i + 1]}": loops.shared_view(small, ways[i], ways[i + 1])
             for i in range(robots - 1)
         }
         shares = list(recording.checks["shared_view"].values()) or [overlap]
@@ -185,7 +185,7 @@ def scene_of(scene: str, up: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """What `recording.json` says about a scene: source and parameters, no path of this machine."""
     if scene in SCENES:
         return {"kind": "simulation"}, {"scene": scene}
-    from duagc.converters.simulate import meshes
+    from duagc.converters.simulate.render import meshes
 
     folder = Path(scene).resolve()
     files = meshes.mesh_files(folder)
@@ -265,7 +265,7 @@ class _Artist:
         self, stage: Any, camera: PinholeCamera, noise: str, seed: int, rig: Rig, movers: list[Mover]
     ) -> None:
         from duagc.converters.layouts.stereo import StereoRig
-        from duagc.converters.simulate.sensors import MovingCamera
+        from duagc.converters.simulate.sensors.rig import MovingCamera
 
         self.eye, self.camera, self.noise, self.seed = stage.eye(camera), camera, noise, seed
         self.depth_scale_m, self.rig, self.has_movers = stage.depth_scale_m, rig, bool(movers)
@@ -274,7 +274,7 @@ class _Artist:
 
     def draw(self, job: _Job) -> _Images:
         """The images of one frame."""
-        from duagc.converters.simulate import noise
+        from duagc.converters.simulate.sensors import noise
 
         view, mask = self._view(job, job.pose)
         color, exact = view.color, _units(view.depth, self.depth_scale_m)

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from duagc.converters.simulate import paradigms, trajectories
 from duagc.converters.simulate.stages import set_up
 from duagc.converters.simulate.team import FRAME_RATE_HZ, camera_of, scene_of
+from duagc.converters.simulate.trajectories import loops, paradigms
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.bench.tables import markdown
@@ -42,7 +42,7 @@ def run(
         about = scene_of(scene, up)[1]
         with tempfile.TemporaryDirectory(prefix="duagc-scene-") as cache:
             stage = set_up(scene, about.get("up", ""), seed, Path(cache), as_meshes=False)
-            small = stage.eye(camera.scaled(*trajectories.OVERLAP_IMAGE))
+            small = stage.eye(camera.scaled(*loops.OVERLAP_IMAGE))
             stage.free_space()
             for figure, count, asked in track(list(product(figures, robots, overlaps)), f"plan {scene}"):
                 row: Row = {"scene": about["scene"], "paradigm": figure, "robots": count, "asked": asked}
@@ -55,7 +55,7 @@ def run(
                     continue
                 finally:
                     row["cpu_s"] = time.process_time() - start
-                shared = [trajectories.shared_view(small, a, b) for a, b in pairwise(ways)]
+                shared = [loops.shared_view(small, a, b) for a, b in pairwise(ways)]
                 step_m = [float(se3.distance(way[:-1], way[1:])[0].mean()) for way in ways]
                 row |= {
                     "shared": float(np.mean(shared)),

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from duagc.converters.datasets.seven_scenes import Options
-from duagc.converters.simulate.noise import gray_noise, kinect_depth
+from duagc.converters.simulate.sensors.noise import gray_noise, kinect_depth
 from duagc.converters.simulate.stages import Stage, set_up
 from duagc.pipeline.base import determinism, random_streams
 from duagc.pipeline.camera_calibration.rig import DEPTH, NAMES, ROTATION

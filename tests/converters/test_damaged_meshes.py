@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from duagc.converters.simulate import meshes
+from duagc.converters.simulate.render import meshes
 from duagc.pipeline.base.errors import DuagError
 from tests.converters.test_simulate_meshes import QUADS, folder_of, write_glb, write_ply
 from tests.fuzz.images import png_bomb

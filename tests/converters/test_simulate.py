@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from duagc.converters.simulate import bake, noise, trajectories
-from duagc.converters.simulate.render import Renderer
-from duagc.converters.simulate.scene import Scene
-from duagc.converters.simulate.scene_settings import build
+from duagc.converters.simulate.render import bake
+from duagc.converters.simulate.render.renderer import Renderer
+from duagc.converters.simulate.scenes.catalog import build
+from duagc.converters.simulate.scenes.scene import Scene
+from duagc.converters.simulate.sensors import noise
 from duagc.converters.simulate.team import camera_of, simulate, write_points
+from duagc.converters.simulate.trajectories import loops
 from duagc.pipeline import messages
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.errors import DuagError
@@ -42,7 +44,7 @@ def camera() -> PinholeCamera:
 
 @pytest.fixture(scope="module")
 def ways(room: Scene, camera: PinholeCamera) -> list[np.ndarray]:
-    return trajectories.plan(room, 3, 150, 0.6, camera)
+    return loops.plan(room, 3, 150, 0.6, camera)
 
 
 @pytest.fixture(scope="module")
@@ -133,9 +135,9 @@ def test_paths_are_smooth_clear_and_long(room, ways):
 
 @pytest.mark.parametrize("overlap", [0.5, 0.7])
 def test_neighbors_share_as_much_of_the_view_as_asked(room, camera, overlap):
-    small = Renderer(room, None, camera.scaled(*trajectories.OVERLAP_IMAGE))
-    one, other = trajectories.plan(room, 2, 150, overlap, camera)
-    assert trajectories.shared_view(small, one, other) == pytest.approx(overlap, abs=0.04)
+    small = Renderer(room, None, camera.scaled(*loops.OVERLAP_IMAGE))
+    one, other = loops.plan(room, 2, 150, overlap, camera)
+    assert loops.shared_view(small, one, other) == pytest.approx(overlap, abs=0.04)
     apart, _ = se3.distance(one[:, None], other[None])
     assert apart.min(axis=0).max() > 0.2  # and not from the same places
 
@@ -144,7 +146,7 @@ def test_neighbors_share_as_much_of_the_view_as_asked(room, camera, overlap):
 def test_every_robot_finds_a_way_in_every_room(seed):
     scene = build("room", seed)
     for robot in range(4):
-        way = trajectories._loop(scene, robot).poses(160, 0.7)
+        way = loops._loop(scene, robot).poses(160, 0.7)
         assert scene.clearance(way[:, :3, 3]).min() > 0.5
 
 

@@ -13,11 +13,12 @@ import cv2
 import numpy as np
 import pytest
 
-from duagc.converters.simulate import meshes, walks
-from duagc.converters.simulate.raycast import Caster, MeshRenderer
+from duagc.converters.simulate.render import meshes
+from duagc.converters.simulate.render.raycast import Caster, MeshRenderer
 from duagc.converters.simulate.stages import MeshStage
 from duagc.converters.simulate.team import camera_of, simulate
-from duagc.converters.simulate.trajectories import look_at, shared_view
+from duagc.converters.simulate.trajectories import walks
+from duagc.converters.simulate.trajectories.loops import look_at, shared_view
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import Recording, open_rgbd

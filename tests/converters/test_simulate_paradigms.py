@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
-from duagc.converters.simulate import figures, paradigms, walks
 from duagc.converters.simulate.stages import MeshStage, RoomStage, set_up
 from duagc.converters.simulate.team import PARADIGMS, camera_of, simulate
-from duagc.converters.simulate.trajectories import OVERLAP_IMAGE, shared_view
+from duagc.converters.simulate.trajectories import figures, paradigms, walks
+from duagc.converters.simulate.trajectories.loops import OVERLAP_IMAGE, shared_view
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.bench import paths

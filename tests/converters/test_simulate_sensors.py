@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from duagc.converters.simulate.movers import Mover, walk
-from duagc.converters.simulate.sensors import RANGE_SIGMA_M, T_CAMERA_LIDAR, MovingCamera, with_gain
+from duagc.converters.simulate.sensors.rig import RANGE_SIGMA_M, T_CAMERA_LIDAR, MovingCamera, with_gain
 from duagc.converters.simulate.stages import MeshStage, set_up
 from duagc.converters.simulate.team import Rig, _twists, camera_of, simulate
 from duagc.pipeline.base import random_streams

@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from duagc.converters.simulate import bake, trajectories
-from duagc.converters.simulate.render import Renderer
-from duagc.converters.simulate.scene_settings import build
+from duagc.converters.simulate.render import bake
+from duagc.converters.simulate.render.renderer import Renderer
+from duagc.converters.simulate.scenes.catalog import build
 from duagc.converters.simulate.team import camera_of
+from duagc.converters.simulate.trajectories import loops
 from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
 from duagc.pipeline.frontend.failure import Reason, StuckImages, intruders
 from duagc.pipeline.frontend.tracked import Status
@@ -37,7 +38,7 @@ def filmed(seed: int, frames: int) -> list[Shot]:
     """Frames of a robot in a simulated room, 22 mm apart."""
     room = build("room", seed)
     renderer = Renderer(room, bake.bake(room, 0.008), CAMERA)
-    way = trajectories.plan(room, 1, 160, 0.6, CAMERA)[0]
+    way = loops.plan(room, 1, 160, 0.6, CAMERA)[0]
     views = [renderer.render(T) for T in way[:frames]]
     return [Shot(k, k * FRAME_NS, view.color, view.depth.astype(np.float32)) for k, view in enumerate(views)]
 

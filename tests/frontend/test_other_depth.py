@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from duagc.converters.layouts.stereo import StereoRig
-from duagc.converters.simulate import bake, trajectories
-from duagc.converters.simulate.render import Renderer
-from duagc.converters.simulate.scene_settings import build
+from duagc.converters.simulate.render import bake
+from duagc.converters.simulate.render.renderer import Renderer
+from duagc.converters.simulate.scenes.catalog import build
 from duagc.converters.simulate.team import camera_of
+from duagc.converters.simulate.trajectories import loops
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.stage import run_frontend
@@ -58,7 +59,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
     """A room filmed by a stereo rig with a LiDAR on top, gray values and ranges with noise."""
     room = build("room", 0)
     eye, wide = Renderer(room, bake.bake(room, 0.02), CAMERA), Renderer(room, None, WIDE)
-    poses = trajectories.plan(room, 1, 160, 0.6, CAMERA)[0][:FRAMES]
+    poses = loops.plan(room, 1, 160, 0.6, CAMERA)[0][:FRAMES]
     pixels, rng, rig = beams(16, 720), np.random.default_rng(1), StereoRig(CAMERA, BASELINE_M)
     rays = WIDE.rays()[pixels[:, 1], pixels[:, 0]]
     units = rays / np.linalg.norm(rays, axis=1, keepdims=True)

@@ -18,7 +18,7 @@ import numpy as np
 from duagc.converters import registry
 from duagc.converters.layouts import mesh_reader
 from duagc.converters.logs import describe
-from duagc.converters.simulate import mesh_process, meshes
+from duagc.converters.simulate.render import mesh_process, meshes
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.checks import check
 from duagc.pipeline.config.base import load_config

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.simulate import bake, meshes
-from duagc.converters.simulate.raycast import Caster
-from duagc.converters.simulate.scene import Ball, Flat, Scene, Side, Surface
+from duagc.converters.simulate.render import bake, meshes
+from duagc.converters.simulate.render.raycast import Caster
+from duagc.converters.simulate.scenes.scene import Ball, Flat, Scene, Side, Surface
 
 Array = NDArray[np.float64]
 

@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from duagc.converters.simulate import drawn
-from duagc.converters.simulate import textures as tex
-from duagc.converters.simulate.scene import Flat, Lamp, Scene
+from duagc.converters.simulate.scenes import drawn
+from duagc.converters.simulate.scenes import textures as tex
+from duagc.converters.simulate.scenes.scene import Flat, Lamp, Scene
 from duagc.pipeline.base import random_streams
 
 

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from duagc.converters.simulate.bake import Atlas
-from duagc.converters.simulate.scene import Ball, Flat, Scene, Side
+from duagc.converters.simulate.render.bake import Atlas
+from duagc.converters.simulate.scenes.scene import Ball, Flat, Scene, Side
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]

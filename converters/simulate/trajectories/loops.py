@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from duagc.converters.simulate.render import Eye, Renderer
-from duagc.converters.simulate.scene import UP, Scene
+from duagc.converters.simulate.render.renderer import Eye, Renderer
+from duagc.converters.simulate.scenes.scene import UP, Scene
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3

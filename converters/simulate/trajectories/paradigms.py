@@ -13,10 +13,10 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.simulate.figures import APART_M, SHAPES, Figure, Ground, Way, apart
-from duagc.converters.simulate.render import Eye
-from duagc.converters.simulate.trajectories import Views, look, shared
-from duagc.converters.simulate.walks import (
+from duagc.converters.simulate.render.renderer import Eye
+from duagc.converters.simulate.trajectories.figures import APART_M, SHAPES, Figure, Ground, Way, apart
+from duagc.converters.simulate.trajectories.loops import Views, look, shared
+from duagc.converters.simulate.trajectories.walks import (
     LEAST_MEDIAN_M,
     MAX_HOLE_SHARE,
     MAX_NEAR_SHARE,

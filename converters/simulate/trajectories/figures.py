@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
-from duagc.converters.simulate.trajectories import HEIGHTS_M, look_at
-from duagc.converters.simulate.walks import MAX_TURN_RAD, MIN_CLEARANCE_M, Terrain, route
+from duagc.converters.simulate.trajectories.loops import HEIGHTS_M, look_at
+from duagc.converters.simulate.trajectories.walks import MAX_TURN_RAD, MIN_CLEARANCE_M, Terrain, route
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.geometry import se3
 

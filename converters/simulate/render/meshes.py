@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.converters.layouts.mesh_reader import LEVELS, NO_TEXTURE, texture_file
-from duagc.converters.simulate import mesh_process
+from duagc.converters.simulate.render import mesh_process
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file
 

@@ -10,8 +10,8 @@ Where no ray hits there is a hole of the scan: depth 0, black; or, in a scene wi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from duagc.converters.simulate.meshes import LEVELS, MeshScene
-from duagc.converters.simulate.render import View
+from duagc.converters.simulate.render.meshes import LEVELS, MeshScene
+from duagc.converters.simulate.render.renderer import View
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]

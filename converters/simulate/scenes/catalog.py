@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from duagc.converters.simulate.buildings import corridor, office
-from duagc.converters.simulate.outdoor import outdoor
-from duagc.converters.simulate.room import room
-from duagc.converters.simulate.scene import Scene
+from duagc.converters.simulate.scenes.buildings import corridor, office
+from duagc.converters.simulate.scenes.outdoor import outdoor
+from duagc.converters.simulate.scenes.room import room
+from duagc.converters.simulate.scenes.scene import Scene
 from duagc.pipeline.base.errors import DuagError
 
 

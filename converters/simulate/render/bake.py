@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.simulate.scene import Ball, Box, Cylinder, Flat, Scene, Solid, Surface
+from duagc.converters.simulate.scenes.scene import Ball, Box, Cylinder, Flat, Scene, Solid, Surface
 from duagc.pipeline.base import random_streams
 
 Array = NDArray[np.float64]

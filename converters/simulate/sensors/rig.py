@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.converters.simulate.movers import Mover
-from duagc.converters.simulate.raycast import OFFSETS, MeshRenderer
-from duagc.converters.simulate.render import View
+from duagc.converters.simulate.render.raycast import OFFSETS, MeshRenderer
+from duagc.converters.simulate.render.renderer import View
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from duagc.converters.simulate import drawn
-from duagc.converters.simulate import textures as tex
-from duagc.converters.simulate.scene import Scene
+from duagc.converters.simulate.scenes import drawn
+from duagc.converters.simulate.scenes import textures as tex
+from duagc.converters.simulate.scenes.scene import Scene
 
 Array = NDArray[np.float64]
 

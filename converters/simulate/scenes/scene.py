@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from duagc.converters.simulate import textures as tex
+from duagc.converters.simulate.scenes import textures as tex
 
 Array = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])

@@ -5,11 +5,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from duagc.converters.simulate import drawn
-from duagc.converters.simulate import furniture as fur
-from duagc.converters.simulate import textures as tex
-from duagc.converters.simulate.furniture import Place
-from duagc.converters.simulate.scene import Flat, Scene
+from duagc.converters.simulate.scenes import drawn
+from duagc.converters.simulate.scenes import furniture as fur
+from duagc.converters.simulate.scenes import textures as tex
+from duagc.converters.simulate.scenes.furniture import Place
+from duagc.converters.simulate.scenes.scene import Flat, Scene
 from duagc.pipeline.base import random_streams
 
 SIZE_M = (44.0, 34.0, 16.0)

@@ -19,9 +19,9 @@ from scipy.ndimage import gaussian_filter1d, label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from duagc.converters.simulate.raycast import Caster
-from duagc.converters.simulate.render import Eye
-from duagc.converters.simulate.trajectories import HEIGHTS_M, OVERLAP_IMAGE, look_at, shared_view
+from duagc.converters.simulate.render.raycast import Caster
+from duagc.converters.simulate.render.renderer import Eye
+from duagc.converters.simulate.trajectories.loops import HEIGHTS_M, OVERLAP_IMAGE, look_at, shared_view
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track

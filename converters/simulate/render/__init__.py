@@ -1,0 +1,1 @@
+"""Rendering: exact depth and color of procedural scenes and of textured meshes."""

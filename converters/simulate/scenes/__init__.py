@@ -1,0 +1,1 @@
+"""Procedural scenes: what stands where, and what it is painted with."""

@@ -1,0 +1,1 @@
+"""Simulated sensors: rolling shutter, motion blur, exposure, LiDAR, depth noise."""

@@ -1,0 +1,1 @@
+"""Camera trajectories of a team through free space, with a given overlap of views."""
