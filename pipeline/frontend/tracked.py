@@ -22,7 +22,7 @@ class Status(Enum):
 
     OK = "ok"
     LOST = "lost"
-    RELOCALizED = "relocalized"
+    RELOCALIZED = "relocalized"
 
 
 @dataclass(frozen=True)

@@ -185,7 +185,7 @@ class Tracker:
     def _accept(self, frame_index: int, stamp_ns: int, pyramid: RgbdPyramid, found: _Found) -> TrackedFrame:
         """Take over the pose of a frame; it becomes a keyframe if it sees much that is new."""
         keyframe_index, result = found.keyframe_index, found.result
-        status = Status.RELOCALizED if self._lost else Status.OK
+        status = Status.RELOCALIZED if self._lost else Status.OK
         elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
         followed = keyframe_index == self._current and not self._lost and elapsed_s > 0
         step = se3.inverse(self._T_keyframe_camera) @ result.T_reference_target

@@ -82,7 +82,7 @@ def test_a_covered_lens_is_lost_and_found_again(run: Undisturbed, start: int) ->
         assert (row.frame.status, row.frame.reason) == (Status.LOST, Reason.NO_DEPTH)
         np.testing.assert_array_equal(row.frame.information, 0)
     assert_found_again(rows, within=4)
-    assert next(row for row in after(rows) if row.good).frame.status is Status.RELOCALizED
+    assert next(row for row in after(rows) if row.good).frame.status is Status.RELOCALIZED
 
 
 @pytest.mark.parametrize("start", STARTS)
@@ -192,7 +192,7 @@ def test_after_a_pause_two_frames_must_agree(run: Undisturbed) -> None:
     rows = run.disturbed(STARTS[0], d.paused)
     first, second = rows[0].frame, rows[1].frame
     assert (first.status, first.reason) == (Status.LOST, Reason.UNCONFIRMED)
-    assert second.status is Status.RELOCALizED
+    assert second.status is Status.RELOCALIZED
 
 
 def test_a_slow_camera_does_not_pause(run: Undisturbed) -> None:

@@ -97,7 +97,7 @@ def test_failed_images_are_lost_and_the_camera_is_found_again(spoil) -> None:
     for frame in frames[5:8]:
         np.testing.assert_array_equal(frame.information, 0)
         np.testing.assert_array_equal(frame.T_keyframe_camera, frames[4].T_keyframe_camera)
-    assert status[8] is Status.RELOCALizED
+    assert status[8] is Status.RELOCALIZED
     assert status[9:] == [Status.OK] * 3
     truth = np.array([walk(0.5 * k)[:3, 3] for k in range(12)])
     seen = [k for k in range(12) if not 5 <= k < 8]
