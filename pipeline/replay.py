@@ -9,18 +9,27 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.runner import agent_input, fuse_robot, prepare_robot, threads_per_worker
+from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.digest import ROBOT_RESULTS, digest_file
 from duagc.pipeline.runs.folder import RunFolder
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One result of one robot, recorded and recomputed."""
+    """One result of one robot, recorded and recomputed.
+
+    Attributes:
+        robot: whose result.
+        name: of the file, or "packets sent".
+        recorded: digest of what the run has.
+        recomputed: digest of what was computed again.
+    """
 
     robot: str
     name: str
@@ -36,18 +45,29 @@ def replay(
     run: Path,
     recording: Path,
     robots: list[str],
-    say: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> list[Comparison]:
     """Recompute robots, front end included, without any store.
 
     Args:
-        run: folder of a finished run. recording: folder of its recording. robots: which to recompute.
-        say: gets a line at the start of every step.
+        run: folder of a finished run.
+        recording: folder of its recording.
+        robots: which to recompute.
+        report: gets a line at the start of every step.
+
     Returns:
         One comparison per result file, and one for the packets that the robot sent.
+
+    Raises:
+        DuagError: the run is incomplete, a robot is unknown, or numpy was imported before duagc.
     """
     from duagc.pipeline.recording import Recording
 
+    determinism.configure_determinism()
+    if not determinism.is_deterministic():
+        raise DuagError(
+            "replay: found numpy imported before duagc, expected duagc first: results would differ"
+        )
     config = load_config(RunConfig, RunFolder(run).config_file)
     logs = Recording(recording)
     known = RunFolder(run).robots
@@ -61,28 +81,29 @@ def replay(
     for robot in robots:
         folder = Path(tempfile.mkdtemp(prefix=f"duagc-replay-{robot}-"))
         try:
-            out += _replay_one(run, logs.log(robot), robot, folder, config, say)
+            out += _replay_one(run, logs.log(robot), robot, folder, config, report)
         finally:
             shutil.rmtree(folder)
     return out
 
 
 def _replay_one(
-    run: Path, log: Path, robot: str, folder: Path, config: RunConfig, say: Callable[[str], None]
+    run: Path, log: Path, robot: str, folder: Path, config: RunConfig, report: Callable[[str], None]
 ) -> list[Comparison]:
     from duagc.pipeline.exchange.replay import replay_agent
 
-    say(f"{robot}: front end and information")
+    report(f"{robot}: front end and information")
     prepare_robot(log, robot, folder, config, threads_per_worker(1))
-    say(f"{robot}: agent, from its delivered packets")
+    report(f"{robot}: agent, from its delivered packets")
     result, sent = replay_agent(
         agent_input(robot, log, folder),
         config.exchange,
         seed=config.seed,
         exchange_path=run / "exchange.mcap",
     )
-    say(f"{robot}: fusion")
-    fuse_robot(robot, log, folder, result, config)
+    report(f"{robot}: fusion")
+    with stages.FUSION.running(folder, robot):
+        fuse_robot(robot, log, folder, result, config)
     comparisons = [Comparison(robot, "packets sent", sent.recorded, sent.recomputed)]
     for name in ROBOT_RESULTS:
         recorded = digest_file(run / "robots" / robot / name)

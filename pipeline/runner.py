@@ -1,16 +1,21 @@
 """The main job: from a recording to fused maps, metrics, report and view.
 
-Robots are prepared in parallel processes; the exchange is one ordered stage in this process. Everything is
-written into a folder beside the output, which gets its final name when all is done.
+Robots are prepared in parallel processes; the exchange is one ordered stage in one process. Everything is
+written into a temporary folder next to the output, which gets its final name when all is done.
 """
 
+from __future__ import annotations
+
 import json
+import multiprocessing
 import os
 import resource
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 from typing import Any
 
@@ -21,25 +26,41 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.config.base import dump_config
 from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.digest import digest_file, result_files
 from duagc.pipeline.runs.folder import SCHEMA
 from duagc.pipeline.runs.robot_data import AgentInput, AgentResult
+from duagc.pipeline.runs.stages import Stage
 
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
 
 
 class Timing:
-    """Wall time, processor time and peak memory per stage; not part of any digest."""
+    """Runs stages inside their declarations, and keeps wall time, processor time and peak memory of each.
+
+    None of the times is part of any digest.
+    """
 
     def __init__(self) -> None:
         self.stages: dict[str, dict[str, Any]] = {}
 
     @contextmanager
-    def stage(self, name: str, robot: str | None = None) -> Iterator[None]:
+    def stage(self, stage: Stage, folder: Path, robot: str | None = None) -> Iterator[None]:
+        """Enforce and time a stage while the block runs.
+
+        Args:
+            stage: with what it declares.
+            folder: of the robot if the stage is per robot, else of the run.
+            robot: whose stage it is; None for a stage of the whole team.
+
+        Raises:
+            DuagError: the stage reads or writes what it did not declare.
+        """
         wall, cpu = time.perf_counter(), time.process_time()
-        yield
-        self.stages[f"{name}.{robot}" if robot else name] = {
-            "stage": name,
+        with stage.running(folder, robot):
+            yield
+        self.stages[f"{stage.name}.{robot}" if robot else stage.name] = {
+            "stage": stage.name,
             "robot": robot,
             "wall_s": round(time.perf_counter() - wall, 3),
             "cpu_s": round(time.process_time() - cpu, 3),
@@ -56,8 +77,12 @@ def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, thread
     """Front end and Fisher information of one robot, from its own log alone.
 
     Args:
-        log: the robot's log. folder: where frontend.mcap and information.mcap go.
+        log: the robot's log.
+        robot: its name.
+        folder: where frontend.mcap and information.mcap go.
+        config: of the run.
         threads: of the kernels; changes no bit of the result.
+
     Returns:
         The timings of the stages.
     """
@@ -70,12 +95,12 @@ def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, thread
         if camera.robot != robot:
             raise DuagError(f"{log}: is the log of {camera.robot}, expected that of {robot}")
     timing = Timing()
-    with timing.stage("frontend", robot):
+    with timing.stage(stages.FRONTEND, folder, robot):
         parts = run_frontend(
             log, folder / "frontend.mcap", config.frontend, seed=config.seed, threads=threads, progress=True
         )
     timing.stages[f"frontend.{robot}"]["parts"] = parts
-    with timing.stage("information", robot):
+    with timing.stage(stages.INFORMATION, folder, robot):
         run_information(
             log,
             folder / "frontend.mcap",
@@ -92,12 +117,12 @@ def prepare_robots(
 ) -> dict[str, Any]:
     """`prepare_robot` for every robot, `workers` at a time, in processes of their own."""
     threads = threads_per_worker(workers)
-    stages: dict[str, Any] = {}
+    timings: dict[str, Any] = {}
     with worker_pool(workers) as pool:
         jobs = [pool.submit(prepare_robot, logs[r], r, folders[r], config, threads) for r in logs]
         for job in jobs:
-            stages.update(job.result())
-    return stages
+            timings.update(job.result())
+    return timings
 
 
 def run(
@@ -107,17 +132,40 @@ def run(
     *,
     workers: int = 2,
     force: bool = False,
-    say: Callable[[str], None] = lambda line: print(line, file=sys.stderr, flush=True),
+    log: Callable[[str], None] = lambda line: print(line, file=sys.stderr, flush=True),
 ) -> None:
     """Run all stages on a recording.
 
+    The result is the same to the last bit in every process: where the numeric libraries were imported before
+    `configure_determinism`, all stages run in a child process. Child processes import the main script again: call
+    this under `if __name__ == "__main__":`.
+
     Args:
-        recording_path: folder of the recording. out: folder of the run; must not exist unless `force`.
+        recording_path: folder of the recording.
+        out: folder of the run; must not exist unless `force`.
+        config: settings of all stages.
         workers: robots prepared at the same time; changes no bit of the result.
-        say: gets a line at the start of every stage.
+        force: replace an earlier run in `out`.
+        log: gets a line at the start of every stage, and every warning.
+
     Raises:
         DuagError: what a user can fix; nothing is left under the name `out`.
     """
+    determinism.configure_determinism()
+    if determinism.is_deterministic():
+        _run(recording_path, out, config, workers, force, log)
+    else:
+        _run_in_child(recording_path, out, config, workers, force, log)
+
+
+def _run(
+    recording_path: Path,
+    out: Path,
+    config: RunConfig,
+    workers: int,
+    force: bool,
+    log: Callable[[str], None],
+) -> None:
     from duagc.pipeline.evaluation import check_ground_truth
     from duagc.pipeline.recording import Recording, content_digest
 
@@ -127,30 +175,67 @@ def run(
         timing = Timing()
         (folder / "config.toml").write_text(dump_config(config))
         logs = {robot: recording.log(robot) for robot in recording.robots}
-        for log in logs.values():
-            if (found := content_digest(log)) != (told := recording.digest(log.name)):
-                say(
-                    f"warning: {log}: has digest {found[:12]}, recording.json tells {told[:12]}; it was changed"
+        for path in logs.values():
+            if (found := content_digest(path)) != (expected := recording.digest(path.name)):
+                log(
+                    f"warning: {path}: has digest {found[:12]}, expected {expected[:12]} as in recording.json"
                 )
         robots = {robot: folder / "robots" / robot for robot in recording.robots}
         for path in robots.values():
             path.mkdir(parents=True)
-        say(f"front end and information: {len(logs)} robots, {min(workers, len(logs))} at a time")
+        log(f"front end and information: {len(logs)} robots, {min(workers, len(logs))} at a time")
         timing.stages.update(prepare_robots(logs, robots, config, min(workers, len(logs))))
-        say("exchange and consensus")
+        log("exchange and consensus")
         results = _exchange(logs, folder, config, timing)
         for robot, result in results.items():
-            say(f"fusion: {robot}")
-            with timing.stage("fusion", robot):
+            log(f"fusion: {robot}")
+            with timing.stage(stages.FUSION, robots[robot], robot):
                 left_out = fuse_robot(robot, logs[robot], robots[robot], result, config)
             for neighbor, reason in left_out.items():
-                say(f"warning: {robot} uses nothing of {neighbor}'s map: {reason}")
+                log(f"warning: {robot} uses nothing of {neighbor}'s map: {reason}")
         _write_json(folder / "manifest.json", _manifest(recording, folder, config))
         _write_json(folder / "timing.json", {"stages": timing.stages})
-        say("evaluation")
+        log("evaluation")
         _evaluate(folder, recording_path, timing)
-        say("report and view")
+        log("report and view")
         _present(folder, recording_path, timing)
+
+
+def _run_in_child(
+    recording_path: Path,
+    out: Path,
+    config: RunConfig,
+    workers: int,
+    force: bool,
+    log: Callable[[str], None],
+) -> None:
+    """`_run` in a process that is started with the settings of `determinism`; its lines come back to `log`."""
+    lines: SimpleQueue[str | None] = multiprocessing.get_context("spawn").SimpleQueue()
+
+    def relay() -> None:
+        while (line := lines.get()) is not None:
+            log(line)
+
+    relaying = threading.Thread(target=relay)
+    relaying.start()
+    try:
+        with worker_pool(1, _keep_queue, (lines,)) as pool:
+            pool.submit(_run_and_send, recording_path, out, config, workers, force).result()
+    finally:
+        lines.put(None)
+        relaying.join()
+
+
+_lines: list[SimpleQueue[str | None]] = []
+
+
+def _keep_queue(lines: SimpleQueue[str | None]) -> None:
+    """Where a child process sends its lines: a queue can be handed to a process only while it starts."""
+    _lines.append(lines)
+
+
+def _run_and_send(recording_path: Path, out: Path, config: RunConfig, workers: int, force: bool) -> None:
+    _run(recording_path, out, config, workers, force, _lines[0].put)
 
 
 def _exchange(
@@ -160,7 +245,7 @@ def _exchange(
 
     determinism.configure_opencv()
     inputs = [agent_input(robot, log, folder / "robots" / robot) for robot, log in logs.items()]
-    with timing.stage("exchange"):
+    with timing.stage(stages.EXCHANGE, folder):
         return run_session(
             inputs,
             config.exchange,
@@ -200,7 +285,7 @@ def fuse_robot(robot: str, log: Path, folder: Path, result: AgentResult, config:
 def _evaluate(folder: Path, recording: Path, timing: Timing) -> None:
     from duagc.pipeline.evaluation import evaluate
 
-    with timing.stage("evaluation"):
+    with timing.stage(stages.EVALUATION, folder):
         evaluate(folder, recording, threads=threads_per_worker(1))
     _write_json(folder / "timing.json", {"stages": timing.stages})
 
@@ -209,9 +294,9 @@ def _present(folder: Path, recording: Path, timing: Timing) -> None:
     from duagc.pipeline.report import write_report
     from duagc.pipeline.viewing.rerun_view import write_rrd
 
-    with timing.stage("report"):
+    with timing.stage(stages.REPORT, folder):
         write_report(folder, recording)
-    with timing.stage("rrd"):
+    with timing.stage(stages.VIEW, folder):
         write_rrd(folder, recording, folder / "run.rrd")
     _write_json(folder / "timing.json", {"stages": timing.stages})
 

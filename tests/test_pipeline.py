@@ -34,7 +34,7 @@ def quiet(line: str) -> None:
 
 
 def make_run(recording: Path, out: Path, *overrides: str, workers: int = 2) -> Path:
-    run(recording, out, load_config(RunConfig, overrides=[*SMALL, *overrides]), workers=workers, say=quiet)
+    run(recording, out, load_config(RunConfig, overrides=[*SMALL, *overrides]), workers=workers, log=quiet)
     return out
 
 
@@ -103,7 +103,7 @@ def test_a_changed_log_is_mentioned(folder: Path, recording: Path) -> None:
     shutil.copy(changed / "alpha.mcap", changed / "bravo.mcap")  # a sound log, but another one
     said: list[str] = []
     with pytest.raises(DuagError, match="is the log of alpha, expected that of bravo"):
-        run(changed, folder / "run_changed", load_config(RunConfig, overrides=SMALL), say=said.append)
+        run(changed, folder / "run_changed", load_config(RunConfig, overrides=SMALL), log=said.append)
     assert [line for line in said if "warning" in line and "bravo.mcap" in line]
 
 

@@ -9,11 +9,12 @@ conversion: it keeps up to 64 MB.
 
 import ctypes
 import os
+import sys
 
 _KEPT_BYTES = 64 << 20
 _OWN_MAPPING_BYTES = 32 << 20  # what is larger is given back at once
 
-_ENVIRONMENT = {
+SETTINGS = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
@@ -28,13 +29,35 @@ _ENVIRONMENT = {
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 
 
+_LIBRARIES = ("numpy", "scipy", "cv2")  # they read the settings once, while they are imported
+
+_in_time: bool | None = None
+
+
 def configure_determinism() -> None:
-    """Put the settings into the environment of this process and of its children."""
-    os.environ.update(_ENVIRONMENT)
+    """Put the settings into the environment of this process and of its children.
+
+    The first call decides whether this process computes under them: see `is_deterministic`.
+    """
+    global _in_time
+    if _in_time is None:
+        inherited = all(os.environ.get(name) == value for name, value in SETTINGS.items())
+        _in_time = inherited or not any(name in sys.modules for name in _LIBRARIES)
+    os.environ.update(SETTINGS)
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # for this process the environment comes too late
     if mallopt:
         mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
         mallopt(_M_MMAP_THRESHOLD, _OWN_MAPPING_BYTES)
+
+
+def is_deterministic() -> bool:
+    """Whether the numeric libraries of this process were, or will be, loaded under the settings.
+
+    False if one of them was imported before `configure_determinism` was called, unless the process was started with the
+    settings in its environment. Results then depend on the processor and on the number of threads; child processes
+    are not affected.
+    """
+    return bool(_in_time)
 
 
 def configure_opencv() -> None:

@@ -40,7 +40,7 @@ def demo(
     with new_folder(out, force) as folder:
         say(f"simulate: {robots} robots, {frames} frames each")
         simulate_recording(folder / "recording", robots=robots, frames=frames, seed=seed, workers=workers)
-        run_stages(folder / "recording", folder / "run", RunConfig(seed=seed), workers=workers, say=say)
+        run_stages(folder / "recording", folder / "run", RunConfig(seed=seed), workers=workers, log=say)
     _print_outputs(out / "run")
 
 
@@ -52,9 +52,6 @@ def run(
     overrides: Overrides = None,
     workers: Workers = 2,
     force: Force = False,
-    no_cache: Annotated[
-        bool, typer.Option("--no-cache", help="Compute every stage (this version always does).")
-    ] = False,
 ) -> None:
     """Run all stages on a recording: maps, information, exchange, fusion, metrics, report, view.
 
@@ -67,7 +64,7 @@ def run(
     from duagc.pipeline.runner import run as run_stages
 
     run_stages(
-        recording, out, load_config(RunConfig, config, overrides or []), workers=workers, force=force, say=say
+        recording, out, load_config(RunConfig, config, overrides or []), workers=workers, force=force, log=say
     )
     _print_outputs(out)
 
@@ -128,13 +125,11 @@ def evaluate(
     from duagc.pipeline.report.labels import comparison_text
     from duagc.pipeline.runner import threads_per_worker
     from duagc.pipeline.runs.folder import RunFolder
+    from duagc.pipeline.runs.stages import EVALUATION
 
-    metrics = evaluate_run(
-        run_folder,
-        recording or RunFolder(run_folder).recording,
-        threads=threads_per_worker(1),
-        own_longer=own_longer,
-    )
+    source = recording or RunFolder(run_folder).recording
+    with EVALUATION.running(run_folder):
+        metrics = evaluate_run(run_folder, source, threads=threads_per_worker(1), own_longer=own_longer)
     if as_json:
         print(json.dumps(metrics, indent=2))
         return
@@ -153,8 +148,11 @@ def report(
     """
     from duagc.pipeline.report import write_report
     from duagc.pipeline.runs.folder import RunFolder
+    from duagc.pipeline.runs.stages import REPORT
 
-    print(write_report(run_folder, recording or RunFolder(run_folder).recording))
+    source = recording or RunFolder(run_folder).recording
+    with REPORT.running(run_folder):
+        print(write_report(run_folder, source))
 
 
 @app.command()

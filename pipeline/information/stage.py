@@ -169,7 +169,7 @@ def read_frontend(path: Path) -> tuple[GaussianMap, list[Keyframe], int]:
     log_time_ns = 0
     keyframes: dict[int, Keyframe] = {}
     held_out: set[int] = set()
-    for record in read_log(path):
+    for record in read_log(path, (topics.MAP, topics.KEYFRAME, topics.ODOMETRY)):
         row = topics.find(record.topic)
         if row is None:
             continue

@@ -25,8 +25,11 @@ from duagc import schemas
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
+from duagc.pipeline.recording.access import check_read
 from duagc.pipeline.recording.identity import ContentDigest, channel_identity, framed
 from duagc.pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, MAGIC
+from duagc.schemas.topics import Topic
+from duagc.schemas.topics import find as find_topic
 
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary start, summary offset start, CRC of the summary
 _DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of everything before
@@ -206,6 +209,8 @@ class LogFile:
 
     def records(self, topics: Sequence[str] | None) -> Iterator[Record]:
         """All messages of some topics, or of all, in the order of the log."""
+        for topic in self.channels if topics is None else topics:
+            check_read(self.path, topic)
         with parsing(self.path):
             for schema, channel, m in self._reader.iter_messages(topics=topics, log_time_order=True):
                 name, data = (schema.name, schema.data) if schema else ("", b"")
@@ -232,6 +237,7 @@ class LogFile:
 
     def entries(self, topic: str) -> list[tuple[int, int, int]]:
         """(log time, start of the chunk in the file, offset in the chunk) of every message of a topic, in log order."""
+        check_read(self.path, topic)
         if topic not in self.channels:
             return []
         number = self.channels[topic].id
@@ -253,6 +259,8 @@ class LogFile:
         Only the messages themselves know their publish time, so all their chunks are unpacked; a process does it
         once per file and topic. others: topics that will be asked for as well: their chunks are the same.
         """
+        for t in (topic, *others):
+            check_read(self.path, t)
         status = self.path.stat()
         file = str(self.path.resolve()), status.st_size, status.st_mtime_ns, status.st_ino
         if (*file, topic) not in _publish_times:
@@ -274,6 +282,7 @@ class LogFile:
 
     def record_at(self, topic: str, entry: tuple[int, int, int]) -> Record:
         """The message at an entry of `entries(topic)`; the last few chunks are kept unpacked."""
+        check_read(self.path, topic)
         _, start, offset = entry
         with parsing(self.path):
             data = self._chunk(start)
@@ -301,15 +310,25 @@ class LogFile:
         return self._chunks[start]
 
 
-def read_log(path: Path, topics: Iterable[str] | None = None) -> Iterator[Record]:
+def read_log(path: Path, topics: Iterable[str | Topic] | None = None) -> Iterator[Record]:
     """Yield the messages of a log, ordered by log time and then by position in the file.
 
     Args:
         path: an MCAP file; its checksums are compared before the first message comes.
-        topics: only these; all if None. A topic that the log does not have yields nothing.
+        topics: only these; all if None. A row of the topic table stands for that topic of every robot in the log.
+            A topic that the log does not have yields nothing.
+
+    Raises:
+        DuagError: the log is damaged, or the stage that runs did not declare a topic that it reads.
     """
     with LogFile(path) as log:
-        yield from log.records(None if topics is None else sorted(topics))
+        if topics is None:
+            yield from log.records(None)
+            return
+        wanted = set(topics)
+        names = {t for t in wanted if isinstance(t, str)}
+        names |= {t for t in log.channels if (row := find_topic(t)) is not None and row[0] in wanted}
+        yield from log.records(sorted(names))
 
 
 def merge(paths: Sequence[Path], topics: Iterable[str] | None = None) -> Iterator[Record]:

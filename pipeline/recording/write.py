@@ -13,6 +13,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from duagc import schemas
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.recording.access import check_write
 from duagc.pipeline.recording.identity import ContentDigest, channel_identity
 from duagc.pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, ROBOT_KEY
 from duagc.schemas import topics as topic_table
@@ -73,6 +74,7 @@ class LogWriter:
         if row is None or row[0].schema != schema:
             expected = row[0].schema if row else "a topic of schemas/topics.py"
             raise ValueError(f"{topic} carries {schema}, expected {expected}")
+        check_write(self.path, topic)
         descriptors = schemas.descriptor_set(schema)
         if schema not in self._schema_ids:
             self._schema_ids[schema] = self._writer.register_schema(schema, "protobuf", descriptors)

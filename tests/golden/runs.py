@@ -69,7 +69,7 @@ def make_run(name: str, folder: Path) -> Path:
     golden = RUNS[name]
     golden.make(folder / "recording")
     config = load_config(RunConfig, overrides=golden.overrides)
-    run(folder / "recording", folder / "run", config, workers=SCRIPT_WORKERS, say=lambda line: None)
+    run(folder / "recording", folder / "run", config, workers=SCRIPT_WORKERS, log=lambda line: None)
     return folder / "run"
 
 

@@ -10,8 +10,8 @@ from duagc.pipeline.network.packets import MAX_PACKET_BYTES, parse
 from duagc.pipeline.posegraph.files import read_team_graph
 from duagc.pipeline.team_posegraph import network, solve
 from duagc.pipeline.team_posegraph.network import Traffic, meet
+from tests.cli.test_cli import assert_one_line, duagc
 from tests.posegraph.graphs import helix_edges, wild_edges, write_g2o, write_team
-from tests.test_cli import assert_one_line, duagc
 
 N = 48
 

@@ -12,7 +12,7 @@ import pytest
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.workers import worker_pool
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def alive(pid: int) -> bool:

@@ -14,7 +14,7 @@ from duagc.pipeline.base.atomic_folder import new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def duagc(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
