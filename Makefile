@@ -8,14 +8,16 @@ STAMP := $(VENV)/.set-up
 SOURCES := pyproject.toml CMakeLists.txt $(wildcard pipeline/kernels/src/*)
 SANITIZED := build/sanitize/.built
 DEMO := outputs/demo
+DOCS_VENV := build/docs-venv
 
-.PHONY: help setup demo test bench lint format sanitize check-full fuzz clean
+.PHONY: help setup demo test docs bench lint format sanitize check-full fuzz clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo        set up, then simulate two robots, fuse their maps, evaluate, report ($(DEMO))"
 	@echo "make test        set up, then run the tests"
 	@echo "make lint        ruff and mypy"
+	@echo "make docs        the site of the documentation, every link checked (build/site)"
 	@echo "make bench       speed of the kernels, side by side with plain torch"
 	@echo "make check-full  the slow checks as well, and the kernels under sanitizers (minutes)"
 	@echo "make fuzz        5000 damaged files for every reader (an hour of one core)"
@@ -38,6 +40,17 @@ demo: setup
 
 test: setup
 	$(BIN)/python -m pytest -m "not slow"
+
+# Nothing is imported, so the tools of the site need neither .venv nor the kernels.
+docs: $(DOCS_VENV)/.set-up
+	NO_MKDOCS_2_WARNING=1 $(DOCS_VENV)/bin/mkdocs build --quiet --strict
+	@echo "build/site/index.html"
+
+$(DOCS_VENV)/.set-up: pyproject.toml
+	test -x $(DOCS_VENV)/bin/python || $(PYTHON) -m venv $(DOCS_VENV)
+	$(DOCS_VENV)/bin/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"], sep="\n")' > $(DOCS_VENV)/requirements.txt
+	$(DOCS_VENV)/bin/python -m pip install --quiet --disable-pip-version-check -r $(DOCS_VENV)/requirements.txt
+	touch $@
 
 check-full: setup sanitize
 	$(BIN)/python -m pytest
