@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import subprocess
@@ -198,6 +199,16 @@ def test_quoted_files_of_the_project_exist(page: Path) -> None:
                 assert path.is_dir() or path.with_suffix(".py").is_file(), module
 
 
+def test_pages_that_the_code_names_exist() -> None:
+    found = set()
+    for folder in ("pipeline", "converters", "schemas", "tests", "examples"):
+        for file in (ROOT / folder).rglob("*"):
+            if file.suffix in (".py", ".proto", ".j2", ".h", ".cpp") and file.parent.name != "docs":
+                found |= set(re.findall(r"docs/[\w/-]+\.md", file.read_text(encoding="utf-8")))
+    assert len(found) >= 5
+    assert sorted(page for page in found if not (ROOT / page).is_file()) == []
+
+
 def test_quoted_verdicts_are_those_of_the_code() -> None:
     text = (DOCS / "tutorial" / "your-bag.md").read_text(encoding="utf-8")
     found = set(re.findall(r"verdict (.*?), detail", text))
@@ -240,13 +251,7 @@ def test_the_readme_example_runs(tmp_path: Path) -> None:
     )
     write_ply(tmp_path / path, gaussian)
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=environment(), capture_output=True, text=True
+        [sys.executable, "-c", code], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "(480, 640, 3)"
-
-
-def environment() -> dict[str, str]:
-    import os
-
-    return {**os.environ, "PYTHONPATH": str(ROOT)}
