@@ -1,4 +1,4 @@
-"""The example of docs/recordings.md is a converter: it is run as it stands there, on files as it describes them."""
+"""The example of docs/howto/dataset.md is a converter: it is run as it stands there, on files as it describes them."""
 
 import json
 from pathlib import Path
@@ -15,7 +15,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import open_rgbd, read_log
 from tests.converters.box_room import path, render, save
 
-DOC = Path(__file__).parents[2] / "docs" / "recordings.md"
+DOC = Path(__file__).parents[2] / "docs" / "howto" / "dataset.md"
 CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 79.5, 59.5)
 
 

@@ -97,7 +97,7 @@ def test_unknown_schemas_are_key_errors(schema: str) -> None:
 
 
 def test_the_documentation_has_every_topic() -> None:
-    text = (build.FOLDER.resolve().parent / "docs" / "formats.md").read_text()
+    text = (build.FOLDER.resolve().parent / "docs" / "reference" / "formats.md").read_text()
     for row in topics.TOPICS:
         assert f"| `{row.pattern}` | `{row.schema}` | {row.producer} | {row.scope.value} |" in text, (
             row.pattern
