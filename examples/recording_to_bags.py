@@ -96,7 +96,11 @@ def write_bag(recording: Recording, robot: str, path: Path) -> None:
             put(name, first_ns, camera_info(first_ns, camera))
         for record in read_log(recording.log(robot), [color, depth]):
             if record.topic == color:
-                put(f"{COLOR}/image_raw/compressed", EPOCH_NS + record.log_time_ns, color_image(record.proto()))
+                put(
+                    f"{COLOR}/image_raw/compressed",
+                    EPOCH_NS + record.log_time_ns,
+                    color_image(record.proto()),
+                )
             else:
                 put(f"{DEPTH}/image_raw", EPOCH_NS + record.log_time_ns, depth_image(record.proto()))
 

@@ -191,7 +191,9 @@ def test_quoted_settings_exist(page: Path) -> None:
 @pytest.mark.parametrize("page", QUOTING, ids=name)
 def test_quoted_files_of_the_project_exist(page: Path) -> None:
     for text in quoted(page):
-        for found in re.findall(r"(?<![\w/.~])(?:pipeline|converters|schemas|tests|examples)/[\w./*-]*\w", text):
+        for found in re.findall(
+            r"(?<![\w/.~])(?:pipeline|converters|schemas|tests|examples)/[\w./*-]*\w", text
+        ):
             assert list(ROOT.glob(found)), found
         for module in re.findall(r"python -m ([\w.]+)", text):
             if module.startswith(("tests.", "duagc.")):
@@ -251,7 +253,11 @@ def test_the_readme_example_runs(tmp_path: Path) -> None:
     )
     write_ply(tmp_path / path, gaussian)
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "(480, 640, 3)"
