@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -126,6 +127,24 @@ def test_every_setting_is_on_its_page() -> None:
         section, _, key = path.rpartition(".")
         if section:
             assert f"| `{key}` |" in sections[section], path
+
+
+def test_every_metric_is_on_its_page() -> None:
+    """Of the golden demo, which has ground truth and two robots, so that nothing is missing."""
+    metrics = json.loads((ROOT / "tests" / "golden" / "demo.json").read_text(encoding="utf-8"))["metrics"]
+    text = (DOCS / "reference" / "metrics.md").read_text(encoding="utf-8")
+    spans = {span.rpartition(".")[2] for span in re.findall(r"`([^`]+)`", text)}
+    stems = tuple(span[:-1] for span in spans if span.endswith("_*"))
+
+    def documented(key: str) -> bool:
+        base = re.sub(r"_(before_consensus|of_truth)$", "", key)
+        return key in spans or base in spans or key.startswith(stems)
+
+    keys = {
+        path.rpartition(".")[2] for path in metrics if not path.startswith(("schema", "protocol", "reasons"))
+    }
+    assert len(keys) >= 50
+    assert sorted(key for key in keys if not documented(key)) == []
 
 
 # --- commands, settings, files and words that pages quote
