@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import visible
 
 GAP = 10  # frames
 PAIRS = 8
@@ -58,11 +59,8 @@ class ReprojectionCheck:
     ) -> None:
         points = self._camera.back_project(first)[::STRIDE, ::STRIDE].reshape(-1, 3)
         points = se3.transform(se3.inverse(T_world_second) @ T_world_first, points[points[:, 2] > 0])
-        points = points[points[:, 2] > 0.05]
-        pixels = np.rint(self._camera.project(points)).astype(int)
-        inside = ((pixels >= 0) & (pixels < (self._camera.width, self._camera.height))).all(axis=1)
-        found = second[pixels[inside, 1], pixels[inside, 0]]
-        expected = points[inside, 2]
+        index, u, v = visible(self._camera, points)
+        found, expected = second[v, u], points[index, 2]
         self._residuals.append(np.abs(found - expected)[found > 0])
         self._depths.append(found[found > 0])
 

@@ -17,7 +17,7 @@ from duagc.pipeline.camera_calibration.rig import NAMES, Rig
 from duagc.pipeline.camera_calibration.views import Views, look_up, normals_at
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3, so3
-from duagc.pipeline.registration.residuals import MAD_TO_SIGMA
+from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma
 
 Array = NDArray[np.float64]
 
@@ -222,7 +222,7 @@ def _sigma(z: Array) -> Array:
 
 
 def _scale(residual: Array, least: float) -> float:
-    return max(MAD_TO_SIGMA * float(np.median(np.abs(residual))), least) if residual.size else max(least, 1.0)
+    return max(mad_sigma(residual), least) if residual.size else max(least, 1.0)
 
 
 # --- normal equations -----------------------------------------------------------------------------------------------
@@ -304,4 +304,4 @@ def _of_planes(views: Views, pairs: NDArray[np.int64], rig: Rig, cameras: int) -
 
 
 def _huber(residual: Array, scale: float) -> Array:
-    return np.asarray(1 / np.maximum(1, np.abs(residual) / (HUBER * scale)) / scale**2)
+    return np.asarray(1 / huber_divisor(residual, HUBER * scale) / scale**2)

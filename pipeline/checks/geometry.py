@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.checks.findings import Finding, Severity
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import visible
 from duagc.pipeline.recording import RgbdFrame, RgbdLog
 from duagc.pipeline.registration import Reference, RgbdPyramid, register
 
@@ -128,11 +129,8 @@ def _move(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera) -> Move:
 def _residual(first_m: Image, second_m: Image, T_first_second: Array, camera: PinholeCamera) -> float:
     points = camera.back_project(first_m)[::4, ::4].reshape(-1, 3)
     points = se3.transform(se3.inverse(T_first_second), points[points[:, 2] > 0])
-    points = points[points[:, 2] > 0]
-    pixels = np.rint(camera.project(points))
-    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-    u, v = pixels[inside].astype(int).T
-    expected, found = points[inside, 2], second_m[v, u]
+    index, u, v = visible(camera, points, near_m=0.0)
+    expected, found = points[index, 2], second_m[v, u]
     both = found > 0
     return float(np.median(np.abs(found - expected)[both] / expected[both])) if both.any() else np.nan
 

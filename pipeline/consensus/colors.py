@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.config.consensus import ColorConfig
 from duagc.pipeline.consensus.evidence import COLOR, COLOR_INFORMATION, Evidence, rows_by_id
-from duagc.pipeline.registration.residuals import MAD_TO_SIGMA
+from duagc.pipeline.geometry.statistics import mad_sigmas
 
 Array = NDArray[np.float64]
 Pairs = Mapping[tuple[str, str], NDArray[np.int64]]
@@ -171,15 +171,13 @@ def _colors_of(own: Evidence, other: Evidence, ids: NDArray[np.int64]) -> tuple[
 def _compare(own: Array, other: Array, config: ColorConfig) -> _Compared:
     """Compare matched colors [m, 3]; continuous in them, and the same with the two exchanged."""
     middle = [np.median(x, axis=0) for x in (own, other)]
-    spread = [
-        MAD_TO_SIGMA * np.median(np.abs(x - m), axis=0) for x, m in zip((own, other), middle, strict=True)
-    ]
+    spread = [mad_sigmas(x - m) for x, m in zip((own, other), middle, strict=True)]
     squares = [s**2 + _LEAST_SPREAD**2 for s in spread]
     for _ in range(_ROUNDS):
         ratio = np.sqrt(squares[1] / squares[0])
         x, y = own - middle[0], other - middle[1]
         apart = (y - ratio * x) / np.sqrt(ratio)
-        sigma = MAD_TO_SIGMA * np.median(np.abs(apart), axis=0) + _LEAST_SPREAD
+        sigma = mad_sigmas(apart) + _LEAST_SPREAD
         weight = 1 / (1 + (apart / (_TUNING * sigma)) ** 2) ** 2
         total = weight.sum(axis=0)
         middle = [(weight * c).sum(axis=0) / total for c in (own, other)]

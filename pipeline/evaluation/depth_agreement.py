@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import inside
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
@@ -106,10 +107,11 @@ def _compare(inverse_depth: Array, points: Array, camera: PinholeCamera) -> Arra
         return None
     front = points[points[:, 2] > 0.05]
     u, v = camera.project(front).T
-    inside = (u >= 0) & (u < camera.width - 1) & (v >= 0) & (v < camera.height - 1)
-    if np.count_nonzero(inside) < MIN_VIEW * len(points):
+    # all four pixels around it; the last row and column have none after them
+    seen = inside(u, v, (camera.height - 1, camera.width - 1))
+    if np.count_nonzero(seen) < MIN_VIEW * len(points):
         return None
-    u, v, z = u[inside], v[inside], front[inside, 2]
+    u, v, z = u[seen], v[seen], front[seen, 2]
     i, j = v.astype(np.int64), u.astype(np.int64)
     a, b = u - j, v - i
     corners = np.stack(

@@ -13,6 +13,7 @@ from duagc.pipeline.evaluation.depth_agreement import depth_agreement
 from duagc.pipeline.evaluation.feature_agreement import feature_agreement
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.trajectory_errors import NO_ROTATIONS, Paired
+from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.recording import open_rgbd
 
 Path3D = Mapping[int, NDArray[np.float64]]
@@ -42,7 +43,7 @@ def section(
         paths = {**paths, OF_TRUTH: dict(zip(true.stamps_ns.tolist(), true.true, strict=True))}
     known = [i for i, stamp in held_out.items() if all(stamp in path for path in paths.values())]
     most = min(VIEWS, len(known))
-    chosen = [known[(2 * k + 1) * len(known) // (2 * most)] for k in range(most)]
+    chosen = [known[k] for k in evenly_spaced(len(known), most)]
     with open_rgbd(log_path) as log:
         camera, frames = log.camera, [log.frame(index) for index in chosen]
     depths = [f.depth if f.mask is None else np.where(f.mask, f.depth, np.float32(0)) for f in frames]

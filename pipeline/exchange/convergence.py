@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import inside
 
 Array = NDArray[np.float64]
 STRIDE_PX = 4  # of the own depth images
@@ -57,12 +58,10 @@ def agreement(
 
 def _judged(coarse_m: NDArray[np.float32], camera: PinholeCamera, q: Array) -> tuple[int, int]:
     """How many of the points q [n, 3] in the camera frame lie on the surface seen there, and how many could be told."""
-    u = np.rint((camera.fx * q[:, 0] / q[:, 2] + camera.cx) / STRIDE_PX)
-    v = np.rint((camera.fy * q[:, 1] / q[:, 2] + camera.cy) / STRIDE_PX)
-    rows, columns = coarse_m.shape
-    inside = (u >= 0) & (u < columns) & (v >= 0) & (v < rows)
-    depth = q[inside, 2]
-    seen_m = coarse_m[v[inside].astype(np.int64), u[inside].astype(np.int64)]
+    u, v = np.rint(camera.project(q) / STRIDE_PX).T
+    seen = inside(u, v, coarse_m.shape)
+    depth = q[seen, 2]
+    seen_m = coarse_m[v[seen].astype(np.int64), u[seen].astype(np.int64)]
     known = seen_m > 0
     near = np.abs(seen_m - depth) < np.maximum(GATE_M, GATE_RELATIVE * depth)
     return int(np.count_nonzero(near & known)), int(np.count_nonzero(known))

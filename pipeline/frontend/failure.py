@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.config.frontend import FailureConfig
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.projection import FREE, back_project, free_space, largest_of_3x3
 from duagc.pipeline.registration import Level, RegistrationConfig, RgbdPyramid
-from duagc.pipeline.registration.moving import largest_of_3x3
 
 Array = NDArray[np.float64]
 Image = NDArray[np.floating]
@@ -137,17 +137,10 @@ def intruders(
     """
     v, u = np.nonzero(level.inverse_depth)
     z = 1 / level.inverse_depth[v, u].astype(np.float64)
-    camera = level.camera
-    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
-    points = se3.transform(T_keyframe_camera, points)
-    points = points[points[:, 2] > 0.05]
-    uv = np.rint(camera.project(points)).astype(np.int64)
-    inside = (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
-    nearest = largest_of_3x3(keyframe.inverse_depth)[uv[inside, 1], uv[inside, 0]]
-    told = nearest > 0
-    z_keyframe, z_seen = 1 / nearest[told].astype(np.float64), points[inside, 2][told]
-    gate_m = np.maximum(config.intruder_gate_m, config.intruder_gate_relative * z_keyframe)
-    return int(np.count_nonzero(z_seen < z_keyframe - gate_m)), len(z_seen)
+    points = se3.transform(T_keyframe_camera, back_project(level.camera, u, v, z))
+    gates = config.intruder_gate_m, config.intruder_gate_relative
+    _, where = free_space(points, largest_of_3x3(keyframe.inverse_depth), level.camera, *gates)
+    return int(np.count_nonzero(where == FREE)), len(where)
 
 
 @dataclass(frozen=True)

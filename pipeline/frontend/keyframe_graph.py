@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.frontend import KeyframeConfig
-from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry import projection, se3
 from duagc.pipeline.registration import Level, Reference, ReferenceLevel, Registration, RgbdPyramid
 
 Array = NDArray[np.float64]
@@ -92,15 +92,8 @@ def predicted_overlap(reference: Reference, pyramid: RgbdPyramid, T_reference_ta
 
 def overlap(samples: ReferenceLevel, level: Level, T_reference_target: Array) -> float:
     """Fraction of samples that a view would see on the same surface (within 10 % of depth)."""
-    if len(samples) == 0:
-        return 0.0
     points = se3.transform(se3.inverse(T_reference_target), samples.points.astype(np.float64))
-    points = points[points[:, 2] > 0.05]
-    u, v = np.rint(level.camera.project(points)).astype(np.int64).T
-    inside = (u >= 0) & (u < level.camera.width) & (v >= 0) & (v < level.camera.height)
-    inverse_depth = level.inverse_depth[v[inside], u[inside]]
-    same = (inverse_depth > 0) & (np.abs(points[inside, 2] * inverse_depth - 1) < 0.1)
-    return float(np.count_nonzero(same)) / len(samples)
+    return projection.overlap(points, level.camera, inverse_depth=level.inverse_depth)
 
 
 def refine(T_map_keyframes: Array, pairs: Sequence[KeyframePair], huber_sigmas: float) -> Refined:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry import projection, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.splat.losses import depth_certainty, halve
 from duagc.pipeline.splat.optimizer import BETA_1, BETA_2
@@ -118,18 +118,11 @@ def overlap(
     first = stride_px // 2
     z = depth_m[first::stride_px, first::stride_px].astype(np.float64)
     row, column = np.nonzero(z > 0)
-    if len(row) == 0:
-        return 0.0
-    z = z[row, column]
-    u, v = first + stride_px * column, first + stride_px * row
-    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
+    points = projection.back_project(
+        camera, first + stride_px * column, first + stride_px * row, z[row, column]
+    )
     seen = se3.transform(se3.inverse(T_map_other) @ T_map_camera, points)
-    seen = seen[seen[:, 2] > 0.05]
-    uv = np.rint(camera.project(seen)).astype(np.int64)
-    inside = (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
-    there = other_depth_m[uv[inside, 1], uv[inside, 0]]
-    agree = np.abs(there - seen[inside, 2]) < 0.1 * seen[inside, 2]
-    return float(np.count_nonzero(agree)) / len(points)
+    return projection.overlap(seen, camera, depth_m=other_depth_m)
 
 
 def _from_bytes(color: Bytes) -> Image:

@@ -24,6 +24,7 @@ from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.keyframe_graph import KeyframePair, Refined, refine
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.frontend.tracking import Tracker
+from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
 from duagc.pipeline.recording import LogWriter, RgbdLog, open_rgbd
 from duagc.pipeline.registration import RgbdPyramid
@@ -305,8 +306,7 @@ def _support(
         and not is_held_out(frame.frame_index)
     ]
     count = min(config.mapping.support_views, len(candidates))
-    # the middle of each of `count` equal parts
-    return [candidates[(2 * k + 1) * len(candidates) // (2 * count)] for k in range(count)]
+    return [candidates[k] for k in evenly_spaced(len(candidates), count)]
 
 
 def _odometry(robot: str, frame: TrackedFrame, T_map_keyframes: Array) -> Odometry:

@@ -40,8 +40,9 @@ from duagc.pipeline.consensus.matching import Pairs, held_thickness, tracks
 from duagc.pipeline.consensus.weighting import in_world
 from duagc.pipeline.geometry import se3, spd
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import visible
+from duagc.pipeline.geometry.statistics import MAD_TO_SIGMA
 from duagc.pipeline.posegraph.factors import inflated
-from duagc.pipeline.registration.residuals import MAD_TO_SIGMA
 from duagc.pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]
@@ -487,11 +488,9 @@ def explained(
     for keyframe, depth in depth_images:
         left = np.flatnonzero(~seen)
         p = se3.transform(se3.inverse(T_world_keyframe[keyframe]), points_world[left])
-        left, p = left[p[:, 2] > _NEAR_M], p[p[:, 2] > _NEAR_M]
-        column, row = np.rint(camera.project(p)).astype(np.int64).T
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        left, z = left[inside], p[inside, 2]
-        measured = depth[row[inside], column[inside]].astype(np.float64)
+        index, column, row = visible(camera, p, _NEAR_M)
+        left, z = left[index], p[index, 2]
+        measured = depth[row, column].astype(np.float64)
         reach = measured + config.explained_m + config.explained_relative * z
         seen[left[(measured > 0) & (z <= reach)]] = True
     return seen

@@ -21,6 +21,7 @@ from duagc.pipeline.fusion.finetune import View
 from duagc.pipeline.fusion.fuse import gaussians_of
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.kernels import Rasterizer
 
 Array = NDArray[np.float64]
@@ -52,7 +53,7 @@ def peer_views(
     shown = [name for name in sorted(evidence) if len(evidence[name])]
     poses = [(name, T) for name in shown for T in _with_middles(T_world_keyframe[name])]
     count = min(most, len(poses))
-    chosen = [poses[(2 * k + 1) * len(poses) // (2 * count)] for k in range(count)]
+    chosen = [poses[k] for k in evenly_spaced(len(poses), count)]
     views, drawn = [], ""
     for name, T_world_camera in chosen:
         if name != drawn:

@@ -24,6 +24,7 @@ from duagc.pipeline.fusion.fuse import FusedMap, fuse
 from duagc.pipeline.fusion.opacity_update import weigh_by_own_pixels
 from duagc.pipeline.fusion.peer_validation import PeerMapReport, validate_peer_maps
 from duagc.pipeline.fusion.peer_views import peer_views
+from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory, write_tum
 from duagc.pipeline.messages import (
     WORLD_FRAME,
@@ -169,7 +170,7 @@ def training_views(
     first = [k for k, f in enumerate(frames) if f.frame_index in keyframes]
     others = [k for k, f in enumerate(frames) if f.frame_index not in keyframes and not f.held_out]
     count = min(config.support_views, len(others))
-    middles = [others[(2 * k + 1) * len(others) // (2 * count)] for k in range(count)]
+    middles = [others[k] for k in evenly_spaced(len(others), count)]
     views = []
     with open_rgbd(source.log) as log:
         free = FreeSpace(log.camera, moving)

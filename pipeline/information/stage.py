@@ -19,11 +19,12 @@ from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry import se3, so3, spd
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import back_project, visible
+from duagc.pipeline.geometry.statistics import mad_sigma
 from duagc.pipeline.kernels import FisherSums, Rasterizer
 from duagc.pipeline.messages import GaussianInformation, GaussianMap, Keyframe, Odometry
 from duagc.pipeline.recording import LogWriter, open_rgbd, read_log
 from duagc.pipeline.registration.moving import FreeSpace
-from duagc.pipeline.registration.residuals import MAD_TO_SIGMA
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.schemas import topics
 
@@ -232,10 +233,10 @@ def estimate_noise(
         told = None if view.depth_sigma_m is None else view.depth_sigma_m[sample][both]
         depths.append(np.abs(residual) / unit.depth_sigma_m(z[both], told))
     color, units = np.concatenate(colors), np.concatenate(depths)
-    color_sigma = MAD_TO_SIGMA * float(np.median(color)) if len(color) else 0.0
+    color_sigma = mad_sigma(color) if len(color) else 0.0
     factor = 1.0
     if config.depth_factor_from_residuals and len(units):
-        factor = MAD_TO_SIGMA * float(np.median(units))
+        factor = mad_sigma(units)
         factor = float(np.clip(factor, config.depth_factor_min, config.depth_factor_max))
     return Noise(
         color_sigma=max(color_sigma, config.color_sigma_floor),
@@ -298,7 +299,7 @@ class _Autocorrelation:
         """Take the usable pixels of an image [H, W]."""
         if not usable.any():
             return
-        limit = 4 * MAD_TO_SIGMA * float(np.median(np.abs(residual[usable])))
+        limit = 4 * mad_sigma(residual[usable])
         x = np.where(usable, np.clip(residual, -limit, limit), 0.0)
         r, (h, w) = self.reach_px, x.shape
         for i in range(min(r, h - 1) + 1):
@@ -362,17 +363,10 @@ def _from_tangent_planes(
     points_camera: NDArray[np.float64], depth_m: NDArray[np.float32], camera: PinholeCamera
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Rows of the points whose pixel and its neighbors two pixels off were measured, and their distances, meters."""
-    rows = np.flatnonzero(points_camera[:, 2] > NEAR_M)
-    u, v = np.rint(camera.project(points_camera[rows])).astype(np.int64).T
-    inside = (u >= 2) & (u < camera.width - 2) & (v >= 2) & (v < camera.height - 2)
-    rows, u, v = rows[inside], u[inside], v[inside]
+    rows, u, v = visible(camera, points_camera, NEAR_M, margin_px=2)
 
     def surface(du: int, dv: int) -> NDArray[np.float64]:
-        z = depth_m[v + dv, u + du].astype(np.float64)
-        ray = np.stack(
-            [(u + du - camera.cx) / camera.fx, (v + dv - camera.cy) / camera.fy, np.ones(len(u))], axis=1
-        )
-        return ray * z[:, None]
+        return back_project(camera, u + du, v + dv, depth_m[v + dv, u + du].astype(np.float64))
 
     at, right, left, below, above = (surface(*d) for d in ((0, 0), (2, 0), (-2, 0), (0, 2), (0, -2)))
     normal = np.cross(right - left, below - above)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import inside
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -44,10 +45,10 @@ def lidar_depth(
     between, change = _drawn(pixels[triangles], inverse[triangles], camera)
 
     u, v = np.rint(pixels).astype(np.int64).T
-    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    pixel = np.where(inside, v * camera.width + u, 0)
+    seen = inside(u, v, (camera.height, camera.width))
+    pixel = np.where(seen, v * camera.width + u, 0)
     behind_m = np.where(between[pixel] > 0, points[:, 2] - 1 / np.maximum(between[pixel], 1e-9), 0)
-    visible = np.flatnonzero(inside & (behind_m <= HIDDEN * points[:, 2] + 3 * range_sigma_m))
+    visible = np.flatnonzero(seen & (behind_m <= HIDDEN * points[:, 2] + 3 * range_sigma_m))
     hit = visible[_largest(pixel[visible], inverse[visible])]
 
     known = between > 0

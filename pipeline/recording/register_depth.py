@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import back_project, visible
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -46,10 +47,8 @@ def register_depth(
         for a in range(steps):
             rho = inverse if a == b == 0 else _between(inverse, a / steps, b / steps)
             v, u = np.nonzero(rho)
-            z = 1 / rho[v, u]
-            x = (u + a / steps - depth_camera.cx) / depth_camera.fx * z
-            y = (v + b / steps - depth_camera.cy) / depth_camera.fy * z
-            drawn.append(_pixels(se3.transform(T_camera_depth, np.stack([x, y, z], axis=-1)), camera))
+            points = back_project(depth_camera, u + a / steps, v + b / steps, 1 / rho[v, u])
+            drawn.append(_pixels(se3.transform(T_camera_depth, points), camera))
     return _nearest(drawn, camera)
 
 
@@ -66,10 +65,8 @@ def _between(inverse: Array, a: float, b: float) -> Array:
 
 def _pixels(points_camera: Array, camera: PinholeCamera) -> tuple[NDArray[np.int32], Array]:
     """Pixel (row by row) and depth of the points that fall into the image."""
-    points = points_camera[points_camera[:, 2] > NEAREST_M]
-    u, v = np.rint(camera.project(points)).T
-    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    return (v[inside] * camera.width + u[inside]).astype(np.int32), points[inside, 2]
+    index, u, v = visible(camera, points_camera, NEAREST_M)
+    return (v * camera.width + u).astype(np.int32), points_camera[index, 2]
 
 
 def _nearest(drawn: Sequence[tuple[NDArray[np.int32], Array]], camera: PinholeCamera) -> Image:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import back_project
 
 Array = NDArray[np.float64]
 Descriptors = NDArray[np.uint8]
@@ -68,9 +69,7 @@ def extract_from_gray(
     order = np.lexsort((angle, u, v, -response))
     order = order[z[order] > 0][:most]
     z = z[order]
-    points = np.stack(
-        [(u[order] - camera.cx) / camera.fx * z, (v[order] - camera.cy) / camera.fy * z, z], axis=-1
-    )
+    points = back_project(camera, u[order], v[order], z)
     return Features(root_sift(sift[order]), points.astype(np.float32))
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import FREE, ON_SURFACE, back_project, free_space, largest_of_3x3
 from duagc.pipeline.registration.pyramid import Level
 
 Array = NDArray[np.float64]
@@ -51,12 +52,13 @@ class FreeSpace:
         v, u = np.nonzero(view.inverse_depth)
         through, there = np.zeros(len(v), np.int32), np.zeros(len(v), np.int32)
         z = 1 / view.inverse_depth[v, u].astype(np.float64)
-        points_map = se3.transform(view.T_map_camera, _points(self._small, u, v, z))
+        points_map = se3.transform(view.T_map_camera, back_project(self._small, u, v, z))
         for other in self._nearest(view):
             points = se3.transform(se3.inverse(other.T_map_camera), points_map)
-            seen, closer = in_front(points, other.nearest, self._small, self.config)
-            through[seen] += closer > 0
-            there[seen] += closer == 0
+            gates = self.config.gate_m, self.config.gate_relative
+            seen, where = free_space(points, other.nearest, self._small, *gates)
+            through[seen] += where == FREE
+            there[seen] += where == ON_SURFACE
         found = np.zeros(view.inverse_depth.shape, bool)
         found[v, u] = (through >= self.config.min_views) & (through > there)
         return self._regions(found)
@@ -78,7 +80,7 @@ class FreeSpace:
         center = np.zeros(3)
         v, u = np.nonzero(small)
         if len(v):
-            center = np.median(_points(self._small, u, v, 1 / small[v, u].astype(np.float64)), axis=0)
+            center = np.median(back_project(self._small, u, v, 1 / small[v, u].astype(np.float64)), axis=0)
         T = np.array(T_map_camera, dtype=np.float64)
         return _View(T, small, largest_of_3x3(small), se3.transform(T, center[None])[0])
 
@@ -106,34 +108,3 @@ class FreeSpace:
         whole = grown.repeat(scale, axis=0).repeat(scale, axis=1)
         full[: whole.shape[0], : whole.shape[1]] = whole
         return full
-
-
-def in_front(
-    points: Array, nearest: Image, camera: PinholeCamera, config: MovingConfig
-) -> tuple[NDArray[np.int64], NDArray[np.int8]]:
-    """Which of the points [n, 3], in the frame of a view, that view can tell about, and what it says.
-
-    nearest: `largest_of_3x3` of the view's inverse depth. Returns indices of the points whose place it looked at, and
-    for each 1 if it looked through, 0 if it saw a surface there. Points hidden behind what it saw are left out.
-    """
-    index = np.flatnonzero(points[:, 2] > 0.05)
-    uv = np.rint(camera.project(points[index])).astype(np.int64)
-    inside = (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
-    index, uv = index[inside], uv[inside]
-    inverse = nearest[uv[:, 1], uv[:, 0]]
-    index, inverse = index[inverse > 0], inverse[inverse > 0]
-    z_view, z_point = 1 / inverse.astype(np.float64), points[index, 2]
-    gate_m = np.maximum(config.gate_m, config.gate_relative * z_view)
-    said = np.where(z_point < z_view - gate_m, 1, np.where(z_point > z_view + gate_m, -1, 0)).astype(np.int8)
-    return index[said >= 0], said[said >= 0]
-
-
-def _points(camera: PinholeCamera, u: NDArray[np.int64], v: NDArray[np.int64], z: Array) -> Array:
-    return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
-
-
-def largest_of_3x3(image: Image) -> Image:
-    """Maximum over every pixel's 3x3 neighborhood."""
-    padded = np.pad(image, 1)
-    rows = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
-    return np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])

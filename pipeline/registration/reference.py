@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.geometry.projection import back_project
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
 
 Samples = NDArray[np.floating]
@@ -88,7 +89,7 @@ def _has_normal(level: Level) -> NDArray[np.bool_]:
 def _samples(level: Level, v: NDArray[np.int64], u: NDArray[np.int64]) -> ReferenceLevel:
     """The samples at pixels (u, v), each [n], of known depth and normal."""
     camera, z = level.camera, 1 / level.inverse_depth[v, u].astype(np.float64)
-    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=-1)
+    points = back_project(camera, u, v, z)
     sigmas = None if level.depth_sigma_m is None else level.depth_sigma_m[v, u]
     return ReferenceLevel(points.astype(np.float32), level.normals[v, u], level.gray[v, u], sigmas)
 

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
 from duagc.pipeline.registration.reference import Reference
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 
-MAD_TO_SIGMA = 1.4826  # of a normal distribution
 MAD_STRIDE = 4  # residuals between those that estimate a scale, where there are thousands
 GATE_SIGMAS = 3  # of depth whose noise is told: the gate is no narrower
 
@@ -230,8 +230,6 @@ def _weighted(
     """Scale by the median absolute deviation, weights by Huber: w = 1 / (scale^2 max(1, |r| / (k scale)))."""
     magnitude = np.abs(residual)
     part = magnitude[::MAD_STRIDE] if len(magnitude) > 1000 * MAD_STRIDE else magnitude
-    scale = max(MAD_TO_SIGMA * float(np.median(part)), floor) if len(residual) else floor
-    weight = 1 / (
-        np.maximum(np.float32(1), magnitude / np.float32(huber_sigmas * scale)) * np.float32(scale**2)
-    )
+    scale = max(mad_sigma(part), floor) if len(residual) else floor
+    weight = 1 / (huber_divisor(magnitude, np.float32(huber_sigmas * scale)) * np.float32(scale**2))
     return Residuals(J, residual, weight, scale, pixels)

@@ -14,6 +14,7 @@ from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.views import score_view, surface_depth
 from duagc.pipeline.fusion.stage import peer_colors
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.messages import GaussianMap
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.report import figures, labels, pictures
@@ -93,8 +94,7 @@ def _chosen_frames(robot: RobotRun, frames: int) -> list[int]:
         for f in robot.frames
         if f.held_out and f.frame_index < frames and f.stamp_ns in before and f.stamp_ns in after
     ]
-    places = [(2 * i + 1) * len(able) // (2 * VIEWS_PER_ROBOT) for i in range(VIEWS_PER_ROBOT)]
-    return sorted({able[place] for place in places}) if able else []
+    return sorted({able[k] for k in evenly_spaced(len(able), VIEWS_PER_ROBOT)}) if able else []
 
 
 def _view(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.config.mapping import SeedingConfig
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import inside
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.losses import Rendered
 
@@ -275,9 +276,8 @@ def _inverse_depth_slope(
     x, y = (np.arange(side * side)[:, None] // step % side - radius_px for step in (1, side))
     u, v = (np.rint(column).astype(np.int64) for column in uv.T)
     u, v = u + x, v + y
-    inside = (u >= 0) & (u < w) & (v >= 0) & (v < h)
     z = depth_m[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)].astype(np.float64)
-    measured = inside & (z > 0)
+    measured = inside(u, v, (h, w)) & (z > 0)
     q = 1.0 / np.where(measured, z, np.inf)
     weight = (measured & (np.abs(q / q_cell - 1) < 0.05)).astype(np.float64)
     wx, wy = weight * x, weight * y

@@ -17,6 +17,7 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import visible
 
 Array = NDArray[np.float64]
 
@@ -178,12 +179,7 @@ def shared_view(renderer: Eye, path_a: Array, path_b: Array) -> float:
 
 def sees(camera: PinholeCamera, depth: Array, points_camera: Array) -> NDArray[np.bool_]:
     """Whether a view with this depth [h, w] sees points [n, 3] of its camera frame, nothing in front of them."""
-    z = points_camera[:, 2]
-    ahead = z > 0.1
-    pixels = np.rint(camera.project(np.where(ahead[:, None], points_camera, (0.0, 0.0, 1.0)))).astype(
-        np.int64
-    )
-    u, v = pixels[:, 0], pixels[:, 1]
-    inside = ahead & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-    u, v = np.where(inside, u, 0), np.where(inside, v, 0)
-    return inside & (np.abs(depth[v, u] - z) < OVERLAP_TOLERANCE * z)
+    index, u, v = visible(camera, points_camera, near_m=0.1)
+    z, seen = points_camera[index, 2], np.zeros(len(points_camera), dtype=bool)
+    seen[index] = np.abs(depth[v, u] - z) < OVERLAP_TOLERANCE * z
+    return seen

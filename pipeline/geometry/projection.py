@@ -1,0 +1,128 @@
+"""What one view shows of another: projection, visibility, overlap, free space.
+
+Everywhere: a pixel's center has integer coordinates, columns u and rows v; z is the depth along the optical axis.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from duagc.pipeline.geometry.camera import PinholeCamera
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Image = NDArray[np.floating]
+
+NEAR_M = 0.05  # points nearer to the image plane are not projected: their pixels mean little
+SAME_SURFACE = 0.1  # relative difference of depth up to which two views show the same surface
+
+FREE, ON_SURFACE, HIDDEN = 1, 0, -1  # where a point is as a view saw it: see `free_space`
+
+
+def inside(u: NDArray, v: NDArray, shape: tuple[int, ...], margin_px: int = 0) -> NDArray[np.bool_]:
+    """Whether pixels lie in an image.
+
+    Args:
+        u: columns [...].
+        v: rows [...].
+        shape: (height, width) of the image.
+        margin_px: pixels at every border that do not count.
+    """
+    height, width = shape[:2]
+    of_columns = (u >= margin_px) & (u < width - margin_px)
+    return np.asarray(of_columns & (v >= margin_px) & (v < height - margin_px))
+
+
+def back_project(camera: PinholeCamera, u: ArrayLike, v: ArrayLike, z: ArrayLike) -> Array:
+    """Points [..., 3] in the camera frame of pixels with known depth.
+
+    Args:
+        camera: of the image.
+        u: columns [...].
+        v: rows [...].
+        z: depth [...], meters.
+    """
+    return camera.rays_at(u, v) * np.asarray(z)[..., None]
+
+
+def visible(
+    camera: PinholeCamera, points_camera: Array, near_m: float = NEAR_M, margin_px: int = 0
+) -> tuple[Indices, Indices, Indices]:
+    """The points before a camera that fall into its image, whatever may hide them.
+
+    Args:
+        camera: of the image.
+        points_camera: [n, 3], meters, camera frame.
+        near_m: points must lie farther away than this along the optical axis.
+        margin_px: pixels at every border of the image that do not count.
+
+    Returns:
+        Rows of these points, and the columns u and rows v of their nearest pixels, each int64 [k].
+    """
+    index = np.flatnonzero(points_camera[:, 2] > near_m)
+    u, v = np.rint(camera.project(points_camera[index])).T
+    seen = inside(u, v, (camera.height, camera.width), margin_px)
+    return index[seen], u[seen].astype(np.int64), v[seen].astype(np.int64)
+
+
+def overlap(
+    points_camera: Array,
+    camera: PinholeCamera,
+    *,
+    depth_m: Image | None = None,
+    inverse_depth: Image | None = None,
+) -> float:
+    """Share of the points that a view sees on the same surface; 0 without points.
+
+    Args:
+        points_camera: [n, 3], meters, samples of another view in the frame of this one.
+        camera: of this view.
+        depth_m: [h, w], what this view measured, 0 = unknown; it may differ by SAME_SURFACE of a point's own depth.
+        inverse_depth: instead of it, 1/m, 0 = unknown; a point may differ by SAME_SURFACE of the measured depth.
+    """
+    if len(points_camera) == 0:
+        return 0.0
+    index, u, v = visible(camera, points_camera)
+    z = points_camera[index, 2]
+    if inverse_depth is not None:
+        measured = inverse_depth[v, u]
+        same = (measured > 0) & (np.abs(z * measured - 1) < SAME_SURFACE)
+    elif depth_m is not None:
+        same = np.abs(depth_m[v, u] - z) < SAME_SURFACE * z
+    else:
+        raise TypeError("overlap needs depth_m or inverse_depth")
+    return float(np.count_nonzero(same)) / len(points_camera)
+
+
+def free_space(
+    points_camera: Array, nearest: Image, camera: PinholeCamera, gate_m: float, gate_relative: float
+) -> tuple[Indices, NDArray[np.int8]]:
+    """Where points are, as far as a view can judge it: in space that it saw to be free, on a surface, or hidden.
+
+    In a rigid world a surface inside a view is never nearer than what the view measured there.
+
+    Args:
+        points_camera: [n, 3], meters, in the frame of the view.
+        nearest: [h, w], `largest_of_3x3` of the view's inverse depth, 1/m, 0 = unknown.
+        camera: of the view.
+        gate_m: a point must differ by this from the measured depth not to be on the surface.
+        gate_relative: the same as a share of the measured depth; the larger limit holds.
+
+    Returns:
+        Rows of the points whose place the view measured, and for each FREE, ON_SURFACE or HIDDEN.
+    """
+    index, u, v = visible(camera, points_camera)
+    inverse = nearest[v, u]
+    index, inverse = index[inverse > 0], inverse[inverse > 0]
+    z_view, z_point = 1 / inverse.astype(np.float64), points_camera[index, 2]
+    gate = np.maximum(gate_m, gate_relative * z_view)
+    where = np.where(z_point < z_view - gate, FREE, np.where(z_point > z_view + gate, HIDDEN, ON_SURFACE))
+    return index, where.astype(np.int8)
+
+
+def largest_of_3x3(image: Image) -> Image:
+    """Maximum over every pixel's 3x3 neighborhood."""
+    padded = np.pad(image, 1)
+    rows = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
+    return np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])

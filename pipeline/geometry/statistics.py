@@ -1,0 +1,46 @@
+"""Robust scales and weights, and samples that are spread evenly."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAD_TO_SIGMA = 1.4826  # median absolute deviation to standard deviation, of a normal distribution
+
+
+def mad_sigma(deviations: NDArray[np.floating]) -> float:
+    """Robust standard deviation of numbers: 1.4826 times the median absolute deviation.
+
+    Args:
+        deviations: from the center, of any sign, any shape.
+    """
+    return MAD_TO_SIGMA * float(np.median(np.abs(deviations)))
+
+
+def mad_sigmas(deviations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same of every column, [c].
+
+    Args:
+        deviations: [n, c], from the center of each column.
+    """
+    return np.asarray(MAD_TO_SIGMA * np.median(np.abs(deviations), axis=0))
+
+
+def huber_divisor(residuals: NDArray[np.floating], limit: float | np.float32) -> NDArray[np.floating]:
+    """Divisor >= 1 of least-squares weights that makes residuals beyond a limit count linearly (Huber 1964).
+
+    Args:
+        residuals: of any sign.
+        limit: in the unit of the residuals.
+    """
+    return np.maximum(residuals.dtype.type(1), np.abs(residuals) / limit)
+
+
+def evenly_spaced(total: int, count: int) -> list[int]:
+    """The middles of `count` equal parts of 0 .. total - 1, ascending.
+
+    Args:
+        total: number of things to choose from.
+        count: number of things chosen.
+    """
+    return [(2 * k + 1) * total // (2 * count) for k in range(count)]

@@ -1,0 +1,39 @@
+"""Robust scales, Huber's weights, even samples."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from duagc.pipeline.geometry.statistics import evenly_spaced, huber_divisor, mad_sigma, mad_sigmas
+
+
+def test_the_scale_of_a_normal_distribution_is_its_standard_deviation_and_outliers_hardly_count() -> None:
+    draws = np.random.default_rng(0).normal(0, 0.3, 100_001)
+    assert mad_sigma(draws) == pytest.approx(0.3, rel=0.01)
+    draws[:1000] = 1e6
+    assert mad_sigma(draws) == pytest.approx(0.3, rel=0.03)
+    columns = np.stack([draws, 2 * draws], axis=1)
+    assert mad_sigmas(columns).tolist() == [mad_sigma(draws), mad_sigma(2 * draws)]
+
+
+def test_residuals_beyond_the_limit_count_linearly() -> None:
+    residuals = np.array([0.0, -0.5, 1.0, -2.0, 10.0])
+    np.testing.assert_allclose(huber_divisor(residuals, 1.0), [1, 1, 1, 2, 10])
+    assert huber_divisor(residuals.astype(np.float32), np.float32(1)).dtype == np.float32
+
+
+@given(total=st.integers(1, 1000), share=st.floats(0.001, 1))
+def test_even_samples_are_distinct_and_symmetric_parts(total: int, share: float) -> None:
+    count = max(1, int(share * total))
+    chosen = evenly_spaced(total, count)
+    assert len(set(chosen)) == count
+    assert chosen == sorted(chosen)
+    assert chosen[0] >= 0
+    assert chosen[-1] < total
+    gaps = np.diff(chosen)
+    assert len(gaps) == 0 or gaps.max() - gaps.min() <= 1
+
+
+def test_no_samples_of_nothing() -> None:
+    assert evenly_spaced(0, 0) == []
