@@ -7,7 +7,7 @@ from pydantic import Field
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.consensus import MatchingConfig, PoseConsensusConfig, WeightKind
 from duagc.pipeline.config.network import LinkConfig, TransportConfig
-from duagc.pipeline.config.registration import RegistrationConfig
+from duagc.pipeline.config.registration import GeometricVerificationConfig, RegistrationConfig
 
 
 class PlacesConfig(Config):
@@ -39,17 +39,11 @@ class PeerRegistrationConfig(RegistrationConfig):
     that agree on a motion."""
 
 
-class VerificationConfig(Config):
-    """From a candidate to a closure: RANSAC over 3-D matches, then registration."""
+class VerificationConfig(GeometricVerificationConfig):
+    """From a candidate to a loop closure with another robot: RANSAC over 3-D matches, then registration."""
 
     hypotheses: int = Field(default=500, ge=1)
-    """Three-point hypotheses per candidate."""
-    inlier_m: float = Field(default=0.05, gt=0.0)
-    """Distance below which a match agrees with a hypothesis, at one meter of depth; grows with depth."""
-    min_inliers: int = Field(default=12, ge=4)
-    """Matches that must agree."""
-    min_inlier_share: float = Field(default=0.25, ge=0.0, le=1.0)
-    """Share of the matches that must agree."""
+    """Three-point samples of RANSAC."""
     samples: int = Field(default=2000, ge=50)
     """Points with normal and intensity of the neighbor's keyframe used by the registration."""
     max_refinement_m: float = Field(default=0.15, gt=0.0)
@@ -57,7 +51,7 @@ class VerificationConfig(Config):
     registration: PeerRegistrationConfig = PeerRegistrationConfig()
     """The registration itself."""
     max_refinement_rad: float = Field(default=0.10, gt=0.0)
-    """Largest rotation by which the registration may change what RANSAC found."""
+    """The same for the rotation."""
 
 
 class InjectionConfig(Config):

@@ -1,8 +1,10 @@
 """Configuration of the front end: tracking, keyframes, mapping."""
 
+from pydantic import Field
+
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.mapping import MappingConfig
-from duagc.pipeline.config.registration import MovingConfig, RegistrationConfig
+from duagc.pipeline.config.registration import GeometricVerificationConfig, MovingConfig, RegistrationConfig
 
 # Not settings: the files of a run and their readers promise this rule.
 HELD_OUT_PERIOD = 8
@@ -14,8 +16,8 @@ def is_held_out(frame_index: int) -> bool:
     return frame_index % HELD_OUT_PERIOD == HELD_OUT_OFFSET
 
 
-class LoopConfig(Config):
-    """Recognizing places of the robot's own path."""
+class LoopConfig(GeometricVerificationConfig):
+    """Loop closures within the robot's own path."""
 
     enabled: bool = True
     min_gap: int = 3
@@ -26,26 +28,16 @@ class LoopConfig(Config):
     """Earlier keyframes, those that share most visual words, whose features are compared."""
     features_compared: int = 120
     """The strongest features, by which earlier keyframes are ranked."""
-    ratio: float = 0.8
-    """Nearest over second-nearest distance of descriptors below which a match counts."""
     min_matches: int = 10
     """Matches among them from which a pair is a candidate."""
     candidates: int = 2
     """Earlier keyframes tried per keyframe, those with most matches."""
-    hypotheses: int = 300
-    """Three-point samples of RANSAC."""
-    inlier_m: float = 0.05
-    """Distance below which a match agrees with a motion, at one meter of depth; grows with depth."""
-    min_inliers: int = 15
+    min_inliers: int = Field(default=15, ge=4)
     """Matches that must agree on one motion."""
-    min_inlier_share: float = 0.3
+    min_inlier_share: float = Field(default=0.3, ge=0.0, le=1.0)
     """The same as a share of the matches; the larger number holds."""
-    min_overlap: float = 0.4
-    """Overlap that the registrations must find."""
-    max_disagreement_m: float = 0.03
-    """Largest distance between the registration one way and the other."""
-    max_disagreement_rad: float = 0.03
-    """The same for the rotation."""
+    min_overlap: float = Field(default=0.4, ge=0.0, le=1.0)
+    """Overlap that the registrations in both directions must find."""
 
 
 class KeyframeConfig(Config):
@@ -142,7 +134,7 @@ class MotionPriorConfig(Config):
     """Plus this for every second: the bias."""
 
 
-class RelocalizationConfig(Config):
+class RelocalizationConfig(GeometricVerificationConfig):
     """Finding a lost camera again by features of its image."""
 
     features: int = 400
@@ -151,22 +143,14 @@ class RelocalizationConfig(Config):
     """The strongest of them, by which keyframes are ranked."""
     max_width_px: int = 400
     """Features come from the finest image of the pyramid that is not wider."""
-    ratio: float = 0.8
-    """Nearest over second-nearest distance of descriptors below which a match counts."""
     candidates: int = 3
     """Keyframes tried per frame, those with most matches."""
     min_matches: int = 6
     """Matches among the strongest features from which a keyframe is tried."""
-    hypotheses: int = 300
-    """Three-point samples of RANSAC."""
-    inlier_m: float = 0.05
-    """Distance below which a match agrees with a motion, at one meter of depth; grows with depth."""
-    min_inliers: int = 10
+    min_inliers: int = Field(default=10, ge=4)
     """Matches that must agree on one motion."""
-    min_inlier_share: float = 0.25
-    """The same as a share of the matches; the larger number holds."""
-    min_overlap: float = 0.5
-    """Overlap by which a place must be seen to be believed."""
+    min_overlap: float = Field(default=0.5, ge=0.0, le=1.0)
+    """Overlap with its keyframe that a plausible pose must have."""
     max_contradiction_m: float = 0.03
     """Largest distance between a place that was found and where a later keyframe, not believed itself, has it."""
     max_conflict: float = 0.1

@@ -2,6 +2,8 @@
 
 from typing import Literal
 
+from pydantic import Field
+
 from duagc.pipeline.config.base import Config
 
 
@@ -57,6 +59,34 @@ class RegistrationConfig(Config):
     """Largest correction of the guess; more is JUMP."""
     max_rotation_rad: float = 0.35
     """Largest correction of the guess; more is JUMP."""
+
+
+class GeometricVerificationConfig(Config):
+    """Whether two views show one place: matched features, RANSAC, registration (`registration.geometric_verification`).
+
+    Loop closures within a robot's path and between robots, and relocalization, extend it.
+    """
+
+    ratio: float = Field(default=0.8, gt=0.0, lt=1.0)
+    """Nearest over second-nearest distance of descriptors below which a match counts."""
+    hypotheses: int = Field(default=300, ge=1)
+    """Three-point samples of RANSAC."""
+    inlier_m: float = Field(default=0.05, gt=0.0)
+    """Distance below which a match agrees with a motion, at one meter of depth; grows with depth."""
+    min_inliers: int = Field(default=12, ge=4)
+    """Matches that must agree on one motion."""
+    min_inlier_share: float = Field(default=0.25, ge=0.0, le=1.0)
+    """The same as a share of the matches; the larger number holds."""
+    min_overlap: float = Field(default=0.3, ge=0.0, le=1.0)
+    """Overlap that the registration must find."""
+    max_disagreement_m: float = Field(default=0.03, gt=0.0)
+    """Largest distance between the registrations in the two directions, where both views' images are at hand."""
+    max_disagreement_rad: float = Field(default=0.03, gt=0.0)
+    """The same for the rotation."""
+    max_refinement_m: float = Field(default=0.3, gt=0.0)
+    """Largest translation by which the registration may change what RANSAC found."""
+    max_refinement_rad: float = Field(default=0.35, gt=0.0)
+    """The same for the rotation."""
 
 
 class MovingConfig(Config):

@@ -237,7 +237,6 @@ class LowerEnd(Meeting):
                 self.places.pyramid(candidate.own_keyframe),
                 sample.features,
                 sample.reference,
-                self.config.places.ratio,
                 self.config.verification,
                 rng,
             )

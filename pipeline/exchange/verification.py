@@ -1,4 +1,4 @@
-"""From a candidate pair of keyframes to a closure: 3-D matches, RANSAC, registration."""
+"""From a candidate pair of keyframes to a loop closure: `registration.geometric_verification`, and its verdict."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.pipeline.config.exchange import VerificationConfig
-from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.loop_closures import Closure
-from duagc.pipeline.registration import Reference, RgbdPyramid, register
-from duagc.pipeline.registration.features import Features, matches, ransac
-
-Array = NDArray[np.float64]
+from duagc.pipeline.registration import Reference, RgbdPyramid, geometric_verification
+from duagc.pipeline.registration.features import Features
+from duagc.pipeline.registration.geometric_verification import (
+    Failure,
+    GeometricVerification,
+    VerificationView,
+)
 
 
 class Verdict(Enum):
@@ -51,53 +52,63 @@ def verify(
     own_pyramid: RgbdPyramid,
     peer: Features,
     peer_reference: Reference,
-    ratio: float,
     config: VerificationConfig,
     rng: np.random.Generator,
 ) -> Verified:
     """Verify one candidate.
 
+    A neighbor sends samples and no images, so that registration is possible in one direction only.
+
     Args:
-        own, own_pyramid: all features and the images of the own keyframe.
-        peer, peer_reference: features and registration samples of the neighbor's keyframe, as it sent them.
-        ratio: of the ratio test. rng: the stream of this pair of keyframes.
+        own_keyframe: index of the own keyframe.
+        peer_keyframe: index of the neighbor's keyframe.
+        own: all features of the own keyframe.
+        own_pyramid: its images.
+        peer: features of the neighbor's keyframe, as it sent them.
+        peer_reference: its registration samples, as it sent them.
+        config: limits of all tests.
+        rng: the stream of this pair of keyframes.
+
     Returns:
         The verdict, and the closure T_own_peer with its information if the verdict is KEPT.
     """
-    pairs = matches(own.descriptors, peer.descriptors, ratio)
-    if len(pairs) < config.min_inliers:
-        return Verified(
-            Verdict.FEW_MATCHES, len(pairs), 0, f"{len(pairs)} matches, {config.min_inliers} needed"
-        )
-    points_own = own.points[pairs[:, 0]].astype(np.float64)
-    points_peer = peer.points[pairs[:, 1]].astype(np.float64)
-    T_own_peer, agree = ransac(points_own, points_peer, config.inlier_m, config.hypotheses, rng)
-    inliers = int(agree.sum())
-    needed = max(config.min_inliers, int(np.ceil(config.min_inlier_share * len(pairs))))
-    if inliers < needed:
-        return Verified(
-            Verdict.FEW_INLIERS, len(pairs), inliers, f"{inliers} of {len(pairs)} agree, {needed} needed"
-        )
-    result = register(peer_reference, own_pyramid, se3.inverse(T_own_peer), config.registration)
-    if not result.ok or np.linalg.eigvalsh(result.information)[0] <= 0:
-        return Verified(Verdict.NOT_REGISTERED, len(pairs), inliers, f"registration: {result.outcome.value}")
-    T_refined = se3.inverse(result.T_reference_target)
-    moved_m, moved_rad = (float(d) for d in se3.distance(T_own_peer, T_refined))
-    if moved_m > config.max_refinement_m or moved_rad > config.max_refinement_rad:
-        return Verified(Verdict.MOVED, len(pairs), inliers, f"by {moved_m:.3f} m and {moved_rad:.3f} rad")
-    closure = Closure(
-        own_keyframe,
-        peer_keyframe,
-        T_refined,
-        inverse_information(result.T_reference_target, result.information),
+    found = geometric_verification.verify(
+        VerificationView(own, images=lambda: own_pyramid),
+        VerificationView(peer, peer_reference),
+        config,
+        config.registration,
+        rng,
     )
-    return Verified(
-        Verdict.KEPT, len(pairs), inliers, f"refined by {moved_m:.4f} m, {moved_rad:.4f} rad", closure
-    )
+    verdict, detail = _VERDICTS[found.failure], _detail(found)
+    closure = None
+    if found.failure is None:
+        closure = Closure(own_keyframe, peer_keyframe, found.T_first_second, found.information)
+    return Verified(verdict, found.features.matches, found.features.inliers, detail, closure)
 
 
-def inverse_information(T_a_b: Array, information: Array) -> Array:
-    """Information [6, 6] of T_b_a in its right tangent, from that of T_a_b: inverse(T exp(x)) = T^-1 exp(-Ad(T) x)."""
-    adjoint_inverse = se3.adjoint(se3.inverse(T_a_b))
-    out = adjoint_inverse.T @ information @ adjoint_inverse
-    return 0.5 * (out + out.T)
+_VERDICTS = {
+    None: Verdict.KEPT,
+    Failure.FEW_MATCHES: Verdict.FEW_MATCHES,
+    Failure.FEW_INLIERS: Verdict.FEW_INLIERS,
+    Failure.NOT_REGISTERED: Verdict.NOT_REGISTERED,
+    Failure.LOW_OVERLAP: Verdict.NOT_REGISTERED,
+    Failure.DIRECTIONS_DISAGREE: Verdict.NOT_REGISTERED,
+    Failure.FAR_FROM_FEATURES: Verdict.MOVED,
+}
+
+
+def _detail(found: GeometricVerification) -> str:
+    """What decided, in words and numbers."""
+    features, result = found.features, found.registration
+    if found.failure is Failure.FEW_MATCHES:
+        return f"{features.matches} matches, {features.needed} needed"
+    if found.failure is Failure.FEW_INLIERS:
+        return f"{features.inliers} of {features.matches} agree, {features.needed} needed"
+    assert result is not None
+    if found.failure is Failure.NOT_REGISTERED:
+        return f"registration: {result.outcome.value}"
+    if found.failure is Failure.FAR_FROM_FEATURES:
+        return f"by {found.correction_m:.3f} m and {found.correction_rad:.3f} rad"
+    if found.failure is not None:
+        return f"registration: {found.failure.value}"
+    return f"refined by {found.correction_m:.4f} m, {found.correction_rad:.4f} rad"

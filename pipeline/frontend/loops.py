@@ -12,8 +12,9 @@ from duagc.pipeline.config.frontend import LoopConfig
 from duagc.pipeline.frontend.bundle import Images, View
 from duagc.pipeline.frontend.keyframe_graph import KeyframePair, overlap
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.registration import RegistrationConfig, register
-from duagc.pipeline.registration.features import matches, ransac
+from duagc.pipeline.registration import RegistrationConfig
+from duagc.pipeline.registration.features import matches
+from duagc.pipeline.registration.geometric_verification import VerificationView, verify
 from duagc.pipeline.registration.place_recognition import Places
 
 Array = NDArray[np.float64]
@@ -77,21 +78,15 @@ def _verified(
     robot: str,
 ) -> KeyframePair | None:
     """The registration of a candidate, if it withstands all tests."""
-    ours, theirs = views[first].features, views[second].features
-    pairs = matches(ours.descriptors, theirs.descriptors, config.ratio)
-    if len(pairs) < config.min_inliers:
-        return None
     rng = random_streams.generator(seed, "frontend.loop", robot=robot, first=first, second=second)
-    points = ours.points[pairs[:, 0]].astype(np.float64), theirs.points[pairs[:, 1]].astype(np.float64)
-    guess, agree = ransac(*points, config.inlier_m, config.hypotheses, rng)
-    if agree.sum() < max(config.min_inliers, config.min_inlier_share * len(pairs)):
-        return None
     levels = len(registration.iterations)
-    forth = register(views[first].reference, images(second, levels), guess, registration)
-    back = register(views[second].reference, images(first, levels), se3.inverse(guess), registration)
-    if not (forth.ok and back.ok) or min(forth.overlap, back.overlap) < config.min_overlap:
+    found = verify(
+        VerificationView(views[first].features, views[first].reference, lambda: images(first, levels)),
+        VerificationView(views[second].features, views[second].reference, lambda: images(second, levels)),
+        config,
+        registration,
+        rng,
+    )
+    if found.failure is not None:
         return None
-    apart_m, apart_rad = se3.distance(forth.T_reference_target, se3.inverse(back.T_reference_target))
-    if apart_m > config.max_disagreement_m or apart_rad > config.max_disagreement_rad:
-        return None
-    return KeyframePair(first, second, forth.T_reference_target, forth.information)
+    return KeyframePair(first, second, found.T_first_second, found.information)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.config.frontend import RelocalizationConfig
-from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import RgbdPyramid
-from duagc.pipeline.registration.features import Features, extract_from_gray, matches, ransac
+from duagc.pipeline.registration.features import Features, extract_from_gray, matches
+from duagc.pipeline.registration.geometric_verification import motion_from_features
 
 Array = NDArray[np.float64]
 
@@ -45,28 +45,8 @@ def guesses(
     for k in ranked[: config.candidates]:
         if scores[k] < config.min_matches:
             return
-        pairs = matches(keyframes[k].descriptors, view.descriptors, config.ratio)
-        if len(pairs) < config.min_inliers:
-            continue
-        T_keyframe_camera, agree = ransac(
-            keyframes[k].points[pairs[:, 0]].astype(np.float64),
-            view.points[pairs[:, 1]].astype(np.float64),
-            config.inlier_m,
-            config.hypotheses,
-            # the draws only choose which samples are tried: the same in every run
-            random_streams.generator(0, "relocalization", frame=frame_index, keyframe=k),
-        )
-        if agree.sum() >= max(config.min_inliers, config.min_inlier_share * len(pairs)):
-            yield k, T_keyframe_camera
-
-
-def supports(
-    view: Features, keyframe: Features, T_keyframe_camera: Array, config: RelocalizationConfig
-) -> bool:
-    """Whether enough matched features of a view are, at a pose, where the keyframe has them."""
-    pairs = matches(keyframe.descriptors, view.descriptors, config.ratio)
-    there = keyframe.points[pairs[:, 0]].astype(np.float64)
-    here = se3.transform(T_keyframe_camera, view.points[pairs[:, 1]].astype(np.float64))
-    limit_m = config.inlier_m * np.maximum(1.0, there[:, 2])
-    agree = np.linalg.norm(there - here, axis=-1) < limit_m
-    return int(agree.sum()) >= max(config.min_inliers, config.min_inlier_share * len(pairs))
+        # the draws only choose which samples are tried: the same in every run
+        rng = random_streams.generator(0, "relocalization", frame=frame_index, keyframe=k)
+        found = motion_from_features(keyframes[k], view, config, rng)
+        if found.T_first_second is not None and found.accepted:
+            yield k, found.T_first_second

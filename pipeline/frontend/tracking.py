@@ -26,7 +26,7 @@ from duagc.pipeline.frontend.failure import (
     saturated_share,
 )
 from duagc.pipeline.frontend.keyframe_graph import KeyframePair, becomes_keyframe, predicted_overlap
-from duagc.pipeline.frontend.relocalization import features_of, guesses, supports
+from duagc.pipeline.frontend.relocalization import features_of, guesses
 from duagc.pipeline.frontend.stable_registration import settle
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.geometry import se3
@@ -34,6 +34,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import MotionPrior
 from duagc.pipeline.registration import Reference, Registration, RgbdPyramid, register
 from duagc.pipeline.registration.features import Features
+from duagc.pipeline.registration.geometric_verification import features_agree
 
 Array = NDArray[np.float64]
 Image = NDArray[np.floating]
@@ -420,7 +421,7 @@ class Tracker:
         ):
             return False
         if len(keyframe.features) >= FEATURES_TO_SAY * relocalization.min_inliers:
-            return supports(view, keyframe.features, T, relocalization)
+            return features_agree(keyframe.features, view, T, relocalization)
         expected = moved_m <= failure.slack_m and turned_rad <= failure.slack_rad
         return bool(expected) and not self._long_lost(stamp_ns)
 

@@ -71,6 +71,18 @@ def adjoint(T: ArrayLike) -> Array:
     return out
 
 
+def inverse_information(T_a_b: Array, information: Array) -> Array:
+    """Information [6, 6] of the inverse motion T_b_a in its right tangent: inverse(T exp(x)) = T^-1 exp(-Ad(T) x).
+
+    Args:
+        T_a_b: [4, 4].
+        information: [6, 6] of the right tangent of T_a_b.
+    """
+    adjoint_inverse = adjoint(inverse(T_a_b))
+    out = adjoint_inverse.T @ information @ adjoint_inverse
+    return 0.5 * (out + out.T)
+
+
 def distance(T_a: ArrayLike, T_b: ArrayLike) -> tuple[Array, Array]:
     """Translation (m) and rotation (rad) between two motions [..., 4, 4], of shape [...]."""
     D = inverse(T_a) @ np.asarray(T_b, dtype=np.float64)

@@ -1,0 +1,197 @@
+"""Geometric verification: whether two views show one place, and the motion between them.
+
+Features are matched, RANSAC finds the motion that most matches agree on, and dense registration confirms and refines
+it. Loop closures of one robot's path, loop closures between robots and relocalization all pass through here; they
+differ in their settings and in what they have of the two views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.config.registration import GeometricVerificationConfig, RegistrationConfig
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration.align import Registration, register
+from duagc.pipeline.registration.features import Features, matches, ransac
+from duagc.pipeline.registration.pyramid import RgbdPyramid
+from duagc.pipeline.registration.reference import Reference
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FeatureMotion:
+    """The motion that matched features of two views agree on.
+
+    Attributes:
+        T_first_second: [4, 4], fitted to the inliers; None with too few matches to try.
+        matches: number of matches.
+        inliers: number of matches that agree.
+        needed: inliers from which the motion is accepted; with too few matches, the matches needed.
+    """
+
+    T_first_second: Array | None
+    matches: int
+    inliers: int
+    needed: int
+
+    @property
+    def accepted(self) -> bool:
+        """Whether enough matches agree."""
+        return self.T_first_second is not None and self.inliers >= self.needed
+
+
+class Failure(Enum):
+    """The test that a pair of views did not pass, in the order of the tests."""
+
+    FEW_MATCHES = "few_matches"
+    FEW_INLIERS = "few_inliers"
+    NOT_REGISTERED = "not_registered"
+    LOW_OVERLAP = "low_overlap"
+    DIRECTIONS_DISAGREE = "directions_disagree"
+    FAR_FROM_FEATURES = "far_from_features"
+
+
+@dataclass(frozen=True)
+class VerificationView:
+    """What is known of one of the two views.
+
+    Attributes:
+        features: with depth.
+        reference: samples that the other view is registered to; None: the other is not registered to this view.
+        images: reads the pyramid that is registered to the other view's samples, called only after the features
+            have agreed; None: this view is not registered to the other.
+    """
+
+    features: Features
+    reference: Reference | None = None
+    images: Callable[[], RgbdPyramid] | None = None
+
+
+@dataclass(frozen=True)
+class GeometricVerification:
+    """Result of `verify`.
+
+    Attributes:
+        failure: the first test that failed; None: the pair is verified.
+        features: what the features alone gave.
+        registration: the decisive registration; None before any.
+        T_first_second: [4, 4], by the registration; identity before it.
+        information: [6, 6] of its right tangent; zero before it.
+        correction_m: how far registration moved the motion that the features gave; 0 before it.
+        correction_rad: the same for the rotation.
+    """
+
+    failure: Failure | None
+    features: FeatureMotion
+    registration: Registration | None
+    T_first_second: Array
+    information: Array
+    correction_m: float = 0.0
+    correction_rad: float = 0.0
+
+
+def motion_from_features(
+    first: Features, second: Features, config: GeometricVerificationConfig, rng: np.random.Generator
+) -> FeatureMotion:
+    """Match two views' features and find the motion that most matches agree on.
+
+    Args:
+        first: features of the first view.
+        second: features of the second view.
+        config: ratio test, RANSAC, inliers needed.
+        rng: draws the samples of RANSAC.
+    """
+    pairs = matches(first.descriptors, second.descriptors, config.ratio)
+    if len(pairs) < config.min_inliers:
+        return FeatureMotion(None, len(pairs), 0, config.min_inliers)
+    points_first = first.points[pairs[:, 0]].astype(np.float64)
+    points_second = second.points[pairs[:, 1]].astype(np.float64)
+    T, agree = ransac(points_first, points_second, config.inlier_m, config.hypotheses, rng)
+    return FeatureMotion(T, len(pairs), int(agree.sum()), _inliers_needed(len(pairs), config))
+
+
+def features_agree(
+    first: Features, second: Features, T_first_second: Array, config: GeometricVerificationConfig
+) -> bool:
+    """Whether enough matched features of two views meet at a given motion.
+
+    Args:
+        first: features of the first view.
+        second: features of the second view.
+        T_first_second: the motion, [4, 4].
+        config: ratio test, inliers needed.
+    """
+    pairs = matches(first.descriptors, second.descriptors, config.ratio)
+    points_first = first.points[pairs[:, 0]].astype(np.float64)
+    moved = se3.transform(T_first_second, second.points[pairs[:, 1]].astype(np.float64))
+    limit_m = config.inlier_m * np.maximum(1.0, points_first[:, 2])
+    agree = np.linalg.norm(points_first - moved, axis=-1) < limit_m
+    return int(agree.sum()) >= _inliers_needed(len(pairs), config)
+
+
+def verify(
+    first: VerificationView,
+    second: VerificationView,
+    config: GeometricVerificationConfig,
+    registration: RegistrationConfig,
+    rng: np.random.Generator,
+) -> GeometricVerification:
+    """Verify that two views show one place.
+
+    With samples and images of both views they are registered in both directions, which must agree; with samples of
+    one and images of the other, in that direction alone.
+
+    Args:
+        first: the view whose frame the motion is expressed in.
+        second: the other view.
+        config: limits of all tests.
+        registration: settings of the registrations.
+        rng: draws the samples of RANSAC.
+
+    Returns:
+        The motion with its information, or the first test that failed.
+    """
+    found = motion_from_features(first.features, second.features, config, rng)
+
+    def failed(failure: Failure, result: Registration | None = None) -> GeometricVerification:
+        return GeometricVerification(failure, found, result, np.eye(4), np.zeros((6, 6)))
+
+    if found.T_first_second is None:
+        return failed(Failure.FEW_MATCHES)
+    if not found.accepted:
+        return failed(Failure.FEW_INLIERS)
+    guess = found.T_first_second
+    measured: list[tuple[Registration, Array, Array]] = []  # T_first_second and its information
+    if first.reference is not None and second.images is not None:
+        forward = register(first.reference, second.images(), guess, registration)
+        measured.append((forward, forward.T_reference_target, forward.information))
+    if second.reference is not None and first.images is not None:
+        backward = register(second.reference, first.images(), se3.inverse(guess), registration)
+        T_second_first, information = backward.T_reference_target, backward.information
+        turned = se3.inverse_information(T_second_first, information)
+        measured.append((backward, se3.inverse(T_second_first), turned))
+    if not measured:
+        raise ValueError("geometric verification needs samples of one view and images of the other")
+    result, T, information = measured[0]
+    for one, _, _ in measured:
+        if not one.ok or np.linalg.eigvalsh(one.information)[0] <= 0:
+            return failed(Failure.NOT_REGISTERED, one)
+    if min(one.overlap for one, _, _ in measured) < config.min_overlap:
+        return failed(Failure.LOW_OVERLAP, result)
+    apart_m, apart_rad = se3.distance(T, measured[-1][1])
+    if apart_m > config.max_disagreement_m or apart_rad > config.max_disagreement_rad:
+        return failed(Failure.DIRECTIONS_DISAGREE, result)
+    moved_m, moved_rad = (float(d) for d in se3.distance(guess, T))
+    far = moved_m > config.max_refinement_m or moved_rad > config.max_refinement_rad
+    failure = Failure.FAR_FROM_FEATURES if far else None
+    return GeometricVerification(failure, found, result, T, information, moved_m, moved_rad)
+
+
+def _inliers_needed(count: int, config: GeometricVerificationConfig) -> int:
+    return max(config.min_inliers, int(np.ceil(config.min_inlier_share * count)))
