@@ -133,7 +133,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             "research that no run depends on",
             _MATHEMATICS,
             _LOGS,
-            "posegraph network consensus exchange frontend fusion runs evaluation bench team_posegraph",
+            "posegraph network consensus exchange frontend fusion runs evaluation bench team_posegraph converters",
         ),
     ),
     (

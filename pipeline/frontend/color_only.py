@@ -1,8 +1,8 @@
-"""Following a camera whose depth is missing or stuck, by its color alone.
+"""Following a camera whose depth is missing or frozen, by its color alone.
 
-What color says of the way that a camera went is off by a share of that way, because depth and color of a real
-camera do not fit together to the pixel. Against a keyframe this error is there at once, as large as the way from it:
-5 cm in RedKitchen. So such frames are registered to the last one that had both images, from which the way is short.
+The translation that color gives is off by a share of itself, because depth and color of a real camera do not fit
+together to the pixel. Against a keyframe this error is there at once, as large as the distance from it: 5 cm in
+RedKitchen. So such frames are registered to the last one that had both images, which is near.
 """
 
 from __future__ import annotations
@@ -32,10 +32,14 @@ OPEN_DIRECTION = 1e-4  # 1/m^2, 1/rad^2: a standard deviation of 100 m says noth
 
 
 @dataclass(frozen=True)
-class SoundFrame:
-    """A frame whose depth and color were both sound.
+class LastGoodFrame:
+    """A frame whose depth and color were both good.
 
-    T_keyframe_camera: [4, 4]. information: [6, 6] of it; None: it is the keyframe. strides: of its samples.
+    Attributes:
+        pyramid: its images.
+        strides: of its samples.
+        T_keyframe_camera: [4, 4].
+        information: [6, 6] of it; None: it is the keyframe.
     """
 
     pyramid: RgbdPyramid = field(repr=False)
@@ -47,18 +51,24 @@ class SoundFrame:
     def _reference(self) -> Reference:
         return Reference.from_pyramid(self.pyramid, self.strides)
 
-    def follow(
+    def register_color(
         self,
         pyramid: RgbdPyramid,
         T_keyframe_guess: Array,
         registration: RegistrationConfig,
         limits: FailureConfig,
+        *,
         prior_information: Array | None,
     ) -> Registration:
         """Register the color of a later frame to this one.
 
         Args:
-            T_keyframe_guess: where it should be, [4, 4]; prior_information: [6, 6] of that, None: unknown.
+            pyramid: of the later frame.
+            T_keyframe_guess: where it should be, [4, 4].
+            registration: settings of the registration.
+            limits: how far and how much of this frame color alone may be followed.
+            prior_information: [6, 6] of the guess; None: unknown.
+
         Returns:
             The registration with T_reference_target and information in the keyframe; overlap and view are shares of
             this frame. JUMP if it is too far from here for color alone, LOW_OVERLAP if too little is shared.
@@ -68,9 +78,9 @@ class SoundFrame:
             self._reference, pyramid.without_depth(), T_here_guess, registration, prior_information
         )
         T = result.T_reference_target
-        way_m = float(np.linalg.norm(T[:3, 3]))
+        translation_m = float(np.linalg.norm(T[:3, 3]))
         outcome = result.outcome
-        if result.ok and way_m > limits.max_way_without_depth_m:
+        if result.ok and translation_m > limits.max_way_without_depth_m:
             outcome = Outcome.JUMP
         elif result.ok and result.view < limits.min_view_without_depth:
             outcome = Outcome.LOW_OVERLAP
@@ -78,29 +88,39 @@ class SoundFrame:
             result,
             outcome=outcome,
             T_reference_target=self.T_keyframe_camera @ T,
-            information=self._information(result, limits.sigma_of_way_without_depth * way_m),
+            information=self._information(result, limits.sigma_of_way_without_depth * translation_m),
         )
 
-    def way_m(self, T_keyframe_camera: Array) -> float:
-        """Distance from this frame to a pose in its keyframe."""
+    def translation_m(self, T_keyframe_camera: Array) -> float:
+        """Distance from this frame to a pose, meters.
+
+        Args:
+            T_keyframe_camera: [4, 4], in the keyframe of this frame.
+        """
         return float(se3.distance(self.T_keyframe_camera, T_keyframe_camera)[0])
 
     def agrees(
-        self, T_keyframe_camera: Array, by_color: Array, limits: FailureConfig, contradicted: bool
+        self, T_keyframe_camera: Array, T_color_only: Array, limits: FailureConfig, contradicted: bool
     ) -> bool:
-        """Whether color alone puts a frame where color and depth together do: both T_keyframe_camera, [4, 4].
+        """Whether color alone puts a frame where color and depth together do.
 
-        If the two images are of different times, or something moves before the camera, the answers differ by as
-        much as the camera moves. Those of a sound camera differ by a share of it; once the two have `contradicted`,
-        only SHARE_AFTER_CONTRADICTION of that share is allowed.
+        If the two images are of different times, or something moves in front of the camera, the answers differ by as
+        much as the camera moves. Those of a good camera differ by a share of it; once the two have contradicted each
+        other, only SHARE_AFTER_CONTRADICTION of that share is allowed.
+
+        Args:
+            T_keyframe_camera: [4, 4], by depth and color.
+            T_color_only: [4, 4], by color alone, in the same keyframe.
+            limits: how much they may differ.
+            contradicted: whether an earlier frame's answers differed by more.
         """
-        apart_m = float(se3.distance(T_keyframe_camera, by_color)[0])
-        way_m = max(self.way_m(T_keyframe_camera), self.way_m(by_color))
+        apart_m = float(se3.distance(T_keyframe_camera, T_color_only)[0])
+        translation_m = max(self.translation_m(T_keyframe_camera), self.translation_m(T_color_only))
         share = limits.max_contradiction_of_way * (SHARE_AFTER_CONTRADICTION if contradicted else 1.0)
-        return apart_m <= max(limits.max_contradiction_m, share * way_m)
+        return apart_m <= max(limits.max_contradiction_m, share * translation_m)
 
     def _information(self, result: Registration, sigma_m: float) -> Array:
-        """Of the pose in the keyframe: what the registration, this frame's pose and the way leave of it."""
+        """Of the pose in the keyframe: covariances of registration, of this frame's pose and of the translation add."""
         depth_m = max(float(np.median(self._reference.levels[-1].points[:, 2])), 0.1)
         covariance = _covariance(result.information)
         covariance += sigma_m**2 * np.diag([1.0, 1.0, 1.0, *[depth_m**-2.0] * 3])

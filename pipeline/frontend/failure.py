@@ -1,4 +1,4 @@
-"""What tells that a camera is lost, or that what it says cannot be believed.
+"""Signs that a camera is lost, or that its images cannot be used.
 
 A registration can end well and be wrong: two images that do not belong together make a compromise, a hand that moves
 with the camera takes the pose along, a foreign room has walls too. The tests here do not ask how well the images fit,
@@ -23,7 +23,10 @@ Image = NDArray[np.floating]
 
 
 class Reason(Enum):
-    """Why a frame has no pose; the values stand in the log. The first five are outcomes of the registration."""
+    """Why a frame has no pose, or only part of it was used; recorded in the log.
+
+    The first five are outcomes of the registration.
+    """
 
     NONE = ""
     LOW_OVERLAP = "low_overlap"
@@ -31,45 +34,53 @@ class Reason(Enum):
     RESIDUAL = "residual"
     JUMP = "jump"
     NO_DEPTH = "no_depth"
-    STUCK_DEPTH = "stuck_depth"
-    STUCK_COLOR = "stuck_color"
+    FROZEN_DEPTH = "stuck_depth"
+    FROZEN_COLOR = "stuck_color"
     OBSTRUCTED = "obstructed"
     CONTRADICTION = "contradiction"
     UNCONFIRMED = "unconfirmed"
 
 
-class StuckImages:
-    """Notices that one image of the camera has stopped while the other goes on.
+class FrozenImageDetector:
+    """Detects that one image of the camera has stopped while the other goes on.
 
     An image that is the same to the last bit as the one before it shows the place where it was taken first. That is
-    no harm while the camera stands still. So each stuck image is held against the other one at the time when it came
+    no harm while the camera stands still. So each frozen image is compared with what the other one was when it came
     first: as soon as that has changed, the two no longer belong together. Drivers do that under load: RedKitchen
     repeats one depth image in fifty.
     """
 
     def __init__(self, config: FailureConfig) -> None:
+        """Begin before the first frame.
+
+        Args:
+            config: what counts as the same and as changed.
+        """
         self.config = config
         self._before: Level | None = None
-        self._depth_came = self._color_came = np.zeros(
-            (0, 0), dtype=np.float32
-        )  # the other image then, coarse
+        # the other image, coarse, when each came first
+        self._gray_then = self._inverse_depth_then = np.zeros((0, 0), dtype=np.float32)
 
-    def look(self, pyramid: RgbdPyramid) -> Reason:
-        """Look at the next frame; STUCK_DEPTH, STUCK_COLOR or NONE."""
+    def update(self, pyramid: RgbdPyramid) -> Reason:
+        """Take the next frame; FROZEN_DEPTH, FROZEN_COLOR or NONE.
+
+        Args:
+            pyramid: its images.
+        """
         finest, coarsest = pyramid.levels[0], pyramid.levels[-1]
         before, self._before = self._before, finest
         same_depth = before is not None and self._same(finest.inverse_depth, before.inverse_depth)
         same_color = before is not None and self._same(finest.gray, before.gray)
         if not same_depth:
-            self._depth_came = _normalized(coarsest.gray)
+            self._gray_then = _normalized(coarsest.gray)
         if not same_color:
-            self._color_came = coarsest.inverse_depth
+            self._inverse_depth_then = coarsest.inverse_depth
         if same_depth:
-            changed = np.abs(_normalized(coarsest.gray) - self._depth_came) > self.config.stuck_gray_change
+            changed = np.abs(_normalized(coarsest.gray) - self._gray_then) > self.config.stuck_gray_change
             if changed.mean() > self.config.stuck_gray_share:
-                return Reason.STUCK_DEPTH
-        if same_color and _depth_changed(coarsest.inverse_depth, self._color_came, self.config):
-            return Reason.STUCK_COLOR
+                return Reason.FROZEN_DEPTH
+        if same_color and _depth_changed(coarsest.inverse_depth, self._inverse_depth_then, self.config):
+            return Reason.FROZEN_COLOR
         return Reason.NONE
 
     def _same(self, image: Image, before: Image) -> bool:
@@ -79,24 +90,29 @@ class StuckImages:
         return known > 0 and same >= self.config.stuck_share * known
 
 
-class Pace:
-    """How much time usually lies between two frames."""
+class FrameIntervals:
+    """How much time lies between frames."""
 
-    FRAMES = 50  # that tell what is usual
+    FRAMES = 50  # of which the median is taken
 
     def __init__(self) -> None:
         self._last_ns: int | None = None
         self._intervals_s: tuple[float, ...] = ()
 
-    def look(self, stamp_ns: int) -> None:
-        """Look at the stamp of the next frame."""
+    def update(self, stamp_ns: int) -> None:
+        """Take the stamp of the next frame.
+
+        Args:
+            stamp_ns: its time.
+        """
         if self._last_ns is not None:
             interval_s = (stamp_ns - self._last_ns) * 1e-9
             self._intervals_s = (*self._intervals_s[1 - self.FRAMES :], interval_s)
         self._last_ns = stamp_ns
 
-    def usual_s(self) -> float:
-        """Median of the last intervals; 0 before there is one."""
+    @property
+    def median_s(self) -> float:
+        """Median of the last intervals, seconds; 0 before there is one."""
         return float(np.median(self._intervals_s)) if self._intervals_s else 0.0
 
 
@@ -113,27 +129,41 @@ def _depth_changed(now: Image, then: Image, config: FailureConfig) -> bool:
 
 
 def saturated_share(level: Level) -> float:
-    """Share of pixels that are as dark or as bright as an image can be."""
+    """Share of pixels that are as dark or as bright as an image can be.
+
+    Args:
+        level: of a frame.
+    """
     return float(np.mean((level.gray <= 0.01) | (level.gray >= 0.99)))
 
 
 def has_enough_depth(pyramid: RgbdPyramid, config: RegistrationConfig) -> bool:
-    """Whether the coarsest image that a registration begins with has as many known depths as it needs."""
+    """Whether the coarsest image that a registration begins with has as many known depths as it needs.
+
+    Args:
+        pyramid: of the frame.
+        config: of the registration.
+    """
     level = pyramid.levels[min(len(config.iterations), len(pyramid.levels)) - 1]
     return int(np.count_nonzero(level.inverse_depth)) >= config.min_samples
 
 
-def intruders(
+def free_space_violations(
     level: Level, keyframe: Level, T_keyframe_camera: Array, config: FailureConfig
 ) -> tuple[int, int]:
-    """How many pixels of a view stand where a keyframe saw free space, and how many the keyframe could tell at all.
+    """How many pixels of a view are in space that a keyframe saw to be free, and how many it can judge at all.
 
-    In a rigid world a surface inside a keyframe's view is never nearer than what the keyframe saw there. A pixel
-    intrudes if its point is nearer than all that the keyframe measured in the 3x3 pixels around its projection, by
-    more than the gate. Surfaces that come in from the side are outside the keyframe's view: it cannot tell.
+    A pixel violates free space if its point is nearer than all that the keyframe measured in the 3x3 pixels around its
+    projection, by more than the gate. Surfaces that come in from the side are outside the keyframe's view.
 
     Args:
-        level, keyframe: one resolution of the view and the same of the keyframe. T_keyframe_camera: [4, 4].
+        level: one resolution of the view.
+        keyframe: the same of the keyframe.
+        T_keyframe_camera: [4, 4].
+        config: the gates.
+
+    Returns:
+        Number of violations, and number of pixels whose place the keyframe measured.
     """
     v, u = np.nonzero(level.inverse_depth)
     z = 1 / level.inverse_depth[v, u].astype(np.float64)
@@ -144,43 +174,67 @@ def intruders(
 
 
 @dataclass(frozen=True)
-class SeenFrom:
-    """A keyframe, coarse, and a view beside it: T_map_keyframe, T_keyframe_camera, [4, 4] each."""
+class Viewpoint:
+    """Where a view was taken, by a keyframe.
+
+    Attributes:
+        keyframe: the keyframe's coarsest image.
+        T_map_keyframe: [4, 4].
+        T_keyframe_camera: [4, 4], of the view.
+    """
 
     keyframe: Level
     T_map_keyframe: Array
     T_keyframe_camera: Array
 
 
-class Obstruction:
-    """Something before the camera: noticed when much of a view stands in space that was seen to be free.
+class OcclusionDetector:
+    """Detects an object in front of the camera: much of a view is in space that was seen to be free.
 
-    Every view is held against its keyframe and against the last clear view. That one was taken nearby: what appears
-    from one frame to the next is inside it, where the keyframe, from elsewhere, cannot judge what is near the lens. The
-    keyframe is older: it also knows what came in slowly.
+    Every view is compared with its keyframe and with the last view without an object. That one was taken nearby: what
+    appears from one frame to the next is inside it, where the keyframe, from elsewhere, cannot judge what is near the
+    lens. The keyframe is older: it also shows what came in slowly.
     """
 
     def __init__(self, config: FailureConfig) -> None:
+        """Begin without an object.
+
+        Args:
+            config: gates and shares.
+        """
         self.config = config
-        self.standing = False
-        self._clear: tuple[Level, Array] | None = None  # the last view without, coarse, and its T_map_camera
+        self.active = False
+        self._unoccluded: tuple[Level, Array] | None = (
+            None  # the last such view, coarse, and its T_map_camera
+        )
 
-    def look(self, view: Level, seen: SeenFrom) -> None:
-        """Look at the next view that was tracked. What stands there is gone only when most of a view can be judged."""
-        intruded, told = self.intruded(view, seen)
-        if intruded:
-            self.standing = True
-        elif told >= self.config.min_told * int(np.count_nonzero(view.inverse_depth)):
-            self.standing = False
-        if not self.standing:
-            self._clear = view, seen.T_map_keyframe @ seen.T_keyframe_camera
+    def update(self, view: Level, viewpoint: Viewpoint) -> None:
+        """Take the next view that was tracked. An object is gone only when most of a view can be judged.
 
-    def intruded(self, view: Level, seen: SeenFrom) -> tuple[bool, int]:
-        """Whether too much of a view stands in free space; second, how many of its pixels could be judged."""
-        judged = [intruders(view, seen.keyframe, seen.T_keyframe_camera, self.config)]
-        if self._clear is not None:
-            clear, T_map_clear = self._clear
-            T_clear_camera = se3.inverse(T_map_clear) @ seen.T_map_keyframe @ seen.T_keyframe_camera
-            judged.append(intruders(view, clear, T_clear_camera, self.config))
-        intruded = any(intruding > self.config.max_intruders * told for intruding, told in judged)
-        return intruded, max(told for _, told in judged)
+        Args:
+            view: its coarsest image.
+            viewpoint: where it was tracked.
+        """
+        occluded, visible = self.judge(view, viewpoint)
+        if occluded:
+            self.active = True
+        elif visible >= self.config.min_told * int(np.count_nonzero(view.inverse_depth)):
+            self.active = False
+        if not self.active:
+            self._unoccluded = view, viewpoint.T_map_keyframe @ viewpoint.T_keyframe_camera
+
+    def judge(self, view: Level, viewpoint: Viewpoint) -> tuple[bool, int]:
+        """Whether too much of a view is in free space, and how many of its pixels could be judged.
+
+        Args:
+            view: its coarsest image.
+            viewpoint: where it was taken.
+        """
+        T_keyframe_camera = viewpoint.T_keyframe_camera
+        found = [free_space_violations(view, viewpoint.keyframe, T_keyframe_camera, self.config)]
+        if self._unoccluded is not None:
+            before, T_map_before = self._unoccluded
+            T_before_camera = se3.inverse(T_map_before) @ viewpoint.T_map_keyframe @ T_keyframe_camera
+            found.append(free_space_violations(view, before, T_before_camera, self.config))
+        occluded = any(violations > self.config.max_intruders * visible for violations, visible in found)
+        return occluded, max(visible for _, visible in found)

@@ -1,38 +1,41 @@
-"""Where a lost camera may be: its features against those of all keyframes."""
+"""Relocalization: where a lost camera is, by its features and those of all keyframes.
+
+A place counts only when later frames are tracked from there: one image can be mistaken.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.config.frontend import RelocalizationConfig
-from duagc.pipeline.registration import RgbdPyramid
-from duagc.pipeline.registration.features import Features, extract_from_gray, matches
+from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
+from duagc.pipeline.frontend.pose_checks import PLAUSIBLE, verify
+from duagc.pipeline.frontend.stable_registration import register_until_stable
+from duagc.pipeline.frontend.tracking_state import Candidate, CurrentFrame, TrackingState
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration.features import Features, matches
 from duagc.pipeline.registration.geometric_verification import motion_from_features
 
 Array = NDArray[np.float64]
 
 
-def features_of(pyramid: RgbdPyramid, config: RelocalizationConfig) -> Features:
-    """The strongest features of a view, from the finest image that is not wider than `max_width_px`."""
-    narrow = [level for level in pyramid.levels if level.camera.width <= config.max_width_px]
-    level = narrow[0] if narrow else pyramid.levels[-1]
-    gray = np.rint(np.clip(level.gray, 0, 1) * 255).astype(np.uint8)
-    known = level.inverse_depth > 0
-    depth_m = np.where(known, 1 / np.where(known, level.inverse_depth, 1), 0).astype(np.float32)
-    return extract_from_gray(gray, depth_m, level.camera, config.features)
-
-
-def guesses(
+def place_candidates(
     view: Features, keyframes: Sequence[Features], frame_index: int, config: RelocalizationConfig
 ) -> Iterator[tuple[int, Array]]:
-    """Keyframes that the view may show, the best first, each with the motion that its matched features agree on.
+    """Keyframes that a view may show, the best first, each with the motion that its matched features agree on.
 
     Args:
-        view: features of the lost view. keyframes: of every keyframe. frame_index: names the random draws.
+        view: features of the lost view.
+        keyframes: features of every keyframe.
+        frame_index: names the random draws.
+        config: how many are tried, and what they must share.
+
     Yields:
         Keyframe index and T_keyframe_camera [4, 4].
     """
@@ -50,3 +53,117 @@ def guesses(
         found = motion_from_features(keyframes[k], view, config, rng)
         if found.T_first_second is not None and found.accepted:
             yield k, found.T_first_second
+
+
+@dataclass(frozen=True)
+class _Unconfirmed:
+    """A place where a lost camera may be, as of a time, and how many later frames agreed."""
+
+    candidate: Candidate
+    stamp_ns: int
+    agreed: int
+
+
+class Relocalizer:
+    """Finds a camera that has been lost for long: when one frame, and then as many as must confirm it, agree."""
+
+    def __init__(self) -> None:
+        self._unconfirmed: _Unconfirmed | None = None
+
+    def reset(self) -> None:
+        """Forget the place that waits for confirmation."""
+        self._unconfirmed = None
+
+    def locate(
+        self, state: TrackingState, frame: CurrentFrame, register_nearby: Callable[[], Candidate | Reason]
+    ) -> Candidate | Reason:
+        """Where a frame is, or why that is not known.
+
+        Args:
+            state: what the tracker knows.
+            frame: the current frame.
+            register_nearby: looks where the camera was last.
+        """
+        if self._unconfirmed is not None:
+            confirmed = self._confirm(state, frame)
+            if confirmed is not None:
+                return confirmed
+        nearby = register_nearby()
+        place = nearby if isinstance(nearby, Candidate) else find_place(state, frame)
+        if place is None:
+            return nearby if isinstance(nearby, Reason) else Reason.UNCONFIRMED
+        if state.config.tracking.relocalization.confirmations == 0:
+            return place
+        self._unconfirmed = _Unconfirmed(place, frame.stamp_ns, 0)
+        return Reason.UNCONFIRMED
+
+    def _confirm(self, state: TrackingState, frame: CurrentFrame) -> Candidate | Reason | None:
+        """Track on from a place that was found; None if the frame does not agree with it."""
+        assert self._unconfirmed is not None
+        before, self._unconfirmed = self._unconfirmed, None
+        index, last = before.candidate.keyframe_index, before.candidate.result.T_reference_target
+        tracking = state.config.tracking
+        result = register_until_stable(
+            state.keyframes[index], frame.pyramid, last, tracking, tracking.registration
+        )
+        candidate = Candidate(index, result)
+        moved_m, _ = se3.distance(last, result.T_reference_target)
+        reach_m = tracking.failure.max_speed_m_s * (frame.stamp_ns - before.stamp_ns) * 1e-9
+        if moved_m > reach_m or isinstance(verify(PLAUSIBLE, state, frame, candidate), Reason):
+            return None
+        if before.agreed + 1 >= tracking.relocalization.confirmations:
+            return candidate
+        self._unconfirmed = _Unconfirmed(candidate, frame.stamp_ns, before.agreed + 1)
+        return Reason.UNCONFIRMED
+
+
+def find_place(state: TrackingState, frame: CurrentFrame) -> Candidate | None:
+    """The first keyframe, in the order of matching features, that a frame can be registered to; None if there is none.
+
+    Args:
+        state: what the tracker knows.
+        frame: the current frame.
+    """
+    tracking = state.config.tracking
+    features = [keyframe.features for keyframe in state.keyframes]
+    for index, guess in place_candidates(
+        frame.features, features, frame.frame_index, tracking.relocalization
+    ):
+        result = register_until_stable(
+            state.keyframes[index], frame.pyramid, guess, tracking, tracking.registration
+        )
+        found = verify(PLAUSIBLE, state, frame, Candidate(index, result))
+        if isinstance(found, Candidate):
+            return by_latest_keyframe(state, frame, found)
+    return None
+
+
+def by_latest_keyframe(state: TrackingState, frame: CurrentFrame, found: Candidate) -> Candidate | None:
+    """A place that was found, by the latest keyframe that shows enough of it; None if one contradicts.
+
+    Between keyframes far apart in time lies the drift of tracking. The path goes on from its end: by an early keyframe
+    the camera would jump by all of that drift (5 cm in RedKitchen). A later keyframe whose pose is not plausible, but
+    that has the camera elsewhere, leaves it open where the camera is.
+
+    Args:
+        state: what the tracker knows.
+        frame: the current frame.
+        found: the place.
+    """
+    tracking, limits = state.config.tracking, state.config.tracking.relocalization
+    T_map_camera = state.keyframes[found.keyframe_index].T_map_keyframe @ found.result.T_reference_target
+    tried = 0
+    for keyframe in reversed(state.keyframes[found.keyframe_index + 1 :]):
+        guess = se3.inverse(keyframe.T_map_keyframe) @ T_map_camera
+        if predicted_overlap(keyframe.reference, frame.pyramid, guess) < limits.min_overlap:
+            continue
+        result = register_until_stable(keyframe, frame.pyramid, guess, tracking, tracking.registration)
+        later = verify(PLAUSIBLE, state, frame, Candidate(keyframe.keyframe_index, result))
+        if isinstance(later, Candidate):
+            return later
+        if result.ok and se3.distance(guess, result.T_reference_target)[0] > limits.max_contradiction_m:
+            return None
+        tried += 1
+        if tried == limits.candidates:
+            break
+    return found

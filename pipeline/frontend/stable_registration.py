@@ -13,11 +13,11 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Outcome, Registration, RegistrationConfig, RgbdPyramid, register
 
 Array = NDArray[np.float64]
-SETTLING_ROUNDS = 3
-SETTLED_M, SETTLED_RAD = 0.01, 0.01  # a registration that moves less from its own answer has settled
+STABILITY_ROUNDS = 3
+STABLE_M, STABLE_RAD = 0.01, 0.01  # a registration that moves less from its own answer is stable
 
 
-def settle(
+def register_until_stable(
     keyframe: TrackedKeyframe,
     pyramid: RgbdPyramid,
     guess: Array,
@@ -36,13 +36,13 @@ def settle(
     if gain != 1:
         pyramid = pyramid.with_exposure(gain, offset)
     result = register(keyframe.reference, pyramid, guess, first)
-    for _ in range(SETTLING_ROUNDS):
+    for _ in range(STABILITY_ROUNDS):
         if not result.ok:
             break
         before = result.T_reference_target
         result = register(keyframe.reference, pyramid, before, config.registration)
         moved_m, turned_rad = se3.distance(before, result.T_reference_target)
-        if moved_m < SETTLED_M and turned_rad < SETTLED_RAD:
+        if moved_m < STABLE_M and turned_rad < STABLE_RAD:
             return _with_exposure(result, gain, offset)
     return replace(result, outcome=Outcome.JUMP) if result.ok else result
 

@@ -1,4 +1,4 @@
-"""What tracking makes of a log: where every frame was, and its keyframes."""
+"""Results of tracking: where every frame was, and the keyframes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 class Status(Enum):
-    """Whether a frame's pose may be used; the values stand in the log."""
+    """Whether a frame's pose may be used; the values are in the log."""
 
     OK = "ok"
     LOST = "lost"
@@ -29,9 +29,17 @@ class Status(Enum):
 class TrackedFrame:
     """Where a frame was, relative to a keyframe.
 
-    keyframe_index: the keyframe that it hangs on. T_keyframe_camera: [4, 4]; the last known one if lost.
-    information: [6, 6] of T_keyframe_camera, right tangent (translation m, rotation rad); zero if lost. reason: why
-    it is lost, or why only its color or only its depth was used.
+    Attributes:
+        frame_index: in the log.
+        stamp_ns: its time.
+        keyframe_index: the keyframe that it is anchored to.
+        T_keyframe_camera: [4, 4]; the last known one if lost.
+        information: [6, 6] of T_keyframe_camera, right tangent (translation m, rotation rad); zero if lost.
+        status: whether the pose may be used.
+        overlap: share of the keyframe's samples that it saw on the same surface.
+        rms_depth_m: weighted depth residual.
+        rms_gray: weighted gray residual.
+        reason: why it is lost, or why only its color or only its depth was used.
     """
 
     frame_index: int
@@ -49,31 +57,50 @@ class TrackedFrame:
     def by(
         frame_index: int,
         stamp_ns: int,
+        *,
         keyframe_index: int,
         result: Registration,
         status: Status,
         reason: Reason = Reason.NONE,
     ) -> TrackedFrame:
-        """A frame that was registered to a keyframe."""
+        """A frame that was registered to a keyframe.
+
+        Args:
+            frame_index: in the log.
+            stamp_ns: its time.
+            keyframe_index: the keyframe.
+            result: the registration.
+            status: whether the camera was lost before.
+            reason: why only its color or only its depth was used.
+        """
         return TrackedFrame(
-            frame_index,
-            stamp_ns,
-            keyframe_index,
-            result.T_reference_target,
-            result.information,
-            status,
-            result.overlap,
-            result.rms_depth_m,
-            result.rms_gray,
-            reason,
+            frame_index=frame_index,
+            stamp_ns=stamp_ns,
+            keyframe_index=keyframe_index,
+            T_keyframe_camera=result.T_reference_target,
+            information=result.information,
+            status=status,
+            overlap=result.overlap,
+            rms_depth_m=result.rms_depth_m,
+            rms_gray=result.rms_gray,
+            reason=reason,
         )
 
 
 @dataclass(frozen=True)
 class TrackedKeyframe:
-    """A keyframe as it was tracked. exposure: (gain, offset) of its gray values relative to keyframe 0.
+    """A keyframe as it was tracked.
 
-    features: by which a lost camera is found here. coarsest: the coarsest image of its pyramid.
+    Attributes:
+        keyframe_index: in the order of time.
+        frame_index: of its frame.
+        stamp_ns: time of its frame.
+        previous_index: the keyframe that it was tracked from; -1 of the first.
+        T_map_keyframe: [4, 4], as tracked.
+        reference: samples that frames are registered to.
+        features: by which a lost camera is relocalized here.
+        coarsest: the coarsest image of its pyramid.
+        exposure: (gain, offset) of its gray values relative to keyframe 0.
     """
 
     keyframe_index: int

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import back_project
+from duagc.pipeline.registration.pyramid import RgbdPyramid
 
 Array = NDArray[np.float64]
 Descriptors = NDArray[np.uint8]
@@ -71,6 +72,22 @@ def extract_from_gray(
     z = z[order]
     points = back_project(camera, u[order], v[order], z)
     return Features(root_sift(sift[order]), points.astype(np.float32))
+
+
+def extract_from_pyramid(pyramid: RgbdPyramid, max_width_px: int, most: int) -> Features:
+    """`extract` from the finest image of a pyramid that is not wider than a limit, or the coarsest if all are.
+
+    Args:
+        pyramid: of the view.
+        max_width_px: the limit.
+        most: number of features kept.
+    """
+    narrow = [level for level in pyramid.levels if level.camera.width <= max_width_px]
+    level = narrow[0] if narrow else pyramid.levels[-1]
+    gray = np.rint(np.clip(level.gray, 0, 1) * 255).astype(np.uint8)
+    known = level.inverse_depth > 0
+    depth_m = np.where(known, 1 / np.where(known, level.inverse_depth, 1), 0).astype(np.float32)
+    return extract_from_gray(gray, depth_m, level.camera, most)
 
 
 def root_sift(sift: NDArray[np.float32]) -> Descriptors:

@@ -12,7 +12,7 @@ from duagc.pipeline.frontend import bundle, loops
 from duagc.pipeline.frontend.bundle import Neighborhood, optimize
 from duagc.pipeline.frontend.keyframe_graph import KeyframePair, refine
 from duagc.pipeline.frontend.loops import find_loops
-from duagc.pipeline.frontend.relocalization import features_of
+from duagc.pipeline.frontend.tracking_state import features_of
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.registration import Level, Reference, RegistrationConfig, RgbdPyramid, register

@@ -7,15 +7,16 @@ import pytest
 
 from duagc.converters.simulate.team import camera_of
 from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.experiments import disturbances as d
+from duagc.pipeline.experiments.disturbances import Shot, Undisturbed, filmed
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.relocalization import features_of
+from duagc.pipeline.frontend.relocalization import by_latest_keyframe
 from duagc.pipeline.frontend.tracked import Status
-from duagc.pipeline.frontend.tracking import Tracker, _Found
+from duagc.pipeline.frontend.tracking import Tracker
+from duagc.pipeline.frontend.tracking_state import Candidate, CurrentFrame
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import RgbdPyramid, register
-from tests.frontend import disturbances as d
-from tests.frontend.disturbances import Shot, Undisturbed
-from tests.frontend.test_lost import CONFIG, filmed
+from tests.frontend.test_lost import CONFIG
 
 CAMERA = camera_of((240, 180))
 START = 45
@@ -28,13 +29,13 @@ def pyramid_of(shot: Shot) -> RgbdPyramid:
 @pytest.fixture(scope="module")
 def run() -> Undisturbed:
     """A run that needs no more frames than these."""
-    return Undisturbed(Tracker(CAMERA, CONFIG), filmed(0, START + 8), (START,))
+    return Undisturbed(Tracker(CAMERA, CONFIG), filmed(0, START + 8, CAMERA), (START,))
 
 
 @pytest.fixture(scope="module")
 def misfit() -> Undisturbed:
     """Depth that does not fit the color, by two pixels: what a poor calibration does."""
-    shots = [replace(shot, depth=np.roll(shot.depth, 2, axis=1)) for shot in filmed(0, START + 8)]
+    shots = [replace(shot, depth=np.roll(shot.depth, 2, axis=1)) for shot in filmed(0, START + 8, CAMERA)]
     return Undisturbed(Tracker(CAMERA, CONFIG), shots, (START,))
 
 
@@ -75,8 +76,9 @@ def test_color_alone_says_how_little_it_knows(run: Undisturbed) -> None:
 
 def test_color_alone_knows_no_more_than_the_frame_it_went_on_from(run: Undisturbed) -> None:
     tracker, shot = run.tracker(START), run.shots[START]
-    assert tracker._sound is not None
-    tracker._sound = replace(tracker._sound, information=1e2 * np.eye(6))  # 10 cm, 0.1 rad
+    last_good = tracker.state.last_good
+    assert last_good is not None
+    tracker.state.last_good = replace(last_good, information=1e2 * np.eye(6))  # 10 cm, 0.1 rad
     frame, _ = d.track(tracker, replace(shot, depth=np.zeros_like(shot.depth)))
     covariance = np.linalg.inv(frame.information)
     assert np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[0]) > 0.099
@@ -108,8 +110,7 @@ def test_what_looks_unlike_is_followed_only_where_it_was_expected(run: Undisturb
     assert [frame.status for frame in found] == [Status.OK, Status.OK, Status.OK, Status.LOST]
     all_of_it = {"tracking": {"strides": (2, 1, 1, 1), "failure": {"min_overlap_unlike": 1.0}}}
     for shot, status in ((here, Status.OK), (unlike(here), Status.LOST)):
-        tracker = run.tracker(START)
-        tracker.config = FrontendConfig.model_validate(all_of_it)
+        tracker = run.tracker(START, FrontendConfig.model_validate(all_of_it))
         assert d.track(tracker, shot)[0].status is status
 
 
@@ -118,19 +119,19 @@ def _drifted(run: Undisturbed) -> Tracker:
     tracker = run.tracker(START)
     drift = se3.exp(np.array([0.04, 0, 0, 0, 0, 0]))
     first, *later = tracker.keyframes
-    tracker.keyframes = [first, *(replace(k, T_map_keyframe=drift @ k.T_map_keyframe) for k in later)]
+    tracker.state.keyframes = [first, *(replace(k, T_map_keyframe=drift @ k.T_map_keyframe) for k in later)]
     return tracker
 
 
-def _found_by_the_first(run: Undisturbed, tracker: Tracker) -> tuple[_Found, _Found | None]:
+def _found_by_the_first(run: Undisturbed, tracker: Tracker) -> tuple[Candidate, Candidate | None]:
     """A place that the first keyframe shows, and what is made of it."""
     shot = run.shots[START]
     pyramid = pyramid_of(shot)
     result = register(tracker.keyframes[0].reference, pyramid, run.poses[START])
     assert result.ok
-    place = _Found(0, result)
-    view = features_of(pyramid, CONFIG.tracking.relocalization)
-    return place, tracker._by_latest(shot.stamp_ns, pyramid, view, place)
+    place = Candidate(0, result)
+    frame = CurrentFrame(shot.index, shot.stamp_ns, pyramid, CONFIG.tracking.relocalization)
+    return place, by_latest_keyframe(tracker.state, frame, place)
 
 
 def test_a_place_counts_from_the_latest_keyframe_that_shows_it(run: Undisturbed) -> None:
@@ -149,7 +150,7 @@ def test_a_later_keyframe_that_has_the_camera_elsewhere_contradicts(run: Undistu
         none = replace(
             first.features, descriptors=first.features.descriptors[:0], points=first.features.points[:0]
         )
-        tracker.keyframes = [first, *(replace(k, features=none) for k in later)]
-        tracker._lost, tracker._stamp_ns = True, run.shots[START].stamp_ns - 10**9
+        tracker.state.keyframes = [first, *(replace(k, features=none) for k in later)]
+        tracker.state.lost, tracker.state.stamp_ns = True, run.shots[START].stamp_ns - 10**9
         place, found = _found_by_the_first(run, tracker)
         assert found == (place if agrees else None)

@@ -11,22 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from duagc.converters.simulate.render import bake
-from duagc.converters.simulate.render.renderer import Renderer
-from duagc.converters.simulate.scenes.catalog import build
 from duagc.converters.simulate.team import camera_of
-from duagc.converters.simulate.trajectories import loops
 from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
-from duagc.pipeline.frontend.failure import Reason, StuckImages, intruders
+from duagc.pipeline.experiments import disturbances as d
+from duagc.pipeline.experiments.disturbances import Row, Shot, Undisturbed
+from duagc.pipeline.frontend.failure import FrozenImageDetector, Reason, free_space_violations
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import open_rgbd
 from duagc.pipeline.registration import RgbdPyramid
-from tests.frontend import disturbances as d
-from tests.frontend.disturbances import Row, Shot, Undisturbed
 
-FRAME_NS = 33_333_333
 CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)))
 CAMERA = camera_of((240, 180))
 STARTS = (17, 34, 50)
@@ -34,23 +29,14 @@ FRAMES = 95
 RED_KITCHEN = Path(__file__).parents[2] / "recordings" / "redkitchen"
 
 
-def filmed(seed: int, frames: int) -> list[Shot]:
-    """Frames of a robot in a simulated room, 22 mm apart."""
-    room = build("room", seed)
-    renderer = Renderer(room, bake.bake(room, 0.008), CAMERA)
-    way = loops.plan(room, 1, 160, 0.6, CAMERA)[0]
-    views = [renderer.render(T) for T in way[:frames]]
-    return [Shot(k, k * FRAME_NS, view.color, view.depth.astype(np.float32)) for k, view in enumerate(views)]
-
-
 @pytest.fixture(scope="module")
 def run() -> Undisturbed:
-    return Undisturbed(Tracker(CAMERA, CONFIG), filmed(0, FRAMES), STARTS)
+    return Undisturbed(Tracker(CAMERA, CONFIG), d.filmed(0, FRAMES, CAMERA), STARTS)
 
 
 @pytest.fixture(scope="module")
 def other_room() -> list[Shot]:
-    return filmed(5, 30)
+    return d.filmed(5, 30, CAMERA)
 
 
 def during(rows: Sequence[Row]) -> list[Row]:
@@ -107,13 +93,13 @@ def test_what_a_hand_leaves_must_tell_the_position(run: Undisturbed) -> None:
 
 def test_a_hand_outside_the_keyframe_s_view_is_noticed(run: Undisturbed) -> None:
     """Near things are soon beside what an old keyframe saw: the frame before must tell, before they become one."""
-    tracker = run.tracker(STARTS[0])
-    tracker.config = FrontendConfig.model_validate(
+    config = FrontendConfig.model_validate(
         {"tracking": {"strides": (2, 1, 1, 1)}, "keyframes": {"min_overlap": 1.0}}
     )
+    tracker = run.tracker(STARTS[0], config)
     *before, current = tracker.keyframes
     blind = replace(current.coarsest, inverse_depth=np.zeros_like(current.coarsest.inverse_depth))
-    tracker.keyframes = [*before, replace(current, coarsest=blind)]
+    tracker.state.keyframes = [*before, replace(current, coarsest=blind)]
     sound, *behind = list(d.hand(run.shots[STARTS[0] : STARTS[0] + 4], np.random.default_rng(0)))
     frame, _ = d.track(tracker, run.shots[sound.index])
     assert frame.keyframe_index == len(before) + 1  # every sound frame becomes a keyframe here
@@ -142,7 +128,7 @@ def test_stuck_depth_is_noticed_and_the_color_goes_on(run: Undisturbed, start: i
     rows = run.disturbed(start, d.frozen)
     assert not any(row.wrong for row in rows)
     for row in during(rows)[1:]:  # the first of them is in fact the right one
-        assert row.frame.reason is Reason.STUCK_DEPTH
+        assert row.frame.reason is Reason.FROZEN_DEPTH
     assert sum(row.good for row in during(rows)) >= 5
     assert_found_again(rows, within=4)
 
@@ -161,7 +147,7 @@ def test_without_depth_the_camera_goes_on_for_a_while(run: Undisturbed, start: i
 def test_stuck_color_is_noticed(run: Undisturbed, start: int) -> None:
     rows = run.disturbed(start, d.frozen_color)
     assert not any(row.wrong for row in rows)
-    assert all(row.frame.reason is Reason.STUCK_COLOR for row in during(rows)[8:])
+    assert all(row.frame.reason is Reason.FROZEN_COLOR for row in during(rows)[8:])
     assert_found_again(rows, within=4)
 
 
@@ -208,8 +194,8 @@ def test_late_stamps_do_not_throw_the_prediction(run: Undisturbed) -> None:
     shots = run.shots[STARTS[0] : STARTS[0] + 3]
     for shot, later_ns in zip(shots[:2], (30_000_000, 0), strict=True):
         d.track(tracker, replace(shot, stamp_ns=shot.stamp_ns + later_ns))
-    predicted, _ = tracker._predicted(shots[2].stamp_ns)
-    T_map_keyframe = tracker.keyframes[tracker._current].T_map_keyframe
+    predicted = tracker.state.predict(shots[2].stamp_ns).T_keyframe_camera
+    T_map_keyframe = tracker.state.keyframe.T_map_keyframe
     expected = run.poses[shots[2].index]
     assert se3.distance(T_map_keyframe @ predicted, expected)[0] < 0.05
 
@@ -228,7 +214,7 @@ def test_a_covered_beginning_is_waited_out(run: Undisturbed) -> None:
 
 def test_a_standing_camera_is_not_stuck(run: Undisturbed) -> None:
     """Without noise the images of a camera at rest repeat bit by bit, both or one of them."""
-    watch = StuckImages(CONFIG.tracking.failure)
+    watch = FrozenImageDetector(CONFIG.tracking.failure)
     rng = np.random.default_rng(0)
     shot = run.shots[0]
     for k in range(6):
@@ -238,7 +224,7 @@ def test_a_standing_camera_is_not_stuck(run: Undisturbed) -> None:
             color = color + np.float32(0.01) * rng.standard_normal(color.shape, dtype=np.float32)
         if k in (4, 5):
             depth = depth * (1 + np.float32(0.003) * rng.standard_normal(depth.shape, dtype=np.float32))
-        assert watch.look(RgbdPyramid.build(color, depth, CAMERA, 4)) is Reason.NONE
+        assert watch.update(RgbdPyramid.build(color, depth, CAMERA, 4)) is Reason.NONE
 
 
 def test_intruders_are_what_stands_in_free_space(run: Undisturbed) -> None:
@@ -248,12 +234,14 @@ def test_intruders_are_what_stands_in_free_space(run: Undisturbed) -> None:
         for s in (run.shots[0], run.shots[6])
     )
     T_one_other = se3.inverse(run.poses[0]) @ run.poses[6]
-    intruding, told = intruders(other, one, T_one_other, limits)
+    intruding, told = free_space_violations(other, one, T_one_other, limits)
     assert told > 0.7 * other.inverse_depth.size
     assert intruding < 0.01 * told
     near = other.inverse_depth.copy()
     near[:, : near.shape[1] // 3] = 1 / 0.4
-    intruding, told = intruders(type(other)(other.camera, other.gray, near), one, T_one_other, limits)
+    intruding, told = free_space_violations(
+        type(other)(other.camera, other.gray, near), one, T_one_other, limits
+    )
     assert intruding > 0.2 * told
 
 

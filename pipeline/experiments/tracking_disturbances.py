@@ -1,6 +1,6 @@
-"""Every disturbance from many places of a log: the table of docs/results/relocalization.md. No test; it takes minutes.
+"""Tracking under every disturbance from many places of a log; it takes minutes.
 
-python -m tests.frontend.sweep_disturbances recordings/redkitchen/alpha.mcap --every 20
+python -m duagc.pipeline.experiments.tracking_disturbances recordings/redkitchen/alpha.mcap --every 20
 """
 
 import argparse
@@ -9,19 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
+from duagc.converters.simulate.team import camera_of
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.evaluation import groundtruth
 from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.experiments import disturbances as d
+from duagc.pipeline.experiments.disturbances import Row, Shot, Undisturbed
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import Recording, open_rgbd
-from tests.frontend import disturbances as d
-from tests.frontend.disturbances import Row, Shot, Undisturbed
-from tests.frontend.test_lost import filmed
 
+FILMED = camera_of((240, 180))  # of the foreign room
 FRAMES = 50  # of a trial
-BEFORE = 17  # frames before a disturbance, half a second, that a trial is laid on the true poses by
+BEFORE = 17  # frames before a disturbance, half a second, by which a trial is aligned to the true poses
 
 
 def main() -> None:
@@ -39,13 +40,14 @@ def main() -> None:
     run = Undisturbed(Tracker(camera, FrontendConfig()), shots, starts)
     lost = sum(frame.status is Status.LOST for frame in run.frames)
     print(f"{len(shots)} frames, {lost} lost undisturbed; {len(starts)} places")
-    head = "disturbance       good while disturbed  wrong  worst mm  found again after  not found"
+    head = "disturbance       good while disturbed  wrong  worst mm  relocalized after  not found"
     print(f"{head}  worst mm from truth  undisturbed" if truth else head)
-    disturbances = d.further() if arguments.further else d.every(d.resized(filmed(5, 30), camera))
+    disturbances = d.further() if arguments.further else d.every(d.resized(d.filmed(5, 30, FILMED), camera))
     for disturbance in disturbances:
         rows = [run.disturbed(start, disturbance, FRAMES) for start in starts]
         print(
-            f"{disturbance.__name__:18}{_summary(rows)}{_beside_truth(run, truth, starts, rows)}", flush=True
+            f"{disturbance.__name__:18}{_summary(rows)}{_errors_to_truth(run, truth, starts, rows)}",
+            flush=True,
         )
 
 
@@ -70,22 +72,24 @@ def _true_poses(log: Path, shots: Sequence[Shot]) -> dict[int, np.ndarray]:
     return {shot.index: poses[shot.stamp_ns] for shot in shots if shot.stamp_ns in poses}
 
 
-def _beside_truth(
+def _errors_to_truth(
     run: Undisturbed, truth: dict[int, np.ndarray], starts: Sequence[int], trials: Sequence[Sequence[Row]]
 ) -> str:
     """Largest error of good poses, mm, and that of the undisturbed run in the same frames.
 
-    By the true poses, relative to the half second before the disturbance: what tracking erred from the beginning of
-    the log to there is no error of what came after.
+    By the true poses, relative to the half second before the disturbance: the drift from the beginning of the log to
+    there is no error of what came after.
     """
     disturbed, undisturbed = [0.0], [0.0]
     for start, rows in zip(starts, trials, strict=True):
         before = [k for k in range(start - BEFORE, start) if k in truth]
         if not before:
             continue
-        # mean of the motions that lay the map on the truth, in the tangent of the last of them
-        laid = [truth[k] @ se3.inverse(run.poses[k]) for k in before]
-        T_world_map = laid[-1] @ se3.exp(np.mean([se3.log(se3.inverse(laid[-1]) @ T) for T in laid], axis=0))
+        # mean of the motions that align the map to the truth, in the tangent of the last of them
+        aligned = [truth[k] @ se3.inverse(run.poses[k]) for k in before]
+        T_world_map = aligned[-1] @ se3.exp(
+            np.mean([se3.log(se3.inverse(aligned[-1]) @ T) for T in aligned], axis=0)
+        )
         for row in rows:
             k = row.shot.index
             if k in truth and row.good and not row.shot.foreign:

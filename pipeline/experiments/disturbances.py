@@ -1,8 +1,7 @@
-"""What can happen to a camera, made of sound frames: for the tests of tracking."""
+"""Disturbances of a camera, applied to undisturbed frames: for tests and experiments on tracking."""
 
 from __future__ import annotations
 
-import copy
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -11,20 +10,32 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.converters.simulate import bake, trajectories
+from duagc.converters.simulate.render import Renderer
+from duagc.converters.simulate.scene_settings import build
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 
+FRAME_NS = 33_333_333  # between simulated frames
 WRONG_M, WRONG_RAD = 0.05, np.deg2rad(3.0)
 """A pose called good that is farther than this from that of the undisturbed run is wrong."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One frame: color uint8 [h, w, 3], depth float32 [h, w] m. disturbed: not what the camera saw. foreign: of
-    another place, so that any pose is wrong."""
+    """One frame.
+
+    Attributes:
+        index: in the log.
+        stamp_ns: its time.
+        color: uint8 [h, w, 3].
+        depth: float32 [h, w], meters, 0 = unknown.
+        disturbed: whether it is not what the camera saw.
+        foreign: whether it shows another place, so that any pose is wrong.
+    """
 
     index: int
     stamp_ns: int
@@ -91,7 +102,10 @@ def foreign(other: Sequence[Shot]) -> Callable[[Sequence[Shot], np.random.Genera
 @first(30)
 def mirrored(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
     """For 30 frames the images are those of the room in a mirror: another place that looks much like this one."""
-    color, depth = (np.ascontiguousarray(a[:, ::-1]) for a in (shots[k].color, shots[k].depth))
+    color, depth = (
+        np.ascontiguousarray(shots[k].color[:, ::-1]),
+        np.ascontiguousarray(shots[k].depth[:, ::-1]),
+    )
     return replace(shots[k], color=color, depth=depth, foreign=True)
 
 
@@ -102,13 +116,13 @@ def dropped(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
 
 @first(20)
 def frozen(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
-    """For 20 frames the depth image is stuck while the color moves on."""
+    """For 20 frames the depth image is frozen while the color goes on."""
     return replace(shots[k], depth=shots[0].depth)
 
 
 @first(20)
 def frozen_color(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
-    """For 20 frames the color image is stuck while the depth moves on."""
+    """For 20 frames the color image is frozen while the depth goes on."""
     return replace(shots[k], color=shots[0].color)
 
 
@@ -139,7 +153,7 @@ def passer(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
     """In 30 frames something patterned, half as wide as the view and 1 m away, crosses it from left to right."""
     h, w = shots[0].depth.shape
     pattern = rng.integers(20, 236, (h // 16 + 1, w // 32 + 1, 3), dtype=np.uint8)
-    pattern = cv2.resize(pattern, (w // 2, h), interpolation=cv2.INTER_LINEAR)
+    pattern = np.asarray(cv2.resize(pattern, (w // 2, h), interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
     for k, shot in enumerate(shots):
         if k >= 30:
             yield shot
@@ -181,13 +195,13 @@ def late_depth(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
 
 @first(20)
 def noisy_stuck(k: int, shots: Sequence[Shot], rng: np.random.Generator) -> Shot:
-    """For 20 frames the depth image is stuck, but something adds 0.3 % of noise to it, new in every frame."""
+    """For 20 frames the depth image is frozen, but something adds 0.3 % of noise to it, new in every frame."""
     noise = 1 + 0.003 * rng.standard_normal(shots[k].depth.shape, dtype=np.float32)
     return replace(shots[k], depth=shots[0].depth * noise)
 
 
 def paused(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot]:
-    """25 frames are missing: the driver hangs for most of a second."""
+    """25 frames are missing: the driver delivers nothing for most of a second."""
     yield from shots[25:]
 
 
@@ -199,7 +213,11 @@ def odd_stamps(shots: Sequence[Shot], rng: np.random.Generator) -> Iterator[Shot
 
 
 def every(other: Sequence[Shot]) -> list[Disturbance]:
-    """All of them; other: frames of a foreign room."""
+    """The nine disturbances of the documented table.
+
+    Args:
+        other: frames of a foreign room.
+    """
     return [
         covered,
         hand,
@@ -214,18 +232,38 @@ def every(other: Sequence[Shot]) -> list[Disturbance]:
 
 
 def further() -> list[Disturbance]:
-    """What else happens in the field."""
+    """Nine more."""
     return [blurred, passer, hunting, dark, half_depth, late_depth, noisy_stuck, paused, odd_stamps]
 
 
+def filmed(seed: int, frames: int, camera: PinholeCamera) -> list[Shot]:
+    """Frames of a robot in a simulated room, 22 mm apart.
+
+    Args:
+        seed: of the room.
+        frames: number of frames.
+        camera: of the robot.
+    """
+    room = build("room", seed)
+    renderer = Renderer(room, bake.bake(room, 0.008), camera)
+    path = trajectories.plan(room, 1, 160, 0.6, camera)[0]
+    views = [renderer.render(T) for T in path[:frames]]
+    return [Shot(k, k * FRAME_NS, view.color, view.depth.astype(np.float32)) for k, view in enumerate(views)]
+
+
 def resized(shots: Sequence[Shot], camera: PinholeCamera) -> list[Shot]:
-    """Frames in the image size of another camera."""
+    """Frames in the image size of another camera.
+
+    Args:
+        shots: the frames.
+        camera: of the other size.
+    """
     size = (camera.width, camera.height)
     return [
         replace(
             shot,
-            color=cv2.resize(shot.color, size),
-            depth=cv2.resize(shot.depth, size, interpolation=cv2.INTER_NEAREST),
+            color=np.asarray(cv2.resize(shot.color, size), dtype=np.uint8),
+            depth=np.asarray(cv2.resize(shot.depth, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32),
         )
         for shot in shots
     ]
@@ -233,7 +271,15 @@ def resized(shots: Sequence[Shot], camera: PinholeCamera) -> list[Shot]:
 
 @dataclass(frozen=True)
 class Row:
-    """A tracked frame of a disturbed run, T_map_camera [4, 4], and its distance from the undisturbed one."""
+    """A tracked frame of a disturbed run.
+
+    Attributes:
+        shot: the frame.
+        frame: as it was tracked.
+        T_map_camera: [4, 4].
+        moved_m: distance from the pose of the undisturbed run.
+        turned_rad: the same of the rotation.
+    """
 
     shot: Shot
     frame: TrackedFrame
@@ -243,18 +289,23 @@ class Row:
 
     @property
     def good(self) -> bool:
-        """Whether the tracker says that the pose may be used."""
+        """Whether the tracker gave a pose."""
         return self.frame.status is not Status.LOST
 
     @property
     def wrong(self) -> bool:
-        """Whether the tracker says so and it may not."""
+        """Whether it gave one that is wrong."""
         far = self.moved_m > WRONG_M or self.turned_rad > WRONG_RAD
         return self.good and (self.shot.foreign or far)
 
 
 def track(tracker: Tracker, shot: Shot) -> tuple[TrackedFrame, NDArray[np.float64]]:
-    """The tracked frame and its pose T_map_camera [4, 4], before any refinement."""
+    """The tracked frame and its pose T_map_camera [4, 4], before any optimization.
+
+    Args:
+        tracker: that takes the frame.
+        shot: the frame.
+    """
     image = shot.color.astype(np.float32) * np.float32(1 / 255)
     frame = tracker.track(shot.index, shot.stamp_ns, image, shot.depth)
     if not tracker.keyframes:
@@ -263,23 +314,35 @@ def track(tracker: Tracker, shot: Shot) -> tuple[TrackedFrame, NDArray[np.float6
 
 
 class Undisturbed:
-    """A run over sound frames, with copies of the tracker as it was before some of them."""
+    """A run over undisturbed frames, with copies of the tracker as it was before some of them."""
 
     def __init__(self, tracker: Tracker, shots: Sequence[Shot], starts: Sequence[int]) -> None:
+        """Track all frames.
+
+        Args:
+            tracker: that has tracked nothing yet.
+            shots: the frames.
+            starts: indices of the frames before which a copy of the tracker is kept.
+        """
         self.shots = shots
         self.frames: list[TrackedFrame] = []
         self.poses: list[NDArray[np.float64]] = []
         self._before: dict[int, Tracker] = {}
         for shot in shots:
             if shot.index in starts:
-                self._before[shot.index] = _copied(tracker)
+                self._before[shot.index] = tracker.copied()
             frame, pose = track(tracker, shot)
             self.frames.append(frame)
             self.poses.append(pose)
 
-    def tracker(self, start: int) -> Tracker:
-        """A tracker as it was before frame `start`."""
-        return _copied(self._before[start])
+    def tracker(self, start: int, config: FrontendConfig | None = None) -> Tracker:
+        """A tracker as it was before a frame.
+
+        Args:
+            start: index of the frame.
+            config: of the tracker from now on; None: the same.
+        """
+        return self._before[start].copied(config)
 
     def disturbed(
         self,
@@ -288,24 +351,18 @@ class Undisturbed:
         frames: int = 45,
         config: FrontendConfig | None = None,
     ) -> list[Row]:
-        """Track on from frame `start` with a disturbance that begins there, maybe with another configuration."""
-        tracker = self.tracker(start)
-        tracker.config = config or tracker.config
+        """Track on from a frame with a disturbance that begins there.
+
+        Args:
+            start: index of the frame.
+            disturbance: of the frames from there on.
+            frames: number of frames.
+            config: of the tracker from there on; None: the same.
+        """
+        tracker = self.tracker(start, config)
         rows = []
         for shot in disturbance(self.shots[start : start + frames], np.random.default_rng(start)):
             frame, pose = track(tracker, shot)
             moved_m, turned_rad = se3.distance(self.poses[shot.index], pose)
             rows.append(Row(shot, frame, pose, float(moved_m), float(turned_rad)))
         return rows
-
-
-def _copied(tracker: Tracker) -> Tracker:
-    """A tracker that goes on from the same state; what it has measured is never changed, so it is shared."""
-    other = copy.copy(tracker)
-    for name, value in vars(tracker).items():
-        if isinstance(value, list):
-            setattr(other, name, list(value))
-    other._stuck = copy.copy(tracker._stuck)
-    other._obstruction = copy.copy(tracker._obstruction)
-    other._pace = copy.copy(tracker._pace)
-    return other

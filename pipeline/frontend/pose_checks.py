@@ -1,0 +1,197 @@
+"""Tests that a registered pose must pass before it is accepted, each with one verdict.
+
+A registration can end well and be wrong. A frame that was simply followed passes FOLLOWED; one that was found with wide
+gates or among all keyframes passes PLAUSIBLE.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from duagc.pipeline.frontend.failure import Reason, free_space_violations
+from duagc.pipeline.frontend.tracking_state import Candidate, CurrentFrame, TrackingState
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration.geometric_verification import features_agree
+
+FEATURES_TO_JUDGE = (
+    3  # times the inliers needed: a keyframe with fewer features cannot decide where a view is
+)
+
+
+class PoseCheck(Protocol):
+    """One test of a candidate pose."""
+
+    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+        """The candidate, maybe corrected, or why it is rejected.
+
+        Args:
+            state: what the tracker knows.
+            frame: the current frame.
+            candidate: whose registration ended well.
+        """
+        ...
+
+
+def verify(
+    checks: Sequence[PoseCheck], state: TrackingState, frame: CurrentFrame, candidate: Candidate
+) -> Candidate | Reason:
+    """The candidate after all checks, or the first reason against it.
+
+    Args:
+        checks: in order.
+        state: what the tracker knows.
+        frame: the current frame.
+        candidate: where it may be.
+    """
+    if not candidate.result.ok:
+        return Reason(candidate.result.outcome.value)
+    for check in checks:
+        verdict = check.judge(state, frame, candidate)
+        if isinstance(verdict, Reason):
+            return verdict
+        candidate = verdict
+    return candidate
+
+
+class WellConstrained:
+    """What an object in front of the camera leaves visible must still determine where the camera is."""
+
+    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+        # along weak directions a prior knows the pose, or the outcome would not be OK
+        covariance = np.linalg.pinv(candidate.result.information, rcond=1e-12, hermitian=True)
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+        if sigma_m <= state.config.tracking.failure.max_sigma_obstructed_m:
+            return candidate
+        occluded, _ = state.occlusion.judge(frame.pyramid.levels[-1], state.viewpoint(candidate))
+        return Reason.OBSTRUCTED if occluded else candidate
+
+
+class MatchesPrediction:
+    """A frame that looks unlike its keyframe must see much of it, where it was predicted, and contradict no depth.
+
+    Exposure that jumps makes frames look unlike, and a hand does; another place that looks somewhat alike is also
+    elsewhere: in RedKitchen a mirrored room would be followed 11 cm and 14 degrees off the path. Burnt out images, of
+    which half a keyframe is seen, are 11 cm off there.
+    """
+
+    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+        tracking, result = state.config.tracking, candidate.result
+        predicted = state.predict(frame.stamp_ns).T_keyframe_camera
+        moved_m, turned_rad = se3.distance(predicted, result.T_reference_target)
+        matches = result.rms_gray <= state.largest_gray_rms or (
+            min(result.overlap, result.view) >= tracking.failure.min_overlap_unlike
+            and moved_m <= tracking.failure.slack_m
+            and turned_rad <= tracking.failure.slack_rad
+            and result.conflict <= tracking.relocalization.max_conflict
+        )
+        return candidate if matches else Reason.OBSTRUCTED
+
+
+class DepthColorConsistency:
+    """A frame that looks worse than usual must be where color alone puts it, as far as that can be determined.
+
+    If the two contradict each other, depth of another time holds the camera back: then the pose by color alone is
+    used, unless by it the camera moved less, or something is in front of the camera.
+    """
+
+    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+        limits = state.config.tracking.failure
+        largest = limits.doubtful_gray_of_usual * state.usual_gray_rms
+        if state.last_good is None or not state.gray_rms or candidate.result.rms_gray <= largest:
+            return candidate
+        color_only = state.register_color(frame)
+        if not color_only.ok or color_only.rms_gray > largest:
+            return Reason.CONTRADICTION if state.depth_color_inconsistent else candidate
+        T, T_color_only = candidate.result.T_reference_target, color_only.T_reference_target
+        if state.last_good.agrees(T, T_color_only, limits, state.depth_color_inconsistent):
+            return replace(candidate, unlike=True)
+        state.depth_color_inconsistent = True
+        view, viewpoint = frame.pyramid.levels[-1], state.viewpoint(candidate)
+        occluded = state.occlusion.active or state.occlusion.judge(view, viewpoint)[0]
+        held_back = state.last_good.translation_m(T) < state.last_good.translation_m(T_color_only)
+        if state.lost or occluded or not held_back or not state.looks_as_usual(color_only):
+            return Reason.CONTRADICTION
+        return Candidate(state.keyframe_index, color_only, Reason.CONTRADICTION)
+
+
+class SharesEnough:
+    """The frame and its keyframe must show enough of the same surfaces and little that contradicts them."""
+
+    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+        limits, result = state.config.tracking.relocalization, candidate.result
+        shares = result.overlap >= limits.min_overlap and result.conflict <= limits.max_conflict
+        return candidate if shares else Reason.OBSTRUCTED
+
+
+class LooksAlike:
+    """Gray values must fit the keyframe: rooms built alike agree in shape, not in their pictures."""
+
+    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+        return candidate if candidate.result.rms_gray <= state.largest_gray_rms else Reason.OBSTRUCTED
+
+
+class RespectsFreeSpace:
+    """Little of the frame may be in space that the keyframe saw to be free."""
+
+    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+        limits, keyframe = state.config.tracking.failure, state.keyframes[candidate.keyframe_index]
+        T = candidate.result.T_reference_target
+        violations, visible = free_space_violations(frame.pyramid.levels[-1], keyframe.coarsest, T, limits)
+        return Reason.OBSTRUCTED if violations > limits.max_intruders * visible else candidate
+
+
+class WithinReach:
+    """A camera of finite speed can have come no farther since it was last tracked."""
+
+    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+        limits = state.config.tracking.failure
+        elapsed_s = max(state.elapsed_s(frame.stamp_ns), 0.0)
+        moved_m, _ = _from_prediction(state, frame, candidate)
+        return Reason.OBSTRUCTED if moved_m > limits.max_speed_m_s * elapsed_s + limits.slack_m else candidate
+
+
+class FeaturesConfirm:
+    """The features of the frame must be where the keyframe has them.
+
+    Where a keyframe has too few features to decide, only a camera that was lost for a moment and is where it was
+    predicted passes.
+    """
+
+    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+        limits, relocalization = state.config.tracking.failure, state.config.tracking.relocalization
+        features = state.keyframes[candidate.keyframe_index].features
+        if len(features) >= FEATURES_TO_JUDGE * relocalization.min_inliers:
+            T = candidate.result.T_reference_target
+            return (
+                candidate
+                if features_agree(features, frame.features, T, relocalization)
+                else Reason.OBSTRUCTED
+            )
+        moved_m, turned_rad = _from_prediction(state, frame, candidate)
+        expected = moved_m <= limits.slack_m and turned_rad <= limits.slack_rad
+        return candidate if expected and not state.is_long_lost(frame.stamp_ns) else Reason.OBSTRUCTED
+
+
+def _from_prediction(state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> tuple[float, float]:
+    """Distance in the map, meters, and angle, radians, of a candidate from the prediction."""
+    keyframe, T = state.keyframes[candidate.keyframe_index], candidate.result.T_reference_target
+    T_map_expected = state.keyframe.T_map_keyframe @ state.predict(frame.stamp_ns).T_keyframe_camera
+    moved_m, turned_rad = se3.distance(T_map_expected, keyframe.T_map_keyframe @ T)
+    return float(moved_m), float(turned_rad)
+
+
+FOLLOWED: tuple[PoseCheck, ...] = (WellConstrained(), MatchesPrediction(), DepthColorConsistency())
+"""Checks of a frame that was registered from where it was predicted."""
+
+PLAUSIBLE: tuple[PoseCheck, ...] = (
+    SharesEnough(),
+    LooksAlike(),
+    RespectsFreeSpace(),
+    WithinReach(),
+    FeaturesConfirm(),
+)
+"""Checks of a pose that was not simply followed."""
