@@ -18,26 +18,33 @@ from duagc.pipeline.camera_calibration.views import Views, look_up, normals_at
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma
+from duagc.pipeline.registration.residuals import depth_noise
 
 Array = NDArray[np.float64]
 
 ROUNDS = 30
-SETTLED, SETTLED_OF_PRIOR = 2e-4, 0.01  # steps: of poses (m, rad), of the cameras' numbers in their priors
+CONVERGED, CONVERGED_OF_PRIOR = (
+    2e-4,
+    0.01,
+)  # steps: of poses (m, rad), of the cameras' numbers (of the prior)
 CAUCHY, HUBER = 2.5, 1.5  # scales
-SAME_ERROR = 50.0  # neighbors err alike, and no model is exact: so many residuals count as one
+SAME_ERROR = 50.0  # errors of neighbors are correlated, and no model is exact: so many residuals count as one
 PRIOR = dict(zip(NAMES, (15, 15, 15, 15, 0.3, 0.5, 0.5, 0.01, 0.01, 0.01, 0.02, *[0.02] * 6), strict=True))
-"""How far cameras may be from what the recording says: pixels at a width of 640, rad, s, 1/m."""
+"""Prior standard deviations of the cameras' numbers from the recording's: pixels at a width of 640, rad, s, 1/m."""
 NEIGHBORS, MIN_OVERLAP = 4, 0.3  # views that the depth of a view is compared with
 GATE_M, GATE_RELATIVE = 0.08, 0.05
 FEATURE_GATE_M = 0.15
-NOISE = RegistrationConfig()  # of depth: its shape
+NOISE = depth_noise(RegistrationConfig())
 
 
 @dataclass(frozen=True)
 class Quality:
     """How well views agree: medians of the features' distances in px, scales of depth in units of its noise sigma(z).
 
-    depth_of_features: of the features' distances from the surface. depth: of point-to-plane distances.
+    Attributes:
+        features_px: of the features.
+        depth_of_features: of the features' distances from the surface.
+        depth: of point-to-plane distances.
     """
 
     features_px: float
@@ -47,7 +54,13 @@ class Quality:
 
 @dataclass(frozen=True)
 class Adjusted:
-    """The cameras, the covariance of their numbers [17, 17] (None: they were held), and the agreement of every part."""
+    """Result of an adjustment.
+
+    Attributes:
+        rig: the cameras.
+        covariance: of their numbers, [17, 17]; None: they were held fixed.
+        quality: agreement of every part.
+    """
 
     rig: Rig
     covariance: Array | None
@@ -55,7 +68,13 @@ class Adjusted:
 
 
 def adjust(parts: Sequence[Views], rig: Rig, calibrate: bool) -> Adjusted:
-    """Adjust poses and landmarks (in place), and the cameras too if asked, until nothing moves."""
+    """Adjust poses and landmarks (in place), and the cameras too if asked, until it has converged.
+
+    Args:
+        parts: of the recording.
+        rig: cameras to begin with.
+        calibrate: whether they are adjusted.
+    """
     start, pairs = Rig.of(rig.camera), [overlapping(part) for part in parts]
     ends = np.cumsum([0] + [6 * len(part.T_map_camera) for part in parts])
     size = len(NAMES) if calibrate else 0
@@ -83,8 +102,8 @@ def adjust(parts: Sequence[Views], rig: Rig, calibrate: bool) -> Adjusted:
             part.T_map_camera = part.T_map_camera @ se3.exp(x[a:b].reshape(-1, 6))
         if calibrate:
             rig = rig.moved(x[ends[-1] :])
-        settled = not calibrate or np.abs(x[ends[-1] :] / prior).max() < SETTLED_OF_PRIOR
-        if settled and np.abs(x[: ends[-1]]).max() < SETTLED:
+        converged = not calibrate or np.abs(x[ends[-1] :] / prior).max() < CONVERGED_OF_PRIOR
+        if converged and np.abs(x[: ends[-1]]).max() < CONVERGED:
             break
     covariance = None
     if calibrate:
@@ -96,7 +115,11 @@ def adjust(parts: Sequence[Views], rig: Rig, calibrate: bool) -> Adjusted:
 
 
 def overlapping(views: Views) -> NDArray[np.int64]:
-    """Pairs of views [p, 2], both ways, whose samples see each other; those that overlap most, and some that less."""
+    """Pairs of views [p, 2], in both orders, that overlap: those that overlap most, and some that overlap less.
+
+    Args:
+        views: of one part.
+    """
     n, rig = len(views.T_map_camera), Rig.of(views.camera)
     share = np.zeros((n, n))
     for a in range(n):
@@ -116,7 +139,13 @@ def overlapping(views: Views) -> NDArray[np.int64]:
 
 
 def quality(views: Views, pairs: NDArray[np.int64], rig: Rig) -> Quality:
-    """How well the views agree as they are."""
+    """How well the views agree as they are.
+
+    Args:
+        views: of one part.
+        pairs: `overlapping` ones, [p, 2].
+        rig: the cameras.
+    """
     features, planes = _features(views, rig), _planes(views, pairs, rig)
     return Quality(
         float(np.median(np.linalg.norm(features.off_px, axis=-1))),
@@ -217,8 +246,8 @@ def _features(views: Views, rig: Rig) -> _Features:
 
 
 def _sigma(z: Array) -> Array:
-    """Shape of the noise of depth, meters, as the registration has it."""
-    return np.asarray(NOISE.depth_sigma_base_m + NOISE.depth_sigma_slope_per_m * (z - 0.4) ** 2)
+    """Shape of the noise of depth, meters, as in the registration."""
+    return np.asarray(NOISE.sigma_m(z))
 
 
 def _scale(residual: Array, least: float) -> float:
@@ -284,7 +313,7 @@ def _linearized(views: Views, pairs: NDArray[np.int64], rig: Rig, calibrate: boo
 
 
 def _of_planes(views: Views, pairs: NDArray[np.int64], rig: Rig, cameras: int) -> tuple[Array, Array]:
-    """What the depth images say of poses and the last `cameras` numbers: H [n, n] and g [n]."""
+    """Normal equations of the depth images over poses and the last `cameras` numbers: H [n, n] and g [n]."""
     count = 6 * len(views.T_map_camera)
     H, g = np.zeros((count + cameras, count + cameras)), np.zeros(count + cameras)
     s = _planes(views, pairs, rig)

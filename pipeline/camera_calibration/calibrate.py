@@ -1,7 +1,8 @@
 """Both cameras of an RGB-D recording, calibrated from its own images; no target, no ground truth.
 
 The front end tracks the recording; then poses, landmarks and cameras are adjusted together, once to all views and once
-to each half, and what a half says is tried on the other: a calibration is only told if it holds there.
+to each half. The calibration by one half is tested on the other: it is reported only if it holds there. Frames that are
+held out for the evaluation of maps take no part.
 """
 
 from __future__ import annotations
@@ -23,16 +24,23 @@ from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.recording import Recording
 
 MIN_LANDMARKS = 200  # of a half
-UNKNOWN = 0.7  # share of its prior that is left of a standard deviation: the images say next to nothing
+UNKNOWN = 0.7  # share of its prior standard deviation from which a number counts as undetermined
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was found.
+    """Result of a calibration.
 
-    rig, sigma: the cameras from all views, and the standard deviation of every number of `NAMES`. halves: from each
-    half alone. before, after: agreement of each half as recorded, and calibrated by the *other* half.
-    views, landmarks: how many there were. parameters: of the recording's converter, "" the name of the converter.
+    Attributes:
+        rig: the cameras, from all views.
+        sigma: standard deviation of every number of `NAMES`.
+        halves: the cameras from each half alone.
+        before: agreement of each half as recorded.
+        after: agreement of each half calibrated by the *other* half.
+        names: of the halves.
+        views: number of views.
+        landmarks: number of landmarks.
+        recording: description of the recording.
     """
 
     rig: Rig
@@ -50,8 +58,11 @@ def calibrate(folder: Path, config: FrontendConfig, robots: Sequence[str], views
     """Calibrate the cameras of a recording; all chosen robots have the same.
 
     Args:
-        folder: of the recording. config: of the front end that tracks it. robots: names; empty = all.
-        views: most of each half.
+        folder: of the recording.
+        config: of the front end that tracks it.
+        robots: names; empty = all.
+        views: largest number of each half.
+
     Raises:
         DuagError: the recording is broken, or its images do not determine the cameras, or a half contradicts the other.
     """
@@ -94,15 +105,15 @@ def _calibrate(
             "near and far) and texture up to the corners"
         )
     found = Calibration(
-        both.rig,
-        sigma,
-        [half.rig for half in alone],
-        [_mean(half.quality) for half in recorded],
-        [_mean(half.quality) for half in by_other],
-        [" and ".join(part.name for part in half) for half in halves],
-        sum(len(part.T_map_camera) for half in halves for part in half),
-        sum(len(part.points_map) for half in halves for part in half),
-        description,
+        rig=both.rig,
+        sigma=sigma,
+        halves=[half.rig for half in alone],
+        before=[_mean(half.quality) for half in recorded],
+        after=[_mean(half.quality) for half in by_other],
+        names=[" and ".join(part.name for part in half) for half in halves],
+        views=sum(len(part.T_map_camera) for half in halves for part in half),
+        landmarks=sum(len(part.points_map) for half in halves for part in half),
+        recording=description,
     )
     for name, before, after in zip(found.names, found.before, found.after, strict=True):
         if after.features_px > before.features_px:

@@ -1,4 +1,4 @@
-"""A calibration in words, and as options of a converter."""
+"""A calibration as text, and as options of a converter."""
 
 from __future__ import annotations
 
@@ -31,7 +31,11 @@ UNITS |= dict.fromkeys(ROTATION, "rad") | {"delay_s": "s"}
 
 
 def plain(found: Calibration) -> dict[str, Any]:
-    """As plain values: every number with its standard deviation and that of each half, the self-check, options."""
+    """As plain values: every number with its standard deviation and those of each half, the self-check, options.
+
+    Args:
+        found: the calibration.
+    """
     values = [found.rig.values(), *(half.values() for half in found.halves)]
     return {
         "views": found.views,
@@ -55,7 +59,11 @@ def plain(found: Calibration) -> dict[str, Any]:
 
 
 def not_taken(recording: dict[str, Any]) -> str:
-    """Why no options of a converter would take a calibration of this recording (its description); "" if some do."""
+    """Why no options of a converter would take a calibration of a recording; "" if some do.
+
+    Args:
+        recording: its description.
+    """
     converter, used = recording.get("converter", {}).get("name"), recording.get("parameters", {})
     if converter != CONVERTER:
         return f"was made by {converter}, which takes no calibration, expected one by {CONVERTER}"
@@ -66,7 +74,10 @@ def not_taken(recording: dict[str, Any]) -> str:
 def options(found: Calibration) -> dict[str, float | str] | None:
     """Options of the recording's converter that take it, None if there are none (see `not_taken`).
 
-    They hold what the cameras were taken for, too: what was found is relative to that.
+    They include the cameras that the recording was made with: the calibration is relative to them.
+
+    Args:
+        found: the calibration.
     """
     if not_taken(found.recording):
         return None
@@ -86,7 +97,10 @@ def options(found: Calibration) -> dict[str, float | str] | None:
 
 
 def toml(found: Calibration) -> str:
-    """The options as a file for `duagc convert --options`; comments say how well each number is known.
+    """The options as a file for `duagc convert --options`; comments give the uncertainty of each number.
+
+    Args:
+        found: the calibration.
 
     Raises:
         ValueError: no options take the calibration.
@@ -102,7 +116,7 @@ def toml(found: Calibration) -> str:
         *(f"{name}: {_change(before, after)}" for name, before, after in _held_out(found)),
         f"To use them: duagc convert {CONVERTER} SRC --options THIS_FILE --out REC",
         "",
-        "what the cameras were taken for, which the rest belongs to",
+        "cameras that the recording was made with; the rest is relative to them",
     ]
     lines = [f"# {line}" if line else "" for line in lines]
     for option, value in taken.items():
@@ -114,7 +128,17 @@ def toml(found: Calibration) -> str:
 
 
 def check_out(out: Path, force: bool, recording: dict[str, Any], folder: Path) -> None:
-    """Refuse, before anything is measured, a file that `write` would not write. Raises DuagError."""
+    """Refuse, before anything is measured, a file that `write` would not write.
+
+    Args:
+        out: the file.
+        force: whether it may exist.
+        recording: description of the recording.
+        folder: of the recording.
+
+    Raises:
+        DuagError: no options take the calibration, or the file cannot be written.
+    """
     if why := not_taken(recording):
         raise DuagError(f"{folder}: {why}, for --out")
     if out.suffix != ".toml" or not out.absolute().parent.is_dir():
@@ -126,7 +150,15 @@ def check_out(out: Path, force: bool, recording: dict[str, Any], folder: Path) -
 
 
 def write(found: Calibration, out: Path) -> None:
-    """Write `toml`; the name appears only when the file is complete. Raises DuagError."""
+    """Write `toml`; the name appears only when the file is complete.
+
+    Args:
+        found: the calibration.
+        out: the file.
+
+    Raises:
+        DuagError: the file cannot be written.
+    """
     text, partial = toml(found), out.with_name(out.name + ".part")
     try:
         partial.write_text(text, encoding="utf-8")
@@ -136,7 +168,11 @@ def write(found: Calibration, out: Path) -> None:
 
 
 def format_calibration(found: Calibration) -> str:
-    """The same for people."""
+    """A calibration as a readable table.
+
+    Args:
+        found: the calibration.
+    """
     tree = plain(found)
     lines = [
         f"{found.views} views, {found.landmarks} features followed; halves: {'; '.join(found.names)}",
@@ -165,7 +201,7 @@ def _held_out(found: Calibration) -> list[tuple[str, Quality, Quality]]:
 
 
 def _known(name: str, entry: dict[str, Any]) -> str:
-    """A number with its standard deviation, and what the halves say."""
+    """A number with its standard deviation, and the values by the halves."""
     first, second = entry["of_halves"]
     text = f"{name} = {entry['value']:.5f} +- {entry['sigma']:.5f} {entry['unit']}".rstrip()
     return f"{text} (halves {first:.5f}, {second:.5f})"

@@ -1,4 +1,4 @@
-"""A color and a depth camera: what is not as a recording has it.
+"""A color and a depth camera: how they differ from what a recording says of them.
 
 In a recording depth is registered to a pinhole color camera. Here the camera that took the color images has a lens,
 is turned against the registered depth and took its images later; the depth has a smooth error in 1/z.
@@ -26,9 +26,12 @@ NAMES = (*LENS, *ROTATION, "delay_s", *DEPTH)
 class Rig:
     """Both cameras.
 
-    camera: of the recording, to which depth is registered. lens: [7], focal lengths and principal point in pixels,
-    radial distortion k1 k2 k3 as OpenCV defines it. R_color_depth: [3, 3]. delay_s: color was taken so much later.
-    depth_error: [6], 1/m, see `geometry.depth_error`.
+    Attributes:
+        camera: of the recording, to which depth is registered.
+        lens: [7], focal lengths and principal point in pixels, radial distortion k1 k2 k3 as OpenCV defines it.
+        R_color_depth: [3, 3].
+        delay_s: how much later color was taken.
+        depth_error: [6], 1/m, see `geometry.depth_error`.
     """
 
     camera: PinholeCamera
@@ -39,7 +42,11 @@ class Rig:
 
     @staticmethod
     def of(camera: PinholeCamera) -> Rig:
-        """As the recording has it: a pinhole, not turned, at the same time, exact depth."""
+        """As the recording says: a pinhole, not turned, at the same time, exact depth.
+
+        Args:
+            camera: of the recording.
+        """
         lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, 0, 0, 0])
         return Rig(camera, lens, np.eye(3), 0.0, np.zeros(6))
 
@@ -48,7 +55,11 @@ class Rig:
         return np.concatenate([self.lens, so3.log(self.R_color_depth), [self.delay_s], self.depth_error])
 
     def moved(self, step: Array) -> Rig:
-        """With a step of all numbers added; that of the rotation from the left."""
+        """With a step of all numbers added; that of the rotation from the left.
+
+        Args:
+            step: [17], in the order of `NAMES`.
+        """
         return replace(
             self,
             lens=self.lens + step[:7],
@@ -58,7 +69,11 @@ class Rig:
         )
 
     def project(self, points_color: Array) -> tuple[Array, Array, Array]:
-        """Pixels [n, 2] of points [n, 3] of the color camera; derivatives by point [n, 2, 3] and lens [n, 2, 7]."""
+        """Pixels [n, 2] of points of the color camera; derivatives by point [n, 2, 3] and lens [n, 2, 7].
+
+        Args:
+            points_color: [n, 3], meters, z > 0.
+        """
         fx, fy, cx, cy, k1, k2, k3 = self.lens
         z = points_color[:, 2]
         x, y = points_color[:, 0] / z, points_color[:, 1] / z
@@ -85,15 +100,24 @@ class Rig:
         return np.stack([fx * x * g + cx, fy * y * g + cy], axis=-1), by_ray @ ray_by_point, by_lens
 
     def depth(self, inverse: Array, rays: Array) -> Array:
-        """True depth [...], meters, of a measured inverse depth at rays [..., 3]."""
+        """True depth [...], meters, of a measured inverse depth.
+
+        Args:
+            inverse: measured, [...], 1/m.
+            rays: [..., 3], with z = 1.
+        """
         terms = depth_error.terms(inverse, rays[..., 0], rays[..., 1])
         return np.asarray(1 / np.maximum(inverse + terms @ self.depth_error, 1 / depth_error.FARTHEST_M))
 
     def depth_by(self, depth_m: Array, rays: Array) -> Array:
         """Derivative [..., 6] of a depth [...] at rays [..., 3] by the coefficients of the error, to their first order.
 
-        Give it a depth whose noise is not the residual's: it grows with depth squared, and were that the measured one,
-        noise would push all coefficients one way, the farther the less they are determined.
+        The depth's noise must not be that of the residual: the derivative grows with depth squared, and with the
+        measured depth noise would bias all coefficients in one direction, the more the less they are determined.
+
+        Args:
+            depth_m: [...].
+            rays: [..., 3], with z = 1.
         """
         terms = depth_error.terms(1 / depth_m, rays[..., 0], rays[..., 1])
         return np.asarray(-(depth_m**2)[..., None] * terms)

@@ -1,4 +1,4 @@
-"""What a calibration sees of a recording: some views with their tracked poses, and features followed through them."""
+"""Views of a recording for its calibration: frames with their tracked poses, and features followed through them."""
 
 from __future__ import annotations
 
@@ -30,20 +30,30 @@ RATIO = 0.75
 LINE_PX, POINT_PX = 8.0, 25.0  # of 640 px: how far a match may be from where the tracked poses put it
 MIN_MATCHES = 10
 MIN_TRACK = 3  # views
-NORMALS_LEVEL = 2  # quarter size: noisy normals feign information along a surface, and steps get too short
+NORMALS_LEVEL = (
+    2  # quarter size: noisy normals add false information along a surface, and steps get too short
+)
 SAMPLES = 150  # of the depth of a view
 FARTHEST_SAMPLE_M = 4.0
-MAX_TURN, MAX_WAY_M = 0.6, 2.0  # cosine between the axes of views that are compared, way between them
+MIN_COSINE, MAX_DISTANCE_M = 0.6, 2.0  # between the axes and the centers of views that are compared
 
 
 @dataclass
 class Views:
     """Views of one part of a recording; poses and points are changed by the adjustment.
 
-    T_map_camera: [n, 4, 4]. velocity: [n, 6] of the camera, right tangent per second. inverse_depth: [n, h, w], NaN
-    where unknown. normals: [n, h', w', 3] of smaller images, zero where unknown. samples: [n, SAMPLES, 2], columns and
-    rows with a normal. view, landmark, pixel: of every observation of a feature, [k], [k], [k, 2]. points_map: of the
-    landmarks [m, 3].
+    Attributes:
+        name: of the part.
+        camera: of all views.
+        T_map_camera: [n, 4, 4].
+        velocity: [n, 6] of the camera, right tangent per second.
+        inverse_depth: [n, h, w], 1/m, NaN where unknown.
+        normals: [n, h', w', 3] of smaller images, zero where unknown.
+        samples: [n, SAMPLES, 2], columns and rows with a normal.
+        view: [k], of every observation of a feature.
+        landmark: [k], of every observation.
+        pixel: [k, 2], of every observation.
+        points_map: [m, 3] of the landmarks.
     """
 
     name: str
@@ -61,12 +71,22 @@ class Views:
 
 @dataclass(frozen=True)
 class Tracked:
-    """A log with the poses of its frames: T_map_camera [n, 4, 4], and whether each was tracked [n]."""
+    """A log with the poses of its n frames.
+
+    Attributes:
+        path: of the log.
+        robot: its name.
+        T_map_camera: [n, 4, 4].
+        ok: whether each was tracked, [n].
+        held_out: whether each is kept for evaluation, [n].
+        stamps_ns: [n].
+    """
 
     path: Path
     robot: str
     T_map_camera: Array
     ok: NDArray[np.bool_]
+    held_out: NDArray[np.bool_]
     stamps_ns: NDArray[np.int64]
 
 
@@ -74,6 +94,11 @@ def track_log(path: Path, robot: str, config: FrontendConfig) -> Tracked:
     """Poses of a log by the front end, without a map.
 
     That depth and color contradict each other is what is to be calibrated: no frame is lost for it.
+
+    Args:
+        path: of the log.
+        robot: its name.
+        config: of the front end.
     """
     failure = config.tracking.failure.model_copy(update={"doubtful_gray_of_usual": math.inf})
     tracking = config.tracking.model_copy(update={"failure": failure})
@@ -82,26 +107,37 @@ def track_log(path: Path, robot: str, config: FrontendConfig) -> Tracked:
         run_frontend(path, Path(folder) / "frontend.mcap", config, progress=True)
         frames = RobotRun(robot, Path(folder)).frames
     return Tracked(
-        path,
-        robot,
-        np.array([frame.T_map_camera for frame in frames]),
-        np.array([frame.status == "ok" for frame in frames]),
-        np.array([frame.stamp_ns for frame in frames]),
+        path=path,
+        robot=robot,
+        T_map_camera=np.array([frame.T_map_camera for frame in frames]),
+        ok=np.array([frame.status == "ok" for frame in frames]),
+        held_out=np.array([frame.held_out for frame in frames]),
+        stamps_ns=np.array([frame.stamp_ns for frame in frames]),
     )
 
 
 def load_views(tracked: Tracked, first: int, last: int, most: int) -> Views:
-    """At most so many views of the frames first .. last - 1, evenly spread, and the features followed through them.
+    """Views of a range of frames, evenly spread, and the features followed through them.
+
+    Held-out frames are never read: a calibration must not be fitted to the images that maps are evaluated by.
+
+    Args:
+        tracked: the log.
+        first: of the frames.
+        last: of the frames, less one.
+        most: largest number of views.
 
     Raises:
-        DuagError: too few frames were tracked, or too few features followed.
+        DuagError: too few frames were tracked.
     """
     import cv2
 
     name = f"{tracked.robot}, frames {first} to {last - 1}"
-    good = first + np.flatnonzero(tracked.ok[first:last])
+    good = first + np.flatnonzero((tracked.ok & ~tracked.held_out)[first:last])
     if len(good) < 8:
-        raise DuagError(f"{tracked.path}: {len(good)} tracked frames in {name}, expected at least 8")
+        raise DuagError(
+            f"{tracked.path}: {len(good)} tracked frames in {name} that are not held out, expected at least 8"
+        )
     chosen = good[np.unique(np.linspace(0, len(good) - 1, most).round().astype(int))]
     sift = cv2.SIFT.create(nfeatures=FEATURES)
     pixels, descriptors, depths, inverse, normals, samples = [], [], [], [], [], []
@@ -129,29 +165,41 @@ def load_views(tracked: Tracked, first: int, last: int, most: int) -> Views:
     T = tracked.T_map_camera[chosen]
     view, landmark, pixel, points = _landmarks(pixels, descriptors, depths, camera, T)
     return Views(
-        name,
-        camera,
-        T,
-        _velocities(tracked, chosen),
-        np.array(inverse),
-        np.array(normals),
-        np.array(samples),
-        view,
-        landmark,
-        pixel,
-        points,
+        name=name,
+        camera=camera,
+        T_map_camera=T,
+        velocity=_velocities(tracked, chosen),
+        inverse_depth=np.array(inverse),
+        normals=np.array(normals),
+        samples=np.array(samples),
+        view=view,
+        landmark=landmark,
+        pixel=pixel,
+        points_map=points,
     )
 
 
 def coarse(index: NDArray[np.int64], size: int) -> NDArray[np.int64]:
-    """Rows or columns of the images of normals, which have `size` of them, for those of full images."""
+    """Rows or columns of the images of normals for those of full images.
+
+    Args:
+        index: rows or columns of full images.
+        size: number of them in the images of normals.
+    """
     return np.minimum(index >> NORMALS_LEVEL, size - 1)
 
 
 def normals_at(
     views: Views, view: NDArray[np.int64], row: NDArray[np.int64], column: NDArray[np.int64]
 ) -> Array:
-    """Normals [..., 3] at pixels of views."""
+    """Normals [..., 3] at pixels of views.
+
+    Args:
+        views: the views.
+        view: [...], which of them.
+        row: [...].
+        column: [...].
+    """
     height, width = views.normals.shape[1:3]
     return views.normals[view, coarse(row, height), coarse(column, width)].astype(np.float64)
 
@@ -203,7 +251,7 @@ def _landmarks(
     _, label = connected_components(graph, directed=False)
     view = np.repeat(np.arange(len(pixels)), np.diff(offsets))
     pixel, depth = np.concatenate(pixels), np.concatenate(depths)
-    # a feature that a view shows twice is none
+    # a feature that a view shows twice is ambiguous
     twice = np.unique(np.stack([label, view]), axis=1, return_inverse=True, return_counts=True)
     single = (twice[2] == 1)[twice[1]]
     kept = np.flatnonzero(single)
@@ -233,7 +281,7 @@ def _matched(
     axes, centers = T[:, :3, 2], T[:, :3, 3]
     for a in range(len(T)):
         for b in range(a + 1, len(T)):
-            if axes[a] @ axes[b] < MAX_TURN or np.linalg.norm(centers[a] - centers[b]) > MAX_WAY_M:
+            if axes[a] @ axes[b] < MIN_COSINE or np.linalg.norm(centers[a] - centers[b]) > MAX_DISTANCE_M:
                 continue
             found = matches(descriptors[a], descriptors[b], RATIO)
             if len(found) < MIN_MATCHES:
@@ -263,7 +311,14 @@ def _line_distance(rays_a: Array, rays_b: Array, T_b_a: Array) -> Array:
 
 
 def look_up(views: Views, view: NDArray[np.int64], u: Array, v: Array) -> Array:
-    """Inverse depth of views at pixels, between neighbors of one surface; NaN where there is none."""
+    """Inverse depth of views at pixels, interpolated between neighbors on one surface; NaN where there is none.
+
+    Args:
+        views: the views.
+        view: [...], which of them.
+        u: columns [...].
+        v: rows [...].
+    """
     height, width = views.inverse_depth.shape[1:]
     inside = (u >= 1) & (u < width - 2) & (v >= 1) & (v < height - 2)
     u, v = np.where(inside, u, 1), np.where(inside, v, 1)

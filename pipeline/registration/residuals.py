@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.depth_noise import DepthNoise
 from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
 from duagc.pipeline.registration.reference import Reference
@@ -120,7 +121,7 @@ def linearize_at(
     intensities = samples.intensities[seen[agreeing]]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy]).astype(np.float32)
     surface = np.stack([rays[0] * z, rays[1] * z, z])
-    sigma = _depth_sigma(z, config) if not told else told[0][agreeing]
+    sigma = depth_noise(config).sigma_m(z) if not told else told[0][agreeing]
     if (
         told and samples.depth_sigmas is not None
     ):  # of two views alike it stays the same, as that of the model
@@ -170,10 +171,13 @@ def _normals_agree(
     return cosine > np.float32(np.cos(limit_rad))
 
 
-def _depth_sigma(z: Floats, config: RegistrationConfig) -> Floats:
-    """Noise of a depth z, meters, up to the scale that is estimated."""
-    base, slope = np.float32(config.depth_sigma_base_m), np.float32(config.depth_sigma_slope_per_m)
-    return base + slope * (z - np.float32(0.4)) ** 2
+def depth_noise(config: RegistrationConfig) -> DepthNoise:
+    """The noise of depth that a registration assumes, up to the scale that it estimates.
+
+    Args:
+        config: of the registration.
+    """
+    return DepthNoise(config.depth_sigma_base_m, config.depth_sigma_slope_per_m)
 
 
 def _depth_residuals(

@@ -24,11 +24,19 @@ from duagc.pipeline.camera_calibration.adjustment import (
 )
 from duagc.pipeline.camera_calibration.calibrate import Calibration, calibrate
 from duagc.pipeline.camera_calibration.rig import NAMES, Rig
-from duagc.pipeline.camera_calibration.views import NORMALS_LEVEL, Views, _landmarks
+from duagc.pipeline.camera_calibration.views import (
+    NORMALS_LEVEL,
+    Tracked,
+    Views,
+    _landmarks,
+    load_views,
+    track_log,
+)
 from duagc.pipeline.cli import app
-from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.recording import Recording, RgbdFrame, RgbdLog
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 
 CAMERA = PinholeCamera(320, 240, 262.0, 262.0, 160.0, 118.0)
@@ -187,7 +195,7 @@ def still_recording(folder: Path, contrast: int = 255) -> Path:
     png = cv2.imencode(".png", np.repeat(pattern[..., None], 3, axis=2))[1].tobytes()
     depth = np.full((240, 320), 1500, np.uint16) + (np.arange(320) // 4).astype(np.uint16)
     with RecordingWriter(folder) as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
-        for k in range(16):
+        for k in range(20):
             robot.add_frame(k * 33_000_000, png, "png", depth, None)
     return folder
 
@@ -200,10 +208,38 @@ def test_a_camera_that_does_not_move_is_refused(tmp_path: Path) -> None:
         calibrate(folder, FrontendConfig(), ["bravo"])
 
 
+def test_held_out_frames_take_no_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Maps are evaluated by them: their images must not be read, however few others there are."""
+    read: list[int] = []
+    frame_of = RgbdLog.frame
+
+    def frame(log: RgbdLog, index: int) -> RgbdFrame:
+        read.append(index)
+        return frame_of(log, index)
+
+    monkeypatch.setattr(RgbdLog, "frame", frame)
+    recording = Recording(still_recording(tmp_path / "still"))
+    tracked = Tracked(
+        path=recording.log("alpha"),
+        robot="alpha",
+        T_map_camera=np.repeat(np.eye(4)[None], 20, axis=0),
+        ok=np.ones(20, dtype=bool),
+        held_out=np.array([is_held_out(k) for k in range(20)]),
+        stamps_ns=np.arange(20) * 33_000_000,
+    )
+    views = load_views(tracked, 0, 20, 56)
+    assert read == [k for k in range(20) if not is_held_out(k)]
+    assert len(views.T_map_camera) == len(read) == 18
+    monkeypatch.undo()
+    held_out = track_log(tracked.path, "alpha", FrontendConfig()).held_out
+    np.testing.assert_array_equal(held_out, tracked.held_out)
+
+
 def test_a_wall_without_texture_is_refused(tmp_path: Path) -> None:
     folder = still_recording(tmp_path / "bare", contrast=0)
     with pytest.raises(
-        DuagError, match=r"bare.* tracked frames in alpha, frames 0 to 7, expected at least 8"
+        DuagError,
+        match=r"bare.* tracked frames in alpha, frames 0 to 9 that are not held out, expected at least 8",
     ):
         calibrate(folder, FrontendConfig(), [])
     pixels, descriptors = [np.zeros((0, 2))] * 2, [np.zeros((0, 128), np.uint8)] * 2

@@ -1,0 +1,34 @@
+"""The noise of a depth camera as a function of distance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+NEAREST_M = 0.4
+"""Depth at which the noise is least, meters."""
+
+
+@dataclass(frozen=True)
+class DepthNoise:
+    """sigma(z) = factor (base + quadratic (z - 0.4 m)^2), the model of structured-light cameras.
+
+    Attributes:
+        base_m: standard deviation at 0.4 m, meters.
+        quadratic_per_m: growth with the squared distance from there, 1/m.
+        factor: on both.
+    Source: Nguyen, Izadi, Lovell, 3DIMPVT 2012, axial noise.
+    """
+
+    base_m: float
+    quadratic_per_m: float
+    factor: float = 1.0
+
+    def sigma_m(self, depth_m: NDArray[np.floating]) -> NDArray[Any]:
+        """Standard deviation of depths [...], meters, computed in their precision."""
+        number = depth_m.dtype.type
+        sigma = number(self.base_m) + number(self.quadratic_per_m) * (depth_m - number(NEAREST_M)) ** 2
+        return sigma if self.factor == 1.0 else number(self.factor) * sigma
