@@ -25,8 +25,10 @@ from duagc.pipeline.registration.residuals import Linearization, linearize_at
 
 Array = NDArray[np.float64]
 
-SETTLED = 4e-6  # m, rad: steps shrink by a third or more each, so less than half of the last one is left
-SETTLED_COARSE = 4e-5  # the next level begins with an error of its own size anyway
+STEP_TOLERANCE = (
+    4e-6  # m, rad: steps shrink by a third or more each, so less than half of the last one is left
+)
+STEP_TOLERANCE_COARSE = 4e-5  # the next level begins with an error of its own size anyway
 TILES = (10, 8)  # columns and rows of the tiles over which correlated residuals are summed
 
 
@@ -44,14 +46,23 @@ class Outcome(Enum):
 class Registration:
     """The motion between a reference and a target view.
 
-    T_reference_target: [4, 4]. information: [6, 6], inverse covariance of its right tangent (translation m,
-    rotation rad), zero if nothing was measured. overlap: fraction of the samples that the target sees on the same
-    surface, of those it could tell. view: fraction of the samples inside the target image. conflict: fraction of
-    the told samples that stand in free space. rms_depth_m, rms_gray: weighted residuals. exposure: (gain, offset)
-    with target gray = gain * reference gray + offset. samples: how many agree. overstated: factor by which the
-    normal matrix was divided to give the information. condition: ratio of the largest to the smallest eigenvalue
-    of the information before weak directions were taken out, rotations scaled by the median depth. weak: [m, 6],
-    directions in the right tangent that the images do not determine; the information is zero along them.
+    Attributes:
+        T_reference_target: [4, 4].
+        information: [6, 6], inverse covariance of its right tangent (translation m, rotation rad); zero if nothing
+            was measured.
+        outcome: how it ended.
+        overlap: fraction of the samples that the target sees on the same surface, of those whose place it measured.
+        view: fraction of the samples inside the target image.
+        conflict: fraction of the samples, of those whose place it measured, in space that it saw to be free.
+        rms_depth_m: weighted depth residual, meters.
+        rms_gray: weighted gray residual.
+        exposure: (gain, offset) with target gray = gain * reference gray + offset.
+        samples: how many agree.
+        overconfidence: factor >= 1 by which the normal matrix was divided to give the information.
+        condition: ratio of the largest to the smallest eigenvalue of the information before weak directions were
+            removed, rotations scaled by the median depth.
+        weak: [m, 6], directions in the right tangent that the images do not determine; the information is zero along
+            them.
     """
 
     T_reference_target: Array
@@ -64,7 +75,7 @@ class Registration:
     rms_gray: float
     exposure: tuple[float, float]
     samples: int
-    overstated: float
+    overconfidence: float
     condition: float
     weak: Array = field(default_factory=lambda: np.zeros((0, 6)))
 
@@ -72,11 +83,6 @@ class Registration:
     def ok(self) -> bool:
         """Whether the result may be used as a measurement."""
         return self.outcome is Outcome.OK
-
-    def weak_names(self) -> list[str]:
-        """The largest part of every weak direction in words, for example "translation x"."""
-        names = [f"{kind} {axis}" for kind in ("translation", "rotation") for axis in "xyz"]
-        return [names[int(np.argmax(np.abs(direction)))] for direction in self.weak]
 
 
 def register(
@@ -93,9 +99,10 @@ def register(
         pyramid: the target view. `without_depth`, gray values alone are used, and every sample inside the image
             counts as seen: overlap is then the view.
         T_reference_target_guess: where to start, [4, 4].
-        config: limits and noise.
+        config: limits and noise; None: the defaults.
         prior_information: [6, 6] in the right tangent of the guess; pulls toward it, is not part of the
             information returned.
+
     Returns:
         The motion with an outcome; if that is not OK, the motion is the best found and must not be trusted.
     """
@@ -120,11 +127,16 @@ def linearize(
     config: RegistrationConfig | None = None,
     level: int = 0,
 ) -> Registration:
-    """The cost of a pair near one pose, as a quadratic: for whoever minimizes the costs of many pairs together.
+    """The cost of a pair near one pose, as a quadratic: to minimize the costs of many pairs together.
 
     Args:
-        reference, pyramid: as for `register`. level: the one that is used, 0 = finest.
-        T_reference_target: where the cost is expanded. exposure: (gain, offset) there.
+        reference: as for `register`.
+        pyramid: as for `register`.
+        T_reference_target: [4, 4], where the cost is expanded.
+        exposure: (gain, offset) there.
+        config: limits and noise; None: the defaults.
+        level: of the pyramid that is used, 0 = finest.
+
     Returns:
         Information at that pose, and the pose and exposure one Gauss-Newton step from it: the minimum of the
         quadratic. Along weak directions there is no step and no information. The outcome is that of `register`.
@@ -163,7 +175,7 @@ def _minimize(
             step = _step(system, T, guess, prior_information, projection)
             T = _orthonormal(T @ se3.exp(step[:6]))
             exposure = exposure + step[6:]
-            if np.max(np.abs(step[:6])) < (SETTLED if index == 0 else SETTLED_COARSE):
+            if np.max(np.abs(step[:6])) < (STEP_TOLERANCE if index == 0 else STEP_TOLERANCE_COARSE):
                 break
     return T, exposure, linearize_at(reference, pyramid, 0, T, exposure, config)
 
@@ -203,22 +215,27 @@ def _regular(H: Array) -> Array:
 class _Determined:
     """What the residuals at one pose determine.
 
-    information: [6, 6]. weak: [m, 6] directions that are not determined. projection: [6, 6], takes a tangent to its
-    part along the other directions. sigma_m: of the weakest direction at the median depth, weak ones included.
+    Attributes:
+        information: [6, 6].
+        weak: [m, 6], directions that are not determined.
+        projection: [6, 6], takes a tangent to its part along the other directions.
+        overconfidence: as in `Registration`.
+        condition: as in `Registration`.
     """
 
     information: Array
     weak: Array
     projection: Array
-    overstated: float
+    overconfidence: float
     condition: float
 
     @staticmethod
     def by(system: Linearization, config: RegistrationConfig) -> _Determined:
         H, _ = system.normal_equations()
-        overstated = _overstatement(system, H)
+        overconfidence = _overconfidence(system, H)
         # the brightness was estimated with the pose: its uncertainty is the pose's too (Schur complement)
-        information = (H[:6, :6] - H[:6, 6:] @ np.linalg.solve(H[6:, 6:] + np.eye(2), H[6:, :6])) / overstated
+        information = H[:6, :6] - H[:6, 6:] @ np.linalg.solve(H[6:, 6:] + np.eye(2), H[6:, :6])
+        information = information / overconfidence
         information = 0.5 * (information + information.T)
         lever = _lever(system)
         values, vectors = np.linalg.eigh(information * np.outer(lever, lever))
@@ -230,7 +247,7 @@ class _Determined:
         weak = (vectors[:, ~known] * lever[:, None]).T
         weak = weak / np.linalg.norm(weak, axis=1, keepdims=True)
         condition = float(values[-1] / values[0]) if values[0] > 0 else float("inf")
-        return _Determined(information, weak, projection, overstated, condition)
+        return _Determined(information, weak, projection, overconfidence, condition)
 
     def without(self, before: _Determined) -> _Determined:
         """The same with nothing known along the directions that were weak before."""
@@ -291,24 +308,24 @@ def _judge(
         rms_gray=system.gray.rms(),
         exposure=(float(exposure[0]), float(exposure[1])),
         samples=system.agreeing,
-        overstated=found.overstated,
+        overconfidence=found.overconfidence,
         condition=found.condition,
         weak=found.weak,
     )
 
 
-def _overstatement(system: Linearization, H: Array) -> float:
-    """By which factor the normal matrix overstates the information, at least 1: the larger of two estimates.
+def _overconfidence(system: Linearization, H: Array) -> float:
+    """The factor by which the normal matrix exceeds the information, at least 1: the larger of two estimates.
 
     Correlation. Neighboring residuals share noise, calibration and model errors. If they did not, the outer
     products of the gradients summed over image tiles would have the expectation H; their ratio to H, averaged over
     the eight directions, is the factor (cluster-robust covariance, reduced to one number so that weak directions
     stay weak).
 
-    Tension. Depth and gray values, each alone, would put the target elsewhere; at the joint minimum their
-    gradients g cancel, and chi^2 = g^T (H_depth^-1 + H_gray^-1) g, the squared distance between the two answers in
-    units of their covariance, should be 6. What exceeds it is calibration error that no image noise explains
-    (Birge ratio).
+    Depth-color chi-squared. Depth and gray values, each alone, would put the target elsewhere; at the joint minimum
+    their gradients g cancel, and chi^2 = g^T (H_depth^-1 + H_gray^-1) g, the squared distance between the two
+    solutions in units of their covariance, should be 6. What exceeds it is calibration error that no image noise
+    explains (Birge ratio).
     """
     columns, rows = TILES
     parts = [part for part in (system.depth, system.gray) if len(part.residual)]
@@ -316,7 +333,7 @@ def _overstatement(system: Linearization, H: Array) -> float:
         return 1.0
     u_max = max(float(part.pixels[0].max()) for part in parts) + 1
     v_max = max(float(part.pixels[1].max()) for part in parts) + 1
-    outer, tension = np.zeros((8, 8)), 0.0
+    outer, depth_color_chi2 = np.zeros((8, 8)), 0.0
     for part in parts:
         u, v = part.pixels
         tile = (v * (rows / v_max)).astype(np.int64) * columns + (u * (columns / u_max)).astype(np.int64)
@@ -326,6 +343,6 @@ def _overstatement(system: Linearization, H: Array) -> float:
     for part in parts if len(parts) == 2 else []:
         H_part, gradient = part.normal_equations()
         answer = np.linalg.solve(_regular(H_part[:6, :6] + 1e-3 * H[:6, :6]), gradient[:6])
-        tension += float(gradient[:6] @ answer)
+        depth_color_chi2 += float(gradient[:6] @ answer)
     correlation = float(np.trace(np.linalg.solve(_regular(H), outer))) / 8
-    return max(1.0, correlation, tension / 6)
+    return max(1.0, correlation, depth_color_chi2 / 6)

@@ -28,7 +28,9 @@ SCALE = 512.0  # RootSIFT entries are at most 1 and mostly below 0.5; larger one
 class Features:
     """Keypoints of one keyframe with known depth, strongest response first.
 
-    descriptors: uint8 [n, 128]. points: float32 [n, 3], meters, camera frame.
+    Attributes:
+        descriptors: uint8 [n, 128].
+        points: float32 [n, 3], meters, camera frame.
     """
 
     descriptors: Descriptors
@@ -44,7 +46,10 @@ def extract(
     """The strongest SIFT features of a frame that have a depth.
 
     Args:
-        color: uint8 RGB [h, w, 3]. depth_m: float32 [h, w], 0 = unknown. most: number of features kept.
+        color: uint8 RGB [h, w, 3].
+        depth_m: float32 [h, w], meters, 0 = unknown.
+        camera: of both.
+        most: number of features kept.
     """
     import cv2
 
@@ -55,7 +60,14 @@ def extract(
 def extract_from_gray(
     gray: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera, most: int
 ) -> Features:
-    """`extract` from a gray image [h, w]."""
+    """`extract` from a gray image.
+
+    Args:
+        gray: uint8 [h, w].
+        depth_m: float32 [h, w], meters, 0 = unknown.
+        camera: of both.
+        most: number of features kept.
+    """
     import cv2
 
     keypoints, sift = cv2.SIFT.create(nfeatures=2 * most).detectAndCompute(gray, None)
@@ -91,7 +103,11 @@ def extract_from_pyramid(pyramid: RgbdPyramid, max_width_px: int, most: int) -> 
 
 
 def root_sift(sift: NDArray[np.float32]) -> Descriptors:
-    """RootSIFT of SIFT descriptors [n, 128], one byte per entry."""
+    """RootSIFT, uint8 [n, 128].
+
+    Args:
+        sift: SIFT descriptors, [n, 128].
+    """
     values = np.asarray(sift, dtype=np.float64)
     total = np.maximum(values.sum(axis=-1, keepdims=True), 1e-12)
     return np.minimum(np.rint(SCALE * np.sqrt(values / total)), 255).astype(np.uint8)
@@ -101,8 +117,10 @@ def matches(ours: Descriptors, theirs: Descriptors, ratio: float) -> NDArray[np.
     """Mutual nearest neighbors that pass the ratio test among ours.
 
     Args:
-        ours: uint8 [n, 128], at least two. theirs: uint8 [m, 128].
+        ours: uint8 [n, 128], at least two.
+        theirs: uint8 [m, 128].
         ratio: nearest distance over second-nearest, below which a match counts.
+
     Returns:
         Pairs (index in ours, index in theirs), int64 [k, 2], by index in theirs.
     """
@@ -127,7 +145,12 @@ def _matches(squared: NDArray[np.float32], ratio: float) -> NDArray[np.int64]:
 
 
 def fit(points_a: Array, points_b: Array) -> Array:
-    """T_a_b [..., 4, 4] that minimizes sum |a - T_a_b b|^2 over paired points [..., n, 3] (Kabsch, batched)."""
+    """T_a_b [..., 4, 4] that minimizes sum |a - T_a_b b|^2 over paired points (Kabsch, batched).
+
+    Args:
+        points_a: [..., n, 3].
+        points_b: [..., n, 3].
+    """
     mean_a, mean_b = points_a.mean(axis=-2, keepdims=True), points_b.mean(axis=-2, keepdims=True)
     R = so3.project(np.swapaxes(points_a - mean_a, -1, -2) @ (points_b - mean_b))
     return se3.from_rotation_translation(R, mean_a[..., 0, :] - (R @ mean_b[..., 0, :, None])[..., 0])
@@ -139,9 +162,12 @@ def ransac(
     """The motion that most matched points agree on.
 
     Args:
-        points_a, points_b: paired points [n, 3], n >= 3, camera frames, meters.
+        points_a: [n, 3], n >= 3, camera frame a, meters.
+        points_b: [n, 3], the same points in camera frame b.
         inlier_m: largest distance at one meter of depth; it grows with depth as the noise of a depth camera does.
         hypotheses: three-point samples drawn.
+        rng: draws them.
+
     Returns:
         T_a_b [4, 4], fitted to its inliers, and the inliers [n].
     """

@@ -1,8 +1,8 @@
-"""What has moved: surfaces that stand where other views saw free space.
+"""Moving objects: surfaces in space that other views saw to be free.
 
 In a rigid world a surface is in front of no other surface in any view that could see it: a point that a second view
-looks through was not there at that time, or is not there any more. One view may err, so several are asked, and a region
-must be of some size. What moves by less than the gate, or stands still in most views that see its place, is not found.
+looks through was not there at that time, or is not there any more. One view may err, so several must agree, and a
+region must be of some size. What moves by less than the gate, or does not move in most views of its place, is not found.
 """
 
 from __future__ import annotations
@@ -32,9 +32,15 @@ class _View:
 
 
 class FreeSpace:
-    """What a set of views of one camera saw to be free."""
+    """Space that a set of views of one camera saw to be free."""
 
     def __init__(self, camera: PinholeCamera, config: MovingConfig) -> None:
+        """Begin without a view.
+
+        Args:
+            camera: of all views.
+            config: gates, number of views, sizes.
+        """
         self.config, self._camera = config, camera
         self._small = camera
         for _ in range(config.halvings):
@@ -42,12 +48,22 @@ class FreeSpace:
         self._views: list[_View] = []
 
     def add(self, depth_m: Image, T_map_camera: Array) -> None:
-        """Take a view. depth_m: [h, w], meters, 0 = unknown or masked."""
+        """Take a view.
+
+        Args:
+            depth_m: [h, w], meters, 0 = unknown or masked.
+            T_map_camera: [4, 4].
+        """
         if self.config.enabled:
             self._views.append(self._view(depth_m, T_map_camera))
 
     def moving(self, depth_m: Image, T_map_camera: Array) -> Mask:
-        """Pixels [h, w] of a view that show what was not there when others of the set looked; it may be one of them."""
+        """Pixels [h, w] of a view that show what was not there in other views of the set; it may be one of them.
+
+        Args:
+            depth_m: [h, w], meters, 0 = unknown or masked.
+            T_map_camera: [4, 4].
+        """
         view = self._view(depth_m, T_map_camera)
         v, u = np.nonzero(view.inverse_depth)
         through, there = np.zeros(len(v), np.int32), np.zeros(len(v), np.int32)
@@ -64,7 +80,13 @@ class FreeSpace:
         return self._regions(found)
 
     def usable(self, depth_m: Image, T_map_camera: Array, mask: Mask | None) -> Mask | None:
-        """The pixels of a mask (None = all) that show nothing that moved; None = all."""
+        """The pixels of a mask that show nothing that moved, bool [h, w]; None = all.
+
+        Args:
+            depth_m: [h, w], meters, 0 = unknown or masked.
+            T_map_camera: [4, 4].
+            mask: bool [h, w]; None = all.
+        """
         moving = self.moving(depth_m, T_map_camera) if self.config.enabled else np.zeros(1, bool)
         if not moving.any():
             return mask

@@ -1,4 +1,4 @@
-"""Which of many views a view may show: a shortlist, so that only a bounded number is compared feature by feature.
+"""A shortlist of the views that resemble a view, so that only a bounded number is compared feature by feature.
 
 A descriptor becomes one word per table: of the directions of the table, all with entries +1 and -1, the one that it
 points along most, and the sign (cross-polytope hashing: Andoni et al. 2015). Near descriptors mostly share some word.
@@ -25,18 +25,25 @@ class Places:
     """Views by the words of their descriptors."""
 
     def __init__(self, views: Sequence[Descriptors]) -> None:
-        """Args:
-        views: descriptors of every view, uint8 [n, 128] each.
+        """Index the views.
+
+        Args:
+            views: descriptors of every view, uint8 [n, 128] each.
         """
-        # what all features have in common tells no places apart
+        # what all features have in common does not distinguish places
         total = sum((d.sum(axis=0, dtype=np.int64) for d in views), np.zeros(DIMENSIONS, dtype=np.int64))
         center = np.rint(total / max(sum(map(len, views)), 1)).astype(np.float32)
         self._has = np.stack([_words(d.astype(np.float32) - center) for d in views])
 
     def alike(self, view: int, among: int, most: int) -> list[int]:
-        """Those of the first `among` views that share most words with a view; at most so many, ascending.
+        """The views that share most words with a view, ascending.
 
         A view of few features has few words to share: the count is divided by the root of its words.
+
+        Args:
+            view: its index.
+            among: only the first so many views are compared.
+            most: largest number of views returned.
         """
         if among <= most:
             return list(range(among))

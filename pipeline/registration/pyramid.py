@@ -26,9 +26,12 @@ NORMAL_WINDOWS = (5, 3)  # pixels; the smaller one is used where the larger touc
 class Level:
     """One resolution of a frame.
 
-    camera: intrinsics of this resolution. gray: float32 [h, w], 0..1. inverse_depth: float32 [h, w], 1/m, 0 where
-    the depth is unknown. has_depth: False if there is no depth image, which is not the same as one that is empty.
-    depth_sigma_m: float32 [h, w], standard deviation of the depth; None: not known pixel by pixel.
+    Attributes:
+        camera: intrinsics of this resolution.
+        gray: float32 [h, w], 0..1.
+        inverse_depth: float32 [h, w], 1/m, 0 where the depth is unknown.
+        has_depth: False if there is no depth image, which is not the same as one that is empty.
+        depth_sigma_m: float32 [h, w], standard deviation of the depth; None: not known pixel by pixel.
     """
 
     camera: PinholeCamera
@@ -67,14 +70,14 @@ class Level:
         normals = np.zeros((*self.gray.shape, 3), dtype=np.float32)
         missing = np.ones(self.gray.shape, dtype=bool)
         for window in NORMAL_WINDOWS:
-            du, dv, mean, sound = _fit_planes(self.inverse_depth, window)
-            take = missing & sound
+            du, dv, mean, smooth = _fit_planes(self.inverse_depth, window)
+            take = missing & smooth
             rays = self.camera.rays().astype(np.float32)[take]
             nx, ny = du[take] * np.float32(self.camera.fx), dv[take] * np.float32(self.camera.fy)
             nz = mean[take] - nx * rays[:, 0] - ny * rays[:, 1]
             length = np.sqrt(nx * nx + ny * ny + nz * nz)
             normals[take] = -np.stack([nx, ny, nz], axis=-1) / length[:, None]
-            missing &= ~sound
+            missing &= ~smooth
         return normals
 
     def halved(self) -> Level:
@@ -101,7 +104,11 @@ class Level:
 
 @dataclass(frozen=True)
 class RgbdPyramid:
-    """A frame at several resolutions; levels[0] is the full one, each next one has half the size."""
+    """A frame at several resolutions.
+
+    Attributes:
+        levels: the full one first, each next one has half the size.
+    """
 
     levels: tuple[Level, ...]
 
@@ -112,7 +119,12 @@ class RgbdPyramid:
         )
 
     def with_exposure(self, gain: float, offset: float) -> RgbdPyramid:
-        """The same with gray values gain * gray + offset."""
+        """The same with gray values gain * gray + offset.
+
+        Args:
+            gain: factor.
+            offset: added.
+        """
         g, o = np.float32(gain), np.float32(offset)
         return self._changed(lambda level: replace(level, gray=g * level.gray + o))
 
@@ -172,7 +184,7 @@ def _fit_planes(values: Image, window: int) -> tuple[NDArray, NDArray, NDArray, 
     mean = cv2.sepFilter2D(values, cv2.CV_32F, box, box, borderType=cv2.BORDER_CONSTANT)
     element = np.ones((window, window), dtype=np.uint8)
     lowest, highest = cv2.erode(values, element), cv2.dilate(values, element)
-    sound = (lowest > 0) & (highest - lowest < SAME_SURFACE * window / 2 * values)
-    sound[:reach] = sound[-reach:] = False
-    sound[:, :reach] = sound[:, -reach:] = False
-    return du, dv, mean, sound
+    smooth = (lowest > 0) & (highest - lowest < SAME_SURFACE * window / 2 * values)
+    smooth[:reach] = smooth[-reach:] = False
+    smooth[:, :reach] = smooth[:, -reach:] = False
+    return du, dv, mean, smooth

@@ -1,4 +1,4 @@
-"""What a view is compared with: samples with a point, a normal and an intensity, at every pyramid level."""
+"""Samples that a view is registered to: a point, a normal and an intensity each, at every pyramid level."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ MARGIN = 2  # pixels at the border that are not sampled
 class ReferenceLevel:
     """Samples for one pyramid level.
 
-    points: float32 [n, 3], meters, reference camera frame. normals: float32 [n, 3], unit length, same frame.
-    intensities: float32 [n], gray value 0..1 of that level's image at the sample. depth_sigmas: float32 [n], meters;
-    None: not known sample by sample.
+    Attributes:
+        points: float32 [n, 3], meters, reference camera frame.
+        normals: float32 [n, 3], unit length, same frame.
+        intensities: float32 [n], gray value 0..1 of that level's image at the sample.
+        depth_sigmas: float32 [n], meters; None: not known sample by sample.
     """
 
     points: Samples
@@ -37,13 +39,22 @@ class ReferenceLevel:
 
 @dataclass(frozen=True)
 class Reference:
-    """Samples of one view; levels[0] belongs to the finest image. Plain arrays: it can be sent and rebuilt."""
+    """Samples of one view: plain arrays, so that it can be sent and rebuilt.
+
+    Attributes:
+        levels: one entry per pyramid level, the finest first.
+    """
 
     levels: tuple[ReferenceLevel, ...]
 
     @staticmethod
     def from_pyramid(pyramid: RgbdPyramid, strides: tuple[int, ...] = DEFAULT_STRIDES) -> Reference:
-        """Sample every level on a grid, `strides` pixels apart, finest level first, wherever a normal is known."""
+        """Sample every level on a grid, wherever a normal is known.
+
+        Args:
+            pyramid: of the view.
+            strides: pixels between samples, finest level first.
+        """
         levels = []
         for level, stride in zip(pyramid.levels, strides, strict=True):
             rows = np.arange(MARGIN, level.camera.height - MARGIN, stride)
@@ -58,7 +69,11 @@ class Reference:
         """At most about `count` samples, the same points and normals at every level, for sending to another robot.
 
         Two thirds are the pixels of strongest gray gradient in the tiles of a grid, one third is spread evenly
-        over a coarser grid, so that weakly textured surfaces still hold the geometry. No random draws.
+        over a coarser grid, so that weakly textured surfaces still determine the geometry. No random draws.
+
+        Args:
+            pyramid: of the view.
+            count: number of samples.
         """
         finest = pyramid.levels[0]
         gu, gv = finest.gradients

@@ -27,12 +27,20 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 
 MAD_STRIDE = 4  # residuals between those that estimate a scale, where there are thousands
-GATE_SIGMAS = 3  # of depth whose noise is told: the gate is no narrower
+GATE_SIGMAS = 3  # of depth whose sigma is measured: the gate is no narrower
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Weighted residuals of one kind; J float32 [n, 8] by (translation, rotation, gain, offset), r = value / noise."""
+    """Weighted residuals of one kind.
+
+    Attributes:
+        jacobian: float32 [n, 8], by (translation, rotation, gain, offset).
+        residual: [n], value over noise.
+        weight: [n].
+        scale: robust standard deviation of the residuals.
+        pixels: columns and rows [n] in the target image.
+    """
 
     jacobian: Floats
     residual: Floats
@@ -61,7 +69,18 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Linearization:
-    """Residuals at one pose and level, and what was seen of the samples."""
+    """Residuals at one pose and level, and how the samples were seen.
+
+    Attributes:
+        depth: point-to-plane distances.
+        gray: gray differences.
+        overlap: as in `Registration`.
+        view: as in `Registration`.
+        conflict: as in `Registration`.
+        agreeing: number of samples on the same surface.
+        median_depth_m: of these.
+        sigma_mean_m: mean noise of their depth.
+    """
 
     depth: Residuals
     gray: Residuals
@@ -73,6 +92,7 @@ class Linearization:
     sigma_mean_m: float
 
     def normal_equations(self) -> tuple[Array, Array]:
+        """H [8, 8] and gradient [8] of both kinds together."""
         H_depth, g_depth = self.depth.normal_equations()
         H_gray, g_gray = self.gray.normal_equations()
         return H_depth + H_gray, g_depth + g_gray
@@ -86,7 +106,16 @@ def linearize_at(
     exposure: Array,
     config: RegistrationConfig,
 ) -> Linearization:
-    """Residuals of all samples of level `index` at one pose. Samples without a partner have none."""
+    """Residuals of all samples of one level at one pose. Samples without a partner have none.
+
+    Args:
+        reference: the samples.
+        pyramid: the target view.
+        index: of the level.
+        T_reference_target: [4, 4].
+        exposure: (gain, offset), [2].
+        config: gates and noise.
+    """
     samples, level = reference.levels[index], pyramid.levels[index]
     camera = level.camera
     T_target_reference = se3.inverse(T_reference_target).astype(np.float32)
@@ -98,13 +127,13 @@ def linearize_at(
     seen = np.flatnonzero(inside)
     q, u, v = q[:, seen], u[seen], v[seen]
 
-    gray, gu, gv, inverse_depth, *told = _interpolate(level, u, v)
+    gray, gu, gv, inverse_depth, *measured_sigma = _interpolate(level, u, v)
     with np.errstate(invalid="ignore"):
         # without a depth image every sample may be what is seen there
         z = 1 / inverse_depth if level.has_depth else q[2]
         gate = np.maximum(np.float32(config.depth_gate_m), np.float32(config.depth_gate_relative) * q[2])
-        if told:
-            gate = np.maximum(gate, np.float32(GATE_SIGMAS) * told[0])
+        if measured_sigma:
+            gate = np.maximum(gate, np.float32(GATE_SIGMAS) * measured_sigma[0])
         off = z - q[2]
         agree = np.abs(off) < gate
         # beyond the gate in front of the surface: that space was seen to be free; behind it: hidden
@@ -121,10 +150,9 @@ def linearize_at(
     intensities = samples.intensities[seen[agreeing]]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy]).astype(np.float32)
     surface = np.stack([rays[0] * z, rays[1] * z, z])
-    sigma = depth_noise(config).sigma_m(z) if not told else told[0][agreeing]
-    if (
-        told and samples.depth_sigmas is not None
-    ):  # of two views alike it stays the same, as that of the model
+    sigma = measured_sigma[0][agreeing] if measured_sigma else depth_noise(config).sigma_m(z)
+    if measured_sigma and samples.depth_sigmas is not None:
+        # of two views alike it stays the same, as that of the model
         sigma = np.sqrt(np.float32(0.5) * (sigma**2 + samples.depth_sigmas[seen[agreeing]] ** 2))
     floor = config.depth_sigma_floor * 4.0**index
     depth = _depth_residuals(surface, q, m, sigma, floor, (u, v), config)

@@ -140,6 +140,12 @@ def test_untextured_wall_is_ill_conditioned():
     assert result.outcome is Outcome.ILL_CONDITIONED
 
 
+def weak_names(result: Registration) -> list[str]:
+    """The largest part of every weak direction."""
+    names = [f"{kind} {axis}" for kind in ("translation", "rotation") for axis in "xyz"]
+    return [names[int(np.argmax(np.abs(direction)))] for direction in result.weak]
+
+
 def wall(shift_px: float, textured: bool = True) -> RgbdPyramid:
     """A plain wall 2 m away with vertical stripes 20 px wide, seen from `shift_px` further to the right."""
     depth = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32)
@@ -154,7 +160,7 @@ def test_weak_directions_stay_at_the_guess_and_carry_no_information():
     guess = se3.exp(np.array([0, 0.05, 0.01, 0, 0, 0]))
     result = register(Reference.from_pyramid(wall(0), STRIDES), wall(2.0), guess)
     assert result.outcome is Outcome.ILL_CONDITIONED
-    assert result.weak_names() == ["translation y"]
+    assert weak_names(result) == ["translation y"]
     assert np.abs(result.information @ result.weak[0]).max() < 1e-6 * np.abs(result.information).max()
     assert np.linalg.matrix_rank(result.information, tol=1.0) == 5
     found = se3.log(result.T_reference_target)
@@ -167,7 +173,7 @@ def test_a_prior_that_knows_the_weak_directions_makes_a_measurement():
     prior = np.diag([1.0, 1e4, 1.0, 1.0, 1.0, 1.0])  # the height to 1 cm, the rest to 1 m
     result = register(reference, target, guess, prior_information=prior)
     assert result.ok
-    assert result.weak_names() == ["translation y"]
+    assert weak_names(result) == ["translation y"]
     assert np.abs(result.information @ result.weak[0]).max() < 1e-6 * np.abs(result.information).max()
     assert abs(se3.log(result.T_reference_target)[1] - 0.05) < 1e-3
 
@@ -176,7 +182,7 @@ def test_bare_wall_names_three_weak_directions():
     bare = wall(0, textured=False)
     result = register(Reference.from_pyramid(bare, STRIDES), bare, np.eye(4))
     assert result.outcome is Outcome.ILL_CONDITIONED
-    assert set(result.weak_names()) == {"translation x", "translation y", "rotation z"}
+    assert set(weak_names(result)) == {"translation x", "translation y", "rotation z"}
     assert np.linalg.matrix_rank(result.information, tol=1e-3 * result.information.max()) == 3
 
 
@@ -189,7 +195,8 @@ def test_each_kind_of_residual_can_be_used_alone(reference, end, residuals, limi
     assert error_m < limit_m
     unused = {"depth": result.rms_gray, "gray": result.rms_depth_m}[residuals]
     assert unused == 0 < min(joint.rms_gray, joint.rms_depth_m)
-    assert np.trace(result.information) < np.trace(joint.information) * joint.overstated / result.overstated
+    ratio = joint.overconfidence / result.overconfidence
+    assert np.trace(result.information) < np.trace(joint.information) * ratio
 
 
 def test_no_depth_is_low_overlap_and_carries_no_information(reference):
@@ -222,27 +229,29 @@ def test_equal_input_gives_equal_bits(start, end):
     np.testing.assert_array_equal(a.information, b.information)
 
 
-def told(T_world_camera, seed: int, tell: bool) -> RgbdPyramid:
-    """A view whose left half has depth of 2 mm, the right half of 8 cm, and says so or not."""
+def view_of(T_world_camera, seed: int, with_sigma: bool) -> RgbdPyramid:
+    """A view whose left half has depth of 2 mm, the right half of 8 cm, with or without its sigma."""
     gray, depth = render(T_world_camera)
     sigma = np.where(np.arange(CAMERA.width) < CAMERA.width // 2, 0.002, 0.08) * np.ones_like(depth)
     noisy = depth + sigma * np.random.default_rng(seed).standard_normal(depth.shape)
-    return RgbdPyramid.build(gray, noisy.astype(np.float32), CAMERA, depth_sigma_m=sigma if tell else None)
+    return RgbdPyramid.build(
+        gray, noisy.astype(np.float32), CAMERA, depth_sigma_m=sigma if with_sigma else None
+    )
 
 
-def test_noise_that_is_told_pixel_by_pixel_counts_as_told(reference):
+def test_noise_that_is_known_pixel_by_pixel_weights_the_residuals(reference):
     errors = {}
-    for tell in (True, False):
-        errors[tell] = []
+    for with_sigma in (True, False):
+        errors[with_sigma] = []
         for seed in range(4):
-            target = told(END, seed + 10, tell)
+            target = view_of(END, seed + 10, with_sigma)
             found = register(reference, target, T_START_END).T_reference_target
-            errors[tell].append(np.hypot(*se3.distance(T_START_END, found)))
+            errors[with_sigma].append(np.hypot(*se3.distance(T_START_END, found)))
     assert np.mean(errors[True]) < 0.3 * np.mean(errors[False])
 
 
-def test_told_noise_follows_the_pixels_down_the_pyramid():
-    view = told(START, 0, True)
+def test_known_noise_follows_the_pixels_down_the_pyramid():
+    view = view_of(START, 0, True)
     for level in view.levels:
         known = level.inverse_depth > 0
         assert np.array_equal(level.depth_sigma_m > 0, known)
