@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.simulate import bake, trajectories
-from duagc.converters.simulate.render import Renderer
-from duagc.converters.simulate.scene_settings import build
+from duagc.converters.simulate.render import bake
+from duagc.converters.simulate.render.renderer import Renderer
+from duagc.converters.simulate.scenes.catalog import build
+from duagc.converters.simulate.trajectories import loops
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.frontend.tracking import Tracker
@@ -246,7 +247,7 @@ def filmed(seed: int, frames: int, camera: PinholeCamera) -> list[Shot]:
     """
     room = build("room", seed)
     renderer = Renderer(room, bake.bake(room, 0.008), camera)
-    path = trajectories.plan(room, 1, 160, 0.6, camera)[0]
+    path = loops.plan(room, 1, 160, 0.6, camera)[0]
     views = [renderer.render(T) for T in path[:frames]]
     return [Shot(k, k * FRAME_NS, view.color, view.depth.astype(np.float32)) for k, view in enumerate(views)]
 

@@ -2,7 +2,7 @@
 
 In a rigid world a surface is in front of no other surface in any view that could see it: a point that a second view
 looks through was not there at that time, or is not there any more. One view may err, so several must agree, and a
-region must be of some size. What moves by less than the gate, or does not move in most views of its place, is not found.
+region must be of some size. What moves by less than the gate, or does not move in most views of its place, is missed.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from duagc.pipeline.registration import (
     Outcome,
     Reference,
     ReferenceLevel,
+    Registration,
     RegistrationConfig,
     RgbdPyramid,
     register,
