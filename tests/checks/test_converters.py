@@ -9,9 +9,9 @@ import pytest
 
 from duagc.converters import registry
 from duagc.pipeline.checks import check
-from tests.converters.test_image_folders import CASES
 from tests.converters.test_ros import Ros, scene
-from tests.converters.test_seven_scenes import make_sequence
+from tests.fixtures.image_folders import CASES
+from tests.fixtures.seven_scenes import make_sequence
 from tests.fuzz.seeds import kimera, s3e
 
 

@@ -13,7 +13,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cli import app
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import open_rgbd, read_log
-from tests.converters.box_room import path, render, save
+from tests.fixtures.box_room import path, render, save
 
 DOC = Path(__file__).parents[2] / "docs" / "howto" / "dataset.md"
 CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 79.5, 59.5)

@@ -17,28 +17,10 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.checks.check import check
 from duagc.pipeline.geometry import so3
 from duagc.pipeline.recording import format_info, info, open_rgbd, read_log
-from tests.converters.box_room import path
-from tests.converters.ros_bags import FRAMES, START_NS, STEP_NS, Ros, scene
-from tests.converters.test_kimera_multi import imu
-
-HUSKY_LATE_NS = 3_250_000_000  # husky's own clock is this much behind jackal's
-
-
-def moved_headers(r: Ros, rows: list[tuple[str, int, Any]], by_ns: int) -> list[tuple[str, int, Any]]:
-    """The same messages with other times in their headers."""
-    for _, _, message in rows:
-        if hasattr(message, "header"):
-            stamp = message.header.stamp
-            time = stamp.sec * 10**9 + stamp.nanosec + by_ns
-            object.__setattr__(stamp, "sec", time // 10**9)
-            object.__setattr__(stamp, "nanosec", time % 10**9)
-    return rows
-
-
-def both(r: Ros) -> tuple[list[tuple[str, int, Any]], list[tuple[str, int, Any]]]:
-    jackal = scene(r, prefix="/jackal")
-    husky = scene(r, prefix="/husky", poses=path(FRAMES, 0.2))
-    return jackal, moved_headers(r, husky, -HUSKY_LATE_NS)
+from tests.fixtures.box_room import path
+from tests.fixtures.kimera_multi import imu
+from tests.fixtures.ros_bags import FRAMES, START_NS, STEP_NS, Ros, scene
+from tests.fixtures.ros_clocks import HUSKY_LATE_NS, both, moved_headers
 
 
 def clocks_of(recording: Path) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import pytest
 
 from duagc.converters.simulate.render import meshes
 from duagc.pipeline.base.errors import DuagError
-from tests.converters.test_simulate_meshes import QUADS, folder_of, write_glb, write_ply
+from tests.fixtures.mesh_scenes import QUADS, folder_of, write_glb, write_ply
 from tests.fuzz.images import png_bomb
 
 ROOT = Path(__file__).parents[2]

@@ -16,11 +16,11 @@ from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cli import app
 from duagc.pipeline.recording import read_log
-from tests.converters.box_room import path
-from tests.converters.ros_bags import FRAMES, REAL, START_NS, Ros, scene
-from tests.converters.test_clocks import both
-from tests.converters.test_foreign_mcap import digests, write
-from tests.converters.test_kimera_multi import imu
+from tests.fixtures.box_room import path
+from tests.fixtures.foreign_mcap import digests, write
+from tests.fixtures.kimera_multi import imu
+from tests.fixtures.ros_bags import FRAMES, REAL, START_NS, Ros, scene
+from tests.fixtures.ros_clocks import both
 
 run = CliRunner()
 

@@ -13,7 +13,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from google.protobuf.json_format import MessageToDict
 from mcap.writer import CompressionType, IndexType, Writer
 
 from duagc import schemas
@@ -25,145 +24,8 @@ from duagc.pipeline.checks.check import check
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import open_rgbd, read_log
-from tests.converters.ros_bags import COLOR, DISTORTION, Ros, scene
-
-Row = tuple[str, int, Any]
-
-
-def foxglove(message: Any) -> Any:
-    """The Foxglove message that says what a ROS message says."""
-    name = message.__msgtype__.rpartition("/")[2]
-
-    def new(schema: str, **fields: Any) -> Any:
-        return schemas.message_class(f"foxglove.{schema}")(**fields)
-
-    def head(header: Any, frame: str = "frame_id") -> dict[str, Any]:
-        time = {"seconds": header.stamp.sec, "nanos": header.stamp.nanosec}
-        return {"timestamp": time, frame: header.frame_id}
-
-    def xyz(v: Any) -> dict[str, float]:
-        return {"x": v.x, "y": v.y, "z": v.z}
-
-    def xyzw(q: Any) -> dict[str, float]:
-        return {**xyz(q), "w": q.w}
-
-    if name == "Image":
-        kind = np.dtype(">u2" if message.is_bigendian else "<u2")
-        data = np.asarray(message.data)
-        if message.encoding == "16UC1":
-            rows = data.reshape(message.height, message.step)
-            used = 2 * message.width
-            values = np.ascontiguousarray(rows[:, :used]).view(kind).astype("<u2").view(np.uint8)
-            data = np.concatenate([values, rows[:, used:]], axis=1).ravel()
-        fields = {k: getattr(message, k) for k in ("width", "height", "encoding", "step")}
-        return new("RawImage", **head(message.header), **fields, data=data.tobytes())
-    if name == "CompressedImage":
-        fields = {"format": message.format, "data": message.data.tobytes()}
-        return new("CompressedImage", **head(message.header), **fields)
-    if name == "CameraInfo":
-        fields = {
-            k: list(getattr(message, k if hasattr(message, k) else k.lower())) for k in ("D", "K", "R", "P")
-        }
-        size = {"width": message.width, "height": message.height}
-        model = message.distortion_model
-        return new("CameraCalibration", **head(message.header), **size, distortion_model=model, **fields)
-    if name == "TFMessage":
-        transforms = [
-            {
-                **head(t.header, "parent_frame_id"),
-                "child_frame_id": t.child_frame_id,
-                "translation": xyz(t.transform.translation),
-                "rotation": xyzw(t.transform.rotation),
-            }
-            for t in message.transforms
-        ]
-        return new("FrameTransforms", transforms=transforms)
-    pose = {"position": xyz(message.pose.pose.position), "orientation": xyzw(message.pose.pose.orientation)}
-    return new("Odometry", **head(message.header), body_frame_id=message.child_frame_id, pose=pose)
-
-
-def as_json(message: Any) -> bytes:
-    """Foxglove's JSON of a message: bytes in base64, times as sec and nsec."""
-
-    def times(members: Any, message: Any) -> Any:
-        for field, value in message.ListFields():
-            if field.message_type and field.message_type.full_name == "google.protobuf.Timestamp":
-                members[field.name] = {"sec": value.seconds, "nsec": value.nanos}
-            elif field.message_type and field.is_repeated:
-                members[field.name] = [times(m, v) for m, v in zip(members[field.name], value, strict=True)]
-            elif field.message_type:
-                times(members[field.name], value)
-        return members
-
-    members = MessageToDict(
-        message, preserving_proto_field_name=True, always_print_fields_with_no_presence=True
-    )
-    return json.dumps(times(members, message)).encode()
-
-
-def as_rosbridge(value: Any, old: bool) -> Any:
-    """A message of ROS as rosbridge has it. old: times of ROS 1, bytes as a list."""
-    if isinstance(value, np.ndarray) and value.dtype == np.uint8 and not old:
-        return base64.b64encode(value.tobytes()).decode()
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, list):
-        return [as_rosbridge(v, old) for v in value]
-    if not hasattr(value, "__msgtype__"):
-        return value
-    members = {k: as_rosbridge(v, old) for k, v in vars(value).items() if k != "__msgtype__"}
-    if old and value.__msgtype__ == "builtin_interfaces/msg/Time":
-        return {"secs": members["sec"], "nsecs": members["nanosec"]}
-    return members
-
-
-def write(path: Path, rows: list[Row], kind: str, ros: Ros, **settings: Any) -> Path:
-    """Write messages of ROS into an MCAP file as "ros1", "cdr", "protobuf", "json" or, of ROS, "rosbridge"."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=1 << 16, **settings)
-        writer.start(profile={"ros1": "ros1", "cdr": "ros2"}.get(kind, ""))
-        channels: dict[str, int] = {}
-        for topic, log_ns, message in rows:
-            name, encoding, text, data = encoded(message, kind, ros)
-            if topic not in channels:
-                channels[topic] = writer.register_channel(
-                    topic,
-                    "json" if kind == "rosbridge" else kind,
-                    writer.register_schema(name, encoding, text),
-                )
-            writer.add_message(channels[topic], log_ns, data, log_ns - 1_000_000)
-        writer.finish()
-    return path
-
-
-def encoded(message: Any, kind: str, ros: Ros) -> tuple[str, str, bytes, bytes]:
-    """Name, encoding and text of the schema, and the message's bytes."""
-    if kind in ("ros1", "cdr"):
-        name = message.__msgtype__
-        text, _ = ros.store.generate_msgdef(name, ros_version=1 if kind == "ros1" else 2)
-        if kind == "ros1":
-            return (
-                name.replace("/msg/", "/"),
-                "ros1msg",
-                text.encode(),
-                bytes(ros.store.serialize_ros1(message, name)),
-            )
-        return name, "ros2msg", text.encode(), bytes(ros.store.serialize_cdr(message, name))
-    if kind == "rosbridge":
-        name = message.__msgtype__.replace("/msg/", "/") if ros.version == 1 else message.__msgtype__
-        text = json.dumps(as_rosbridge(message, ros.version == 1))
-        return name, "jsonschema", b'{"type": "object"}', text.encode()
-    proto = foxglove(message)
-    name = proto.DESCRIPTOR.full_name
-    if kind == "json":
-        return name, "jsonschema", b'{"type": "object"}', as_json(proto)
-    return name, "protobuf", schemas.descriptor_set(name), proto.SerializeToString()
-
-
-def digests(recording: Path) -> dict[str, str]:
-    robots = json.loads((recording / "recording.json").read_text())["robots"]
-    return {name: digest for row in robots.values() for name, digest in row["digests"].items()}
+from tests.fixtures.foreign_mcap import Row, as_rosbridge, digests, encoded, foxglove, write
+from tests.fixtures.ros_bags import COLOR, DISTORTION, Ros, scene
 
 
 @pytest.fixture(scope="module")

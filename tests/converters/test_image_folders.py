@@ -13,173 +13,17 @@ import numpy as np
 import pytest
 
 from duagc.converters import registry
-from duagc.converters.datasets import bonn, icl_nuim, tum
+from duagc.converters.datasets import bonn, icl_nuim
 from duagc.converters.layouts import tum_layout
 from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
-from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import open_rgbd, read_log
 from duagc.schemas import topics
-from tests.converters.box_room import look, path, render, save
+from tests.fixtures.box_room import path, render, save
+from tests.fixtures.image_folders import CASES, FRAMES, smooth, traj_line, tum_line
 
-REPLICA = PinholeCamera(1200, 680, 600.0, 600.0, 599.5, 339.5)
-SMALL = REPLICA.scaled(150, 85)
-ARIA = PinholeCamera(512, 512, 280.0, 280.0, 255.5, 255.5).scaled(128, 128)
-FRAMES = 4
 REAL = Path(__file__).parents[3] / "shared" / "data" / "replica_office0" / "office0"
-
-
-def traj_line(T: np.ndarray) -> str:
-    return " ".join(f"{v:.18e}" for v in T.ravel())
-
-
-def make_part(folder: Path, camera: PinholeCamera, poses: list[np.ndarray], scale: float) -> None:
-    """One part in the layout of NICE-SLAM, with one pose more than images."""
-    for i, T in enumerate(poses):
-        color, z = render(camera, T)
-        save(folder / "results" / f"frame{i:06d}.jpg", color)
-        save(folder / "results" / f"depth{i:06d}.png", np.rint(z * scale).astype(np.uint16))
-    (folder / "traj.txt").write_text("\n".join(traj_line(T) for T in [*poses, poses[-1]]) + "\n")
-
-
-def make_replica(root: Path) -> Path:
-    make_part(root / "room0", SMALL, path(FRAMES), 6553.5)
-    camera = {k: getattr(SMALL, k) for k in ("fx", "fy", "cx", "cy")}
-    camera |= {"w": SMALL.width, "h": SMALL.height, "scale": 6553.5}
-    (root / "cam_params.json").write_text(json.dumps({"camera": camera}))
-    return root / "room0"
-
-
-def make_replica_multiagent(root: Path) -> Path:
-    for part in (1, 2):
-        make_part(root / "Office-0" / f"office_0_part{part}", SMALL, path(FRAMES, 0.1 * part), 6553.5)
-    return root / "Office-0"
-
-
-def make_aria(root: Path) -> Path:
-    for agent in range(3):
-        make_part(root / "room0" / f"agent_{agent}", ARIA, path(FRAMES, 0.1 * agent), 6553.5)
-    return root / "room0"
-
-
-def tum_line(stamp: float, T: np.ndarray) -> str:
-    w, x, y, z = so3.to_quat_wxyz(T[:3, :3])
-    return f"{stamp:.4f} " + " ".join(f"{v:.9f}" for v in (*T[:3, 3], x, y, z, w))
-
-
-def smooth(t: float) -> np.ndarray:
-    """T_world_camera at a time (s) after the start."""
-    a = 0.4 * t
-    return look([1.5 * np.cos(a), 1.5 * np.sin(a), 0.2], [4.0, 3.0, -0.5])
-
-
-def make_tum_files(
-    root: Path,
-    camera: PinholeCamera,
-    distortion: tuple[float, ...],
-    marker_of: Callable[[np.ndarray], np.ndarray] = lambda T: T,
-) -> Path:
-    """Six color images at 30 Hz, depth 15 ms later; the last depth is 50 ms late; poses at 100 Hz."""
-    start = 1305031452.0
-    rgb, depth = ["# color images", "# file: 'x.bag'", "# timestamp filename"], ["# depth maps", "#", "#"]
-    for i in range(6):
-        t = 0.05 + i / 30
-        late = 0.05 if i == 5 else 0.015
-        color, _ = render(camera, smooth(t), distortion)
-        _, z = render(camera, smooth(t), distortion)
-        names = f"rgb/{start + t:.6f}.png", f"depth/{start + t + late:.6f}.png"
-        save(root / names[0], color)
-        save(root / names[1], np.rint(z * 5000).astype(np.uint16))
-        rgb.append(f"{start + t:.6f} {names[0]}")
-        depth.append(f"{start + t + late:.6f} {names[1]}")
-    (root / "rgb.txt").write_text("\n".join(rgb) + "\n")
-    (root / "depth.txt").write_text("\n".join(depth) + "\n")
-    poses = [tum_line(start + t, marker_of(smooth(t))) for t in np.arange(0, 0.3, 0.01)]
-    poses.insert(3, f"{start + 0.025:.4f} nan nan nan nan nan nan nan")
-    (root / "groundtruth.txt").write_text("\n".join(["#", "#", "# timestamp tx", *poses]) + "\n")
-    return root
-
-
-def make_tum(root: Path) -> Path:
-    camera, distortion = tum.CAMERAS["freiburg1"]
-    return make_tum_files(root / "rgbd_dataset_freiburg1_box", camera, distortion)
-
-
-def make_bonn(root: Path) -> Path:
-    def marker_of(T: np.ndarray) -> np.ndarray:
-        return bonn.T_ROS @ T @ se3.inverse(bonn.T_MARKER_CAMERA) @ se3.inverse(bonn.T_ROS)
-
-    return make_tum_files(root / "rgbd_bonn_box", bonn.CAMERA, bonn.DISTORTION, marker_of)
-
-
-def make_icl(root: Path) -> Path:
-    folder = root / "living_room_traj0_frei_png"
-    lines, poses = [], []
-    for i, T in enumerate(path(FRAMES)):
-        color, z = render(icl_nuim.CAMERA, T)
-        save(folder / "rgb" / f"{i}.png", color)
-        save(folder / "depth" / f"{i}.png", np.rint(z * 5000).astype(np.uint16))
-        lines.append(f"{i} depth/{i}.png {i} rgb/{i}.png")
-        poses.append(tum_line(i + 1, icl_nuim.S @ T @ icl_nuim.S).replace(".0000", "", 1))
-    (folder / "associations.txt").write_text("\n".join(lines) + "\n")
-    (folder / "traj0.gt.freiburg").write_text("\n".join(poses) + "\n")
-    return folder
-
-
-DEPTH_CAMERA = PinholeCamera(160, 120, 145.0, 145.2, 79.6, 60.1)
-COLOR_CAMERA = PinholeCamera(324, 242, 292.4, 291.8, 161.6, 122.5)
-
-
-def intrinsics(camera: PinholeCamera) -> str:
-    K = np.eye(4)
-    K[0, 0], K[1, 1], K[0, 2], K[1, 2] = camera.fx, camera.fy, camera.cx, camera.cy
-    return "\n".join(" ".join(f"{v:.6f}" for v in row) for row in K)
-
-
-def make_scannet(root: Path) -> Path:
-    folder = root / "scene0000_00"
-    for i, T in zip((0, 1, 2, 10), path(FRAMES), strict=True):
-        save(folder / "color" / f"{i}.jpg", render(COLOR_CAMERA, T)[0])
-        save(folder / "depth" / f"{i}.png", np.rint(render(DEPTH_CAMERA, T)[1] * 1000).astype(np.uint16))
-        (folder / "pose").mkdir(exist_ok=True)
-        values = np.full((4, 4), -np.inf) if i == 2 else T
-        (folder / "pose" / f"{i}.txt").write_text("\n".join(" ".join(map(str, row)) for row in values))
-    (folder / "intrinsic").mkdir()
-    (folder / "intrinsic" / "intrinsic_depth.txt").write_text(intrinsics(DEPTH_CAMERA))
-    (folder / "intrinsic" / "intrinsic_color.txt").write_text(intrinsics(COLOR_CAMERA))
-    return folder
-
-
-def make_scannetpp(root: Path) -> Path:
-    folder = root / "b20a261fdf"
-    camera = DEPTH_CAMERA
-    frames = []
-    for i, T in enumerate(path(FRAMES)):
-        color, z = render(camera, T)
-        save(folder / "dslr" / "undistorted_images" / f"DSC{i:05d}.JPG", color)
-        save(folder / "dslr" / "undistorted_depths" / f"DSC{i:05d}.png", np.rint(z * 1000).astype(np.uint16))
-        matrix = (T @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
-        frames.append({"file_path": f"DSC{i:05d}.JPG", "transform_matrix": matrix, "is_bad": i == 3})
-    content = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx + 0.5, "cy": camera.cy + 0.5}
-    content |= {"w": camera.width, "h": camera.height, "frames": frames[1:], "test_frames": frames[:1]}
-    where = folder / "dslr" / "nerfstudio" / "transforms_undistorted.json"
-    where.parent.mkdir()
-    where.write_text(json.dumps(content))
-    return folder
-
-
-# dataset: how its fixture is made, options, robots, frames of the first, its true poses
-CASES = {
-    "replica": (make_replica, [], 1, path(FRAMES)),
-    "replica-multiagent": (make_replica_multiagent, ["size=150x85"], 2, path(FRAMES, 0.1)),
-    "aria-multiagent": (make_aria, ["size=128x128"], 3, path(FRAMES)),
-    "tum": (make_tum, [], 1, [smooth(0.05 + i / 30) for i in range(5)]),
-    "bonn": (make_bonn, [], 1, [smooth(0.05 + i / 30) for i in range(5)]),
-    "icl-nuim": (make_icl, [], 1, path(FRAMES)),
-    "scannet": (make_scannet, [], 1, [path(FRAMES)[i] for i in (0, 1, 3)]),
-    "scannetpp": (make_scannetpp, [], 1, path(FRAMES)[:3]),
-}
 
 
 @pytest.fixture(scope="module")

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -15,124 +13,24 @@ from duagc.converters.datasets import kimera_multi
 from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.checks.check import check
-from duagc.pipeline.geometry import se3, so3
-from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry import so3
 from duagc.pipeline.recording import open_rgbd, read_log
 from duagc.pipeline.recording.motion import GyroPrior, motion_prior
 from duagc.pipeline.recording.read import LogFile
-from tests.converters.box_room import look, render
-from tests.converters.ros_bags import Ros, odometry
+from tests.fixtures.box_room import render
+from tests.fixtures.kimera_multi import (
+    COLOR,
+    FRAMES,
+    INFRA,
+    START_NS,
+    STEP_NS,
+    bag_rows,
+    body_at,
+    write_truth,
+)
+from tests.fixtures.ros_bags import Ros
 
-COLOR = PinholeCamera(160, 120, 95.0, 95.2, 80.4, 59.1)
-INFRA = PinholeCamera(160, 120, 94.3073, 94.37165, 81.588, 59.915)  # the dataset's, at a quarter of its size
-DISTORTION = (-0.055, 0.066, -0.0004, 0.0007, -0.021)  # of a D455's color camera
-START_NS = 1_665_777_600_123_456_789
-STEP_NS = 400_000_000
-FRAMES = 3
 CONTAINERS = {"acl_jackal": "bz2", "sparkal2": "lz4", "thoth": "plain"}
-RATE = np.array([0.02, -0.05, 0.3])  # rad/s, about the axes of the body
-
-
-def body_at(seconds: float, start: float) -> np.ndarray:
-    """A body (x forward, y left, z up) that drives along a line and turns evenly: exact between any two poses."""
-    T_start = look([-1.5, start, 0.1], [4.0, 1.0, -0.2])
-    R = T_start[:3, :3] @ se3.inverse(kimera_multi.T_BODY_INFRA1)[:3, :3] @ so3.exp(RATE * seconds)
-    return se3.from_rotation_translation(R, T_start[:3, 3] + seconds * np.array([0.8, 0.1, 0.02]))
-
-
-def vector(r: Ros, values: Any) -> Any:
-    return r.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, values), strict=True)))
-
-
-def imu(r: Ros, stamp_ns: int, frame: str, rates: np.ndarray) -> Any:
-    return r.make(
-        "sensor_msgs/msg/Imu",
-        header=r.header(stamp_ns, frame),
-        orientation=r.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-        orientation_covariance=np.array([-1.0] + [0.0] * 8),
-        angular_velocity=vector(r, rates),
-        angular_velocity_covariance=np.zeros(9),
-        linear_acceleration=vector(r, [0.0, -9.81, 0.0]),
-        linear_acceleration_covariance=np.zeros(9),
-    )
-
-
-def cloud(r: Ros, stamp_ns: int, frame: str) -> Any:
-    kinds = (("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 16, 7), ("ring", 20, 4), ("time", 24, 7))
-    fields = [
-        r.make("sensor_msgs/msg/PointField", name=n, offset=o, datatype=k, count=1) for n, o, k in kinds
-    ]
-    return r.make(
-        "sensor_msgs/msg/PointCloud2",
-        header=r.header(stamp_ns, frame),
-        height=1,
-        width=4,
-        fields=fields,
-        is_bigendian=False,
-        point_step=32,
-        row_step=128,
-        data=np.zeros(128, np.uint8),
-        is_dense=True,
-    )
-
-
-def bag_rows(r: Ros, robot: str, start: float, frame_prefix: str) -> list[tuple[str, int, Any]]:
-    """Messages of a robot by time of recording, which is 5 ms after that of the header."""
-    T_infra1_color, _ = kimera_multi.extrinsics(robot)
-    frames = {k: f"{frame_prefix}/forward_{k}_optical_frame" for k in ("color", "depth", "imu", "infra1")}
-    rows = []
-
-    def add(topic: str, stamp_ns: int, message: Any) -> None:
-        rows.append((f"/{robot}/{topic}", stamp_ns + 5_000_000, message))
-
-    for i in range(FRAMES):
-        at = START_NS + i * STEP_NS
-        T_infra1 = body_at(i * STEP_NS * 1e-9, start) @ kimera_multi.T_BODY_INFRA1
-        color, _ = render(COLOR, T_infra1 @ T_infra1_color, DISTORTION)
-        gray, z = render(INFRA, T_infra1)
-        jpeg = cv2.imencode(".jpg", color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
-        left = cv2.imencode(".jpg", gray[..., 0])[1].tobytes()
-        depth = np.rint(z * 1000).astype(np.uint16)
-        add("forward/color/camera_info", at, r.info(at, frames["color"], COLOR, DISTORTION))
-        add(
-            "forward/color/image_raw/compressed",
-            at,
-            r.compressed(at, frames["color"], jpeg, "rgb8; jpeg compressed bgr8"),
-        )
-        add("forward/depth/camera_info", at, r.info(at, frames["depth"], INFRA))
-        add(
-            "forward/depth/image_rect_raw",
-            at + 2_000_000,
-            r.image(at + 2_000_000, frames["depth"], depth, "16UC1"),
-        )
-        for side in ("infra1", "infra2"):
-            name = f"forward/{side}"
-            add(f"{name}/camera_info", at, r.info(at, frames["infra1"], INFRA))
-            add(
-                f"{name}/image_rect_raw/compressed",
-                at,
-                r.compressed(at, frames["infra1"], left, "mono8; jpeg compressed "),
-            )
-    R_infra1_body = kimera_multi.T_BODY_INFRA1[:3, :3].T
-    for k in range(-4, 200):
-        at = START_NS + k * 5_000_000
-        add("forward/imu", at, imu(r, at, frames["imu"], R_infra1_body @ RATE))
-    for k in range(5):
-        at = START_NS + k * 20_000_000
-        add("jackal_velocity_controller/odom", at, odometry(r, at, f"{frame_prefix}/base_link", np.eye(4)))
-    add("lidar_points", START_NS, cloud(r, START_NS, f"{frame_prefix}/velodyne"))
-    return sorted(rows, key=lambda row: row[1])
-
-
-def write_truth(path: Path, start: float) -> None:
-    """Five rows, irregular, as the dataset has them: nanoseconds, w first."""
-    lines = ["#timestamp_kf,x,y,z,qw,qx,qy,qz"]
-    for seconds in (-0.7, -0.25, 0.3, 0.9, 2.1):
-        T = body_at(seconds, start)
-        values = [*T[:3, 3], *so3.to_quat_wxyz(T[:3, :3])]
-        lines.append(",".join([str(START_NS + round(seconds * 1e9)), *(f"{v:.9f}" for v in values)]))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join(lines) + "\n")
 
 
 @pytest.fixture(scope="module")

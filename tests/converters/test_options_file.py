@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 from duagc.converters import registry
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cli import app
-from tests.converters.box_room import path, render, save
 from tests.converters.test_adding_a_dataset import CAMERA, DOC
-from tests.converters.test_seven_scenes import make_sequence
+from tests.fixtures.box_room import path, render, save
+from tests.fixtures.seven_scenes import make_sequence
 
 
 def convert(*arguments: object) -> None:

@@ -20,7 +20,7 @@ from duagc.converters.logs.entries import Entry
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.bench import convert
 from duagc.pipeline.geometry.camera import PinholeCamera
-from tests.recording.long_logs import COLOR, DEPTH, FRAME, IMU, KINDS, Seed, write
+from tests.fixtures.long_logs import COLOR, DEPTH, FRAME, IMU, KINDS, Seed, write
 
 CAMERA = PinholeCamera(96, 64, 80.0, 80.0, 47.5, 31.5)
 FRAMES = 7

@@ -23,8 +23,8 @@ from duagc.pipeline.recording import open_rgbd, read_log
 from duagc.pipeline.recording.read import LogFile
 from duagc.pipeline.recording.register_depth import register_depth
 from duagc.schemas import topics
-from tests.converters.box_room import path, render
-from tests.converters.ros_bags import (
+from tests.fixtures.box_room import path, render
+from tests.fixtures.ros_bags import (
     COLOR,
     DEPTH,
     DISTORTION,

@@ -13,7 +13,8 @@ import pytest
 from duagc.converters.layouts import ros_images
 from duagc.converters.logs.foxglove import Fields
 from duagc.pipeline.base.errors import DuagError
-from tests.converters.ros_bags import COLOR, Ros
+from tests.fixtures.ros_bags import COLOR, Ros
+from tests.fixtures.rvl_images import rvl
 
 
 @pytest.mark.parametrize(
@@ -116,39 +117,6 @@ def test_depth_of_sixteen_bits_and_of_floats(big: bool) -> None:
     got = ros_images.depth_m(floats, "here", 0.001)
     assert (got[0, :4] == 0).all()
     assert np.array_equal(got[1:], meters[1:])
-
-
-def rvl(raw: np.ndarray) -> bytes:
-    """RVL encoder, as the paper has it."""
-    nibbles: list[int] = []
-
-    def put(value: int) -> None:
-        while True:
-            nibble, value = value & 7, value >> 3
-            nibbles.append(nibble | (8 if value else 0))
-            if not value:
-                return
-
-    flat, at, previous = raw.ravel().astype(int).tolist(), 0, 0
-    while at < len(flat):
-        zeros = at
-        while at < len(flat) and flat[at] == 0:
-            at += 1
-        put(at - zeros)
-        end = at
-        while end < len(flat) and flat[end] != 0:
-            end += 1
-        put(end - at)
-        for value in flat[at:end]:
-            delta = value - previous
-            put((delta << 1) ^ (delta >> 63))
-            previous = value
-        at = end
-    nibbles += [0] * (-len(nibbles) % 8)
-    words = [
-        sum(n << (28 - 4 * k) for k, n in enumerate(nibbles[i : i + 8])) for i in range(0, len(nibbles), 8)
-    ]
-    return struct.pack("<II", raw.shape[1], raw.shape[0]) + struct.pack(f"<{len(words)}I", *words)
 
 
 def test_compressed_depth() -> None:

@@ -13,30 +13,23 @@ from duagc.converters import registry
 from duagc.converters.layouts.stereo import RawCamera, StereoOptions, StereoRig
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
-from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import Recording, open_rgbd
-from tests.converters.ros_bags import Ros, odometry
-from tests.converters.stereo_room import path, render, right_of
-from tests.converters.test_s3e import (
+from tests.fixtures.lidar_logs import FRAMES, START, lidar_log
+from tests.fixtures.ros_bags import Ros, odometry
+from tests.fixtures.s3e import (
     D_LEFT,
     D_RIGHT,
     LEFT,
-    RATE,
     RIGHTS,
     START_NS,
     STEP_NS,
-    T_IMU_LEFT,
-    T_LIDAR_LEFT,
     T_right_left_of,
-    cloud,
     pose_at,
-    turning_sweep,
 )
+from tests.fixtures.stereo_room import render, right_of
 
 RIGHT, T_RIGHT_LEFT = RIGHTS["bob"], T_right_left_of("bob")
 T_LEFT_RIGHT = se3.inverse(T_RIGHT_LEFT)
-FRAMES = 3
-START = path(1)[0]
 TEXT = " ".join(f"{v:.12f}" for v in (*T_LEFT_RIGHT[:3, 3], *so3.to_quat_wxyz(T_LEFT_RIGHT[:3, :3])))
 
 
@@ -122,44 +115,6 @@ def test_a_pair_whose_rows_do_not_meet_is_refused(tmp_path: Path) -> None:
         DuagError, match=r"P of /eyes/right/camera_info has no base line, and /tf_static does not tie"
     ):
         registry.convert("ros", log, tmp_path / "rec", options=["depth_from=stereo"])
-
-
-def lidar_log(folder: Path, tied: bool = True) -> Path:
-    """A camera that turns with a LiDAR and an IMU on it."""
-    r, camera = Ros(2), PinholeCamera(240, 180, 200.0, 200.0, 119.5, 89.5)
-    rows = [("/camera/camera_info", START_NS, r.info(START_NS, "cam", camera))]
-    if tied:
-        ties = [("cam", "velo", se3.inverse(T_LIDAR_LEFT)), ("cam", "imu", se3.inverse(T_IMU_LEFT))]
-        rows.append(("/tf_static", START_NS, r.tf(*(r.transform(START_NS, *tie) for tie in ties))))
-    for k in range(FRAMES):
-        at = START_NS + k * STEP_NS
-        T = pose_at(START, at)
-        message = r.image(at, "cam", render(camera, T)[0], "rgb8")
-        rows.append(("/camera/image_raw", at + 5_000_000, message))
-        rows.append(("/odom", at + 6_000_000, odometry(r, at, "cam", T)))
-        sweep = cloud(at + 30_000_000, *turning_sweep(START, at + 30_000_000))
-        sweep.header.frame_id = "velo"
-        rows.append(("/points", at + 35_000_000, sweep))
-    for k in range(50):
-        at = START_NS - 150_000_000 + k * 10_000_000
-        w = T_IMU_LEFT[:3, :3] @ RATE
-        vector = [
-            r.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", v, strict=True)))
-            for v in (w, [0.0, 0.0, 9.8])
-        ]
-        message = r.make(
-            "sensor_msgs/msg/Imu",
-            header=r.header(at, "imu"),
-            orientation=r.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-            orientation_covariance=np.zeros(9),
-            angular_velocity=vector[0],
-            angular_velocity_covariance=np.zeros(9),
-            linear_acceleration=vector[1],
-            linear_acceleration_covariance=np.zeros(9),
-        )
-        rows.append(("/imu", at, message))
-    rows.sort(key=lambda row: row[1])
-    return r.write(folder / f"lidar{tied}", rows, "sqlite3")
 
 
 def test_a_lidar_and_what_turns_it(tmp_path: Path) -> None:

@@ -18,64 +18,9 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import Recording, content_digest, open_rgbd, read_log
+from tests.fixtures.seven_scenes import FRAMES, T_DEPTH_COLOR, depth_pose, make_sequence, render, render_rays
 
-ROOM_HALF_M = np.array([1.6, 1.3, 1.1])
-BOX_HALF_M = np.array([0.25, 0.3, 0.2])
-BOX_CENTER_M = np.array([0.1, 0.5, 0.1])
 REAL = Path(__file__).parents[3] / "shared" / "data" / "redkitchen"
-FRAMES = 7
-T_DEPTH_COLOR = se3.from_rotation_translation(np.eye(3), [Options().baseline_m, 0, 0])
-
-
-def render(camera: PinholeCamera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Color uint8 [H, W, 3] and exact z-depth [H, W] of a box in a room, seen from inside the room."""
-    return render_rays(camera.rays(), T_world_camera)
-
-
-def render_rays(rays_camera: np.ndarray, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`render` along rays [H, W, 3] with z = 1."""
-    rays = rays_camera.reshape(-1, 3) @ T_world_camera[:3, :3].T
-    origin = T_world_camera[:3, 3]
-    with np.errstate(divide="ignore"):
-        to_walls = np.where(rays > 0, (ROOM_HALF_M - origin) / rays, (-ROOM_HALF_M - origin) / rays).min(
-            axis=1
-        )
-        a, b = ((BOX_CENTER_M + s * BOX_HALF_M - origin) / rays for s in (-1, 1))
-    enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
-    z = np.where((enter < leave) & (enter > 0), enter, to_walls)
-    points = origin + z[:, None] * rays
-    shade = (np.floor(points * 5 + 0.3).sum(axis=1) % 2) * 90 + 80
-    color = np.stack([shade, shade * 0.8, shade * 0.6], axis=-1).astype(np.uint8)
-    return color.reshape(rays_camera.shape), z.reshape(rays_camera.shape[:2])
-
-
-def depth_pose(index: int) -> np.ndarray:
-    """T_world_depth of frame `index`: an arc around the box, looking at it (z forward, y down)."""
-    angle = -0.3 + 0.05 * index
-    position = np.array([0.9 * np.sin(angle), -0.8 * np.cos(angle), -0.1])
-    z = BOX_CENTER_M - position
-    z /= np.linalg.norm(z)
-    x = np.cross(z, [0, 0, 1.0])
-    x /= np.linalg.norm(x)
-    return se3.from_rotation_translation(np.stack([x, np.cross(z, x), z], axis=1), position)
-
-
-def make_sequence(folder: Path) -> Path:
-    """A sequence in the files of the dataset."""
-    folder.mkdir(parents=True)
-    options = Options()
-    for index in range(FRAMES):
-        pose = depth_pose(index)
-        color, _ = render(options.color_camera(), pose @ T_DEPTH_COLOR)
-        _, depth = render(options.depth_camera(), pose)
-        raw = np.rint(depth * 1000).astype(np.uint16)
-        raw[:20, :30], raw[20:40, :30] = 0, 65535
-        stem = folder / f"frame-{index:06d}"
-        cv2.imwrite(f"{stem}.color.jpg", color)
-        cv2.imwrite(f"{stem}.depth.png", raw, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        pose[:3, :3] += np.random.default_rng(index).uniform(-4e-4, 4e-4, (3, 3))  # as the dataset has it
-        np.savetxt(f"{stem}.pose.txt", pose, delimiter="\t")
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -2,11 +2,9 @@
 
 import json
 import shutil
-import struct
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -22,179 +20,19 @@ from duagc.converters.simulate.trajectories.loops import look_at, shared_view
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import Recording, open_rgbd
-
-HOUSE = Path(__file__).parents[3] / "shared" / "data" / "scenes" / "house_upper"
-ROOM = np.array([5.0, 4.0, 2.6])
-TABLE = np.array([[2.0, 1.6, 0.0], [3.0, 2.4, 0.7]])
-TEXEL_M = 0.01
-
-
-@dataclass(frozen=True)
-class Quad:
-    """A rectangle corner + s axis_s + t axis_t, 0 <= s, t <= size, painted by `color`."""
-
-    corner: np.ndarray
-    axis_s: np.ndarray
-    axis_t: np.ndarray
-    size: tuple[float, float]
-    phase: float
-
-    def color(self, s: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """RGB at surface coordinates (m); every 12 cm or more a wave, different in s and t, and on every quad."""
-        waves = np.stack(
-            [
-                np.sin(2 * np.pi * s / 0.5 + self.phase),
-                np.sin(2 * np.pi * t / 0.35 + 2 * self.phase),
-                np.cos(2 * np.pi * (s + 2 * t) / 0.6 + 3 * self.phase),
-            ],
-            axis=-1,
-        )
-        return 128 + 90 * waves
-
-
-def box(low: np.ndarray, high: np.ndarray, first: int) -> list[Quad]:
-    quads = []
-    for axis in range(3):
-        for end in (low, high):
-            i, j = (axis + 1) % 3, (axis + 2) % 3
-            corner = low.copy()
-            corner[axis] = end[axis]
-            size = (high - low)[[i, j]]
-            quads.append(
-                Quad(corner, np.eye(3)[i], np.eye(3)[j], (size[0], size[1]), 0.7 * (first + len(quads)))
-            )
-    return quads
-
-
-QUADS = box(np.zeros(3), ROOM, 0) + box(TABLE[0], TABLE[1], 6)
-
-
-def texture(quad: Quad) -> np.ndarray:
-    w, h = (round(size / TEXEL_M) for size in quad.size)
-    s, t = np.meshgrid((np.arange(w) + 0.5) * TEXEL_M, (np.arange(h) + 0.5) * TEXEL_M)
-    return np.rint(quad.color(s, t)).astype(np.uint8)
-
-
-def corners(quad: Quad) -> np.ndarray:
-    s, t = quad.size
-    steps = [(0, 0), (s, 0), (s, t), (0, t)]
-    return np.stack([quad.corner + a * quad.axis_s + b * quad.axis_t for a, b in steps])
-
-
-def y_up(points: np.ndarray) -> np.ndarray:
-    return np.stack([points[:, 0], points[:, 2], -points[:, 1]], axis=1)
-
-
-def png(image: np.ndarray) -> bytes:
-    return cv2.imencode(".png", image[..., ::-1])[1].tobytes()
-
-
-UVS = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], dtype=np.float32)  # down from the top, as glTF counts
-FACES = np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32)
-
-
-def write_glb(path: Path, quads: list[Quad], plain: bool = False) -> None:
-    """A binary glTF file by its specification; `plain` leaves the textures out."""
-    blob, views, accessors, materials, parts = b"", [], [], [], []
-
-    def add(data: bytes) -> int:
-        nonlocal blob
-        views.append({"buffer": 0, "byteOffset": len(blob), "byteLength": len(data)})
-        blob += data + bytes(-len(data) % 4)
-        return len(views) - 1
-
-    images = []
-    for quad in quads:
-        points = y_up(corners(quad)).astype(np.float32)
-        bounds = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
-        shape = {"componentType": 5126, "count": 4}
-        accessors.append({"bufferView": add(points.tobytes()), "type": "VEC3", **shape, **bounds})
-        accessors.append({"bufferView": add(UVS.tobytes()), "type": "VEC2", **shape})
-        accessors.append(
-            {"bufferView": add(FACES.tobytes()), "type": "SCALAR", "componentType": 5125, "count": 6}
-        )
-        k = len(materials)
-        about = {} if plain else {"pbrMetallicRoughness": {"baseColorTexture": {"index": k}}}
-        materials.append(about)
-        if not plain:
-            images.append({"bufferView": add(png(texture(quad))), "mimeType": "image/png"})
-        attributes = {"POSITION": 3 * k, "TEXCOORD_0": 3 * k + 1}
-        parts.append({"primitives": [{"attributes": attributes, "indices": 3 * k + 2, "material": k}]})
-    content = {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": list(range(len(parts)))}],
-        "nodes": [{"mesh": k} for k in range(len(parts))],
-        "meshes": parts,
-        "materials": materials,
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(blob)}],
-    }
-    if images:
-        content |= {"images": images, "textures": [{"source": k} for k in range(len(images))]}
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    size = 12 + 8 + len(text) + 8 + len(blob)
-    path.write_bytes(
-        struct.pack("<4sII", b"glTF", 2, size)
-        + struct.pack("<I4s", len(text), b"JSON")
-        + text
-        + struct.pack("<I4s", len(blob), b"BIN\0")
-        + blob
-    )
-
-
-def write_obj(path: Path, quads: list[Quad]) -> None:
-    lines, materials = [f"mtllib {path.stem}.mtl"], []
-    for k, quad in enumerate(quads):
-        image = f"{path.stem}{k}.png"
-        (path.parent / image).write_bytes(png(texture(quad)))
-        materials.append(f"newmtl m{k}\nKd 1 1 1\nmap_Kd {image}\n")
-        lines += [f"usemtl m{k}"]
-        lines += ["v {} {} {}".format(*point) for point in y_up(corners(quad))]
-        lines += [f"vt {u} {1 - v}" for u, v in UVS]  # up from the bottom, as OBJ counts
-        lines += ["f " + " ".join(f"{4 * k + i + 1}/{4 * k + i + 1}" for i in face) for face in FACES]
-    path.write_text("\n".join(lines) + "\n")
-    path.with_suffix(".mtl").write_text("\n".join(materials))
-
-
-def write_ply(path: Path, quads: list[Quad], colors: bool = True) -> None:
-    """Vertices every 25 mm, colored; z up."""
-    points, paints, faces = [], [], []
-    for quad in quads:
-        n, m = (round(size / 0.025) + 1 for size in quad.size)
-        across, down = np.linspace(0, quad.size[0], n), np.linspace(0, quad.size[1], m)
-        s, t = (grid.ravel() for grid in np.meshgrid(across, down))
-        first = sum(map(len, points))
-        points.append(quad.corner + s[:, None] * quad.axis_s + t[:, None] * quad.axis_t)
-        paints.append(np.rint(quad.color(s, t)).astype(np.uint8))
-        a = first + (np.arange(m - 1)[:, None] * n + np.arange(n - 1)).ravel()
-        faces += [np.stack([a, a + 1, a + n + 1], axis=1), np.stack([a, a + n + 1, a + n], axis=1)]
-    vertices, triangles = np.concatenate(points), np.concatenate(faces)
-    row = np.dtype([("p", "<f4", 3)] + ([("c", "u1", 3)] if colors else []))
-    rows = np.zeros(len(vertices), dtype=row)
-    rows["p"] = vertices
-    if colors:
-        rows["c"] = np.concatenate(paints)
-    face_rows = np.zeros(len(triangles), dtype=[("n", "u1"), ("i", "<i4", 3)])
-    face_rows["n"], face_rows["i"] = 3, triangles
-    names = [f"property float {c}" for c in "xyz"]
-    names += [f"property uchar {c}" for c in ("red", "green", "blue")] if colors else []
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}", *names]
-    header += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header", ""]
-    path.write_bytes("\n".join(header).encode() + rows.tobytes() + face_rows.tobytes())
-
-
-WRITERS = {"glb": write_glb, "obj": write_obj, "ply": write_ply}
-
-
-def folder_of(path: Path, kind: str) -> Path:
-    """The room in two chunks."""
-    path.mkdir(parents=True)
-    WRITERS[kind](path / f"walls.{kind}", QUADS[:6])
-    WRITERS[kind](path / f"table.{kind}", QUADS[6:])
-    return path
+from tests.fixtures.mesh_scenes import (
+    HOUSE,
+    QUADS,
+    ROOM,
+    TABLE,
+    WRITERS,
+    folder_of,
+    png,
+    some_poses,
+    write_glb,
+    write_obj,
+    write_ply,
+)
 
 
 @pytest.fixture(scope="module", params=sorted(WRITERS))
@@ -205,12 +43,6 @@ def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     (where / "cache").mkdir()
     meshes.read(folder, meshes.up_axis(files, "auto"), where / "cache")
     return MeshStage(0, where / "cache")
-
-
-def some_poses() -> np.ndarray:
-    at = np.array([(1.0, 1.0, 1.4), (4.2, 0.9, 1.1), (2.5, 3.3, 1.9)])
-    to = np.array([(3.2, 2.6, 0.5), (1.8, 2.9, 0.9), (2.6, 1.0, 0.2)])
-    return look_at(at, to)
 
 
 def true_view(origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

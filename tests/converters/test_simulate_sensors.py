@@ -14,8 +14,8 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import Recording, open_rgbd
-from tests.converters.test_simulate_meshes import ROOM, folder_of, some_poses
-from tests.converters.test_simulate_paradigms import true_poses
+from tests.fixtures.mesh_scenes import ROOM, folder_of, some_poses
+from tests.fixtures.recordings import true_poses
 
 CAMERA = camera_of((80, 60))
 TWIST = np.array([0.5, -0.2, 0.3, 0.4, 0.6, -0.3])
@@ -117,8 +117,8 @@ def test_gain_changes_the_light():
     assert with_gain(gray, 2.0).mean() == pytest.approx(60 * 2 ** (1 / 2.2), abs=1)
 
 
-def test_cameras_differ_by_channel(tmp_path):
-    kind = {"frames": 2, "size": (64, 48), "workers": 1}
+def test_cameras_differ_by_channel(folder, tmp_path):
+    kind = {"scene": str(folder), "frames": 2, "size": (64, 48), "workers": 1}
     simulate(tmp_path / "alike", **kind)
     simulate(tmp_path / "differ", rig=Rig(camera_stops=1.0), **kind)
     checks = json.loads((tmp_path / "differ" / "recording.json").read_text())["checks"]

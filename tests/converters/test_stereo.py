@@ -10,7 +10,7 @@ from duagc.converters.layouts.stereo import RawCamera, RowCheck, StereoOptions, 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from tests.converters.stereo_room import path, render, right_of
+from tests.fixtures.stereo_room import path, render, right_of
 
 LEFT = PinholeCamera(306, 256, 294.1, 294.0, 155.4, 127.0)
 RIGHT = PinholeCamera(306, 256, 292.7, 292.7, 150.6, 126.4)

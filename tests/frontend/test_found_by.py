@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from duagc.converters.simulate.team import camera_of
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.experiments import disturbances as d
-from duagc.pipeline.experiments.disturbances import Shot, Undisturbed, filmed
+from duagc.pipeline.experiments.disturbances import Shot, Undisturbed
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.relocalization import by_latest_keyframe
 from duagc.pipeline.frontend.tracked import Status
@@ -16,10 +15,9 @@ from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.frontend.tracking_state import Candidate, CurrentFrame
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import RgbdPyramid, register
-from tests.frontend.test_lost import CONFIG
-
-CAMERA = camera_of((240, 180))
-START = 45
+from tests.fixtures.films import CAMERA, filmed
+from tests.frontend.conftest import CONFIG
+from tests.frontend.conftest import START_OF_COMPARISONS as START
 
 
 def pyramid_of(shot: Shot) -> RgbdPyramid:
@@ -27,15 +25,9 @@ def pyramid_of(shot: Shot) -> RgbdPyramid:
 
 
 @pytest.fixture(scope="module")
-def run() -> Undisturbed:
-    """A run that needs no more frames than these."""
-    return Undisturbed(Tracker(CAMERA, CONFIG), filmed(0, START + 8, CAMERA), (START,))
-
-
-@pytest.fixture(scope="module")
 def misfit() -> Undisturbed:
     """Depth that does not fit the color, by two pixels: what a poor calibration does."""
-    shots = [replace(shot, depth=np.roll(shot.depth, 2, axis=1)) for shot in filmed(0, START + 8, CAMERA)]
+    shots = [replace(shot, depth=np.roll(shot.depth, 2, axis=1)) for shot in filmed(0, START + 8)]
     return Undisturbed(Tracker(CAMERA, CONFIG), shots, (START,))
 
 

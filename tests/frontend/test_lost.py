@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from duagc.converters.simulate.team import camera_of
-from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
+from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.experiments import disturbances as d
 from duagc.pipeline.experiments.disturbances import Row, Shot, Undisturbed
 from duagc.pipeline.frontend.failure import FrozenImageDetector, Reason, free_space_violations
@@ -21,22 +20,16 @@ from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import open_rgbd
 from duagc.pipeline.registration import RgbdPyramid
+from tests.fixtures.films import CAMERA, FRAMES, filmed
+from tests.fixtures.sampling import sampled
+from tests.frontend.conftest import CONFIG, STARTS
 
-CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)))
-CAMERA = camera_of((240, 180))
-STARTS = (17, 34, 50)
-FRAMES = 95
 RED_KITCHEN = Path(__file__).parents[2] / "recordings" / "redkitchen"
 
 
 @pytest.fixture(scope="module")
-def run() -> Undisturbed:
-    return Undisturbed(Tracker(CAMERA, CONFIG), d.filmed(0, FRAMES, CAMERA), STARTS)
-
-
-@pytest.fixture(scope="module")
 def other_room() -> list[Shot]:
-    return d.filmed(5, 30, CAMERA)
+    return filmed(5, 30)
 
 
 def during(rows: Sequence[Row]) -> list[Row]:
@@ -60,7 +53,7 @@ def test_the_undisturbed_run_is_sound(run: Undisturbed) -> None:
     assert all(frame.reason is Reason.NONE for frame in run.frames)
 
 
-@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("start", sampled(STARTS))
 def test_a_covered_lens_is_lost_and_found_again(run: Undisturbed, start: int) -> None:
     rows = run.disturbed(start, d.covered)
     assert not any(row.wrong for row in rows)
@@ -71,7 +64,7 @@ def test_a_covered_lens_is_lost_and_found_again(run: Undisturbed, start: int) ->
     assert next(row for row in after(rows) if row.good).frame.status is Status.RELOCALIZED
 
 
-@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("start", sampled(STARTS))
 def test_a_hand_before_the_lens_does_not_take_the_pose_along(run: Undisturbed, start: int) -> None:
     rows = run.disturbed(start, d.hand)
     assert not any(row.wrong for row in rows)
@@ -107,7 +100,7 @@ def test_a_hand_outside_the_keyframe_s_view_is_noticed(run: Undisturbed) -> None
     assert {d.track(tracker, shot)[0].keyframe_index for shot in behind} == {len(before) + 1}
 
 
-@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("start", sampled(STARTS))
 def test_a_foreign_room_is_nowhere(run: Undisturbed, other_room: list[Shot], start: int) -> None:
     for disturbance in (d.foreign(other_room), d.mirrored):
         rows = run.disturbed(start, disturbance)
@@ -116,14 +109,14 @@ def test_a_foreign_room_is_nowhere(run: Undisturbed, other_room: list[Shot], sta
         assert_found_again(rows, within=4)
 
 
-@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("start", sampled(STARTS))
 def test_dropped_frames_change_nothing(run: Undisturbed, start: int) -> None:
     rows = run.disturbed(start, d.dropped)
     assert [row.frame.status for row in rows] == [Status.OK] * len(rows)
     assert max(row.moved_m for row in rows) < 2e-3
 
 
-@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("start", sampled(STARTS))
 def test_stuck_depth_is_noticed_and_the_color_goes_on(run: Undisturbed, start: int) -> None:
     rows = run.disturbed(start, d.frozen)
     assert not any(row.wrong for row in rows)
@@ -133,7 +126,7 @@ def test_stuck_depth_is_noticed_and_the_color_goes_on(run: Undisturbed, start: i
     assert_found_again(rows, within=4)
 
 
-@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("start", sampled(STARTS))
 def test_without_depth_the_camera_goes_on_for_a_while(run: Undisturbed, start: int) -> None:
     rows = run.disturbed(start, d.depthless)
     assert not any(row.wrong for row in rows)
@@ -143,7 +136,7 @@ def test_without_depth_the_camera_goes_on_for_a_while(run: Undisturbed, start: i
     assert_found_again(rows, within=4)
 
 
-@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("start", sampled(STARTS))
 def test_stuck_color_is_noticed(run: Undisturbed, start: int) -> None:
     rows = run.disturbed(start, d.frozen_color)
     assert not any(row.wrong for row in rows)
@@ -151,7 +144,7 @@ def test_stuck_color_is_noticed(run: Undisturbed, start: int) -> None:
     assert_found_again(rows, within=4)
 
 
-@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("start", sampled(STARTS))
 def test_flipped_exposure_is_followed_or_lost(run: Undisturbed, start: int) -> None:
     rows = run.disturbed(start, d.flipped)
     assert not any(row.wrong for row in rows)

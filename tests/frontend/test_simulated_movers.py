@@ -8,7 +8,7 @@ from duagc.converters.simulate.team import simulate
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.recording import Recording, open_rgbd, read_log
-from tests.converters.test_simulate_meshes import folder_of
+from tests.fixtures.mesh_scenes import folder_of
 
 
 def test_what_moves_is_not_in_the_map(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from duagc.pipeline.config.base import load_config
 from duagc.pipeline.geometry.trajectory import read_tum
 from duagc.pipeline.recording import Recording, format_info, info, open_rgbd, read_log, recovery
 from duagc.pipeline.runs import digest
-from tests.converters import test_image_folders
+from tests.fixtures import image_folders
 from tests.fuzz import seeds
 from tests.fuzz.formats import Special, any_special
 
@@ -225,7 +225,7 @@ def _truth() -> list[str]:
 CONVERTERS = (
     *(
         converter(name, make, name, partial(seeds.image_options, name))
-        for name, (make, *_) in test_image_folders.CASES.items()
+        for name, (make, *_) in image_folders.CASES.items()
     ),
     converter("7scenes", seeds.seven, "7scenes", seeds.seven_options),
     converter("ros1", seeds.ros_bag(1, "plain"), "ros", _truth),

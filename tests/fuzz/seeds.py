@@ -20,22 +20,22 @@ from rosbags.typesys import store
 from duagc.converters.datasets import bonn, icl_nuim, seven_scenes, tum
 from duagc.converters.layouts.ros_images import rows_of
 from duagc.pipeline.geometry.camera import PinholeCamera
-from tests.converters import (
-    box_room,
-    ros_bags,
-    test_foreign_mcap,
-    test_image_folders,
-    test_kimera_multi,
-    test_ros_other_depth,
-    test_s3e,
-    test_seven_scenes,
-    test_simulate_meshes,
-)
-from tests.converters.ros_bags import Ros, scene
-from tests.converters.test_ros_images import rvl
-from tests.converters.test_simulate_meshes import QUADS
 from tests.evaluation import fake_run
-from tests.recording.logs import write_recording
+from tests.fixtures import (
+    box_room,
+    foreign_mcap,
+    image_folders,
+    kimera_multi,
+    lidar_logs,
+    mesh_scenes,
+    ros_bags,
+)
+from tests.fixtures import s3e as s3e_bags
+from tests.fixtures import seven_scenes as seven_scenes_files
+from tests.fixtures.mesh_scenes import QUADS
+from tests.fixtures.recording_logs import write_recording
+from tests.fixtures.ros_bags import Ros, scene
+from tests.fixtures.rvl_images import rvl
 
 SMALL_PX = 112  # wide: the self-check of converters wants 200 points, 6 pixels apart
 STEREO_PX = 224  # that of rectification wants 50 features
@@ -53,20 +53,20 @@ def shrink() -> None:
         module.CAMERA = small(module.CAMERA)
     tum.CAMERAS = {name: (small(camera), lens) for name, (camera, lens) in tum.CAMERAS.items()}
     for fixtures, names in (
-        (test_image_folders, ("SMALL", "ARIA", "DEPTH_CAMERA", "COLOR_CAMERA")),
+        (image_folders, ("SMALL", "ARIA", "DEPTH_CAMERA", "COLOR_CAMERA")),
         (ros_bags, ("COLOR", "DEPTH")),
-        (test_kimera_multi, ("COLOR", "INFRA")),
+        (kimera_multi, ("COLOR", "INFRA")),
     ):
         for name in names:
             setattr(fixtures, name, small(getattr(fixtures, name)))
-    test_s3e.LEFT = small(test_s3e.LEFT, STEREO_PX)
-    test_s3e.RIGHTS = {name: small(camera, STEREO_PX) for name, camera in test_s3e.RIGHTS.items()}
-    for fixtures in (ros_bags, test_kimera_multi, test_s3e, test_seven_scenes):
+    s3e_bags.LEFT = small(s3e_bags.LEFT, STEREO_PX)
+    s3e_bags.RIGHTS = {name: small(camera, STEREO_PX) for name, camera in s3e_bags.RIGHTS.items()}
+    for fixtures in (ros_bags, kimera_multi, s3e_bags, seven_scenes_files):
         fixtures.FRAMES = FRAMES
     seven_scenes.WIDTH, seven_scenes.HEIGHT = SMALL_PX, round(SMALL_PX * 0.75)
     wall = fake_run.wall
     fake_run.wall = lambda seed=0: wall(seed).select(slice(None, None, 50))
-    test_simulate_meshes.TEXEL_M = 0.1
+    mesh_scenes.TEXEL_M = 0.1
     # most of the time to read a bag goes into texts that every bag holds, and into code that is made of them
     anyreader.get_types_from_msg = cache(anyreader.get_types_from_msg)
     store.exec = serde_utils.exec = lambda text, *where: exec(_compiled(text), *where)
@@ -79,7 +79,7 @@ def _compiled(text: str) -> CodeType:
 
 def image_options(dataset: str) -> list[str]:
     """Options of the datasets that are folders of images."""
-    cameras = {"replica-multiagent": test_image_folders.SMALL, "aria-multiagent": test_image_folders.ARIA}
+    cameras = {"replica-multiagent": image_folders.SMALL, "aria-multiagent": image_folders.ARIA}
     camera = cameras.get(dataset)
     return [f"size={camera.width}x{camera.height}"] if camera else []
 
@@ -120,7 +120,7 @@ def compressed_bag(root: Path) -> Path:
 def lidar_bag(root: Path) -> Path:
     """A camera, a LiDAR and an IMU."""
     root.mkdir(parents=True)
-    return test_ros_other_depth.lidar_log(root)
+    return lidar_logs.lidar_log(root)
 
 
 LIDAR_OPTIONS = ("depth_from=lidar", "truth=/odom", "imu=/imu")
@@ -137,7 +137,7 @@ def team_file(root: Path) -> Path:
         lines += [f"[robots.{name}]", f'logs = ["{name}"]', f'namespace = "/{name}"', 'truth_file = "gt.tum"']
         lines += ["truth_offset_s = 0.25", 'T_truth_color = "0 0 0 1 0 0 0"', ""]
     poses = [
-        test_image_folders.tum_line((ros_bags.START_NS + (i + 1) * ros_bags.STEP_NS) / 1e9 - 0.25, T)
+        image_folders.tum_line((ros_bags.START_NS + (i + 1) * ros_bags.STEP_NS) / 1e9 - 0.25, T)
         for i, T in enumerate(box_room.path(FRAMES))
     ]
     (root / "gt.tum").write_text("\n".join(poses) + "\n")
@@ -155,7 +155,7 @@ def make_logs(seed: Path) -> None:
 def foreign(kind: str) -> Callable[[Path], Path]:
     def make(root: Path) -> Path:
         r = Ros(1 if kind == "ros1" else 2)
-        return test_foreign_mcap.write(root / "log.mcap", scene(r), kind, r)
+        return foreign_mcap.write(root / "log.mcap", scene(r), kind, r)
 
     return make
 
@@ -164,25 +164,25 @@ def kimera(root: Path) -> Path:
     folder = root / "campus_outdoor_1014_compressed"
     folder.mkdir(parents=True)
     r = Ros(1)
-    rows = test_kimera_multi.bag_rows(r, "sparkal2", 0.3, "sparkal2")
+    rows = kimera_multi.bag_rows(r, "sparkal2", 0.3, "sparkal2")
     r.write(folder / "10_14_sparkal2", rows, "lz4")
-    test_kimera_multi.write_truth(root / "ground_truth" / "1014" / "sparkal2_gt_odom.csv", 0.3)
+    kimera_multi.write_truth(root / "ground_truth" / "1014" / "sparkal2_gt_odom.csv", 0.3)
     return folder
 
 
 def s3e(root: Path) -> Path:
     sequence = root / "S3E_Playground_2"
-    names = test_s3e.NAMES[:2]
-    test_s3e.write_bag(sequence, names)
+    names = s3e_bags.NAMES[:2]
+    s3e_bags.write_bag(sequence, names)
     for name in names:
-        test_s3e.write_calibration(root / "Calibration" / f"{name.lower()}.yaml", name.lower())
-        test_s3e.write_truth(sequence / f"{name.lower()}_gt.txt", name)
+        s3e_bags.write_calibration(root / "Calibration" / f"{name.lower()}.yaml", name.lower())
+        s3e_bags.write_truth(sequence / f"{name.lower()}_gt.txt", name)
     return sequence
 
 
 def seven(root: Path) -> Path:
     """One sequence."""
-    return test_seven_scenes.make_sequence(root / "seq-01")
+    return seven_scenes_files.make_sequence(root / "seq-01")
 
 
 def seven_options() -> list[str]:
@@ -200,7 +200,7 @@ def make_scene(kind: str) -> Callable[[Path], None]:
     def make(seed: Path) -> None:
         (seed / "scene").mkdir()
         for name, sides in (("walls", QUADS[9:11]), ("table", QUADS[11:])):
-            test_simulate_meshes.WRITERS[kind](seed / "scene" / f"{name}.{kind}", sides)
+            mesh_scenes.WRITERS[kind](seed / "scene" / f"{name}.{kind}", sides)
 
     return make
 

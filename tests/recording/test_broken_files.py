@@ -12,7 +12,7 @@ from mcap.writer import CompressionType, Writer
 from duagc import schemas
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording import Record, content_digest, info, log_metadata, open_rgbd, read_log, verify
-from tests.recording.logs import update, write_camera, write_updates
+from tests.fixtures.recording_logs import update, write_camera, write_updates
 
 
 def error_of(read: Callable[[Path], object], path: Path) -> str | None:

@@ -12,7 +12,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import LogWriter, open_rgbd
 from duagc.pipeline.recording.register_depth import register_depth
 from duagc.schemas import topics
-from tests.recording.logs import CALIBRATION, COLOR, png
+from tests.fixtures.recording_logs import CALIBRATION, COLOR, png
 
 WIDE = PinholeCamera(64, 48, 56.0, 56.0, 31.5, 23.5)
 DEPTH_CAMERA = PinholeCamera(60, 44, 50.0, 51.0, 29.0, 22.5)

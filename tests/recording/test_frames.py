@@ -15,7 +15,17 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import LogWriter, info, open_rgbd
 from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
 from duagc.schemas import topics
-from tests.recording.logs import CALIBRATION, CAMERA, COLOR, DEPTH, FRAME_NS, depth, image, png, write_camera
+from tests.fixtures.recording_logs import (
+    CALIBRATION,
+    CAMERA,
+    COLOR,
+    DEPTH,
+    FRAME_NS,
+    depth,
+    image,
+    png,
+    write_camera,
+)
 
 
 def test_frames_come_back_in_any_order(tmp_path: Path) -> None:

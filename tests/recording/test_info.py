@@ -10,7 +10,7 @@ import pytest
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording import format_info, info, open_rgbd, preview, write_preview_of
-from tests.recording.logs import CAMERA, COLOR, DEPTH, write_camera, write_recording, write_updates
+from tests.fixtures.recording_logs import CAMERA, COLOR, DEPTH, write_camera, write_recording, write_updates
 
 
 def test_info_of_a_recording(tmp_path: Path) -> None:

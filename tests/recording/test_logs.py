@@ -14,7 +14,7 @@ from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording import LogWriter, content_digest, log_metadata, merge, read_log
 from duagc.schemas import topics
-from tests.recording.logs import update, write_camera, write_updates
+from tests.fixtures.recording_logs import update, write_camera, write_updates
 
 
 @settings(max_examples=20, deadline=None)

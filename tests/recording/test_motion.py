@@ -9,7 +9,7 @@ from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import LogWriter, open_rgbd
-from tests.recording.logs import copy_camera, write_camera
+from tests.fixtures.recording_logs import copy_camera, write_camera
 
 
 def spin(time_s: float) -> np.ndarray:

@@ -6,7 +6,7 @@ import pytest
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording import Recording, content_digest, info, open_rgbd, read_log
-from tests.recording.logs import CALIBRATION, COLOR, DEPTH, LOGS, write_recording, write_updates
+from tests.fixtures.recording_logs import CALIBRATION, COLOR, DEPTH, LOGS, write_recording, write_updates
 
 
 def test_rerun_reads_our_files(tmp_path: Path) -> None:

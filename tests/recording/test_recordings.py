@@ -12,7 +12,7 @@ from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import Recording, log_metadata, open_rgbd, read_log
-from tests.recording.logs import CAMERA, depth, image, png, write_recording, write_robot
+from tests.fixtures.recording_logs import CAMERA, depth, image, png, write_recording, write_robot
 
 
 def test_a_recording_reads_back(tmp_path: Path) -> None:

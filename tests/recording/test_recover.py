@@ -19,7 +19,7 @@ from duagc.pipeline.checks import check
 from duagc.pipeline.cli import app
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import LogWriter, Record, Recording, content_digest, read_log, recovery
-from tests.recording.logs import COLOR, FRAME_NS, png, update
+from tests.fixtures.recording_logs import COLOR, FRAME_NS, png, update
 
 BLOBS = 12
 

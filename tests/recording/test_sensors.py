@@ -14,7 +14,7 @@ from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.recording.lidar import lidar_depth
-from tests.converters.stereo_room import path, render, sweep
+from tests.fixtures.stereo_room import path, render, sweep
 
 CAMERA = PinholeCamera(240, 180, 200.0, 201.0, 119.2, 89.7)
 R_CAMERA_LIDAR = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # x forward, z up
