@@ -16,6 +16,7 @@ LOSS = LossWeights(color_huber=0.1, depth_weight=0.5, depth_huber_m=0.02, alpha_
 SURFACE = LossWeights(**{**vars(LOSS), "surface_weight": 0.3})
 CALLS = [(isa, threads) for isa in available_isas() for threads in (1, 2, 3, 5)]
 QUICK = [call for call in CALLS if call[0] != "portable" or call[1] in (1, 3)]  # it imitates fma, at length
+FAST = [call for call in QUICK if call[0] != "portable"] or QUICK[:1]
 
 
 def digest(rasterizer: Rasterizer) -> str:
@@ -66,10 +67,11 @@ def digest_of(call: tuple[str, int]) -> str:
     return digest(Rasterizer(*call))
 
 
-def test_one_digest_for_processes():
+@pytest.mark.parametrize("calls", [FAST, pytest.param(QUICK, marks=pytest.mark.slow)], ids=["fast", "all"])
+def test_one_digest_for_processes(calls):
     """Fresh processes, each with addresses and hash seeds of its own."""
     with multiprocessing.get_context("spawn").Pool(2) as pool:
-        assert set(pool.map(digest_of, QUICK * 2, chunksize=len(QUICK))) == {one_digest()}
+        assert set(pool.map(digest_of, calls * 2, chunksize=len(calls))) == {one_digest()}
 
 
 def be_busy() -> None:
