@@ -20,6 +20,7 @@ from duagc.pipeline.cli import bench
 __all__ = ["app", "bench", "inspect", "main", "posegraph", "recordings", "runs", "settings"]
 
 TYPER_INTERRUPTED = 130  # what typer makes of Ctrl-C, without a word
+COMPILED_KERNELS = "duagc.pipeline.kernels._raster"  # a module that a source tree lacks before it is built
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # the disk, the user's share of it, a limit on files
 
 
@@ -29,6 +30,11 @@ def main() -> None:
     try:
         app()
     except DuagError as error:
+        print(f"duagc: {error}", file=sys.stderr)
+        sys.exit(EXIT_FAILED)
+    except ImportError as error:
+        if error.name != COMPILED_KERNELS:
+            raise
         print(f"duagc: {error}", file=sys.stderr)
         sys.exit(EXIT_FAILED)
     except OSError as error:

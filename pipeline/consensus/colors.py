@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.consensus import ColorConfig
-from duagc.pipeline.consensus.evidence import COLOR, COLOR_INFORMATION, Evidence, rows_by_id
+from duagc.pipeline.consensus.evidence import Evidence, rows_by_id
 from duagc.pipeline.geometry.statistics import mad_sigmas
+from duagc.pipeline.splat.information import COLOR, COLOR_INFORMATION
 
 Array = NDArray[np.float64]
 Pairs = Mapping[tuple[str, str], NDArray[np.int64]]

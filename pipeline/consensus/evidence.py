@@ -1,11 +1,7 @@
-"""What a robot's own pixels say about its Gaussians, in the flat chart of method section 1, and how it turns.
+"""What a robot's own pixels say about its Gaussians, in the flat chart of method section 1, and its change of frame.
 
-theta [13] = mean 3 (m), vec log Sigma 6 (`geometry.spd` order), color 3 (RGB 0..1), opacity logit 1.
-
-information [31] is block diagonal in that chart: the upper triangles, row by row, of the 3x3 of the mean (xx, xy, xz,
-yy, yz, zz; 1/m^2) and of the 6x6 of vec log Sigma (21), the diagonal of the color (3), and the opacity (1). The cross
-terms between mean and covariance, which the Fisher sums of the information stage still hold, are dropped: fusion
-works per block. The blocks are then conditional, not marginal, information. Zero is no information.
+theta [13] and information [31] are laid out as in `splat.information`. The cross terms between mean and covariance,
+which the Fisher sums of the information stage hold, are dropped: fusion works per block.
 """
 
 from __future__ import annotations
@@ -19,20 +15,30 @@ from numpy.typing import ArrayLike, NDArray
 from duagc.pipeline.geometry import se3, so3, spd
 from duagc.pipeline.posegraph.factors import inflated
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import (
+    COLOR_INFORMATION,
+    INFORMATION_SIZE,
+    LOG_COVARIANCE,
+    LOG_COVARIANCE_INFORMATION,
+    MEAN,
+    MEAN_INFORMATION,
+    OPACITY_INFORMATION,
+    THETA_SIZE,
+    information_of_geometry,
+    log_covariance_block,
+    mean_block,
+    pack_symmetric,
+    theta_of,
+)
 
 Array = NDArray[np.float64]
-MEAN, LOG_COVARIANCE, COLOR, OPACITY = slice(0, 3), slice(3, 9), slice(9, 12), 12
-"""Places in theta."""
-COLOR_INFORMATION = slice(27, 30)
-"""Places of the color in the packed information."""
 SHAPE_FLOOR = 0.1
 """Least standard deviation of a coordinate of vec log Sigma: 5 % of a scale."""
 LEAST_DEVIATION_M = 1e-4
 """Deviation of a mean from the measured surface below which nobody claims to know that surface."""
-_POSITION, _SHAPE, _OPACITY = slice(0, 6), slice(6, 27), 30
 
 
-class FisherSums(Protocol):
+class MapInformation(Protocol):
     """What the information stage hands over, in the map frame: see `messages.GaussianInformation`."""
 
     @property
@@ -63,35 +69,6 @@ class FisherSums(Protocol):
         """Gaussians drawn in a pixel."""
 
 
-def unpack_symmetric(upper: ArrayLike, size: int) -> Array:
-    """Symmetric matrices [..., size, size] of their upper triangles, row by row."""
-    upper = np.asarray(upper, dtype=np.float64)
-    rows, columns = np.triu_indices(size)
-    out = np.empty((*upper.shape[:-1], size, size))
-    out[..., rows, columns] = upper
-    out[..., columns, rows] = upper
-    return out
-
-
-def pack_symmetric(matrix: Array) -> Array:
-    """Upper triangles, row by row, of symmetric matrices [..., size, size]."""
-    rows, columns = np.triu_indices(matrix.shape[-1])
-    return matrix[..., rows, columns]
-
-
-def theta_of(gaussians: Gaussians) -> Array:
-    """theta [n, 13] of Gaussians, in their frame."""
-    return np.concatenate(
-        [
-            gaussians.means.astype(np.float64),
-            spd.log_covariance(gaussians.quats_wxyz, gaussians.log_scales),
-            gaussians.colors.astype(np.float64),
-            gaussians.opacity_logits.astype(np.float64)[:, None],
-        ],
-        axis=1,
-    )
-
-
 @dataclass(frozen=True)
 class Evidence:
     """A robot's own evidence on n of its Gaussians. It never contains what came from a neighbor.
@@ -111,8 +88,8 @@ class Evidence:
         shapes: dict[str, tuple[type, tuple[int, ...]]] = {
             "ids": (np.int64, (n,)),
             "anchors": (np.int32, (n,)),
-            "theta": (np.float64, (n, 13)),
-            "information": (np.float64, (n, 31)),
+            "theta": (np.float64, (n, THETA_SIZE)),
+            "information": (np.float64, (n, INFORMATION_SIZE)),
         }
         for name, (dtype, shape) in shapes.items():
             array: NDArray[Any] = np.ascontiguousarray(getattr(self, name), dtype=dtype)
@@ -122,7 +99,7 @@ class Evidence:
 
     @staticmethod
     def from_map(
-        owner: str, gaussians: Gaussians, information: FisherSums | None, T_map_keyframe: ArrayLike
+        owner: str, gaussians: Gaussians, information: MapInformation | None, T_map_keyframe: ArrayLike
     ) -> Evidence:
         """What a robot can tell others of its own map, each Gaussian in the frame of its anchor.
 
@@ -142,18 +119,21 @@ class Evidence:
         if information is not None and len(rows):
             deviation_m = np.zeros(len(gaussians))
             deviation_m[rows >= 0] = information.deviation_m[rows[rows >= 0]]
-            sums = unpack_symmetric(packed[:, _POSITION], 3)
+            sums = mean_block(packed)
             known = (sums != 0).any(axis=(1, 2), keepdims=True)
             across = known * _across_surface(gaussians, deviation_m)
             position = inflated(sums + across, deviation_m[:, None, None] ** 2 * np.eye(3))
-            shape = inflated(unpack_symmetric(packed[:, _SHAPE], 6), SHAPE_FLOOR**2 * np.eye(6))
-            packed[:, _POSITION], packed[:, _SHAPE] = pack_symmetric(position), pack_symmetric(shape)
+            shape = inflated(log_covariance_block(packed), SHAPE_FLOOR**2 * np.eye(6))
+            packed[:, MEAN_INFORMATION], packed[:, LOG_COVARIANCE_INFORMATION] = (
+                pack_symmetric(position),
+                pack_symmetric(shape),
+            )
         in_map = Evidence(owner, gaussians.ids, gaussians.anchors, theta_of(gaussians), packed)
         return in_map._turned(se3.inverse(T_map_keyframe))
 
     @staticmethod
     def of_splats(
-        owner: str, gaussians: Gaussians, information: FisherSums | None, T_map_keyframe: ArrayLike
+        owner: str, gaussians: Gaussians, information: MapInformation | None, T_map_keyframe: ArrayLike
     ) -> Evidence:
         """How stiff a robot's own splats are among each other: what its own images lose if all of them move a little.
 
@@ -190,17 +170,21 @@ class Evidence:
         theta[:, MEAN] = (R @ theta[:, MEAN, None])[..., 0] + t
         theta[:, LOG_COVARIANCE] = (D @ theta[:, LOG_COVARIANCE, None])[..., 0]
         information = self.information.copy()
-        information[:, _POSITION] = pack_symmetric(R @ self.position_information() @ R.swapaxes(-1, -2))
-        information[:, _SHAPE] = pack_symmetric(D @ self.shape_information() @ D.swapaxes(-1, -2))
+        information[:, MEAN_INFORMATION] = pack_symmetric(
+            R @ self.position_information() @ R.swapaxes(-1, -2)
+        )
+        information[:, LOG_COVARIANCE_INFORMATION] = pack_symmetric(
+            D @ self.shape_information() @ D.swapaxes(-1, -2)
+        )
         return Evidence(self.owner, self.ids, self.anchors, theta, information)
 
     def position_information(self) -> Array:
         """[n, 3, 3], 1/m^2."""
-        return unpack_symmetric(self.information[:, _POSITION], 3)
+        return mean_block(self.information)
 
     def shape_information(self) -> Array:
         """[n, 6, 6], over vec log Sigma."""
-        return unpack_symmetric(self.information[:, _SHAPE], 6)
+        return log_covariance_block(self.information)
 
     def color_information(self) -> Array:
         """[n, 3]."""
@@ -208,7 +192,7 @@ class Evidence:
 
     def opacity_information(self) -> Array:
         """[n], over the logit."""
-        return self.information[:, _OPACITY]
+        return self.information[:, OPACITY_INFORMATION]
 
 
 def _across_surface(gaussians: Gaussians, deviation_m: Array) -> Array:
@@ -222,18 +206,16 @@ def _across_surface(gaussians: Gaussians, deviation_m: Array) -> Array:
     return np.asarray(normal[:, :, None] * normal[:, None, :], dtype=np.float64)
 
 
-def _sums_of(gaussians: Gaussians, information: FisherSums | None) -> tuple[Array, NDArray[np.int64]]:
+def _sums_of(gaussians: Gaussians, information: MapInformation | None) -> tuple[Array, NDArray[np.int64]]:
     """The block diagonal of the sums [n, 31] in the map frame, by Gaussian, and the row of each there, -1 without."""
-    packed = np.zeros((len(gaussians), 31))
+    packed = np.zeros((len(gaussians), INFORMATION_SIZE))
     if information is None:
         return packed, np.full(len(gaussians), -1, dtype=np.int64)
     rows = rows_by_id(gaussians.ids, information.ids)
     found, row = rows >= 0, rows[rows >= 0]
-    geometry = unpack_symmetric(information.geometry[row], 9)
-    packed[found, _POSITION] = pack_symmetric(geometry[:, :3, :3])
-    packed[found, _SHAPE] = pack_symmetric(geometry[:, 3:, 3:])
-    packed[found, COLOR_INFORMATION] = information.color[row]
-    packed[found, _OPACITY] = information.opacity[row]
+    packed[found] = information_of_geometry(
+        information.geometry[row], information.color[row], information.opacity[row]
+    )
     return packed, rows
 
 
@@ -244,8 +226,3 @@ def rows_by_id(wanted: NDArray[np.int64], ids: NDArray[np.int64]) -> NDArray[np.
     order = np.argsort(ids, kind="stable")
     at = order[np.minimum(np.searchsorted(ids[order], wanted), len(order) - 1)]
     return np.where(ids[at] == wanted, at, -1).astype(np.int64)
-
-
-def pack_information(position: Array, shape: Array, color: Array, opacity: Array) -> Array:
-    """Information [n, 31] of its blocks [n, 3, 3], [n, 6, 6], [n, 3] and [n]."""
-    return np.concatenate([pack_symmetric(position), pack_symmetric(shape), color, opacity[:, None]], axis=1)

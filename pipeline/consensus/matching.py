@@ -26,8 +26,9 @@ from scipy.spatial import cKDTree
 
 from duagc.pipeline.config.consensus import MatchingConfig
 from duagc.pipeline.consensus.colors import team_colors
-from duagc.pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Evidence
+from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.geometry import spd
+from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from duagc.pipeline.config.consensus import WeightKind
-from duagc.pipeline.consensus.evidence import Evidence, FisherSums, pack_information, rows_by_id
+from duagc.pipeline.consensus.evidence import Evidence, MapInformation, rows_by_id
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import pack_information
 
 Array = NDArray[np.float64]
 UNIT_SIGMA_M, UNIT_SIGMA_SHAPE, UNIT_SIGMA_COLOR, UNIT_SIGMA_OPACITY = 0.01, 1.0, 0.07, 0.5
@@ -26,7 +27,7 @@ UNIT_SIGMA_M, UNIT_SIGMA_SHAPE, UNIT_SIGMA_COLOR, UNIT_SIGMA_OPACITY = 0.01, 1.0
 
 
 def told(
-    owner: str, gaussians: Gaussians, information: FisherSums, T_map_keyframe: ArrayLike, kind: WeightKind
+    owner: str, gaussians: Gaussians, information: MapInformation, T_map_keyframe: ArrayLike, kind: WeightKind
 ) -> Evidence:
     """Evidence of a robot's own map with weights of a kind, for others; arguments as of `Evidence.from_map`.
 
@@ -61,7 +62,7 @@ def told(
 
 
 def own_stiffness(
-    owner: str, gaussians: Gaussians, information: FisherSums, T_map_keyframe: ArrayLike, kind: WeightKind
+    owner: str, gaussians: Gaussians, information: MapInformation, T_map_keyframe: ArrayLike, kind: WeightKind
 ) -> Evidence:
     """How much a robot's own splats resist being moved: among each other with information, else as it tells others."""
     if kind == "block":

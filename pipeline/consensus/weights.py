@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Evidence
+from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -21,7 +21,7 @@ from duagc.pipeline.config.base import Model
 from duagc.pipeline.config.consensus import MatchingConfig, PoseConsensusConfig
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.fusion import FusionConfig
-from duagc.pipeline.consensus.evidence import Evidence, theta_of
+from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.pose_admm import with_floor
 from duagc.pipeline.consensus.weighting import own_stiffness, told
 from duagc.pipeline.consensus.weights import Weights
@@ -37,6 +37,7 @@ from duagc.pipeline.recording import read_log
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
 from duagc.pipeline.runs.robot_data import Step, factors_of, registrations_of
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import theta_of
 from duagc.schemas import topics
 
 Array = NDArray[np.float64]

@@ -151,7 +151,7 @@ def score_maps(
         for name, (gaussians, poses) in maps.items():
             T = poses.get(frame.stamp_ns)
             if T is not None:
-                render = own.rasterizer.forward(gaussians, camera, se3.inverse(T), depth=depth)
+                render = own.rasterizer.forward(gaussians, camera, se3.inverse(T), depth_kind=depth)
                 drawn[name] = render, own.rasterizer.layer_depth()
         together = [drawn[name][0].alpha >= MIN_ALPHA for name in compared if name in drawn]
         common = np.logical_and.reduce(together) if len(together) > 1 else None

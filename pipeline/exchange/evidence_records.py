@@ -16,14 +16,13 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.packets import Kind
 from duagc.pipeline.runs.robot_data import RobotData
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import INFORMATION_DIAGONAL, MEAN
 
 Array = NDArray[np.float64]
 Records = NDArray[Any]
 
 # what a receiver expects before it is told: standard deviations of position (m), log-covariance, color, opacity logit
 PRIOR_SIGMA = np.repeat([0.05, 1.0, 0.1, 2.0], [3, 6, 3, 1])
-# places of the diagonal in the 31 numbers of information: upper triangles of 3x3 and 6x6, then color and opacity
-DIAGONAL = np.array([0, 3, 5, 6, 12, 17, 21, 24, 26, 27, 28, 29, 30])
 VOXEL_BITS = 20  # per axis; voxels beyond +-2^19 share those at the border
 
 
@@ -51,13 +50,13 @@ def gain(records: Records) -> Array:
 
     It has no unit, unlike the paper's (4), which adds 1/m^2 to 1/rad^2. All records have the same size.
     """
-    known = np.maximum(records["information"][:, DIAGONAL].astype(np.float64), 0.0)
+    known = np.maximum(records["information"][:, INFORMATION_DIAGONAL].astype(np.float64), 0.0)
     return 0.5 * np.log1p(known * PRIOR_SIGMA**2).sum(axis=1)
 
 
 def paper_priority(records: Records) -> Array:
     """The paper's (4) [n]: the sum of the information over all dimensions, which depends on the unit of length."""
-    return np.maximum(records["information"][:, DIAGONAL].astype(np.float64), 0.0).sum(axis=1)
+    return np.maximum(records["information"][:, INFORMATION_DIAGONAL].astype(np.float64), 0.0).sum(axis=1)
 
 
 def best_first(records: Records, order: Literal["gain", "paper"] = "gain") -> NDArray[np.int64]:
@@ -90,7 +89,7 @@ def within(
         T_world_keyframe: [k, 4, 4] of the owner's keyframes, by anchor.
     """
     T = T_world_keyframe[records["anchor"]]
-    mean = records["theta"][:, :3].astype(np.float64)
+    mean = records["theta"][:, MEAN].astype(np.float64)
     points = (T[:, :3, :3] @ mean[:, :, None])[..., 0] + T[:, :3, 3]
     return np.isin(voxel_keys(points, edge_m), voxels)
 

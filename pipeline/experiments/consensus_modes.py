@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base import progress, random_streams
 from duagc.pipeline.bench.tables import markdown
 from duagc.pipeline.config.network import LinkConfig, TransportConfig
-from duagc.pipeline.consensus.evidence import Evidence, pack_information
+from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.weights import Weights
 from duagc.pipeline.exchange.wire import evidence_wire
 from duagc.pipeline.experiments.gaussian_consensus import (
@@ -35,6 +35,7 @@ from duagc.pipeline.experiments.gaussian_consensus import (
 from duagc.pipeline.network.link_model import LinkModel, neighbors
 from duagc.pipeline.network.packets import EVIDENCE_HEAD_BYTES, HEADER_BYTES, MAX_PAYLOAD_BYTES, Kind, parse
 from duagc.pipeline.network.transport import Message, Transport
+from duagc.pipeline.splat.information import pack_information
 
 Array = NDArray[np.float64]
 PERIOD_NS = 100_000_000

@@ -8,7 +8,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import MatchingConfig
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.network import LinkConfig
-from duagc.pipeline.consensus.evidence import LOG_COVARIANCE, Evidence, pack_information
+from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import tracks
 from duagc.pipeline.consensus.weighting import told
 from duagc.pipeline.consensus.weights import Weights
@@ -20,6 +20,7 @@ from duagc.pipeline.fusion.fuse import association_covariance
 from duagc.pipeline.network.link_model import neighbors
 from duagc.pipeline.posegraph.factors import inflated
 from duagc.pipeline.runs.folder import RunFolder
+from duagc.pipeline.splat.information import LOG_COVARIANCE, pack_information
 
 
 def team_of_run(run: RunFolder, topology: str) -> Team:

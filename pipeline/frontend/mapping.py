@@ -201,7 +201,7 @@ class Mapper:
             self.cameras[level],
             se3.inverse(view.T_map_camera),
             mask=mask,
-            depth=self.depth,
+            depth_kind=self.depth,
         )
 
     def _loss(self, view: View, level: int) -> float:
@@ -218,7 +218,7 @@ class Mapper:
             self._loss_weights,
             exposure=view.exposure,
             mask=view.usable(level),
-            depth=self.depth,
+            depth_kind=self.depth,
             depth_certainty=view.certainty if level == 0 else view.half_certainty,
         )
 

@@ -78,7 +78,7 @@ class ModelTracker:
     def _register(self, frame: RgbdFrame, T_map_camera: Array, information: Array) -> Registration:
         """The frame against the map drawn at T_map_camera, known with `information`; the motion is from there."""
         drawn = self._rasterizer.forward(
-            self._gaussians, self._camera, se3.inverse(T_map_camera), depth=self._depth
+            self._gaussians, self._camera, se3.inverse(T_map_camera), depth_kind=self._depth
         )
         solid = drawn.alpha > self.config.min_alpha
         depth_m = np.where(solid, self._rasterizer.layer_depth(), np.float32(0))

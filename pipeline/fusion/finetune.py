@@ -103,7 +103,7 @@ def refine(
             view.depth_m,
             weights,
             mask=view.mask,
-            depth=depth,
+            depth_kind=depth,
             depth_certainty=certainty,
         )
         share = config.rate * falling(step, total, config.rate_decay)

@@ -26,16 +26,7 @@ from duagc.pipeline.config.consensus import MatchingConfig, WeightKind
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import ColorMap, team_colors
-from duagc.pipeline.consensus.evidence import (
-    COLOR,
-    COLOR_INFORMATION,
-    LOG_COVARIANCE,
-    MEAN,
-    OPACITY,
-    Evidence,
-    pack_information,
-    unpack_symmetric,
-)
+from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import Pairs, held_thickness, tracks
 from duagc.pipeline.consensus.weighting import in_world
 from duagc.pipeline.geometry import se3, spd
@@ -44,6 +35,17 @@ from duagc.pipeline.geometry.projection import visible
 from duagc.pipeline.geometry.statistics import MAD_TO_SIGMA
 from duagc.pipeline.posegraph.factors import inflated
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import (
+    COLOR,
+    COLOR_INFORMATION,
+    LOG_COVARIANCE,
+    MEAN,
+    OPACITY,
+    THETA_SIZE,
+    gaussians_of,
+    mean_block,
+    pack_information,
+)
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -269,7 +271,7 @@ def _moves(
     color = rows.color / (1 + rows.color * spread.color[:, None])
     opacity = rows.opacity / (1 + rows.opacity * spread.opacity)
     prior_position, prior_shape = PRIOR[config.association]
-    move = np.zeros((len(first), 13))
+    move = np.zeros((len(first), THETA_SIZE))
     move[:, MEAN] = weighted_move(position, delta[:, MEAN], first, prior_position)
     move[:, LOG_COVARIANCE] = weighted_move(shape, delta[:, LOG_COVARIANCE], first, prior_shape, free)
     move[:, COLOR] = _weighted_move_diagonal(color, delta[:, COLOR], first)
@@ -332,7 +334,7 @@ def fuse(
     reference[track_of_member[found.robot == me]] = np.flatnonzero(found.robot == me)
     representative = member[reference]
 
-    move = np.zeros((len(rows.theta), 13))
+    move = np.zeros((len(rows.theta), THETA_SIZE))
     members = np.ones(len(rows.theta), dtype=np.int32)
     sums = pack_information(rows.position, rows.shape, rows.color, rows.opacity)
     if len(first):
@@ -415,20 +417,6 @@ def _applied(gaussians: Gaussians, move: Array, vec_log_covariance: Array) -> Ga
     )
 
 
-def gaussians_of(ids: Index, anchors: NDArray[np.int32], theta: Array) -> Gaussians:
-    """Gaussians of theta [n, 13]."""
-    quats, scales = spd.from_log_covariance(theta[:, LOG_COVARIANCE])
-    return Gaussians(
-        ids=ids,
-        anchors=anchors,
-        means=theta[:, MEAN].astype(np.float32),
-        quats_wxyz=quats.astype(np.float32),
-        log_scales=scales.astype(np.float32),
-        colors=theta[:, COLOR].astype(np.float32),
-        opacity_logits=theta[:, OPACITY].astype(np.float32),
-    )
-
-
 def _to_add(
     foreign: Index,
     rows: _Rows,
@@ -439,7 +427,7 @@ def _to_add(
     config: FusionConfig,
 ) -> Index:
     """Which of the neighbors' Gaussians to take over: those in space that no own keyframe saw."""
-    position = np.trace(unpack_symmetric(sums[foreign, :6], 3), axis1=-2, axis2=-1)
+    position = np.trace(mean_block(sums[foreign]), axis1=-2, axis2=-1)
     if config.added_need_information:
         foreign, position = foreign[position > 0], position[position > 0]
     new = ~explained(rows.theta[foreign, MEAN], T_world_keyframe, depth_images, camera, config)
@@ -466,7 +454,7 @@ def _surfaces(
     rasterizer = Rasterizer()
     for keyframe, measured in depth_images:
         T_camera_world = se3.inverse(T_world_keyframe[keyframe])
-        render = rasterizer.forward(own_world, camera, T_camera_world, depth=depth)
+        render = rasterizer.forward(own_world, camera, T_camera_world, depth_kind=depth)
         drawn = render.depth / np.maximum(render.alpha, np.float32(1e-3))
         surface = np.where(measured > 0, measured, drawn)
         known = np.where(render.alpha >= config.explained_opacity, surface, np.float32(0))

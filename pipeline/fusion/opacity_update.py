@@ -18,15 +18,13 @@ import numpy as np
 
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.training import DepthKind
-from duagc.pipeline.consensus.evidence import OPACITY
 from duagc.pipeline.fusion.finetune import View
 from duagc.pipeline.fusion.fuse import FusedMap
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import FisherSums, Rasterizer
+from duagc.pipeline.splat.information import OPACITY, OPACITY_INFORMATION
 
-OPACITY_INFORMATION = 30
-"""Place in the information of `consensus.evidence`."""
 LARGEST_RESIDUAL_SIGMA = 10.0  # what is farther off is no noise; it counts as that much
 LARGEST_STEP, LARGEST_LOGIT = 2.0, 6.0
 
@@ -65,7 +63,7 @@ def weigh_by_own_pixels(
         slope, sums = np.zeros(len(gaussians)), FisherSums(len(gaussians))
         for view in views:
             T_camera_world = se3.inverse(view.T_world_camera)
-            render = rasterizer.forward(gaussians, camera, T_camera_world, mask=view.mask, depth=depth)
+            render = rasterizer.forward(gaussians, camera, T_camera_world, mask=view.mask, depth_kind=depth)
             off = np.clip(render.color - view.color * np.float32(1 / 255), -limit, limit)
             if view.mask is not None:
                 off[~view.mask] = 0.0

@@ -28,15 +28,15 @@ from duagc.pipeline.config.consensus import MatchingConfig, WeightKind
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import team_colors
-from duagc.pipeline.consensus.evidence import LOG_COVARIANCE, MEAN, Evidence, rows_by_id
+from duagc.pipeline.consensus.evidence import Evidence, rows_by_id
 from duagc.pipeline.consensus.matching import Pairs, gaussian_distance, threshold
 from duagc.pipeline.consensus.weighting import in_world
 from duagc.pipeline.fusion.finetune import View
-from duagc.pipeline.fusion.fuse import gaussians_of
 from duagc.pipeline.geometry import se3, spd
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import LOG_COVARIANCE, MEAN, gaussians_of
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -269,7 +269,7 @@ class _PeerMapCheck:
         for view in self.views:
             T_camera_world = se3.inverse(view.T_world_camera)
             render = self.rasterizer.forward(
-                gaussians, self.camera, T_camera_world, mask=view.mask, depth=self.depth
+                gaussians, self.camera, T_camera_world, mask=view.mask, depth_kind=self.depth
             )
             alpha = np.maximum(render.alpha, np.float32(COVERED))
             reach = view.depth_m * (1 + self.config.explained_relative) + self.config.explained_m

@@ -18,11 +18,11 @@ from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.weighting import in_world
 from duagc.pipeline.fusion.finetune import View
-from duagc.pipeline.fusion.fuse import gaussians_of
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.kernels import Rasterizer
+from duagc.pipeline.splat.information import gaussians_of
 
 Array = NDArray[np.float64]
 COVERED = 0.9
@@ -59,7 +59,7 @@ def peer_views(
         if name != drawn:
             there = in_world(colors[name].of(evidence[name]), T_world_keyframe[name], weights)
             gaussians, drawn = gaussians_of(there.ids, there.anchors, there.theta), name
-        render = rasterizer.forward(gaussians, camera, se3.inverse(T_world_camera), depth=depth_of[name])
+        render = rasterizer.forward(gaussians, camera, se3.inverse(T_world_camera), depth_kind=depth_of[name])
         seen = render.alpha >= COVERED
         share = np.where(seen, render.alpha, np.float32(1))
         color = np.rint(np.clip(render.color / share[..., None], 0, 1) * 255).astype(np.uint8)

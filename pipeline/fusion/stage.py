@@ -17,7 +17,6 @@ from duagc.pipeline.config.fusion import FusionConfig, RefineConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import ColorMap
-from duagc.pipeline.consensus.evidence import unpack_symmetric
 from duagc.pipeline.consensus.weighting import own_stiffness
 from duagc.pipeline.fusion.finetune import View, refine
 from duagc.pipeline.fusion.fuse import FusedMap, fuse
@@ -38,6 +37,7 @@ from duagc.pipeline.recording import LogWriter, open_rgbd, read_log
 from duagc.pipeline.registration.moving import FreeSpace
 from duagc.pipeline.runs.robot_data import AgentInput, AgentResult, RobotData, load
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import COLOR_INFORMATION, OPACITY_INFORMATION, geometry_of_information
 from duagc.pipeline.splat.ply import write_ply
 from duagc.schemas import topics
 
@@ -268,24 +268,19 @@ def _peer_map_report(robot: str, report: PeerMapReport, stamp_ns: int) -> Any:
 
 def _information(robot: str, fused: FusedMap, stamp_ns: int) -> GaussianInformation:
     """The summed information of the fused Gaussians as a message; no cross terms between mean and covariance."""
-    n = len(fused.gaussians)
-    blocks = np.zeros((n, 9, 9))
-    blocks[:, :3, :3] = unpack_symmetric(fused.information[:, :6], 3)
-    blocks[:, 3:, 3:] = unpack_symmetric(fused.information[:, 6:27], 6)
-    rows, columns = np.triu_indices(9)
     return GaussianInformation(
         stamp_ns=stamp_ns,
         robot=robot,
         kind=FUSED_KIND,
         window="sum over the robots whose evidence was fused; observations count those robots",
         ids=fused.gaussians.ids,
-        geometry=blocks[:, rows, columns].astype(np.float32),
-        color=fused.information[:, 27:30].astype(np.float32),
-        opacity=fused.information[:, 30].astype(np.float32),
+        geometry=geometry_of_information(fused.information).astype(np.float32),
+        color=fused.information[:, COLOR_INFORMATION].astype(np.float32),
+        opacity=fused.information[:, OPACITY_INFORMATION].astype(np.float32),
         observations=fused.members.astype(np.uint32),
         color_sigma=0.0,
         depth_sigma="as each member said",
-        deviation_m=np.zeros(n, np.float32),  # in what the members said
+        deviation_m=np.zeros(len(fused.gaussians), np.float32),  # in what the members said
         color_pixels_per_sample=1.0,
         depth_pixels_per_sample=1.0,
         overlap=1.0,

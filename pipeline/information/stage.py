@@ -222,7 +222,7 @@ def estimate_noise(
     for view in views:
         usable = mask if view.mask is None else mask & view.mask  # alpha is 0 elsewhere: not covered
         render = rasterizer.forward(
-            gaussians, camera, se3.inverse(view.T_map_camera), mask=usable, depth=depth
+            gaussians, camera, se3.inverse(view.T_map_camera), mask=usable, depth_kind=depth
         )
         alpha, z = render.alpha[sample].astype(np.float64), view.depth_m[sample].astype(np.float64)
         covered = alpha > 0.9
@@ -271,7 +271,7 @@ def with_correlation(
     drawn = pixels = 0
     for view in chosen:
         render = rasterizer.forward(
-            gaussians, camera, se3.inverse(view.T_map_camera), mask=view.mask, depth=depth
+            gaussians, camera, se3.inverse(view.T_map_camera), mask=view.mask, depth_kind=depth
         )
         drawn += rasterizer.statistics().blended_pairs
         pixels += camera.height * camera.width if view.mask is None else int(np.count_nonzero(view.mask))
@@ -406,7 +406,9 @@ def sum_information(
         variance = np.square(noise.depth_sigma_m(view.depth_m, view.depth_sigma_m)) * noise.depth_pixels
         inverse_variance = 1.0 / variance
         inverse_depth = np.where(view.depth_m > 0, inverse_variance, 0.0).astype(np.float32)
-        rasterizer.forward(gaussians, camera, se3.inverse(view.T_map_camera), mask=view.mask, depth=depth)
+        rasterizer.forward(
+            gaussians, camera, se3.inverse(view.T_map_camera), mask=view.mask, depth_kind=depth
+        )
         if config.window == "per_gaussian":
             one = FisherSums(len(gaussians))
             rasterizer.fisher(inverse_color, inverse_depth, one)

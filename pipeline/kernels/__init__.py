@@ -1,27 +1,19 @@
 """Drawing Gaussians, and the derivatives and information of what was drawn."""
 
-from duagc.pipeline.base.errors import DuagError
-
 try:
     import duagc.pipeline.kernels._raster  # noqa: F401
 except ImportError as error:
-    raise DuagError(f"the compiled kernels: {error}, expected what `make setup` builds") from error
+    raise ImportError(
+        f"the compiled kernels: {error}, expected the module that `make setup` or `pip install .` builds",
+        name="duagc.pipeline.kernels._raster",
+    ) from error
 
 from duagc.pipeline.kernels.adam import CompiledAdam
 from duagc.pipeline.kernels.rasterizer import Rasterizer, available_isas
-from duagc.pipeline.kernels.types import (
-    DepthKind,
-    FisherSums,
-    Gradients,
-    LossWeights,
-    Render,
-    Statistics,
-    ViewLoss,
-)
+from duagc.pipeline.kernels.types import FisherSums, Gradients, LossWeights, Render, Statistics, ViewLoss
 
 __all__ = [
     "CompiledAdam",
-    "DepthKind",
     "FisherSums",
     "Gradients",
     "LossWeights",

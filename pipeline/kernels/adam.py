@@ -29,21 +29,17 @@ class CompiledAdam(Adam):
         for name, value in zip(names, values, strict=True):
             _check_gradient(name, getattr(gradients, name), value.shape)
         out = [empty(*value.shape) for value in values]
-        _raster.adam(
-            self.isa,
+        arrays = (
             values,
             [getattr(gradients, name) for name in names],
             [self._first[name] for name in names],
             [self._second[name] for name in names],
             out,
-            np.array([getattr(rates, name) for name in names], np.float32),
-            _CONSTANTS,
-            gradients.colors,
-            gradients.opacity_logits,
-            self._steps,
-            self._corrections,
-            self.threads,
         )
+        step_lengths = np.array([getattr(rates, name) for name in names], np.float32)
+        touched_by = (gradients.colors, gradients.opacity_logits)
+        counts = (self._steps, self._corrections)
+        _raster.adam(self.isa, *arrays, step_lengths, _CONSTANTS, *touched_by, *counts, self.threads)
         return gaussians.replace(**dict(zip(names, out, strict=True)))
 
 

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import threading
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch.autograd.function import once_differentiable
 
+from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels.rasterizer import Rasterizer
-from duagc.pipeline.kernels.types import DepthKind
 from duagc.pipeline.splat.gaussians import Gaussians
 
 _TAILS = {"means": (3,), "quats_wxyz": (4,), "log_scales": (3,), "colors": (3,), "opacity_logits": ()}
@@ -28,10 +28,11 @@ def rasterize(
     log_scales: torch.Tensor,
     colors: torch.Tensor,
     opacity_logits: torch.Tensor,
+    *,
     camera: PinholeCamera,
     T_camera_map: ArrayLike,
     background: ArrayLike = (0.0, 0.0, 0.0),
-    depth: DepthKind = "blended",
+    depth_kind: DepthKind = "blended",
     xi: torch.Tensor | None = None,
     rasterizer: Rasterizer | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -42,10 +43,19 @@ def rasterize(
     a forward. The derivative of the derivative is refused.
 
     Args:
-        means, quats_wxyz, log_scales, colors, opacity_logits: float32 CPU tensors [n, 3], [n, 4], [n, 3], [n, 3], [n].
-        camera, T_camera_map, background, depth: as in `Rasterizer.forward`.
+        means: float32 CPU tensor [n, 3], meters, in the frame `map`.
+        quats_wxyz: float32 CPU tensor [n, 4], any non-zero length.
+        log_scales: float32 CPU tensor [n, 3], log of meters.
+        colors: float32 CPU tensor [n, 3], RGB 0..1.
+        opacity_logits: float32 CPU tensor [n].
+        camera: as in `Rasterizer.forward`.
+        T_camera_map: as in `Rasterizer.forward`.
+        background: as in `Rasterizer.forward`.
+        depth_kind: as in `Rasterizer.forward`.
         xi: float32 or float64 [6], moves the camera to T_map_camera exp(xi) (translation m, rotation rad).
         rasterizer: what draws; by default one of one thread, kept for each thread that calls.
+    Returns:
+        Color [H, W, 3], depth [H, W] (m, not divided by alpha), alpha [H, W].
     Raises:
         ValueError: names the argument that has the wrong device, type, shape or values.
     """
@@ -64,10 +74,19 @@ def rasterize(
             _of_thread.rasterizer = Rasterizer()
         rasterizer = _of_thread.rasterizer
     contiguous = [tensor.contiguous() for tensor in parameters.values()]
-    color, depths, alpha = _Rasterize.apply(
-        rasterizer, camera, T_camera_map, background, depth, xi, *contiguous
-    )
-    return color, depths, alpha
+    seen = _Seen(rasterizer, camera, T_camera_map, background, depth_kind)
+    color, depth, alpha = _Rasterize.apply(seen, xi, *contiguous)
+    return color, depth, alpha
+
+
+class _Seen(NamedTuple):
+    """What a view is drawn with, but for what can be differentiated."""
+
+    rasterizer: Rasterizer
+    camera: PinholeCamera
+    T_camera_map: ArrayLike
+    background: ArrayLike
+    depth_kind: DepthKind
 
 
 class _Rasterize(torch.autograd.Function):
@@ -76,22 +95,25 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        rasterizer: Rasterizer,
-        camera: PinholeCamera,
-        T_camera_map: ArrayLike,
-        background: ArrayLike,
-        depth: DepthKind,
+        seen: _Seen,
         xi: torch.Tensor | None,
         *parameters: torch.Tensor,
     ) -> tuple[torch.Tensor, ...]:
-        pose = np.asarray(T_camera_map, dtype=np.float64)
+        pose = np.asarray(seen.T_camera_map, dtype=np.float64)
         if xi is not None:
             pose = se3.exp(-_array(xi).astype(np.float64)) @ pose  # of T_map_camera exp(xi)
         arrays = dict(zip(_TAILS, map(_array, parameters), strict=True))
         n = len(parameters[0])
         ctx.gaussians = Gaussians(ids=np.arange(n), anchors=np.zeros(n, dtype=np.int32), **arrays)
-        ctx.rasterizer = rasterizer
-        ctx.draw = partial(rasterizer.forward, ctx.gaussians, camera, pose, background, depth=depth)
+        ctx.rasterizer = seen.rasterizer
+        ctx.draw = partial(
+            seen.rasterizer.forward,
+            ctx.gaussians,
+            seen.camera,
+            pose,
+            seen.background,
+            depth_kind=seen.depth_kind,
+        )
         ctx.save_for_backward(xi, *parameters)  # torch then refuses a backward after a change in place
         ctx.set_materialize_grads(False)
         render = ctx.draw()
@@ -105,7 +127,7 @@ class _Rasterize(torch.autograd.Function):
         d_color, d_depth, d_alpha = (None if c is None else _array(c.contiguous()) for c in cotangents)
         if d_color is None:
             d_color = np.zeros(ctx.color_shape, dtype=np.float32)
-        by_pose, parameters = ctx.needs_input_grad[5], any(ctx.needs_input_grad[6:])
+        by_pose, parameters = ctx.needs_input_grad[1], any(ctx.needs_input_grad[2:])
         if ctx.rasterizer._gaussians is not ctx.gaussians:  # every context has its own
             ctx.draw()
         gradients = ctx.rasterizer.backward(d_color, d_depth, d_alpha, pose=by_pose, parameters=parameters)
@@ -115,7 +137,7 @@ class _Rasterize(torch.autograd.Function):
         of_parameters = [
             torch.from_numpy(getattr(gradients, name)) if parameters else None for name in _TAILS
         ]
-        return None, None, None, None, None, by_xi, *of_parameters
+        return None, by_xi, *of_parameters
 
 
 def _array(tensor: torch.Tensor) -> NDArray[Any]:

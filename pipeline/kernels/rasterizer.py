@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import _raster
 from duagc.pipeline.kernels.types import (
-    DEPTH_KINDS,
     FISHER_DIAGONAL_COLUMNS,
-    GEOMETRY_COLUMNS,
-    DepthKind,
     FisherSums,
     Gradients,
     LossWeights,
@@ -25,7 +23,8 @@ from duagc.pipeline.kernels.types import (
     Statistics,
     ViewLoss,
 )
-from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
+from duagc.pipeline.splat.information import GEOMETRY_SIZE
 
 MAX_SIDE_PX = 16384
 MAX_THREADS = 1024
@@ -81,18 +80,26 @@ class Rasterizer:
         T_camera_map: ArrayLike,
         background: ArrayLike = (0.0, 0.0, 0.0),
         *,
-        depth: DepthKind = "blended",
+        depth_kind: DepthKind = "blended",
         mask: NDArray[np.bool_] | None = None,
     ) -> Render:
-        """Draw the Gaussians (frame map) into the camera at T_camera_map [4, 4].
+        """Draw the Gaussians into a camera.
 
-        background: RGB seen where the Gaussians let light through; its depth is 0. depth: of a Gaussian at a pixel,
-        that of its center ("blended") or its mean along the pixel's ray ("ray_plane": of a flat disc, that of its
-        plane). mask: bool [H, W]; where it is False nothing is drawn, all images are 0, and no derivative or
-        information is taken later.
-        Raises ValueError, naming the argument, for what no camera or Gaussian can be.
+        Args:
+            gaussians: n Gaussians in the frame `map`.
+            camera: pinhole camera that draws; its size is that of the images.
+            T_camera_map: [4, 4], takes points of the frame `map` to the camera (x right, y down, z forward).
+            background: RGB (0..1) seen where the Gaussians let light through; its depth is 0.
+            depth_kind: depth of a Gaussian at a pixel: that of its center ("blended"), or its mean along the pixel's
+                ray ("ray_plane": of a flat disc, that of its plane).
+            mask: bool [H, W]; where it is False nothing is drawn, all images are 0, and no derivative or information
+                is taken later. None: all pixels.
+        Returns:
+            Color [H, W, 3], depth [H, W] (m, not divided by alpha) and alpha [H, W], float32.
+        Raises:
+            ValueError: an argument that no camera or Gaussian can have; the message names it.
         """
-        height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth)
+        height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth_kind)
         color, depths, alpha = empty(height, width, 3), empty(height, width), empty(height, width)
         self._finish(
             gaussians, (height, width), self._raster.forward(*_arrays(gaussians), *view, color, depths, alpha)
@@ -111,7 +118,7 @@ class Rasterizer:
         exposure: tuple[float, float] = (0.0, 0.0),
         background: ArrayLike = (0.0, 0.0, 0.0),
         mask: NDArray[np.bool_] | None = None,
-        depth: DepthKind = "blended",
+        depth_kind: DepthKind = "blended",
         pose: bool = False,
         parameters: bool = True,
         depth_certainty: Image | None = None,
@@ -122,11 +129,28 @@ class Rasterizer:
         over Gaussians of blending weight times the Huber loss of the Gaussian's depth at the pixel minus the measured
         one. The blended depth may be right because what lies in front and behind cancels; this one may not.
 
-        color: measured, float32 [H, W, 3], compared with exp(a) * rendered + b for exposure (a, b). depth_m: measured,
-        float32 [H, W], 0 where there is none. The rest as in `forward` and `backward`; `fisher` and the others may
-        follow as after a `forward`. depth_certainty: factor [H, W] of the depth residuals, all 1 if absent.
+        `fisher` and the others may follow as after a `forward`.
+
+        Args:
+            gaussians: as in `forward`.
+            camera: as in `forward`.
+            T_camera_map: as in `forward`.
+            color: measured, float32 [H, W, 3], RGB 0..1, compared with exp(a) * rendered + b.
+            depth_m: measured, float32 [H, W], 0 where there is none.
+            loss: weights of the terms.
+            exposure: (a, b), log gain and offset of this image.
+            background: as in `forward`.
+            mask: as in `forward`.
+            depth_kind: as in `forward`.
+            pose: also differentiate by the right tangent of T_map_camera.
+            parameters: False takes the derivative of the pose alone, which is cheaper.
+            depth_certainty: factor [H, W] of the depth residuals, 0..1; None: all 1.
+        Returns:
+            The loss with its terms, and the derivatives of its value.
+        Raises:
+            ValueError: an argument of a wrong type, shape or value; the message names it.
         """
-        height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth)
+        height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth_kind)
         measured = (
             _checked_image("color", color, (height, width, 3), "the camera"),
             _checked_image("depth_m", depth_m, (height, width), "the camera"),
@@ -143,10 +167,6 @@ class Rasterizer:
             arguments.append(
                 _checked_image("depth_certainty", depth_certainty, (height, width), "the camera")
             )
-        elif surface_weight > 0:
-            arguments.append(
-                None
-            )  # kernels built before there was this term refuse it, rather than leave it out
         status = self._raster.fit(*arguments)
         self._gaussians = None
         _refuse_bad_image(status, {"color": _NOT_FINITE, "depth_m": _NEGATIVE, "depth_certainty": _NEGATIVE})
@@ -170,19 +190,19 @@ class Rasterizer:
         T_camera_map: ArrayLike,
         background: ArrayLike,
         mask: NDArray[np.bool_] | None,
-        depth: DepthKind,
+        depth_kind: DepthKind,
     ) -> tuple[int, int, tuple[Any, ...]]:
         """Height, width, and what the kernels take of a view, checked."""
         _check_type("gaussians", gaussians, Gaussians)
         height, width, intrinsics = _checked_camera(camera)
         pose = _checked_pose("T_camera_map", T_camera_map)
         behind = _checked_background(background)
-        if not isinstance(depth, str) or depth not in DEPTH_KINDS:
-            raise ValueError(f"depth is {depth!r}, expected one of {', '.join(DEPTH_KINDS)}")
+        if not isinstance(depth_kind, str) or depth_kind not in DEPTH_KINDS:
+            raise ValueError(f"depth_kind is {depth_kind!r}, expected one of {', '.join(DEPTH_KINDS)}")
         if len(gaussians) > MAX_GAUSSIANS:
             raise ValueError(f"gaussians are {len(gaussians)}, expected at most {MAX_GAUSSIANS}")
         wanted = _NO_MASK if mask is None else _checked_mask(mask, (height, width))
-        ray_plane = depth == "ray_plane"
+        ray_plane = depth_kind == "ray_plane"
         return height, width, (pose, intrinsics, behind, wanted, ray_plane, width, height, self.threads)
 
     def _finish(self, gaussians: Gaussians, size: tuple[int, int], status: int) -> None:
@@ -201,15 +221,26 @@ class Rasterizer:
         d_color: Image,
         d_depth: Image | None = None,
         d_alpha: Image | None = None,
+        *,
         pose: bool = False,
         fisher: bool = False,
         parameters: bool = True,
     ) -> Gradients:
-        """Derivatives of L from those of L by the images: float32 [H, W, 3], [H, W], [H, W]; None is zero.
+        """Derivatives of a scalar L by the Gaussians of the last `forward`, from those of L by its images.
 
-        pose: also by the right tangent of T_map_camera. fisher: also the `empirical` diagonal, the sum over pixels
-        of (d L_p / d theta)^2 with L_p = <d_color_p, color_p> + d_depth_p depth_p + d_alpha_p alpha_p: pass
-        cotangents without a 1/N in front. parameters: False takes the pose alone, which is cheaper.
+        Args:
+            d_color: dL/dcolor, float32 [H, W, 3].
+            d_depth: dL/ddepth, float32 [H, W]; None is zero.
+            d_alpha: dL/dalpha, float32 [H, W]; None is zero.
+            pose: also differentiate by the right tangent of T_map_camera.
+            fisher: also give the `empirical` diagonal, the sum over pixels of (d L_p / d theta)^2 with
+                L_p = <d_color_p, color_p> + d_depth_p depth_p + d_alpha_p alpha_p: pass cotangents without a 1/N in
+                front.
+            parameters: False takes the derivative of the pose alone, which is cheaper.
+        Returns:
+            The derivatives; those that were not asked for are None.
+        Raises:
+            ValueError: an image of a wrong type, shape or value; the message names it.
         """
         _check_wanted(pose, parameters, fisher)
         gaussians, (height, width) = self._last_forward()
@@ -233,17 +264,24 @@ class Rasterizer:
     ) -> None:
         """Add the `gauss_newton` information of the last view, sum over pixels of J^T R^-1 J, to `sums`.
 
-        inv_var_color: float32 [H, W], 1/sigma^2 of every color channel; 0 leaves the pixel out.
-        inv_var_depth: float32 [H, W], 1/sigma^2 of the depth as drawn, 1/m^2; 0 leaves it out.
-        residual: float32 [H, W], not negative; summed by weight into sums.residual.
+        Args:
+            inv_var_color: float32 [H, W], 1/sigma^2 of every color channel; 0 leaves the pixel out.
+            inv_var_depth: float32 [H, W], 1/sigma^2 of the depth as drawn, 1/m^2; 0 leaves it out.
+            sums: of as many Gaussians; changed in place.
+            residual: float32 [H, W], not negative; summed by weight into sums.residual.
+        Raises:
+            ValueError: an argument of a wrong type, shape or value; the message names it.
         """
         gaussians, size = self._last_forward()
         n = len(gaussians)
-        color = _checked_image("inv_var_color", inv_var_color, size)
-        depth = _checked_image("inv_var_depth", inv_var_depth, size)
+        images = (
+            _checked_image("inv_var_color", inv_var_color, size),
+            _checked_image("inv_var_depth", inv_var_depth, size),
+            _NOTHING if residual is None else _checked_image("residual", residual, size),
+        )
         _check_type("sums", sums, FisherSums)
         expected = {
-            "geometry": ((n, GEOMETRY_COLUMNS), np.float64),
+            "geometry": ((n, GEOMETRY_SIZE), np.float64),
             "color": ((n, 3), np.float64),
             "opacity": ((n,), np.float64),
             "weight": ((n,), np.float64),
@@ -254,25 +292,27 @@ class Rasterizer:
             expected["diagonal"] = ((n, FISHER_DIAGONAL_COLUMNS), np.float64)
         for name, (shape, dtype) in expected.items():
             _check_array(f"sums.{name}", getattr(sums, name), shape, dtype)
-        status = self._raster.fisher(
-            *_arrays(gaussians),
-            color,
-            depth,
-            _NOTHING if residual is None else _checked_image("residual", residual, size),
+        diagonal = _NO_DOUBLES if sums.diagonal is None else sums.diagonal
+        added = (
             sums.geometry,
             sums.color,
             sums.opacity,
             sums.weight,
             sums.residual,
-            _NO_DOUBLES if sums.diagonal is None else sums.diagonal,
+            diagonal,
             sums.observations,
         )
+        status = self._raster.fisher(*_arrays(gaussians), *images, *added)
         _refuse_bad_image(status, dict.fromkeys(("inv_var_color", "inv_var_depth", "residual"), _NEGATIVE))
 
     def full_fisher(self, inv_var_color: Image, inv_var_depth: Image) -> NDArray[np.float64]:
         """J^T R^-1 J [n, 14, 14] of the last view with all its cross terms; for validation, not for speed.
 
-        Columns: mean 3, quaternion 4, log-scale 3, color 3, logit 1. The images as in `fisher`.
+        Columns: mean 3, quaternion 4, log-scale 3, color 3, logit 1.
+
+        Args:
+            inv_var_color: as in `fisher`.
+            inv_var_depth: as in `fisher`.
         """
         gaussians, size = self._last_forward()
         color = _checked_image("inv_var_color", inv_var_color, size)
@@ -297,14 +337,13 @@ class Rasterizer:
         blending weight, of the Gaussians within `tolerance` (relative) of its depth. At an edge, where the blended
         depth mixes two surfaces, it is that of one of them. 0 where more than half of the light passes. No derivative
         is taken of it.
+
+        Args:
+            tolerance: relative difference of depth, 0..1.
         """
         _, size = self._last_forward()
         if not (isinstance(tolerance, Real) and 0 <= float(tolerance) <= 1):
             raise ValueError(f"tolerance is {tolerance!r}, expected a number from 0 to 1")
-        if not hasattr(self._raster, "layer_depth"):
-            raise RuntimeError(
-                "the compiled kernels are older than their sources; build them again (make setup)"
-            )
         depth = empty(*size)
         self._raster.layer_depth(float(tolerance), depth)
         return depth
@@ -350,8 +389,9 @@ def _gradients(
     fisher_diagonal: NDArray[np.float32] | None = None,
 ) -> Gradients:
     nothing: list[None] = [None] * 5
-    means, quats_wxyz, log_scales, colors, opacity_logits = of_parameters or nothing
-    return Gradients(means, quats_wxyz, log_scales, colors, opacity_logits, pose, fisher_diagonal)
+    names = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
+    arrays: dict[str, Any] = dict(zip(names, of_parameters or nothing, strict=True))
+    return Gradients(**arrays, pose=pose, fisher_diagonal=fisher_diagonal)
 
 
 def _check_wanted(pose: bool, parameters: bool, fisher: bool) -> None:

@@ -26,18 +26,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry import spd
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.kernels.types import (
-    DEPTH_KINDS,
-    DepthKind,
-    FisherSums,
-    Gradients,
-    LossWeights,
-    Render,
-    ViewLoss,
-)
-from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.kernels.types import FisherSums, Gradients, LossWeights, Render, ViewLoss
+from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
 
 NEAR_M = 0.01
 BLUR_PX2 = 1 / 12
@@ -64,16 +57,16 @@ class ReferenceRasterizer:
         T_camera_map: ArrayLike,
         background: ArrayLike = (0.0, 0.0, 0.0),
         *,
-        depth: DepthKind = "blended",
+        depth_kind: DepthKind = "blended",
         mask: NDArray[np.bool_] | None = None,
     ) -> Render:
         """Draw the Gaussians (frame map) into the camera at T_camera_map [4, 4]; see `Rasterizer.forward`."""
         import torch
 
-        if depth not in DEPTH_KINDS:
-            raise ValueError(f"depth is {depth!r}, expected one of {', '.join(DEPTH_KINDS)}")
+        if depth_kind not in DEPTH_KINDS:
+            raise ValueError(f"depth_kind is {depth_kind!r}, expected one of {', '.join(DEPTH_KINDS)}")
         n, shape = len(gaussians), (camera.height, camera.width)
-        self._camera, self._n, self._depth = camera, n, depth
+        self._camera, self._n, self._depth_kind = camera, n, depth_kind
         self._drawn = np.ones(shape, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
         self._pixels = _tensor(np.argwhere(self._drawn)[:, ::-1].copy())  # x, y
         self._T, self._background = _tensor(T_camera_map), _tensor(background)
@@ -90,6 +83,7 @@ class ReferenceRasterizer:
         d_color: ArrayLike,
         d_depth: ArrayLike | None = None,
         d_alpha: ArrayLike | None = None,
+        *,
         pose: bool = False,
         fisher: bool = False,
         parameters: bool = True,
@@ -149,7 +143,7 @@ class ReferenceRasterizer:
         exposure: tuple[float, float] = (0.0, 0.0),
         background: ArrayLike = (0.0, 0.0, 0.0),
         mask: NDArray[np.bool_] | None = None,
-        depth: DepthKind = "blended",
+        depth_kind: DepthKind = "blended",
         pose: bool = False,
         parameters: bool = True,
         depth_certainty: ArrayLike | None = None,
@@ -157,7 +151,7 @@ class ReferenceRasterizer:
         """Draw, compare with a measured image, differentiate; see `Rasterizer.view_gradients`."""
         import torch
 
-        self.forward(gaussians, camera, T_camera_map, background, depth=depth, mask=mask)
+        self.forward(gaussians, camera, T_camera_map, background, depth_kind=depth_kind, mask=mask)
         certainty = np.ones(self._drawn.shape) if depth_certainty is None else depth_certainty
         rgb, z, sure = (_tensor(np.asarray(image)[self._drawn]) for image in (color, depth_m, certainty))
         gain_and_offset = _tensor(exposure).requires_grad_()
@@ -245,7 +239,7 @@ class ReferenceRasterizer:
         JW, self._from_clamp = _linearized(places, W[order], camera)
         along_z = JW @ sigma[order] @ W[order, 2, :, None]  # k, covariance of screen position and depth
         slopes = (conics @ along_z)[..., 0]
-        if self._depth == "blended":
+        if self._depth_kind == "blended":
             slopes = torch.zeros_like(slopes)
         return Screen(
             centers, conics, z, slopes, torch.sigmoid(p["opacity_logits"])[order], p["colors"][order]

@@ -9,13 +9,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.config.training import DepthKind
-from duagc.pipeline.splat.gaussians import DEPTH_KINDS
-
-__all__ = ["DEPTH_KINDS", "DepthKind"]
+from duagc.pipeline.splat.information import GEOMETRY_SIZE
 
 FISHER_DIAGONAL_COLUMNS = 14
-GEOMETRY_COLUMNS = 45
 SMALLEST_HUBER = 1e-9  # its inverse, in float32, must leave room for residuals
 LARGEST_LOSS_WEIGHT = 1e9
 
@@ -25,8 +21,13 @@ MaybeNone: TypeAlias = Any
 
 @dataclass(frozen=True)
 class Render:
-    """One view. color: [H, W, 3], RGB; depth: [H, W], meters, blended sum of weight * z, not divided by alpha;
-    alpha: [H, W], sum of the weights. float32 (float64 from the reference). All zero where a mask is False."""
+    """One view as it is drawn; float32, float64 from the reference. All zero where a mask is False.
+
+    Attributes:
+        color: [H, W, 3], RGB.
+        depth: [H, W], meters, the blended sum of weight * z, not divided by alpha.
+        alpha: [H, W], sum of the weights.
+    """
 
     color: NDArray[np.floating]
     depth: NDArray[np.floating]
@@ -37,9 +38,17 @@ class Render:
 class Gradients:
     """Derivatives of a scalar by the Gaussians, shapes and types as in `Gaussians`; zero where nothing was drawn.
 
-    All five are None if only the pose was asked for (parameters=False). pose: [6] float64, by the right tangent
-    (translation m, rotation rad) of T_map_camera. fisher_diagonal: [n, 14], sum over pixels of the squared per-pixel
-    derivative, order mean 3, quaternion 4, log-scale 3, color 3, logit 1.
+    The first five are None if only the pose was asked for (parameters=False).
+
+    Attributes:
+        means: [n, 3].
+        quats_wxyz: [n, 4].
+        log_scales: [n, 3].
+        colors: [n, 3].
+        opacity_logits: [n].
+        pose: [6] float64, by the right tangent (translation m, rotation rad) of T_map_camera.
+        fisher_diagonal: [n, 14], sum over pixels of the squared per-pixel derivative, order mean 3, quaternion 4,
+            log-scale 3, color 3, logit 1.
     """
 
     means: NDArray[np.floating] | MaybeNone
@@ -54,17 +63,20 @@ class Gradients:
 class FisherSums:
     """Information of n Gaussians, summed over the views added so far (method section 2, `gauss_newton`).
 
-    geometry: float64 [n, 45], upper triangle, row by row, of the 9x9 information in (mean 3, vec log Sigma 6) in the
-    frame of the Gaussians; 1/m^2 for the mean. color: float64 [n, 3]. opacity: float64 [n], of the logit.
-    observations: uint32 [n], views in which a pixel of non-zero precision saw the Gaussian. Over the pixels of
-    non-zero precision: weight: float64 [n], sum of the blending weights; residual: float64 [n], sum of weight times
-    the residual image, in its unit, so that residual / weight is the mean residual that the Gaussian answers for.
-    diagonal: float64 [n, 14] or None, of the information in (mean 3, quaternion 4 as given, log-scale 3, color 3,
-    logit 1), the vector of paper eq. (3); summed on request only.
+    Attributes:
+        geometry: float64 [n, 45] as in `splat.information`, in the frame of the Gaussians.
+        color: float64 [n, 3].
+        opacity: float64 [n], of the logit.
+        observations: uint32 [n], views in which a pixel of non-zero precision saw the Gaussian.
+        weight: float64 [n], sum of the blending weights over the pixels of non-zero precision.
+        residual: float64 [n], sum over these pixels of weight times the residual image, in its unit: residual / weight
+            is the mean residual that is due to the Gaussian.
+        diagonal: float64 [n, 14] or None, of the information in (mean 3, quaternion 4 as given, log-scale 3, color 3,
+            logit 1), the vector of paper eq. (3); summed on request only.
     """
 
     def __init__(self, n: int, diagonal: bool = False) -> None:
-        self.geometry = np.zeros((n, GEOMETRY_COLUMNS))
+        self.geometry = np.zeros((n, GEOMETRY_SIZE))
         self.color = np.zeros((n, 3))
         self.opacity = np.zeros(n)
         self.observations = np.zeros(n, dtype=np.uint32)
@@ -79,23 +91,18 @@ class FisherSums:
         """The sums by name, [n, ...] each; `diagonal` only if it was asked for."""
         return {name: array for name, array in vars(self).items() if array is not None}
 
-    def geometry_matrices(self) -> NDArray[np.float64]:
-        """The symmetric 9x9 matrices [n, 9, 9]."""
-        rows, columns = np.triu_indices(9)
-        full = np.zeros((len(self), 9, 9))
-        full[:, rows, columns] = self.geometry
-        full[:, columns, rows] = self.geometry
-        return full
-
 
 @dataclass(frozen=True)
 class LossWeights:
     """Weights of the loss of one view; the loss itself is `splat.losses.rgbd_loss`.
 
-    color_huber: color residual (0..1) where the loss turns from quadratic to linear of slope 1. depth_huber_m: the
-    same of depth, meters. depth_weight: of one meter of depth against one unit of color. alpha_weight: of missing
-    opacity where a depth was measured. surface_weight: of one meter between the depth of single Gaussians, by their
-    blending weight, and the measured one.
+    Attributes:
+        color_huber: color residual (0..1) where the loss turns from quadratic to linear of slope 1.
+        depth_weight: of one meter of depth against one unit of color.
+        depth_huber_m: depth residual (m) where the loss turns from quadratic to linear of slope 1.
+        alpha_weight: of missing opacity where a depth was measured.
+        surface_weight: of one meter between the depth of single Gaussians, by their blending weight, and the measured
+            one.
     """
 
     color_huber: float
@@ -121,9 +128,15 @@ class LossWeights:
 
 @dataclass(frozen=True)
 class ViewLoss:
-    """Loss of one view: value, the weighted sum of its terms; color (0..1), depth and surface (meters), the means of
-    those terms before their weights; d_exposure, the derivatives of value by the exposure (a, b). The surface term is
-    not measured where its weight is 0, and then 0."""
+    """Loss of one view.
+
+    Attributes:
+        value: weighted sum of the terms.
+        color: mean of the color term before its weight, 0..1.
+        depth: mean of the depth term before its weight, meters.
+        d_exposure: derivatives of value by the exposure (a, b).
+        surface: mean of the surface term before its weight, meters; not measured, and 0, where its weight is 0.
+    """
 
     value: float
     color: float
@@ -134,9 +147,15 @@ class ViewLoss:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Work of the last view. visible: Gaussians on the screen. intersections: entries of all tile lists.
-    evaluated_pairs: pairs of pixel and Gaussian whose alpha was computed. blended_pairs: those that were drawn.
-    scratch_bytes: memory held between calls."""
+    """Work of the last view.
+
+    Attributes:
+        visible: Gaussians on the screen.
+        intersections: entries of all tile lists.
+        evaluated_pairs: pairs of pixel and Gaussian whose alpha was computed.
+        blended_pairs: of them, those that were drawn.
+        scratch_bytes: memory held between calls.
+    """
 
     visible: int
     intersections: int

@@ -102,7 +102,7 @@ def _view(
 ) -> dict[str, Any]:
     """Image and renders of maps at poses, their depths, their errors."""
     renders = {
-        kind: rasterizer.forward(shown.gaussians, log.camera, se3.inverse(T), depth=shown.depth)
+        kind: rasterizer.forward(shown.gaussians, log.camera, se3.inverse(T), depth_kind=shown.depth)
         for kind, (shown, T) in maps.items()
     }
     measured = frame.depth > 0

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Evidence, theta_of
+from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.weights import Weights
 from duagc.pipeline.exchange.record import Recorded, RecordedPacket, read_session
 from duagc.pipeline.exchange.wire import evidence_wire, state_wire
@@ -27,6 +27,7 @@ from duagc.pipeline.network.packets import (
 )
 from duagc.pipeline.recording import read_log
 from duagc.pipeline.runs.folder import RunFolder
+from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY, theta_of
 from duagc.schemas import topics
 
 Facts = dict[str, Any]

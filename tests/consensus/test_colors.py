@@ -8,7 +8,8 @@ import pytest
 
 from duagc.pipeline.config.consensus import ColorConfig
 from duagc.pipeline.consensus.colors import team_colors
-from duagc.pipeline.consensus.evidence import COLOR, Evidence
+from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.splat.information import COLOR
 
 CONFIG = ColorConfig()
 GAIN = {"alpha": [1.0, 1.0, 1.0], "bravo": [0.7, 0.8, 0.9], "charlie": [1.2, 1.0, 0.85]}

@@ -6,19 +6,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from duagc.pipeline.consensus.evidence import (
+from duagc.pipeline.consensus.evidence import SHAPE_FLOOR, Evidence
+from duagc.pipeline.geometry import se3, so3, spd
+from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import (
     COLOR,
     LOG_COVARIANCE,
     MEAN,
     OPACITY,
-    SHAPE_FLOOR,
-    Evidence,
     pack_information,
     pack_symmetric,
     unpack_symmetric,
 )
-from duagc.pipeline.geometry import se3, so3, spd
-from duagc.pipeline.splat.gaussians import Gaussians
 from tests.consensus.worlds import random_poses
 
 

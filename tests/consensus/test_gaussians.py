@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from duagc.pipeline.consensus.evidence import Evidence, pack_information
+from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.weights import Weights
 from duagc.pipeline.experiments.gaussian_consensus import (
     COORDINATES,
@@ -18,6 +18,7 @@ from duagc.pipeline.experiments.gaussian_consensus import (
     optimum,
     total_weights,
 )
+from duagc.pipeline.splat.information import pack_information
 
 EDGES = {
     "full": lambda n: [(i, j) for i in range(n) for j in range(i)],

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.consensus import ColorConfig
-from duagc.pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, Evidence
+from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import MatchingConfig, gaussian_distance, match, threshold, tracks
 from duagc.pipeline.geometry import so3, spd
+from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN
 from tests.consensus.worlds import random_poses
 
 CONFIG = MatchingConfig()

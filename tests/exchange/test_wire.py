@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from duagc.pipeline.consensus.admm_edge import PosePacket, SharedKeyframes
-from duagc.pipeline.consensus.evidence import pack_symmetric, unpack_symmetric
 from duagc.pipeline.exchange.wire import evidence_wire, places_wire, state_wire
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses
 from duagc.pipeline.geometry import se3
@@ -19,6 +18,7 @@ from duagc.pipeline.posegraph.cycle_consistency import Proposal
 from duagc.pipeline.registration import Reference, ReferenceLevel
 from duagc.pipeline.registration.features import Features
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS
+from duagc.pipeline.splat.information import pack_symmetric, unpack_symmetric
 
 RNG = np.random.default_rng(5)
 TEAM = 4

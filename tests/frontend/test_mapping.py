@@ -221,7 +221,7 @@ def test_both_depths_of_a_gaussian_make_a_map(depth: DepthKind) -> None:
     mapper, _ = build(MappingConfig(max_gaussians=4000, iterations=20, final_iterations=15, depth=depth))
     mapper.finish()
     color, z = shot(POSES[1])
-    render = Rasterizer().forward(mapper.gaussians, CAMERA, se3.inverse(POSES[1]), depth=depth)
+    render = Rasterizer().forward(mapper.gaussians, CAMERA, se3.inverse(POSES[1]), depth_kind=depth)
     assert psnr(render.color, color / 255) > 28.0
     assert depth_error(render, z)[0] < 0.02
 
@@ -233,7 +233,7 @@ def test_loss_on_single_gaussians_brings_each_to_its_surface() -> None:
         )
         mapper.finish()
         rasterizer, depth_m = Rasterizer(), shot(POSES[1])[1]
-        rasterizer.forward(mapper.gaussians, CAMERA, se3.inverse(POSES[1]), depth="ray_plane")
+        rasterizer.forward(mapper.gaussians, CAMERA, se3.inverse(POSES[1]), depth_kind="ray_plane")
         layer_m = rasterizer.layer_depth()
         assert (layer_m > 0).mean() > 0.97
         return float(np.abs(layer_m - depth_m)[layer_m > 0].mean())

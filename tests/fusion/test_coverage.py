@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from duagc.pipeline.consensus.evidence import LOG_COVARIANCE, MEAN, Evidence
+from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.fusion.fuse import FusionConfig, explained, fuse
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import LOG_COVARIANCE, MEAN
 from tests.fusion.worlds import (
     CAMERA,
     CONFIG,

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.consensus import ColorConfig
-from duagc.pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, Evidence, pack_information
+from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import MatchingConfig
 from duagc.pipeline.consensus.weights import Weights
 from duagc.pipeline.fusion.fuse import association_covariance, fuse, weighted_move
 from duagc.pipeline.geometry import se3, so3, spd
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, pack_information
 from tests.fusion.worlds import (
     ALIKE,
     CAMERA,

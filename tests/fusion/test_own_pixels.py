@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.fusion import FusionConfig
-from duagc.pipeline.consensus.evidence import OPACITY, theta_of
 from duagc.pipeline.fusion.finetune import View
 from duagc.pipeline.fusion.fuse import FusedMap
-from duagc.pipeline.fusion.opacity_update import OPACITY_INFORMATION, weigh_by_own_pixels
+from duagc.pipeline.fusion.opacity_update import weigh_by_own_pixels
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import OPACITY, OPACITY_INFORMATION, theta_of
 from tests.fusion.test_refine import CAMERA, POSES, wall
 
 CONFIG = FusionConfig()

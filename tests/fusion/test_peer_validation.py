@@ -7,12 +7,13 @@ import pytest
 
 from duagc.pipeline.config.consensus import MatchingConfig
 from duagc.pipeline.config.fusion import FusionConfig
-from duagc.pipeline.consensus.evidence import COLOR, LOG_COVARIANCE, MEAN, OPACITY, Evidence, theta_of
+from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.fusion.finetune import View
 from duagc.pipeline.fusion.peer_validation import ValidatedPeers, validate_peer_maps
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY, theta_of
 from tests.fusion.test_refine import CAMERA, POSES
 from tests.fusion.test_refine import wall as speckled
 

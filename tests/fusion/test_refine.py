@@ -124,7 +124,7 @@ def test_a_neighbors_map_is_drawn_with_the_depth_that_it_was_made_with() -> None
     seen = {}
     for depth in DEPTH_KINDS:
         (view,) = peer_views({"zulu": evidence}, {"zulu": poses}, CAMERA, 1, {"zulu": depth}, colors=ALIKE)
-        render = Rasterizer().forward(tilted, CAMERA, se3.inverse(poses[0]), depth=depth)
+        render = Rasterizer().forward(tilted, CAMERA, se3.inverse(poses[0]), depth_kind=depth)
         sure = (render.alpha > 0.901) & (view.depth_m > 0)
         assert sure.any()
         np.testing.assert_allclose(view.depth_m[sure], (render.depth / render.alpha)[sure], atol=1e-3)

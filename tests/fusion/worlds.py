@@ -2,12 +2,13 @@
 
 import numpy as np
 
-from duagc.pipeline.consensus.evidence import Evidence, pack_information
+from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import MatchingConfig
 from duagc.pipeline.fusion.fuse import FusionConfig, fuse
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import pack_information
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 CONFIG = FusionConfig(

@@ -15,8 +15,8 @@ from collections import defaultdict
 
 import numpy as np
 
+from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.kernels import DepthKind
 from tests.kernels.agreement import Error, compare
 from tests.kernels.drawn_scenes import OPACITIES, PLACES, SHAPES, made_scene
 from tests.kernels.scenes import KINDS, Scene, make_scene
@@ -45,13 +45,13 @@ def main() -> None:
     fixed: dict[str, list[Error]] = defaultdict(list)
     made: dict[str, list[Error]] = defaultdict(list)
     count = int(sys.argv[1]) if len(sys.argv) > 1 else MADE
-    depth: DepthKind = "ray_plane" if "ray_plane" in sys.argv else "blended"
+    depth_kind: DepthKind = "ray_plane" if "ray_plane" in sys.argv else "blended"
     for scenes, errors in (
         ((make_scene(kind) for kind in KINDS), fixed),
         ((mixed_scene(seed) for seed in range(count)), made),
     ):
         for scene in scenes:
-            for error in compare(scene, depth=depth):
+            for error in compare(scene, depth_kind=depth_kind):
                 group = group_of(error.name)
                 if group is not None:
                     errors[group].append(error)

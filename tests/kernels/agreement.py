@@ -25,9 +25,11 @@ from typing import Any
 
 import numpy as np
 
+from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.kernels import DepthKind, FisherSums, Gradients, LossWeights, Rasterizer
+from duagc.pipeline.kernels import FisherSums, Gradients, LossWeights, Rasterizer
 from duagc.pipeline.kernels.reference import ReferenceRasterizer
+from duagc.pipeline.splat.information import unpack_geometry
 from duagc.pipeline.splat.losses import rgbd_loss
 from tests.kernels.scenes import Scene
 
@@ -83,13 +85,13 @@ def outputs(
     rasterizer: Any,
     scene: Scene,
     where: np.ndarray,
-    depth: DepthKind = "blended",
+    depth_kind: DepthKind = "blended",
     inputs: tuple[Any, ...] | None = None,
     floors: bool = False,
 ) -> Outputs:
     """Everything about one view of the pixels `where`; `inputs` instead of the scene's own. floors: the reference's."""
     view = inputs or (scene.gaussians, scene.camera, scene.T_camera_map)
-    options: dict[str, Any] = {"depth": depth, "mask": None if where.all() else where}
+    options: dict[str, Any] = {"depth_kind": depth_kind, "mask": None if where.all() else where}
     render = rasterizer.forward(*view, scene.background, **options)
     out: Outputs = {name: (image, IMAGE_BAR, 0.0) for name, image in vars(render).items()}
     weights, pixels = rasterizer.contributions()
@@ -124,7 +126,7 @@ def information_outputs(rasterizer: Any, scene: Scene, n: int, floors: bool) -> 
     """The `gauss_newton` information of the last view, in blocks and one Gaussian at a time."""
     precisions, sums = (scene.image(4, low=0.0), scene.image(5, low=0.0)), FisherSums(n, diagonal=True)
     rasterizer.fisher(*precisions, sums, residual=scene.image(6, low=0.0))
-    blocks, mean, log = sums.geometry_matrices(), slice(0, 3), slice(3, 9)
+    blocks, mean, log = unpack_geometry(sums.geometry), slice(0, 3), slice(3, 9)
     out: Outputs = {}
     for name, rows, columns in (("mm", mean, mean), ("ms", mean, log), ("ss", log, log)):
         out[f"block {name}"] = (blocks[:, rows, columns], INFORMATION_BAR, 0.0)
@@ -193,13 +195,13 @@ class Error:
     passes: bool
 
 
-def compare(scene: Scene, isa: str = "auto", depth: DepthKind = "blended") -> Iterator[Error]:
+def compare(scene: Scene, isa: str = "auto", depth_kind: DepthKind = "blended") -> Iterator[Error]:
     """The error of every output; inputs are moved only until all are explained."""
     reference = ReferenceRasterizer()
     reference.forward(scene.gaussians, scene.camera, scene.T_camera_map, scene.background)
     where = reference.decided()
-    wanted = outputs(reference, scene, where, depth, floors=True)
-    found = outputs(Rasterizer(isa), scene, where, depth)
+    wanted = outputs(reference, scene, where, depth_kind, floors=True)
+    found = outputs(Rasterizer(isa), scene, where, depth_kind)
     errors = {name: float(np.linalg.norm(found[name][0] - exact)) for name, (exact, _, _) in wanted.items()}
     limits = {
         name: max(bar * float(np.linalg.norm(exact)), floor) for name, (exact, bar, floor) in wanted.items()
@@ -208,7 +210,7 @@ def compare(scene: Scene, isa: str = "auto", depth: DepthKind = "blended") -> It
     for seed in range(DRAWS):
         if all(errors[name] <= max(limits[name], SLACK * changes[name]) for name in wanted):
             break
-        other = outputs(reference, scene, where, depth, moved(scene, seed))
+        other = outputs(reference, scene, where, depth_kind, moved(scene, seed))
         for name, (exact, _, _) in wanted.items():
             changes[name] = max(changes[name], float(np.linalg.norm(other[name][0] - exact)))
     for name, error in errors.items():

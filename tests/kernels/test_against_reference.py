@@ -8,7 +8,8 @@ import pytest
 
 from duagc.pipeline.kernels import FisherSums, Rasterizer, available_isas
 from duagc.pipeline.kernels.reference import ReferenceRasterizer
-from duagc.pipeline.kernels.types import DEPTH_KINDS
+from duagc.pipeline.splat.gaussians import DEPTH_KINDS
+from duagc.pipeline.splat.information import unpack_geometry
 from tests.kernels.scenes import KINDS, make_scene
 
 ISAS = available_isas()
@@ -36,7 +37,7 @@ def evaluate(rasterizer, kind):
 
 
 def layers_of(rasterizer, scene, depth):
-    rasterizer.forward(scene.gaussians, scene.camera, scene.T_camera_map, scene.background, depth=depth)
+    rasterizer.forward(scene.gaussians, scene.camera, scene.T_camera_map, scene.background, depth_kind=depth)
     return rasterizer.layer_depth()
 
 
@@ -93,7 +94,7 @@ def test_empirical_diagonal(kind, isa, cotangents):
 @both
 def test_gauss_newton_information(kind, isa):
     found, wanted = computed(kind, isa).sums, expected(kind).sums
-    blocks, exact = found.geometry_matrices(), wanted.geometry_matrices()
+    blocks, exact = unpack_geometry(found.geometry), unpack_geometry(wanted.geometry)
     for rows, columns in [(slice(0, 3), slice(0, 3)), (slice(0, 3), slice(3, 9)), (slice(3, 9), slice(3, 9))]:
         assert_close(blocks[:, rows, columns], exact[:, rows, columns], 1e-4)
     # one Gaussian at a time too: a weak one must not hide behind a strong one

@@ -61,10 +61,10 @@ def test_masks_that_cannot_be(mask):
 
 @pytest.mark.parametrize("depth", ["center", "", "BLENDED", None, 1, b"blended", ["blended"]])
 def test_kinds_of_depth_that_do_not_exist(depth):
-    with pytest.raises(REFUSED, match=r"depth .*ray_plane"):
-        Rasterizer().forward(random_gaussians(5, 0), CAMERA, np.eye(4), depth=depth)
-    with pytest.raises(REFUSED, match=r"depth .*ray_plane"):
-        differentiated(depth=depth)
+    with pytest.raises(REFUSED, match=r"depth_kind .*ray_plane"):
+        Rasterizer().forward(random_gaussians(5, 0), CAMERA, np.eye(4), depth_kind=depth)
+    with pytest.raises(REFUSED, match=r"depth_kind .*ray_plane"):
+        differentiated(depth_kind=depth)
 
 
 @pytest.mark.parametrize(
@@ -294,7 +294,7 @@ def test_any_size_of_anything(isa, size, n, depth):
         image,
         LOSS,
         mask=mask,
-        depth=depth,
+        depth_kind=depth,
         pose=True,
     )
     rasterizer.fisher(image, image, sums, residual=image)
@@ -321,7 +321,7 @@ def test_extremes_stay_finite(isa, depth):
     )
     rasterizer, sums = Rasterizer(isa), FisherSums(n, diagonal=True)
     loss, gradients = rasterizer.view_gradients(
-        gaussians, CAMERA, np.eye(4), ones(3), ones(), LOSS, depth=depth, pose=True
+        gaussians, CAMERA, np.eye(4), ones(3), ones(), LOSS, depth_kind=depth, pose=True
     )
     rasterizer.fisher(ones(), ones(), sums, residual=ones())
     assert np.isfinite([loss.value, loss.color, loss.depth, *loss.d_exposure]).all()

@@ -21,7 +21,8 @@ def tensors_of(scene, requires_grad=True):
 
 
 def draw(scene, parameters, **options):
-    return rasterize(*parameters, scene.camera, scene.T_camera_map, scene.background, **options)
+    view = {"camera": scene.camera, "T_camera_map": scene.T_camera_map, "background": scene.background}
+    return rasterize(*parameters, **view, **options)
 
 
 def weighted(scene, images):
@@ -39,14 +40,14 @@ def assert_close(found, wanted, tolerance):
 def test_gradients_are_those_of_the_reference(kind, xi_type, depth):
     scene = make_scene(kind)
     parameters, xi = tensors_of(scene), torch.tensor(TWIST, dtype=xi_type, requires_grad=True)
-    images = draw(scene, parameters, depth=depth, xi=xi)
+    images = draw(scene, parameters, depth_kind=depth, xi=xi)
     value, cotangents = weighted(scene, images)
     value.backward()
 
     def reference_at(twist):
         reference = ReferenceRasterizer()
         pose = se3.exp(-twist) @ scene.T_camera_map
-        render = reference.forward(scene.gaussians, scene.camera, pose, scene.background, depth=depth)
+        render = reference.forward(scene.gaussians, scene.camera, pose, scene.background, depth_kind=depth)
         assert reference.gate_margin() > 1e-5  # rounding does not decide what is drawn
         return reference, render
 
@@ -192,7 +193,7 @@ def test_wrong_poses_are_refused_by_name(plain):
         with pytest.raises(ValueError, match=complaint):
             draw(plain, parameters, xi=xi)
     with pytest.raises(ValueError, match="T_camera_map requires a gradient"):
-        rasterize(*parameters, plain.camera, torch.eye(4, requires_grad=True))
+        rasterize(*parameters, camera=plain.camera, T_camera_map=torch.eye(4, requires_grad=True))
     parameters[0].data[2] = torch.nan
     with pytest.raises(ValueError, match=r"means holds a NaN .* row 2"):
         draw(plain, parameters)

@@ -9,8 +9,9 @@ from duagc.pipeline.geometry import so3, spd
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.kernels.reference import ReferenceRasterizer
-from duagc.pipeline.kernels.types import DEPTH_KINDS, FisherSums, Gradients, LossWeights
-from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.kernels.types import FisherSums, Gradients, LossWeights
+from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
+from duagc.pipeline.splat.information import unpack_geometry
 from duagc.pipeline.splat.losses import rgbd_loss
 from tests.kernels.scenes import BACKGROUND, Scene, make_scene, random_gaussians
 
@@ -103,7 +104,7 @@ def test_ray_plane_depth_of_a_disc_is_where_the_ray_meets_its_plane(rasterizer, 
     """n.(z ray) = n.p: depth and slope at the center; beyond, affine, so the error grows with the square."""
     gaussians, normal, center = slanted_disc(normal)
     camera = PinholeCamera(121, 101, 200.0, 210.0, 30.0, 71.0)
-    render = rasterizer.forward(gaussians, camera, np.eye(4), depth="ray_plane")
+    render = rasterizer.forward(gaussians, camera, np.eye(4), depth_kind="ray_plane")
     depth = render.depth / render.alpha
     plane = (normal @ center) / (camera.rays() @ normal)
     u, v = camera.project(center)  # both whole: a pixel lies on the center
@@ -126,13 +127,13 @@ def test_ray_plane_depth_of_a_ball_is_that_of_its_center_on_the_axis(rasterizer)
     gaussians = random_gaussians(1, 0).replace(means=[[0, 0, 2.0]], log_scales=[[-2.0] * 3])
     camera = PinholeCamera(11, 9, 20.0, 20.0, 5.0, 4.0)
     blended, ray_plane = (
-        rasterizer.forward(gaussians, camera, np.eye(4), depth=d).depth for d in DEPTH_KINDS
+        rasterizer.forward(gaussians, camera, np.eye(4), depth_kind=d).depth for d in DEPTH_KINDS
     )
     np.testing.assert_allclose(ray_plane, blended, rtol=1e-6)
 
 
 def test_only_depth_knows_of_its_kind(rasterizer, scene):
-    blended, ray_plane = (draw(rasterizer, scene, depth=d) for d in DEPTH_KINDS)
+    blended, ray_plane = (draw(rasterizer, scene, depth_kind=d) for d in DEPTH_KINDS)
     np.testing.assert_array_equal(blended.color, ray_plane.color)
     np.testing.assert_array_equal(blended.alpha, ray_plane.alpha)
     assert np.abs(blended.depth - ray_plane.depth).max() > 1e-3
@@ -148,12 +149,12 @@ def test_gradients_are_differences(depth):
     def loss(name, index, change):
         gaussians = Float64Gaussians(scene.gaussians)
         getattr(gaussians, name)[index] += change
-        render = reference.forward(gaussians, scene.camera, scene.T_camera_map, BACKGROUND, depth=depth)
+        render = reference.forward(gaussians, scene.camera, scene.T_camera_map, BACKGROUND, depth_kind=depth)
         return (
             (d_color * render.color).sum() + (d_depth * render.depth).sum() + (d_alpha * render.alpha).sum()
         )
 
-    draw(reference, scene, depth=depth)
+    draw(reference, scene, depth_kind=depth)
     gradients = reference.backward(d_color, d_depth, d_alpha)
     for name in PARAMETERS:
         found = getattr(gradients, name)
@@ -180,9 +181,9 @@ class Float64Gaussians:
 @pytest.mark.parametrize("depth", DEPTH_KINDS)
 def test_masked_pixels_are_black_and_silent(rasterizer, scene, depth):
     mask = checkerboard(scene)
-    whole, d_color, d_depth = draw(rasterizer, scene, depth=depth), scene.image(1, 3), scene.image(2)
+    whole, d_color, d_depth = draw(rasterizer, scene, depth_kind=depth), scene.image(1, 3), scene.image(2)
     silenced = rasterizer.backward(d_color * mask[..., None], d_depth * mask, pose=True, fisher=True)
-    masked = draw(rasterizer, scene, depth=depth, mask=mask)
+    masked = draw(rasterizer, scene, depth_kind=depth, mask=mask)
     found = rasterizer.backward(d_color, d_depth, pose=True, fisher=True)
     for name in ("color", "depth", "alpha"):
         np.testing.assert_array_equal(getattr(masked, name)[mask], getattr(whole, name)[mask])
@@ -232,7 +233,7 @@ def test_one_layer_is_never_between_two(rasterizer, depth):
     """A near wall covers the right half: blended depth slides from the far one to it, the layer's depth jumps."""
     camera = tiny().camera
     near, far = wall(1.0, 0.9, right_of_px=3), wall(2.0, 0.9)
-    render = rasterizer.forward(Gaussians.concatenate([near, far]), camera, np.eye(4), depth=depth)
+    render = rasterizer.forward(Gaussians.concatenate([near, far]), camera, np.eye(4), depth_kind=depth)
     layer, blended = rasterizer.layer_depth(), render.depth / render.alpha
     is_near, is_far = np.abs(layer - 1) < 1e-3, np.abs(layer - 2) < 2e-3
     assert (is_near | is_far).all()
@@ -301,11 +302,11 @@ def rows_of(reference, scene: Scene) -> np.ndarray:
 def test_information_is_the_sum_over_pixels_of_squared_derivatives(rasterizer, depth):
     scene, reference = tiny(), ReferenceRasterizer()
     of_color, of_depth = scene.image(4, low=0.0), scene.image(5, low=0.0)
-    draw(reference, scene, depth=depth)
+    draw(reference, scene, depth_kind=depth)
     rows = rows_of(reference, scene)
     precision = np.stack([of_color.ravel()] * 3 + [of_depth.ravel()]).astype(np.float64)
     wanted = np.einsum("cp,cpni,cpnj->nij", precision, rows, rows)
-    draw(rasterizer, scene, depth=depth)
+    draw(rasterizer, scene, depth_kind=depth)
     found = rasterizer.full_fisher(of_color, of_depth)
     assert found.dtype == np.float64
     np.testing.assert_allclose(found, wanted, atol=tolerance(rasterizer) * np.abs(wanted).max())
@@ -336,7 +337,7 @@ def test_both_charts_of_the_geometry_say_the_same(rasterizer, kind, depth):
     scene = make_scene(kind)
     n, step = len(scene.gaussians), 1e-5
     views, sums = (scene.image(4, low=0.0), scene.image(5, low=0.0)), FisherSums(n)
-    draw(rasterizer, scene, depth=depth)
+    draw(rasterizer, scene, depth_kind=depth)
     rasterizer.fisher(*views, sums)
     quats, scales = (a.astype(np.float64) for a in (scene.gaussians.quats_wxyz, scene.gaussians.log_scales))
     T = np.zeros((n, 9, 10))
@@ -347,7 +348,7 @@ def test_both_charts_of_the_geometry_say_the_same(rasterizer, kind, depth):
         ahead = spd.log_covariance(quats + change[:4], scales + change[4:])
         behind = spd.log_covariance(quats - change[:4], scales - change[4:])
         T[:, 3:, 3 + k] = (ahead - behind) / (2 * step)
-    wanted = np.swapaxes(T, 1, 2) @ sums.geometry_matrices() @ T
+    wanted = np.swapaxes(T, 1, 2) @ unpack_geometry(sums.geometry) @ T
     found = rasterizer.full_fisher(*views)[:, :10, :10]
     seen = sums.observations > 0
     error = np.linalg.norm((found - wanted)[seen], axis=(1, 2)) / np.linalg.norm(wanted[seen], axis=(1, 2))
@@ -437,10 +438,10 @@ def test_view_gradients_are_forward_loss_and_backward(rasterizer, scene, exposur
         exposure=exposure,
         background=scene.background,
         mask=mask,
-        depth=depth,
+        depth_kind=depth,
         pose=True,
     )
-    render = draw(rasterizer, scene, depth=depth, mask=mask)
+    render = draw(rasterizer, scene, depth_kind=depth, mask=mask)
     wanted = rgbd_loss(render, color, depth_m, LOSS, exposure, mask)
     rtol = 1e-12 if isinstance(rasterizer, ReferenceRasterizer) else 2e-6
     np.testing.assert_allclose(
@@ -489,7 +490,7 @@ def test_view_gradients_of_the_depth_of_single_gaussians_are_those_of_the_refere
     color, depth_m = measured_images(plain)
     certainty = np.random.default_rng(5).uniform(0, 1, depth_m.shape).astype(np.float32)
     arguments = plain.gaussians, plain.camera, plain.T_camera_map, color, depth_m
-    options = {"depth": depth, "pose": True, "depth_certainty": certainty, "mask": checkerboard(plain)}
+    options = {"depth_kind": depth, "pose": True, "depth_certainty": certainty, "mask": checkerboard(plain)}
     options |= {"parameters": not pose_only}
     both = dataclasses.replace(LOSS, surface_weight=0.8)
     loss, gradients = Rasterizer().view_gradients(*arguments, both, **options)

@@ -30,7 +30,7 @@ def digest(rasterizer: Rasterizer) -> str:
     arrays: list[np.ndarray] = []
     for depth, mask in (("blended", None), ("ray_plane", rng.random(shape) < 0.8)):
         sums = FisherSums(len(gaussians), diagonal=True)
-        render = rasterizer.forward(*view, (0.1, 0.2, 0.3), depth=depth, mask=mask)
+        render = rasterizer.forward(*view, (0.1, 0.2, 0.3), depth_kind=depth, mask=mask)
         gradients = rasterizer.backward(d_color, d_depth, d_alpha, pose=True, fisher=True)
         by_pose = rasterizer.backward(d_color, d_depth, d_alpha, pose=True, parameters=False)
         rasterizer.fisher(of_color, of_depth, sums, residual=of_depth)
@@ -38,10 +38,10 @@ def digest(rasterizer: Rasterizer) -> str:
         arrays += [rasterizer.full_fisher(of_color, of_depth), *rasterizer.contributions()]
         arrays += [rasterizer.layer_depth()]
         loss, gradients = rasterizer.view_gradients(
-            *view, color, depth_m, LOSS, exposure=(0.1, -0.05), mask=mask, depth=depth, pose=True
+            *view, color, depth_m, LOSS, exposure=(0.1, -0.05), mask=mask, depth_kind=depth, pose=True
         )
         _, of_surface = rasterizer.view_gradients(
-            *view, color, depth_m, SURFACE, mask=mask, depth=depth, depth_certainty=color[..., 0].copy()
+            *view, color, depth_m, SURFACE, mask=mask, depth_kind=depth, depth_certainty=color[..., 0].copy()
         )
         arrays += [a for a in vars(of_surface).values() if a is not None]
         statistics = rasterizer.statistics()

@@ -12,9 +12,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.kernels import DepthKind, Rasterizer, available_isas
-from duagc.pipeline.kernels.types import DEPTH_KINDS
+from duagc.pipeline.kernels import Rasterizer, available_isas
+from duagc.pipeline.splat.gaussians import DEPTH_KINDS
 from tests.kernels.agreement import compare, outputs
 from tests.kernels.drawn_scenes import (
     OPACITIES,
@@ -37,7 +38,9 @@ def examples(count: int) -> settings:
 
 def assert_agreement(scene: Scene, depth: DepthKind = "blended") -> None:
     failed = [
-        f"{error.name}: {error.relative:.1e}" for error in compare(scene, depth=depth) if not error.passes
+        f"{error.name}: {error.relative:.1e}"
+        for error in compare(scene, depth_kind=depth)
+        if not error.passes
     ]
     assert not failed, failed
 

@@ -16,7 +16,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.consensus.evidence import pack_symmetric, unpack_symmetric
+from duagc.pipeline.splat.information import (
+    COLOR,
+    COLOR_INFORMATION,
+    LOG_COVARIANCE,
+    LOG_COVARIANCE_INFORMATION,
+    MEAN,
+    MEAN_INFORMATION,
+    OPACITY,
+    OPACITY_INFORMATION,
+    log_covariance_block,
+    mean_block,
+    pack_symmetric,
+)
 
 Array = NDArray[np.float64]
 COMPACT = np.dtype(
@@ -57,14 +69,14 @@ def encode(records: NDArray[Any]) -> NDArray[Any]:
     out = np.zeros(len(records), COMPACT)
     theta = records["theta"].astype(np.float64)
     information = records["information"].astype(np.float64)
-    out["id"], out["anchor"], out["mean"] = records["id"], records["anchor"], records["theta"][:, :3]
-    out["shape"] = _steps(theta[:, 3:9], SHAPE_STEP)
-    out["color"] = _steps(theta[:, 9:12], COLOR_STEP)
-    out["opacity"] = _steps(theta[:, 12], OPACITY_STEP)
-    out["position_factor"] = _half(_lower(_factor(unpack_symmetric(information[:, :6], 3))) / POSITION_UNIT)
-    out["shape_factor"] = _half(_lower(_factor(unpack_symmetric(information[:, 6:27], 6))))
-    out["color_root"] = _half(np.sqrt(np.maximum(information[:, 27:30], 0.0)))
-    out["opacity_root"] = _half(np.sqrt(np.maximum(information[:, 30], 0.0)))
+    out["id"], out["anchor"], out["mean"] = records["id"], records["anchor"], records["theta"][:, MEAN]
+    out["shape"] = _steps(theta[:, LOG_COVARIANCE], SHAPE_STEP)
+    out["color"] = _steps(theta[:, COLOR], COLOR_STEP)
+    out["opacity"] = _steps(theta[:, OPACITY], OPACITY_STEP)
+    out["position_factor"] = _half(_lower(_factor(mean_block(information))) / POSITION_UNIT)
+    out["shape_factor"] = _half(_lower(_factor(log_covariance_block(information))))
+    out["color_root"] = _half(np.sqrt(np.maximum(information[:, COLOR_INFORMATION], 0.0)))
+    out["opacity_root"] = _half(np.sqrt(np.maximum(information[:, OPACITY_INFORMATION], 0.0)))
     return out
 
 
@@ -72,15 +84,17 @@ def decode(compact: NDArray[Any], record: np.dtype[Any]) -> NDArray[Any]:
     """Records of dtype `record` (`evidence_wire.RECORD`) from compact ones."""
     out = np.zeros(len(compact), record)
     out["id"], out["anchor"] = compact["id"], compact["anchor"]
-    out["theta"][:, :3] = compact["mean"]
-    out["theta"][:, 3:9] = compact["shape"] * SHAPE_STEP
-    out["theta"][:, 9:12] = compact["color"] * COLOR_STEP
-    out["theta"][:, 12] = compact["opacity"] * OPACITY_STEP
+    out["theta"][:, MEAN] = compact["mean"]
+    out["theta"][:, LOG_COVARIANCE] = compact["shape"] * SHAPE_STEP
+    out["theta"][:, COLOR] = compact["color"] * COLOR_STEP
+    out["theta"][:, OPACITY] = compact["opacity"] * OPACITY_STEP
     position = _product(compact["position_factor"].astype(np.float64) * POSITION_UNIT, 3)
-    out["information"][:, :6] = pack_symmetric(position)
-    out["information"][:, 6:27] = pack_symmetric(_product(compact["shape_factor"].astype(np.float64), 6))
-    out["information"][:, 27:30] = compact["color_root"].astype(np.float64) ** 2
-    out["information"][:, 30] = compact["opacity_root"].astype(np.float64) ** 2
+    out["information"][:, MEAN_INFORMATION] = pack_symmetric(position)
+    out["information"][:, LOG_COVARIANCE_INFORMATION] = pack_symmetric(
+        _product(compact["shape_factor"].astype(np.float64), 6)
+    )
+    out["information"][:, COLOR_INFORMATION] = compact["color_root"].astype(np.float64) ** 2
+    out["information"][:, OPACITY_INFORMATION] = compact["opacity_root"].astype(np.float64) ** 2
     return out
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.training import DepthKind
-from duagc.pipeline.consensus.evidence import unpack_symmetric
 from duagc.pipeline.exchange.wire.compact_wire import COMPACT, decode, encode
 from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, Reader
 from duagc.pipeline.network.packets import (
@@ -24,6 +23,14 @@ from duagc.pipeline.network.packets import (
     records_per_chunk,
 )
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS
+from duagc.pipeline.splat.information import (
+    COLOR_INFORMATION,
+    INFORMATION_SIZE,
+    LOG_COVARIANCE,
+    THETA_SIZE,
+    log_covariance_block,
+    mean_block,
+)
 
 Array = NDArray[np.float64]
 
@@ -31,8 +38,12 @@ MAX_INFORMATION = 1e15  # of a coordinate, 1/m^2: 30 nm
 INDEFINITE_TOLERANCE = 1e-4  # of the largest eigenvalue: rounding of float32
 MAX_LOG_COVARIANCE = 60.0  # beyond it exponentials overflow in float32
 
-RECORD = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f4", 13), ("information", "<f4", 31)])
-RECORD_DOUBLE = np.dtype([("id", "<i8"), ("anchor", "<i4"), ("theta", "<f8", 13), ("information", "<f8", 31)])
+RECORD = np.dtype(
+    [("id", "<i8"), ("anchor", "<i4"), ("theta", "<f4", THETA_SIZE), ("information", "<f4", INFORMATION_SIZE)]
+)
+RECORD_DOUBLE = np.dtype(
+    [("id", "<i8"), ("anchor", "<i4"), ("theta", "<f8", THETA_SIZE), ("information", "<f8", INFORMATION_SIZE)]
+)
 # owner, 1 + index of the depth its map was made with, records of the whole message
 _EVIDENCE = struct.Struct("<HHI")
 assert RECORD.itemsize == EVIDENCE_EXACT_BYTES
@@ -114,7 +125,7 @@ def check_evidence(records: NDArray[Any]) -> None:
     """Refuse records with impossible numbers. Raises MalformedError."""
     theta = records["theta"]
     if len(records) and (
-        np.abs(theta).max() > MAX_COORDINATE or np.abs(theta[:, 3:9]).max() > MAX_LOG_COVARIANCE
+        np.abs(theta).max() > MAX_COORDINATE or np.abs(theta[:, LOG_COVARIANCE]).max() > MAX_LOG_COVARIANCE
     ):
         raise MalformedError("evidence: a Gaussian of impossible place or size")
     if len(records) and records["anchor"].min() < 0:
@@ -131,9 +142,9 @@ def check_information(information: Array) -> None:
     """
     if np.abs(information).max(initial=0.0) > MAX_INFORMATION:
         raise MalformedError(f"evidence: information beyond {MAX_INFORMATION:g}")
-    if information[:, 27:].min(initial=0.0) < 0:
+    if information[:, COLOR_INFORMATION.start :].min(initial=0.0) < 0:
         raise MalformedError("evidence: negative information")
-    for part, size in ((slice(0, 6), 3), (slice(6, 27), 6)):
-        values = np.linalg.eigvalsh(unpack_symmetric(information[:, part], size))
+    for block in (mean_block(information), log_covariance_block(information)):
+        values = np.linalg.eigvalsh(block)
         if (values[:, 0] < -INDEFINITE_TOLERANCE * np.maximum(values[:, -1], 1e-6)).any():
             raise MalformedError("evidence: indefinite information")
