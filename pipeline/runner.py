@@ -105,9 +105,9 @@ def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, thread
             log,
             folder / "frontend.mcap",
             folder / "information.mcap",
-            config.information,
-            config.frontend.moving,
-            threads,
+            config=config.information,
+            moving=config.frontend.moving,
+            threads=threads,
         )
     return timing.stages
 

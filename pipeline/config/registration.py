@@ -26,7 +26,7 @@ class RegistrationConfig(Config):
     depth_sigma_base_m: float = 0.0012
     """Depth noise sigma(z) = base + slope * (z - 0.4)^2, where the log does not tell it pixel by pixel; only its shape
     counts, its scale is estimated."""
-    depth_sigma_slope_per_m: float = 0.0019
+    depth_sigma_quadratic_per_m: float = 0.0019
     """See depth_sigma_base_m (Nguyen, Izadi and Lovell 2012)."""
     depth_sigma_floor: float = 0.05
     """Smallest estimated scale of the depth noise at the finest level, as a multiple of sigma(z). Four times more at

@@ -205,7 +205,7 @@ def depth_noise(config: RegistrationConfig) -> DepthNoise:
     Args:
         config: of the registration.
     """
-    return DepthNoise(config.depth_sigma_base_m, config.depth_sigma_slope_per_m)
+    return DepthNoise(config.depth_sigma_base_m, config.depth_sigma_quadratic_per_m)
 
 
 def _depth_residuals(

@@ -14,24 +14,22 @@ from duagc.pipeline.config.mapping import THICKNESS_FLOOR_M
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.geometry import se3, so3, spd
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.information.stage import (
-    Noise,
-    View,
-    estimate_noise,
-    run_information,
-    sum_information,
-    surface_deviation,
-    with_correlation,
-    without_moving,
-    without_thickness,
-)
+from duagc.pipeline.geometry.depth_noise import DepthNoise
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
+from duagc.pipeline.information.deviation import surface_deviation
+from duagc.pipeline.information.noise import ImageNoise, estimate_noise, with_correlation
+from duagc.pipeline.information.stage import run_information
+from duagc.pipeline.information.sums import sum_information, without_thickness
+from duagc.pipeline.information.views import MapViews, without_moving
 from duagc.pipeline.kernels import FisherSums, Rasterizer
 from duagc.pipeline.recording import LogWriter, read_log
 from duagc.pipeline.splat.gaussians import Gaussians
+from duagc.pipeline.splat.information import pack_geometry, unpack_geometry
 from duagc.schemas import topics
 
 CAMERA = PinholeCamera(48, 36, 40.0, 40.0, 23.5, 17.5)
-NOISE = Noise(0.02, 1.0, 0.0012, 0.0019)
+SENSOR = DepthNoise(0.0012, 0.0019)
+NOISE = ImageNoise(0.02, SENSOR)
 FRAME_NS = 33_333_333
 POSES = [se3.exp(np.array([0.05 * k, 0.0, 0.02 * k, 0.0, 0.02 * k, 0.0])) for k in range(4)]
 
@@ -54,7 +52,7 @@ def wall(n: int = 600, seed: int = 0) -> Gaussians:
     )
 
 
-def views_of(gaussians: Gaussians, color_noise: float = 0.0, depth_factor: float = 0.0) -> list[View]:
+def views_of(gaussians: Gaussians, color_noise: float = 0.0, depth_factor: float = 0.0) -> list[PosedRgbd]:
     """Renders of the Gaussians with noise added: what a perfect map's images would be."""
     r = np.random.default_rng(1)
     out = []
@@ -64,7 +62,7 @@ def views_of(gaussians: Gaussians, color_noise: float = 0.0, depth_factor: float
         z = render.depth / np.maximum(render.alpha, 1e-3)
         z = z + depth_factor * NOISE.depth_sigma_m(z) * r.normal(0, 1, z.shape)
         z = np.where(render.alpha > 0.9, z, 0)
-        out.append(View(np.rint(color * 255).astype(np.uint8), z.astype(np.float32), T))
+        out.append(PosedRgbd(np.rint(color * 255).astype(np.uint8), z.astype(np.float32), T))
     return out
 
 
@@ -76,8 +74,8 @@ def test_noise_that_the_log_tells_takes_the_place_of_the_model() -> None:
         [replace(v, depth_sigma_m=np.full(v.depth_m.shape, sigma, np.float32)) for v in plain]
         for sigma in (0.01, 0.02)
     )
-    told = Noise(1e6, 1.0, 0.0012, 0.0019, from_log=True)  # color says nothing
-    sums = [sum_information(gaussians, CAMERA, views, told, config) for views in (tight, loose)]
+    told = ImageNoise(1e6, SENSOR, from_log=True)  # color says nothing
+    sums = [sum_information(MapViews(gaussians, CAMERA, views), told, config) for views in (tight, loose)]
     assert sums[0].geometry.any()
     np.testing.assert_allclose(sums[0].geometry, 4 * sums[1].geometry, rtol=1e-4, atol=1e-3)
     r = np.random.default_rng(2)
@@ -87,39 +85,39 @@ def test_noise_that_the_log_tells_takes_the_place_of_the_model() -> None:
         )
         for v in tight
     ]
-    found = estimate_noise(gaussians, CAMERA, noisy, config, every=1)
-    assert found.depth_factor == pytest.approx(3.0, rel=0.05)
-    assert found.depth_formula() == f"{found.depth_factor:.6g} * sigma of the log"
+    found = estimate_noise(MapViews(gaussians, CAMERA, noisy), config, every=1)
+    assert found.depth.factor == pytest.approx(3.0, rel=0.05)
+    assert found.depth_formula() == f"{found.depth.factor:.6g} * sigma of the log"
 
 
 def test_noise_is_found_in_the_residuals() -> None:
     gaussians = wall()
     views = views_of(gaussians, 0.05, 2.0)
-    noisy = estimate_noise(gaussians, CAMERA, views, InformationConfig(), every=1)
+    noisy = estimate_noise(MapViews(gaussians, CAMERA, views), InformationConfig(), every=1)
     assert noisy.color_sigma == pytest.approx(0.05, rel=0.05)
-    assert noisy.depth_factor == pytest.approx(2.0, rel=0.05)
-    assert noisy.depth_formula() == f"{noisy.depth_factor:.6g} * (0.0012 + 0.0019 * (z - 0.4)^2)"
-    sampled = estimate_noise(gaussians, CAMERA, views, InformationConfig())
+    assert noisy.depth.factor == pytest.approx(2.0, rel=0.05)
+    assert noisy.depth_formula() == f"{noisy.depth.factor:.6g} * (0.0012 + 0.0019 * (z - 0.4)^2)"
+    sampled = estimate_noise(MapViews(gaussians, CAMERA, views), InformationConfig())
     assert sampled.color_sigma == pytest.approx(noisy.color_sigma, rel=0.15)  # 384 pixels
-    assert sampled.depth_factor == pytest.approx(noisy.depth_factor, rel=0.15)
-    clean = estimate_noise(gaussians, CAMERA, views_of(gaussians), InformationConfig())
+    assert sampled.depth.factor == pytest.approx(noisy.depth.factor, rel=0.15)
+    clean = estimate_noise(MapViews(gaussians, CAMERA, views_of(gaussians)), InformationConfig())
     assert clean.color_sigma == InformationConfig().color_sigma_floor
-    assert clean.depth_factor == InformationConfig().depth_factor_min
+    assert clean.depth.factor == InformationConfig().depth.factor_min
     fixed = InformationConfig(depth_factor_from_residuals=False)
-    assert estimate_noise(gaussians, CAMERA, views_of(gaussians, 0, 2.0), fixed).depth_factor == 1.0
+    assert estimate_noise(MapViews(gaussians, CAMERA, views_of(gaussians, 0, 2.0)), fixed).depth.factor == 1.0
 
 
 def test_a_few_wrong_pixels_do_not_change_the_noise() -> None:
     gaussians = wall()
     views = views_of(gaussians, 0.05, 1.0)
-    spoiled = [View(v.color.copy(), v.depth_m.copy(), v.T_map_camera) for v in views]
+    spoiled = [PosedRgbd(v.color.copy(), v.depth_m.copy(), v.T_world_camera) for v in views]
     for view in spoiled:
         view.color[:6] = 255
         view.depth_m[:6] = 9.0
     config = InformationConfig()
-    a, b = (estimate_noise(gaussians, CAMERA, v, config, every=1) for v in (views, spoiled))
+    a, b = (estimate_noise(MapViews(gaussians, CAMERA, v), config, every=1) for v in (views, spoiled))
     assert b.color_sigma == pytest.approx(a.color_sigma, rel=0.35)
-    assert b.depth_factor == pytest.approx(a.depth_factor, rel=0.35)
+    assert b.depth.factor == pytest.approx(a.depth.factor, rel=0.35)
 
 
 @pytest.mark.parametrize(("width", "pixels"), [(1, 1.0), (3, 9.0), (5, 25.0)])
@@ -136,18 +134,18 @@ def test_residuals_that_are_alike_count_once(width: int, pixels: float) -> None:
             np.uint8
         )
         depth = np.where(view.depth_m > 0, view.depth_m + 0.01 * noise[..., 1], 0).astype(np.float32)
-        views.append(View(color, depth, view.T_map_camera))
-    noise, overlap = with_correlation(NOISE, gaussians, CAMERA, views, InformationConfig())
+        views.append(PosedRgbd(color, depth, view.T_world_camera))
+    noise, overlap = with_correlation(NOISE, MapViews(gaussians, CAMERA, views), InformationConfig())
     assert noise.color_pixels == pytest.approx(pixels, rel=0.35, abs=0.5)  # 4 images of 48 x 36 px
     assert noise.depth_pixels == pytest.approx(pixels, rel=0.35, abs=0.5)
     assert 2 < overlap < 100
     once, shared = (
-        sum_information(gaussians, CAMERA, views, n, InformationConfig())
+        sum_information(MapViews(gaussians, CAMERA, views), n, InformationConfig())
         for n in (NOISE, replace(NOISE, color_pixels=pixels, depth_pixels=pixels))
     )
     np.testing.assert_allclose(pixels * shared.geometry, once.geometry, rtol=1e-4, atol=1e-3)
     independent = InformationConfig(correlation_px=0)
-    assert with_correlation(NOISE, gaussians, CAMERA, views, independent)[0].depth_pixels == 1.0
+    assert with_correlation(NOISE, MapViews(gaussians, CAMERA, views), independent)[0].depth_pixels == 1.0
 
 
 def test_the_deviation_is_the_distance_from_the_measured_surface() -> None:
@@ -164,17 +162,17 @@ def test_the_deviation_is_the_distance_from_the_measured_surface() -> None:
         np.arange(n), np.zeros(n), means, np.tile([1.0, 0, 0, 0], (n, 1)), np.full((n, 3), -4.0), np.zeros((n, 3)),
         np.zeros(n),
     )  # fmt: skip
-    view = View(np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8), depth, np.eye(4))
-    found = surface_deviation(gaussians, CAMERA, [view] * 1000, 0.1)
+    view = PosedRgbd(np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8), depth, np.eye(4))
+    found = surface_deviation(MapViews(gaussians, CAMERA, [view] * 1000), 0.1)
     np.testing.assert_allclose(found[:3], np.abs(off_m[:3]), atol=1e-3)
     np.testing.assert_array_equal(found[3:], 0.1)  # not measured within the gate
-    half = surface_deviation(gaussians, CAMERA, [view], 0.1)  # and it counts as half a view
+    half = surface_deviation(MapViews(gaussians, CAMERA, [view]), 0.1)  # and it counts as half a view
     np.testing.assert_allclose(half[1:3] ** 2, (off_m[1:3] ** 2 + 0.5 * 0.02**2) / 1.5, rtol=0.05)
-    other = View(view.color, (depth + 0.04).astype(np.float32), np.eye(4))  # two of five look past it
-    past = surface_deviation(gaussians, CAMERA, [*[view] * 300, *[other] * 200], 0.1)
+    other = PosedRgbd(view.color, (depth + 0.04).astype(np.float32), np.eye(4))  # two of five look past it
+    past = surface_deviation(MapViews(gaussians, CAMERA, [*[view] * 300, *[other] * 200]), 0.1)
     np.testing.assert_allclose(past[:3], np.abs(off_m[:3]), atol=1e-3)
-    blind = View(view.color, view.depth_m, view.T_map_camera, np.zeros(depth.shape, bool))
-    np.testing.assert_array_equal(surface_deviation(gaussians, CAMERA, [blind], 0.1), 0.1)
+    blind = PosedRgbd(view.color, view.depth_m, view.T_world_camera, np.zeros(depth.shape, bool))
+    np.testing.assert_array_equal(surface_deviation(MapViews(gaussians, CAMERA, [blind]), 0.1), 0.1)
 
 
 def test_windows() -> None:
@@ -183,7 +181,7 @@ def test_windows() -> None:
 
     def total(window: str, length: int) -> FisherSums:
         config = InformationConfig.model_validate({"window": window, "window_length": length})
-        return sum_information(gaussians, CAMERA, views, NOISE, config)
+        return sum_information(MapViews(gaussians, CAMERA, views), NOISE, config)
 
     everything, rolling, latest = total("all", 2), total("rolling", 2), total("per_gaussian", 2)
     assert everything.observations.max() == 4
@@ -204,12 +202,14 @@ def test_windows() -> None:
 def test_never_seen_is_zero_and_noise_scales() -> None:
     gaussians = wall()
     views = views_of(gaussians)
-    once = sum_information(gaussians, CAMERA, views, NOISE, InformationConfig())
+    once = sum_information(MapViews(gaussians, CAMERA, views), NOISE, InformationConfig())
     assert once.observations[-1] == 0
     assert not once.geometry[-1].any()
     assert not once.color[-1].any()
     assert once.opacity[-1] == 0
-    twice = sum_information(gaussians, CAMERA, views, Noise(0.04, 2.0, 0.0012, 0.0019), InformationConfig())
+    twice = sum_information(
+        MapViews(gaussians, CAMERA, views), ImageNoise(0.04, replace(SENSOR, factor=2.0)), InformationConfig()
+    )
     np.testing.assert_allclose(twice.geometry, once.geometry / 4, rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(twice.color, once.color / 4, rtol=1e-5)
 
@@ -217,13 +217,13 @@ def test_never_seen_is_zero_and_noise_scales() -> None:
 def test_holes_in_the_depth_bring_no_depth_information() -> None:
     gaussians = wall()
     views = views_of(gaussians)
-    blind = [View(v.color, np.zeros_like(v.depth_m), v.T_map_camera) for v in views]
-    with_depth = sum_information(gaussians, CAMERA, views, NOISE, InformationConfig())
-    without = sum_information(gaussians, CAMERA, blind, NOISE, InformationConfig())
+    blind = [PosedRgbd(v.color, np.zeros_like(v.depth_m), v.T_world_camera) for v in views]
+    with_depth = sum_information(MapViews(gaussians, CAMERA, views), NOISE, InformationConfig())
+    without = sum_information(MapViews(gaussians, CAMERA, blind), NOISE, InformationConfig())
     np.testing.assert_array_equal(with_depth.color, without.color)
-    along_z = FisherSums(len(gaussians)).geometry_matrices()[:, 0, 0] * 0  # shape [n]
+    along_z = np.zeros(len(gaussians))
     for sums, sign in ((with_depth, 1.0), (without, -1.0)):
-        along_z += sign * sums.geometry_matrices()[:, 2, 2]
+        along_z += sign * unpack_geometry(sums.geometry)[:, 2, 2]
     assert (along_z >= 0).all()
     assert np.median(along_z[with_depth.observations > 0]) > 100.0
 
@@ -237,12 +237,15 @@ def test_masked_pixels_bring_nothing() -> None:
     for view in whole:
         color, depth = view.color.copy(), view.depth_m.copy()
         color[~mask], depth[~mask] = 255, 9.0
-        masked.append(View(view.color, view.depth_m, view.T_map_camera, mask))
-        spoiled.append(View(color, depth, view.T_map_camera, mask))
+        masked.append(PosedRgbd(view.color, view.depth_m, view.T_world_camera, mask))
+        spoiled.append(PosedRgbd(color, depth, view.T_world_camera, mask))
     config = InformationConfig()
-    noise = estimate_noise(gaussians, CAMERA, masked, config)
-    assert noise == estimate_noise(gaussians, CAMERA, spoiled, config)
-    sums = [sum_information(gaussians, CAMERA, views, noise, config) for views in (masked, spoiled, whole)]
+    noise = estimate_noise(MapViews(gaussians, CAMERA, masked), config)
+    assert noise == estimate_noise(MapViews(gaussians, CAMERA, spoiled), config)
+    sums = [
+        sum_information(MapViews(gaussians, CAMERA, views), noise, config)
+        for views in (masked, spoiled, whole)
+    ]
     for name, array in sums[0].arrays().items():
         np.testing.assert_array_equal(array, sums[1].arrays()[name])
     assert np.all(sums[0].color <= sums[2].color * (1 + 1e-6))
@@ -261,10 +264,7 @@ def test_thickness_at_the_floor_has_no_information_and_the_rest_is_untouched() -
     gaussians = Gaussians(np.arange(n), np.zeros(n), zero, quats, np.log(scales), zero, np.zeros(n))
     root = r.normal(size=(n, 9, 9))
     full = root @ root.swapaxes(1, 2)
-    upper = np.triu_indices(9)
-    result = FisherSums(n)
-    result.geometry[:] = without_thickness(full[:, upper[0], upper[1]], gaussians, THICKNESS_FLOOR_M)
-    after = result.geometry_matrices()
+    after = unpack_geometry(without_thickness(pack_geometry(full), gaussians, THICKNESS_FLOOR_M))
     np.testing.assert_array_equal(after[~floored], full[~floored])
     axes = so3.from_quat_wxyz(gaussians.quats_wxyz)
     for k in np.flatnonzero(floored):
@@ -326,7 +326,7 @@ def write_logs(
 def test_the_stage_writes_what_it_returns_and_the_threads_do_not_show(tmp_path: Path) -> None:
     gaussians = write_logs(tmp_path)
     paths = [tmp_path / name for name in ("alpha.mcap", "frontend.mcap", "information.mcap")]
-    result = run_information(*paths, InformationConfig(), MovingConfig())
+    result = run_information(*paths, config=InformationConfig(), moving=MovingConfig())
     (record,) = read_log(paths[2])
     assert record.topic == "/alpha/information"
     back = record.message()
@@ -336,7 +336,8 @@ def test_the_stage_writes_what_it_returns_and_the_threads_do_not_show(tmp_path: 
     assert back.window == "all"
     assert back.observations.max() == 3
     assert back.color_sigma == pytest.approx(0.05, rel=0.15)
-    run_information(*paths[:2], tmp_path / "again.mcap", InformationConfig(), MovingConfig(), threads=3)
+    settings = {"config": InformationConfig(), "moving": MovingConfig()}
+    run_information(*paths[:2], tmp_path / "again.mcap", **settings, threads=3)
     (again,) = read_log(tmp_path / "again.mcap")
     assert again.data == record.data
 
@@ -348,8 +349,8 @@ def test_held_out_frames_never_enter(tmp_path: Path) -> None:
             tmp_path / "alpha.mcap",
             tmp_path / "frontend.mcap",
             tmp_path / "out.mcap",
-            InformationConfig(),
-            MovingConfig(),
+            config=InformationConfig(),
+            moving=MovingConfig(),
         )
     assert not (tmp_path / "out.mcap").exists()
 
@@ -363,8 +364,8 @@ def test_a_front_end_without_a_map_is_one_line(tmp_path: Path) -> None:
             tmp_path / "alpha.mcap",
             tmp_path / "unfinished.mcap",
             tmp_path / "out.mcap",
-            InformationConfig(),
-            MovingConfig(),
+            config=InformationConfig(),
+            moving=MovingConfig(),
         )
 
 
@@ -377,10 +378,10 @@ def test_what_moved_is_in_no_sum() -> None:
         normal, offset = T[:3, :3].T @ np.array([0.0, 0.0, 1.0]), 2.0 - T[2, 3]
         depth = (offset / (CAMERA.rays() @ normal)).astype(np.float32)
         color = np.full((CAMERA.height, CAMERA.width, 3), 128, np.uint8)
-        plain.append(View(color, depth, T))
+        plain.append(PosedRgbd(color, depth, T))
         card = depth.copy()
         card[8:24, 2 + 11 * k : 12 + 11 * k] = 1.0
-        crossed.append(View(color, card, T))
+        crossed.append(PosedRgbd(color, card, T))
     config = MovingConfig(halvings=1, grow_px=4)
     assert all(view.mask is None for view in without_moving(plain, CAMERA, config))
     masked = without_moving(crossed, CAMERA, config)
@@ -389,6 +390,6 @@ def test_what_moved_is_in_no_sum() -> None:
         assert view.mask[view.depth_m < 1.5].mean() < 0.05
         assert view.mask.mean() > 0.7
     assert without_moving(crossed, CAMERA, MovingConfig(enabled=False)) == crossed
-    less = sum_information(gaussians, CAMERA, masked, NOISE, InformationConfig())
-    more = sum_information(gaussians, CAMERA, crossed, NOISE, InformationConfig())
+    less = sum_information(MapViews(gaussians, CAMERA, masked), NOISE, InformationConfig())
+    more = sum_information(MapViews(gaussians, CAMERA, crossed), NOISE, InformationConfig())
     assert less.weight.sum() < 0.95 * more.weight.sum()
