@@ -268,18 +268,18 @@ def fuse_robot(robot: str, log: Path, folder: Path, result: AgentResult, config:
     """
     from duagc.pipeline.fusion.stage import run_fusion
 
-    reports = run_fusion(
+    checks = run_fusion(
         agent_input(robot, log, folder),
         result,
         folder,
-        config.fusion,
-        config.exchange.matching,
-        config.frontend.moving,
-        config.exchange.weights,
+        config=config.fusion,
+        matching=config.exchange.matching,
+        moving=config.frontend.moving,
+        weights=config.exchange.weights,
         seed=config.seed,
         threads=threads_per_worker(1),
     )
-    return {report.peer: report.reason for report in reports if not report.trusted}
+    return {check.peer: check.reason for check in checks if not check.trusted}
 
 
 def _evaluate(folder: Path, recording: Path, timing: Timing) -> None:

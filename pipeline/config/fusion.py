@@ -9,16 +9,16 @@ from duagc.pipeline.config.training import LearningRates, MapLossConfig
 
 
 class RefineConfig(Config):
-    """Training of the fused map on the robot's own images and on what its neighbors' maps show."""
+    """Finetuning of the fused map on the robot's own images and on renders of its peers' maps."""
 
     steps_per_view: int = Field(default=9, ge=0)
     """Steps for each own view; 0: the fused map stays as fusion left it."""
     steps_max: int = Field(default=600, ge=0)
     """Most steps on own views."""
     peer_share: float = Field(default=0.25, ge=0.0, le=1.0)
-    """Steps on views of neighbors' maps for every step on an own view; 0: none, and only own Gaussians are trained."""
+    """Steps on views of peers' maps for every step on an own view; 0: none, and only own Gaussians are trained."""
     peer_views: int = Field(default=40, ge=1)
-    """Most views of neighbors' maps."""
+    """Most views of peers' maps."""
     support_views: int = Field(default=40, ge=0)
     """Most tracked frames between keyframes that take part."""
     rate: float = Field(default=0.15, gt=0.0)
@@ -29,21 +29,46 @@ class RefineConfig(Config):
     loss: MapLossConfig = MapLossConfig()
 
 
+class PeerValidationConfig(Config):
+    """The check of peers' maps against the robot's own images, before anything of them is used."""
+
+    min_opacity: float = Field(default=0.5, gt=0.0, le=1.0)
+    """Opacity from which on a pixel shows a peer's surface."""
+    min_explained_variance: float = Field(default=0.3, ge=0.0, le=1.0)
+    """Share of the variance of own pixels that a peer's map must explain to be used at all; honest maps explain two
+    thirds and more, one constant color explains nothing."""
+    min_color_variance: float = Field(default=0.01, gt=0.0)
+    """Least variance of own colors (0..1) that is assumed: where images show one color, errors of maps and
+    poses dominate."""
+    min_gaussian_px: float = Field(default=4.0, gt=0.0)
+    """Blending weight, in pixels, from which on a single Gaussian is judged."""
+    min_overlap: float = Field(default=0.01, ge=0.0, le=1.0)
+    """Share of the own pixels from which on a peer's map is judged as a whole."""
+    passes: int = Field(default=2, ge=1)
+    """Times that the map is rendered; Gaussians behind a contradicted one are judged in the next pass."""
+    max_size_ratio: float = Field(default=2.0, gt=0.0)
+    """Largest Gaussian of a peer, in units of the largest of the own map: no mapper makes a larger one."""
+    match_radius_factor: float = Field(default=2.0, gt=0.0)
+    """Matched Gaussians may be this many matching radii apart, so that rounding rejects no match of an honest robot."""
+    match_distance_factor: float = Field(default=1.5, gt=0.0)
+    """Matched Gaussians may differ by this many times tau_G of the own map."""
+
+
 class FusionConfig(Config):
     """From evidence to a robot's fused map."""
 
     coverage: Literal["all", "overlap"] = "all"
-    """Take over what only neighbors saw (all), or only fuse what is matched (overlap)."""
+    """Import what only peers saw (all), or only fuse what is matched (overlap)."""
     association: Literal["neighbors", "members"] = "neighbors"
-    """Whose values carry the variance of where a robot happened to put its splats: only the neighbors', so that a
-    robot estimates its own splat at its own place, or every member's alike, so that all robots end with one and the
-    same Gaussian, as method and paper have it (see `docs/explanation/fusion.md`)."""
+    """Whose values carry the association variance (where on the surface a robot happened to put its splats): only the
+    peers', so that a robot estimates its own splat at its own place, or every member's alike, so that all robots end
+    with one and the same Gaussian, as method and paper have it (see `docs/explanation/fusion.md`)."""
     spacing_per_sigma: float = Field(default=1.8, ge=0.0)
     """Local spacing of splats, in units of their standard deviation along the surface: the mapper seeds discs with a
     standard deviation of 0.55 cells."""
     scatter_position_m: float = Field(default=0.01, gt=0.0)
-    """Standard deviation by which two robots' splats of one place are expected to differ across the surface. What is
-    expected counts as much as `scatter_support` matched Gaussians, the rest is measured (association = neighbors)."""
+    """Standard deviation by which two robots' splats of one place are expected to differ across the surface. It counts
+    as much as `scatter_support` matched Gaussians, the rest is measured (association = neighbors)."""
     scatter_log_covariance: float = Field(default=1.0, gt=0.0)
     """The same for a coordinate of vec log Sigma."""
     scatter_color: float = Field(default=0.07, gt=0.0)
@@ -53,17 +78,19 @@ class FusionConfig(Config):
     scatter_support: int = Field(default=50, ge=1)
     """Matched Gaussians that the expectation is worth."""
     explained_m: float = Field(default=0.10, ge=0.0)
-    """A neighbor's Gaussian this far behind a surface that an own keyframe measured still counts as explained..."""
+    """A peer's Gaussian this far behind a surface that an own keyframe measured still counts as explained..."""
     explained_relative: float = Field(default=0.03, ge=0.0)
     """... plus this share of its depth."""
     explained_px: int = Field(default=4, ge=0)
-    """The farthest surface within so many pixels decides: at outlines the two robots' poses and depths never agree."""
+    """The farthest surface within so many pixels counts: at outlines the two robots' poses and depths never agree."""
     explained_opacity: float = Field(default=0.9, ge=0.0, le=1.0)
-    """A keyframe explains only where the own map draws at least this opaque; without depth, the drawn one stands in."""
+    """A keyframe explains only where the own map is at least this opaque; where depth is missing, the rendered one is
+    used."""
     own_pixel_steps: int = Field(default=3, ge=0)
-    """Gauss-Newton steps on the opacities of what was taken over, by the robot's own images; 0: as their owners say."""
+    """Gauss-Newton steps on the opacities of imported Gaussians, by the robot's own images; 0: their owners' values."""
     added_need_information: bool = True
-    """Take over only Gaussians on whose position their owner's pixels said something."""
+    """Import only Gaussians with information on their position."""
+    peer_validation: PeerValidationConfig = PeerValidationConfig()
     refine: RefineConfig = RefineConfig()
     max_added: int | None = Field(default=None, ge=0)
-    """At most so many Gaussians of neighbors are taken over, those of most position information first."""
+    """Most Gaussians of peers that are imported, those of most position information first."""

@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 SHAPE_FLOOR = 0.1
 """Least standard deviation of a coordinate of vec log Sigma: 5 % of a scale."""
 LEAST_DEVIATION_M = 1e-4
-"""Deviation of a mean from the measured surface below which nobody claims to know that surface."""
+"""Least deviation of a mean from the measured surface that is assumed."""
 
 
 class MapInformation(Protocol):
@@ -71,10 +71,14 @@ class MapInformation(Protocol):
 
 @dataclass(frozen=True)
 class Evidence:
-    """A robot's own evidence on n of its Gaussians. It never contains what came from a neighbor.
+    """A robot's own evidence on n of its Gaussians. It never contains what came from a peer.
 
-    owner: the robot. ids: int64 [n]. anchors: int32 [n], index of the owner's keyframe. theta: float64 [n, 13], in
-    the frame of the anchor (or of the world, after `in_world`). information: float64 [n, 31], likewise.
+    Attributes:
+        owner: the robot.
+        ids: int64 [n].
+        anchors: int32 [n], index of the owner's keyframe that each is anchored to.
+        theta: float64 [n, 13], in the frame of the anchor (or of the world, after `in_world`).
+        information: float64 [n, 31], likewise.
     """
 
     owner: str
@@ -101,12 +105,12 @@ class Evidence:
     def from_map(
         owner: str, gaussians: Gaussians, information: MapInformation | None, T_map_keyframe: ArrayLike
     ) -> Evidence:
-        """What a robot can tell others of its own map, each Gaussian in the frame of its anchor.
+        """Evidence on a robot's own map for its peers, each Gaussian in the frame of its anchor.
 
-        The sums of the images hold everything but one Gaussian fixed; what others want to know is where the surface is.
-        The depth images say that it lies within the measured deviation of the mean, across the disc, however little
-        the sums know of one splat among many; and nobody knows it better: the deviation's square is added to the
-        mean's covariance. Nobody knows a shape better than `SHAPE_FLOOR`. No information stays none.
+        The sums of the images hold everything but one Gaussian fixed; peers need the position of the surface. By the
+        depth images it lies within the measured deviation of the mean, across the disc, however little information the
+        sums have on one splat among many. That is also the limit: the square of the deviation is added to the mean's
+        covariance, and `SHAPE_FLOOR` squared to that of the shape. No information stays none.
 
         Args:
             owner: the robot.
@@ -129,23 +133,28 @@ class Evidence:
                 pack_symmetric(shape),
             )
         in_map = Evidence(owner, gaussians.ids, gaussians.anchors, theta_of(gaussians), packed)
-        return in_map._turned(se3.inverse(T_map_keyframe))
+        return in_map._moved(se3.inverse(T_map_keyframe))
 
     @staticmethod
-    def of_splats(
+    def from_rendering(
         owner: str, gaussians: Gaussians, information: MapInformation | None, T_map_keyframe: ArrayLike
     ) -> Evidence:
-        """How stiff a robot's own splats are among each other: what its own images lose if all of them move a little.
+        """Information of a robot's own splats as parts of one rendering: the loss of its images if all move a little.
 
-        Splats of a pixel make up for each other, so the loss is no sum over splats; `overlap` times the Fisher sums is
-        a sum over splats that is never less (|sum of n numbers|^2 <= n times the sum of their squares).
-        Arguments as of `from_map`.
+        Splats of a pixel compensate for each other, so the loss is no sum over splats; `overlap` times the Fisher sums
+        is a sum over splats that is never less (|sum of n numbers|^2 <= n times the sum of their squares).
+
+        Args:
+            owner: as of `from_map`.
+            gaussians: as of `from_map`.
+            information: as of `from_map`.
+            T_map_keyframe: as of `from_map`.
         """
         packed, _ = _sums_of(gaussians, information)
         if information is not None:
             packed *= information.overlap
         in_map = Evidence(owner, gaussians.ids, gaussians.anchors, theta_of(gaussians), packed)
-        return in_map._turned(se3.inverse(T_map_keyframe))
+        return in_map._moved(se3.inverse(T_map_keyframe))
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -158,9 +167,9 @@ class Evidence:
 
     def in_world(self, T_world_keyframe: ArrayLike) -> Evidence:
         """The same in the world frame, by the owner's keyframe poses [k, 4, 4] (by anchor)."""
-        return self._turned(np.asarray(T_world_keyframe, dtype=np.float64))
+        return self._moved(np.asarray(T_world_keyframe, dtype=np.float64))
 
-    def _turned(self, T_new_anchor: Array) -> Evidence:
+    def _moved(self, T_new_anchor: Array) -> Evidence:
         """theta and information with every anchor's frame moved by its T [k, 4, 4]."""
         if not len(self):
             return self

@@ -68,8 +68,9 @@ class _Chart:
         return _Chart(clamped, held_thickness(theta[:, LOG_COVARIANCE], config.thickness_floor_m))
 
 
-def _distances(a: _Chart, i: Index, b: _Chart, j: Index, config: MatchingConfig) -> Array:
-    """d_G [m] of Gaussians i of a and j of b."""
+def _distances(charts: tuple[_Chart, _Chart], i: Index, j: Index, config: MatchingConfig) -> Array:
+    """d_G [m] of Gaussians i of the first chart and j of the second."""
+    a, b = charts
     out = np.empty(len(i))
     thick_a, thick_b = (~np.any(x.held != 0, axis=(1, 2)) for x in (a, b))
     for start in range(0, len(i), _CHUNK):
@@ -86,11 +87,20 @@ def _distances(a: _Chart, i: Index, b: _Chart, j: Index, config: MatchingConfig)
     return out
 
 
-def gaussian_distance(a: Evidence, i: Index, b: Evidence, j: Index, config: MatchingConfig) -> Array:
-    """d_G [m] between rows i of a and rows j of b, both in the world frame."""
+def gaussian_distance(a: Evidence, i: Index, b: Evidence, j: Index, *, config: MatchingConfig) -> Array:
+    """d_G [m] of pairs of Gaussians.
+
+    Args:
+        a: of one robot, in the world frame.
+        i: [m], rows of `a`.
+        b: of the other robot, in the world frame, in the colors of the first.
+        j: [m], rows of `b`.
+        config: scales of the distance.
+    """
     used_a, i = np.unique(i, return_inverse=True)
     used_b, j = np.unique(j, return_inverse=True)
-    return _distances(_Chart.of(a.theta[used_a], config), i, _Chart.of(b.theta[used_b], config), j, config)
+    charts = _Chart.of(a.theta[used_a], config), _Chart.of(b.theta[used_b], config)
+    return _distances(charts, i, j, config)
 
 
 def threshold(own: Evidence, config: MatchingConfig) -> float:
@@ -105,7 +115,7 @@ def threshold(own: Evidence, config: MatchingConfig) -> float:
     # of coinciding Gaussians the query may name the Gaussian itself second
     other = np.where(neighbor[near, 1] == near, neighbor[near, 0], neighbor[near, 1])
     chart = _Chart.of(own.theta, config)
-    return float(np.percentile(_distances(chart, near, chart, other, config), config.percentile))
+    return float(np.percentile(_distances((chart, chart), near, other, config), config.percentile))
 
 
 def match(own: Evidence, peer: Evidence, config: MatchingConfig) -> Index:
@@ -129,7 +139,7 @@ def match(own: Evidence, peer: Evidence, config: MatchingConfig) -> Index:
 def _match(own: Evidence, peer: Evidence, config: MatchingConfig) -> Index:
     """`match` of evidence in the same colors, not empty."""
     i, j = _candidates(own.theta[:, MEAN], peer.theta[:, MEAN], config)
-    d = _distances(_Chart.of(own.theta, config), i, _Chart.of(peer.theta, config), j, config)
+    d = _distances((_Chart.of(own.theta, config), _Chart.of(peer.theta, config)), i, j, config)
     close = d < threshold(own, config)
     i, j, d = i[close], j[close], d[close]
     best_of_own = _first_of_each(i, d, peer.ids[j])
@@ -216,7 +226,7 @@ def tracks(evidence: Mapping[str, Evidence], pairs: Pairs, config: MatchingConfi
         if not len(broken):
             break
         if d is None:
-            d = np.concatenate([gaussian_distance(*pair, config) for pair in apart if len(pair[1])])
+            d = np.concatenate([gaussian_distance(*pair, config=config) for pair in apart if len(pair[1])])
         bad = np.flatnonzero(np.isin(component[i], broken))
         worst_first = bad[np.lexsort((j[bad], i[bad], -d[bad], component[i[bad]]))]
         leaders = np.ones(len(worst_first), dtype=bool)

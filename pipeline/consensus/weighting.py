@@ -1,4 +1,4 @@
-"""Kinds of weights: what a robot tells of how sure it is, in full, in part, or by a rule of thumb.
+"""Kinds of weights: the information that a robot shares, in full, in part, or replaced by a rule of thumb.
 
     block               the information itself: 3x3 of the mean, 6x6 of vec log Sigma, diagonals of color and opacity
     diagonal            its diagonal in the common frame: (12) of the paper
@@ -7,8 +7,8 @@
     residual_magnitude  over the square of its distance from the surface that the depth images show (Table 14)
     uniform             the same for all
 
-The last three ask no information; so that they can meet the variance of sampling and be sent as information, they are
-in units of what two robots' splats usually differ by.
+The last three use no information; so that they can be combined with the association variance and be sent as
+information, they are in units of what two robots' splats usually differ by.
 """
 
 from __future__ import annotations
@@ -26,12 +26,22 @@ UNIT_SIGMA_M, UNIT_SIGMA_SHAPE, UNIT_SIGMA_COLOR, UNIT_SIGMA_OPACITY = 0.01, 1.0
 """Standard deviations of a weight of one: mean, coordinates of vec log Sigma, colors, opacity logits."""
 
 
-def told(
-    owner: str, gaussians: Gaussians, information: MapInformation, T_map_keyframe: ArrayLike, kind: WeightKind
+def shared_evidence(
+    owner: str,
+    gaussians: Gaussians,
+    information: MapInformation,
+    T_map_keyframe: ArrayLike,
+    *,
+    kind: WeightKind,
 ) -> Evidence:
-    """Evidence of a robot's own map with weights of a kind, for others; arguments as of `Evidence.from_map`.
+    """Evidence of a robot's own map with weights of a kind, as it is shared with peers.
 
-    `diagonal` depends on the frame: see `in_world`.
+    Args:
+        owner: as of `Evidence.from_map`.
+        gaussians: as of `Evidence.from_map`.
+        information: as of `Evidence.from_map`.
+        T_map_keyframe: as of `Evidence.from_map`.
+        kind: of the weights; `diagonal` depends on the frame, see `in_world`.
     """
     full = Evidence.from_map(owner, gaussians, information, T_map_keyframe)
     if kind in ("block", "diagonal"):
@@ -61,17 +71,38 @@ def told(
     )
 
 
-def own_stiffness(
-    owner: str, gaussians: Gaussians, information: MapInformation, T_map_keyframe: ArrayLike, kind: WeightKind
+def self_information(
+    owner: str,
+    gaussians: Gaussians,
+    information: MapInformation,
+    T_map_keyframe: ArrayLike,
+    *,
+    kind: WeightKind,
 ) -> Evidence:
-    """How much a robot's own splats resist being moved: among each other with information, else as it tells others."""
+    """Evidence that a robot's own splats count with in its own map.
+
+    With `block`, the information of their common rendering (`Evidence.from_rendering`), else what is shared with peers.
+
+    Args:
+        owner: as of `Evidence.from_map`.
+        gaussians: as of `Evidence.from_map`.
+        information: as of `Evidence.from_map`.
+        T_map_keyframe: as of `Evidence.from_map`.
+        kind: of the weights.
+    """
     if kind == "block":
-        return Evidence.of_splats(owner, gaussians, information, T_map_keyframe)
-    return told(owner, gaussians, information, T_map_keyframe, kind)
+        return Evidence.from_rendering(owner, gaussians, information, T_map_keyframe)
+    return shared_evidence(owner, gaussians, information, T_map_keyframe, kind=kind)
 
 
 def in_world(evidence: Evidence, T_world_keyframe: ArrayLike, kind: WeightKind) -> Evidence:
-    """Evidence as `told`, in the world frame; of `diagonal`, the diagonal there."""
+    """`shared_evidence` or `self_information` in the world frame; of `diagonal`, the diagonal there.
+
+    Args:
+        evidence: in anchor frames.
+        T_world_keyframe: [k, 4, 4], the owner's keyframes, by anchor.
+        kind: of the weights.
+    """
     there = evidence.in_world(T_world_keyframe)
     if kind != "diagonal":
         return there

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from duagc.pipeline.evaluation.results import Absent
-from duagc.pipeline.fusion.stage import peer_colors
 from duagc.pipeline.runs.folder import RobotRun
+from duagc.pipeline.runs.peer_colors import read_peer_colors
 
 CHANNELS = ("red", "green", "blue")
 VALUES = ("gain", "offset", "sigma_gain", "sigma_offset")
@@ -16,7 +16,7 @@ def section(robot: RobotRun) -> dict[str, Any]:
     """What this robot's camera makes of a color c of the first robot of its component: gain * c + offset."""
     first = robot.component[0]
     names = [f"{value}_{channel}" for value in VALUES for channel in CHANNELS]
-    told = peer_colors(robot.folder / "fused.mcap", robot.robot).get(first)
+    told = read_peer_colors(robot.folder / "fused.mcap", robot.robot).get(first)
     if len(robot.component) < 2:
         reason = Absent("this robot met nobody")
     elif first == robot.robot:

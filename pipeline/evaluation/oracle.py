@@ -23,10 +23,11 @@ from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.pose_admm import with_floor
-from duagc.pipeline.consensus.weighting import own_stiffness, told
+from duagc.pipeline.consensus.weighting import in_world, self_information, shared_evidence
 from duagc.pipeline.consensus.weights import Weights
 from duagc.pipeline.evaluation.results import Absent
-from duagc.pipeline.fusion.fuse import fuse
+from duagc.pipeline.fusion.context import MapContext
+from duagc.pipeline.fusion.fuse import OwnMap, fuse
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.messages import GaussianInformation, unpack_pose
@@ -144,21 +145,23 @@ def _gaussian_gaps(
 ) -> Array:
     """Largest |x - x*| sqrt(diagonal of the information at x*) of each of a robot's matched Gaussians [m]."""
     weights = section_of(run, ExchangeConfig, "exchange").weights
-    evidence = {name: told(*_map_of(run.robots[name]), weights) for name in members}
+    evidence = {
+        name: in_world(shared_evidence(*_map_of(run.robots[name]), kind=weights), central[name], weights)
+        for name in members
+    }
     _, own, _, T_map_keyframe = mine = _map_of(run.robots[robot])
-    best = fuse(
-        robot,
-        own,
-        T_map_keyframe,
-        evidence,
-        own_stiffness(*mine, weights),
-        central,
-        pairs,
-        (),
-        PinholeCamera(2, 2, 1.0, 1.0, 0.5, 0.5),  # looks at nothing: what is taken over is not compared
+    context = MapContext(
+        PinholeCamera(2, 2, 1.0, 1.0, 0.5, 0.5),  # looks at nothing: what is imported is not compared
         section_of(run, FusionConfig, "fusion").model_copy(update={"coverage": "overlap"}),
         section_of(run, MatchingConfig, "exchange", "matching"),
         weights=weights,
+    )
+    best = fuse(
+        OwnMap(robot, own, T_map_keyframe, central[robot]),
+        evidence,
+        pairs,
+        context,
+        self_information=in_world(self_information(*mine, kind=weights), central[robot], weights),
     )
     matched = best.members[: len(own)] > 1
     theta = theta_of(run.robots[robot].fused_map.gaussians.select(slice(0, len(own))))

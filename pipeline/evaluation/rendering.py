@@ -16,18 +16,20 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.config.consensus import MatchingConfig
-from duagc.pipeline.config.fusion import RefineConfig
+from duagc.pipeline.config.fusion import FusionConfig, RefineConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.evaluation import groundtruth, views
 from duagc.pipeline.evaluation.oracle import section_of
 from duagc.pipeline.evaluation.results import Absent, Row
-from duagc.pipeline.fusion.finetune import refine, steps_of
-from duagc.pipeline.fusion.stage import peer_colors, training_views
+from duagc.pipeline.fusion.context import MapContext
+from duagc.pipeline.fusion.finetune import finetune_map, num_steps
+from duagc.pipeline.fusion.stage import training_views
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import Recording, RgbdLog, open_rgbd
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
+from duagc.pipeline.runs.peer_colors import read_peer_colors
 from duagc.pipeline.runs.robot_data import AgentInput
 from duagc.pipeline.splat.gaussians import Gaussians
 
@@ -106,7 +108,7 @@ def rendering_sections(
             for kind, score in scores.items():
                 found.add(name, kind, "training", index, score)
         world = {kind: in_world(robot, kind, g) for kind, g in maps.items() if kind in COMPARED}
-        colors = peer_colors(robot.folder / "fused.mcap", name)
+        colors = read_peer_colors(robot.folder / "fused.mcap", name)
         for peer in mates(run, robot):
             seen = {kind: in_colors_of(colors.get(peer.robot), g) for kind, g in world.items()}
             there = {kind: PosedMap(g, peer.trajectory) for kind, g in seen.items()}
@@ -155,19 +157,23 @@ def own_longer(run: RunFolder, robot: RobotRun, source: Recording, threads: int)
     own = robot.own_map
     with open_rgbd(log) as camera_log:
         camera = camera_log.camera
-    views = training_views(files, frames, poses, config, section_of(run, MovingConfig, "frontend", "moving"))
-    steps = sum(steps_of(config, len(views), 1))
-    return refine(
-        own.gaussians,
-        np.ones(len(own.gaussians), bool),
-        views,
-        camera,
-        config.model_copy(update={"steps_per_view": steps, "steps_max": steps}),
-        section_of(run, MatchingConfig, "exchange", "matching").thickness_floor_m,
-        own.depth,
-        run.config["seed"],
-        threads,
+    views = training_views(
+        files,
+        frames,
+        poses,
+        num_support=config.support_views,
+        moving=section_of(run, MovingConfig, "frontend", "moving"),
     )
+    steps = sum(num_steps(config, len(views), 1))
+    context = MapContext(
+        camera,
+        FusionConfig(refine=config.model_copy(update={"steps_per_view": steps, "steps_max": steps})),
+        section_of(run, MatchingConfig, "exchange", "matching"),
+        own.depth,
+        threads=threads,
+        seed=run.config["seed"],
+    )
+    return finetune_map(own.gaussians, views, context)
 
 
 def _own_trajectory(robot: RobotRun, kind: str) -> Trajectory:

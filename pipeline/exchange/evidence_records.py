@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.config.consensus import MatchingConfig, WeightKind
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import match
-from duagc.pipeline.consensus.weighting import told
+from duagc.pipeline.consensus.weighting import shared_evidence
 from duagc.pipeline.exchange.wire.evidence_wire import record_dtype
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.packets import Kind
@@ -28,7 +28,9 @@ VOXEL_BITS = 20  # per axis; voxels beyond +-2^19 share those at the border
 
 def own_records(data: RobotData, kind: Kind, weights: WeightKind) -> Records:
     """A robot's own evidence in the frames of its anchors, in the precision of this kind of evidence."""
-    evidence = told(data.robot, data.gaussians, data.information, data.T_map_keyframe, weights)
+    evidence = shared_evidence(
+        data.robot, data.gaussians, data.information, data.T_map_keyframe, kind=weights
+    )
     return to_records(evidence, kind)
 
 

@@ -10,13 +10,13 @@ from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.network import LinkConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import tracks
-from duagc.pipeline.consensus.weighting import told
+from duagc.pipeline.consensus.weighting import shared_evidence
 from duagc.pipeline.consensus.weights import Weights
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.oracle import section_of
 from duagc.pipeline.experiments.consensus_modes import Team
 from duagc.pipeline.experiments.gaussian_consensus import COORDINATES
-from duagc.pipeline.fusion.fuse import association_covariance
+from duagc.pipeline.fusion.association import association_covariance
 from duagc.pipeline.network.link_model import neighbors
 from duagc.pipeline.posegraph.factors import inflated
 from duagc.pipeline.runs.folder import RunFolder
@@ -37,7 +37,7 @@ def team_of_run(run: RunFolder, topology: str) -> Team:
         robot = run.robots[name]
         T_map = np.array([k.T_map_camera for k in robot.keyframes])
         T_world[name] = robot.corrected.T_world_keyframe
-        own = told(name, robot.own_map.gaussians, robot.information, T_map, "block")
+        own = shared_evidence(name, robot.own_map.gaussians, robot.information, T_map, kind="block")
         evidence[name] = _with_sampling(own.in_world(T_world[name]), section_of(run, FusionConfig, "fusion"))
     pairs = {key: ids for key, ids in Session(run).pairs.items() if key[0] in names and key[1] in names}
     found = tracks(evidence, pairs, section_of(run, MatchingConfig, "exchange", "matching"))

@@ -29,8 +29,9 @@ from duagc.pipeline.kernels import (
     Render,
     ViewLoss,
 )
+from duagc.pipeline.kernels.training import TrainingStep
 from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.optimizer import falling
+from duagc.pipeline.splat.optimizer import smoothstep_decay
 from duagc.pipeline.splat.seeding import seed_discs, unexplained, worst_drawn
 
 
@@ -66,6 +67,7 @@ class Mapper:
         self.rasterizer = Rasterizer(threads=threads)
         self.depth = config.depth_kind(depth_noise_m)
         self._loss_weights = LossWeights(**config.loss.of(self.depth).model_dump())
+        self._step = TrainingStep(self.rasterizer, self._loss_weights, self.depth)
         self._gaussians = Gaussians.empty()
         self._adam = CompiledAdam(threads=threads)
         self._views: list[View] = []
@@ -186,7 +188,7 @@ class Mapper:
                 inserted, pruned = inserted + came, pruned + went
             elif step == steps // 2:
                 pruned += self._keep(self._contributions(self._views)[0] >= config.min_contribution)
-            rates = config.rates.times(falling(step, steps, config.final_rate_decay))
+            rates = config.rates.times(smoothstep_decay(step, steps, config.final_rate_decay))
             self._optimize(views[order[position]], 0, rates)
         pruned += self._prune_degenerate()
         if config.exposure and self._views:
@@ -208,35 +210,24 @@ class Mapper:
         return self._view_gradients(view, level)[0].value
 
     def _view_gradients(self, view: View, level: int) -> tuple[ViewLoss, Gradients]:
-        color, depth_m = view.images(level)
-        return self.rasterizer.view_gradients(
-            self._gaussians,
-            self.cameras[level],
-            se3.inverse(view.T_map_camera),
-            color,
-            depth_m,
-            self._loss_weights,
-            exposure=view.exposure,
-            mask=view.usable(level),
-            depth_kind=self.depth,
-            depth_certainty=view.certainty if level == 0 else view.half_certainty,
-        )
+        return self._step.gradients(self._gaussians, self.cameras[level], view.training(level))
 
     def _mean_loss(self) -> float:
         return float(np.mean([self._loss(view, 0) for view in self._views])) if self._views else 0.0
 
     def _optimize(self, view: View, level: int, rates: LearningRates) -> None:
         """One Adam step of all Gaussians in one view."""
-        loss, gradients = self._view_gradients(view, level)
+        self._gaussians, loss = self._step(
+            self._gaussians,
+            self.cameras[level],
+            view.training(level),
+            adam=self._adam,
+            rates=rates,
+            least_log_scales=np.float32(np.log(self.config.seeding.thickness_m)),
+        )
         if self.config.exposure and view is not self._views[0]:
             decay = rates.colors / self.config.rates.colors
             view.step_exposure(loss.d_exposure, self.config.exposure_rate * decay)
-        stepped = self._adam.step(self._gaussians, gradients, rates)
-        floor = np.float32(np.log(self.config.seeding.thickness_m))
-        self._gaussians = stepped.replace(
-            log_scales=np.maximum(stepped.log_scales, floor),
-            opacity_logits=np.clip(stepped.opacity_logits, np.float32(-6), np.float32(6)),
-        )
 
     def _center_exposures(self, views: Sequence[View]) -> None:
         """Give the map the keyframes' mean exposure, so that (0, 0) is the best guess for an image that has none.

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.geometry import projection, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels.training import TrainingView
 from duagc.pipeline.splat.losses import depth_certainty, halve
 from duagc.pipeline.splat.optimizer import BETA_1, BETA_2
 
@@ -86,6 +87,12 @@ class View:
         if level == 0:
             return _from_bytes(self.color), self.depth_m
         return self.half_color, self.half_depth_m
+
+    def training(self, level: int) -> TrainingView:
+        """The images of a level as a training step takes them."""
+        color, depth_m = self.images(level)
+        certainty = self.certainty if level == 0 else self.half_certainty
+        return TrainingView(color, depth_m, self.T_map_camera, self.usable(level), certainty, self.exposure)
 
     def usable(self, level: int) -> NDArray[np.bool_] | None:
         """The mask of a level; None = all pixels."""

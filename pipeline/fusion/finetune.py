@@ -1,123 +1,106 @@
-"""A fused map trained again on what the robot saw, and on what its neighbors' maps show, at the corrected poses.
+"""Finetuning of a fused map on the robot's own images, and on renders of its peers' maps, at the corrected poses.
 
-Consensus moves keyframes and fusion moves Gaussians; nobody asks the images whether the result still draws them. Some
-steps of the mapper's own kind do: color and depth loss of the robot's keyframes and frames between them, never of
-held-out ones. Own images alone would teach the map to look right from where the robot stood and from nowhere else, so
-every few steps comes a view of a neighbor's map from where the neighbor stood (`peer_views`); own images, which are
-no copies, have the last word. Without such views only the robot's own Gaussians move: the few own views that see one
-taken over, from afar or through a door, know less of it than its owner's many. The information is that of before: what
-is learned here comes from the same pixels and is not counted again.
+Consensus moves keyframes and fusion moves Gaussians; neither checks that the result still renders the images. So the
+map takes some steps of the mapper's own kind: color and depth loss of the robot's keyframes and frames between them,
+never of held-out ones. Own images alone would fit the map to the robot's own viewpoints and to no others, so renders of
+peers' maps from the peers' keyframes (`peer_views`) are mixed in; own images, which are measurements, come last.
+Without such views only the robot's own Gaussians are trained: the few own views that see an imported one, from afar or
+through a door, have less information on it than its owner's many. The information of the Gaussians stays that of
+before: what is learned here comes from the same pixels and is not counted again.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.config.fusion import RefineConfig
-from duagc.pipeline.config.training import DepthKind
-from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.fusion.context import MapContext
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
+from duagc.pipeline.kernels.training import TrainingStep, TrainingView
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.losses import depth_certainty
-from duagc.pipeline.splat.optimizer import falling
-
-
-@dataclass(frozen=True)
-class View:
-    """An own image: color uint8 [H, W, 3], depth (m, 0 = none) [H, W], T_world_camera [4, 4], pixels that count.
-
-    depth_sigma_m: [H, W], standard deviation of the depth; None: not known pixel by pixel.
-    """
-
-    color: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
-    T_world_camera: NDArray[np.float64]
-    mask: NDArray[np.bool_] | None = None
-    depth_sigma_m: NDArray[np.float32] | None = None
-
+from duagc.pipeline.splat.optimizer import smoothstep_decay
 
 PEERS_UNTIL = 0.6
-"""Share of the steps after which only own images come."""
+"""Share of the steps after which only own images are used."""
 _TRAINED = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
 
 
-def steps_of(config: RefineConfig, own_views: int, peer_views: int) -> tuple[int, int]:
-    """How many steps the training takes on own views and on those of neighbors' maps."""
+def num_steps(config: RefineConfig, own_views: int, peer_views: int) -> tuple[int, int]:
+    """How many steps the training takes on own views and on views of peers' maps.
+
+    Args:
+        config: schedule.
+        own_views: how many there are.
+        peer_views: how many there are.
+    """
     steps = min(config.steps_per_view * own_views, config.steps_max)
     return steps, round(config.peer_share * steps) if peer_views else 0
 
 
-def refine(
+def finetune_map(
     gaussians: Gaussians,
-    trained: NDArray[np.bool_],
-    views: Sequence[View],
-    camera: PinholeCamera,
-    config: RefineConfig,
-    thickness_floor_m: float,
-    depth: DepthKind,
-    seed: int,
-    threads: int = 1,
+    views: Sequence[PosedRgbd],
+    context: MapContext,
     *,
-    peer_views: Sequence[View] = (),
+    trained: NDArray[np.bool_] | None = None,
+    peer_views: Sequence[PosedRgbd] = (),
 ) -> Gaussians:
-    """The map after some steps, each on one view: own ones in random order, each once before any comes again, and
-    neighbors' likewise, evenly spread among the first.
+    """The map after some training steps, each on one view.
+
+    Own views come in random order, each once before any comes again; peer views likewise, evenly spread among the
+    first steps.
 
     Args:
-        gaussians: in the world frame of the views. trained: [n], which of them may change.
-        views: own images. peer_views: as neighbors' maps show them.
-        thickness_floor_m: none becomes thinner than this, or than it was.
-        depth: as the map was made. threads: changes no bit.
+        gaussians: in the world frame of the views.
+        views: own images.
+        context: camera and settings; `config.refine` is the schedule.
+        trained: bool [n], which of the Gaussians may change; None: all.
+        peer_views: as peers' maps show them.
     Returns:
         As many Gaussians, in the same order, with the same ids and anchors.
     """
-    own_steps, peer_steps = steps_of(config, len(views), len(peer_views))
+    config = context.config.refine
+    own_steps, peer_steps = num_steps(config, len(views), len(peer_views))
     if not own_steps or not len(gaussians):
         return gaussians
     total = own_steps + peer_steps
     head = max(peer_steps, round(PEERS_UNTIL * total))
-    rasterizer, adam = Rasterizer(threads=threads), CompiledAdam(len(gaussians), threads=threads)
-    weights = LossWeights(**config.loss.of(depth).model_dump())
-    floor = np.minimum(
-        gaussians.log_scales, np.float32(np.log(thickness_floor_m))
-    )  # thinner ones stay as they are
-    own, peer = _in_turn(views, seed, "fusion.refine"), _in_turn(peer_views, seed, "fusion.refine.peers")
+    weights = LossWeights(**config.loss.of(context.depth_kind).model_dump())
+    take_step = TrainingStep(Rasterizer(threads=context.threads), weights, context.depth_kind)
+    adam = CompiledAdam(len(gaussians), threads=context.threads)
+    floor_m = context.matching.thickness_floor_m
+    floor = np.minimum(gaussians.log_scales, np.float32(np.log(floor_m)))  # thinner ones stay as they are
+    own = _in_turn(views, context.seed, "fusion.refine")
+    peer = _in_turn(peer_views, context.seed, "fusion.refine.peers")
     for step in range(total):
         of_peer = step < head and (step + 1) * peer_steps // head > step * peer_steps // head
-        view = next(peer if of_peer else own)
-        certainty = None
-        if view.depth_sigma_m is not None:
-            certainty = depth_certainty(view.depth_sigma_m, weights.depth_huber_m)
-        _, gradients = rasterizer.view_gradients(
+        share = config.rate * smoothstep_decay(step, total, config.rate_decay)
+        stepped, _ = take_step(
             gaussians,
-            camera,
-            se3.inverse(view.T_world_camera),
-            view.color.astype(np.float32) * np.float32(1 / 255),
-            view.depth_m,
-            weights,
-            mask=view.mask,
-            depth_kind=depth,
-            depth_certainty=certainty,
+            context.camera,
+            _training_view(next(peer if of_peer else own), weights.depth_huber_m),
+            adam=adam,
+            rates=config.rates.times(share),
+            least_log_scales=floor,
         )
-        share = config.rate * falling(step, total, config.rate_decay)
-        stepped = adam.step(gaussians, gradients, config.rates.times(share))
-        stepped = stepped.replace(
-            log_scales=np.maximum(stepped.log_scales, floor),
-            opacity_logits=np.clip(stepped.opacity_logits, np.float32(-6), np.float32(6)),
-        )
-        gaussians = _where(trained, stepped, gaussians)
+        gaussians = stepped if trained is None else _where(trained, stepped, gaussians)
     return gaussians
 
 
-def _in_turn(views: Sequence[View], seed: int, stream: str) -> Iterator[View]:
-    """The views for ever, in random order, each once before any comes again."""
+def _training_view(view: PosedRgbd, huber_m: float) -> TrainingView:
+    certainty = None if view.depth_sigma_m is None else depth_certainty(view.depth_sigma_m, huber_m)
+    return TrainingView(view.unit_color, view.depth_m, view.T_world_camera, view.mask, certainty)
+
+
+def _in_turn(views: Sequence[PosedRgbd], seed: int, stream: str) -> Iterator[PosedRgbd]:
+    """The views without end, in random order, each once before any comes again."""
     for start in itertools.count(step=max(1, len(views))):
         for k in random_streams.generator(seed, stream, start=start).permutation(len(views)):
             yield views[k]

@@ -1,90 +1,75 @@
-"""What a robot's own images say against its neighbors' maps, before anything of them is used.
+"""Photometric consistency check of peers' maps, before anything of them is used.
 
-A signature says who made a Gaussian, not that it is true, and a robot that met the wrong neighbor must not end worse
-than alone. So every neighbor's map is drawn where the robot's own keyframes stood, and compared with what they saw:
+A signature proves who made a Gaussian, not that it is true, and a robot that met a wrong peer must not end worse than
+alone. So every peer's map is rendered where the robot's own keyframes were, and compared with their images:
 
-    e_p = |color drawn - color seen|^2,    blame of a Gaussian = (sum of its weights times e) / (sum of its weights),
+    e_p = |color rendered - color seen|^2,    error of a Gaussian = (sum of its weights times e) / (sum of its weights),
 
-over pixels at which the neighbor's surface lies in front of the measured one or on it; what lies behind is hidden and
-says nothing. Colors are those that the own camera would show (`consensus.colors`, by the matches of this pair alone).
-A Gaussian is contradicted if its pixels are drawn worse than by one gray for everything: blame above the variance of
-the own images. So is a neighbor as a whole if its map does not explain some of the variance of the pixels that it was
-judged on; honest ones explain two thirds and more, one color for everything nothing. What no own keyframe saw cannot
-be judged.
+over pixels at which the peer's surface lies in front of the measured one or on it; what lies behind is hidden and gives
+no evidence. Colors are those that the own camera would show (`consensus.colors`, by the matches of this pair alone).
+A Gaussian is contradicted if its pixels are rendered worse than by one gray for everything: its error is above the
+variance of the own images. A peer as a whole is contradicted if its map does not explain some of the variance of the
+pixels that it was judged on. What no own keyframe saw cannot be judged.
 
-Matches are checked, too, because the lower-named robot of a pair speaks for it: two Gaussians that are not where each
-other are, or differ more than neighbors in the own map do, are none.
+Matches are checked, too, because the lower-named robot of a pair decides on them: two Gaussians that are not near each
+other, or differ more than neighbors in the own map do, are no match.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.config.consensus import MatchingConfig, WeightKind
-from duagc.pipeline.config.fusion import FusionConfig
+from duagc.pipeline.config.consensus import MatchingConfig
+from duagc.pipeline.config.fusion import PeerValidationConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import team_colors
 from duagc.pipeline.consensus.evidence import Evidence, rows_by_id
 from duagc.pipeline.consensus.matching import Pairs, gaussian_distance, threshold
-from duagc.pipeline.consensus.weighting import in_world
-from duagc.pipeline.fusion.finetune import View
+from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.geometry import se3, spd
-from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import LOG_COVARIANCE, MEAN, gaussians_of
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-NOTHING: Index = np.zeros((0, 2), np.int64)
-COVERED = 0.5  # opacity from which on a pixel shows a neighbor's surface
-EXPLAINED = 0.3  # of the variance of own pixels, that a map must explain to be used at all
-LEAST_GRAY = 0.01  # of images that show next to nothing, where errors of maps and poses count for more
-LEAST_PX = 4.0  # weight, in pixels, from which on a Gaussian is judged
-LEAST_SHARE = 0.01  # of the own pixels, from which on a neighbor is judged as a whole
-PASSES = 2  # what hid behind a contradicted Gaussian is judged in the second
-LARGEST = 2.0  # times the largest Gaussian of the own map: no mapper makes a larger one
-# on what makes a match; far enough that rounding tips none of an honest robot
-RADIUS_SLACK, DISTANCE_SLACK = 2.0, 1.5
+NO_PAIRS: Index = np.zeros((0, 2), np.int64)
 
 
 @dataclass(frozen=True)
-class PeerMapReport:
-    """The check of one peer's map against own images.
+class PeerCheck:
+    """What own images show of one peer's map.
 
     Attributes:
         peer: name of the robot that sent the map.
         gaussians: Gaussians that it sent.
         too_large: of them, not used because no mapper makes any that large.
         contradicted: of them, not used because own images contradict them.
-        matches: of the peer with this robot.
-        rejected_matches: of them, found to be false.
         compared_px: own pixels on which the map was compared.
         own_px: all own pixels.
         color_mse: mean squared error of the map's colors on the compared pixels, colors 0..1.
-        color_variance: of the own colors there, at least LEAST_GRAY.
+        color_variance: of the own colors there, at least `PeerValidationConfig.min_color_variance`.
+        trusted: whether the map explains own images, or too few pixels see it to decide.
+        matches: of the peer with this robot.
+        rejected_matches: of them, found to be false.
     """
 
     peer: str
     gaussians: int
     too_large: int
     contradicted: int
-    matches: int
-    rejected_matches: int
     compared_px: int
     own_px: int
     color_mse: float
     color_variance: float
-
-    @property
-    def trusted(self) -> bool:
-        """Whether the map explains own images, or too few pixels of them see it to decide."""
-        explains = self.color_mse <= (1 - EXPLAINED) * self.color_variance
-        return explains or self.compared_px < LEAST_SHARE * self.own_px
+    trusted: bool
+    matches: int
+    rejected_matches: int
 
     @property
     def reason(self) -> str:
@@ -99,75 +84,79 @@ class PeerMapReport:
 
 @dataclass(frozen=True)
 class ValidatedPeers:
-    """What may be used of the neighbors' maps.
+    """What may be used of the peers' maps.
 
-    evidence: by name, in anchor frames; empty of who is not trusted. contradicted: by name, which of these Gaussians
-    own images contradict. pairs: of matched Gaussians. reports: one per neighbor, in order of name.
+    Attributes:
+        evidence: by name, in the world frame; empty of a peer that is not trusted.
+        contradicted: by name, bool [n], which of these Gaussians own images contradict.
+        pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians.
+        checks: one per peer, in order of name.
     """
 
     evidence: dict[str, Evidence]
     contradicted: dict[str, NDArray[np.bool_]]
     pairs: dict[tuple[str, str], Index]
-    reports: tuple[PeerMapReport, ...]
+    checks: tuple[PeerCheck, ...]
 
 
 def validate_peer_maps(
     own: Evidence,
-    evidence: Mapping[str, Evidence],
-    T_world_keyframe: Mapping[str, Array],
+    peers: Mapping[str, Evidence],
     pairs: Pairs,
-    views: Sequence[View],
-    camera: PinholeCamera,
-    config: FusionConfig,
-    matching: MatchingConfig,
-    depth_of: Mapping[str, DepthKind],
-    weights: WeightKind = "block",
-    threads: int = 1,
+    context: MapContext,
+    *,
+    views: Sequence[PosedRgbd],
+    depth_kinds: Mapping[str, DepthKind],
 ) -> ValidatedPeers:
-    """Hold every neighbor's map against the robot's own keyframes.
+    """Compare every peer's map with the robot's own keyframes.
 
     Args:
-        own: the robot's own evidence. evidence: of the neighbors, by name. Both in anchor frames.
-        T_world_keyframe: by name, [k, 4, 4] by anchor. pairs: as they came, (robot a, robot b) -> ids [m, 2].
-        views: own keyframes at their corrected poses. camera: of the views.
-        matching: as the pairs were found. depth_of: as the neighbors' maps were made, by name. threads: changes no
-            bit.
+        own: the robot's own evidence, in the world frame.
+        peers: evidence of the peers, by name, in the world frame.
+        pairs: as they were received, (robot a, robot b) -> ids int64 [m, 2].
+        context: camera and settings.
+        views: own keyframes at their corrected poses.
+        depth_kinds: as the peers' maps were made, by name.
     """
-    own_colors = _Spread()
+    config, matching = context.config.peer_validation, context.matching
+    own_colors = _ColorStatistics(config.min_color_variance)
     for view in views:
         own_colors.add(view.color[... if view.mask is None else view.mask])
-    world = {own.owner: in_world(own, T_world_keyframe[own.owner], weights)}
-    largest = LARGEST * _sizes_m(world[own.owner]).max(initial=0.0)
-    kept, contradicted, reports = {}, {}, []
-    for name in sorted(evidence):
-        told = evidence[name]
-        there = in_world(told, T_world_keyframe[name], weights)
-        possible = _sizes_m(there) <= largest
-        told, there = told.select(possible), there.select(possible)
-        judge = _PeerMapCheck(views, camera, config, depth_of[name], threads)
-        pair = _near(world[own.owner], there, _between(pairs, own.owner, name), matching)
-        against = judge.contradicted(
-            _in_colors_of(world[own.owner], there, pair, matching), own_colors.variance
+    largest_m = config.max_size_ratio * _sizes_m(own).max(initial=0.0)
+    radius_m = config.match_radius_factor * matching.radius_m
+    world, contradicted, judged = {own.owner: own}, {}, {}
+    too_large = {}
+    for name in sorted(peers):
+        possible = _sizes_m(peers[name]) <= largest_m
+        peer, too_large[name] = peers[name].select(possible), int(np.sum(~possible))
+        near = _near(own, peer, _between(pairs, own.owner, name), radius_m)
+        judged[name] = _PhotometricCheck(views, context, depth_kinds[name], config)
+        against = judged[name].contradicted(_in_colors_of(own, peer, near, matching), own_colors.variance)
+        used = slice(None) if judged[name].trusted(own_colors.pixels) else slice(0, 0)
+        world[name], contradicted[name] = peer.select(used), against[used]
+        judged[name].num_contradicted = int(np.sum(against))
+    largest = config.match_distance_factor * threshold(own, matching)
+    true = _true_pairs(world, pairs, matching, radius_m=radius_m, largest=largest)
+    checks = []
+    for name, check in judged.items():
+        matches = len(_between(pairs, own.owner, name))
+        checks.append(
+            PeerCheck(
+                peer=name,
+                gaussians=len(peers[name]),
+                too_large=too_large[name],
+                contradicted=check.num_contradicted,
+                compared_px=check.own.pixels,
+                own_px=own_colors.pixels,
+                color_mse=check.color_mse,
+                color_variance=check.own.variance,
+                trusted=check.trusted(own_colors.pixels),
+                matches=matches,
+                rejected_matches=matches - len(_between(true, own.owner, name)),
+            )
         )
-        report = PeerMapReport(
-            name,
-            len(possible),
-            int(np.sum(~possible)),
-            int(np.sum(against)),
-            0,
-            0,
-            judge.own.pixels,
-            own_colors.pixels,
-            judge.error,
-            judge.own.variance,
-        )
-        used = slice(None) if report.trusted else slice(0, 0)
-        kept[name], contradicted[name], world[name] = told.select(used), against[used], there.select(used)
-        reports.append(report)
-    true = _true_pairs(world, pairs, DISTANCE_SLACK * threshold(world[own.owner], matching), matching)
-    return ValidatedPeers(
-        kept, contradicted, true, tuple(_with_pairs(d, own.owner, pairs, true) for d in reports)
-    )
+    evidence = {name: world[name] for name in sorted(peers)}
+    return ValidatedPeers(evidence, contradicted, true, tuple(checks))
 
 
 def _sizes_m(evidence: Evidence) -> Array:
@@ -178,16 +167,16 @@ def _sizes_m(evidence: Evidence) -> Array:
 
 def _between(pairs: Pairs, own: str, other: str) -> Index:
     """Matches [m, 2] of two robots, the own id first."""
-    found = pairs.get((min(own, other), max(own, other)), NOTHING)
+    found = pairs.get((min(own, other), max(own, other)), NO_PAIRS)
     return found if own < other else np.flip(found, axis=1)
 
 
-def _near(a: Evidence, b: Evidence, pairs: Index, matching: MatchingConfig) -> Index:
-    """The pairs [m, 2] whose Gaussians are there and near each other."""
+def _near(a: Evidence, b: Evidence, pairs: Index, radius_m: float) -> Index:
+    """The pairs [m, 2] whose Gaussians exist and are near each other."""
     i, j = rows_by_id(pairs[:, 0], a.ids), rows_by_id(pairs[:, 1], b.ids)
     known = np.flatnonzero((i >= 0) & (j >= 0))
     apart_m = np.linalg.norm(a.theta[i[known], MEAN] - b.theta[j[known], MEAN], axis=1)
-    near: Index = pairs[known[apart_m <= RADIUS_SLACK * matching.radius_m]]
+    near: Index = pairs[known[apart_m <= radius_m]]
     return near
 
 
@@ -198,28 +187,28 @@ def _in_colors_of(a: Evidence, b: Evidence, pairs: Index, matching: MatchingConf
 
 
 def _true_pairs(
-    world: Mapping[str, Evidence], pairs: Pairs, largest: float, matching: MatchingConfig
+    world: Mapping[str, Evidence],
+    pairs: Pairs,
+    matching: MatchingConfig,
+    *,
+    radius_m: float,
+    largest: float,
 ) -> dict[tuple[str, str], Index]:
-    """The pairs whose Gaussians are there, near each other and alike: d_G at most `largest`."""
+    """The pairs whose Gaussians exist, are near each other and alike: d_G at most `largest`."""
     true = {}
     for a, b in sorted(p for p in pairs if p[0] in world and p[1] in world):
-        near = _near(world[a], world[b], pairs[a, b], matching)
+        near = _near(world[a], world[b], pairs[a, b], radius_m)
         i, j = rows_by_id(near[:, 0], world[a].ids), rows_by_id(near[:, 1], world[b].ids)
         other = _in_colors_of(world[a], world[b], near, matching)
-        true[a, b] = near[gaussian_distance(world[a], i, other, j, matching) <= largest]
+        true[a, b] = near[gaussian_distance(world[a], i, other, j, config=matching) <= largest]
     return true
 
 
-def _with_pairs(report: PeerMapReport, own: str, pairs: Pairs, true: Pairs) -> PeerMapReport:
-    """How many matches of the neighbor with this robot there are, and how many of them are none."""
-    count = len(_between(pairs, own, report.peer))
-    return replace(report, matches=count, rejected_matches=count - len(_between(true, own, report.peer)))
+class _ColorStatistics:
+    """Variance of colors 0..255, summed as they come."""
 
-
-class _Spread:
-    """How much colors 0..255 differ, summed as they come."""
-
-    def __init__(self) -> None:
+    def __init__(self, least_variance: float) -> None:
+        self.least_variance = least_variance
         self.pixels, self._sum, self._squares = 0, np.zeros(3), np.zeros(3)
 
     def add(self, colors: NDArray[np.uint8]) -> None:
@@ -231,50 +220,63 @@ class _Spread:
 
     @property
     def variance(self) -> float:
-        """Mean over the channels, of colors 0..1; at least LEAST_GRAY."""
+        """Mean over the channels, of colors 0..1; not below the least one."""
         n = max(self.pixels, 1)
-        return max(float(np.mean(self._squares / n - (self._sum / n) ** 2)), LEAST_GRAY)
+        return max(float(np.mean(self._squares / n - (self._sum / n) ** 2)), self.least_variance)
 
 
-class _PeerMapCheck:
-    """Draws a map at own keyframes. own, error: own colors at the judged pixels, mean squared error there, of the
-    first drawing."""
+class _PhotometricCheck:
+    """Renders one peer's map at own keyframes.
+
+    Attributes:
+        own: own colors at the pixels on which the whole map was compared.
+        color_mse: mean squared error of the map there, colors 0..1.
+        num_contradicted: Gaussians that own images contradict.
+    """
 
     def __init__(
         self,
-        views: Sequence[View],
-        camera: PinholeCamera,
-        config: FusionConfig,
-        depth: DepthKind,
-        threads: int,
+        views: Sequence[PosedRgbd],
+        context: MapContext,
+        depth_kind: DepthKind,
+        config: PeerValidationConfig,
     ) -> None:
-        self.views, self.camera, self.config, self.depth = views, camera, config, depth
-        self.rasterizer = Rasterizer(threads=threads)
-        self.own, self.error = _Spread(), 0.0
+        self.views, self.context, self.depth_kind, self.config = views, context, depth_kind, config
+        self.rasterizer = Rasterizer(threads=context.threads)
+        self.own, self.color_mse = _ColorStatistics(config.min_color_variance), 0.0
+        self.num_contradicted = 0
+
+    def trusted(self, own_px: int) -> bool:
+        """Whether the map explains own images, or too few of all own pixels see it to decide."""
+        explains = self.color_mse <= (1 - self.config.min_explained_variance) * self.own.variance
+        return explains or self.own.pixels < self.config.min_overlap * own_px
 
     def contradicted(self, world: Evidence, gray: float) -> NDArray[np.bool_]:
-        """Which Gaussians [n] own images contradict."""
+        """Which Gaussians [n] own images contradict: error above `gray`, the variance of own colors."""
         gaussians = gaussians_of(world.ids, world.anchors, world.theta)
         against = np.zeros(len(world), bool)
-        for turn in range(PASSES):
+        for turn in range(self.config.passes):
             rows = np.flatnonzero(~against)
-            blame = self._blame(gaussians.select(rows), first=turn == 0)
-            against[rows[blame > gray]] = True
+            errors = self._errors(gaussians.select(rows), first=turn == 0)
+            against[rows[errors > gray]] = True
         return against
 
-    def _blame(self, gaussians: Gaussians, first: bool) -> Array:
-        """Mean squared error of what each Gaussian draws [n], zero of too little."""
+    def _errors(self, gaussians: Gaussians, first: bool) -> Array:
+        """Mean squared error of the pixels of each Gaussian [n], zero of too few."""
         errors, weights = np.zeros(len(gaussians)), np.zeros(len(gaussians))
-        total = 0.0
+        total, fusion, least = 0.0, self.context.config, self.config.min_opacity
         for view in self.views:
-            T_camera_world = se3.inverse(view.T_world_camera)
             render = self.rasterizer.forward(
-                gaussians, self.camera, T_camera_world, mask=view.mask, depth_kind=self.depth
+                gaussians,
+                self.context.camera,
+                se3.inverse(view.T_world_camera),
+                mask=view.mask,
+                depth_kind=self.depth_kind,
             )
-            alpha = np.maximum(render.alpha, np.float32(COVERED))
-            reach = view.depth_m * (1 + self.config.explained_relative) + self.config.explained_m
-            judged = (render.alpha >= COVERED) & (view.depth_m > 0) & (render.depth / alpha <= reach)
-            off = render.color / alpha[..., None] - view.color * np.float32(1 / 255)
+            alpha = np.maximum(render.alpha, np.float32(least))
+            reach = view.depth_m * (1 + fusion.explained_relative) + fusion.explained_m
+            judged = (render.alpha >= least) & (view.depth_m > 0) & (render.depth / alpha <= reach)
+            off = render.color / alpha[..., None] - view.unit_color
             images = np.zeros_like(render.color)
             images[..., 0] = np.where(judged, np.mean(np.clip(off, -1, 1) ** 2, axis=2), 0)
             images[..., 1] = judged
@@ -284,5 +286,6 @@ class _PeerMapCheck:
             if first:
                 self.own.add(view.color[judged])
         if first:
-            self.error = total / max(self.own.pixels, 1)
-        return np.where(weights >= LEAST_PX, errors / np.maximum(weights, LEAST_PX), 0.0)
+            self.color_mse = total / max(self.own.pixels, 1)
+        least_px = self.config.min_gaussian_px
+        return np.where(weights >= least_px, errors / np.maximum(weights, least_px), 0.0)

@@ -1,8 +1,8 @@
-"""What neighbors' maps show from where the neighbors stood: views to train on that no own camera took.
+"""Renders of peers' maps from the peers' keyframes: views to train on that no own camera took.
 
-A robot has its neighbors' whole maps and the poses of their keyframes, both by packets. What a neighbor's map draws
-from there stands in for the images that the neighbor took and never sent. From such views the fused map learns what
-two robots saw from different sides, which neither robot's own images can tell.
+A robot has its peers' whole maps and the poses of their keyframes, both by packets. A render of a peer's map from
+there stands in for the images that the peer took and never sent. From such views the fused map learns what two robots
+saw from different sides, which neither robot's own images contain.
 """
 
 from __future__ import annotations
@@ -12,59 +12,57 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.config.consensus import WeightKind
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.consensus.evidence import Evidence
-from duagc.pipeline.consensus.weighting import in_world
-from duagc.pipeline.fusion.finetune import View
+from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.information import gaussians_of
 
 Array = NDArray[np.float64]
 COVERED = 0.9
-"""Opacity from which on a pixel of a neighbor's map counts as seen by it."""
+"""Opacity from which on a pixel of a peer's map counts as seen by it."""
 
 
 def peer_views(
     evidence: Mapping[str, Evidence],
     T_world_keyframe: Mapping[str, Array],
-    camera: PinholeCamera,
-    most: int,
-    depth_of: Mapping[str, DepthKind],
-    weights: WeightKind = "block",
-    threads: int = 1,
+    context: MapContext,
     *,
+    depth_kinds: Mapping[str, DepthKind],
     colors: Mapping[str, ColorMap],
-) -> list[View]:
-    """Color and depth of every neighbor's map at its keyframes and half way between them, as the own camera sees.
+) -> list[PosedRgbd]:
+    """Color and depth of every peer's map at its keyframes and half way between them, as the own camera sees.
+
+    What a peer's map does not cover is masked.
 
     Args:
-        evidence: of the neighbors, by name, in anchor frames. T_world_keyframe: by name, [k, 4, 4] by anchor.
-        camera: the robot's own; what the neighbor's map does not cover counts as not seen.
-        most: so many views in all, evenly spread.
-        depth_of: as the maps were made, by name. threads: changes no bit.
-        colors: from every neighbor's colors to the own.
+        evidence: of the peers, by name, in the world frame, each in its own colors.
+        T_world_keyframe: by name, [k, 4, 4] by anchor.
+        context: the robot's own camera and settings; `config.refine.peer_views` of all views are taken, evenly spread.
+        depth_kinds: as the maps were made, by name.
+        colors: from every peer's colors to the own.
     """
-    rasterizer = Rasterizer(threads=threads)
+    rasterizer = Rasterizer(threads=context.threads)
     shown = [name for name in sorted(evidence) if len(evidence[name])]
     poses = [(name, T) for name in shown for T in _with_middles(T_world_keyframe[name])]
-    count = min(most, len(poses))
+    count = min(context.config.refine.peer_views, len(poses))
     chosen = [poses[k] for k in evenly_spaced(len(poses), count)]
     views, drawn = [], ""
     for name, T_world_camera in chosen:
         if name != drawn:
-            there = in_world(colors[name].of(evidence[name]), T_world_keyframe[name], weights)
-            gaussians, drawn = gaussians_of(there.ids, there.anchors, there.theta), name
-        render = rasterizer.forward(gaussians, camera, se3.inverse(T_world_camera), depth_kind=depth_of[name])
+            own_colors = colors[name].of(evidence[name])
+            gaussians, drawn = gaussians_of(own_colors.ids, own_colors.anchors, own_colors.theta), name
+        T_camera_world = se3.inverse(T_world_camera)
+        render = rasterizer.forward(gaussians, context.camera, T_camera_world, depth_kind=depth_kinds[name])
         seen = render.alpha >= COVERED
         share = np.where(seen, render.alpha, np.float32(1))
         color = np.rint(np.clip(render.color / share[..., None], 0, 1) * 255).astype(np.uint8)
         depth_m = np.where(seen, render.depth / share, np.float32(0))
-        views.append(View(color, depth_m, T_world_camera, seen))
+        views.append(PosedRgbd(color, depth_m, T_world_camera, seen))
     return views
 
 

@@ -1,28 +1,26 @@
-"""The fusion stage: what a robot took home from the session becomes its fused map and its corrected trajectory."""
+"""The fusion stage: the result of a session becomes a robot's fused map and its corrected trajectory."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc import schemas
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.consensus import MatchingConfig, WeightKind
-from duagc.pipeline.config.fusion import FusionConfig, RefineConfig
+from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.registration import MovingConfig
-from duagc.pipeline.config.training import DepthKind
-from duagc.pipeline.consensus.colors import ColorMap
-from duagc.pipeline.consensus.weighting import own_stiffness
-from duagc.pipeline.fusion.finetune import View, refine
-from duagc.pipeline.fusion.fuse import FusedMap, fuse
-from duagc.pipeline.fusion.opacity_update import weigh_by_own_pixels
-from duagc.pipeline.fusion.peer_validation import PeerMapReport, validate_peer_maps
+from duagc.pipeline.consensus.weighting import in_world, self_information
+from duagc.pipeline.fusion.context import MapContext
+from duagc.pipeline.fusion.finetune import finetune_map
+from duagc.pipeline.fusion.fuse import FusedMap, OwnMap, fuse
+from duagc.pipeline.fusion.opacity_update import update_opacities
+from duagc.pipeline.fusion.peer_validation import PeerCheck, ValidatedPeers, validate_peer_maps
 from duagc.pipeline.fusion.peer_views import peer_views
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory, write_tum
 from duagc.pipeline.messages import (
@@ -31,13 +29,18 @@ from duagc.pipeline.messages import (
     GaussianInformation,
     GaussianMap,
     Odometry,
-    pack_stamp,
+    PeerColors,
+    PeerMapReport,
 )
 from duagc.pipeline.recording import LogWriter, open_rgbd, read_log
 from duagc.pipeline.registration.moving import FreeSpace
 from duagc.pipeline.runs.robot_data import AgentInput, AgentResult, RobotData, load
 from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.information import COLOR_INFORMATION, OPACITY_INFORMATION, geometry_of_information
+from duagc.pipeline.splat.information import (
+    COLOR_INFORMATION,
+    OPACITY_INFORMATION,
+    geometry_of_information,
+)
 from duagc.pipeline.splat.ply import write_ply
 from duagc.schemas import topics
 
@@ -45,131 +48,163 @@ Array = NDArray[np.float64]
 FUSED_KIND = "gauss_newton"
 
 
+@dataclass(frozen=True)
+class _Fusion:
+    """What the stage found.
+
+    Attributes:
+        fused: the fused map.
+        refined: the finetuned map; None for a robot that met no other.
+        checks: of every peer's map.
+    """
+
+    fused: FusedMap
+    refined: Gaussians | None
+    checks: tuple[PeerCheck, ...]
+
+
 def run_fusion(
     source: AgentInput,
     result: AgentResult,
     folder: Path,
+    *,
     config: FusionConfig,
     matching: MatchingConfig,
     moving: MovingConfig,
     weights: WeightKind = "block",
-    *,
     seed: int = 0,
     threads: int = 1,
-) -> tuple[PeerMapReport, ...]:
+) -> tuple[PeerCheck, ...]:
     """Write fused.mcap, fused.ply, refined.ply, trajectory.tum and odometry.tum of one robot.
 
     Args:
         source: the robot's own files.
-        result: what it took home from the session.
+        result: of the session.
         folder: where the results go.
-        matching: as the pairs of the session were found. weights: kind of the session.
+        config: of fusion.
+        matching: as the pairs of the session were found.
         moving: as the front end looked for what moves.
-        seed: of the run. threads: of the rasterizer; changes no bit.
+        weights: kind of the session.
+        seed: of the run.
+        threads: of the rasterizer; changes no bit.
     Returns:
-        What own images say against every neighbor's map.
+        The check of every peer's map against own images.
+    Raises:
+        DuagError: a file lacks what it should hold, or two files do not belong together.
     """
     own = load(source)
-    frames = _frames(source)
-    hung = np.array([result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera for f in frames])
-    stamp_ns = frames[-1].stamp_ns
-    met = len(result.component) > 1
-    views = training_views(source, frames, hung, config.refine, moving) if met else []
-    validated = validate_peer_maps(
-        result.own_evidence,
-        result.evidence,
-        result.T_world_keyframe_of,
-        result.pairs,
-        views[: own.keyframes],
-        own.camera,
-        config,
-        matching,
-        result.depth_of,
-        weights,
-        threads,
+    frames = _placed_frames(source)
+    T_world_camera = np.array(
+        [result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera for f in frames]
     )
-    fused = fuse(
-        own.robot,
-        own.gaussians,
-        own.T_map_keyframe,
-        {own.robot: result.own_evidence, **validated.evidence},
-        own_stiffness(own.robot, own.gaussians, own.information, own.T_map_keyframe, weights),
-        result.T_world_keyframe_of,
-        validated.pairs,
-        _depth_images(own),
-        own.camera,
-        config,
-        matching,
-        own.depth,
-        weights,
-        contradicted=validated.contradicted,
-    )
-    refined = None
-    if met:
-        info = own.information
-        fused = weigh_by_own_pixels(
-            fused,
-            len(own.gaussians),
-            views[: own.keyframes],
-            own.camera,
-            info.color_sigma,
-            info.color_pixels_per_sample,
-            config,
-            own.depth,
-            threads,
-        )
-        if config.refine.steps_per_view:
-            shown = peer_views(
-                {name: e.select(~validated.contradicted[name]) for name, e in validated.evidence.items()},
-                result.T_world_keyframe_of,
-                own.camera,
-                config.refine.peer_views if config.refine.peer_share else 0,
-                result.depth_of,
-                weights,
-                threads,
-                colors=fused.colors,
-            )
-            owned = fused.source == fused.robots.index(own.robot)
-            refined = refine(
-                fused.gaussians,
-                np.ones_like(owned) if shown else owned,
-                views,
-                own.camera,
-                config.refine,
-                matching.thickness_floor_m,
-                own.depth,
-                seed,
-                threads,
-                peer_views=shown,
-            )
-    write_ply(folder / "fused.ply", fused.gaussians)
-    write_ply(folder / "refined.ply", fused.gaussians if refined is None else refined)
-    _write_log(folder / "fused.mcap", result, fused, refined, validated.reports, stamp_ns, own.depth)
+    context = MapContext(own.camera, config, matching, own.depth, weights, threads, seed=seed)
+    views: list[PosedRgbd] = []
+    if len(result.component) > 1:
+        num_support = config.refine.support_views
+        views = training_views(source, frames, T_world_camera, num_support=num_support, moving=moving)
+    fusion = _fuse(own, result, views, context)
+    refined = fusion.fused.gaussians if fusion.refined is None else fusion.refined
+    write_ply(folder / "fused.ply", fusion.fused.gaussians)
+    write_ply(folder / "refined.ply", refined)
+    _write_log(folder / "fused.mcap", result, fusion, stamp_ns=frames[-1].stamp_ns, own=own)
     stamps = np.array([f.stamp_ns for f in frames], dtype=np.int64)
     before = np.array([f.T_map_camera for f in frames])
     write_tum(folder / "odometry.tum", Trajectory(stamps, before))
-    write_tum(folder / "trajectory.tum", Trajectory(stamps, hung))
-    return validated.reports
+    write_tum(folder / "trajectory.tum", Trajectory(stamps, T_world_camera))
+    return fusion.checks
+
+
+def _fuse(own: RobotData, result: AgentResult, views: Sequence[PosedRgbd], context: MapContext) -> _Fusion:
+    """Validate the peers' maps, fuse, update opacities, finetune.
+
+    Args:
+        own: the robot's own files.
+        result: of the session.
+        views: own images, keyframes first; none for a robot that met no other.
+        context: camera and settings.
+    """
+    poses, keyframe_views = result.T_world_keyframe_of, views[: own.keyframes]
+    mine = in_world(result.own_evidence, poses[own.robot], context.weights)
+    valid = validate_peer_maps(
+        mine,
+        {name: in_world(e, poses[name], context.weights) for name, e in result.evidence.items()},
+        result.pairs,
+        context,
+        views=keyframe_views,
+        depth_kinds=result.depth_of,
+    )
+    own_information = self_information(
+        own.robot, own.gaussians, own.information, own.T_map_keyframe, kind=context.weights
+    )
+    fused = fuse(
+        OwnMap(own.robot, own.gaussians, own.T_map_keyframe, poses[own.robot]),
+        {own.robot: mine, **valid.evidence},
+        valid.pairs,
+        context,
+        self_information=in_world(own_information, poses[own.robot], context.weights),
+        depth_images=_depth_images(own),
+        contradicted=valid.contradicted,
+    )
+    if len(result.component) < 2:
+        return _Fusion(fused, None, valid.checks)
+    fused = update_opacities(
+        fused,
+        keyframe_views,
+        context,
+        num_own=len(own.gaussians),
+        color_sigma=own.information.color_sigma,
+        pixels_per_sample=own.information.color_pixels_per_sample,
+    )
+    return _Fusion(fused, _finetuned(own, result, fused, valid, views, context), valid.checks)
+
+
+def _finetuned(
+    own: RobotData,
+    result: AgentResult,
+    fused: FusedMap,
+    valid: ValidatedPeers,
+    views: Sequence[PosedRgbd],
+    context: MapContext,
+) -> Gaussians | None:
+    """The fused map trained on own images and on renders of peers' maps; None if the settings have no steps."""
+    config = context.config.refine
+    if not config.steps_per_view:
+        return None
+    shown: list[PosedRgbd] = []
+    if config.peer_share:
+        shown = peer_views(
+            {name: e.select(~valid.contradicted[name]) for name, e in valid.evidence.items()},
+            result.T_world_keyframe_of,
+            context,
+            depth_kinds=result.depth_of,
+            colors=fused.colors,
+        )
+    trained = None if shown else fused.source == fused.robots.index(own.robot)
+    return finetune_map(fused.gaussians, views, context, trained=trained, peer_views=shown)
 
 
 def training_views(
     source: AgentInput,
     frames: Sequence[Odometry],
-    T_frame_camera: Array,
-    config: RefineConfig,
+    T_world_camera: Array,
+    *,
+    num_support: int,
     moving: MovingConfig,
-) -> list[View]:
+) -> list[PosedRgbd]:
     """The robot's keyframes and, evenly spread, frames between them; none held out.
 
     Args:
-        frames: that have a pose, in order. T_frame_camera: [n, 4, 4], these poses, in the frame of the views.
+        source: the robot's own files.
+        frames: that have a pose, in order.
+        T_world_camera: [n, 4, 4], these poses, in the frame of the views.
+        num_support: most frames between keyframes.
         moving: as the front end looked for what moves.
     """
     topic = topics.KEYFRAME.of(source.robot)
     keyframes = {record.message().frame_index for record in read_log(source.frontend, (topic,))}
     first = [k for k, f in enumerate(frames) if f.frame_index in keyframes]
     others = [k for k, f in enumerate(frames) if f.frame_index not in keyframes and not f.held_out]
-    count = min(config.support_views, len(others))
+    count = min(num_support, len(others))
     middles = [others[k] for k in evenly_spaced(len(others), count)]
     views = []
     with open_rgbd(source.log) as log:
@@ -178,8 +213,8 @@ def training_views(
             frame = log.frame(frames[k].frame_index)
             usable = frame.usable_depth
             if frames[k].frame_index in keyframes:
-                free.add(usable, T_frame_camera[k])
-            views.append(View(frame.color, usable, T_frame_camera[k], frame.mask, frame.depth_sigma))
+                free.add(usable, T_world_camera[k])
+            views.append(PosedRgbd(frame.color, usable, T_world_camera[k], frame.mask, frame.depth_sigma))
     return [replace(v, mask=free.usable(v.depth_m, v.T_world_camera, v.mask)) for v in views]
 
 
@@ -188,8 +223,8 @@ def _depth_images(own: RobotData) -> Iterator[tuple[int, NDArray[np.float32]]]:
         yield keyframe, own.images(keyframe).depth_m
 
 
-def _frames(source: AgentInput) -> list[Odometry]:
-    """Every frame that the front end placed, in order."""
+def _placed_frames(source: AgentInput) -> list[Odometry]:
+    """Every frame that the front end gave a pose, in order."""
     topic = topics.ODOMETRY.of(source.robot)
     frames = [record.message() for record in read_log(source.frontend, (topic,))]
     placed = [f for f in frames if f.status != "lost"]
@@ -198,16 +233,8 @@ def _frames(source: AgentInput) -> list[Odometry]:
     return placed
 
 
-def _write_log(
-    path: Path,
-    result: AgentResult,
-    fused: FusedMap,
-    refined: Gaussians | None,
-    reports: Sequence[PeerMapReport],
-    stamp_ns: int,
-    depth: DepthKind,
-) -> None:
-    robot = result.robot
+def _write_log(path: Path, result: AgentResult, fusion: _Fusion, *, stamp_ns: int, own: RobotData) -> None:
+    robot, depth_kind, fused = result.robot, own.depth, fusion.fused
     keyframes = CorrectedKeyframes(
         stamp_ns=stamp_ns,
         robot=robot,
@@ -215,18 +242,17 @@ def _write_log(
         keyframe_indices=np.arange(len(result.T_world_keyframe), dtype=np.int32),
         T_world_keyframe=result.T_world_keyframe,
     )
-    fused_map = GaussianMap(
-        stamp_ns, robot, WORLD_FRAME, fused.gaussians, _information(robot, fused, stamp_ns), depth
-    )
+    information = _information(robot, fused, stamp_ns)
+    fused_map = GaussianMap(stamp_ns, robot, WORLD_FRAME, fused.gaussians, information, depth_kind)
     with LogWriter(path, robot) as log:
         log.write(topics.CORRECTED_KEYFRAMES.of(robot), keyframes, stamp_ns, stamp_ns)
         log.write(topics.FUSED_MAP.of(robot), fused_map, stamp_ns, stamp_ns)
-        if refined is not None:
-            refined_map = GaussianMap(stamp_ns, robot, WORLD_FRAME, refined, None, depth)
+        if fusion.refined is not None:
+            refined_map = GaussianMap(stamp_ns, robot, WORLD_FRAME, fusion.refined, None, depth_kind)
             log.write(topics.REFINED_MAP.of(robot), refined_map, stamp_ns, stamp_ns)
         for peer, colors in sorted(fused.colors.items()):
-            message = schemas.new(
-                "PeerColors",
+            peer_colors = PeerColors(
+                stamp_ns=stamp_ns,
                 robot=robot,
                 peer=peer,
                 gain=colors.gain,
@@ -235,35 +261,30 @@ def _write_log(
                 offset_sigma=colors.sigma_offset,
                 matches=colors.matches,
             )
-            pack_stamp(message, stamp_ns)
-            log.write(topics.PEER_COLORS.of(robot), message, stamp_ns, stamp_ns)
-        for report in reports:
-            log.write(
-                topics.PEER_MAP_REPORT.of(robot),
-                _peer_map_report(robot, report, stamp_ns),
-                stamp_ns,
-                stamp_ns,
-            )
+            log.write(topics.PEER_COLORS.of(robot), peer_colors, stamp_ns, stamp_ns)
+        for check in fusion.checks:
+            report = _report(robot, check, stamp_ns)
+            log.write(topics.PEER_MAP_REPORT.of(robot), report, stamp_ns, stamp_ns)
 
 
-def peer_colors(path: Path, robot: str) -> dict[str, ColorMap]:
-    """From every neighbor's colors to the robot's, by name, of its fused.mcap; empty if that holds none."""
-    found = [record.message() for record in read_log(path, (topics.PEER_COLORS.of(robot),))]
-    return {
-        m.peer: ColorMap(
-            np.array(m.gain), np.array(m.offset), np.array(m.gain_sigma), np.array(m.offset_sigma), m.matches
-        )
-        for m in found
-    }
-
-
-def _peer_map_report(robot: str, report: PeerMapReport, stamp_ns: int) -> Any:
-    """duagc.v1.PeerMapReport."""
-    message = schemas.new(
-        "PeerMapReport", robot=robot, used=report.trusted, reason=report.reason, **vars(report)
+def _report(robot: str, check: PeerCheck, stamp_ns: int) -> PeerMapReport:
+    """The check of a peer's map as a message."""
+    return PeerMapReport(
+        stamp_ns=stamp_ns,
+        robot=robot,
+        peer=check.peer,
+        gaussians=check.gaussians,
+        too_large=check.too_large,
+        contradicted=check.contradicted,
+        matches=check.matches,
+        rejected_matches=check.rejected_matches,
+        compared_px=check.compared_px,
+        own_px=check.own_px,
+        color_mse=check.color_mse,
+        color_variance=check.color_variance,
+        used=check.trusted,
+        reason=check.reason,
     )
-    pack_stamp(message, stamp_ns)
-    return message
 
 
 def _information(robot: str, fused: FusedMap, stamp_ns: int) -> GaussianInformation:
@@ -280,7 +301,7 @@ def _information(robot: str, fused: FusedMap, stamp_ns: int) -> GaussianInformat
         observations=fused.members.astype(np.uint32),
         color_sigma=0.0,
         depth_sigma="as each member said",
-        deviation_m=np.zeros(len(fused.gaussians), np.float32),  # in what the members said
+        deviation_m=np.zeros(len(fused.gaussians), np.float32),  # included in the members' information
         color_pixels_per_sample=1.0,
         depth_pixels_per_sample=1.0,
         overlap=1.0,

@@ -23,6 +23,7 @@ from duagc.pipeline.messages.parts import (
     unpack_pose,
     unpack_stamp,
 )
+from duagc.pipeline.messages.peers import PeerColors, PeerMapReport
 from duagc.pipeline.messages.sensors import (
     pack_calibration,
     pack_color,
@@ -49,6 +50,8 @@ __all__ = [
     "KeyframeFactor",
     "MapUpdate",
     "Odometry",
+    "PeerColors",
+    "PeerMapReport",
     "camera_frame",
     "map_frame",
     "pack_calibration",

@@ -25,6 +25,7 @@ from duagc.pipeline.messages.parts import (
     unpack_pose,
     unpack_stamp,
 )
+from duagc.pipeline.messages.peers import PeerColors, PeerMapReport
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
 
 _STATUS = {"ok": 1, "lost": 2, "relocalized": 3}
@@ -485,6 +486,8 @@ _UNPACK: dict[str, Callable[[Any], Any]] = {
         GaussianMap,
         GaussianInformation,
         CorrectedKeyframes,
+        PeerColors,
+        PeerMapReport,
     )
 }
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from duagc.pipeline.evaluation.rendering import in_colors_of, in_world, mates, poses_by_stamp
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.views import score_view, surface_depth
-from duagc.pipeline.fusion.stage import peer_colors
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.messages import GaussianMap
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.report import figures, labels, pictures
 from duagc.pipeline.runs.folder import RobotRun, RunFolder, position_information
+from duagc.pipeline.runs.peer_colors import read_peer_colors
 
 if TYPE_CHECKING:
     from duagc.pipeline.kernels import Rasterizer, Render
@@ -69,7 +69,7 @@ def _peer_views(
     robot: RobotRun, peer: RobotRun, log: RgbdLog, rasterizer: Rasterizer
 ) -> Iterator[dict[str, Any]]:
     """The robot's maps at a frame of a peer, in the colors of the peer's camera."""
-    alike = peer_colors(robot.folder / "fused.mcap", robot.robot).get(peer.robot)
+    alike = read_peer_colors(robot.folder / "fused.mcap", robot.robot).get(peer.robot)
     poses = poses_by_stamp(peer.trajectory)
     kind, final = _final(robot)
     own = in_world(robot, "own", robot.own_map.gaussians)

@@ -37,8 +37,14 @@ class GaussianGradients(Protocol):
     def opacity_logits(self) -> Array: ...
 
 
-def falling(step: int, steps: int, last: float) -> float:
-    """Share of the learning rates at a step of `steps`: from 1 to `last`, level at both ends."""
+def smoothstep_decay(step: int, steps: int, last: float) -> float:
+    """Share of the learning rates at a step: a smoothstep from 1 to `last`.
+
+    Args:
+        step: from 0.
+        steps: in all.
+        last: share at the last step.
+    """
     done = step / max(steps - 1, 1)
     return last + (1.0 - last) * (1.0 - done * done * (3.0 - 2.0 * done))
 
@@ -64,10 +70,12 @@ class Adam:
         return len(self._steps)
 
     def freeze_after(self, steps: int | None) -> None:
-        """From now on Gaussians settle: their step lengths fall to a tenth over their first `steps` steps, and then
-        they stay as they are, and their moments too. None: they never settle.
+        """From now on Gaussians freeze after so many steps, and their moments too.
 
-        Steps go on being counted.
+        Their step lengths fall to a tenth over their first `steps` steps. Steps continue to be counted.
+
+        Args:
+            steps: of a Gaussian; None: Gaussians never freeze.
         """
         self._corrections = self._unbiased.copy()
         if steps is not None:

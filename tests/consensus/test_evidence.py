@@ -88,7 +88,7 @@ def test_anchored_and_back_in_the_map_is_what_the_map_said():
 
 def test_own_splats_are_as_stiff_as_all_that_share_a_pixel():
     gaussians, sums, T_map_keyframe = random_map(7)
-    back = Evidence.of_splats("alpha", gaussians, sums, T_map_keyframe).in_world(T_map_keyframe)
+    back = Evidence.from_rendering("alpha", gaussians, sums, T_map_keyframe).in_world(T_map_keyframe)
     geometry = unpack_symmetric(sums.geometry, 9)
     np.testing.assert_allclose(back.position_information(), 12 * geometry[:, :3, :3], atol=1e-10)
     np.testing.assert_allclose(back.opacity_information(), 12 * sums.opacity)

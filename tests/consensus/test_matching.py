@@ -42,7 +42,7 @@ def test_two_samplings_of_one_wall_match():
     i = np.searchsorted(np.sort(a.ids), pairs[:, 0])
     row_a, row_b = np.argsort(a.ids)[i], np.argsort(b.ids)[np.searchsorted(np.sort(b.ids), pairs[:, 1])]
     assert np.linalg.norm(a.theta[row_a, MEAN] - b.theta[row_b, MEAN], axis=1).max() <= CONFIG.radius_m
-    assert gaussian_distance(a, row_a, b, row_b, CONFIG).max() < threshold(a, CONFIG)
+    assert gaussian_distance(a, row_a, b, row_b, CONFIG).max() < threshold(a, config=CONFIG)
 
 
 def test_every_gaussian_is_matched_at_most_once():
@@ -78,7 +78,7 @@ def test_matches_are_mutual_bests_of_all_candidates():
     a, b = surface("alpha", 7, n=100), surface("bravo", 8, n=100)
     config = CONFIG.model_copy(update={"candidates": 100})
     i, j = np.meshgrid(np.arange(len(a)), np.arange(len(b)), indexing="ij")
-    d = gaussian_distance(a, i.ravel(), b, j.ravel(), config).reshape(i.shape)
+    d = gaussian_distance(a, i.ravel(), b, j.ravel(), config=config).reshape(i.shape)
     far = np.linalg.norm(a.theta[:, None, MEAN] - b.theta[None, :, MEAN], axis=-1) > config.radius_m
     d[far | (d >= threshold(a, config))] = np.inf
     expected = {
@@ -105,12 +105,12 @@ def test_thickness_at_the_floor_says_nothing():
     theta[:, LOG_COVARIANCE] = spd.log_covariance(np.tile([1.0, 0, 0, 0], (2, 1)), scales)
     e = Evidence("alpha", np.arange(2), np.zeros(2), theta, np.zeros((2, 31)))
     zero, one = np.array([0]), np.array([1])
-    assert gaussian_distance(e, zero, e, one, CONFIG)[0] == pytest.approx(0.0, abs=1e-12)
+    assert gaussian_distance(e, zero, e, one, config=CONFIG)[0] == pytest.approx(0.0, abs=1e-12)
     thick = scales + np.log(2.0)
     theta[1, LOG_COVARIANCE] = spd.log_covariance(np.array([1.0, 0, 0, 0]), thick[0])
     thicker = Evidence("alpha", np.arange(2), np.zeros(2), theta, np.zeros((2, 31)))
     expected = np.sqrt(0.1 * 2 * (2 * np.log(2)) ** 2)  # two axes along the surface, not the third
-    assert gaussian_distance(thicker, zero, thicker, one, CONFIG)[0] == pytest.approx(expected)
+    assert gaussian_distance(thicker, zero, thicker, one, config=CONFIG)[0] == pytest.approx(expected)
 
 
 def identical(owner, ids):
@@ -174,7 +174,7 @@ def test_tracks_of_five_robots_are_what_a_plain_search_finds(seed):
 
     def far(edge):
         (a, x), (b, y) = edge
-        return gaussian_distance(evidence[a], np.array([x]), evidence[b], np.array([y]), CONFIG)[0]
+        return gaussian_distance(evidence[a], np.array([x]), evidence[b], np.array([y]), config=CONFIG)[0]
 
     def parts(edges):
         found = []
@@ -205,6 +205,6 @@ def test_a_tilt_counts_even_between_discs_at_the_floor():
     theta = np.zeros((3, 13))
     theta[:, LOG_COVARIANCE] = spd.log_covariance(quats, scales)
     e = Evidence("alpha", np.arange(3), np.zeros(3), theta, np.zeros((3, 31)))
-    little, corner = gaussian_distance(e, np.array([0, 0]), e, np.array([1, 2]), CONFIG)
+    little, corner = gaussian_distance(e, np.array([0, 0]), e, np.array([1, 2]), config=CONFIG)
     assert little < 0.3
     assert corner > 1.0

@@ -9,7 +9,13 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.config.consensus import WeightKind
 from duagc.pipeline.consensus.evidence import Evidence
-from duagc.pipeline.consensus.weighting import UNIT_SIGMA_M, UNIT_SIGMA_SHAPE, in_world, own_stiffness, told
+from duagc.pipeline.consensus.weighting import (
+    UNIT_SIGMA_M,
+    UNIT_SIGMA_SHAPE,
+    in_world,
+    self_information,
+    shared_evidence,
+)
 from tests.consensus.test_evidence import Sums, random_map
 from tests.consensus.worlds import random_poses
 
@@ -30,7 +36,7 @@ def world(seed: int) -> tuple[Any, Seen, Any]:
 def told_in_map(seed: int, kind: WeightKind) -> tuple[Evidence, Seen, Any]:
     gaussians, sums, T_map_keyframe = world(seed)
     return (
-        in_world(told("alpha", gaussians, sums, T_map_keyframe, kind), T_map_keyframe, kind),
+        in_world(shared_evidence("alpha", gaussians, sums, T_map_keyframe, kind=kind), T_map_keyframe, kind),
         sums,
         gaussians,
     )
@@ -63,7 +69,7 @@ def test_what_each_kind_keeps() -> None:
 def test_all_but_the_diagonal_are_the_same_in_every_frame(kind: WeightKind) -> None:
     gaussians, sums, T_map_keyframe = world(1)
     T = random_poses(np.random.default_rng(2), 1)[0]
-    evidence = told("alpha", gaussians, sums, T_map_keyframe, kind)
+    evidence = shared_evidence("alpha", gaussians, sums, T_map_keyframe, kind=kind)
     here, there = in_world(evidence, T_map_keyframe, kind), in_world(evidence, T @ T_map_keyframe, kind)
     turned = T[:3, :3] @ here.position_information() @ T[:3, :3].T
     same = np.allclose(there.position_information(), turned, rtol=1e-9, atol=1e-7)
@@ -77,13 +83,13 @@ def test_all_but_the_diagonal_are_the_same_in_every_frame(kind: WeightKind) -> N
 
 def test_own_splats_are_stiffer_only_where_information_counts() -> None:
     gaussians, sums, T_map_keyframe = world(3)
-    stiff = own_stiffness("alpha", gaussians, sums, T_map_keyframe, "block")
-    same = Evidence.of_splats("alpha", gaussians, sums, T_map_keyframe)
+    stiff = self_information("alpha", gaussians, sums, T_map_keyframe, kind="block")
+    same = Evidence.from_rendering("alpha", gaussians, sums, T_map_keyframe)
     np.testing.assert_array_equal(stiff.information, same.information)
     for kind in ("uniform", "scalar"):
         np.testing.assert_array_equal(
-            own_stiffness("alpha", gaussians, sums, T_map_keyframe, kind).information,
-            told("alpha", gaussians, sums, T_map_keyframe, kind).information,
+            self_information("alpha", gaussians, sums, T_map_keyframe, kind=kind).information,
+            shared_evidence("alpha", gaussians, sums, T_map_keyframe, kind=kind).information,
         )
 
 
@@ -92,6 +98,6 @@ def test_what_the_sums_do_not_name_has_no_counted_weight() -> None:
     half = Seen(**{k: v[::2] if isinstance(v, np.ndarray) else v for k, v in vars(sums).items()})
     missing = ~np.isin(gaussians.ids, half.ids)
     for kind in ("observation_count", "residual_magnitude", "scalar"):
-        evidence = told("alpha", gaussians, half, T_map_keyframe, kind)
+        evidence = shared_evidence("alpha", gaussians, half, T_map_keyframe, kind=kind)
         assert missing.any()
         assert not evidence.information[missing].any()

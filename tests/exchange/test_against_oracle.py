@@ -17,7 +17,8 @@ from duagc.pipeline.consensus.pose_admm import with_floor
 from duagc.pipeline.consensus.weights import Weights
 from duagc.pipeline.evaluation.oracle import WeightedClosure, pose_gap, solve_component
 from duagc.pipeline.exchange.session import run_session_of
-from duagc.pipeline.fusion.fuse import fuse
+from duagc.pipeline.fusion.context import MapContext
+from duagc.pipeline.fusion.fuse import OwnMap, fuse
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.loop_closures import Closure
 from duagc.pipeline.runs.robot_data import AgentResult, RobotData, factors_of
@@ -79,18 +80,13 @@ def fused_theta(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """theta of a robot's own Gaussians after fusion, roots of their information, and which were matched."""
     own = next(d for d in data if d.robot == name)
+    splats = Evidence.from_rendering(own.robot, own.gaussians, own.information, own.T_map_keyframe)
     fused = fuse(
-        name,
-        own.gaussians,
-        own.T_map_keyframe,
-        evidence,
-        Evidence.of_splats(own.robot, own.gaussians, own.information, own.T_map_keyframe),
-        poses,
+        OwnMap(name, own.gaussians, own.T_map_keyframe, poses[name]),
+        {robot: e.in_world(poses[robot]) for robot, e in evidence.items()},
         pairs,
-        (),
-        own.camera,
-        FusionConfig(coverage="overlap"),
-        MatchingConfig(),
+        MapContext(own.camera, FusionConfig(coverage="overlap"), MatchingConfig()),
+        self_information=splats.in_world(poses[name]),
     )
     n = len(own.gaussians)
     whole = Evidence(name, own.gaussians.ids, own.gaussians.anchors, fused.theta[:n], fused.information[:n])

@@ -2,16 +2,18 @@
 
 import numpy as np
 
+from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.consensus.evidence import Evidence
-from duagc.pipeline.fusion.fuse import FusionConfig, explained, fuse
+from duagc.pipeline.fusion.coverage import explained
+from duagc.pipeline.fusion.fuse import OwnMap
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import LOG_COVARIANCE, MEAN
 from tests.fusion.worlds import (
     CAMERA,
     CONFIG,
-    MATCHING,
     N,
     World,
+    fused,
     information,
 )
 
@@ -40,7 +42,7 @@ def test_neighbors_unmatched_gaussians_fill_only_unseen_space():
     points = np.array(
         [[-0.5, 0, 1.0], [-0.5, 0, 2.1], [-0.5, 0, 2.5], [0.5, 0, 1.0], [0, 0, -1.0], [9, 0, 1.0]]
     )
-    seen = explained(points, np.eye(4)[None], [(0, depth)], CAMERA, CONFIG)
+    seen = explained(points, np.eye(4)[None], [(0, depth)], CAMERA, config=CONFIG)
     # in front of the wall, at it, behind it, where nothing was measured, behind the camera, beside the image
     assert seen.tolist() == [True, True, False, False, False, False]
     theta = np.zeros((6, 13))
@@ -52,13 +54,13 @@ def test_neighbors_unmatched_gaussians_fill_only_unseen_space():
         "pairs": {},
         "T_world_keyframe": {"alpha": np.tile(np.eye(4), (3, 1, 1)), "bravo": np.eye(4)[None]},
     }
-    fused = world.fuse("alpha", depth_images=[(0, depth)], **given)
-    assert fused.added == 4
-    new = fused.gaussians.select(slice(N, None))
+    found = world.fuse("alpha", depth_images=[(0, depth)], **given)
+    assert found.added == 4
+    new = found.gaussians.select(slice(N, None))
     np.testing.assert_allclose(new.means, points[2:], atol=1e-6)
-    np.testing.assert_array_equal(fused.source_ids[N:], [2, 3, 4, 5])
-    assert [fused.robots[s] for s in fused.source[N:]] == ["bravo"] * 4
-    assert len(np.unique(fused.gaussians.ids)) == N + 4
+    np.testing.assert_array_equal(found.source_ids[N:], [2, 3, 4, 5])
+    assert [found.robots[s] for s in found.source[N:]] == ["bravo"] * 4
+    assert len(np.unique(found.gaussians.ids)) == N + 4
     beside = np.array([[0.05, 0, 1.0], [0.3, 0, 1.0]])  # 2 and 15 pixels beside the wall's outline
     for px, count in ((4, 1), (0, 2)):
         taken = theta[:2].copy()
@@ -93,12 +95,18 @@ def test_the_own_map_explains_where_depth_is_missing():
     }
     poses, nothing = {"alpha": origin, "bravo": origin}, np.zeros((CAMERA.height, CAMERA.width), np.float32)
     taken = {
-        opacity: fuse(
-            "alpha", own, origin, evidence, evidence["alpha"], poses, {}, [(0, nothing)], CAMERA,
-            CONFIG.model_copy(update={"explained_opacity": opacity}), MATCHING,
-        ).source_ids[n:].tolist()
+        opacity: fused(
+            OwnMap("alpha", own, origin, origin),
+            evidence=evidence,
+            T_world_keyframe=poses,
+            pairs={},
+            config=CONFIG.model_copy(update={"explained_opacity": opacity}),
+            depth_images=[(0, nothing)],
+        )
+        .source_ids[n:]
+        .tolist()
         for opacity in (0.5, 1.0)
-    }  # fmt: skip
+    }
     assert taken == {0.5: [2], 1.0: [0, 1, 2]}
 
 
@@ -116,28 +124,23 @@ def test_a_surface_that_the_own_map_hardly_draws_is_not_explained():
     }
     measured = [(0, np.full((CAMERA.height, CAMERA.width), 2.0, np.float32))]
     still = {"alpha": origin, "bravo": origin}
-    fused = fuse(
-        "alpha",
-        own,
-        origin,
-        evidence,
-        evidence["alpha"],
-        still,
-        {},
-        measured,
-        CAMERA,
-        FusionConfig(),
-        MATCHING,
+    found = fused(
+        OwnMap("alpha", own, origin, origin),
+        evidence=evidence,
+        T_world_keyframe=still,
+        pairs={},
+        config=FusionConfig(),
+        depth_images=measured,
     )
-    assert fused.source_ids[n:].tolist() == [1]
+    assert found.source_ids[n:].tolist() == [1]
 
 
 def test_what_two_neighbors_share_is_taken_over_once():
     world = World(14)
     pair = {("bravo", "charlie"): world.pairs["bravo", "charlie"]}
-    fused = world.fuse("alpha", pairs=pair)  # bravo's, with what charlie says about them
-    assert (fused.matched, fused.added) == (0, N)
-    assert [fused.robots[s] for s in fused.source[N:]] == ["bravo"] * N
+    found = world.fuse("alpha", pairs=pair)  # bravo's, with what charlie says about them
+    assert (found.matched, found.added) == (0, N)
+    assert [found.robots[s] for s in found.source[N:]] == ["bravo"] * N
     both = world.fuse("bravo", evidence={n: world.evidence[n] for n in ("bravo", "charlie")}, pairs=pair)
-    np.testing.assert_allclose(fused.gaussians.means[N:], both.gaussians.means, atol=2e-6)
-    np.testing.assert_array_equal(fused.members[N:], 2)
+    np.testing.assert_allclose(found.gaussians.means[N:], both.gaussians.means, atol=2e-6)
+    np.testing.assert_array_equal(found.members[N:], 2)

@@ -7,18 +7,19 @@ from duagc.pipeline.config.consensus import ColorConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import MatchingConfig
 from duagc.pipeline.consensus.weights import Weights
-from duagc.pipeline.fusion.fuse import association_covariance, fuse, weighted_move
+from duagc.pipeline.fusion.association import association_covariance, weighted_move
+from duagc.pipeline.fusion.fuse import OwnMap
 from duagc.pipeline.geometry import se3, so3, spd
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, pack_information
 from tests.fusion.worlds import (
     ALIKE,
-    CAMERA,
     CONFIG,
     MATCHING,
     N,
     World,
     assert_same_map,
+    fused,
     random_pose,
 )
 
@@ -149,7 +150,7 @@ def test_by_default_a_well_known_splat_keeps_its_place_on_the_surface():
     np.testing.assert_allclose(alike, [0.004, 0, 0.002], atol=3e-4)
     a = evidence["alpha"]
     vague = Evidence("alpha", a.ids, a.anchors, a.theta, 1e-6 * a.information)
-    moved = fuse_discs(maps, evidence, own_splats=vague).gaussians.means[0] - own
+    moved = fuse_discs(maps, evidence, self_information=vague).gaussians.means[0] - own
     np.testing.assert_allclose(moved, [0.008, 0, 0.004], atol=3e-4)
 
 
@@ -263,12 +264,19 @@ def tilted_discs(tilt_rad, offset_m, shape_information):
     return maps, evidence
 
 
-def fuse_discs(maps, evidence, config=CONFIG, own_splats=None):
+def fuse_discs(maps, evidence, config=CONFIG, self_information=None):
     origin = np.eye(4)[None]
     pairs = {("alpha", "bravo"): np.array([[0, 0]])}
-    splats = evidence["alpha"] if own_splats is None else own_splats
     still = dict.fromkeys(maps, origin)
-    return fuse("alpha", maps["alpha"], origin, evidence, splats, still, pairs, (), CAMERA, config, MATCHING)
+    own = OwnMap("alpha", maps["alpha"], origin, origin)
+    return fused(
+        own,
+        evidence=evidence,
+        T_world_keyframe=still,
+        pairs=pairs,
+        config=config,
+        self_information=self_information,
+    )
 
 
 def test_tilted_discs_do_not_slide_to_where_their_planes_cross():
@@ -344,10 +352,15 @@ def test_what_is_fused_changes_no_faster_than_what_is_known(config, most_sigma):
         bare = Evidence.from_map(name, maps[name], None, np.eye(4)[None])
         evidence[name] = Evidence(name, bare.ids, bare.anchors, bare.theta, packed)
 
-    def fused(evidence):
+    def fused_once(evidence):
         pairs, still = {("alpha", "bravo"): np.stack([np.arange(n)] * 2, axis=1)}, np.eye(4)[None]
-        return fuse("alpha", maps["alpha"], still, evidence, evidence["alpha"], {"alpha": still, "bravo": still},
-                    pairs, (), CAMERA, config.model_copy(update={"coverage": "overlap"}), MATCHING)  # fmt: skip
+        return fused(
+            OwnMap("alpha", maps["alpha"], still, still),
+            evidence=evidence,
+            T_world_keyframe={"alpha": still, "bravo": still},
+            pairs=pairs,
+            config=config.model_copy(update={"coverage": "overlap"}),
+        )
 
     def shaken(e):
         less, theta = 1 + 1e-6 * rng.uniform(-1, 1, (n, 1)), e.theta.copy()
@@ -355,7 +368,7 @@ def test_what_is_fused_changes_no_faster_than_what_is_known(config, most_sigma):
             theta[:, LOG_COVARIANCE] += 1e-6 * rng.uniform(-1, 1, (n, 6))
         return Evidence(e.owner, e.ids, e.anchors, theta, e.information * less)
 
-    one, other = fused(evidence), fused({name: shaken(e) for name, e in evidence.items()})
+    one, other = fused_once(evidence), fused_once({name: shaken(e) for name, e in evidence.items()})
     sigma = 1 / np.sqrt(
         Weights.of(Evidence("", np.arange(n), np.zeros(n), one.theta, one.information)).diagonal()
     )

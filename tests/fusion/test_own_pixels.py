@@ -1,13 +1,15 @@
-"""Opacities of what was taken over: own pixels against what the owner knew."""
+"""Opacities of imported Gaussians: own pixels against the information of the owner."""
 
 import numpy as np
 import pytest
 
+from duagc.pipeline.config.consensus import MatchingConfig
 from duagc.pipeline.config.fusion import FusionConfig
-from duagc.pipeline.fusion.finetune import View
+from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.fuse import FusedMap
-from duagc.pipeline.fusion.opacity_update import weigh_by_own_pixels
+from duagc.pipeline.fusion.opacity_update import update_opacities
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import OPACITY, OPACITY_INFORMATION, theta_of
@@ -17,45 +19,55 @@ CONFIG = FusionConfig()
 SIGMA = 0.02
 
 
-def views(mask=None) -> list[View]:
-    """Images of the wall and of the third of what is taken over, but not of the first."""
-    seen = with_taken_over(0.0).gaussians
+def views(mask=None) -> list[PosedRgbd]:
+    """Images of the wall and of the third imported disc, but not of the first."""
+    seen = with_imported(0.0).gaussians
     seen = seen.select(np.r_[: len(wall()), len(seen) - 1])
     out = []
     for T in POSES:
         render = Rasterizer().forward(seen, CAMERA, se3.inverse(T))
         color = np.clip(np.rint(255 * render.color), 0, 255).astype(np.uint8)
-        out.append(View(color, np.zeros(color.shape[:2], np.float32), T, mask))
+        out.append(PosedRgbd(color, np.zeros(color.shape[:2], np.float32), T, mask))
     return out
 
 
-def with_taken_over(information: float) -> FusedMap:
-    """The wall, and three white discs of a neighbor's: before it, behind the cameras, before it again."""
+def with_imported(information: float) -> FusedMap:
+    """The wall, and three white discs of a peer: in front of it, behind the cameras, in front of it again."""
     own = wall()
     means = np.array([[0.3, 0.0, 1.5], [0.0, 0.0, -2.0], [-0.3, 0.1, 1.6]])
     quats, scales = np.tile([1.0, 0, 0, 0], (3, 1)), np.tile(np.log([0.08, 0.08, 0.001]), (3, 1))
-    taken = Gaussians(
+    imported = Gaussians(
         1000 + np.arange(3), np.zeros(3), means, quats, scales, np.ones((3, 3)), np.full(3, 2.0)
     )
-    gaussians = Gaussians.concatenate([own, taken])
+    gaussians = Gaussians.concatenate([own, imported])
     n = len(gaussians)
     sums = np.zeros((n, 31))
     sums[:, OPACITY_INFORMATION] = information
     source = np.where(np.arange(n) < len(own), 0, 1).astype(np.int32)
     return FusedMap(
-        gaussians, theta_of(gaussians), sums, ("alpha", "bravo"), source, gaussians.ids, np.ones(n, np.int32), 0, 3, {}
-    )  # fmt: skip
+        gaussians=gaussians,
+        theta=theta_of(gaussians),
+        information=sums,
+        robots=("alpha", "bravo"),
+        source=source,
+        source_ids=gaussians.ids,
+        members=np.ones(n, np.int32),
+        matched=0,
+        added=3,
+        colors={},
+    )
 
 
-def weighed(information: float, config: FusionConfig = CONFIG, threads: int = 1, mask=None) -> FusedMap:
-    fused = with_taken_over(information)
-    return weigh_by_own_pixels(
-        fused, len(wall()), views(mask), CAMERA, SIGMA, 9.0, config, "blended", threads
-    )  # fmt: skip
+def updated(information: float, config: FusionConfig = CONFIG, threads: int = 1, mask=None) -> FusedMap:
+    fused = with_imported(information)
+    context = MapContext(CAMERA, config, MatchingConfig(), threads=threads)
+    return update_opacities(
+        fused, views(mask), context, num_own=len(wall()), color_sigma=SIGMA, pixels_per_sample=9.0
+    )
 
 
 def test_what_own_pixels_contradict_fades_and_nothing_else_changes():
-    before, after = with_taken_over(1.0), weighed(1.0)
+    before, after = with_imported(1.0), updated(1.0)
     n = len(wall())
     hanging, unseen, fitting = after.gaussians.opacity_logits[n:]
     assert hanging < -2.0
@@ -68,20 +80,20 @@ def test_what_own_pixels_contradict_fades_and_nothing_else_changes():
     np.testing.assert_allclose(after.theta[:, OPACITY], after.gaussians.opacity_logits, atol=1e-6)
 
 
-def test_an_owner_who_is_sure_is_believed_more():
+def test_more_information_of_the_owner_counts_more():
     n = len(wall())
-    logits = [float(weighed(w).gaussians.opacity_logits[n]) for w in (1.0, 1e3, 1e5, 1e12)]
+    logits = [float(updated(w).gaussians.opacity_logits[n]) for w in (1.0, 1e3, 1e5, 1e12)]
     assert logits == sorted(logits)
     assert logits[-1] == pytest.approx(2.0, abs=1e-3)
 
 
 def test_without_steps_or_usable_pixels_every_bit_stays():
-    before = with_taken_over(1.0)
+    before = with_imported(1.0)
     none = np.zeros((CAMERA.height, CAMERA.width), bool)
-    for after in (weighed(1.0, CONFIG.model_copy(update={"own_pixel_steps": 0})), weighed(1.0, mask=none)):
+    for after in (updated(1.0, CONFIG.model_copy(update={"own_pixel_steps": 0})), updated(1.0, mask=none)):
         np.testing.assert_array_equal(after.gaussians.opacity_logits, before.gaussians.opacity_logits)
 
 
 def test_threads_do_not_show():
-    one, three = weighed(1.0), weighed(1.0, threads=3)
+    one, three = updated(1.0), updated(1.0, threads=3)
     np.testing.assert_array_equal(one.gaussians.opacity_logits, three.gaussians.opacity_logits)

@@ -8,9 +8,10 @@ import pytest
 from duagc.pipeline.config.consensus import MatchingConfig
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.consensus.evidence import Evidence
-from duagc.pipeline.fusion.finetune import View
+from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.peer_validation import ValidatedPeers, validate_peer_maps
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY, theta_of
@@ -25,23 +26,23 @@ def wall() -> Gaussians:
 
 
 N = len(wall())
-HERE = {"alpha": np.eye(4)[None], "bravo": np.eye(4)[None]}
+HERE = np.eye(4)[None]
 
 
 @pytest.fixture(scope="module")
-def views() -> list[View]:
+def views() -> list[PosedRgbd]:
     out = []
     for T in POSES:
         render = Rasterizer().forward(wall(), CAMERA, se3.inverse(T))
         alpha = np.maximum(render.alpha, 1e-6)
         color = np.rint(255 * np.clip(render.color / alpha[..., None], 0, 1)).astype(np.uint8)
         depth = np.where(render.alpha > 0.5, render.depth / alpha, 0).astype(np.float32)
-        out.append(View(color, depth, T))
+        out.append(PosedRgbd(color, depth, T))
     return out
 
 
 def map_of(robot: str, change=lambda theta: None, discs=()) -> Evidence:
-    """The wall as a robot tells of it, with small errors, changed; and discs (center, size, color) beside it."""
+    """The wall as a robot shares it, with small errors, changed; and discs (center, size, color) next to it."""
     rng = np.random.default_rng(len(robot))
     theta = theta_of(wall())
     theta[:, MEAN] += rng.normal(0, 0.002, (N, 3))
@@ -56,24 +57,30 @@ def map_of(robot: str, change=lambda theta: None, discs=()) -> Evidence:
     return Evidence(robot, ids, np.zeros(len(theta), np.int32), theta, np.ones((len(theta), 31)))
 
 
-def told(views: list[View], bravo: Evidence, pairs=None, threads: int = 1) -> ValidatedPeers:
+def validated_by_alpha(
+    views: list[PosedRgbd], bravo: Evidence, pairs=None, threads: int = 1
+) -> ValidatedPeers:
     ids = 10 + np.arange(N)
     pairs = {("alpha", "bravo"): np.stack([ids, ids], axis=1)} if pairs is None else pairs
     return validate_peer_maps(
-        map_of("alpha"), {"bravo": bravo}, HERE, pairs, views, CAMERA, FusionConfig(), MatchingConfig(),
-        {"bravo": "blended"}, threads=threads,
-    )  # fmt: skip
+        map_of("alpha").in_world(HERE),
+        {"bravo": bravo.in_world(HERE)},
+        pairs,
+        MapContext(CAMERA, FusionConfig(), MatchingConfig(), threads=threads),
+        views=views,
+        depth_kinds={"bravo": "blended"},
+    )
 
 
-def test_an_honest_neighbor_is_believed(views):
-    validated = told(views, map_of("bravo"))
-    (report,) = validated.reports
-    assert report.trusted
-    assert report.reason == ""
-    assert (report.too_large, report.contradicted, report.rejected_matches) == (0, 0, 0)
-    assert report.color_mse < 0.1 * report.color_variance
-    assert report.compared_px > 0.5 * report.own_px
-    assert len(validated.evidence["bravo"]) == len(validated.pairs["alpha", "bravo"]) == report.matches == N
+def test_an_honest_peer_is_trusted(views):
+    validated = validated_by_alpha(views, map_of("bravo"))
+    (check,) = validated.checks
+    assert check.trusted
+    assert check.reason == ""
+    assert (check.too_large, check.contradicted, check.rejected_matches) == (0, 0, 0)
+    assert check.color_mse < 0.1 * check.color_variance
+    assert check.compared_px > 0.5 * check.own_px
+    assert len(validated.evidence["bravo"]) == len(validated.pairs["alpha", "bravo"]) == check.matches == N
 
 
 def repaint(color):
@@ -85,62 +92,67 @@ def repaint(color):
 
 @pytest.mark.parametrize("color", [lambda c: 1 - c, np.zeros_like, lambda c: c[::-1]])
 def test_made_up_colors_leave_a_neighbor_out(views, color):
-    validated = told(views, map_of("bravo", repaint(color)))
-    (report,) = validated.reports
-    assert not report.trusted
-    assert "contradicts own images" in report.reason
+    validated = validated_by_alpha(views, map_of("bravo", repaint(color)))
+    (check,) = validated.checks
+    assert not check.trusted
+    assert "contradicts own images" in check.reason
     assert len(validated.evidence["bravo"]) == len(validated.pairs["alpha", "bravo"]) == 0
 
 
 def test_another_camera_is_no_lie(views):
-    assert told(views, map_of("bravo", repaint(lambda c: 0.6 * c + 0.05))).reports[0].trusted
+    assert validated_by_alpha(views, map_of("bravo", repaint(lambda c: 0.6 * c + 0.05))).checks[0].trusted
 
 
-def test_discs_before_own_cameras_are_contradicted_and_the_rest_is_believed(views):
-    """In free space, and beside the view of the first camera but reaching into it."""
+def test_discs_before_own_cameras_are_contradicted_and_the_rest_is_trusted(views):
+    """In free space, and next to the view of the first camera but reaching into it."""
     discs = [
         ((0.2, 0.1, 0.8), 0.05, (0, 0, 0)),
         ((-0.62, 0, 1.0), 0.15, (1, 1, 1)),
         ((0, 0, -3), 0.05, (0, 0, 0)),
     ]
-    validated = told(views, map_of("bravo", discs=discs))
-    assert validated.reports[0].trusted
+    validated = validated_by_alpha(views, map_of("bravo", discs=discs))
+    assert validated.checks[0].trusted
     assert validated.contradicted["bravo"][N:].tolist() == [True, True, False]
     assert np.mean(validated.contradicted["bravo"][:N]) < 0.05  # those that share pixels with them
 
 
 def test_what_lies_behind_own_surfaces_is_not_judged(views):
-    validated = told(views, map_of("bravo", discs=[((0, 0, 4), 0.1, (0, 0, 0))]))
+    validated = validated_by_alpha(views, map_of("bravo", discs=[((0, 0, 4), 0.1, (0, 0, 0))]))
     assert not validated.contradicted["bravo"].any()
 
 
 def test_gaussians_of_impossible_size_are_left_out(views):
     """Also those that no rasterizer can draw."""
     discs = [((0, 0, 4), 1.0, (0, 0, 0)), ((0, 0, 4), 1e13, (0, 0, 0)), ((0, 0, 4), 1e30, (0, 0, 0))]
-    validated = told(views, map_of("bravo", discs=discs))
-    assert validated.reports[0].too_large == 3
+    validated = validated_by_alpha(views, map_of("bravo", discs=discs))
+    assert validated.checks[0].too_large == 3
     assert len(validated.evidence["bravo"]) == N
 
 
 def test_matches_far_apart_unlike_or_of_nothing_are_refused(views):
     ids = 10 + np.arange(N)
     wrong = np.stack([ids, np.roll(ids, 1)], axis=1)
-    validated = told(views, map_of("bravo"), {("alpha", "bravo"): wrong})
-    assert validated.reports[0].rejected_matches > 0.95 * N
-    assert told(views, map_of("bravo"), {("alpha", "bravo"): wrong + 10_000}).reports[0].rejected_matches == N
+    validated = validated_by_alpha(views, map_of("bravo"), {("alpha", "bravo"): wrong})
+    assert validated.checks[0].rejected_matches > 0.95 * N
+    assert (
+        validated_by_alpha(views, map_of("bravo"), {("alpha", "bravo"): wrong + 10_000})
+        .checks[0]
+        .rejected_matches
+        == N
+    )
     white = map_of("bravo", lambda theta: theta.__setitem__((slice(0, 20), COLOR), 2.0))
-    assert told(views, white).reports[0].rejected_matches == 20
+    assert validated_by_alpha(views, white).checks[0].rejected_matches == 20
 
 
 def test_a_neighbor_that_shares_no_view_is_not_judged(views):
     away = map_of("bravo", lambda theta: theta.__setitem__((slice(None), 2), -5.0))
-    report = told(views, replace(away, theta=away.theta)).reports[0]
-    assert report.trusted
-    assert report.compared_px == report.contradicted == 0
+    check = validated_by_alpha(views, replace(away, theta=away.theta)).checks[0]
+    assert check.trusted
+    assert check.compared_px == check.contradicted == 0
 
 
 def test_threads_do_not_show(views):
     bravo = map_of("bravo", discs=[((0.2, 0.1, 0.8), 0.05, (0, 0, 0))])
-    one, three = told(views, bravo), told(views, bravo, threads=3)
-    assert one.reports == three.reports
+    one, three = validated_by_alpha(views, bravo), validated_by_alpha(views, bravo, threads=3)
+    assert one.checks == three.checks
     np.testing.assert_array_equal(one.contradicted["bravo"], three.contradicted["bravo"])

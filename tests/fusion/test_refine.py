@@ -5,19 +5,32 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from duagc.pipeline.config.fusion import RefineConfig
+from duagc.pipeline.config.consensus import MatchingConfig
+from duagc.pipeline.config.fusion import FusionConfig, RefineConfig
+from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.consensus.evidence import Evidence
-from duagc.pipeline.fusion.finetune import View, refine, steps_of
+from duagc.pipeline.fusion.context import MapContext
+from duagc.pipeline.fusion.finetune import finetune_map, num_steps
 from duagc.pipeline.fusion.peer_views import peer_views
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
 from duagc.pipeline.splat.losses import psnr
 
 CAMERA = PinholeCamera(64, 48, 55.0, 55.0, 31.5, 23.5)
 ALL = np.ones(400, bool)
+
+
+def context(
+    config: RefineConfig, depth_kind: DepthKind = "blended", seed: int = 0, threads: int = 1
+) -> MapContext:
+    fusion = FusionConfig(refine=config)
+    return MapContext(CAMERA, fusion, MatchingConfig(), depth_kind, threads=threads, seed=seed)
+
+
 ALIKE = {"zulu": ColorMap(np.ones(3), np.zeros(3), np.zeros(3), np.zeros(3), 0)}
 POSES = [se3.exp(np.array([0.05 * k, 0.02 * k, 0, 0, -0.02 * k, 0])) for k in range(6)]
 
@@ -39,7 +52,7 @@ def wall(n: int = 400) -> Gaussians:
 
 
 @pytest.fixture(scope="module")
-def spoilt() -> tuple[Gaussians, list[View]]:
+def spoiled() -> tuple[Gaussians, list[PosedRgbd]]:
     """A wall whose Gaussians were moved and dulled after its images were taken."""
     true = wall()
     views = []
@@ -47,41 +60,39 @@ def spoilt() -> tuple[Gaussians, list[View]]:
         render = Rasterizer().forward(true, CAMERA, se3.inverse(T))
         depth = np.where(render.alpha > 0.9, render.depth / np.maximum(render.alpha, 1e-6), 0)
         color = np.clip(np.rint(255 * render.color), 0, 255).astype(np.uint8)
-        views.append(View(color, depth.astype(np.float32), T))
+        views.append(PosedRgbd(color, depth.astype(np.float32), T))
     rng = np.random.default_rng(1)
     moved = true.means + rng.normal(0, 0.01, true.means.shape).astype(np.float32)
     return true.replace(means=moved, colors=0.8 * true.colors), views
 
 
-def score(gaussians: Gaussians, views: list[View]) -> float:
+def score(gaussians: Gaussians, views: list[PosedRgbd]) -> float:
     drawn = [Rasterizer().forward(gaussians, CAMERA, se3.inverse(v.T_world_camera)) for v in views]
     return float(np.mean([psnr(r.color, v.color / 255) for r, v in zip(drawn, views, strict=True)]))
 
 
-def test_it_draws_better_also_where_it_was_not_trained(spoilt: tuple[Gaussians, list[View]]) -> None:
-    gaussians, views = spoilt
+def test_it_draws_better_also_where_it_was_not_trained(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
+    gaussians, views = spoiled
     train, held_out = views[::2], views[1::2]
-    better = refine(
-        gaussians, ALL, train, CAMERA, RefineConfig(steps_per_view=30, rate=0.3), 1e-3, "blended", seed=0
-    )
+    better = finetune_map(gaussians, train, context(RefineConfig(steps_per_view=30, rate=0.3)))
     assert score(better, train) > score(gaussians, train) + 5
     assert score(better, held_out) > score(gaussians, held_out) + 3
     assert np.array_equal(better.ids, gaussians.ids)
 
 
-def test_what_no_view_sees_stays(spoilt: tuple[Gaussians, list[View]]) -> None:
-    gaussians, views = spoilt
-    better = refine(gaussians, ALL, views, CAMERA, RefineConfig(), 1e-3, "blended", seed=0)
+def test_what_no_view_sees_stays(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
+    gaussians, views = spoiled
+    better = finetune_map(gaussians, views, context(RefineConfig()))
     for name in ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits"):
         before, after = getattr(gaussians, name), getattr(better, name)
         assert np.array_equal(before[-10:], after[-10:])
         assert not np.array_equal(before[:-10], after[:-10])
 
 
-def test_what_others_own_stays(spoilt: tuple[Gaussians, list[View]]) -> None:
-    gaussians, views = spoilt
+def test_what_others_own_stays(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
+    gaussians, views = spoiled
     own = np.arange(400) % 3 > 0
-    better = refine(gaussians, own, views, CAMERA, RefineConfig(), 1e-3, "blended", seed=0)
+    better = finetune_map(gaussians, views, context(RefineConfig()), trained=own)
     for name in ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits"):
         before, after = getattr(gaussians, name), getattr(better, name)
         assert np.array_equal(before[~own], after[~own])
@@ -89,18 +100,18 @@ def test_what_others_own_stays(spoilt: tuple[Gaussians, list[View]]) -> None:
     assert score(better, views) > score(gaussians, views)
 
 
-def test_masked_pixels_teach_nothing(spoilt: tuple[Gaussians, list[View]]) -> None:
-    gaussians, views = spoilt
-    nothing = [View(v.color, v.depth_m, v.T_world_camera, np.zeros((48, 64), bool)) for v in views]
-    same = refine(gaussians, ALL, nothing, CAMERA, RefineConfig(), 1e-3, "blended", seed=0)
+def test_masked_pixels_teach_nothing(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
+    gaussians, views = spoiled
+    nothing = [PosedRgbd(v.color, v.depth_m, v.T_world_camera, np.zeros((48, 64), bool)) for v in views]
+    same = finetune_map(gaussians, nothing, context(RefineConfig()))
     assert np.array_equal(same.means, gaussians.means)
     assert np.array_equal(same.colors, gaussians.colors)
 
 
-def test_the_same_bits_on_any_number_of_threads(spoilt: tuple[Gaussians, list[View]]) -> None:
-    gaussians, views = spoilt
+def test_the_same_bits_on_any_number_of_threads(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
+    gaussians, views = spoiled
     one, three, other = (
-        refine(gaussians, ALL, views, CAMERA, RefineConfig(), 1e-3, "ray_plane", seed=seed, threads=threads)
+        finetune_map(gaussians, views, context(RefineConfig(), "ray_plane", seed=seed, threads=threads))
         for seed, threads in ((0, 1), (0, 3), (1, 1))
     )
     assert np.array_equal(one.means, three.means)
@@ -108,13 +119,26 @@ def test_the_same_bits_on_any_number_of_threads(spoilt: tuple[Gaussians, list[Vi
     assert not np.array_equal(one.means, other.means)
 
 
-def test_no_steps_change_nothing(spoilt: tuple[Gaussians, list[View]]) -> None:
-    gaussians, views = spoilt
-    assert (
-        refine(gaussians, ALL, views, CAMERA, RefineConfig(steps_per_view=0), 1e-3, "blended", seed=0)
-        is gaussians
+def test_no_steps_change_nothing(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
+    gaussians, views = spoiled
+    assert finetune_map(gaussians, views, context(RefineConfig(steps_per_view=0))) is gaussians
+    assert finetune_map(gaussians, [], context(RefineConfig())) is gaussians
+
+
+def seen_by_zulu(
+    evidence: Evidence,
+    T_world_keyframe: np.ndarray,
+    most: int,
+    depth_kind: DepthKind = "blended",
+    threads: int = 1,
+) -> list[PosedRgbd]:
+    return peer_views(
+        {"zulu": evidence.in_world(T_world_keyframe)},
+        {"zulu": T_world_keyframe},
+        context(RefineConfig(peer_views=most), threads=threads),
+        depth_kinds={"zulu": depth_kind},
+        colors=ALIKE,
     )
-    assert refine(gaussians, ALL, [], CAMERA, RefineConfig(), 1e-3, "blended", seed=0) is gaussians
 
 
 def test_a_neighbors_map_is_drawn_with_the_depth_that_it_was_made_with() -> None:
@@ -123,7 +147,7 @@ def test_a_neighbors_map_is_drawn_with_the_depth_that_it_was_made_with() -> None
     evidence = Evidence.from_map("zulu", tilted.replace(anchors=np.zeros(400, np.int32)), None, poses)
     seen = {}
     for depth in DEPTH_KINDS:
-        (view,) = peer_views({"zulu": evidence}, {"zulu": poses}, CAMERA, 1, {"zulu": depth}, colors=ALIKE)
+        (view,) = seen_by_zulu(evidence, poses, 1, depth)
         render = Rasterizer().forward(tilted, CAMERA, se3.inverse(poses[0]), depth_kind=depth)
         sure = (render.alpha > 0.901) & (view.depth_m > 0)
         assert sure.any()
@@ -139,12 +163,10 @@ def test_a_neighbors_map_shows_what_it_would_from_where_the_neighbor_stood() -> 
         size=(400, 3)
     )  # no two at one depth
     true = true.replace(means=scattered.astype(np.float32))
-    hung = true.replace(anchors=anchors.astype(np.int32))
-    evidence = Evidence.from_map("zulu", hung, None, poses)
+    anchored = true.replace(anchors=anchors.astype(np.int32))
+    evidence = Evidence.from_map("zulu", anchored, None, poses)
     there = T_world_map @ poses
-    all_of_them = peer_views(
-        {"zulu": evidence}, {"zulu": there}, CAMERA, 40, {"zulu": "blended"}, colors=ALIKE
-    )
+    all_of_them = seen_by_zulu(evidence, there, 40)
     assert len(all_of_them) == 5  # three keyframes and the two places between them
     for k, view in enumerate(all_of_them[::2]):
         np.testing.assert_allclose(view.T_world_camera, there[k], atol=1e-12)
@@ -158,41 +180,39 @@ def test_a_neighbors_map_shows_what_it_would_from_where_the_neighbor_stood() -> 
         share = render.alpha[sure]
         np.testing.assert_allclose(view.depth_m[sure], render.depth[sure] / share, atol=1e-3)
         np.testing.assert_allclose(view.color[sure], 255 * render.color[sure] / share[:, None], atol=1)
-    some = peer_views(
-        {"zulu": evidence}, {"zulu": there}, CAMERA, 2, {"zulu": "blended"}, threads=2, colors=ALIKE
-    )
+    some = seen_by_zulu(evidence, there, 2, threads=2)
     assert [v.T_world_camera.tolist() for v in some] == [
         all_of_them[k].T_world_camera.tolist() for k in (1, 3)
     ]
     assert np.array_equal(some[0].color, all_of_them[1].color)
-    assert peer_views({}, {}, CAMERA, 40, {}, colors=ALIKE) == []
+    assert peer_views({}, {}, context(RefineConfig()), depth_kinds={}, colors={}) == []
 
 
-def test_neighbors_views_teach_what_own_ones_do_not_see(spoilt: tuple[Gaussians, list[View]]) -> None:
-    gaussians, views = spoilt
+def test_neighbors_views_teach_what_own_ones_do_not_see(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
+    gaussians, views = spoiled
     half = np.zeros((48, 64), bool)
     half[:, :20] = True
-    own = [View(v.color, v.depth_m, v.T_world_camera, half) for v in views[::2]]
+    own = [PosedRgbd(v.color, v.depth_m, v.T_world_camera, half) for v in views[::2]]
     config = RefineConfig(steps_per_view=30, rate=0.3, peer_share=1.0)
-    alone = refine(gaussians, ALL, own, CAMERA, config, 1e-3, "blended", seed=0)
-    together = refine(gaussians, ALL, own, CAMERA, config, 1e-3, "blended", seed=0, peer_views=views[1::2])
+    alone = finetune_map(gaussians, own, context(config))
+    together = finetune_map(gaussians, own, context(config), peer_views=views[1::2])
     assert score(together, views) > score(alone, views) + 3
-    same = refine(
-        gaussians, ALL, own, CAMERA, config, 1e-3, "blended", seed=0, peer_views=views[1::2], threads=2
-    )
+    same = finetune_map(gaussians, own, context(config, threads=2), peer_views=views[1::2])
     assert np.array_equal(together.means, same.means)
 
 
 def test_steps_are_shared_out() -> None:
     config = RefineConfig(steps_per_view=5, steps_max=100, peer_share=0.25)
-    assert steps_of(config, 4, 7) == (20, 5)
-    assert steps_of(config, 40, 7) == (100, 25)
-    assert steps_of(config, 40, 0) == (100, 0)
+    assert num_steps(config, 4, 7) == (20, 5)
+    assert num_steps(config, 40, 7) == (100, 25)
+    assert num_steps(config, 40, 0) == (100, 0)
 
 
-def test_made_up_colors_of_a_neighbor_do_little_to_own_views(spoilt: tuple[Gaussians, list[View]]) -> None:
+def test_made_up_colors_of_a_neighbor_do_little_to_own_views(
+    spoiled: tuple[Gaussians, list[PosedRgbd]],
+) -> None:
     """Robust loss, a fifth of the steps, and own images last."""
-    gaussians, views = spoilt
+    gaussians, views = spoiled
     own, hostile = views[::2], [replace(v, color=255 - v.color) for v in views[1::2]]
-    fooled = refine(gaussians, ALL, own, CAMERA, RefineConfig(), 1e-3, "blended", seed=0, peer_views=hostile)
+    fooled = finetune_map(gaussians, own, context(RefineConfig()), peer_views=hostile)
     assert score(fooled, own) > score(gaussians, own) + 1

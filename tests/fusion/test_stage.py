@@ -14,7 +14,7 @@ from duagc.pipeline.config.consensus import ColorConfig, MatchingConfig
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.consensus.evidence import Evidence
-from duagc.pipeline.fusion.stage import peer_colors, run_fusion
+from duagc.pipeline.fusion.stage import run_fusion
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.trajectory import read_tum
@@ -28,6 +28,7 @@ from duagc.pipeline.messages import (
     map_frame,
 )
 from duagc.pipeline.recording import LogWriter, read_log
+from duagc.pipeline.runs.peer_colors import read_peer_colors
 from duagc.pipeline.runs.robot_data import AgentInput
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.ply import write_ply
@@ -35,6 +36,11 @@ from duagc.schemas import topics
 
 CAMERA = PinholeCamera(32, 24, 25.0, 25.0, 15.5, 11.5)
 FRAMES, KEYFRAMES, N = 6, (0, 3), 12
+SETTINGS: dict[str, Any] = {
+    "config": FusionConfig(explained_opacity=0.0),
+    "matching": MatchingConfig(),
+    "moving": MovingConfig(),
+}
 
 
 @dataclass
@@ -140,7 +146,7 @@ def robot(tmp_path_factory):
 
 def fuse_files(robot, result, folder):
     source = AgentInput("bravo", robot.log, robot.frontend, robot.information)
-    run_fusion(source, result, folder, FusionConfig(explained_opacity=0.0), MatchingConfig(), MovingConfig())
+    run_fusion(source, result, folder, **SETTINGS)
     fused = [topics.FUSED_MAP.of("bravo"), topics.CORRECTED_KEYFRAMES.of("bravo")]
     return {type(r.message()): r.message() for r in read_log(folder / "fused.mcap", topics=fused)}
 
@@ -156,7 +162,7 @@ def test_alone_everything_stays(robot, tmp_path):
     np.testing.assert_allclose(geometry[:, [0, 9, 17]], told[:, [0, 3, 5]], rtol=1e-5)  # diagonals
     np.testing.assert_allclose(geometry[:, [24, 44]], told[:, [6, 26]], rtol=1e-5)
     assert said[CorrectedKeyframes].component == ["bravo"]
-    assert peer_colors(tmp_path / "fused.mcap", "bravo") == {}
+    assert read_peer_colors(tmp_path / "fused.mcap", "bravo") == {}
 
 
 def test_frames_and_gaussians_move_with_their_keyframes(robot, tmp_path):
@@ -193,7 +199,7 @@ def test_what_only_a_neighbor_saw_is_taken_over(robot, tmp_path):
     fused = fuse_files(robot, result, tmp_path)[GaussianMap]
     assert len(fused.gaussians) == len(fused.information.ids) == N + 1
     np.testing.assert_allclose(fused.gaussians.means[-1], [0, 0, -3.0])
-    told = peer_colors(tmp_path / "fused.mcap", "bravo")[
+    told = read_peer_colors(tmp_path / "fused.mcap", "bravo")[
         "alpha"
     ]  # nothing matched: as if alike, and nobody knows
     assert told.is_identity
@@ -228,8 +234,6 @@ def test_information_of_another_map_is_refused(robot, tmp_path):
             source,
             robot.alone(),
             tmp_path,
-            FusionConfig(explained_opacity=0.0),
-            MatchingConfig(),
-            MovingConfig(),
+            **SETTINGS,
         )
     assert [p.name for p in tmp_path.iterdir()] == ["information.mcap"]

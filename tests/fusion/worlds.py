@@ -2,9 +2,12 @@
 
 import numpy as np
 
+from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import MatchingConfig
-from duagc.pipeline.fusion.fuse import FusionConfig, fuse
+from duagc.pipeline.consensus.weighting import in_world
+from duagc.pipeline.fusion.context import MapContext
+from duagc.pipeline.fusion.fuse import OwnMap, fuse
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -34,6 +37,29 @@ def information(rng, n):
         A = rng.normal(size=(n, d, d)) + 2 * np.eye(d)
         blocks.append(scale * A @ A.swapaxes(-1, -2))
     return pack_information(*blocks, rng.uniform(100, 1000, (n, 3)), rng.uniform(1, 10, n))
+
+
+def fused(
+    own,
+    *,
+    evidence,
+    T_world_keyframe,
+    pairs,
+    config,
+    self_information=None,
+    matching=MATCHING,
+    depth_images=(),
+):
+    """`fuse` of evidence in anchor frames; the own evidence is also the self-information if no other is given."""
+    splats = evidence[own.robot] if self_information is None else self_information
+    return fuse(
+        own,
+        {name: in_world(e, T_world_keyframe[name], "block") for name, e in evidence.items()},
+        pairs,
+        MapContext(CAMERA, config, matching),
+        self_information=in_world(splats, T_world_keyframe[own.robot], "block"),
+        depth_images=depth_images,
+    )
 
 
 class World:
@@ -68,19 +94,8 @@ class World:
 
     def fuse(self, robot, config=CONFIG, depth_images=(), **changes):
         given = {"evidence": self.evidence, "pairs": self.pairs, "T_world_keyframe": self.T_world} | changes
-        return fuse(
-            robot,
-            self.maps[robot],
-            self.T_map[robot],
-            given["evidence"],
-            given.get("own_splats", given["evidence"][robot]),
-            given["T_world_keyframe"],
-            given["pairs"],
-            depth_images,
-            CAMERA,
-            config,
-            given.get("matching", MATCHING),
-        )
+        own = OwnMap(robot, self.maps[robot], self.T_map[robot], given["T_world_keyframe"][robot])
+        return fused(own, depth_images=depth_images, config=config, **given)
 
     def without_information(self, name):
         e = self.evidence[name]

@@ -9,7 +9,7 @@ import pytest
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.kernels import CompiledAdam, Gradients, available_isas
 from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.optimizer import BETA_1, BETA_2, Adam, falling
+from duagc.pipeline.splat.optimizer import BETA_1, BETA_2, Adam, smoothstep_decay
 
 NAMES = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
 
@@ -155,9 +155,9 @@ def test_what_does_not_fit_is_refused() -> None:
 
 
 def test_rates_fall_from_one_to_the_last_and_never_rise() -> None:
-    shares = np.array([falling(step, 101, 0.03) for step in range(101)])
+    shares = np.array([smoothstep_decay(step, 101, 0.03) for step in range(101)])
     assert shares[0] == 1.0
     assert shares[-1] == pytest.approx(0.03)
     assert shares[50] == pytest.approx((1.0 + 0.03) / 2)
     assert (np.diff(shares) < 0).all()
-    assert falling(0, 1, 0.03) == 1.0
+    assert smoothstep_decay(0, 1, 0.03) == 1.0

@@ -1,0 +1,102 @@
+"""One training step of a Gaussian map: draw, compare with an image, Adam, limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.config.training import DepthKind, LearningRates
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels.adam import CompiledAdam
+from duagc.pipeline.kernels.rasterizer import Rasterizer
+from duagc.pipeline.kernels.types import Gradients, LossWeights, ViewLoss
+from duagc.pipeline.splat.gaussians import Gaussians
+
+Image = NDArray[np.float32]
+LARGEST_LOGIT = 6.0
+"""Opacity logits stay within +- this: gradients vanish beyond."""
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """An RGB-D image as the loss takes it.
+
+    Attributes:
+        color: float32 [H, W, 3], RGB in 0..1.
+        depth_m: float32 [H, W], meters, 0 where nothing was measured.
+        T_map_camera: [4, 4], pose of the camera in the frame of the Gaussians.
+        mask: bool [H, W], pixels that count; None: all.
+        depth_certainty: float32 [H, W], factor of the depth residuals (`splat.losses.depth_certainty`); None: 1.
+        exposure: (a, b), log gain and offset of the image.
+    """
+
+    color: Image
+    depth_m: Image
+    T_map_camera: NDArray[np.float64]
+    mask: NDArray[np.bool_] | None = None
+    depth_certainty: Image | None = None
+    exposure: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class TrainingStep:
+    """What stays the same from step to step.
+
+    Attributes:
+        rasterizer: that draws.
+        loss: weights of the terms.
+        depth_kind: depth of a Gaussian at a pixel.
+    """
+
+    rasterizer: Rasterizer
+    loss: LossWeights
+    depth_kind: DepthKind
+
+    def gradients(
+        self, gaussians: Gaussians, camera: PinholeCamera, view: TrainingView
+    ) -> tuple[ViewLoss, Gradients]:
+        """Loss of a view and its derivatives by the Gaussians."""
+        return self.rasterizer.view_gradients(
+            gaussians,
+            camera,
+            se3.inverse(view.T_map_camera),
+            view.color,
+            view.depth_m,
+            self.loss,
+            exposure=view.exposure,
+            mask=view.mask,
+            depth_kind=self.depth_kind,
+            depth_certainty=view.depth_certainty,
+        )
+
+    def __call__(
+        self,
+        gaussians: Gaussians,
+        camera: PinholeCamera,
+        view: TrainingView,
+        *,
+        adam: CompiledAdam,
+        rates: LearningRates,
+        least_log_scales: NDArray[np.float32] | np.float32,
+    ) -> tuple[Gaussians, ViewLoss]:
+        """The Gaussians after one step of Adam on one view, and the loss before it.
+
+        Args:
+            gaussians: as many as `adam` has a state of.
+            camera: of the view.
+            view: an image with its pose in the frame of the Gaussians.
+            adam: state of the optimization; changed.
+            rates: step lengths.
+            least_log_scales: log of meters, one for all or [n, 3]; no log-scale falls below.
+        """
+        loss, gradients = self.gradients(gaussians, camera, view)
+        stepped = adam.step(gaussians, gradients, rates)
+        limit = np.float32(LARGEST_LOGIT)
+        limited = stepped.replace(
+            log_scales=np.maximum(stepped.log_scales, least_log_scales),
+            opacity_logits=np.clip(stepped.opacity_logits, -limit, limit),
+        )
+        return limited, loss
