@@ -42,7 +42,7 @@ def test_two_samplings_of_one_wall_match():
     i = np.searchsorted(np.sort(a.ids), pairs[:, 0])
     row_a, row_b = np.argsort(a.ids)[i], np.argsort(b.ids)[np.searchsorted(np.sort(b.ids), pairs[:, 1])]
     assert np.linalg.norm(a.theta[row_a, MEAN] - b.theta[row_b, MEAN], axis=1).max() <= CONFIG.radius_m
-    assert gaussian_distance(a, row_a, b, row_b, CONFIG).max() < threshold(a, config=CONFIG)
+    assert gaussian_distance(a, row_a, b, row_b, config=CONFIG).max() < threshold(a, CONFIG)
 
 
 def test_every_gaussian_is_matched_at_most_once():

@@ -102,7 +102,7 @@ def test_noise_is_found_in_the_residuals() -> None:
     assert sampled.depth.factor == pytest.approx(noisy.depth.factor, rel=0.15)
     clean = estimate_noise(MapViews(gaussians, CAMERA, views_of(gaussians)), InformationConfig())
     assert clean.color_sigma == InformationConfig().color_sigma_floor
-    assert clean.depth.factor == InformationConfig().depth.factor_min
+    assert clean.depth.factor == InformationConfig().depth_factor_min
     fixed = InformationConfig(depth_factor_from_residuals=False)
     assert estimate_noise(MapViews(gaussians, CAMERA, views_of(gaussians, 0, 2.0)), fixed).depth.factor == 1.0
 
