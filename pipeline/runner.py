@@ -29,7 +29,7 @@ from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.digest import digest_file, result_files
 from duagc.pipeline.runs.folder import SCHEMA
-from duagc.pipeline.runs.robot_data import AgentInput, AgentResult
+from duagc.pipeline.runs.robot_data import AgentInput, SessionResult
 from duagc.pipeline.runs.stages import Stage
 
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
@@ -240,7 +240,7 @@ def _run_and_send(recording_path: Path, out: Path, config: RunConfig, workers: i
 
 def _exchange(
     logs: dict[str, Path], folder: Path, config: RunConfig, timing: Timing
-) -> dict[str, AgentResult]:
+) -> dict[str, SessionResult]:
     from duagc.pipeline.exchange.session import run_session
 
     determinism.configure_opencv()
@@ -260,7 +260,9 @@ def agent_input(robot: str, log: Path, folder: Path) -> AgentInput:
     return AgentInput(robot, log, folder / "frontend.mcap", folder / "information.mcap")
 
 
-def fuse_robot(robot: str, log: Path, folder: Path, result: AgentResult, config: RunConfig) -> dict[str, str]:
+def fuse_robot(
+    robot: str, log: Path, folder: Path, result: SessionResult, config: RunConfig
+) -> dict[str, str]:
     """Fused map and corrected trajectory of one robot, into the folder of its own results; one robot at a time.
 
     Returns:

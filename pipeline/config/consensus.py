@@ -9,7 +9,7 @@ from duagc.pipeline.config.base import Config
 WeightKind = Literal["uniform", "observation_count", "residual_magnitude", "scalar", "diagonal", "block"]
 
 
-class ClosureConfig(Config):
+class LoopClosureConfig(Config):
     """Trust in single closures and in their mutual agreement."""
 
     sigma_floor_m: float = Field(default=0.005, ge=0.0)
@@ -78,7 +78,7 @@ class PoseConsensusConfig(Config):
     """Added to the covariance of every odometry factor: registration does not report its bias (m)."""
     odometry_floor_rad: float = Field(default=0.001, ge=0.0)
     """The same for rotations (rad)."""
-    closures: ClosureConfig = ClosureConfig()
+    closures: LoopClosureConfig = LoopClosureConfig()
     """Trust in closures."""
 
 

@@ -5,12 +5,12 @@ from typing import Literal
 from pydantic import Field
 
 from duagc.pipeline.config.base import Config
-from duagc.pipeline.config.consensus import ClosureConfig, PoseConsensusConfig
+from duagc.pipeline.config.consensus import LoopClosureConfig, PoseConsensusConfig
 
 Solver = Literal["admm", "elimination", "paper"]
 Robust = Literal["none", "gnc"]
 
-_AS_GIVEN = ClosureConfig(
+_AS_GIVEN = LoopClosureConfig(
     sigma_floor_m=0, sigma_floor_rad=0, drift_floor_m=0, drift_floor_rad=0, min_support=1,
     frame_sigma_m=5.0, frame_sigma_rad=0.1,
 )  # fmt: skip

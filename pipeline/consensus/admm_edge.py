@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.config.consensus import ClosureConfig
+from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.geometry import so3
-from duagc.pipeline.posegraph.factors import Factors
-from duagc.pipeline.posegraph.loop_closures import Closure, closure_factors
-from duagc.pipeline.posegraph.robust import RobustWeights
+from duagc.pipeline.posegraph.gnc import RobustWeights
+from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, closures_as_relative_poses
 
 Array = NDArray[np.float64]
 STEP_M = 2.0**-27
@@ -80,8 +79,8 @@ class Link:
     keyframes: NDArray[np.int32]
     metric: Array
     slots: NDArray[np.int64]  # [s] where the shared keyframes stand among this robot's variables
-    closures: tuple[Closure, ...]  # held ones; none at the other end
-    factors: Factors  # the same, between this robot's variables
+    closures: tuple[LoopClosure, ...]  # held ones; none at the other end
+    factors: RelativePoses  # the same, between this robot's variables
     robust: RobustWeights  # of the same
     penalties: Array  # [2] translation, rotation
     offset: Array = field(init=False)  # [s, 6] d = x - y (translation, rotation)
@@ -141,11 +140,11 @@ def rounded(T: Array, wire: str) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def link_metric(
-    closures: Sequence[Closure], keyframes: NDArray[np.int64], config: ClosureConfig
+    closures: Sequence[LoopClosure], keyframes: NDArray[np.int64], config: LoopClosureConfig
 ) -> NDArray[np.float32]:
     """Information [s, 6] of the closures about each copied keyframe, averaged over directions per block."""
     position = np.searchsorted(keyframes, [c.peer_keyframe for c in closures])
-    information = closure_factors(closures, np.zeros(len(closures)), position, config).information
+    information = closures_as_relative_poses(closures, np.zeros(len(closures)), position, config).information
     blocks = np.diagonal(information, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)
     total = np.zeros((len(keyframes), 2))
     np.add.at(total, position, blocks)

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from duagc.pipeline.posegraph import factors as pose_factors
-from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph import least_squares
+from duagc.pipeline.posegraph.relative_poses import RelativePoses
 
 Array = NDArray[np.float64]
 Variable = tuple[int, int]  # index of the owner in the team, its keyframe
@@ -98,7 +98,7 @@ class Front:
         H = sparse.coo_matrix((np.concatenate(values), index), shape=shape).tocsc()
         e = 6 * self.eliminated
         across, kept = H[:e, e:].toarray(), H[e:, e:].toarray()
-        self._solve = pose_factors.factorized(H[:e, :e].tocsc()) if e else None
+        self._solve = least_squares.factorized(H[:e, :e].tocsc()) if e else None
         self._coupling = self._solve(across) if self._solve is not None and across.size else across
         S = kept - across.T @ self._coupling
         return 0.5 * (S + S.T)
@@ -125,14 +125,14 @@ def _lanes(slots: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def damped(
-    factors: Factors, jacobians: tuple[Array, Array], n: int, damping: float, anchor: int | None
+    factors: RelativePoses, jacobians: tuple[Array, Array], n: int, damping: float, anchor: int | None
 ) -> sparse.csc_matrix:
     """Gauss-Newton matrix of a robot's own factors over its n variables, damped relative to its diagonal.
 
     Args:
         anchor: own variable that is held, at the root: it only fixes the gauge.
     """
-    H = pose_factors.curvature_matrix(factors, jacobians, np.zeros((n, 6)))
+    H = least_squares.curvature_matrix(factors, jacobians, np.zeros((n, 6)))
     scale = H.diagonal().reshape(-1, 6)
     diagonal = damping * scale + _FLOOR * scale.max(initial=1.0)
     if anchor is not None:

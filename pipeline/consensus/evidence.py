@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from duagc.pipeline.geometry import se3, so3, spd
-from duagc.pipeline.posegraph.factors import inflated
+from duagc.pipeline.geometry.spd import add_covariance
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import (
     COLOR_INFORMATION,
@@ -126,8 +126,8 @@ class Evidence:
             sums = mean_block(packed)
             known = (sums != 0).any(axis=(1, 2), keepdims=True)
             across = known * _across_surface(gaussians, deviation_m)
-            position = inflated(sums + across, deviation_m[:, None, None] ** 2 * np.eye(3))
-            shape = inflated(log_covariance_block(packed), SHAPE_FLOOR**2 * np.eye(6))
+            position = add_covariance(sums + across, deviation_m[:, None, None] ** 2 * np.eye(3))
+            shape = add_covariance(log_covariance_block(packed), SHAPE_FLOOR**2 * np.eye(6))
             packed[:, MEAN_INFORMATION], packed[:, LOG_COVARIANCE_INFORMATION] = (
                 pack_symmetric(position),
                 pack_symmetric(shape),

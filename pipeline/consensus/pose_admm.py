@@ -42,10 +42,11 @@ from numpy.typing import ArrayLike, NDArray
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.admm_edge import BLOCK, Link, PosePacket, SharedKeyframes, link_metric, rounded
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.posegraph import factors as pose_factors
-from duagc.pipeline.posegraph.factors import Factors, difference, inflated, retract
-from duagc.pipeline.posegraph.loop_closures import Closure, closure_factors
-from duagc.pipeline.posegraph.robust import COUNTS, RobustWeights
+from duagc.pipeline.geometry.spd import add_covariance
+from duagc.pipeline.posegraph import least_squares
+from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT, RobustWeights
+from duagc.pipeline.posegraph.least_squares import difference, retract
+from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, closures_as_relative_poses
 
 Array = NDArray[np.float64]
 _STEADY = 1e-3  # m, rad: a link that moves less has left its start behind
@@ -62,10 +63,10 @@ class PoseAgent:
         self,
         robot: str,
         T_map_keyframe: ArrayLike,
-        odometry: Factors,
+        odometry: RelativePoses,
         config: PoseConsensusConfig,
         *,
-        loops: Factors | None = None,
+        loops: RelativePoses | None = None,
         keep_loops: ArrayLike | None = None,
     ) -> None:
         """Take a robot's own graph.
@@ -81,7 +82,7 @@ class PoseAgent:
         self.robot, self.config = robot, config
         self.T_map_keyframe = np.array(T_map_keyframe, dtype=np.float64)
         self.odometry = with_floor(odometry, config)
-        self.loops = Factors.empty() if loops is None else with_floor(loops, config)
+        self.loops = RelativePoses.empty() if loops is None else with_floor(loops, config)
         kept = np.ones(len(self.loops)) if keep_loops is None else np.array(keep_loops, dtype=np.float64)
         self.loop_weights = RobustWeights(kept, config)
         self.T_world_map = np.eye(4)
@@ -91,7 +92,7 @@ class PoseAgent:
         self._copies_start: dict[str, Array] = {}
         self._started = False
         self._x = self.T_map_keyframe.copy()
-        self._factors = Factors.concatenate([self.odometry, self.loops])
+        self._factors = RelativePoses.concatenate([self.odometry, self.loops])
         self._collect_weights()
         self._solve: Callable[[Array], Array] | None = None
         self._moved_rad = 0.0
@@ -108,7 +109,7 @@ class PoseAgent:
     def add_link(
         self,
         peer: str,
-        closures_held: Sequence[Closure] = (),
+        closures_held: Sequence[LoopClosure] = (),
         shared: SharedKeyframes | None = None,
         *,
         keep: ArrayLike | None = None,
@@ -149,7 +150,7 @@ class PoseAgent:
             metric=np.asarray(shared.metric, dtype=np.float64),
             slots=np.asarray(shared.keyframes, dtype=np.int64),
             closures=closures,
-            factors=Factors.empty(),
+            factors=RelativePoses.empty(),
             robust=RobustWeights(kept.astype(np.float64), self.config),
             penalties=np.full(2, np.float64(np.float32(self.config.penalty_start))),
         )
@@ -158,7 +159,7 @@ class PoseAgent:
 
     def _copies(
         self,
-        closures: Sequence[Closure],
+        closures: Sequence[LoopClosure],
         kept: NDArray[np.bool_],
         keyframes: NDArray[np.int64],
         known: Mapping[int, ArrayLike],
@@ -186,11 +187,11 @@ class PoseAgent:
                 poses.append(copies)
                 own = [c.own_keyframe for c in link.closures]
                 copy = link.slots[np.searchsorted(link.keyframes, [c.peer_keyframe for c in link.closures])]
-                link.factors = closure_factors(link.closures, own, copy, self.config.closures)
+                link.factors = closures_as_relative_poses(link.closures, own, copy, self.config.closures)
                 parts.append(link.factors)
                 count += len(copies)
         self._x = self.T_world_map @ np.concatenate(poses)
-        self._factors = Factors.concatenate(parts)
+        self._factors = RelativePoses.concatenate(parts)
         self._collect_weights()
 
     def _collect_weights(self) -> None:
@@ -213,7 +214,7 @@ class PoseAgent:
             self._weigh(link)
             self._decide(link)
         force_before = {peer: link.force() for peer, link in self.links.items()}
-        g, jacobians = pose_factors.gradient(self._factors, self._weights, self._x)
+        g, jacobians = least_squares.gradient(self._factors, self._weights, self._x)
         for peer, link in self.links.items():
             g[link.slots] += force_before[peer]
         if self._solve is None or self._moved_rad > self.config.relinearize_rad:
@@ -221,8 +222,8 @@ class PoseAgent:
             for link in self.links.values():
                 diagonal[link.slots] += link.penalty()
             diagonal += 1e-9 * diagonal.max()  # a variable that nothing holds stays where it is
-            H = pose_factors.curvature_matrix(self._factors, jacobians, diagonal)
-            self._solve, self._moved_rad = pose_factors.factorized(H), 0.0
+            H = least_squares.curvature_matrix(self._factors, jacobians, diagonal)
+            self._solve, self._moved_rad = least_squares.factorized(H), 0.0
             self.factorizations += 1
         delta = -self._solve(g.ravel()).reshape(-1, 6)
         turn_rad = float(np.linalg.norm(delta[:, 3:], axis=1).max())
@@ -350,7 +351,7 @@ class PoseAgent:
         """Robust weights of a link's held closures, paced by what arrives on it."""
 
         def squared() -> Array:
-            return pose_factors.squared_residuals(link.factors, self._x)
+            return least_squares.squared_residuals(link.factors, self._x)
 
         if link.robust.advance(link.received_total, self._steady(link), squared):
             self._reweighted()
@@ -362,7 +363,7 @@ class PoseAgent:
         links = self.links.values()
 
         def squared() -> Array:
-            return pose_factors.squared_residuals(self.loops, self._x)
+            return least_squares.squared_residuals(self.loops, self._x)
 
         received = min(link.received_total for link in links)
         if self.loop_weights.advance(received, all(self._steady(link) for link in links), squared):
@@ -422,7 +423,7 @@ class PoseAgent:
         It takes `closures.min_support` to join two robots, and as many to keep them joined.
         """
         link = self.links[peer]
-        kept = int(np.count_nonzero(link.robust.weights >= COUNTS))
+        kept = int(np.count_nonzero(link.robust.weights >= INLIER_WEIGHT))
         return link.holds and link.robust.done and kept < self.config.closures.min_support
 
     def residuals(self) -> dict[str, Any]:
@@ -436,7 +437,7 @@ class PoseAgent:
         return {
             "primal": max(changes, default=0.0) / self.config.relaxation,
             "dual": self._dual_change,
-            "cost": pose_factors.cost(self._factors, self._x, self._weights) if self._started else 0.0,
+            "cost": least_squares.cost(self._factors, self._x, self._weights) if self._started else 0.0,
             "step": self.step_change,
             "penalties": {peer: tuple(link.penalties.tolist()) for peer, link in self.links.items()},
             "versions": {peer: link.version for peer, link in self.links.items()},
@@ -447,7 +448,7 @@ class PoseAgent:
         }
 
 
-def with_floor(odometry: Factors, config: PoseConsensusConfig) -> Factors:
+def with_floor(odometry: RelativePoses, config: PoseConsensusConfig) -> RelativePoses:
     """Odometry as it counts in the objective: its covariance plus the floor of the settings."""
     floor = np.repeat([config.odometry_floor_m**2, config.odometry_floor_rad**2], 3) * np.eye(6)
-    return Factors(odometry.i, odometry.j, odometry.T_i_j, inflated(odometry.information, floor))
+    return RelativePoses(odometry.i, odometry.j, odometry.T_i_j, add_covariance(odometry.information, floor))

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.elimination import Block, Front, Step, Variable, damped, shared_variables
-from duagc.pipeline.posegraph import factors as pose_factors
-from duagc.pipeline.posegraph.factors import Factors, retract
-from duagc.pipeline.posegraph.robust import RobustWeights
+from duagc.pipeline.posegraph import least_squares
+from duagc.pipeline.posegraph.gnc import RobustWeights
+from duagc.pipeline.posegraph.least_squares import retract
+from duagc.pipeline.posegraph.relative_poses import RelativePoses
 
 Array = NDArray[np.float64]
 Message = dict[Variable, int] | tuple[int, Block] | Step
@@ -61,8 +62,8 @@ class TreeGraph:
     variables: Sequence[Variable]
     poses: Array
     shared: Mapping[Variable, int]
-    trusted: Factors
-    doubted: Sequence[tuple[Factors, RobustWeights]]
+    trusted: RelativePoses
+    doubted: Sequence[tuple[RelativePoses, RobustWeights]]
 
 
 class TreeNode:
@@ -78,7 +79,7 @@ class TreeNode:
         self.outbox: list[tuple[int, Message]] = []
         self.largest_step = 0.0
         self.factorizations = 0
-        self._factors = Factors.concatenate([graph.trusted, *(factors for factors, _ in graph.doubted)])
+        self._factors = RelativePoses.concatenate([graph.trusted, *(factors for factors, _ in graph.doubted)])
         self._front: Front | None = None
         self._fronts: dict[int, dict[Variable, int]] = {}
         self._blocks: dict[int, Block] = {}
@@ -144,7 +145,8 @@ class TreeNode:
         for child in self.place.children:
             for v, mask in self._fronts[child].items():
                 known[v] = known.get(v, 0) | mask
-        shared = shared_variables(known, self.place.subtree)
+        # nothing is shared beyond the root, whatever a front claims
+        shared = [] if self.place.parent is None else shared_variables(known, self.place.subtree)
         children = {c: list(self._fronts[c]) for c in self.place.children}
         self._front = Front(self.graph.variables, children, shared)
         if self.place.parent is not None:
@@ -155,12 +157,12 @@ class TreeNode:
         self._sent = self.exchange
         reweighted = self._weigh()
         weights, blocks = self._weights(), self._blocks.values()
-        g, jacobians = pose_factors.gradient(self._factors, weights, self.poses)
+        g, jacobians = least_squares.gradient(self._factors, weights, self.poses)
         H = self._relinearized(front, jacobians, reweighted)
         block = Block(
             H,
             front.eliminate(g, {child: b.g for child, b in self._blocks.items()}),
-            pose_factors.cost(self._factors, self.poses, weights) + sum(b.cost for b in blocks),
+            least_squares.cost(self._factors, self.poses, weights) + sum(b.cost for b in blocks),
             max([self.largest_step, *(b.largest_step for b in blocks)]),
             reweighted or any(b.reweighted for b in blocks),
             not self.robust_done or any(b.unsure for b in blocks),
@@ -225,8 +227,8 @@ class TreeNode:
         received, changed = float(self.exchange * self.config.robust_packets), False
         for factors, robust in self.graph.doubted:
 
-            def squared(factors: Factors = factors) -> Array:
-                return pose_factors.squared_residuals(factors, self.poses)
+            def squared(factors: RelativePoses = factors) -> Array:
+                return least_squares.squared_residuals(factors, self.poses)
 
             changed |= robust.advance(received, False, squared)
         return changed
@@ -243,4 +245,4 @@ class TreeNode:
     @property
     def cost(self) -> float:
         """Of the own factors, weighted."""
-        return pose_factors.cost(self._factors, self.poses, self._weights())
+        return least_squares.cost(self._factors, self.poses, self._weights())

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation.oracle import gap_to_oracle
 from duagc.pipeline.evaluation.results import Absent
-from duagc.pipeline.posegraph.robust import COUNTS
+from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT
 from duagc.pipeline.recording import read_log
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.schemas import topics
@@ -34,7 +34,7 @@ PURPOSE = {  # of a message, by its kind
     "REQUEST": "set-up",
     "SAMPLE": "set-up",
     "CLOSURES": "set-up",
-    "FRAME": "set-up",
+    "RELATIVE_FRAME": "set-up",
     "VOXELS": "set-up",
     "PAIRS": "set-up",
     "ANCHORS": "set-up",
@@ -82,7 +82,7 @@ class Link:
 
 def counts(closure: Any) -> bool:
     """Whether a closure counted in the end: it took part, and the robust weight did not turn it off."""
-    return closure.weight >= COUNTS
+    return closure.weight >= INLIER_WEIGHT
 
 
 def measured(closure: Any) -> bool:

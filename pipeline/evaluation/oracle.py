@@ -31,12 +31,11 @@ from duagc.pipeline.fusion.fuse import OwnMap, fuse
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.messages import GaussianInformation, unpack_pose
-from duagc.pipeline.posegraph.central import solve_central, team_graph
-from duagc.pipeline.posegraph.factors import Factors
-from duagc.pipeline.posegraph.loop_closures import Closure
+from duagc.pipeline.posegraph.pose_graph import PoseGraph, solve_pose_graph
+from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, LoopClosure, RelativePose, RelativePoses
 from duagc.pipeline.recording import read_log
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
-from duagc.pipeline.runs.robot_data import Step, factors_of, registrations_of
+from duagc.pipeline.runs.robot_data import registrations_of
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import theta_of
 from duagc.schemas import topics
@@ -62,16 +61,6 @@ class Gap:
     sigma_p99: float | Absent
 
 
-@dataclass(frozen=True)
-class WeightedClosure:
-    """A closure that took part in the pose consensus: between whom, and its final robust weight."""
-
-    robot: str
-    peer: str
-    closure: Closure
-    weight: float
-
-
 def gap_to_oracle(
     run: RunFolder, decisions: Sequence[Any], pairs: Mapping[tuple[str, str], NDArray[np.int64]]
 ) -> Gap | Absent:
@@ -93,7 +82,7 @@ def gap_to_oracle(
             return closures
         poses = {name: run.robots[name].corrected.T_world_keyframe for name in members}
         odometry = {
-            name: with_floor(factors_of(_registrations(run.robots[name])), config) for name in members
+            name: with_floor(RelativePoses.of(_registrations(run.robots[name])), config) for name in members
         }
         central = solve_component(poses, odometry, closures, config)
         gaps.append(central if isinstance(central, Absent) else _gap(run, members, poses, central, pairs))
@@ -180,8 +169,8 @@ def _map_of(robot: RobotRun) -> tuple[str, Gaussians, GaussianInformation, Array
 
 def solve_component(
     T_world_keyframe: Mapping[str, Array],
-    odometry: Mapping[str, Factors],
-    closures: Sequence[WeightedClosure],
+    odometry: Mapping[str, RelativePoses],
+    closures: Sequence[HeldLoopClosures],
     config: PoseConsensusConfig,
 ) -> dict[str, Array] | Absent:
     """Keyframe poses [n, 4, 4] of every robot by the centralized answer.
@@ -194,12 +183,8 @@ def solve_component(
         T_world_keyframe: [n, 4, 4] of every member, by its own estimate. odometry: with the floor of `config`.
         closures: between members, with final weights. config: of the run.
     """
-    team = team_graph(
-        T_world_keyframe, odometry, [(c.robot, c.peer, [c.closure]) for c in closures], config.closures
-    )
-    own_factors = sum(len(factors) for factors in odometry.values())
-    weights = np.concatenate([np.ones(own_factors), [c.weight for c in closures]])
-    solution = solve_central(team.factors, team.T_start, weights)
+    team = PoseGraph.of_team(T_world_keyframe, odometry, closures, config.closures)
+    solution = solve_pose_graph(team.relative_poses, team.T_start, team.weights)
     if not solution.converged:
         return Absent(f"the centralized solver did not converge in {solution.iterations} steps")
     root = team.first[min(T_world_keyframe)]
@@ -210,14 +195,14 @@ def solve_component(
     }
 
 
-def _registrations(robot: RobotRun) -> list[Step]:
+def _registrations(robot: RobotRun) -> list[RelativePose]:
     """A robot's own registrations, as its agent reads them."""
     path = robot.folder / "frontend.mcap"
     factors = [record.message() for record in read_log(path, [topics.KEYFRAME_FACTOR.of(robot.robot)])]
     return registrations_of(path, robot.keyframes, factors)
 
 
-def _closures(members: Sequence[str], decisions: Sequence[Any]) -> list[WeightedClosure] | Absent:
+def _closures(members: Sequence[str], decisions: Sequence[Any]) -> list[HeldLoopClosures] | Absent:
     """The closures between members that took part, in order of the log."""
     out = []
     for d in decisions:
@@ -226,8 +211,8 @@ def _closures(members: Sequence[str], decisions: Sequence[Any]) -> list[Weighted
         if len(d.information) != 36:
             return NO_INFORMATION
         information = np.array(d.information, dtype=np.float64).reshape(6, 6)
-        closure = Closure(d.own_keyframe, d.peer_keyframe, unpack_pose(d.pose_own_peer), information)
-        out.append(WeightedClosure(d.robot, d.peer, closure, d.weight))
+        closure = LoopClosure(d.own_keyframe, d.peer_keyframe, unpack_pose(d.pose_own_peer), information)
+        out.append(HeldLoopClosures(d.robot, d.peer, (closure,), (d.weight,)))
     return out
 
 

@@ -21,7 +21,7 @@ from duagc.pipeline.splat.information import INFORMATION_DIAGONAL, MEAN
 Array = NDArray[np.float64]
 Records = NDArray[Any]
 
-# what a receiver expects before it is told: standard deviations of position (m), log-covariance, color, opacity logit
+# what a receiver expects before any evidence: standard deviations of position (m), log-covariance, color, opacity logit
 PRIOR_SIGMA = np.repeat([0.05, 1.0, 0.1, 2.0], [3, 6, 3, 1])
 VOXEL_BITS = 20  # per axis; voxels beyond +-2^19 share those at the border
 
@@ -88,7 +88,10 @@ def within(
     """Which records [n] lie in one of the voxels.
 
     Args:
+        records: of one owner.
         T_world_keyframe: [k, 4, 4] of the owner's keyframes, by anchor.
+        voxels: ascending keys.
+        edge_m: of a voxel.
     """
     T = T_world_keyframe[records["anchor"]]
     mean = records["theta"][:, MEAN].astype(np.float64)
@@ -97,17 +100,14 @@ def within(
 
 
 def match_pairs(
-    own: str,
-    own_evidence: Records,
-    T_common_own: Array,
-    peer: str,
-    peer_evidence: Records,
-    T_common_peer: Array,
-    config: MatchingConfig,
+    own: tuple[str, Records, Array], peer: tuple[str, Records, Array], config: MatchingConfig
 ) -> NDArray[np.int64]:
-    """Ids of matched Gaussians of two robots, int64 [n, 2]. Poses are [k, 4, 4], by anchor, in one frame."""
-    return match(
-        to_evidence(own, own_evidence).in_world(T_common_own),
-        to_evidence(peer, peer_evidence).in_world(T_common_peer),
-        config,
-    )
+    """Ids of matched Gaussians of two robots, int64 [n, 2].
+
+    Args:
+        own: name, evidence, and keyframes [k, 4, 4] by anchor in the common frame.
+        peer: the same of the other robot.
+        config: of the matching.
+    """
+    a, b = (to_evidence(name, records).in_world(T_common) for name, records, T_common in (own, peer))
+    return match(a, b, config)

@@ -1,6 +1,6 @@
 """What an agent knows of its team beyond itself: evidence, agreed poses and pair lists, by owner.
 
-Kept as they arrived, so that they can be handed on unchanged, however many hops away their owner is.
+Kept as they arrived, so that they can be passed on unchanged, however many hops away their owner is.
 """
 
 from __future__ import annotations
@@ -21,7 +21,13 @@ Records = NDArray[Any]
 
 @dataclass
 class Incoming:
-    """Evidence of one owner on its way in from one neighbor: its chunks so far, by message."""
+    """Evidence of one owner that is arriving from one neighbor.
+
+    Attributes:
+        owner: index of the robot whose evidence it is.
+        provider: index of the neighbor.
+        chunks: those that are here, by message.
+    """
 
     owner: int
     provider: int
@@ -32,7 +38,13 @@ class Knowledge:
     """Evidence, anchors and pairs of the team, as one agent holds them."""
 
     def __init__(self, own: int, team: int, kind: Kind) -> None:
-        """own: index in the sorted team. team: its size. kind: of the evidence that this team exchanges."""
+        """Nothing is known.
+
+        Args:
+            own: index of the robot in the sorted team.
+            team: number of robots.
+            kind: of the evidence that this team exchanges.
+        """
         self.own, self.team, self.kind = own, team, kind
         self.evidence: dict[int, Records] = {}  # complete, by owner
         self.bodies: dict[int, Records] = {}  # the same as they were sent
@@ -63,7 +75,7 @@ class Knowledge:
         return owner
 
     def forget_incoming(self, owner: int) -> list[tuple[int, int]]:
-        """Drop what else is on its way in from an owner that is complete; returns (provider, message)."""
+        """Drop what else is arriving of an owner that is complete; returns (provider, message)."""
         keys = sorted(k for k, entry in self.incoming.items() if entry.owner == owner)
         for key in keys:
             del self.incoming[key]
@@ -73,7 +85,8 @@ class Knowledge:
         """Where the evidence of each owner comes from: COMPLETE, a neighbor, or NOBODY.
 
         Args:
-            direct: neighbors that will send their own evidence themselves. living: neighbors not given up.
+            direct: neighbors that will send their own evidence themselves.
+            living: neighbors not given up.
         """
         out = np.full(self.team, state_wire.NOBODY, np.uint8)
         for owner in range(self.team):
@@ -88,7 +101,7 @@ class Knowledge:
         return out
 
     def take_anchors(self, payload: bytes) -> int:
-        """Take agreed poses, if they are news; returns their owner."""
+        """Take agreed poses, if they are new; returns their owner."""
         anchors = state_wire.read_anchors(payload, self.team)
         if anchors.owner == self.own:
             raise MalformedError("anchors: a neighbor speaks for this robot")
@@ -97,7 +110,7 @@ class Knowledge:
         return anchors.owner
 
     def take_pairs(self, payload: bytes) -> tuple[int, int]:
-        """Take a pair list, if it is news; returns the pair. The lower-named robot of a pair speaks for it."""
+        """Take a pair list, if it is new; returns the pair. The lower-named robot of a pair speaks for it."""
         pairs = state_wire.read_pairs(payload, self.team)
         key = (pairs.lower, pairs.higher)
         if pairs.lower == self.own:

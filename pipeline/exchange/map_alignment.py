@@ -1,8 +1,8 @@
 """Where every robot's map lies: relative frames of pairs, flooded, and what follows from them.
 
-The end of a pair that holds its closures says how the two first keyframes lie to each other, with one proposal for
-each group of closures that agrees. Who knows the same pairs places the team the same way (`consensus.cycles`), to the
-last bit.
+The end of a pair that decides on its loop closures floods the relative pose of the two first keyframes, with one
+proposal for each group of loop closures that agrees. Agents that know the same pairs place the team alike
+(`posegraph.cycle_consistency`), to the last bit.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.consensus.tree import TreePlace
 from duagc.pipeline.exchange.wire import state_wire
-from duagc.pipeline.exchange.wire.state_wire import PairFrames, pair_bit
+from duagc.pipeline.exchange.wire.state_wire import RelativeFrames, pair_bit
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph.cycle_consistency import Placement, place
 
@@ -22,26 +22,34 @@ Array = NDArray[np.float64]
 Pair = tuple[int, int]
 
 
-class Frames:
+class MapAlignment:
     """What one robot knows of the pairs of its team."""
 
-    def __init__(self, own: int, team: Sequence[str], margin: float) -> None:
-        """own: index in the sorted team. margin: factor on variances round a cycle."""
-        self.own, self.team, self.margin = own, list(team), margin
-        self.pairs: dict[Pair, PairFrames] = {}
-        self.payloads: dict[Pair, bytes] = {}
-        self.parted = 0  # links known to have been parted, a mask of pair_bit
-        self._placement: Placement | None = None
-
-    def learn(self, payload: bytes, held: set[Pair]) -> Pair:
-        """Take what is told of a pair, if it is news; returns the pair.
+    def __init__(self, own: int, team: Sequence[str], margin: float, *, short: bool = False) -> None:
+        """Nothing is known.
 
         Args:
-            held: pairs whose closures this robot holds.
-        Raises:
-            MalformedError: it says nothing sensible, or speaks for this robot.
+            own: index of the robot in the sorted team.
+            team: names of all robots, sorted.
+            margin: factor on variances around a cycle.
+            short: send relative frames in float32.
         """
-        frames = state_wire.read_frames(payload, len(self.team))
+        self.own, self.team, self.margin, self.short = own, list(team), margin, short
+        self.pairs: dict[Pair, RelativeFrames] = {}
+        self.payloads: dict[Pair, bytes] = {}
+        self.revoked = 0  # links known to have been revoked, a mask of pair_bit
+        self._placement: Placement | None = None
+
+    def receive(self, payload: bytes, held: set[Pair]) -> Pair:
+        """Use what a neighbor sent of a pair, if it is new; returns the pair.
+
+        Args:
+            payload: of the message.
+            held: pairs that this robot decides on.
+        Raises:
+            MalformedError: it is not what it should be, or decides on a pair of this robot.
+        """
+        frames = state_wire.read_relative_frames(payload, len(self.team))
         pair = (frames.lower, frames.higher)
         if pair in held and pair not in self.pairs:
             raise MalformedError("frame: a neighbor speaks for this robot")
@@ -50,23 +58,29 @@ class Frames:
             self._placement = None
         return pair
 
-    def tell(self, frames: PairFrames) -> None:
-        """Take what this robot itself found out, as everybody will read it."""
-        pair, payload = (frames.lower, frames.higher), state_wire.write_frames(frames)
-        self.pairs[pair], self.payloads[pair] = state_wire.read_frames(payload, len(self.team)), payload
+    def add(self, frames: RelativeFrames) -> None:
+        """Add what this robot itself decided, as all others will read it."""
+        pair, payload = (
+            (frames.lower, frames.higher),
+            state_wire.write_relative_frames(frames, short=self.short),
+        )
+        self.pairs[pair], self.payloads[pair] = (
+            state_wire.read_relative_frames(payload, len(self.team)),
+            payload,
+        )
         self._placement = None
 
-    def part(self, known: int) -> None:
-        """These links are parted: as if they had never been."""
-        self.parted, self._placement = known, None
+    def revoke(self, known: int) -> None:
+        """Revoke these links, a mask of `pair_bit`: they do not count any more."""
+        self.revoked, self._placement = known, None
 
     @property
     def links(self) -> int:
-        """All pairs known, parted ones too, as a mask."""
+        """All pairs known, revoked ones too, as a mask."""
         return sum(pair_bit(*pair) for pair in self.pairs)
 
     def _alive(self) -> list[Pair]:
-        return [pair for pair in sorted(self.pairs) if not self.parted & pair_bit(*pair)]
+        return [pair for pair in sorted(self.pairs) if not self.revoked & pair_bit(*pair)]
 
     @property
     def members(self) -> list[int]:
@@ -96,7 +110,7 @@ class Frames:
 
     @property
     def undecided(self) -> int:
-        """Links of the component that contradict each other while nothing tells which are false, as a mask."""
+        """Links of the component that contradict each other without a sign of which are false, as a mask."""
         pairs = self.placement.undecided
         return sum(pair_bit(self.team.index(a), self.team.index(b)) for a, b in pairs)
 

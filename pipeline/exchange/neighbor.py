@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.exchange.loop_closing import Meeting
+from duagc.pipeline.exchange.loop_closing import LoopClosureProtocol
 from duagc.pipeline.exchange.wire.state_wire import State
 from duagc.pipeline.network.transport import Transport
 
@@ -15,41 +15,85 @@ Pair = tuple[int, int]
 
 
 @dataclass
+class Revocation:
+    """Whether, and why, the link to a neighbor does not count any more.
+
+    Attributes:
+        revoked: the two robots count as if they had never met.
+        undecided: other links contradict this one, and nothing shows which of them is false.
+        contradiction: how the placement of the team contradicts the link; empty if it does not.
+        weights: of the loop closures held, when the link was revoked.
+    """
+
+    revoked: bool = False
+    undecided: bool = False
+    contradiction: str = ""
+    weights: list[float] = field(default_factory=list)
+
+
+@dataclass
+class Passed:
+    """Flooded messages that a neighbor has, or was sent.
+
+    Attributes:
+        frames: relative frames by pair, with the id of the message; 0: they came from the neighbor.
+        pairs: pair lists, likewise.
+        poses: owners of agreed poses.
+        voxels: the space that this robot saw.
+        evidence: ids of messages by owner of the evidence.
+    """
+
+    frames: dict[Pair, int] = field(default_factory=dict)
+    pairs: dict[Pair, int] = field(default_factory=dict)
+    poses: set[int] = field(default_factory=set)
+    voxels: bool = False
+    evidence: dict[int, int] = field(default_factory=dict)
+
+
+@dataclass
 class Neighbor:
-    """One end of a radio link."""
+    """One end of a radio link.
+
+    Attributes:
+        index: of the neighbor in the sorted team.
+        name: of the neighbor.
+        transport: the own end of the radio link.
+        loop_closing: None before it is known which end has which role.
+        verdict_message: id of the own message that says what was decided.
+        hello_sent: the greeting is on its way.
+        lost: silent for too long.
+        state: the last one that came.
+        sent_state: the last one that was sent, and its round.
+        link: whether the link still counts.
+        passed: flooded messages that it has.
+        early: messages of the solver for a start that is still to come: revoked links, the rest.
+        voxels: keys of the space that it saw.
+    """
 
     index: int
     name: str
     transport: Transport
-    meeting: Meeting | None = None  # before it is known which end is which
-    greeted: bool = False
-    state: State | None = None
+    loop_closing: LoopClosureProtocol | None = None
     verdict_message: int | None = None
-    gone: bool = False  # silent for too long
-    parted: bool = False  # its closures were refuted: as if never met
-    contradiction: str = ""  # what the placement of the team has against the link
-    undecided: bool = False  # parted because other links contradict it and nothing tells which is false
-    last_weights: list[float] = field(default_factory=list)  # of the closures held, when the link was parted
-    early: list[tuple[int, bytes]] = field(
-        default_factory=list
-    )  # TREE of a start still to come: parted, rest
+    hello_sent: bool = False
+    lost: bool = False
+    state: State | None = None
+    sent_state: tuple[bytes, int] = (b"", 0)
+    link: Revocation = field(default_factory=Revocation)
+    passed: Passed = field(default_factory=Passed)
+    early: list[tuple[int, bytes]] = field(default_factory=list)
     voxels: NDArray[np.int64] | None = None
-    frames_told: dict[Pair, int] = field(default_factory=dict)  # message; 0 = it told this robot
-    pairs_told: dict[Pair, int] = field(default_factory=dict)  # likewise
-    anchors_told: set[int] = field(default_factory=set)  # owners
-    voxels_told: bool = False
-    evidence_sent: dict[int, int] = field(default_factory=dict)  # owner: message
 
     @property
     def decided(self) -> bool:
-        """Whether it is settled if the two robots share a frame."""
-        if self.gone:
+        """Whether it is final if the two robots share a frame, and the neighbor knows it."""
+        if self.lost:
             return True
-        told = self.verdict_message is None or not self.transport.is_open(self.verdict_message)
-        return self.meeting is not None and self.meeting.verdicts is not None and told
+        acknowledged = self.verdict_message is None or not self.transport.is_open(self.verdict_message)
+        return self.loop_closing is not None and self.loop_closing.decided and acknowledged
 
     @property
     def joined(self) -> bool:
         """Whether the two robots share a frame, and the neighbor knows it."""
-        met = self.meeting is not None and self.meeting.joined is not None
-        return met and not self.gone and not self.parted and self.decided
+        met = self.loop_closing is not None and self.loop_closing.joined is not None
+        return met and not self.lost and not self.link.revoked and self.decided

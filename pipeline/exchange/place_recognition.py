@@ -1,13 +1,13 @@
-"""Recognizing places: which pairs of keyframes may show the same place, and which of them are worth a closer look.
+"""Place recognition: which pairs of keyframes may show the same place, and which of them are worth verifying.
 
-A closer look costs the neighbor's sample of a keyframe, some 80 kB. What it brings is the expected information about
-where the two robots are to each other, in nats:
+To verify costs the neighbor's sample of a keyframe, some 80 kB. It brings the expected information about the relative
+pose of the two robots, in nats:
 
-    P(closure | score) (P(apart) gain of two strangers + P(joined) gain beside the closures that are there)
+    P(loop closure | score) (P(apart) gain of the first one + P(joined) gain in addition to the others)
 
-A pair of robots is joined when at least `min_support` closures came out. Beside others a closure says the less the
-more of them lie near: what was known before is the sum of their information, each with the drift of both odometries
-from there to here added to its variance.
+A pair of robots is joined when at least `min_support` loop closures were verified. The nearer others are, the less a
+further one adds: what was known before is the sum of their information, each with the drift of both odometries from
+there to here added to its variance.
 """
 
 from __future__ import annotations
@@ -18,20 +18,26 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.config.consensus import ClosureConfig
+from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.config.exchange import PlacesConfig
 from duagc.pipeline.registration.features import Descriptors, Features, matches
 
 Array = NDArray[np.float64]
-STRANGERS_SIGMA = np.array([10.0, 1.0])  # of the relative frame before anything is known (m, rad)
+FIRST_SIGMA = np.array([10.0, 1.0])  # of the relative frame before anything is known (m, rad)
 MOST_LIKELY = 0.95
-"""Probability of a closure for many matching descriptors; it falls as 1 - exp((4 - score) / 5). Counted on 413 tried
-pairs of RedKitchen and a scanned house: 56 % at 8 to 9 matches, 70 % at 10 to 12, 94, 90 and 96 % beyond."""
+"""Probability of a loop closure for many matching descriptors; it falls as 1 - exp((4 - score) / 5). Counted on 413
+tried pairs of RedKitchen and a scanned house: 56 % at 8 to 9 matches, 70 % at 10 to 12, 94, 90 and 96 % beyond."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Two keyframes, one of each robot, that may show the same place; score = number of matching descriptors."""
+    """Two keyframes, one of each robot, that may show the same place.
+
+    Attributes:
+        own_keyframe: index of the own keyframe.
+        peer_keyframe: index of the neighbor's keyframe.
+        score: number of matching descriptors.
+    """
 
     own_keyframe: int
     peer_keyframe: int
@@ -39,7 +45,7 @@ class Candidate:
 
     @property
     def probability(self) -> float:
-        """That a closer look ends with a closure."""
+        """Of a loop closure, before it is verified."""
         return max(0.0, MOST_LIKELY * (1.0 - float(np.exp((4.0 - self.score) / 5.0))))
 
 
@@ -49,7 +55,10 @@ def scored(
     """Pairs of keyframes with at least `min_score` matches, best first; and those that come nearest for the rest.
 
     Args:
-        own: all features of each own keyframe. peer: the compact descriptors of each keyframe of the neighbor.
+        own: all features of each own keyframe.
+        peer: the compact descriptors of each keyframe of the neighbor.
+        ratio: of the ratio test of the matches.
+        min_score: matches from which a pair is a candidate.
     Returns:
         Candidates; for every keyframe of the neighbor that resembles no own one enough, the pair that comes nearest.
     """
@@ -64,7 +73,7 @@ def scored(
 
 
 class Planner:
-    """What to ask of a neighbor next, given what came of what was asked before."""
+    """Which samples to request from a neighbor next, given what became of the earlier candidates."""
 
     def __init__(
         self,
@@ -72,28 +81,36 @@ class Planner:
         drift_own: Array,
         drift_peer: Array,
         config: PlacesConfig,
-        closures: ClosureConfig,
+        closures: LoopClosureConfig,
     ) -> None:
-        """drift_own, drift_peer: [n, 2], variance along the odometry (m^2, rad^2)."""
+        """Start with all candidates.
+
+        Args:
+            candidates: best first.
+            drift_own: [n, 2], variance along the own odometry (m^2, rad^2).
+            drift_peer: [n, 2], the same of the neighbor.
+            config: budget of requests.
+            closures: for their least variance.
+        """
         self.config, self.min_support = config, closures.min_support
         self.drift_own, self.drift_peer = drift_own, drift_peer
         self.variance = 2 * np.array([closures.sigma_floor_m**2, closures.sigma_floor_rad**2])
         self.left: dict[int, list[Candidate]] = {}  # by keyframe of the neighbor, best first
         for c in candidates:
             self.left.setdefault(c.peer_keyframe, []).append(c)
-        self.asked = 0
-        self._weaker: list[Candidate] = []  # of keyframes that were asked for
-        self._outcomes: list[tuple[Candidate, float]] = []  # and the probability that it is a closure
+        self.requested = 0
+        self._weaker: list[Candidate] = []  # of keyframes that were requested
+        self._outcomes: list[tuple[Candidate, float]] = []  # and the probability that it is a loop closure
 
     def take(self, candidate: Candidate, closure: bool) -> None:
-        """What came of a candidate."""
+        """What became of a candidate."""
         self._outcomes.append((candidate, float(closure)))
 
     def next(self) -> list[Candidate]:
-        """The next candidates to look at, those of some keyframes of the neighbor; none if nothing is worth it."""
+        """The next candidates to verify, those of some keyframes of the neighbor; none if nothing is worth it."""
         chosen: list[Candidate] = []
         for _ in range(
-            min(self.config.keyframes_per_request, self.config.max_requested_keyframes - self.asked)
+            min(self.config.keyframes_per_request, self.config.max_requested_keyframes - self.requested)
         ):
             assumed = [*self._outcomes, *((c, c.probability) for c in chosen)]
             worth = {j: self.worth(j, assumed) for j in sorted(self.left)}
@@ -103,13 +120,13 @@ class Planner:
             of_keyframe, most = self.left.pop(best), self.config.candidates_per_keyframe
             chosen += of_keyframe[:most]
             self._weaker += of_keyframe[most:]
-            self.asked += 1
+            self.requested += 1
         return chosen
 
-    def not_asked_for(self) -> list[tuple[Candidate, str]]:
-        """Every candidate that no closer look was taken at, with the reason."""
+    def not_requested(self) -> list[tuple[Candidate, str]]:
+        """Every candidate that was not verified, with the reason."""
         out = [(c, "its keyframe has better ones") for c in self._weaker]
-        full = self.asked >= self.config.max_requested_keyframes
+        full = self.requested >= self.config.max_requested_keyframes
         for j, candidates in sorted(self.left.items()):
             reason = f"keyframe {j} is worth {self.worth(j, self._outcomes):.2f} nats"
             budget = f"the budget of {self.config.max_requested_keyframes} keyframes is used up"
@@ -118,10 +135,11 @@ class Planner:
         return out
 
     def worth(self, peer_keyframe: int, assumed: Sequence[tuple[Candidate, float]]) -> float:
-        """Expected information (nats) of a closer look at a keyframe of the neighbor.
+        """Expected information (nats) of verifying the candidates of a keyframe of the neighbor.
 
         Args:
-            assumed: candidates before it, each with the probability that it is a closure.
+            peer_keyframe: index of this keyframe.
+            assumed: candidates before it, each with the probability that it is a loop closure.
         """
         before, total = list(assumed), 0.0
         for c in self.left[peer_keyframe][: self.config.candidates_per_keyframe]:
@@ -130,18 +148,18 @@ class Planner:
         return total
 
     def _gain(self, candidate: Candidate, before: Sequence[tuple[Candidate, float]]) -> float:
-        """Information (nats) of a closure beside others that may be there."""
+        """Information (nats) of a loop closure in addition to others that may exist."""
         apart = _fewer_than([p for _, p in before], self.min_support)
-        strangers = 3 * float(np.log(STRANGERS_SIGMA**2 / self.variance).sum()) / 2
+        first = 3 * float(np.log(FIRST_SIGMA**2 / self.variance).sum()) / 2
         if not before:
-            return strangers
+            return first
         i, j = np.array([(c.own_keyframe, c.peer_keyframe) for c, _ in before]).T
-        way = np.abs(self.drift_own[i] - self.drift_own[candidate.own_keyframe])
-        way = way + np.abs(self.drift_peer[j] - self.drift_peer[candidate.peer_keyframe])
+        between = np.abs(self.drift_own[i] - self.drift_own[candidate.own_keyframe])
+        between = between + np.abs(self.drift_peer[j] - self.drift_peer[candidate.peer_keyframe])
         p = np.array([p for _, p in before])
-        known = (p[:, None] / (self.variance + way)).sum(axis=0) + 1 / STRANGERS_SIGMA**2
-        beside = 3 * float(np.log1p(1 / (known * self.variance)).sum()) / 2
-        return apart * strangers + (1 - apart) * beside
+        known = (p[:, None] / (self.variance + between)).sum(axis=0) + 1 / FIRST_SIGMA**2
+        further = 3 * float(np.log1p(1 / (known * self.variance)).sum()) / 2
+        return apart * first + (1 - apart) * further
 
 
 def _fewer_than(probabilities: Sequence[float], count: int) -> float:

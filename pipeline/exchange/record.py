@@ -10,7 +10,7 @@ from typing import Any
 
 from duagc import schemas
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.exchange.agent import Agent
+from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.messages import map_frame, pack_pose, pack_stamp
 from duagc.pipeline.network.link_model import Fate
 from duagc.pipeline.network.packets import (
@@ -23,7 +23,7 @@ from duagc.pipeline.network.packets import (
 )
 from duagc.pipeline.network.transport import Outgoing
 from duagc.pipeline.recording import LogWriter, read_log
-from duagc.pipeline.runs.robot_data import AgentResult, RobotData
+from duagc.pipeline.runs.robot_data import RobotData, SessionResult
 from duagc.schemas import topics
 
 
@@ -31,9 +31,10 @@ from duagc.schemas import topics
 class RawAlternative:
     """Bytes of sending everything to every other robot once, without any protocol.
 
-    maps_and_information: every Gaussian (14 float32) with the part of its information that fusion needs (31 float32),
-    and every factor of the pose graph (40 bytes): the least that would allow the same fusion. maps_only: without the
-    information, which allows to look at the neighbors' maps and not to fuse them.
+    Attributes:
+        maps_and_information: every Gaussian (14 float32) with the part of its information that fusion needs (31
+            float32), and every relative pose (40 bytes): the least that would allow the same fusion.
+        maps_only: without the information, which allows to render the neighbors' maps and not to fuse them.
     """
 
     maps_and_information: int
@@ -58,9 +59,7 @@ class ExchangeRecorder:
         self._by_content: dict[bytes, tuple[str, int]] = {}
         self._totals: dict[tuple[str, str, str], list[int]] = {}  # packets, dropped, bytes, bytes delivered
 
-    def packet(
-        self, sender: str, out: Outgoing, sequence: int, round_index: int, send_ns: int, fate: Fate
-    ) -> None:
+    def packet(self, sender: str, out: Outgoing, *, round_index: int, send_ns: int, fate: Fate) -> None:
         """Record one packet, and its message if this is the first packet of it."""
         self._message(sender, out, send_ns)
         length = payload_bytes(out.packet)
@@ -70,7 +69,7 @@ class ExchangeRecorder:
             "PeerPacket",
             robot=sender,
             receiver=out.receiver,
-            sequence=sequence,
+            sequence=out.sequence,
             round=round_index,
             message=out.message.id,
             offset=packet.offset,
@@ -113,7 +112,7 @@ class ExchangeRecorder:
         self.writer.write(topics.PEER_MESSAGE.of(sender), message, send_ns)
 
     def summary(
-        self, team: list[str], rounds: int, converged: bool, raw: RawAlternative, now_ns: int
+        self, team: list[str], *, rounds: int, converged: bool, raw: RawAlternative, now_ns: int
     ) -> None:
         """Record what the session cost."""
         message = schemas.new(
@@ -150,7 +149,13 @@ RUNNING_KINDS = frozenset(kind.name for kind in (Kind.ACK, Kind.STATE, *EVIDENCE
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recorded session: the team, the number of rounds, all packets in the order of sending."""
+    """A recorded session.
+
+    Attributes:
+        team: names, sorted.
+        rounds: how many there were.
+        packets: all of them in the order of sending.
+    """
 
     team: tuple[str, ...]
     rounds: int
@@ -159,7 +164,19 @@ class Recorded:
 
 @dataclass(frozen=True)
 class RecordedPacket:
-    """One packet of a recorded session, rebuilt; deliver_ns: of every copy that arrived."""
+    """One packet of a recorded session, rebuilt.
+
+    Attributes:
+        sender: name of the robot that sent it.
+        receiver: name of the robot that it is for.
+        sequence: its number on this directed link.
+        round: in which it was sent.
+        kind_name: of its message.
+        send_ns: when it was sent.
+        deliver_ns: when every copy arrived; empty if it was dropped.
+        dropped: why it was dropped; empty if it was not.
+        data: its bytes.
+    """
 
     sender: str
     receiver: str
@@ -198,15 +215,15 @@ def read_session(exchange_path: Path) -> Recorded:
                 raise DuagError(f"{where} is no packet ({error}), expected what its header says") from error
             packets.append(
                 RecordedPacket(
-                    m.robot,
-                    m.receiver,
-                    m.sequence,
-                    m.round,
-                    kind_name,
-                    record.log_time_ns,
-                    (m.deliver_ns, *m.copies_deliver_ns) if m.delivered else (),
-                    m.dropped,
-                    data + m.signature,
+                    sender=m.robot,
+                    receiver=m.receiver,
+                    sequence=m.sequence,
+                    round=m.round,
+                    kind_name=kind_name,
+                    send_ns=record.log_time_ns,
+                    deliver_ns=(m.deliver_ns, *m.copies_deliver_ns) if m.delivered else (),
+                    dropped=m.dropped,
+                    data=data + m.signature,
                 )
             )
         elif record.schema == topics.EXCHANGE_SUMMARY.schema:
@@ -234,7 +251,7 @@ class ConsensusRecorder:
         self.writer = writer
         self._last: dict[str, bytes] = {}
 
-    def round(self, agent: Agent, round_index: int, now_ns: int) -> None:
+    def round(self, agent: MapAgent, round_index: int, now_ns: int) -> None:
         """Record where an agent stands, if that changed, and its pose round, if there was one."""
         robot = agent.data.robot
         self._write_changed(topics.AGENT_ROUND.of(robot), self._agent(agent), round_index, now_ns)
@@ -251,40 +268,40 @@ class ConsensusRecorder:
             self.writer.write(topic, message, now_ns)
 
     @staticmethod
-    def _agent(agent: Agent) -> Any:
+    def _agent(agent: MapAgent) -> Any:
         neighbors = agent.neighbors.values()
         return schemas.new(
             "AgentRound",
-            frame_id=map_frame(agent.team[agent.frames.root]),
+            frame_id=map_frame(agent.team[agent.alignment.root]),
             robot=agent.data.robot,
-            root=agent.team[agent.frames.root],
-            members=[agent.team[i] for i in agent.frames.members],
+            root=agent.team[agent.alignment.root],
+            members=[agent.team[i] for i in agent.alignment.members],
             joined_links=sum(n.joined for n in neighbors),
             undecided_links=sum(not n.decided for n in neighbors),
             evidence_owners=len(agent.knowledge.evidence),
             pair_lists=len(agent.knowledge.pairs),
             open_messages=sum(n.transport.open_messages for n in neighbors),
-            revoked_links=sum(n.parted for n in neighbors),
+            revoked_links=sum(n.link.revoked for n in neighbors),
             agreed=agent.agreed,
             done=agent.done,
             packets_refused=sum(agent.refused.values()),
         )
 
     @staticmethod
-    def _poses(agent: Agent) -> Any:
+    def _poses(agent: MapAgent) -> Any:
         assert agent.poses is not None
         values = agent.poses.residuals()
         largest = agent.poses.largest_change
         message = schemas.new(
             "ConsensusRound",
-            frame_id=map_frame(agent.team[agent.frames.root]),
+            frame_id=map_frame(agent.team[agent.alignment.root]),
             robot=agent.data.robot,
             primal=values["primal"],
             dual=values["dual"],
             cost=values["cost"],
             step=values["step"],
             largest_change=largest,
-            converged=agent.poses.settled,
+            converged=agent.poses.converged,
             agreed=agent.agreed,
             factorizations=values["factorizations"],
         )
@@ -298,7 +315,7 @@ class ConsensusRecorder:
             )
         return message
 
-    def result(self, result: AgentResult, now_ns: int) -> None:
+    def result(self, result: SessionResult, now_ns: int) -> None:
         """Record what became of every candidate."""
         for c in result.closures:
             message = schemas.new(

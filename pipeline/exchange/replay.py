@@ -8,17 +8,22 @@ from pathlib import Path
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.config.exchange import ExchangeConfig
-from duagc.pipeline.exchange.agent import Agent
+from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.exchange.record import read_session
-from duagc.pipeline.exchange.session import Delivery, due
+from duagc.pipeline.exchange.rounds import Delivery, due
 from duagc.pipeline.exchange.session_result import result_of
 from duagc.pipeline.network import link_model
-from duagc.pipeline.runs.robot_data import AgentInput, AgentResult, RobotData, load
+from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult, load
 
 
 @dataclass(frozen=True)
 class SentPackets:
-    """Digest of all packets that a robot sent, in order: as recorded, and as recomputed."""
+    """Digests of all packets that a robot sent, in order.
+
+    Attributes:
+        recorded: of those in the log.
+        recomputed: of those of the replay.
+    """
 
     recorded: str
     recomputed: str
@@ -31,21 +36,23 @@ class SentPackets:
 
 def replay_agent(
     source: AgentInput, config: ExchangeConfig, *, seed: int, exchange_path: Path
-) -> tuple[AgentResult, SentPackets]:
+) -> tuple[SessionResult, SentPackets]:
     """Recompute one robot's agent.
 
     Args:
-        source: files of this robot only. config, seed: of the run.
+        source: files of this robot only.
+        config: of the run.
+        seed: of the run.
         exchange_path: its exchange.mcap; only packets delivered to this robot are given to the agent.
     Returns:
-        What the robot takes home, and whether it sent the same packets.
+        The result of the robot, and whether it sent the same packets.
     """
     return replay_agent_of(load(source), config, seed=seed, exchange_path=exchange_path)
 
 
 def replay_agent_of(
     data: RobotData, config: ExchangeConfig, *, seed: int, exchange_path: Path
-) -> tuple[AgentResult, SentPackets]:
+) -> tuple[SessionResult, SentPackets]:
     """`replay_agent` on data in memory."""
     determinism.configure_opencv()
     session = read_session(exchange_path)
@@ -57,7 +64,7 @@ def replay_agent_of(
         if p.receiver == data.robot:
             waiting.extend((at_ns, p.sender, p.sequence, p.data) for at_ns in p.deliver_ns)
     neighbors = link_model.neighbors(config.link, session.team)[data.robot]
-    agent = Agent(data, session.team, neighbors, config, seed)
+    agent = MapAgent(data, session.team, neighbors, config, seed=seed)
     for round_index in range(session.rounds):
         now_ns = round_index * config.period_ns
         for out in agent.tick(round_index, now_ns, due(waiting, now_ns)):

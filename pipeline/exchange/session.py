@@ -1,4 +1,4 @@
-"""One rendezvous of the team: a round is one tick of every agent, packets travel between them over the link model."""
+"""One rendezvous of the team, recorded."""
 
 from __future__ import annotations
 
@@ -7,20 +7,19 @@ from pathlib import Path
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.base.progress import track
 from duagc.pipeline.config.exchange import ExchangeConfig
-from duagc.pipeline.exchange.agent import Agent
+from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.exchange.record import ConsensusRecorder, ExchangeRecorder, RawAlternative
+from duagc.pipeline.exchange.rounds import run_rounds
 from duagc.pipeline.exchange.session_result import result_of
 from duagc.pipeline.exchange.wire.state_wire import MAX_TEAM
 from duagc.pipeline.network import link_model
-from duagc.pipeline.network.link_model import LinkModel
+from duagc.pipeline.network.link_model import Fate, LinkModel
+from duagc.pipeline.network.transport import Outgoing
 from duagc.pipeline.recording import LogWriter
-from duagc.pipeline.runs.robot_data import AgentInput, AgentResult, RobotData, load
+from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult, load
 
 __all__ = ["AgentInput", "run_session", "run_session_of"]
-
-Delivery = tuple[int, str, int, bytes]  # deliver_ns, sender, sequence, packet
 
 
 def run_session(
@@ -30,20 +29,40 @@ def run_session(
     seed: int,
     exchange_path: Path,
     consensus_path: Path,
-) -> dict[str, AgentResult]:
+) -> dict[str, SessionResult]:
     """Let the team meet.
 
     Args:
         inputs: files of every robot.
-        config: the same for all. seed: of this run.
-        exchange_path, consensus_path: logs to write.
+        config: the same for all.
+        seed: of this run.
+        exchange_path: log of messages and packets to write.
+        consensus_path: log of rounds and loop closures to write.
     Returns:
-        What every robot takes home, by name.
+        The result of every robot, by name.
     Raises:
         DuagError: a file that an agent needs is missing or broken, or the team is too large.
     """
     data = [load(i) for i in sorted(inputs, key=lambda i: i.robot)]
     return run_session_of(data, config, seed=seed, exchange_path=exchange_path, consensus_path=consensus_path)
+
+
+class _Recorder:
+    """Both logs of a session, as rounds go by."""
+
+    def __init__(self, exchange: ExchangeRecorder, consensus: ConsensusRecorder) -> None:
+        self.exchange, self.consensus = exchange, consensus
+
+    def ticked(self, agent: MapAgent, round_index: int, now_ns: int) -> None:
+        """Record where the agent stands."""
+        self.consensus.round(agent, round_index, now_ns)
+
+    def sent(self, sender: str, out: Outgoing, fate: Fate, *, round_index: int, now_ns: int) -> None:
+        """Record a packet."""
+        self.exchange.packet(sender, out, round_index=round_index, send_ns=now_ns, fate=fate)
+
+    def ended(self, round_index: int) -> None:
+        """Nothing is recorded of a round as a whole."""
 
 
 def run_session_of(
@@ -53,63 +72,43 @@ def run_session_of(
     seed: int,
     exchange_path: Path,
     consensus_path: Path,
-) -> dict[str, AgentResult]:
+) -> dict[str, SessionResult]:
     """`run_session` on data in memory, one entry per robot."""
     determinism.configure_opencv()
     agents = team_of(data, config, seed)
-    model = LinkModel(config.link, seed)
-    waiting: dict[str, list[Delivery]] = {robot: [] for robot in agents}
     metadata = {"config": config.model_dump_json(), "seed": str(seed)}
     with (
         LogWriter(exchange_path, metadata=metadata) as exchange,
         LogWriter(consensus_path, metadata=metadata) as log,
     ):
         packets, rounds = ExchangeRecorder(exchange), ConsensusRecorder(log)
-        now_ns = round_index = 0
-        for round_index in track(iter(range(config.max_rounds)), "exchange"):
-            now_ns = round_index * config.period_ns
-            sent = []
-            for robot, agent in agents.items():
-                delivered = due(waiting[robot], now_ns)
-                sent.append((robot, agent.tick(round_index, now_ns, delivered)))
-                rounds.round(agent, round_index, now_ns)
-            for sender, burst in sent:
-                for out in burst:
-                    sequence = int.from_bytes(out.packet[8:12], "little")
-                    fate = model.fate(sender, out.receiver, sequence, now_ns, len(out.packet))
-                    packets.packet(sender, out, sequence, round_index, now_ns, fate)
-                    waiting[out.receiver].extend(
-                        (at_ns, sender, sequence, out.packet) for at_ns in fate.deliver_ns
-                    )
-            if all(agent.done for agent in agents.values()):
-                break
+        count = run_rounds(
+            agents,
+            LinkModel(config.link, seed),
+            _Recorder(packets, rounds),
+            period_ns=config.period_ns,
+            max_rounds=config.max_rounds,
+            title="exchange",
+        )
+        now_ns = (count - 1) * config.period_ns
         results = {robot: result_of(agent) for robot, agent in agents.items()}
         for result in results.values():
             rounds.result(result, now_ns)
         packets.summary(
             list(agents),
-            round_index + 1,
-            all(result.converged for result in results.values()),
-            RawAlternative.of(data),
-            now_ns,
+            rounds=count,
+            converged=all(result.converged for result in results.values()),
+            raw=RawAlternative.of(data),
+            now_ns=now_ns,
         )
     return results
 
 
-def team_of(data: Sequence[RobotData], config: ExchangeConfig, seed: int) -> dict[str, Agent]:
+def team_of(data: Sequence[RobotData], config: ExchangeConfig, seed: int) -> dict[str, MapAgent]:
     """The agents of a team, by name, in alphabetical order; each is given its own data only."""
     names = sorted(d.robot for d in data)
     if len(set(names)) != len(names) or len(names) > MAX_TEAM:
         raise DuagError(f"team of {len(names)}: expected different names and at most {MAX_TEAM} robots")
     linked = link_model.neighbors(config.link, names)
     by_name = {d.robot: d for d in data}
-    return {name: Agent(by_name[name], names, linked[name], config, seed) for name in names}
-
-
-def due(waiting: list[Delivery], now_ns: int) -> list[bytes]:
-    """Take the packets that have arrived out of a queue, by (time of delivery, sender, sequence)."""
-    waiting.sort(key=lambda d: d[:3])
-    count = next((i for i, d in enumerate(waiting) if d[0] > now_ns), len(waiting))
-    arrived = [d[3] for d in waiting[:count]]
-    del waiting[:count]
-    return arrived
+    return {name: MapAgent(by_name[name], names, linked[name], config, seed=seed) for name in names}

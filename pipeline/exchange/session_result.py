@@ -1,4 +1,4 @@
-"""What a robot takes home from a session, by its own estimate."""
+"""The result of a session at one robot, by its own estimate."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.exchange.agent import Agent
 from duagc.pipeline.exchange.evidence_records import to_evidence
+from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.verification import Verdict
 from duagc.pipeline.exchange.wire.state_wire import PairList
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.posegraph.loop_closures import Closure
-from duagc.pipeline.posegraph.robust import COUNTS
-from duagc.pipeline.runs.robot_data import AgentResult, ClosureRecord
+from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT
+from duagc.pipeline.posegraph.relative_poses import LoopClosure
+from duagc.pipeline.runs.robot_data import LoopClosureRecord, SessionResult
 
 Array = NDArray[np.float64]
 
 
-def result_of(agent: Agent) -> AgentResult:
-    """What an agent takes home. Alone, its poses are those of its own map, bit for bit."""
+def result_of(agent: MapAgent) -> SessionResult:
+    """The result of an agent. Alone, its poses are those of its own map, bit for bit."""
     robot, team, knowledge = agent.data.robot, agent.team, agent.knowledge
     T_common = {robot: agent.data.T_map_keyframe}
     gauge = np.eye(4)
@@ -38,17 +38,17 @@ def result_of(agent: Agent) -> AgentResult:
         for p in knowledge.pairs.values()
         if team[p.lower] in names and team[p.higher] in names and _active(agent, p)
     }
-    own = agent.sharing.own_records()
+    own = agent.evidence.own_records()
     evidence = {team[i]: knowledge.sound_records(i) for i in others if i in knowledge.anchors}
     depths = {team[i]: knowledge.depth(i) for i in others}
-    return AgentResult(
+    return SessionResult(
         robot=robot,
         component=tuple(sorted(names)),
         T_world_keyframe=T_world[robot],
         T_world_keyframe_of=T_world,
         own_evidence=to_evidence(robot, own[np.argsort(own["id"])]),
         evidence={name: to_evidence(name, records) for name, records in evidence.items()},
-        # a robot that told no kind of depth told no Gaussian either: nothing of it is drawn
+        # a robot that sent no kind of depth sent no Gaussian either: nothing of it is rendered
         depth_of={name: depths[name] or agent.data.depth for name in evidence},
         pairs=pairs,
         closures=tuple(_closures(agent)),
@@ -60,64 +60,64 @@ def result_of(agent: Agent) -> AgentResult:
     )
 
 
-def _active(agent: Agent, pairs: PairList) -> bool:
+def _active(agent: MapAgent, pairs: PairList) -> bool:
     """Whether a pair list counts: at the end that made it, only when the other end is known to have it."""
     if pairs.lower != agent.own or agent.done:
         return True
     neighbor = agent.neighbors.get(pairs.higher)
-    message = None if neighbor is None else neighbor.pairs_told.get((pairs.lower, pairs.higher))
+    message = None if neighbor is None else neighbor.passed.pairs.get((pairs.lower, pairs.higher))
     return neighbor is not None and message is not None and not neighbor.transport.is_open(message)
 
 
-def _gauge(agent: Agent) -> Array:
-    """T_world_common: the root's first keyframe is where its own map has it. Identity before the root said so."""
-    root = agent.knowledge.anchors.get(agent.frames.root)
+def _gauge(agent: MapAgent) -> Array:
+    """T_world_common: the root's first keyframe is where its own map has it. Identity before that has arrived."""
+    root = agent.knowledge.anchors.get(agent.alignment.root)
     if root is None:
         return np.eye(4)
     return root.T_map_first @ se3.inverse(root.T_common_keyframe[0])
 
 
-def _closures(agent: Agent) -> Iterator[ClosureRecord]:
+def _closures(agent: MapAgent) -> Iterator[LoopClosureRecord]:
     """Every candidate that this robot decided on, with the reason for what became of it."""
     for n in agent.neighbors.values():
-        for t in n.meeting.tried if n.meeting else ():
+        for t in n.loop_closing.tried if n.loop_closing else ():
             r = t.result
             weight = None if r.closure is None else _weight(agent, n, r.closure)
             verdict, detail = r.verdict, r.detail
             if weight is not None:
-                detail = f"{detail}; the link {n.contradiction}" if n.contradiction else detail
-                if n.undecided:
+                detail = f"{detail}; the link {n.link.contradiction}" if n.link.contradiction else detail
+                if n.link.undecided:
                     verdict, weight = Verdict.UNDECIDED, 0.0
-                elif n.parted:
-                    verdict = Verdict.ALONE if weight >= COUNTS else Verdict.OUTWEIGHED
-                    detail, weight = f"weight {weight:.2f} when the link was parted; {detail}", 0.0
+                elif n.link.revoked:
+                    verdict = Verdict.ALONE if weight >= INLIER_WEIGHT else Verdict.OUTWEIGHED
+                    detail, weight = f"weight {weight:.2f} when the link was revoked; {detail}", 0.0
                 else:  # the graduated weights have the last word
-                    verdict = Verdict.KEPT if weight >= COUNTS else Verdict.OUTWEIGHED
-            yield ClosureRecord(
-                agent.data.robot,
-                n.name,
-                t.candidate.own_keyframe,
-                t.candidate.peer_keyframe,
-                t.candidate.score,
-                verdict.value,
-                r.matches,
-                r.inliers,
-                detail,
-                weight,
-                None if r.closure is None else r.closure.T_own_peer,
-                None if r.closure is None else r.closure.information,
+                    verdict = Verdict.KEPT if weight >= INLIER_WEIGHT else Verdict.OUTWEIGHED
+            yield LoopClosureRecord(
+                robot=agent.data.robot,
+                peer=n.name,
+                own_keyframe=t.candidate.own_keyframe,
+                peer_keyframe=t.candidate.peer_keyframe,
+                score=t.candidate.score,
+                verdict=verdict.value,
+                matches=r.matches,
+                inliers=r.inliers,
+                detail=detail,
+                weight=weight,
+                T_own_peer=None if r.closure is None else r.closure.T_own_peer,
+                information=None if r.closure is None else r.closure.information,
             )
 
 
-def _weight(agent: Agent, n: Neighbor, closure: Closure) -> float | None:
-    """Robust weight of a closure at the end, or when its link was parted; None if it took no part."""
-    if n.meeting is None or n.meeting.joined is None:
+def _weight(agent: MapAgent, n: Neighbor, closure: LoopClosure) -> float | None:
+    """Robust weight of a loop closure at the end, or when its link was revoked; None if it took no part."""
+    if n.loop_closing is None or n.loop_closing.joined is None:
         return None
-    if n.parted:
-        weights = n.last_weights
+    if n.link.revoked:
+        weights = n.link.weights
     elif agent.poses is not None and n.index in agent.links:
         weights = agent.poses.weights(n.name).tolist()
     else:
         return None
-    held = n.meeting.joined.closures
+    held = n.loop_closing.joined.closures
     return next((w for w, other in zip(weights, held, strict=True) if other is closure), None)

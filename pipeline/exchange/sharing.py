@@ -1,9 +1,9 @@
-"""What an agent tells on: evidence to whoever lacks it; space seen, agreed poses and pair lists to everybody."""
+"""What an agent shares besides poses: evidence with robots that lack it; space, agreed poses and matches with all."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,9 @@ from duagc.pipeline.exchange.evidence_records import best_first, match_pairs, ow
 from duagc.pipeline.exchange.knowledge import Knowledge
 from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.wire import evidence_wire, state_wire
-from duagc.pipeline.exchange.wire.state_wire import PairList
-from duagc.pipeline.network.packets import Kind
+from duagc.pipeline.exchange.wire.state_wire import Anchors, PairList, State
+from duagc.pipeline.network.packets import Kind, MalformedError
+from duagc.pipeline.network.transport import Arrival
 from duagc.pipeline.runs.robot_data import RobotData
 
 Array = NDArray[np.float64]
@@ -26,19 +27,103 @@ EVIDENCE_WIRES = {
 }
 
 
-class Sharing:
-    """Own evidence as it is sent, and what is handed on of others'."""
+SendTo = Callable[[Neighbor, Kind, bytes], int]
+"""Queues a reliable message for a neighbor and returns its id."""
 
-    def __init__(
-        self,
-        data: RobotData,
-        team: Sequence[str],
-        config: ExchangeConfig,
-        seed: int,
-        send: Callable[[Neighbor, Kind, bytes], int],
+
+class SharedData(Protocol):
+    """What an agent needs of its sharing.
+
+    Attributes:
+        enabled: evidence is shared; if not, only poses are agreed.
+        knowledge: what came from others.
+    """
+
+    enabled: bool
+    knowledge: Knowledge
+
+    def take(
+        self, n: Neighbor, arrival: Arrival, round_index: int, neighbors: Mapping[int, Neighbor]
     ) -> None:
-        """team: sorted. send: queues a reliable message for a neighbor and returns its id."""
-        self.data, self.team, self.config, self.seed, self._send = data, list(team), config, seed, send
+        """Use what a neighbor sent.
+
+        Raises:
+            MalformedError: it is not what it should be.
+        """
+
+    def send_missing(
+        self, send: SendTo, joined: Sequence[Neighbor], members: Sequence[int], T_world_map: Array | None
+    ) -> None:
+        """Send every joined neighbor what it lacks."""
+
+    def match(self, others: Sequence[int]) -> None:
+        """Match own Gaussians with those of other members, once everything needed is here."""
+
+    def add_poses(self, T_common_keyframe: Array, T_map_first: Array) -> None:
+        """Own poses became final."""
+
+    def complete(self, members: Sequence[int]) -> bool:
+        """Whether all is here that the members of the component share."""
+
+    def supplied(self, state: State, members: Sequence[int]) -> bool:
+        """Whether a neighbor in this state lacks nothing that only this robot may bring."""
+
+
+class NoSharing:
+    """Only poses are agreed; nothing else is shared."""
+
+    enabled = False
+
+    def __init__(self, own: int, team: int) -> None:
+        """Nothing is known, and nothing will be.
+
+        Args:
+            own: index of the robot in the sorted team.
+            team: number of robots.
+        """
+        self.knowledge = Knowledge(own, team, Kind.EVIDENCE)
+
+    def take(
+        self, n: Neighbor, arrival: Arrival, round_index: int, neighbors: Mapping[int, Neighbor]
+    ) -> None:
+        """Refuse whatever comes."""
+        raise MalformedError(f"{arrival.kind.name} is not for a team that agrees on poses only")
+
+    def send_missing(
+        self, send: SendTo, joined: Sequence[Neighbor], members: Sequence[int], T_world_map: Array | None
+    ) -> None:
+        """There is nothing to send."""
+
+    def match(self, others: Sequence[int]) -> None:
+        """There is nothing to match."""
+
+    def add_poses(self, T_common_keyframe: Array, T_map_first: Array) -> None:
+        """No other robot needs them."""
+
+    def complete(self, members: Sequence[int]) -> bool:
+        """Nothing is missing."""
+        return True
+
+    def supplied(self, state: State, members: Sequence[int]) -> bool:
+        """A neighbor needs this robot until it has agreed too."""
+        return state.agreed
+
+
+class Sharing:
+    """Own evidence as it is sent, and what is passed on of others'."""
+
+    enabled = True
+
+    def __init__(self, data: RobotData, team: Sequence[str], config: ExchangeConfig, seed: int) -> None:
+        """Start with own data only.
+
+        Args:
+            data: of this robot.
+            team: names of all robots that may exist.
+            config: the same at all robots.
+            seed: of this run.
+        """
+        self.data, self.team, self.config, self.seed = data, sorted(team), config, seed
         self.own = self.team.index(data.robot)
         self.kind = EVIDENCE_WIRES[config.evidence_wire]
         self.knowledge = Knowledge(self.own, len(self.team), self.kind)
@@ -70,39 +155,99 @@ class Sharing:
             )
         return k.evidence_bytes[self.own]
 
-    # --- telling others
+    # --- incoming
 
-    def tell(self, joined: Sequence[Neighbor], members: Sequence[int], T_world_map: Array | None) -> None:
-        """Everything that a neighbor lacks.
+    def take(
+        self, n: Neighbor, arrival: Arrival, round_index: int, neighbors: Mapping[int, Neighbor]
+    ) -> None:
+        """Use what a neighbor sent.
 
         Args:
-            members: of the component. T_world_map: own map frame in the common one once poses are agreed, else None.
+            n: the neighbor.
+            arrival: a message of it, or a part of its evidence.
+            round_index: the current round.
+            neighbors: all of them, by index; evidence that is complete need not come from the others any more.
+        Raises:
+            MalformedError: it is not what it should be.
+        """
+        k, payload = self.knowledge, arrival.payload
+        if arrival.kind is Kind.VOXELS:
+            _, n.voxels = state_wire.read_voxels(payload, len(self.team))
+        elif arrival.kind is Kind.ANCHORS:
+            n.passed.poses.add(k.take_anchors(payload))
+        elif arrival.kind is Kind.PAIRS:
+            n.passed.pairs.setdefault(k.take_pairs(payload), 0)
+        elif arrival.kind is self.kind:
+            owner = k.take_evidence(n.index, arrival.message, payload, arrival.complete)
+            if owner is not None:
+                for provider, message in k.forget_incoming(owner):
+                    neighbors[provider].transport.accept_rest(message, round_index)
+                n.transport.accept_rest(arrival.message, round_index)
+
+    def add_poses(self, T_common_keyframe: Array, T_map_first: Array) -> None:
+        """Own poses became final: they are flooded.
+
+        Args:
+            T_common_keyframe: [n, 4, 4], own keyframes in the common frame of the consensus.
+            T_map_first: [4, 4], the first keyframe in the own map.
+        """
+        anchors = Anchors(self.own, T_common_keyframe, T_map_first)
+        self.knowledge.anchors[self.own] = anchors
+        self.knowledge.anchors_bytes[self.own] = state_wire.write_anchors(anchors)
+
+    def complete(self, members: Sequence[int]) -> bool:
+        """Whether agreed poses, evidence and matches of all members are here."""
+        k = self.knowledge
+        return (
+            all(m in k.anchors for m in members)
+            and all(m in k.evidence for m in members if m != self.own)
+            and all((a, b) in k.pairs for a in members for b in members if a < b)
+        )
+
+    def supplied(self, state: State, members: Sequence[int]) -> bool:
+        """Whether a neighbor has the evidence of all members."""
+        return all(state.sources[m] == state_wire.COMPLETE for m in members)
+
+    # --- outgoing
+
+    def send_missing(
+        self, send: SendTo, joined: Sequence[Neighbor], members: Sequence[int], T_world_map: Array | None
+    ) -> None:
+        """Send every joined neighbor what it lacks.
+
+        Args:
+            send: queues a message.
+            joined: the neighbors.
+            members: of the component.
+            T_world_map: [4, 4], own map frame in the common one once poses are agreed, else None.
         """
         k = self.knowledge
         for n in joined:
-            if self.config.coverage == "overlap" and T_world_map is not None and not n.voxels_told:
-                n.voxels_told = True
+            if self.config.coverage == "overlap" and T_world_map is not None and not n.passed.voxels:
+                n.passed.voxels = True
                 keys = seen_voxels(self.data.gaussians, T_world_map, self.config.overlap_voxel_m)
-                self._send(n, Kind.VOXELS, state_wire.write_voxels(self.own, keys))
-            self._tell_evidence(n, members, T_world_map)
+                send(n, Kind.VOXELS, state_wire.write_voxels(self.own, keys))
+            self._send_evidence(send, n, members, T_world_map)
             for owner in sorted(k.anchors_bytes):
-                if owner != n.index and owner not in n.anchors_told:
-                    n.anchors_told.add(owner)
-                    self._send(n, Kind.ANCHORS, k.anchors_bytes[owner])
+                if owner != n.index and owner not in n.passed.poses:
+                    n.passed.poses.add(owner)
+                    send(n, Kind.ANCHORS, k.anchors_bytes[owner])
             for pair in sorted(k.pairs_bytes):
-                if pair[0] != n.index and pair not in n.pairs_told:
-                    n.pairs_told[pair] = self._send(n, Kind.PAIRS, k.pairs_bytes[pair])
+                if pair[0] != n.index and pair not in n.passed.pairs:
+                    n.passed.pairs[pair] = send(n, Kind.PAIRS, k.pairs_bytes[pair])
 
-    def _tell_evidence(self, n: Neighbor, members: Sequence[int], T_world_map: Array | None) -> None:
+    def _send_evidence(
+        self, send: SendTo, n: Neighbor, members: Sequence[int], T_world_map: Array | None
+    ) -> None:
         if n.state is None:
             return
         for owner in [self.own, *sorted(self.knowledge.evidence)]:
             if owner not in members:
                 continue
             wanted = owner != n.index and n.state.sources[owner] in (state_wire.NOBODY, self.own)
-            if not wanted and owner in n.evidence_sent:  # it is there, or somebody else brings it
-                n.transport.cancel(n.evidence_sent.pop(owner))
-            if not wanted or owner in n.evidence_sent:
+            if not wanted and owner in n.passed.evidence:  # it is there, or comes from another robot
+                n.transport.cancel(n.passed.evidence.pop(owner))
+            if not wanted or owner in n.passed.evidence:
                 continue
             if self.config.coverage == "overlap":
                 payload = self._overlapping(n, owner, T_world_map)
@@ -111,18 +256,18 @@ class Sharing:
             else:
                 payload = self.knowledge.evidence_bytes[owner]
             if payload is not None:
-                n.evidence_sent[owner] = self._send(n, self.kind, payload)
+                n.passed.evidence[owner] = send(n, self.kind, payload)
 
     def _overlapping(self, n: Neighbor, owner: int, T_world_map: Array | None) -> bytes | None:
-        """Evidence of an owner in the space that a neighbor saw; None until that can be told."""
+        """Evidence of an owner in the space that a neighbor saw; None before both are known."""
         k = self.knowledge
         if n.voxels is None or T_world_map is None:
             return None
         if owner == self.own:
             records, body, depth = self.own_records(), self.own_body(), self.data.depth
             T_common = T_world_map @ self.data.T_map_keyframe
-        elif owner in k.anchors and (told := k.depth(owner)) is not None:
-            records, body, depth = k.evidence[owner], k.bodies[owner], told
+        elif owner in k.anchors and (kind := k.depth(owner)) is not None:
+            records, body, depth = k.evidence[owner], k.bodies[owner], kind
             T_common = k.anchors[owner].T_common_keyframe
         else:
             return None
@@ -139,16 +284,12 @@ class Sharing:
             ready = other in k.anchors and other in k.evidence and (self.own, other) not in k.pairs
             if self.own < other and ready:
                 ids = match_pairs(
-                    self.data.robot,
-                    self.own_records(),
-                    k.anchors[self.own].T_common_keyframe,
-                    self.team[other],
-                    k.sound_records(other),
-                    k.anchors[other].T_common_keyframe,
+                    (self.data.robot, self.own_records(), k.anchors[self.own].T_common_keyframe),
+                    (self.team[other], k.sound_records(other), k.anchors[other].T_common_keyframe),
                     self.config.matching,
                 )
                 ids = injection.false_matches(
-                    ids, self.config.injection, self.seed, self.data.robot, self.team[other]
+                    ids, self.config.injection, seed=self.seed, robot=self.data.robot, peer=self.team[other]
                 )
                 pairs = PairList(self.own, other, 1, ids)
                 k.pairs[self.own, other] = pairs

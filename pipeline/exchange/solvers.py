@@ -1,8 +1,8 @@
-"""The two solvers of the poses behind one interface: relaxed edge-ADMM, and elimination along the tree of frames."""
+"""Solvers of the poses behind one interface: relaxed edge-ADMM, and elimination along the tree of robots."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -10,15 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.consensus import PoseConsensusConfig
+from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes
 from duagc.pipeline.consensus.elimination import Variable
 from duagc.pipeline.consensus.pose_admm import PoseAgent, with_floor
 from duagc.pipeline.consensus.tree import TreeGraph, TreeNode, TreePlace
+from duagc.pipeline.exchange.own_graph import OwnGraph
 from duagc.pipeline.exchange.wire import elimination_wire
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses_in_parts
-from duagc.pipeline.posegraph.factors import Factors
-from duagc.pipeline.posegraph.loop_closures import Closure, closure_factors
-from duagc.pipeline.posegraph.robust import COUNTS, RobustWeights
+from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT, RobustWeights
+from duagc.pipeline.posegraph.relative_poses import LoopClosure, closures_as_relative_poses
 
 Array = NDArray[np.float64]
 
@@ -27,33 +28,48 @@ Array = NDArray[np.float64]
 class LinkStart:
     """A joined neighbor as the solver gets it.
 
-    shared: keyframes that both ends have. closures, keep, T_world_keyframe: at the end that holds the closures; which
-    of them the weights begin with, and where the neighbor's keyframes start, [n, 4, 4].
+    Attributes:
+        index: of the neighbor in the sorted team.
+        name: of the neighbor.
+        shared: keyframes that both ends have.
+        closures: m loop closures at the end that holds them; else none.
+        keep: bool [m], those that the robust weights begin with.
+        T_world_keyframe: [n, 4, 4], where the neighbor's keyframes start, at the end that holds the loop closures.
     """
 
     index: int
     name: str
     shared: SharedKeyframes
-    closures: tuple[Closure, ...]
+    closures: tuple[LoopClosure, ...]
     keep: NDArray[np.bool_]
     T_world_keyframe: Array
 
 
 @dataclass(frozen=True)
 class SolverStart:
-    """What a robot knows when the pose rounds begin: registrations between own keyframes, places, neighbors."""
+    """What a robot knows when the pose rounds begin.
 
-    robot: str
+    Attributes:
+        own: its own graph; its keyframes count as seen from the first.
+        index: of the robot in the sorted team.
+        T_world_map: [4, 4], where its first keyframe was placed.
+        tree: its place in the tree along which the maps were placed.
+        links: joined neighbors.
+    """
+
+    own: OwnGraph
     index: int
-    T_map_keyframe: Array
-    registrations: Factors
     T_world_map: Array
     tree: TreePlace
     links: Sequence[LinkStart]
 
 
 class PoseSolver(Protocol):
-    """One robot's side of the pose consensus. refused: reasons why kept messages could not be used."""
+    """One robot's side of the pose consensus.
+
+    Attributes:
+        refused: reasons why kept messages could not be used.
+    """
 
     refused: list[str]
 
@@ -64,7 +80,11 @@ class PoseSolver(Protocol):
         """What goes to a neighbor in this round, never again; each fits into `room_bytes`."""
 
     def take_state(self, neighbor: LinkStart, payload: bytes) -> None:
-        """Use what a neighbor sent in a round. Raises ValueError."""
+        """Use what a neighbor sent in a round.
+
+        Raises:
+            ValueError: it is not what it should be.
+        """
 
     def messages(self) -> list[tuple[int, bytes]]:
         """Reliable messages that are to be sent now, by receiver."""
@@ -73,8 +93,8 @@ class PoseSolver(Protocol):
         """Keep a neighbor's reliable message for the next round."""
 
     @property
-    def settled(self) -> bool:
-        """This robot holds still, and its weights are final."""
+    def converged(self) -> bool:
+        """This robot changes less than the tolerance, and its weights are final."""
 
     @property
     def largest_change(self) -> float:
@@ -85,10 +105,14 @@ class PoseSolver(Protocol):
         """Own keyframes [n, 4, 4] in the common frame."""
 
     def weights(self, peer: str) -> Array:
-        """Robust weight of every closure held with a neighbor, in the order given."""
+        """Robust weight of every loop closure held with a neighbor, in the order given."""
+
+    @property
+    def loop_weights(self) -> Array:
+        """Robust weight of every own loop."""
 
     def refuted(self, peer: str) -> bool:
-        """Whether the closures held with a neighbor join nobody any more: final weights, too few of which count."""
+        """Whether final weights leave too few of the loop closures held with a neighbor to join the two robots."""
 
     def residuals(self) -> dict[str, Any]:
         """What a round looked like, for the record; keys as `PoseAgent.residuals`."""
@@ -97,10 +121,26 @@ class PoseSolver(Protocol):
 class AdmmSolver:
     """`PoseAgent` with its packets in the states of the rounds."""
 
-    def __init__(self, start: SolverStart, config: PoseConsensusConfig) -> None:
-        self.own = start.index
+    def __init__(self, start: SolverStart, config: PoseConsensusConfig, *, release: float = 1.0) -> None:
+        """Lay out the graph.
+
+        Args:
+            start: what the robot knows.
+            config: the same at all robots.
+            release: a robot that has converged stays so until it changes by this multiple of the tolerance.
+        """
+        self.own, self.config, self.release = start.index, config, release
         self.refused: list[str] = []
-        self.agent = PoseAgent(start.robot, start.T_map_keyframe, start.registrations, config)
+        self._stays = False  # it had converged, and changed little since
+        own = start.own
+        self.agent = PoseAgent(
+            own.robot,
+            own.T_first_keyframe,
+            own.relative_poses,
+            config,
+            loops=own.loops,
+            keep_loops=own.keep_loops,
+        )
         self.agent.set_frame(start.T_world_map)
         for link in start.links:
             if link.closures:
@@ -111,6 +151,11 @@ class AdmmSolver:
 
     def advance(self) -> None:
         self.agent.step()
+        recent = max(
+            [self.agent.step_change, *(k.largest_recent_change() for k in self.agent.links.values())]
+        )
+        little = recent < self.release * self.config.tolerance
+        self._stays = little and (self._stays or self.agent.settled) and self.release > 1.0
 
     def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
         packet = self.agent.outgoing(neighbor.name)
@@ -127,8 +172,8 @@ class AdmmSolver:
         """Edge-ADMM knows no reliable messages; there is nothing to keep."""
 
     @property
-    def settled(self) -> bool:
-        return self.agent.settled
+    def converged(self) -> bool:
+        return self.agent.settled or self._stays
 
     @property
     def largest_change(self) -> float:
@@ -141,6 +186,10 @@ class AdmmSolver:
     def weights(self, peer: str) -> Array:
         return self.agent.weights(peer)
 
+    @property
+    def loop_weights(self) -> Array:
+        return self.agent.loop_weights.weights.copy()
+
     def refuted(self, peer: str) -> bool:
         return self.agent.refuted(peer)
 
@@ -149,12 +198,20 @@ class AdmmSolver:
 
 
 class EliminationSolver:
-    """A node of the tree along which the maps were placed; everything it says is a reliable message."""
+    """A node of the tree along which the maps were placed; everything it sends is a reliable message."""
 
     def __init__(self, start: SolverStart, config: PoseConsensusConfig, team: int, precision: str) -> None:
-        """team: its size. precision: of matrices on the wire."""
+        """Lay out the graph.
+
+        Args:
+            start: what the robot knows.
+            config: the same at all robots.
+            team: number of robots.
+            precision: of matrices on the wire, float32 or float64.
+        """
         self.config, self.team, self.precision = config, team, precision
-        self.keyframes = len(start.T_map_keyframe)
+        self.keyframes = len(start.own.T_map_keyframe)
+        self._loops = RobustWeights(start.own.keep_loops.astype(np.float64), config)
         self.refused: list[str] = []
         self._held: dict[str, RobustWeights] = {}
         self._links = [link.name for link in start.links]
@@ -163,9 +220,10 @@ class EliminationSolver:
 
     def _graph(self, start: SolverStart) -> TreeGraph:
         variables: list[Variable] = [(start.index, k) for k in range(self.keyframes)]
-        poses = [start.T_world_map @ start.T_map_keyframe]
+        poses = [start.T_world_map @ start.own.T_first_keyframe]
         masks: dict[Variable, int] = {}
-        doubted = []
+        loops = with_floor(start.own.loops, self.config)
+        weighted = [(loops, self._loops)] if len(loops) else []
         for link in start.links:
             keyframes = link.shared.keyframes.tolist()
             if not link.closures:
@@ -175,15 +233,15 @@ class EliminationSolver:
             peer = [c.peer_keyframe for c in link.closures]
             slots = len(variables) + np.searchsorted(link.shared.keyframes, peer)
             own = [c.own_keyframe for c in link.closures]
-            factors = closure_factors(link.closures, own, slots, self.config.closures)
+            factors = closures_as_relative_poses(link.closures, own, slots, self.config.closures)
             self._held[link.name] = RobustWeights(link.keep.astype(np.float64), self.config)
-            doubted.append((factors, self._held[link.name]))
+            weighted.append((factors, self._held[link.name]))
             copies: list[Variable] = [(link.index, k) for k in keyframes]
             variables += copies
             masks |= dict.fromkeys(copies, 0)
             poses.append(link.T_world_keyframe[keyframes])
-        trusted = with_floor(start.registrations, self.config)
-        return TreeGraph(variables, np.concatenate(poses), masks, trusted, doubted)
+        trusted = with_floor(start.own.relative_poses, self.config)
+        return TreeGraph(variables, np.concatenate(poses), masks, trusted, weighted)
 
     def advance(self) -> None:
         self._arrived, refused = elimination_wire.take_messages(self.node, self._arrived, self.team)
@@ -205,7 +263,7 @@ class EliminationSolver:
         self._arrived.append((sender, payload))
 
     @property
-    def settled(self) -> bool:
+    def converged(self) -> bool:
         return self.node.finished
 
     @property
@@ -219,11 +277,15 @@ class EliminationSolver:
     def weights(self, peer: str) -> Array:
         return self._held[peer].weights.copy() if peer in self._held else np.zeros(0)
 
+    @property
+    def loop_weights(self) -> Array:
+        return self._loops.weights.copy()
+
     def refuted(self, peer: str) -> bool:
         robust = self._held.get(peer)
         if robust is None or not robust.done:
             return False
-        return int(np.count_nonzero(robust.weights >= COUNTS)) < self.config.closures.min_support
+        return int(np.count_nonzero(robust.weights >= INLIER_WEIGHT)) < self.config.closures.min_support
 
     def residuals(self) -> dict[str, Any]:
         return {
@@ -236,3 +298,22 @@ class EliminationSolver:
             "weights": {peer: robust.weights.tolist() for peer, robust in self._held.items()},
             "factorizations": self.node.factorizations,
         }
+
+
+SolverFactory = Callable[[SolverStart], PoseSolver]
+
+
+def solver_of(config: ExchangeConfig, team: int) -> SolverFactory:
+    """How a solver is made by the settings.
+
+    Args:
+        config: the same at all robots.
+        team: number of robots.
+    """
+
+    def make(start: SolverStart) -> PoseSolver:
+        if config.solver == "admm":
+            return AdmmSolver(start, config.consensus)
+        return EliminationSolver(start, config.consensus, team, config.elimination_wire)
+
+    return make

@@ -8,8 +8,10 @@ from enum import Enum
 import numpy as np
 
 from duagc.pipeline.config.exchange import VerificationConfig
-from duagc.pipeline.posegraph.loop_closures import Closure
-from duagc.pipeline.registration import Reference, RgbdPyramid, geometric_verification
+from duagc.pipeline.exchange.place_recognition import Candidate
+from duagc.pipeline.exchange.wire.loop_closing_wire import KeyframeSample
+from duagc.pipeline.posegraph.relative_poses import LoopClosure
+from duagc.pipeline.registration import RgbdPyramid, geometric_verification
 from duagc.pipeline.registration.features import Features
 from duagc.pipeline.registration.geometric_verification import (
     Failure,
@@ -23,35 +25,42 @@ class Verdict(Enum):
 
     KEPT = "kept"
     UNLIKE = "the neighbor's keyframe resembles no own one"
-    NOT_ASKED_FOR = "enough matches, but a closer look was not worth it"
+    NOT_REQUESTED = "enough matches, but verifying was not worth it"
     FEW_MATCHES = "too few matches between all features of the two keyframes"
     FEW_INLIERS = "too few matches agree on one motion"
     NOT_REGISTERED = "registration of the two views failed"
-    MOVED = "registration moved far from what the matches say"
+    MOVED = "registration moved far from the motion of the matches"
     OUTWEIGHED = "lost its weight in the pose consensus"
     ALONE = "kept its weight, but too few others of this pair of robots did"
-    UNDECIDED = "other links of the team contradict it, and nothing tells which are false"
-    INCONSISTENT = "disagrees with the other closures of this pair of robots"
+    UNDECIDED = "other links of the team contradict it, and it is open which are false"
+    INCONSISTENT = "disagrees with the other loop closures of this pair of robots"
 
 
 @dataclass(frozen=True)
 class Verified:
-    """Outcome of one candidate; closure only if it was kept."""
+    """Outcome of one candidate.
+
+    Attributes:
+        verdict: what became of it.
+        matches: of all features.
+        inliers: matches that agree on one motion.
+        detail: with numbers.
+        closure: the loop closure, if the candidate was kept.
+    """
 
     verdict: Verdict
     matches: int
     inliers: int
     detail: str = ""
-    closure: Closure | None = None
+    closure: LoopClosure | None = None
 
 
 def verify(
-    own_keyframe: int,
-    peer_keyframe: int,
+    candidate: Candidate,
     own: Features,
     own_pyramid: RgbdPyramid,
-    peer: Features,
-    peer_reference: Reference,
+    sample: KeyframeSample,
+    *,
     config: VerificationConfig,
     rng: np.random.Generator,
 ) -> Verified:
@@ -60,21 +69,19 @@ def verify(
     A neighbor sends samples and no images, so that registration is possible in one direction only.
 
     Args:
-        own_keyframe: index of the own keyframe.
-        peer_keyframe: index of the neighbor's keyframe.
+        candidate: the two keyframes.
         own: all features of the own keyframe.
         own_pyramid: its images.
-        peer: features of the neighbor's keyframe, as it sent them.
-        peer_reference: its registration samples, as it sent them.
+        sample: of the neighbor's keyframe, as it sent it.
         config: limits of all tests.
         rng: the stream of this pair of keyframes.
 
     Returns:
-        The verdict, and the closure T_own_peer with its information if the verdict is KEPT.
+        The verdict, and the loop closure T_own_peer with its information if the verdict is KEPT.
     """
     found = geometric_verification.verify(
         VerificationView(own, images=lambda: own_pyramid),
-        VerificationView(peer, peer_reference),
+        VerificationView(sample.features, sample.reference),
         config,
         config.registration,
         rng,
@@ -82,7 +89,9 @@ def verify(
     verdict, detail = _VERDICTS[found.failure], _detail(found)
     closure = None
     if found.failure is None:
-        closure = Closure(own_keyframe, peer_keyframe, found.T_first_second, found.information)
+        closure = LoopClosure(
+            candidate.own_keyframe, candidate.peer_keyframe, found.T_first_second, found.information
+        )
     return Verified(verdict, found.features.matches, found.features.inliers, detail, closure)
 
 

@@ -23,8 +23,8 @@ from duagc.pipeline.evaluation.network import Session, counts
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.trajectory_errors import Paired
 from duagc.pipeline.frontend import bundle
-from duagc.pipeline.frontend.keyframe_graph import KeyframePair
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import Recording, RgbdLog, open_rgbd
 from duagc.pipeline.registration import Level, Reference, RgbdPyramid
 from duagc.pipeline.registration.features import Features
@@ -169,7 +169,7 @@ class _Team:
         """Where all images together put everybody, from a start."""
         T = np.array([start[robot.run.robot][row] for robot, row in self.where])
         T = se3.inverse(T[0]) @ T
-        tracked = [KeyframePair(a, b, se3.inverse(T[a]) @ T[b], np.eye(6)) for a, b in sorted(self.ends)]
+        tracked = [RelativePose(a, b, se3.inverse(T[a]) @ T[b], np.eye(6)) for a, b in sorted(self.ends)]
         registration = self.config.tracking.registration.model_copy(update={"residuals": residuals})
         settings = self.config.keyframes
         found, _ = bundle.optimize(T, self.views, self.images, tracked, settings, registration)

@@ -27,7 +27,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import Recording, read_log
 from duagc.pipeline.runs.folder import RunFolder
-from duagc.pipeline.runs.robot_data import AgentInput, AgentResult, RobotData, load
+from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult, load
 from duagc.schemas import topics
 
 CHECKS = ("frames", "names", "closures", "loss", "silence", "solver")
@@ -98,7 +98,7 @@ class TeamBench:
             ),
         }
 
-    def _team_ate(self, found: dict[str, AgentResult], names: dict[str, str]) -> float | None:
+    def _team_ate(self, found: dict[str, SessionResult], names: dict[str, str]) -> float | None:
         """One alignment for all; None unless everybody shares one world."""
         if any(len(r.component) < len(names) for r in found.values()):
             return None

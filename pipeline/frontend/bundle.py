@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.frontend import KeyframeConfig
-from duagc.pipeline.frontend.keyframe_graph import KeyframePair, Refined, overlap, refine
+from duagc.pipeline.frontend.keyframe_graph import Refined, overlap, refine
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration import (
     Level,
     Outcome,
@@ -61,10 +62,10 @@ def optimize(
     T_map_keyframes: Array,
     views: Sequence[View],
     images: Images,
-    tracked: Sequence[KeyframePair],
+    tracked: Sequence[RelativePose],
     config: KeyframeConfig,
     registration: RegistrationConfig,
-) -> tuple[Refined, list[KeyframePair]]:
+) -> tuple[Refined, list[RelativePose]]:
     """Keyframe poses that explain the images of all overlapping keyframes best; the first keyframe stays.
 
     Args:
@@ -82,7 +83,7 @@ def optimize(
     for index in range(config.optimization_rounds):
         T = refined.T_map_keyframe
         if index in (0, coarse_rounds, config.optimization_rounds // 2):
-            ends = _in_order({(pair.first, pair.second) for pair in tracked} | set(neighborhood.pairs(T)))
+            ends = _in_order({(pair.i, pair.j) for pair in tracked} | set(neighborhood.pairs(T)))
         costs.expand(ends, T, level=max(0, coarse_rounds - index))
         factors = costs.factors(ends)
         refined = refine(T, factors, config.huber_sigmas)
@@ -96,9 +97,9 @@ def _in_order(pairs: Iterable[Ends]) -> list[Ends]:
     return sorted(pairs, key=lambda pair: (pair[1], pair[0]))
 
 
-def _far(T: Array, pairs: Sequence[KeyframePair]) -> bool:
+def _far(T: Array, pairs: Sequence[RelativePose]) -> bool:
     """Whether some registration contradicts the poses by more than `FAR`."""
-    found = (se3.distance(pair.T_first_second, se3.inverse(T[pair.first]) @ T[pair.second]) for pair in pairs)
+    found = (se3.distance(pair.T_i_j, se3.inverse(T[pair.i]) @ T[pair.j]) for pair in pairs)
     return any(max(moved_m, turned_rad) > FAR for moved_m, turned_rad in found)
 
 
@@ -109,19 +110,19 @@ class _Costs:
         self,
         views: Sequence[View],
         images: Images,
-        tracked: Sequence[KeyframePair],
+        tracked: Sequence[RelativePose],
         config: KeyframeConfig,
         registration: RegistrationConfig,
     ) -> None:
         self._views, self._registration = views, registration
         self._images = images
         self._min_overlap = 0.8 * config.optimization_overlap
-        self._tracked = {(pair.first, pair.second): pair for pair in tracked}
-        self._found: dict[Ends, KeyframePair | None] = {}  # None: the images cannot be compared
+        self._tracked = {(pair.i, pair.j): pair for pair in tracked}
+        self._found: dict[Ends, RelativePose | None] = {}  # None: the images cannot be compared
         self._where: dict[Ends, tuple[Array, int]] = {}  # motion and level of the last expansion
         self._exposures: dict[Ends, tuple[float, float]] = {}  # of (reference, target)
 
-    def factors(self, ends: Sequence[Ends]) -> list[KeyframePair]:
+    def factors(self, ends: Sequence[Ends]) -> list[RelativePose]:
         """The quadratics of pairs; of one that cannot be compared, what tracking said, if anything."""
         found = (self._found.get(pair) or self._tracked.get(pair) for pair in ends)
         return [factor for factor in found if factor is not None]
@@ -169,7 +170,7 @@ class _Costs:
 
 def _factor(
     first: int, second: int, T_first_second: Array, forth: Registration | None, back: Registration | None
-) -> KeyframePair | None:
+) -> RelativePose | None:
     """Mean of the quadratics of a pair, one way and the other: both are made of the same two images."""
     information, force = np.zeros((6, 6)), np.zeros(6)
     ways = [way for way in (forth, back) if way is not None]
@@ -185,7 +186,7 @@ def _factor(
         return None
     information, force = 0.5 * (information + information.T) / len(ways), force / len(ways)
     step = np.linalg.pinv(information, rcond=1e-10, hermitian=True) @ force
-    return KeyframePair(first, second, T_first_second @ se3.exp(step), information)
+    return RelativePose(first, second, T_first_second @ se3.exp(step), information)
 
 
 class Neighborhood:

@@ -12,22 +12,13 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.config.frontend import KeyframeConfig
 from duagc.pipeline.geometry import projection, se3
+from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration import Level, Reference, ReferenceLevel, Registration, RgbdPyramid
 
 Array = NDArray[np.float64]
 MAX_STEPS = 20
 STEP_TOLERANCE = 1e-9
 OPEN_DIRECTION = 1e-4  # 1/m^2, 1/rad^2: a standard deviation of 100 m says nothing
-
-
-@dataclass(frozen=True)
-class KeyframePair:
-    """A registration between two keyframes: T_first_second [4, 4] and its information [6, 6], right tangent."""
-
-    first: int
-    second: int
-    T_first_second: Array
-    information: Array
 
 
 @dataclass(frozen=True)
@@ -96,7 +87,7 @@ def overlap(samples: ReferenceLevel, level: Level, T_reference_target: Array) ->
     return projection.overlap(points, level.camera, inverse_depth=level.inverse_depth)
 
 
-def refine(T_map_keyframes: Array, pairs: Sequence[KeyframePair], huber_sigmas: float) -> Refined:
+def refine(T_map_keyframes: Array, pairs: Sequence[RelativePose], huber_sigmas: float) -> Refined:
     """Keyframe poses that agree best with all registrations between them; the first keyframe stays.
 
     Gauss-Newton on sum |log(T_first_second^-1 T_map_first^-1 T_map_second)|^2 weighted by the information, with
@@ -125,15 +116,15 @@ def refine(T_map_keyframes: Array, pairs: Sequence[KeyframePair], huber_sigmas: 
 
 
 def _normal_equations(
-    T: Array, pairs: Sequence[KeyframePair], huber_sigmas: float
+    T: Array, pairs: Sequence[RelativePose], huber_sigmas: float
 ) -> tuple[Any, Array, Array, Array]:
     """Sparse H [6k, 6k] and gradient [6k] with the first pose held, every pair's weighted square, and its weight."""
     from scipy.sparse import csc_array
 
     k = len(T)
-    first = np.array([pair.first for pair in pairs], dtype=np.int64)
-    second = np.array([pair.second for pair in pairs], dtype=np.int64)
-    measured = np.array([pair.T_first_second for pair in pairs]).reshape(-1, 4, 4)
+    first = np.array([pair.i for pair in pairs], dtype=np.int64)
+    second = np.array([pair.j for pair in pairs], dtype=np.int64)
+    measured = np.array([pair.T_i_j for pair in pairs]).reshape(-1, 4, 4)
     information = np.array([pair.information for pair in pairs]).reshape(-1, 6, 6)
     T_first_second = se3.inverse(T[first]) @ T[second]
     residual = se3.log(se3.inverse(measured) @ T_first_second)

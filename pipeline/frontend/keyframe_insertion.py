@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from duagc.pipeline.frontend.keyframe_graph import KeyframePair, predicted_overlap
+from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.frontend.tracking_state import Candidate, CurrentFrame, TrackingState
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration import Reference, register
 
 
@@ -48,7 +49,7 @@ def insert_keyframe(state: TrackingState, frame: CurrentFrame, tracked: Candidat
     T_map_keyframe = previous.T_map_keyframe @ result.T_reference_target
     new = len(state.keyframes)
     state.pairs.append(
-        KeyframePair(previous.keyframe_index, new, result.T_reference_target, result.information)
+        RelativePose(previous.keyframe_index, new, result.T_reference_target, result.information)
     )
     state.pairs += _neighbor_registrations(state, frame, previous.keyframe_index, T_map_keyframe)
     gain_before, offset_before = previous.exposure
@@ -71,7 +72,7 @@ def insert_keyframe(state: TrackingState, frame: CurrentFrame, tracked: Candidat
 
 def _neighbor_registrations(
     state: TrackingState, frame: CurrentFrame, previous: int, T_map_keyframe: np.ndarray
-) -> list[KeyframePair]:
+) -> list[RelativePose]:
     """A new keyframe registered to the earlier ones that see most of it, the one it was tracked from excepted."""
     limits = state.config.keyframes
     # where it was tracked from looks at nearly the same place
@@ -91,5 +92,5 @@ def _neighbor_registrations(
         result = register(reference, frame.pyramid, guess, state.config.tracking.registration)
         if result.ok and result.overlap >= limits.neighbor_overlap:
             new = len(state.keyframes)
-            pairs.append(KeyframePair(-negative_index, new, result.T_reference_target, result.information))
+            pairs.append(RelativePose(-negative_index, new, result.T_reference_target, result.information))
     return pairs

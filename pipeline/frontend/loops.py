@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.config.frontend import LoopConfig
 from duagc.pipeline.frontend.bundle import Images, View
-from duagc.pipeline.frontend.keyframe_graph import KeyframePair, overlap
+from duagc.pipeline.frontend.keyframe_graph import overlap
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration import RegistrationConfig
 from duagc.pipeline.registration.features import matches
 from duagc.pipeline.registration.geometric_verification import VerificationView, verify
@@ -28,7 +29,7 @@ def find_loops(
     registration: RegistrationConfig,
     seed: int,
     robot: str,
-) -> list[KeyframePair]:
+) -> list[RelativePose]:
     """Pairs of keyframes that show the same place although their poses say that they do not, or not by enough.
 
     Candidates have many matching features; three-point samples give a motion; registrations from there, one way and
@@ -76,7 +77,7 @@ def _verified(
     registration: RegistrationConfig,
     seed: int,
     robot: str,
-) -> KeyframePair | None:
+) -> RelativePose | None:
     """The registration of a candidate, if it withstands all tests."""
     rng = random_streams.generator(seed, "frontend.loop", robot=robot, first=first, second=second)
     levels = len(registration.iterations)
@@ -89,4 +90,4 @@ def _verified(
     )
     if found.failure is not None:
         return None
-    return KeyframePair(first, second, found.T_first_second, found.information)
+    return RelativePose(first, second, found.T_first_second, found.information)

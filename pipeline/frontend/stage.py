@@ -21,11 +21,12 @@ from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.frontend import bundle, loops
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.keyframe_graph import KeyframePair, Refined, refine
+from duagc.pipeline.frontend.keyframe_graph import Refined, refine
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
+from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import LogWriter, RgbdLog, open_rgbd
 from duagc.pipeline.registration import RgbdPyramid
 from duagc.pipeline.registration.moving import FreeSpace
@@ -113,7 +114,7 @@ def _track(log: RgbdLog, config: FrontendConfig, progress: bool) -> tuple[Tracke
 
 def _refine(
     log: RgbdLog, tracker: Tracker, config: FrontendConfig, seed: int
-) -> tuple[Refined, Sequence[KeyframePair]]:
+) -> tuple[Refined, Sequence[RelativePose]]:
     """Keyframe poses from all that their images say together, and the factors that say the same."""
     keyframes, settings = tracker.keyframes, config.keyframes
     start = np.array([keyframe.T_map_keyframe for keyframe in keyframes])
@@ -163,16 +164,16 @@ def _keyframe_messages(robot: str, keyframes: Sequence[TrackedKeyframe], refined
 
 
 def _factor_messages(
-    robot: str, keyframes: Sequence[TrackedKeyframe], pairs: Sequence[KeyframePair], refined: Refined
+    robot: str, keyframes: Sequence[TrackedKeyframe], pairs: Sequence[RelativePose], refined: Refined
 ) -> list[KeyframeFactor]:
     """Every registration that the refinement used, in the order of the later keyframes."""
     return [
         KeyframeFactor(
-            stamp_ns=keyframes[pair.second].stamp_ns,
+            stamp_ns=keyframes[pair.j].stamp_ns,
             robot=robot,
-            first_index=pair.first,
-            second_index=pair.second,
-            T_first_second=pair.T_first_second,
+            first_index=pair.i,
+            second_index=pair.j,
+            T_first_second=pair.T_i_j,
             information=pair.information / refined.contradiction,
             weight=float(weight),
         )

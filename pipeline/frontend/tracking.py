@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
 from duagc.pipeline.frontend.color_only import LastGoodFrame
 from duagc.pipeline.frontend.failure import Reason, has_enough_depth, saturated_share
-from duagc.pipeline.frontend.keyframe_graph import KeyframePair, becomes_keyframe
+from duagc.pipeline.frontend.keyframe_graph import becomes_keyframe
 from duagc.pipeline.frontend.keyframe_insertion import insert_first_keyframe, insert_keyframe
 from duagc.pipeline.frontend.pose_checks import FOLLOWED, PLAUSIBLE, DepthColorConsistency, PoseCheck, verify
 from duagc.pipeline.frontend.relocalization import Relocalizer
@@ -27,6 +27,7 @@ from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyfram
 from duagc.pipeline.frontend.tracking_state import GRAY_RMS_FRAMES, Candidate, CurrentFrame, TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import MotionPrior
 from duagc.pipeline.registration import Reference, Registration, RgbdPyramid, register
 
@@ -58,7 +59,7 @@ class Tracker:
         return self.state.keyframes
 
     @property
-    def pairs(self) -> list[KeyframePair]:
+    def pairs(self) -> list[RelativePose]:
         """Registrations between keyframes, for `keyframe_graph.solve_pose_graph`."""
         return self.state.pairs
 

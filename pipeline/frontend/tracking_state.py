@@ -18,9 +18,9 @@ from duagc.pipeline.frontend.failure import (
     Reason,
     Viewpoint,
 )
-from duagc.pipeline.frontend.keyframe_graph import KeyframePair
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import MotionPrior
 from duagc.pipeline.registration import Registration, RgbdPyramid
 from duagc.pipeline.registration.features import Features, extract_from_pyramid
@@ -116,7 +116,7 @@ class TrackingState:
     config: FrontendConfig
     motion: MotionPrior | None = None
     keyframes: list[TrackedKeyframe] = field(default_factory=list)
-    pairs: list[KeyframePair] = field(default_factory=list)
+    pairs: list[RelativePose] = field(default_factory=list)
     keyframe_index: int = 0
     T_keyframe_camera: Array = field(default_factory=lambda: np.eye(4))
     stamp_ns: int = 0

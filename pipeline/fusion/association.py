@@ -17,8 +17,8 @@ from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import held_thickness
 from duagc.pipeline.geometry import spd
+from duagc.pipeline.geometry.spd import add_covariance
 from duagc.pipeline.geometry.statistics import MAD_TO_SIGMA
-from duagc.pipeline.posegraph.factors import inflated
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY, THETA_SIZE
 
 Array = NDArray[np.float64]
@@ -266,8 +266,8 @@ def fused_moves(members: TrackMembers, config: FusionConfig, thickness_floor_m: 
     spread = _AssociationCovariance.of(members, config)
     held = held_thickness(rows.theta[members.reference, LOG_COVARIANCE], thickness_floor_m)
     free = np.eye(6) - held.swapaxes(-1, -2) @ held
-    position = inflated(rows.position, spread.position)
-    shape = inflated(rows.shape, spread.shape[:, None, None] * np.eye(6))
+    position = add_covariance(rows.position, spread.position)
+    shape = add_covariance(rows.shape, spread.shape[:, None, None] * np.eye(6))
     color = rows.color / (1 + rows.color * spread.color[:, None])
     opacity = rows.opacity / (1 + rows.opacity * spread.opacity)
     prior_position, prior_shape = PRIOR[config.association]

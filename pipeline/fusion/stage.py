@@ -34,7 +34,7 @@ from duagc.pipeline.messages import (
 )
 from duagc.pipeline.recording import LogWriter, open_rgbd, read_log
 from duagc.pipeline.registration.moving import FreeSpace
-from duagc.pipeline.runs.robot_data import AgentInput, AgentResult, RobotData, load
+from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult, load
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import (
     COLOR_INFORMATION,
@@ -65,7 +65,7 @@ class _Fusion:
 
 def run_fusion(
     source: AgentInput,
-    result: AgentResult,
+    result: SessionResult,
     folder: Path,
     *,
     config: FusionConfig,
@@ -114,7 +114,7 @@ def run_fusion(
     return fusion.checks
 
 
-def _fuse(own: RobotData, result: AgentResult, views: Sequence[PosedRgbd], context: MapContext) -> _Fusion:
+def _fuse(own: RobotData, result: SessionResult, views: Sequence[PosedRgbd], context: MapContext) -> _Fusion:
     """Validate the peers' maps, fuse, update opacities, finetune.
 
     Args:
@@ -160,7 +160,7 @@ def _fuse(own: RobotData, result: AgentResult, views: Sequence[PosedRgbd], conte
 
 def _finetuned(
     own: RobotData,
-    result: AgentResult,
+    result: SessionResult,
     fused: FusedMap,
     valid: ValidatedPeers,
     views: Sequence[PosedRgbd],
@@ -233,7 +233,7 @@ def _placed_frames(source: AgentInput) -> list[Odometry]:
     return placed
 
 
-def _write_log(path: Path, result: AgentResult, fusion: _Fusion, *, stamp_ns: int, own: RobotData) -> None:
+def _write_log(path: Path, result: SessionResult, fusion: _Fusion, *, stamp_ns: int, own: RobotData) -> None:
     robot, depth_kind, fused = result.robot, own.depth, fusion.fused
     keyframes = CorrectedKeyframes(
         stamp_ns=stamp_ns,

@@ -51,3 +51,13 @@ def from_log_covariance(vec_log: ArrayLike) -> tuple[Array, Array]:
     vectors = vectors[..., ::-1].copy()
     vectors[..., :, 2] *= np.linalg.det(vectors)[..., None]
     return so3.to_quat_wxyz(vectors), 0.5 * values[..., ::-1]
+
+
+def add_covariance(information: ArrayLike, covariance: ArrayLike) -> Array:
+    """(W^-1 + C)^-1 for positive semidefinite W and C [..., d, d], either may be singular.
+
+    Computed as (I + W C)^-1 W, which needs no inverse of either: a direction without information stays without.
+    """
+    W, C = np.asarray(information, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
+    out = np.linalg.solve(np.eye(W.shape[-1]) + W @ C, W)
+    return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)), dtype=np.float64)

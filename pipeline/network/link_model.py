@@ -27,7 +27,12 @@ QUEUE_FULL = "the sender's queue is full"
 
 @dataclass(frozen=True)
 class Fate:
-    """What became of one packet: dropped for a reason, or delivered at one time, or at several if it was duplicated."""
+    """What became of one packet.
+
+    Attributes:
+        deliver_ns: when it is delivered, at several times if it was duplicated; empty if it was dropped.
+        reason: why it was dropped; empty if it was not.
+    """
 
     deliver_ns: tuple[int, ...]
     reason: str = ""
@@ -93,7 +98,7 @@ class _Radio:
 
 
 class LinkModel:
-    """Decides the fate of every packet. Packets of one directed link are asked for in the order of sending."""
+    """Decides the fate of every packet. Packets of one directed link must be given in the order of sending."""
 
     def __init__(self, config: LinkConfig, seed: int) -> None:
         self.config, self.seed = config, seed
@@ -166,7 +171,7 @@ class LinkModel:
 
 
 class _Draws:
-    """Numbers in [0, 1) for one packet, drawn only when one is asked for."""
+    """Numbers in [0, 1) for one packet, drawn only when needed."""
 
     def __init__(self, seed: int, sender: str, receiver: str, sequence: int) -> None:
         self._key = seed, sender, receiver, sequence

@@ -39,8 +39,8 @@ class Kind(IntEnum):
     """What a message holds. The order is the order of sending within a round; evidence comes last."""
 
     ACK = 1  # chunks received, per message
-    STATE = 2  # where the sender stands, and its poses of this round if it has any
-    FRAME = 3  # what the closures of two robots say of their relative frame; flooded
+    STATE = 2  # the state of the sender, and its poses of this round if it has any
+    RELATIVE_FRAME = 3  # the relative frame of two robots by their loop closures; flooded
     DESCRIPTORS = 4  # compact descriptors of every keyframe, to recognize places
     REQUEST = 5  # keyframes whose sample is wanted
     SAMPLE = 6  # one keyframe: features with 3-D points, and points for registration
@@ -51,25 +51,37 @@ class Kind(IntEnum):
     EVIDENCE = 11  # Gaussians of one robot with their information, compact
     EVIDENCE_EXACT = 12  # the same in float32
     EVIDENCE_DOUBLE = 13  # the same in float64
-    POSE_GRAPH = 14  # `duagc posegraph` only: frames and eliminated graphs; its first byte says which
-    HELLO = 16  # digest of what the sender saw; the two ends' roles follow from it
+    KEYFRAMES = 14  # own keyframes that known loop closures name (`duagc posegraph`)
+    HELLO = 16  # digest of what the sender saw, from which the roles of the two ends follow
     TREE = 15  # elimination: fronts and blocks up the tree of robots, steps down
 
 
 FIRE_AND_FORGET = frozenset({Kind.ACK, Kind.STATE})
 """Kinds that are sent once, in one packet, and never acknowledged."""
 
-URGENT_KINDS = frozenset({Kind.TREE, Kind.POSE_GRAPH})
+URGENT_KINDS = frozenset({Kind.TREE, Kind.KEYFRAMES})
 """Kinds that hold up the whole team until they arrive."""
 
 
 class MalformedError(ValueError):
-    """A packet or a message that does not say what it should; the text is the reason."""
+    """A packet or a message that is not what it should be; the text is the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """One parsed packet."""
+    """One parsed packet.
+
+    Attributes:
+        kind: of the message that it is cut from.
+        sender: index in the sorted team.
+        receiver: index in the sorted team.
+        sequence: counts on this directed link.
+        round: in which it was sent.
+        message: id, unique for its sender.
+        offset: of the payload in the message, bytes.
+        total: bytes of the message.
+        payload: a slice of the message.
+    """
 
     kind: Kind
     sender: int
@@ -142,7 +154,7 @@ def parse(data: bytes) -> Packet:
     """Read one packet.
 
     Raises:
-        MalformedError: anything is not as `serialize` writes it; the text says what.
+        MalformedError: anything is not as `serialize` writes it; the text is the reason.
     """
     if not HEADER_BYTES <= len(data) <= MAX_PACKET_BYTES:
         raise MalformedError(f"{len(data)} bytes, expected {HEADER_BYTES} to {MAX_PACKET_BYTES}")
@@ -173,4 +185,14 @@ def parse(data: bytes) -> Packet:
         raise MalformedError(
             f"{length} bytes at offset {offset} of {total}, expected {min(step, total - offset)}"
         )
-    return Packet(kind, sender, receiver, sequence, round_, message, offset, total, payload)
+    return Packet(
+        kind=kind,
+        sender=sender,
+        receiver=receiver,
+        sequence=sequence,
+        round=round_,
+        message=message,
+        offset=offset,
+        total=total,
+        payload=payload,
+    )

@@ -1,6 +1,6 @@
 """Packets that only their sender can have made: Ed25519 (RFC 8032) over header and payload, 64 bytes behind them.
 
-A CRC protects against accidents, a signature against whoever puts packets on the air in another's name. The keys of a
+A CRC protects against accidents, a signature against packets that are sent in another robot's name. The keys of a
 simulated team are drawn from the seed of the run, so that a replay signs the same bytes.
 """
 
@@ -20,7 +20,7 @@ SIGNATURE_BYTES = 64
 
 
 class Identity:
-    """What one robot needs to sign, and to check the others: its private key and everybody's public keys."""
+    """What one robot needs to sign, and to check the others: its private key and all public keys."""
 
     def __init__(self, private: Ed25519PrivateKey, public: Sequence[Ed25519PublicKey]) -> None:
         """public: of the sorted team, by index."""

@@ -1,7 +1,7 @@
 """Reliable messages to one neighbor: cutting, bursts within a budget, selective acknowledgement, reassembly.
 
 A burst holds, in this order: acknowledgements, the state of this round, then the open messages by kind and id,
-what is overdue before what is new. Nothing here looks into a payload, save that evidence is handed on chunk by chunk.
+what is overdue before what is new. Nothing here looks into a payload, except that evidence is passed on chunk by chunk.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from duagc.pipeline.network.packets import (
 )
 from duagc.pipeline.network.signatures import SIGNATURE_BYTES, Identity
 
-_ACK_HEAD = struct.Struct("<IIH")  # message id, first chunk, number of chunks told; then one bit per chunk
+_ACK_HEAD = struct.Struct("<IIH")  # message id, first chunk, number of chunks; then one bit per chunk
 MAX_REPEATS = 32
 SEQUENCE_BLOCK = 1024
 ACK_CHUNKS = 8 * (MAX_PAYLOAD_BYTES - _ACK_HEAD.size)
@@ -37,7 +37,13 @@ ACK_CHUNKS = 8 * (MAX_PAYLOAD_BYTES - _ACK_HEAD.size)
 
 @dataclass(frozen=True)
 class Message:
-    """A message on its way out: id unique for its sender, kind, bytes."""
+    """A message to send.
+
+    Attributes:
+        id: unique for its sender.
+        kind: of its content.
+        payload: its bytes.
+    """
 
     id: int
     kind: Kind
@@ -46,16 +52,31 @@ class Message:
 
 @dataclass(frozen=True)
 class Outgoing:
-    """One packet on its way out, and the message it is cut from."""
+    """One packet to send.
+
+    Attributes:
+        receiver: name of the robot that it is for.
+        sequence: its number on this directed link.
+        packet: its bytes.
+        message: what it is cut from.
+    """
 
     receiver: str
+    sequence: int
     packet: bytes
     message: Message
 
 
 @dataclass(frozen=True)
 class Arrival:
-    """What a delivered packet brought: a chunk of evidence, or a complete message."""
+    """What a delivered packet brought.
+
+    Attributes:
+        kind: of the message.
+        message: its id.
+        payload: of the message, or of a chunk of evidence.
+        complete: it is a message, not a chunk.
+    """
 
     kind: Kind
     message: int
@@ -107,9 +128,15 @@ class Transport:
         new_id: Callable[[], int],
         identity: Identity | None = None,
     ) -> None:
-        """own, peer: indices in the sorted team. new_id: gives message ids that are unique for this sender.
+        """Nothing is queued.
 
-        identity: signs the packets; without, they are not signed.
+        Args:
+            own: index of this robot in the sorted team.
+            peer: index of the neighbor.
+            peer_name: its name.
+            config: of retransmission.
+            new_id: gives message ids that are unique for this sender.
+            identity: signs the packets; without, they are not signed.
         """
         self.own, self.peer, self.peer_name, self.config = own, peer, peer_name, config
         self.new_id = new_id
@@ -165,7 +192,9 @@ class Transport:
         """All packets of this round for this neighbor.
 
         Args:
-            states: fire-and-forget messages, one packet each. budget_bytes: most that may be sent, headers included.
+            round_index: the current round.
+            states: fire-and-forget messages, one packet each.
+            budget_bytes: most that may be sent, headers included.
         """
         out: list[Outgoing] = []
         for message in [*self._acknowledgements(round_index), *states]:
@@ -203,18 +232,18 @@ class Transport:
     def _packet(self, message: Message, chunk: int, round_index: int) -> Outgoing:
         step = chunk_bytes(message.kind)
         packet = Packet(
-            message.kind,
-            self.own,
-            self.peer,
-            self.sequence,
-            round_index,
-            message.id,
-            chunk * step,
-            len(message.payload),
-            message.payload[chunk * step : (chunk + 1) * step],
+            kind=message.kind,
+            sender=self.own,
+            receiver=self.peer,
+            sequence=self.sequence,
+            round=round_index,
+            message=message.id,
+            offset=chunk * step,
+            total=len(message.payload),
+            payload=message.payload[chunk * step : (chunk + 1) * step],
         )
         self.sequence += 1
-        return Outgoing(self.peer_name, self._seal(packet), message)
+        return Outgoing(self.peer_name, packet.sequence, self._seal(packet), message)
 
     def _acknowledgements(self, round_index: int) -> list[Message]:
         """ACK messages for every chunk that arrived lately, with what arrived around it."""
@@ -268,7 +297,7 @@ class Transport:
             MalformedError: it contradicts what came before, or asks for too much; it is then ignored.
         """
         if not self._is_new(packet.sequence):
-            return None  # a copy that the network made, or somebody repeats what was heard
+            return None  # a copy that the network made, or a replayed packet
         self.last_heard = round_index
         self._packets_heard += 1
         delay = max(0, round_index - packet.round)
@@ -334,7 +363,7 @@ class Transport:
             self._to_acknowledge[message] = _News(0, last, round_index + self._repeats())
 
     def _take_acknowledgements(self, payload: bytes) -> None:
-        """Mark what the neighbor says it has; what it says about anything else has no effect."""
+        """Mark what the neighbor acknowledges; acknowledgements of anything else have no effect."""
         position = 0
         while position < len(payload):
             if position + _ACK_HEAD.size > len(payload):

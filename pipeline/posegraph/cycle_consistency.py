@@ -1,9 +1,9 @@
-"""Relative frames of many pairs of robots: cycles of three robots say which of them belong together.
+"""Relative frames of many pairs of robots: cycles of three robots show which of them belong together.
 
-Closures of one pair may form several groups, each of which agrees on another relative frame, because places look
-alike; which group is right the pair cannot tell. Round a cycle of three robots the motions must compose to none. Where
-they do not, and no other cycle speaks for the links, the one that is weaker by far gives way. If there is none, nobody
-can tell which of them is false, and none of them counts.
+Loop closures of one pair may form several groups, each of which agrees on another relative frame, because places look
+alike; the pair alone cannot decide which group is right. Around a cycle of three robots the motions must compose to the
+identity. Where they do not, and no other cycle confirms the links, the one that is weaker by far is left out. If there
+is none, it cannot be decided which of them is false, and none of them counts.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.posegraph.loop_closures import CHI2_3_999, chain_frames, spanning_tree
+from duagc.pipeline.posegraph.loop_closures import CHI2_3_999
+from duagc.pipeline.posegraph.spanning_tree import chain_frames, spanning_tree
 
 Array = NDArray[np.float64]
 Pair = tuple[str, str]
@@ -28,11 +29,14 @@ CLEAR = 0.5
 
 @dataclass(frozen=True)
 class Proposal:
-    """One relative frame of two robots, and the closures that agree on it.
+    """One relative frame of two robots, and the loop closures that agree on it.
 
-    support: how many. T_a_b: [4, 4], map frame of the later name in that of the earlier one. variance: of the
-    translation anywhere in the two maps and of the rotation (m^2, rad^2), by the closures and both robots' drift.
-    agreement: share of what one robot measured that the other, placed like this, sees at the same place, 0 to 1.
+    Attributes:
+        support: number of these loop closures.
+        T_a_b: [4, 4], map frame of the later name in that of the earlier one.
+        variance: of the translation anywhere in the two maps and of the rotation (m^2, rad^2), by the loop closures
+            and both robots' drift.
+        agreement: share of what one robot measured that the other, placed like this, sees at the same place, 0 to 1.
     """
 
     support: int
@@ -45,18 +49,21 @@ class Proposal:
         """How much it counts: by the rest of the images, and by the closures, which see the same few places again."""
         return self.agreement * math.sqrt(self.support)
 
-    def turned(self) -> Proposal:
-        """The same as the other robot says it."""
+    def reversed(self) -> Proposal:
+        """The same from the side of the other robot."""
         return Proposal(self.support, se3.inverse(self.T_a_b), self.variance, self.agreement)
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where everybody's map lies, and which proposal of every pair fits to that.
+    """Where the maps of all robots lie, and which proposal of every pair fits to that.
 
-    T_world_map: [4, 4] by robot, in the frame of its component's lowest name. parent: tree that they were placed
-    along. chosen: proposal of every pair; None if none fits. contradictions: what is wrong with those pairs, in words.
-    undecided: pairs of which some must be false, and nothing tells which, with the reason; they should be parted.
+    Attributes:
+        T_world_map: [4, 4] by robot, in the frame of its component's lowest name.
+        parent: tree that they were placed along, by robot; None for a root.
+        chosen: index of the proposal of every pair; None if none fits.
+        contradictions: why no proposal of these pairs fits, in words.
+        undecided: pairs of which some must be false without a sign of which, with the reason; they should be revoked.
     """
 
     T_world_map: dict[str, Array]
@@ -73,7 +80,9 @@ def place(pairs: Mapping[Pair, Sequence[Proposal]], robots: Sequence[str], margi
     motions close within `margin` times their variance.
 
     Args:
-        pairs: proposals by (earlier, later) name. robots: all names.
+        pairs: proposals by (earlier, later) name.
+        robots: all names.
+        margin: factor on variances; infinite if all proposals are true.
     """
     scores = {pair: [_score(pair, k, pairs, margin) for k in range(len(pairs[pair]))] for pair in pairs}
     best = {pair: int(np.argmax(score)) for pair, score in scores.items()}  # the first of equals
@@ -89,14 +98,14 @@ def place(pairs: Mapping[Pair, Sequence[Proposal]], robots: Sequence[str], margi
             chosen[a, b] = best[a, b]
             continue
         placed = se3.inverse(T_world_map[a]) @ T_world_map[b]
-        way = _way(a, b, parent)
-        variance = np.array([pairs[edge][best[edge]].variance for edge in way]).sum(axis=0)
+        path = _path(a, b, parent)
+        variance = np.array([pairs[edge][best[edge]].variance for edge in path]).sum(axis=0)
         fits = [_closes(placed @ se3.inverse(p.T_a_b), variance + p.variance, margin) for p in proposals]
         chosen[a, b] = fits.index(True) if any(fits) else None
         if chosen[a, b] is None:
             off_m, off_rad = (float(d) for d in se3.distance(placed, proposals[0].T_a_b))
-            names = ", ".join(sorted({name for edge in way for name in edge} - {a, b}))
-            contradictions[a, b] = f"is {off_m:.2f} m and {off_rad:.2f} rad off the way by {names}"
+            names = ", ".join(sorted({name for edge in path for name in edge} - {a, b}))
+            contradictions[a, b] = f"is {off_m:.2f} m and {off_rad:.2f} rad off the path by {names}"
     return Placement(T_world_map, parent, chosen, contradictions, _undecided(pairs, cycles))
 
 
@@ -105,12 +114,14 @@ def _score(pair: Pair, k: int, pairs: Mapping[Pair, Sequence[Proposal]], margin:
     a, b = pair
     proposal = pairs[pair][k]
     score = proposal.weight
+    if math.isinf(margin):  # all of them are true: that cycles close is no evidence
+        return score
     thirds = sorted({name for other in pairs for name in other} - {a, b})
     for c in thirds:
         confirmed = [
             min(first.weight, second.weight)
-            for first in _turned(pairs, a, c)
-            for second in _turned(pairs, c, b)
+            for first in _proposals(pairs, a, c)
+            for second in _proposals(pairs, c, b)
             if _agree(first, second, proposal, margin)
         ]
         score += max(confirmed, default=0.0)
@@ -118,7 +129,7 @@ def _score(pair: Pair, k: int, pairs: Mapping[Pair, Sequence[Proposal]], margin:
 
 
 def _agree(first: Proposal, second: Proposal, direct: Proposal, margin: float) -> bool:
-    """Whether the way by a third robot ends where the direct one does."""
+    """Whether the path by a third robot ends where the direct one does."""
     variance = np.array([first.variance, second.variance, direct.variance]).sum(axis=0)
     return _closes(first.T_a_b @ second.T_a_b @ se3.inverse(direct.T_a_b), variance, margin)
 
@@ -129,8 +140,8 @@ def _cycles(pairs: Mapping[Pair, Sequence[Proposal]], margin: float) -> dict[Cyc
     for a, b, c in itertools.combinations(sorted({name for pair in pairs for name in pair}), 3):
         cycle = (a, b), (b, c), (a, c)
         if set(cycle) <= set(pairs):
-            ways = itertools.product(pairs[a, b], pairs[b, c], pairs[a, c])
-            closed[cycle] = any(_agree(ab, bc, ac, margin) for ab, bc, ac in ways)
+            triples = itertools.product(pairs[a, b], pairs[b, c], pairs[a, c])
+            closed[cycle] = any(_agree(ab, bc, ac, margin) for ab, bc, ac in triples)
     return closed
 
 
@@ -142,12 +153,15 @@ def _confirmed(cycles: Mapping[Cycle, bool]) -> set[Pair]:
 def _refuted(cycles: Mapping[Cycle, bool]) -> dict[Pair, float]:
     """No support for a link that spoils a cycle whose other two links stand in cycles that close."""
     confirmed = _confirmed(cycles)
-    doubtful = [set(cycle) - confirmed for cycle, closed in cycles.items() if not closed]
-    return {pair: 0.0 for links in doubtful if len(links) == 1 for pair in links}
+    unconfirmed = [set(cycle) - confirmed for cycle, closed in cycles.items() if not closed]
+    return {pair: 0.0 for links in unconfirmed if len(links) == 1 for pair in links}
 
 
 def _undecided(pairs: Mapping[Pair, Sequence[Proposal]], cycles: Mapping[Cycle, bool]) -> dict[Pair, str]:
-    """Links of cycles that do not close, if no other cycle confirms them and none is the weakest by far."""
+    """Links of cycles that do not close, if no other cycle confirms them and none is the weakest by far.
+
+    A link that is stronger by far than the weakest is not among the false ones.
+    """
     confirmed = _confirmed(cycles)
     out: dict[Pair, str] = {}
     for cycle, closed in cycles.items():
@@ -155,19 +169,17 @@ def _undecided(pairs: Mapping[Pair, Sequence[Proposal]], cycles: Mapping[Cycle, 
         least, *rest = sorted(weights.values()) or [0.0]
         if closed or not rest or least < CLEAR * rest[0]:
             continue
-        said = ", ".join(f"{a}-{b} {weight:.2f}" for (a, b), weight in sorted(weights.items()))
-        reason = (
-            f"is in a cycle of three robots that does not close, and nothing tells which is false ({said})"
-        )
-        out |= dict.fromkeys(weights, reason)
+        weighed = ", ".join(f"{a}-{b} {weight:.2f}" for (a, b), weight in sorted(weights.items()))
+        reason = f"is in a cycle of three robots that does not close; which link is false is open ({weighed})"
+        out |= {p: reason for p, weight in weights.items() if CLEAR * weight <= least}
     return out
 
 
-def _turned(pairs: Mapping[Pair, Sequence[Proposal]], a: str, b: str) -> list[Proposal]:
+def _proposals(pairs: Mapping[Pair, Sequence[Proposal]], a: str, b: str) -> list[Proposal]:
     """Proposals of a pair as motions from b to a."""
     if (a, b) in pairs:
         return list(pairs[a, b])
-    return [p.turned() for p in pairs.get((b, a), ())]
+    return [p.reversed() for p in pairs.get((b, a), ())]
 
 
 def _closes(T: Array, variance: Array, margin: float) -> bool:
@@ -177,13 +189,13 @@ def _closes(T: Array, variance: Array, margin: float) -> bool:
     return bool(distance_m**2 < limit[0] and angle_rad**2 < limit[1])
 
 
-def _way(a: str, b: str, parent: Mapping[str, str | None]) -> list[Pair]:
+def _path(a: str, b: str, parent: Mapping[str, str | None]) -> list[Pair]:
     """Links from a to b along the tree."""
-    ways = []
+    paths = []
     for robot in (a, b):
-        way: list[Pair] = []
+        path: list[Pair] = []
         while (nearer := parent[robot]) is not None:
-            way.append((min(robot, nearer), max(robot, nearer)))
+            path.append((min(robot, nearer), max(robot, nearer)))
             robot = nearer
-        ways.append(way)
-    return [edge for edge in ways[0] if edge not in ways[1]] + [e for e in ways[1] if e not in ways[0]]
+        paths.append(path)
+    return [edge for edge in paths[0] if edge not in paths[1]] + [e for e in paths[1] if e not in paths[0]]

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.posegraph.factors import Factors, isotropic_information
-from duagc.pipeline.posegraph.loop_closures import Closure
+from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, isotropic_information
 
 Array = NDArray[np.float64]
 SYMBOL_BITS = 56  # a gtsam symbol is a character in the highest byte and an index below it
@@ -67,9 +66,9 @@ class RobotGraph:
 
     name: str
     keyframes: int
-    odometry: Factors
-    loops: Factors
-    closures: dict[str, list[Closure]]
+    odometry: RelativePoses
+    loops: RelativePoses
+    closures: dict[str, list[LoopClosure]]
 
 
 @dataclass(frozen=True)
@@ -359,14 +358,14 @@ def _team(edges: Edges, reference: str | None, ignored: tuple[str, ...], path: P
             pairs.setdefault((min(a, b), max(a, b)), []).append(k)
     information = isotropic_information(edges.kappa, edges.tau)
 
-    def factors(rows: Iterable[int]) -> Factors:
+    def factors(rows: Iterable[int]) -> RelativePoses:
         k = np.array(list(rows), dtype=np.int64)
         i, j = ([at[keys[r][0]][keys[r][1]] for r in k] for keys in (edges.i, edges.j))
-        return Factors(np.array(i, np.int64), np.array(j, np.int64), edges.T_i_j[k], information[k])
+        return RelativePoses(np.array(i, np.int64), np.array(j, np.int64), edges.T_i_j[k], information[k])
 
-    def closure(k: int, side: str) -> Closure:
+    def closure(k: int, side: str) -> LoopClosure:
         (a, i), (b, j) = edges.i[k], edges.j[k]
-        seen_from_i = Closure(at[a][i], at[b][j], edges.T_i_j[k], information[k])
+        seen_from_i = LoopClosure(at[a][i], at[b][j], edges.T_i_j[k], information[k])
         return seen_from_i if a == side else seen_from_i.reversed()
 
     robots = {}

@@ -9,20 +9,20 @@ from scipy.sparse import linalg as sparse_linalg
 
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.geometry import se3, so3
-from duagc.pipeline.posegraph import factors as pose_factors
-from duagc.pipeline.posegraph.central import solve_central
-from duagc.pipeline.posegraph.factors import Factors
-from duagc.pipeline.posegraph.robust import controls, graduated_weights
+from duagc.pipeline.posegraph import least_squares
+from duagc.pipeline.posegraph.gnc import controls, graduated_weights
+from duagc.pipeline.posegraph.pose_graph import solve_pose_graph
+from duagc.pipeline.posegraph.relative_poses import RelativePoses
 
 Array = NDArray[np.float64]
 _STEPS = 3  # Gauss-Newton steps per step of the graduated weights
 
 
-def chordal(factors: Factors, n: int) -> Array:
+def chordal(factors: RelativePoses, n: int) -> Array:
     """Chordal start [n, 4, 4]: linear rotations, then linear translations; variable 0 at the identity.
 
     Args:
-        factors: isotropic ones (`isotropic_information`); the graph must be connected.
+        factors: isotropic relative poses (`isotropic_information`); the graph must be connected.
         n: number of variables.
     Source: Martinec and Pajdla 2007; Carlone et al., "Initialization techniques for 3D SLAM", 2015.
     """
@@ -48,27 +48,29 @@ def chordal(factors: Factors, n: int) -> Array:
 
 
 def own_start(
-    odometry: Factors, loops: Factors, n: int, config: PoseConsensusConfig
+    odometry: RelativePoses, loops: RelativePoses, n: int, config: PoseConsensusConfig
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """A robot's own optimum before it has met anybody.
+    """A robot's own optimum before it has met any other robot.
 
     Args:
-        odometry: connects all n keyframes and is trusted. loops: the rest.
-        config: `robust` says whether loops are in doubt.
+        odometry: connects all n keyframes and is trusted.
+        loops: the other relative poses between own keyframes.
+        n: number of keyframes.
+        config: with `robust`, loops may be false.
     Returns:
-        T_map_keyframe [n, 4, 4], keyframe 0 at the identity; which loops fit (all of them if none is in doubt).
+        T_map_keyframe [n, 4, 4], keyframe 0 at the identity; which loops fit (all of them if none may be false).
     """
     kept = np.ones(len(loops), dtype=bool)
     if n == 1:
         return np.eye(4)[None], kept
-    both = Factors.concatenate([odometry, loops])
+    both = RelativePoses.concatenate([odometry, loops])
     if not (config.robust and len(loops)):
-        return solve_central(both, chordal(both, n)).poses, kept
-    T = solve_central(odometry, chordal(odometry, n)).poses
+        return solve_pose_graph(both, chordal(both, n)).poses, kept
+    T = solve_pose_graph(odometry, chordal(odometry, n)).poses
     c2, trusted = config.truncation**2, np.ones(len(odometry))
     for mu in controls(config):
-        squared = pose_factors.squared_residuals(loops, T)
+        squared = least_squares.squared_residuals(loops, T)
         weights = graduated_weights(squared, c2, mu)
-        T = solve_central(both, T, np.concatenate([trusted, weights]), iterations=_STEPS).poses
-    kept = pose_factors.squared_residuals(loops, T) <= c2
-    return solve_central(both, T, np.concatenate([trusted, kept])).poses, kept
+        T = solve_pose_graph(both, T, np.concatenate([trusted, weights]), iterations=_STEPS).poses
+    kept = least_squares.squared_residuals(loops, T) <= c2
+    return solve_pose_graph(both, T, np.concatenate([trusted, kept])).poses, kept

@@ -15,7 +15,7 @@ from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.messages import GaussianInformation, GaussianMap, Keyframe, KeyframeFactor
-from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.schemas import topics
 
@@ -41,16 +41,6 @@ class AgentInput:
 
 
 @dataclass(frozen=True)
-class Step:
-    """A motion between two own keyframes: T_i_j [4, 4] and its information [6, 6] (right tangent)."""
-
-    i: int
-    j: int
-    T_i_j: Array
-    information: Array
-
-
-@dataclass(frozen=True)
 class RobotData:
     """One robot's own results in memory.
 
@@ -63,8 +53,8 @@ class RobotData:
     robot: str
     camera: PinholeCamera
     T_map_keyframe: Array
-    odometry: list[Step]
-    registrations: list[Step]
+    odometry: list[RelativePose]
+    registrations: list[RelativePose]
     images: Callable[[int], Images]
     gaussians: Gaussians
     information: GaussianInformation
@@ -77,12 +67,12 @@ class RobotData:
 
 
 @dataclass(frozen=True)
-class ClosureRecord:
+class LoopClosureRecord:
     """One candidate for a closure between two keyframes, and what became of it.
 
     robot: the end that decided. score: matches of compact descriptors. T_own_peer: [4, 4] if it was measured,
     with its information [6, 6] (right tangent, as measured, without floor). weight: robust weight at the end, 0 on a
-    link that was parted; None if it took no part in the pose consensus.
+    link that was revoked; None if it took no part in the pose consensus.
     """
 
     robot: str
@@ -100,7 +90,7 @@ class ClosureRecord:
 
 
 @dataclass(frozen=True)
-class AgentResult:
+class SessionResult:
     """One robot after a session, by its own estimate.
 
     component: names of the robots that share its world frame, sorted; only itself if it met nobody.
@@ -122,7 +112,7 @@ class AgentResult:
     evidence: dict[str, Evidence]
     depth_of: dict[str, DepthKind]
     pairs: dict[tuple[str, str], NDArray[np.int64]]
-    closures: tuple[ClosureRecord, ...]
+    closures: tuple[LoopClosureRecord, ...]
     agreed: bool
     converged: bool
     rounds: int
@@ -130,10 +120,10 @@ class AgentResult:
     refused: dict[str, int]
 
 
-def steps_of(keyframes: Sequence[Keyframe]) -> list[Step]:
+def odometry_of(keyframes: Sequence[Keyframe]) -> list[RelativePose]:
     """Odometry of a robot, in order of its keyframes: each to the one that it was registered to."""
     return [
-        Step(k.previous_index, k.keyframe_index, k.T_previous_keyframe, k.information)
+        RelativePose(k.previous_index, k.keyframe_index, k.T_previous_keyframe, k.information)
         for k in keyframes
         if k.previous_index >= 0
     ]
@@ -141,7 +131,7 @@ def steps_of(keyframes: Sequence[Keyframe]) -> list[Step]:
 
 def registrations_of(
     frontend: Path, keyframes: Sequence[Keyframe], factors: Sequence[KeyframeFactor]
-) -> list[Step]:
+) -> list[RelativePose]:
     """Registrations between a robot's keyframes as its refinement weighed them, in order of the log.
 
     Args:
@@ -155,17 +145,10 @@ def registrations_of(
         raise DuagError(
             f"{frontend}: registrations tie keyframes {sorted(tied)} to earlier ones, expected {sorted(expected)}"
         )
-    return [Step(f.first_index, f.second_index, f.T_first_second, f.weight * f.information) for f in factors]
-
-
-def factors_of(steps: Sequence[Step]) -> Factors:
-    """Steps as factors between keyframes, in the same order."""
-    return Factors(
-        np.array([s.i for s in steps], dtype=np.int64),
-        np.array([s.j for s in steps], dtype=np.int64),
-        np.array([s.T_i_j for s in steps], dtype=np.float64).reshape(-1, 4, 4),
-        np.array([s.information for s in steps], dtype=np.float64).reshape(-1, 6, 6),
-    )
+    return [
+        RelativePose(f.first_index, f.second_index, f.T_first_second, f.weight * f.information)
+        for f in factors
+    ]
 
 
 def load(source: AgentInput) -> RobotData:
@@ -218,7 +201,7 @@ def load(source: AgentInput) -> RobotData:
         robot,
         camera,
         poses,
-        steps_of(keyframes),
+        odometry_of(keyframes),
         registrations,
         images,
         gaussian_map.gaussians,

@@ -1,25 +1,27 @@
 """The printed iteration (8), (10), (11), (14) on the wire, to compare with: not a solver to use.
 
-Every closure is a constraint with a multiplier at either end. Per round a robot takes one Riemannian gradient step
+Every loop closure is a constraint with a multiplier at either end. Per round a robot takes one Riemannian gradient step
 with Armijo backtracking on its augmented Lagrangian, neighbors' poses held at what last arrived, sends its keyframes,
 and adds penalty times residual to its multipliers. As printed the residual vanishes only if the measurement is the
-identity; here it is that of the measured relative pose, whitened. Even so the multipliers grow until closures hold as
-if they were exact, so that noisy cycles have no fixed point and the limit, if any, is not the least-squares optimum.
+identity; here it is that of the measured relative pose, whitened. Even so the multipliers grow until loop closures hold
+as if they were exact, so that noisy cycles have no fixed point and the limit, if any, is not the least-squares optimum.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.config.posegraph import PoseGraphConfig
 from duagc.pipeline.consensus.admm_edge import PosePacket
+from duagc.pipeline.exchange.solvers import LinkStart, SolverStart
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses_in_parts
 from duagc.pipeline.geometry import se3, so3
-from duagc.pipeline.network.packets import MAX_PAYLOAD_BYTES
-from duagc.pipeline.posegraph import factors as pose_factors
-from duagc.pipeline.posegraph.factors import Factors, retract
-from duagc.pipeline.posegraph.loop_closures import closure_factors
-from duagc.pipeline.team_posegraph.agent import GraphAgent, Neighbor
+from duagc.pipeline.posegraph import least_squares
+from duagc.pipeline.posegraph.least_squares import retract
+from duagc.pipeline.posegraph.relative_poses import RelativePoses, closures_as_relative_poses
 
 Array = NDArray[np.float64]
 _ARMIJO = 1e-4
@@ -27,34 +29,46 @@ _RESIDUAL = 1e-4  # m, rad: the paper's stopping test
 _HALVINGS = 40
 
 
-class PaperAgent(GraphAgent):
-    """A robot with a multiplier per closure."""
+class PrintedAdmmSolver:
+    """A robot with a multiplier per loop closure; both ends of a link hold its loop closures.
 
-    def start(self) -> None:
-        """Own keyframes, then what each neighbor told of its own."""
-        poses = [self.T_world_map[self.own] @ self.T_map_keyframe]
-        count, parts, c = self.graph.keyframes, [], self.config.consensus
+    Attributes:
+        refused: none, it has no reliable messages.
+    """
+
+    def __init__(self, start: SolverStart, config: PoseGraphConfig) -> None:
+        """Lay out own keyframes, then what each neighbor sent of its own.
+
+        Args:
+            start: what the robot knows.
+            config: the same at all robots.
+        """
+        self.config, self.refused = config, list[str]()
+        self.keyframes, self._loops = len(start.own.T_map_keyframe), len(start.own.loops)
+        poses = [start.T_world_map @ start.own.T_first_keyframe]
+        count, parts = self.keyframes, []
         self._slots: dict[int, NDArray[np.int64]] = {}
-        for n in self.neighbors.values():
-            assert n.told is not None
-            slots = self._slots[n.index] = count + np.arange(len(n.told.keyframes))
-            copies = slots[np.searchsorted(n.told.keyframes, [k.peer_keyframe for k in n.closures])]
-            parts.append(
-                closure_factors(n.closures, [k.own_keyframe for k in n.closures], copies, c.closures)
-            )
-            poses.append(self.T_world_map[n.index] @ n.told.T_map_keyframe)
+        for link in start.links:
+            own = [c.own_keyframe for c in link.closures]
+            peer = [c.peer_keyframe for c in link.closures]
+            named = link.shared.keyframes
+            slots = self._slots[link.index] = count + np.arange(len(named))
+            copies = slots[np.searchsorted(named, peer)]
+            closures = config.consensus.closures
+            parts.append(closures_as_relative_poses(link.closures, own, copies, closures))
+            poses.append(link.T_world_keyframe[named])
             count += len(slots)
         self._x = np.concatenate(poses)
-        self._own, self._between = self.own_factors(), Factors.concatenate(parts)
+        self._own = RelativePoses.concatenate([start.own.relative_poses, start.own.loops])
+        self._between = RelativePoses.concatenate(parts)
         self._multipliers = np.zeros((len(self._between), 6))
         self._length, self._step, self._sent = 1.0, np.inf, 0
         self._newest = dict.fromkeys(self._slots, 0)
+        self._weights = {link.name: np.ones(len(link.closures)) for link in start.links}
 
     def advance(self) -> None:
         """One gradient step (11), then the multipliers (14)."""
-        if self.first_round is None:
-            self.first_round = self.round
-        if self.settled:
+        if self.converged:
             return
         g = self._gradient()
         before, slope = self._lagrangian(self._x), float((g**2).sum())
@@ -65,64 +79,100 @@ class PaperAgent(GraphAgent):
                 self._x, self._step = moved, self._length * float(np.abs(g).max())
                 break
             self._length /= 2.0
-        self._multipliers += self.config.paper_penalty * pose_factors.residuals(self._between, self._x)
+        self._multipliers += self.config.paper_penalty * least_squares.residuals(self._between, self._x)
 
     def _lagrangian(self, x: Array) -> float:
         """(10): own cost, multipliers times residuals, penalty."""
-        r = pose_factors.residuals(self._between, x)
+        r = least_squares.residuals(self._between, x)
         penalty = 0.5 * self.config.paper_penalty * float((r**2).sum())
-        return 0.5 * pose_factors.cost(self._own, x) + float((self._multipliers * r).sum()) + penalty
+        return 0.5 * least_squares.cost(self._own, x) + float((self._multipliers * r).sum()) + penalty
 
     def _gradient(self) -> Array:
         """Of the Lagrangian by the own keyframes; zero for the neighbors'."""
-        g, _ = pose_factors.gradient(self._own, np.ones(len(self._own)), self._x)
-        r, Ji, Jj = pose_factors.linearized(self._between, self._x)
+        g, _ = least_squares.gradient(self._own, np.ones(len(self._own)), self._x)
+        r, Ji, Jj = least_squares.linearized(self._between, self._x)
         pull = (self._multipliers + self.config.paper_penalty * r)[..., None]
         np.add.at(g, self._between.i, (np.swapaxes(Ji, -1, -2) @ pull)[..., 0])
         np.add.at(g, self._between.j, (np.swapaxes(Jj, -1, -2) @ pull)[..., 0])
-        g[self.graph.keyframes :] = 0.0
+        g[self.keyframes :] = 0.0
         return g
 
     # --- packets
 
-    def states(self, neighbor: Neighbor) -> list[bytes]:
-        named = neighbor.own_keyframes
+    def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
+        named = np.unique([c.own_keyframe for c in neighbor.closures]).astype(np.int32)
         T = self._x[named]
         self._sent += 1
         nothing = np.zeros(2, dtype=np.float32)
         quats, t = so3.to_quat_wxyz(T[:, :3, :3]).astype(np.float32), T[:, :3, 3].astype(np.float32)
-        packet = PosePacket(self._sent, 0, named, quats, t, nothing, None, self.settled)
-        return write_poses_in_parts(packet, MAX_PAYLOAD_BYTES, decides=False)
+        packet = PosePacket(
+            sequence=self._sent,
+            version=0,
+            keyframes=named,
+            quats_wxyz=quats,
+            translations=t,
+            penalties=nothing,
+            curvature=None,
+            converged=self.converged,
+        )
+        return write_poses_in_parts(packet, room_bytes, decides=False)
 
-    def take_state(self, neighbor: Neighbor, payload: bytes) -> None:
-        packet = read_poses(payload, neighbor.peer_keyframes, from_decider=False)
+    def take_state(self, neighbor: LinkStart, payload: bytes) -> None:
+        expected = neighbor.shared.keyframes
+        packet = read_poses(payload, expected, from_decider=False)
         if packet.sequence >= self._newest[neighbor.index]:
             self._newest[neighbor.index] = packet.sequence
-            at = np.searchsorted(neighbor.peer_keyframes, packet.keyframes)
+            at = np.searchsorted(expected, packet.keyframes)
             self._x[self._slots[neighbor.index][at]] = se3.from_quat_translation(
                 packet.quats_wxyz, packet.translations
             )
+
+    def messages(self) -> list[tuple[int, bytes]]:
+        return []
+
+    def take_message(self, sender: int, payload: bytes) -> None:
+        """The printed iteration has no reliable messages; there is nothing to keep."""
 
     # --- results
 
     @property
     def T_world_keyframe(self) -> Array:  # noqa: N802 (a transform)
-        return self._x[: self.graph.keyframes] if self.T_world_map else self.T_map_keyframe
+        return self._x[: self.keyframes].copy()
 
     @property
-    def settled(self) -> bool:
+    def converged(self) -> bool:
         """The paper's primal residual is small, and so is the step."""
-        if not self.T_world_map:
-            return False
-        if not self.neighbors:
-            return True
-        raw = np.linalg.solve(
-            self._between.whitening, pose_factors.residuals(self._between, self._x)[..., None]
-        )
-        return float(np.abs(raw).max()) < _RESIDUAL and self._step < self.config.consensus.tolerance
+        return self._primal() < _RESIDUAL and self._step < self.config.consensus.tolerance
 
-    def kept(self) -> tuple[Array, dict[str, Array]]:
+    def _primal(self) -> float:
+        """Largest residual of a loop closure, not whitened."""
+        r = least_squares.residuals(self._between, self._x)
+        return float(np.abs(np.linalg.solve(self._between.whitening, r[..., None])).max())
+
+    @property
+    def largest_change(self) -> float:
+        return self._step
+
+    def weights(self, peer: str) -> Array:
         """The printed iteration has no robust weights: everything counts."""
-        return np.ones(len(self.graph.loops)), {
-            n.name: np.ones(len(n.closures)) for n in self.neighbors.values()
+        return self._weights[peer].copy()
+
+    @property
+    def loop_weights(self) -> Array:
+        return np.ones(self._loops)
+
+    def refuted(self, peer: str) -> bool:
+        """Never."""
+        return False
+
+    def residuals(self) -> dict[str, Any]:
+        return {
+            "primal": self._primal(),
+            "dual": 0.0,
+            "cost": least_squares.cost(self._own, self._x),
+            "step": self._step,
+            "penalties": dict.fromkeys(self._weights, (self.config.paper_penalty,) * 2),
+            "versions": dict.fromkeys(self._weights, 0),
+            "weights": {peer: weights.tolist() for peer, weights in self._weights.items()},
+            "factorizations": 0,
         }

@@ -15,15 +15,14 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.config.posegraph import PoseGraphConfig
 from duagc.pipeline.network.packets import HEADER_BYTES, MAX_PAYLOAD_BYTES
-from duagc.pipeline.posegraph import factors as pose_factors
-from duagc.pipeline.posegraph.central import CentralSolution, Team, solve_central, team_graph
-from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.files import TeamGraph, read_team_graph
+from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT
 from duagc.pipeline.posegraph.initialization import chordal
-from duagc.pipeline.posegraph.robust import COUNTS
-from duagc.pipeline.team_posegraph.agent import GraphAgent
-from duagc.pipeline.team_posegraph.elimination import EliminationAgent
-from duagc.pipeline.team_posegraph.network import Traffic, meet
+from duagc.pipeline.posegraph.pose_graph import PoseGraph, PoseGraphSolution, solve_pose_graph
+from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, RelativePoses
+from duagc.pipeline.team_posegraph.agent import PoseGraphAgent
+from duagc.pipeline.team_posegraph.team import Traffic, meet
 
 Array = NDArray[np.float64]
 GAPS = {"1e-2": 1e-2, "1e-4": 1e-4, "1e-6": 1e-6}
@@ -36,21 +35,21 @@ class _Component:
     """One group of connected robots: its whole graph in one place, and what was seen of its agents.
 
     factors: odometry and loops by robot, then closures by pair. trusted: bool per factor. true: bool per factor that
-    is in doubt, what the reference says.
+    may be false, whether the reference has it.
     """
 
     robots: tuple[str, ...]
-    team: Team
+    graph: PoseGraph
     trusted: NDArray[np.bool_]
     true: NDArray[np.bool_] | None
     closures: int
-    optimum: CentralSolution | None = None
+    optimum: PoseGraphSolution | None = None
     trace: list[tuple[int, float, int]] = field(default_factory=list)  # round, cost, bytes by these robots
     setup: tuple[int, int] = (0, 0)  # last round before all of them iterated, bytes until then
 
     def cost(self, T: Array, c2: float | None) -> float:
         """Sum of |r|^2, truncated at c2 for what is not trusted."""
-        squared = pose_factors.squared_residuals(self.team.factors, T)
+        squared = least_squares.squared_residuals(self.graph.relative_poses, T)
         if c2 is not None:
             squared = np.where(self.trusted, squared, np.minimum(squared, c2))
         return float(squared.sum())
@@ -59,7 +58,7 @@ class _Component:
 def solve(
     path: Path, config: PoseGraphConfig, robots: int | None = None, *, only_reference: bool = False
 ) -> dict[str, Any]:
-    """Read, cut, let the team meet, compare; see `docs/howto/pose-graph.md` for the result."""
+    """Read, cut, let the team solve it, compare; see `docs/howto/pose-graph.md` for the result."""
     graph = read_team_graph(path, robots, only_reference=only_reference)
     c2 = config.consensus.truncation**2 if config.consensus.robust else None
     components = [_component(graph, members, config) for members in graph.components()]
@@ -78,40 +77,46 @@ def solve(
 
 def _component(graph: TeamGraph, members: tuple[str, ...], config: PoseGraphConfig) -> _Component:
     robots = [graph.robots[name] for name in members]
-    own = {r.name: Factors.concatenate([r.odometry, r.loops]) for r in robots}
+    own = {r.name: RelativePoses.concatenate([r.odometry, r.loops]) for r in robots}
     pairs = [pair for pair in graph.pairs if pair[0] in members]
-    closures = [(a, b, graph.robots[a].closures[b]) for a, b in pairs]
+    closures = [_held(graph, a, b) for a, b in pairs]
     starts = {r.name: np.tile(np.eye(4), (r.keyframes, 1, 1)) for r in robots}
-    team = team_graph(starts, own, closures, config.consensus.closures)
-    between = sum(len(held) for _, _, held in closures)
+    whole = PoseGraph.of_team(starts, own, closures, config.consensus.closures)
+    between = sum(len(held.loop_closures) for held in closures)
     trusted = [np.arange(len(r.odometry) + len(r.loops)) < len(r.odometry) for r in robots]
     true = None
     if graph.loops_true is not None and graph.closures_true is not None:
         true = np.concatenate(
             [*(graph.loops_true[name] for name in members), *(graph.closures_true[pair] for pair in pairs)]
         )
-    return _Component(members, team, np.concatenate([*trusted, np.zeros(between, bool)]), true, between)
+    return _Component(members, whole, np.concatenate([*trusted, np.zeros(between, bool)]), true, between)
 
 
-def _central(component: _Component) -> CentralSolution:
+def _held(graph: TeamGraph, a: str, b: str) -> HeldLoopClosures:
+    """The loop closures of a pair from the side of a, each with weight one."""
+    closures = graph.robots[a].closures[b]
+    return HeldLoopClosures(a, b, closures, [1.0] * len(closures))
+
+
+def _central(component: _Component) -> PoseGraphSolution:
     """The optimum from a chordal start of the whole graph."""
-    n = len(component.team.T_start)
-    start = chordal(component.team.factors, n) if n > 1 else component.team.T_start
-    return solve_central(component.team.factors, start)
+    n = len(component.graph.T_start)
+    start = chordal(component.graph.relative_poses, n) if n > 1 else component.graph.T_start
+    return solve_pose_graph(component.graph.relative_poses, start)
 
 
-def _truncated(component: _Component, T: Array, kept: NDArray[np.bool_], c2: float) -> CentralSolution:
-    """Truncated least squares in one place, from poses and a selection [doubtful]: solve, select, until it stays."""
+def _truncated(component: _Component, T: Array, kept: NDArray[np.bool_], c2: float) -> PoseGraphSolution:
+    """Truncated least squares in one place, from poses and a selection of what may be false: solve, select, repeat."""
     weights = component.trusted.astype(np.float64)
     best = None
     for _ in range(_TRUNCATIONS):
         weights[~component.trusted] = kept
-        found = solve_central(component.team.factors, T, weights)
+        found = solve_pose_graph(component.graph.relative_poses, T, weights)
         T = found.poses
         cost = component.cost(T, c2)
         if best is None or cost < best.cost:
-            best = CentralSolution(T, cost, found.iterations, found.converged)
-        again = pose_factors.squared_residuals(component.team.factors, T)[~component.trusted] <= c2
+            best = PoseGraphSolution(T, cost, found.iterations, found.converged)
+        again = least_squares.squared_residuals(component.graph.relative_poses, T)[~component.trusted] <= c2
         if np.array_equal(again, kept):
             break
         kept = again
@@ -123,13 +128,17 @@ def _truncated(component: _Component, T: Array, kept: NDArray[np.bool_], c2: flo
 
 
 def _watch(
-    components: list[_Component], k: int, agents: dict[str, GraphAgent], traffic: Traffic, c2: float | None
+    components: list[_Component],
+    k: int,
+    agents: dict[str, PoseGraphAgent],
+    traffic: Traffic,
+    c2: float | None,
 ) -> None:
     """After round k: costs of all components that are past their set-up."""
     for component in components:
         members = [agents[name] for name in component.robots]
         sent = sum(traffic.sent[name] for name in component.robots)
-        if any(agent.first_round is None for agent in members):
+        if any(agent.first_pose_round is None for agent in members):
             component.setup = (k, sent)
             continue
         T = np.concatenate([agent.T_world_keyframe for agent in members])
@@ -137,7 +146,7 @@ def _watch(
 
 
 def _result(
-    component: _Component, agents: dict[str, GraphAgent], config: PoseGraphConfig, c2: float | None
+    component: _Component, agents: dict[str, PoseGraphAgent], config: PoseGraphConfig, c2: float | None
 ) -> dict[str, Any]:
     """What one component reached."""
     members = [agents[name] for name in component.robots]
@@ -145,7 +154,7 @@ def _result(
     kept = _kept(component, agents)
     optimum = component.optimum or _truncated(component, T, kept, c2 or np.inf)
     cost = component.cost(T, c2)
-    squared = pose_factors.squared_residuals(component.team.factors, T)
+    squared = least_squares.squared_residuals(component.graph.relative_poses, T)
     counted = component.trusted.copy()
     counted[~component.trusted] = kept
     first, bytes_before = component.setup
@@ -153,11 +162,11 @@ def _result(
     for name, gap in GAPS.items():
         hit = next((t for t in component.trace if t[1] <= optimum.cost * (1 + gap)), None)
         reached[name] = (hit[0] - first, hit[2]) if hit else None
-    exchanges = max((a.exchange for a in members if isinstance(a, EliminationAgent)), default=None)
+    exchanges = max((a.exchanges for a in members if a.exchanges is not None), default=None)
     return {
         "robots": list(component.robots),
         "keyframes": len(T),
-        "factors": len(component.team.factors),
+        "factors": len(component.graph.relative_poses),
         "closures": component.closures,
         "cost": cost,
         "inlier_cost": float(squared[counted].sum()),
@@ -172,17 +181,19 @@ def _result(
         "rounds_to": {name: hit and hit[0] for name, hit in reached.items()},
         "bytes_to": {name: hit and hit[1] for name, hit in reached.items()},
         "bytes_raw_alternative": _raw_bytes(members),
-        "converged": all(agent.settled for agent in members),
+        "converged": all(agent.done for agent in members),
         "kept": int(kept.sum()),
         "reference": None if component.true is None else _against_reference(component, kept, T, c2),
     }
 
 
-def _kept(component: _Component, agents: dict[str, GraphAgent]) -> NDArray[np.bool_]:
-    """Which doubtful factors count, in the order of the team's graph; closures that nobody holds yet do not."""
+def _kept(component: _Component, agents: dict[str, PoseGraphAgent]) -> NDArray[np.bool_]:
+    """Which of the factors that may be false count, in the order of the graph; loop closures not yet held do not."""
     members = [agents[name] for name in component.robots]
     pairs = [
-        (agent.graph.name, n.name, len(n.closures)) for agent in members for n in agent.neighbors.values()
+        (agent.part.name, peer, len(closures))
+        for agent in members
+        for peer, closures in agent.part.closures.items()
     ]
     held = {(a, b): np.zeros(count) for a, b, count in pairs if a < b}
     loops = []
@@ -190,7 +201,7 @@ def _kept(component: _Component, agents: dict[str, GraphAgent]) -> NDArray[np.bo
         weights, by_peer = agents[name].kept()
         loops.append(weights)
         held.update({(min(name, peer), max(name, peer)): w for peer, w in by_peer.items()})
-    return np.concatenate([*loops, *(held[pair] for pair in sorted(held))]) >= COUNTS
+    return np.concatenate([*loops, *(held[pair] for pair in sorted(held))]) >= INLIER_WEIGHT
 
 
 def _against_reference(
@@ -214,7 +225,7 @@ def _against_reference(
     if c2 is not None:
         weights = component.trusted.astype(np.float64)
         weights[~component.trusted] = true
-        solved = solve_central(component.team.factors, T, weights)
+        solved = solve_pose_graph(component.graph.relative_poses, T, weights)
         result["cost_of_reference"] = component.cost(solved.poses, c2)
     return result
 
@@ -228,12 +239,13 @@ def _distance(T: Array, T_optimum: Array) -> float:
     return float(np.sqrt(((b - a @ R.T) ** 2).sum(axis=1).mean()))
 
 
-def _raw_bytes(members: list[GraphAgent]) -> int:
+def _raw_bytes(members: list[PoseGraphAgent]) -> int:
     """What it takes to send every robot's graph once to every other robot, each closure from one end."""
     total = 0
     for agent in members:
-        closures = sum(len(n.closures) for n in agent.neighbors.values() if agent.own < n.index)
-        share = RAW_FACTOR_BYTES * (len(agent.own_factors()) + closures)
+        part = agent.part
+        closures = sum(len(held) for peer, held in part.closures.items() if part.name < peer)
+        share = RAW_FACTOR_BYTES * (len(part.odometry) + len(part.loops) + closures)
         total += share + HEADER_BYTES * -(-share // MAX_PAYLOAD_BYTES)
     return total * (len(members) - 1)
 
@@ -246,7 +258,7 @@ def _summary(
     path: Path,
     config: PoseGraphConfig,
     components: list[dict[str, Any]],
-    agents: dict[str, GraphAgent],
+    agents: dict[str, PoseGraphAgent],
     traffic: Traffic,
     rounds: int,
     seconds: float,
@@ -287,8 +299,8 @@ def _summary(
             gap: last("bytes_to", gap) if len(together) == 1 else _sum(together, gap) for gap in GAPS
         },
         "bytes_raw_alternative": total("bytes_raw_alternative"),
-        "converged": all(agent.settled for agent in agents.values()),
-        "packets_refused": sum(len(agent.refused) for agent in agents.values()),
+        "converged": all(agent.done for agent in agents.values()),
+        "packets_refused": sum(sum(agent.refused.values()) for agent in agents.values()),
         "seconds": round(seconds, 3),
         "robot_ms_per_round": round(1e3 * seconds / (rounds * len(agents)), 3),
         "reference": graph.reference,

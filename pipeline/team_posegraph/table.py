@@ -20,11 +20,13 @@ def format_result(result: dict[str, Any]) -> str:
         if several:
             lines.append(f"component of {', '.join(component['robots'])}")
         lines += _component(component)
-    state = "all agents hold still" if r["converged"] else "NOT converged: some agents still moved at the end"
+    state = (
+        "all agents have converged" if r["converged"] else "NOT converged: some agents still moved at the end"
+    )
     lines += [
         f"{'sent in all':<28}{_bytes(r['bytes'])}  ({r['packets']} packets, {r['packets_lost']} lost)",
         f"{'set-up':<28}{_bytes(r['bytes_setup'])}  in {r['rounds_setup']} rounds",
-        f"{'raw graphs to everybody':<28}{_bytes(r['bytes_raw_alternative'])}  for comparison",
+        f"{'raw graphs to all others':<28}{_bytes(r['bytes_raw_alternative'])}  for comparison",
         f"{'time':<28}{r['seconds']:.1f} s, {r['robot_ms_per_round']:.2f} ms per robot and round",
         f"{state}",
     ]

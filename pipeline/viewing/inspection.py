@@ -184,9 +184,9 @@ class Inspector:
                 }
                 return {
                     "links": [pair for pair, bit in pairs.items() if state.links & bit],
-                    "parted": [pair for pair, bit in pairs.items() if state.parted & bit],
-                    "frames_hops": state.frames_hops,
-                    "still_hops": state.still_hops,
+                    "revoked": [pair for pair, bit in pairs.items() if state.revoked_links & bit],
+                    "alignment_hops": state.alignment_hops,
+                    "converged_hops": state.converged_hops,
                     "agreed": state.agreed,
                     "done": state.done,
                     "bytes_of_poses": len(poses),

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.consensus.elimination import Front, damped, shared_variables
-from duagc.pipeline.posegraph import factors as pose_factors
-from duagc.pipeline.posegraph.factors import Factors
-from tests.consensus.worlds import random_information, random_poses
+from duagc.pipeline.posegraph import least_squares
+from duagc.pipeline.posegraph.relative_poses import RelativePoses
+from tests.posegraph.worlds import random_information, random_poses
 
 
 def scattered(seed, n=12, m=30):
@@ -15,7 +15,7 @@ def scattered(seed, n=12, m=30):
     i = np.concatenate([np.arange(n - 1), rng.integers(n, size=m)])
     j = np.concatenate([np.arange(1, n), rng.integers(n, size=m)])
     i, j = i[i != j], j[i != j]
-    factors = Factors(i, j, random_poses(rng, len(i)), random_information(rng, len(i)))
+    factors = RelativePoses(i, j, random_poses(rng, len(i)), random_information(rng, len(i)))
     return factors, random_poses(rng, n), np.arange(n) * 3 // n
 
 
@@ -56,7 +56,7 @@ def test_fronts_take_the_step_of_the_whole_graph(tree, damping):
         known = {v: masks[v] if subtree[a] >> v[0] & 1 else 0 for v in here}  # owners below say who has it
         shared[a] = shared_variables(known, subtree[a])
         fronts[a] = Front(variables, {c: shared[c] for c in children}, shared[a])
-        gradient, jacobians = pose_factors.gradient(own, np.ones(len(own)), T[poses])
+        gradient, jacobians = least_squares.gradient(own, np.ones(len(own)), T[poses])
         H_own = damped(own, jacobians, len(poses), damping, 0 if a == 0 else None)
         H[a] = fronts[a].factorize(H_own, {c: H[c] for c in children})
         g[a] = fronts[a].eliminate(gradient, {c: g[c] for c in children})
@@ -74,7 +74,7 @@ def test_fronts_take_the_step_of_the_whole_graph(tree, damping):
         for v, step in zip(parts[a][0], own, strict=True):  # copies move as their owners do
             if v[0] < a:
                 np.testing.assert_allclose(step, steps[v[1]], rtol=1e-9, atol=1e-12)
-    whole_gradient, jacobians = pose_factors.gradient(factors, np.ones(len(factors)), T)
+    whole_gradient, jacobians = least_squares.gradient(factors, np.ones(len(factors)), T)
     whole = damped(factors, jacobians, len(T), damping, 0).toarray()
     expected = -np.linalg.solve(whole, whole_gradient.ravel()).reshape(-1, 6)
     expected -= expected[0]  # both hold pose 0, one with a stiffer spring

@@ -18,7 +18,7 @@ from duagc.pipeline.splat.information import (
     pack_symmetric,
     unpack_symmetric,
 )
-from tests.consensus.worlds import random_poses
+from tests.posegraph.worlds import random_poses
 
 
 @dataclass

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.consensus.admm_edge import REMEMBERED, SharedKeyframes
 from duagc.pipeline.consensus.pose_admm import PoseAgent, PoseConsensusConfig
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.posegraph.factors import Factors
-from duagc.pipeline.posegraph.loop_closures import Closure, ClosureConfig
-from duagc.pipeline.posegraph.robust import graduated_weights
-from tests.consensus.worlds import (
+from duagc.pipeline.posegraph.gnc import graduated_weights
+from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses
+from tests.posegraph.worlds import (
     EXACT,
     TeamWorld,
     benchmark,
@@ -199,7 +199,9 @@ def test_outliers_end_with_weight_zero_and_the_rest_with_one(good_start, loss):
     rng = np.random.default_rng(15)
     held = world.closures["alpha", "bravo"]
     wild = [
-        Closure(c.own_keyframe, c.peer_keyframe, c.T_own_peer @ se3.exp(rng.normal(size=6)), c.information)
+        LoopClosure(
+            c.own_keyframe, c.peer_keyframe, c.T_own_peer @ se3.exp(rng.normal(size=6)), c.information
+        )
         for c in held[:3]
     ]
     clean = make_team(14, robots=2, keyframes=12, closures=6)
@@ -233,7 +235,7 @@ def test_graduated_weights_go_from_convex_to_truncated():
 def test_overconfident_odometry_does_not_freeze_the_team():
     """Floors bound every claim: odometry that claims micrometers still yields to closures."""
     world = make_team(16, robots=2)
-    sure = {r: Factors(f.i, f.j, f.T_i_j, 1e6 * f.information) for r, f in world.odometry.items()}
+    sure = {r: RelativePoses(f.i, f.j, f.T_i_j, 1e6 * f.information) for r, f in world.odometry.items()}
     config = PoseConsensusConfig()
     agent = PoseAgent("alpha", world.maps["alpha"], sure["alpha"], config)
     covariance = np.linalg.inv(agent.odometry.information)
@@ -256,14 +258,14 @@ def test_links_are_checked():
         agent.add_link("charlie", shared=shared)
     with pytest.raises(ValueError, match="first step"):
         agent.set_frame(np.eye(4))
-    blind = [Closure(0, 0, np.eye(4), np.diag([1.0, 1, 1, 0, 0, 0]))]
+    blind = [LoopClosure(0, 0, np.eye(4), np.diag([1.0, 1, 1, 0, 0, 0]))]
     with pytest.raises(ValueError, match="cannot join"):
         PoseAgent("bravo", world.maps["bravo"], world.odometry["bravo"], PLAIN).add_link("alpha", blind)
 
 
 def test_records_name_every_neighbor():
     world = make_team(18, robots=3)
-    agents = world.agents(PoseConsensusConfig(closures=ClosureConfig(min_support=1)))
+    agents = world.agents(PoseConsensusConfig(closures=LoopClosureConfig(min_support=1)))
     talk(agents, 20)
     record = agents["bravo"].residuals()
     assert set(record["penalties"]) == {"alpha", "charlie"}

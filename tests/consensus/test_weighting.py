@@ -17,7 +17,7 @@ from duagc.pipeline.consensus.weighting import (
     shared_evidence,
 )
 from tests.consensus.test_evidence import Sums, random_map
-from tests.consensus.worlds import random_poses
+from tests.posegraph.worlds import random_poses
 
 
 @dataclass

@@ -5,13 +5,13 @@ import pytest
 
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.pose_admm import with_floor
-from duagc.pipeline.evaluation.oracle import WeightedClosure, gap_to_oracle, pose_gap, solve_component
+from duagc.pipeline.evaluation.oracle import gap_to_oracle, pose_gap, solve_component
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, RelativePoses
 from duagc.pipeline.runs.folder import RunFolder
-from tests.consensus.worlds import make_team, talk
 from tests.evaluation.fake_run import make
+from tests.posegraph.worlds import make_team, talk
 
 CONFIG = PoseConsensusConfig(wire="float64", tolerance=1e-9)
 
@@ -25,7 +25,7 @@ def agreed():
     poses = {name: agent.T_world_keyframe for name, agent in agents.items()}
     odometry = {name: agent.odometry for name, agent in agents.items()}
     closures = [
-        WeightedClosure(agent.robot, link.peer, closure, weight)
+        HeldLoopClosures(agent.robot, link.peer, (closure,), (weight,))
         for agent in agents.values()
         for link in agent.links.values()
         for closure, weight in zip(link.closures, link.robust.weights.tolist(), strict=True)
@@ -67,8 +67,8 @@ def test_a_moved_keyframe_is_the_gap(agreed):
 def test_other_weights_have_another_answer(agreed):
     """The final weights count: with one closure left out, the robots are not at the answer."""
     poses, odometry, closures = agreed
-    assert sum(c.weight > 0 for c in closures) > 2
-    used = next(k for k, c in enumerate(closures) if c.weight > 0)
+    assert sum(c.weights[0] > 0 for c in closures) > 2
+    used = next(k for k, c in enumerate(closures) if c.weights[0] > 0)
     less = [c for k, c in enumerate(closures) if k != used]
     assert gap_of_component(poses, odometry, less)[0] > 1e-5
 
@@ -81,7 +81,7 @@ def test_without_information_or_company_there_is_no_gap(tmp_path):
 
 
 def test_the_floor_is_that_of_the_agents():
-    one = Factors(np.array([0]), np.array([1]), np.eye(4)[None], 1e12 * np.eye(6)[None])
+    one = RelativePoses(np.array([0]), np.array([1]), np.eye(4)[None], 1e12 * np.eye(6)[None])
     information = with_floor(one, CONFIG).information[0]
     assert information[0, 0] == pytest.approx(1 / CONFIG.odometry_floor_m**2, rel=1e-4)
     assert information[5, 5] == pytest.approx(1 / CONFIG.odometry_floor_rad**2, rel=1e-4)

@@ -13,7 +13,8 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.messages import GaussianInformation
-from duagc.pipeline.runs.robot_data import Images, RobotData, Step
+from duagc.pipeline.posegraph.relative_poses import RelativePose
+from duagc.pipeline.runs.robot_data import Images, RobotData
 from duagc.pipeline.splat.gaussians import Gaussians
 
 Array = NDArray[np.float64]
@@ -71,7 +72,7 @@ def robot(
         noise = np.concatenate([rng.normal(0, 0.004, 3), rng.normal(0, 0.002, 3)])
         T = se3.inverse(truth[k - 1]) @ truth[k] @ se3.exp(noise)
         information = np.diag([1 / 0.004**2] * 3 + [1 / 0.002**2] * 3)
-        steps.append(Step(k - 1, k, T, information))
+        steps.append(RelativePose(k - 1, k, T, information))
         T_map.append(T_map[-1] @ T)
     poses = np.array(T_map)
     images = [Images(*view(T)) for T in truth]

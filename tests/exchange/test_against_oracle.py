@@ -15,13 +15,13 @@ from duagc.pipeline.config.network import LinkConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.pose_admm import with_floor
 from duagc.pipeline.consensus.weights import Weights
-from duagc.pipeline.evaluation.oracle import WeightedClosure, pose_gap, solve_component
+from duagc.pipeline.evaluation.oracle import pose_gap, solve_component
 from duagc.pipeline.exchange.session import run_session_of
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.fuse import OwnMap, fuse
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.posegraph.loop_closures import Closure
-from duagc.pipeline.runs.robot_data import AgentResult, RobotData, factors_of
+from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, LoopClosure, RelativePoses
+from duagc.pipeline.runs.robot_data import RobotData, SessionResult
 
 NAMES = ("alpha", "bravo", "charlie", "delta", "echo", "foxtrot", "golf", "hotel")
 BURSTS = {"burst_gap_ns": 900_000_000, "burst_length_ns": 300_000_000}
@@ -36,7 +36,7 @@ def unrounded(**link: Any) -> ExchangeConfig:
     )
 
 
-def meet(data: list[RobotData], folder: Path, config: ExchangeConfig) -> dict[str, AgentResult]:
+def meet(data: list[RobotData], folder: Path, config: ExchangeConfig) -> dict[str, SessionResult]:
     results = run_session_of(
         data, config, seed=0, exchange_path=folder / "exchange.mcap", consensus_path=folder / "consensus.mcap"
     )
@@ -52,14 +52,17 @@ def team(make_robot: Any, robots: int, link: dict[str, Any]) -> list[RobotData]:
 
 
 def oracle_poses(
-    data: list[RobotData], results: dict[str, AgentResult], config: PoseConsensusConfig
+    data: list[RobotData], results: dict[str, SessionResult], config: PoseConsensusConfig
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """The robots' poses, and the centralized answer to the same factors, closures and final weights."""
     poses = {d.robot: results[d.robot].T_world_keyframe for d in data}
-    odometry = {d.robot: with_floor(factors_of(d.registrations), config) for d in data}
+    odometry = {d.robot: with_floor(RelativePoses.of(d.registrations), config) for d in data}
     closures = [
-        WeightedClosure(
-            c.robot, c.peer, Closure(c.own_keyframe, c.peer_keyframe, c.T_own_peer, c.information), c.weight
+        HeldLoopClosures(
+            c.robot,
+            c.peer,
+            (LoopClosure(c.own_keyframe, c.peer_keyframe, c.T_own_peer, c.information),),
+            (c.weight,),
         )
         for result in results.values()
         for c in result.closures
@@ -94,7 +97,7 @@ def fused_theta(
 
 
 def gaps(
-    data: list[RobotData], results: dict[str, AgentResult], config: ExchangeConfig
+    data: list[RobotData], results: dict[str, SessionResult], config: ExchangeConfig
 ) -> tuple[float, float, np.ndarray]:
     """Meters and radians of poses, and of every matched Gaussian [m, 13] in standard deviations, from the oracle."""
     poses, central = oracle_poses(data, results, config.consensus)

@@ -11,7 +11,7 @@ import pytest
 
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.network import TransportConfig
-from duagc.pipeline.exchange.agent import Agent
+from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.exchange.record import read_session
 from duagc.pipeline.exchange.replay import replay_agent_of
 from duagc.pipeline.exchange.session import run_session_of, team_of
@@ -26,7 +26,7 @@ from duagc.pipeline.network.packets import (
     serialize,
 )
 from duagc.pipeline.network.signatures import SIGNATURE_BYTES, Identity
-from duagc.pipeline.runs.robot_data import AgentResult, RobotData
+from duagc.pipeline.runs.robot_data import RobotData, SessionResult
 from tests.exchange.test_session import same
 
 NAMES = ("alpha", "bravo")
@@ -42,7 +42,7 @@ def team(make_robot: Any) -> list[RobotData]:
 
 def meet(
     team: list[RobotData], config: ExchangeConfig, tampers: list[Tamper], per_round: int, seed: int = 0
-) -> tuple[dict[str, AgentResult], dict[str, Agent], int]:
+) -> tuple[dict[str, SessionResult], dict[str, MapAgent], int]:
     """A session over lossless air, with invented packets among the true ones, in any order."""
     agents = team_of(team, config, seed=0)
     rng = np.random.default_rng(seed)
@@ -65,7 +65,7 @@ def meet(
     return {name: result_of(agent) for name, agent in agents.items()}, agents, invented
 
 
-def moved(results: dict[str, AgentResult], others: dict[str, AgentResult]) -> list[str]:
+def moved(results: dict[str, SessionResult], others: dict[str, SessionResult]) -> list[str]:
     """Robots whose results are not the same bit for bit; what they refused does not count."""
     return [
         name
@@ -126,7 +126,7 @@ def forged(rng: np.random.Generator, heard: list[bytes]) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def quiet(team: list[RobotData]) -> dict[str, AgentResult]:
+def quiet(team: list[RobotData]) -> dict[str, SessionResult]:
     results, _, _ = meet(team, ExchangeConfig(), [], 0)
     assert all(result.converged for result in results.values())
     return results

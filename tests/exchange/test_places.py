@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.base import random_streams
-from duagc.pipeline.config.consensus import ClosureConfig
+from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.config.exchange import (
     ExchangeConfig,
     PeerRegistrationConfig,
@@ -15,21 +15,21 @@ from duagc.pipeline.config.exchange import (
     VerificationConfig,
 )
 from duagc.pipeline.exchange import place_recognition
-from duagc.pipeline.exchange.loop_closing import OwnPlaces
+from duagc.pipeline.exchange.detected_loop_closures import KeyframeDatabase
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
-from duagc.pipeline.exchange.verification import Verdict, verify
-from duagc.pipeline.exchange.wire import places_wire
+from duagc.pipeline.exchange.verification import Verdict, Verified, verify
+from duagc.pipeline.exchange.wire import loop_closing_wire
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import features
 from duagc.pipeline.runs.robot_data import Images
 
 
 @pytest.fixture(scope="module")
-def robots(make_robot: Any) -> dict[str, tuple[OwnPlaces, np.ndarray]]:
+def robots(make_robot: Any) -> dict[str, tuple[KeyframeDatabase, np.ndarray]]:
     out = {}
     for name, turn in (("alpha", 0.0), ("bravo", 0.6)):
         data, truth = make_robot(name, turn, keyframes=3, gaussians=10)
-        out[name] = (OwnPlaces(data, ExchangeConfig()), truth)
+        out[name] = (KeyframeDatabase(data, ExchangeConfig()), truth)
     return out
 
 
@@ -60,13 +60,23 @@ def test_ransac_finds_the_motion_among_false_matches() -> None:
     assert max(float(d) for d in se3.distance(found, T)) < 0.01
 
 
+def verified(candidate, database, sample, config=None) -> Verified:
+    """What becomes of a candidate between a keyframe of a database and a neighbor's sample."""
+    own = candidate.own_keyframe
+    return verify(
+        candidate,
+        database.features[own],
+        database.pyramid(own),
+        sample,
+        config=config or VerificationConfig(),
+        rng=random_streams.generator(0, "test"),
+    )
+
+
 def test_a_closure_is_as_good_as_its_information_says(robots: dict) -> None:
     (alpha, truth_a), (bravo, truth_b) = robots["alpha"], robots["bravo"]
-    sample = places_wire.read_sample(places_wire.write_sample(bravo.sample(0)), 3)
-    result = verify(
-        2, 0, alpha.features[2], alpha.pyramid(2), sample.features, sample.reference, VerificationConfig(),
-        random_streams.generator(0, "test"),
-    )  # fmt: skip
+    sample = loop_closing_wire.read_sample(loop_closing_wire.write_sample(bravo.sample(0)), 3)
+    result = verified(Candidate(2, 0, 0), alpha, sample)
     assert result.verdict is Verdict.KEPT
     assert result.closure is not None
     T_true = se3.inverse(truth_a[2]) @ truth_b[0]
@@ -83,26 +93,22 @@ def test_a_darker_camera_finds_the_same_place(robots: dict) -> None:
         color, *depth = alpha.data.images(keyframe)
         return Images(np.rint(0.45 * color + 8).astype(np.uint8), *depth)
 
-    darker = OwnPlaces(replace(alpha.data, images=dark), ExchangeConfig())
-    sample = places_wire.read_sample(places_wire.write_sample(bravo.sample(0)), 3)
-    given = darker.features[2], darker.pyramid(2), sample.features, sample.reference
-    result = verify(2, 0, *given, VerificationConfig(), random_streams.generator(0, "test"))
+    darker = KeyframeDatabase(replace(alpha.data, images=dark), ExchangeConfig())
+    sample = loop_closing_wire.read_sample(loop_closing_wire.write_sample(bravo.sample(0)), 3)
+    result = verified(Candidate(2, 0, 0), darker, sample)
     assert result.closure is not None
     moved_m, moved_rad = se3.distance(result.closure.T_own_peer, se3.inverse(truth_a[2]) @ truth_b[0])
     assert moved_m < 0.003
     assert moved_rad < 0.002
     alike = VerificationConfig(registration=PeerRegistrationConfig(max_gain=2.0))  # as within one robot
-    assert verify(2, 0, *given, alike, random_streams.generator(0, "test")).verdict is Verdict.NOT_REGISTERED
+    assert verified(Candidate(2, 0, 0), darker, sample, alike).verdict is Verdict.NOT_REGISTERED
 
 
 def test_different_places_are_refused(robots: dict, make_robot: Any) -> None:
     alpha, _ = robots["alpha"]
     far, _ = make_robot("charlie", np.pi, keyframes=1, gaussians=10)
-    sample = OwnPlaces(far, ExchangeConfig()).sample(0)
-    result = verify(
-        0, 0, alpha.features[0], alpha.pyramid(0), sample.features, sample.reference, VerificationConfig(),
-        random_streams.generator(0, "test"),
-    )  # fmt: skip
+    sample = KeyframeDatabase(far, ExchangeConfig()).sample(0)
+    result = verified(Candidate(0, 0, 0), alpha, sample)
     assert result.verdict in (Verdict.FEW_MATCHES, Verdict.FEW_INLIERS)
     assert result.closure is None
     assert "needed" in result.detail
@@ -112,7 +118,7 @@ DRIFT = np.stack([np.arange(40) * 0.003**2, np.arange(40) * 0.001**2], axis=1)
 
 
 def planner(candidates: list[Candidate], **config: Any) -> Planner:
-    return Planner(candidates, DRIFT, DRIFT, PlacesConfig(**config), ClosureConfig())
+    return Planner(candidates, DRIFT, DRIFT, PlacesConfig(**config), LoopClosureConfig())
 
 
 def test_every_pair_of_keyframes_is_scored_or_has_a_word_said_about_it(robots: dict) -> None:
@@ -133,7 +139,7 @@ def test_the_plan_keeps_to_the_budget_and_says_why_not_more() -> None:
     assert [len({c.peer_keyframe for c in batch}) for batch in (first, second)] == [3, 1]
     assert len(first) == 9  # three of each keyframe
     assert plan.next() == []
-    left = plan.not_asked_for()
+    left = plan.not_requested()
     assert {c for c, _ in left} | set(first) | set(second) == set(candidates)
     assert all(reason for _, reason in left)
     assert any("budget of 4" in reason for _, reason in left)
@@ -156,9 +162,9 @@ def test_strangers_try_on_and_those_who_met_stop() -> None:
         while batch := plan.next():
             for c in batch:
                 plan.take(c, closure)
-    assert refused.asked == 20
-    assert kept.asked < 15
-    assert all("nats, 1 needed" in reason for _, reason in kept.not_asked_for())
+    assert refused.requested == 20
+    assert kept.requested < 15
+    assert all("nats, 1 needed" in reason for _, reason in kept.not_requested())
 
 
 def test_information_of_the_inverse_motion() -> None:

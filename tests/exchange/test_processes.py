@@ -10,8 +10,9 @@ from typing import Any
 from duagc.pipeline.base import determinism
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.network import LinkConfig
-from duagc.pipeline.exchange.agent import Agent
-from duagc.pipeline.exchange.session import Delivery, due, run_session_of
+from duagc.pipeline.exchange.map_agent import MapAgent
+from duagc.pipeline.exchange.rounds import Delivery, due
+from duagc.pipeline.exchange.session import run_session_of
 from duagc.pipeline.exchange.session_result import result_of
 from duagc.pipeline.network import link_model
 from duagc.pipeline.network.link_model import LinkModel
@@ -26,7 +27,7 @@ def live(pipe: Connection, place: int) -> None:
     """A robot's whole life: it makes its own data, and knows its name, its neighbors and the settings."""
     determinism.configure_opencv()
     data, _ = robot(NAMES[place], 0.6 * place, keyframes=4)
-    agent = Agent(data, NAMES, link_model.neighbors(CONFIG.link, NAMES)[NAMES[place]], CONFIG, seed=0)
+    agent = MapAgent(data, NAMES, link_model.neighbors(CONFIG.link, NAMES)[NAMES[place]], CONFIG, seed=0)
     while (heard := pipe.recv()) is not None:
         round_index, now_ns, packets = heard
         sent = [(out.receiver, out.packet) for out in agent.tick(round_index, now_ns, packets)]

@@ -15,16 +15,17 @@ import pytest
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.config.exchange import ExchangeConfig, InjectionConfig
 from duagc.pipeline.config.network import LinkConfig, TransportConfig
-from duagc.pipeline.exchange.agent import Agent
 from duagc.pipeline.exchange.evidence_records import best_first, own_records, paper_priority
+from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.exchange.record import read_session
 from duagc.pipeline.exchange.replay import replay_agent_of
 from duagc.pipeline.exchange.session import run_session_of
 from duagc.pipeline.exchange.session_result import result_of
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.packets import Kind, Packet, chunk_bytes, parse, serialize
+from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import content_digest, read_log
-from duagc.pipeline.runs.robot_data import AgentResult, RobotData, Step
+from duagc.pipeline.runs.robot_data import RobotData, SessionResult
 
 NAMES = ("alpha", "bravo", "charlie")
 
@@ -39,7 +40,7 @@ def team(make_robot: Any) -> dict[str, tuple[RobotData, np.ndarray]]:
 
 def meet(
     team: dict[str, tuple[RobotData, np.ndarray]], robots: int, folder: Path, seed: int = 0, **config: Any
-) -> dict[str, AgentResult]:
+) -> dict[str, SessionResult]:
     data = [team[name][0] for name in NAMES[:robots]]
     return run_session_of(
         data,
@@ -55,14 +56,14 @@ def lossy_chain(
     team: dict[str, tuple[RobotData, np.ndarray]],
     tmp_path_factory: pytest.TempPathFactory,
     request: pytest.FixtureRequest,
-) -> tuple[dict[str, AgentResult], Path, ExchangeConfig]:
+) -> tuple[dict[str, SessionResult], Path, ExchangeConfig]:
     folder = tmp_path_factory.mktemp("chain")
     config = ExchangeConfig(link=LinkConfig(topology="chain", loss_probability=0.3), solver=request.param)
     return meet(team, 3, folder, link=config.link, solver=config.solver), folder, config
 
 
 def test_robots_know_how_the_maps_of_others_were_made(
-    lossy_chain: tuple[dict[str, AgentResult], Path, ExchangeConfig],
+    lossy_chain: tuple[dict[str, SessionResult], Path, ExchangeConfig],
 ) -> None:
     """Of alpha's and charlie's, who are not linked, by what bravo hands on."""
     kinds = {"alpha": "blended", "bravo": "blended", "charlie": "ray_plane"}
@@ -70,13 +71,13 @@ def test_robots_know_how_the_maps_of_others_were_made(
         assert result.depth_of == {other: kind for other, kind in kinds.items() if other != name}
 
 
-def error_m(result: AgentResult, team: dict[str, tuple[RobotData, np.ndarray]]) -> float:
+def error_m(result: SessionResult, team: dict[str, tuple[RobotData, np.ndarray]]) -> float:
     """Largest distance of an own keyframe from the truth, in the map frame of the lowest-named robot."""
     T_true = se3.inverse(team[result.component[0]][1][0]) @ team[result.robot][1]
     return float(se3.distance(T_true, result.T_world_keyframe)[0].max())
 
 
-def same(a: AgentResult, b: AgentResult) -> bool:
+def same(a: SessionResult, b: SessionResult) -> bool:
     """Whether two results are equal bit for bit."""
 
     def equal(x: Any, y: Any) -> bool:
@@ -229,13 +230,13 @@ TROUBLE = {
 
 
 @pytest.fixture(scope="module")
-def undisturbed(team: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, AgentResult]:
+def undisturbed(team: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, SessionResult]:
     return meet(team, 2, tmp_path_factory.mktemp("undisturbed"))
 
 
 @pytest.mark.parametrize("name", TROUBLE)
 def test_a_troubled_link_costs_rounds_and_nothing_else(
-    team: Any, undisturbed: dict[str, AgentResult], tmp_path: Path, name: str
+    team: Any, undisturbed: dict[str, SessionResult], tmp_path: Path, name: str
 ) -> None:
     link = LinkConfig(**TROUBLE[name])  # type: ignore[arg-type]
     results = meet(team, 2, tmp_path, link=link)
@@ -253,7 +254,7 @@ def test_a_troubled_link_costs_rounds_and_nothing_else(
 
 
 def test_a_copy_made_by_the_network_changes_nothing(
-    team: Any, undisturbed: dict[str, AgentResult], tmp_path: Path
+    team: Any, undisturbed: dict[str, SessionResult], tmp_path: Path
 ) -> None:
     results = meet(team, 2, tmp_path, link=LinkConfig(duplicate_probability=1.0))
     assert all(same(results[robot], undisturbed[robot]) for robot in undisturbed)
@@ -263,7 +264,7 @@ def test_a_copy_made_by_the_network_changes_nothing(
 
 @pytest.mark.parametrize("seed", range(3))
 def test_injected_false_closures_are_found_out(
-    team: Any, undisturbed: dict[str, AgentResult], tmp_path: Path, seed: int
+    team: Any, undisturbed: dict[str, SessionResult], tmp_path: Path, seed: int
 ) -> None:
     faults = InjectionConfig(false_closures=0.3)
     results = meet(team, 2, tmp_path, seed=seed, injection=faults)
@@ -280,7 +281,7 @@ def test_injected_false_closures_are_found_out(
 
 
 def test_elimination_ends_where_the_other_solver_does(
-    team: Any, undisturbed: dict[str, AgentResult], tmp_path: Path
+    team: Any, undisturbed: dict[str, SessionResult], tmp_path: Path
 ) -> None:
     results = meet(team, 2, tmp_path, solver="elimination")
     for name, result in results.items():
@@ -293,7 +294,7 @@ def test_elimination_ends_where_the_other_solver_does(
 
 
 def test_missing_poses_cost_rounds_and_false_matches_are_as_many_as_asked_for(
-    team: Any, undisturbed: dict[str, AgentResult], tmp_path: Path
+    team: Any, undisturbed: dict[str, SessionResult], tmp_path: Path
 ) -> None:
     faults = InjectionConfig(pose_dropouts=0.5, false_matches=0.4)
     results = meet(team, 2, tmp_path, injection=faults)
@@ -409,7 +410,7 @@ def test_a_robot_without_a_map_keeps_nobody_waiting(team: Any, tmp_path: Path) -
 def test_a_neighbor_that_falls_silent_ends_the_session(team: Any) -> None:
     """Whoever it met has gone: the agent stops waiting, keeps what it has, and does not call that agreement."""
     config = ExchangeConfig(transport=TransportConfig(silent_after_rounds=15))
-    agents = {n: Agent(team[n][0], NAMES[:2], set(NAMES[:2]) - {n}, config, seed=0) for n in NAMES[:2]}
+    agents = {n: MapAgent(team[n][0], NAMES[:2], set(NAMES[:2]) - {n}, config, seed=0) for n in NAMES[:2]}
     air: dict[str, list[bytes]] = {n: [] for n in NAMES[:2]}
     for round_index in range(60):
         if round_index == 20:  # the poses move by now; bravo is switched off
@@ -444,7 +445,7 @@ def test_hostile_packets_change_nothing(team: Any) -> None:
                 rubbish.append(Packet(kind, sender, 0, 0, 0, int(kind), 0, size, payload))
         if kind > Kind.STATE:
             rubbish.append(Packet(kind, 1, 0, 0, 0, 77, 0, 1 << 31, bytes(chunk_bytes(kind))))
-    agent = Agent(team["alpha"][0], ["alpha", "bravo", "charlie"], ["bravo"], ExchangeConfig(), seed=0)
+    agent = MapAgent(team["alpha"][0], ["alpha", "bravo", "charlie"], ["bravo"], ExchangeConfig(), seed=0)
     sequences = itertools.count()
     for round_index in range(4):
         packets = [
@@ -486,7 +487,7 @@ def test_every_registration_counts_in_the_consensus(team: Any, tmp_path: Path) -
     last = alpha.keyframes - 1
     T_first_last = se3.inverse(alpha.T_map_keyframe[0]) @ alpha.T_map_keyframe[last]
     T_first_last = T_first_last @ se3.exp(np.array([0.03, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    sure = Step(0, last, T_first_last, 1e10 * np.eye(6))
+    sure = RelativePose(0, last, T_first_last, 1e10 * np.eye(6))
     consensus = PoseConsensusConfig(odometry_floor_m=1e-5, odometry_floor_rad=1e-5)
     away_m = []
     for more in ([], [sure]):

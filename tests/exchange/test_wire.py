@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from duagc.pipeline.consensus.admm_edge import PosePacket, SharedKeyframes
-from duagc.pipeline.exchange.wire import evidence_wire, places_wire, state_wire
+from duagc.pipeline.exchange.wire import evidence_wire, loop_closing_wire, state_wire
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.packets import EVIDENCE_KINDS, Kind, MalformedError, chunk_bytes
@@ -51,13 +51,13 @@ def as_sent(kind: Kind, sent: np.ndarray) -> np.ndarray:
     return evidence_wire.from_body(kind, evidence_wire.to_body(kind, sent))
 
 
-def sample() -> places_wire.KeyframeSample:
+def sample() -> loop_closing_wire.KeyframeSample:
     points = RNG.uniform(-2, 3, (30, 3)).astype(np.float32)
     normals = RNG.normal(size=(30, 3))
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
     levels = tuple(ReferenceLevel(points, normals, RNG.random(30).astype(np.float32)) for _ in range(3))
     features = Features(RNG.integers(0, 256, (9, 128)).astype(np.uint8), points[:9])
-    return places_wire.KeyframeSample(2, features, Reference(levels))
+    return loop_closing_wire.KeyframeSample(2, features, Reference(levels))
 
 
 def records(n: int) -> np.ndarray:
@@ -78,20 +78,20 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
         lambda d: state_wire.read_state(d, TEAM),
     ),
     "places": (
-        places_wire.write_places(
-            places_wire.PlaceBook(
+        loop_closing_wire.write_descriptors(
+            loop_closing_wire.DescriptorSet(
                 [RNG.integers(0, 256, (n, 128)).astype(np.uint8) for n in (3, 0, 2)],
                 poses(3),
                 np.array([[0, 0], [1, 1], [1, 3.0]]),
             )
         ),
-        places_wire.read_places,
+        loop_closing_wire.read_descriptors,
     ),
-    "request": (places_wire.write_indices([1, 5, 6]), lambda d: places_wire.read_indices(d, 7)),
-    "sample": (places_wire.write_sample(sample()), lambda d: places_wire.read_sample(d, 3)),
+    "request": (loop_closing_wire.write_indices([1, 5, 6]), lambda d: loop_closing_wire.read_indices(d, 7)),
+    "sample": (loop_closing_wire.write_sample(sample()), lambda d: loop_closing_wire.read_sample(d, 3)),
     "closures": (
-        places_wire.write_verdicts(
-            places_wire.Verdicts(
+        loop_closing_wire.write_verdicts(
+            loop_closing_wire.Verdicts(
                 9,
                 5,
                 4,
@@ -99,19 +99,19 @@ MESSAGES: dict[str, tuple[bytes, Callable[[bytes], Any]]] = {
                 SharedKeyframes(np.array([2, 6], np.int32), np.ones((2, 6), np.float32)),
             )
         ),
-        lambda d: places_wire.read_verdicts(d, 7),
+        lambda d: loop_closing_wire.read_verdicts(d, 7),
     ),
     "poses": (
         write_poses(pose_packet(), 0, 2, False),
         lambda d: read_poses(d, SHARED, False),
     ),
     "frame": (
-        state_wire.write_frames(
-            state_wire.PairFrames(
+        state_wire.write_relative_frames(
+            state_wire.RelativeFrames(
                 1, 2, tuple(Proposal(n, poses(1)[0], (0.01 * n, 0.02), 0.1 * n) for n in (7, 2))
             )
         ),
-        lambda d: state_wire.read_frames(d, TEAM),
+        lambda d: state_wire.read_relative_frames(d, TEAM),
     ),
     "anchors": (
         state_wire.write_anchors(state_wire.Anchors(2, poses(4), poses(1)[0])),
@@ -173,7 +173,7 @@ def test_final_poses_and_voxels_come_back_bit_for_bit() -> None:
 
 def test_a_sample_comes_back_within_its_quantization() -> None:
     before = sample()
-    after = places_wire.read_sample(places_wire.write_sample(before), 3)
+    after = loop_closing_wire.read_sample(loop_closing_wire.write_sample(before), 3)
     assert np.array_equal(after.features.descriptors, before.features.descriptors)
     assert np.abs(after.features.points - before.features.points).max() < 1e-4  # 3 m / 32767
     for a, b in zip(after.reference.levels, before.reference.levels, strict=True):

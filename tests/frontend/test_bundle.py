@@ -10,11 +10,12 @@ import pytest
 from duagc.pipeline.config.frontend import KeyframeConfig, LoopConfig, RelocalizationConfig
 from duagc.pipeline.frontend import bundle, loops
 from duagc.pipeline.frontend.bundle import Neighborhood, optimize
-from duagc.pipeline.frontend.keyframe_graph import KeyframePair, Refined, refine
+from duagc.pipeline.frontend.keyframe_graph import Refined, refine
 from duagc.pipeline.frontend.loops import find_loops
 from duagc.pipeline.frontend.tracking_state import features_of
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration import Level, Reference, RegistrationConfig, RgbdPyramid, register
 from duagc.pipeline.registration.features import Features, matches
 from tests.registration.room import pose, render
@@ -59,15 +60,15 @@ class Walk:
             guess = se3.inverse(self.truth[k - 1]) @ self.truth[k]
             found = register(self.views[k - 1].reference, self.pyramids[k], guess)
             assert found.ok
-            self.pairs.append(KeyframePair(k - 1, k, found.T_reference_target, found.information))
+            self.pairs.append(RelativePose(k - 1, k, found.T_reference_target, found.information))
 
     def images(self, index: int, levels: int) -> RgbdPyramid:
         return self.pyramids[index]
 
-    def chained(self, pairs: list[KeyframePair]) -> np.ndarray:
+    def chained(self, pairs: list[RelativePose]) -> np.ndarray:
         T = [np.eye(4)]
         for pair in pairs:
-            T.append(T[-1] @ pair.T_first_second)
+            T.append(T[-1] @ pair.T_i_j)
         return np.array(T)
 
     def error_m(self, T: np.ndarray) -> float:
@@ -82,7 +83,7 @@ def noisy() -> Walk:
 
 
 @pytest.fixture(scope="module")
-def good(noisy: Walk) -> tuple[Refined, list[KeyframePair]]:
+def good(noisy: Walk) -> tuple[Refined, list[RelativePose]]:
     """What the optimization makes of the true poses."""
     return optimize(noisy.truth, noisy.views, noisy.images, noisy.pairs, CONFIG, REGISTRATION)
 
@@ -99,13 +100,11 @@ def test_joint_optimization_is_better_than_the_registrations_alone(noisy: Walk) 
 
 
 def test_poor_start_ends_where_the_good_one_does(
-    noisy: Walk, good: tuple[Refined, list[KeyframePair]]
+    noisy: Walk, good: tuple[Refined, list[RelativePose]]
 ) -> None:
     rng = np.random.default_rng(2)
     spoilt = [
-        KeyframePair(
-            p.first, p.second, p.T_first_second @ se3.exp(0.005 * rng.standard_normal(6)), p.information
-        )
+        RelativePose(p.i, p.j, p.T_i_j @ se3.exp(0.005 * rng.standard_normal(6)), p.information)
         for p in noisy.pairs
     ]
     poor = optimize(noisy.chained(spoilt), noisy.views, noisy.images, spoilt, CONFIG, REGISTRATION)[0]
@@ -113,10 +112,10 @@ def test_poor_start_ends_where_the_good_one_does(
     assert se3.distance(good[0].T_map_keyframe, poor.T_map_keyframe)[0].max() < 1e-3  # of 9 mm
 
 
-def test_factors_say_what_the_optimization_found(good: tuple[Refined, list[KeyframePair]]) -> None:
+def test_factors_say_what_the_optimization_found(good: tuple[Refined, list[RelativePose]]) -> None:
     found, factors = good
     weighted = [
-        KeyframePair(f.first, f.second, f.T_first_second, w * f.information)
+        RelativePose(f.i, f.j, f.T_i_j, w * f.information)
         for f, w in zip(factors, found.weights, strict=True)
     ]
     again = refine(found.T_map_keyframe, weighted, 1e9)
@@ -130,13 +129,13 @@ def test_keyframe_that_shows_nothing_keeps_what_tracking_said(noisy: Walk) -> No
     found, factors = optimize(
         noisy.truth, views, lambda k, levels: images[k], noisy.pairs, CONFIG, REGISTRATION
     )
-    of_dark = [f for f in factors if 7 in (f.first, f.second)]
+    of_dark = [f for f in factors if 7 in (f.i, f.j)]
     assert of_dark == [noisy.pairs[-1]]
     moved = se3.inverse(found.T_map_keyframe[6]) @ found.T_map_keyframe[7]
-    assert se3.distance(moved, noisy.pairs[-1].T_first_second)[0] < 1e-9
+    assert se3.distance(moved, noisy.pairs[-1].T_i_j)[0] < 1e-9
 
 
-def test_equal_input_gives_equal_bits(noisy: Walk, good: tuple[Refined, list[KeyframePair]]) -> None:
+def test_equal_input_gives_equal_bits(noisy: Walk, good: tuple[Refined, list[RelativePose]]) -> None:
     a, b = good[0], optimize(noisy.truth, noisy.views, noisy.images, noisy.pairs, CONFIG, REGISTRATION)[0]
     np.testing.assert_array_equal(a.T_map_keyframe, b.T_map_keyframe)
     np.testing.assert_array_equal(a.covariance([3, 5]), b.covariance([3, 5]))
@@ -148,23 +147,20 @@ def circle() -> Walk:
     return Walk([pose(x=0.1, yaw=2 * np.pi * k / 16) for k in range(17)])
 
 
-def drifted(circle: Walk) -> tuple[np.ndarray, list[KeyframePair]]:
+def drifted(circle: Walk) -> tuple[np.ndarray, list[RelativePose]]:
     """Tracking that turned and moved a little too far at every step: 30 degrees at the end."""
     step = se3.exp(np.array([0.025, 0.0, 0.0, 0.0, 0.033, 0.0]))
-    wrong = [
-        KeyframePair(p.first, p.second, p.T_first_second @ step, np.diag([1e3] * 3 + [1e3] * 3))
-        for p in circle.pairs
-    ]
+    wrong = [RelativePose(p.i, p.j, p.T_i_j @ step, np.diag([1e3] * 3 + [1e3] * 3)) for p in circle.pairs]
     return circle.chained(wrong), wrong
 
 
 def test_loop_is_found_and_closes_the_drift(circle: Walk) -> None:
     start, wrong = drifted(circle)
     loops = find_loops(start, circle.views, circle.images, LoopConfig(), REGISTRATION, 0, "alpha")
-    assert (0, 16) in [(p.first, p.second) for p in loops]
+    assert (0, 16) in [(p.i, p.j) for p in loops]
     for loop in loops:
-        truth = se3.inverse(circle.truth[loop.first]) @ circle.truth[loop.second]
-        assert se3.distance(truth, loop.T_first_second)[0] < 5e-3
+        truth = se3.inverse(circle.truth[loop.i]) @ circle.truth[loop.j]
+        assert se3.distance(truth, loop.T_i_j)[0] < 5e-3
     assert circle.error_m(start) > 0.07
     closed, _ = optimize(start, circle.views, circle.images, [*wrong, *loops], CONFIG, REGISTRATION)
     # association is projective, rounds converge as ICP does: ten of them end at 6 mm, forty at 2
@@ -184,7 +180,7 @@ def test_loops_are_looked_for_among_a_bounded_number(circle: Walk, monkeypatch: 
     monkeypatch.setattr(loops, "matches", lambda *a: compared.append(a) or matches(*a))
     config = LoopConfig(compared=3, min_matches=60)
     found = find_loops(poses, views, lambda k, _: images[k], config, REGISTRATION, 0, "alpha")
-    assert [(p.first, p.second) for p in found] == [(0, 41)]
+    assert [(p.i, p.j) for p in found] == [(0, 41)]
     assert len(compared) <= 3 * len(views)
 
 
@@ -224,7 +220,7 @@ def test_work_per_keyframe_does_not_grow_with_the_path(noisy: Walk, monkeypatch:
         there_and_back = [k if k < 8 else 14 - k for k in range(14)]
         order = [there_and_back[k % 14] for k in range(length)]
         steps = [se3.inverse(noisy.truth[a]) @ noisy.truth[b] for a, b in pairwise(order)]
-        tracked = [KeyframePair(k, k + 1, step, 1e4 * np.eye(6)) for k, step in enumerate(steps)]
+        tracked = [RelativePose(k, k + 1, step, 1e4 * np.eye(6)) for k, step in enumerate(steps)]
         counts.update(images=0, overlaps=0, costs=0)
         optimize(
             noisy.truth[order],

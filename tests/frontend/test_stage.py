@@ -12,11 +12,12 @@ from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig, Track
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.keyframe_graph import KeyframePair, refine
+from duagc.pipeline.frontend.keyframe_graph import refine
 from duagc.pipeline.frontend.stage import LATENCY_NS, _support, depth_noise_m, run_frontend
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import ate_rmse_m
+from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import content_digest, log_metadata, read_log
 from duagc.schemas import topics
 from tests.registration.room import CAMERA, pose, render
@@ -90,7 +91,7 @@ def test_registrations_in_the_log_give_the_keyframe_poses(sensor_log: Path, tmp_
     factors = messages(tmp_path / "frontend.mcap", topics.KEYFRAME_FACTOR)
     assert len(factors) > len(keyframes) - 1  # some keyframe is registered to more than the one before
     pairs = [
-        KeyframePair(f.first_index, f.second_index, f.T_first_second, f.weight * f.information)
+        RelativePose(f.first_index, f.second_index, f.T_first_second, f.weight * f.information)
         for f in factors
     ]
     poses = np.array([m.T_map_camera for m in keyframes])

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig, TrackingConfig, is_held_out
-from duagc.pipeline.frontend.keyframe_graph import KeyframePair, refine
+from duagc.pipeline.frontend.keyframe_graph import refine
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import ate_rmse_m
+from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import Motion
 from tests.registration.room import CAMERA, pose, render
 
@@ -60,7 +61,7 @@ def test_keyframes_are_made_and_are_never_held_out(walked) -> None:
         tracked = frames[keyframe.frame_index]
         assert tracked.keyframe_index == keyframe.keyframe_index
         np.testing.assert_array_equal(tracked.T_keyframe_camera, np.eye(4))
-    assert {pair.second for pair in tracker.pairs} == set(range(1, len(tracker.keyframes)))
+    assert {pair.j for pair in tracker.pairs} == set(range(1, len(tracker.keyframes)))
 
 
 def test_refinement_does_not_spoil_exact_tracking(walked) -> None:
@@ -219,15 +220,15 @@ def test_refine_finds_poses_and_their_covariance() -> None:
     truth = chain(6, rng)
     ends = [(i, j) for i in range(6) for j in range(i + 1, min(i + 4, 6))]
 
-    def draw() -> list[KeyframePair]:
+    def draw() -> list[RelativePose]:
         return [
-            KeyframePair(
+            RelativePose(
                 i, j, se3.inverse(truth[i]) @ truth[j] @ se3.exp(sigma * rng.standard_normal(6)), information
             )
             for i, j in ends
         ]
 
-    exact = [KeyframePair(i, j, se3.inverse(truth[i]) @ truth[j], information) for i, j in ends]
+    exact = [RelativePose(i, j, se3.inverse(truth[i]) @ truth[j], information) for i, j in ends]
     start = truth @ se3.exp(np.concatenate([np.zeros((1, 6)), 0.05 * rng.standard_normal((5, 6))]))
     np.testing.assert_allclose(refine(start, exact, 3.0).T_map_keyframe, truth, atol=1e-8)
     chi2 = []
@@ -245,12 +246,12 @@ def test_refine_withstands_a_wrong_pair() -> None:
     truth = chain(5, rng)
     information = np.eye(6) * 1e4
     pairs = [
-        KeyframePair(i, j, se3.inverse(truth[i]) @ truth[j], information)
+        RelativePose(i, j, se3.inverse(truth[i]) @ truth[j], information)
         for i in range(5)
         for j in range(i + 1, 5)
     ]
-    wrong = pairs[3].T_first_second @ se3.exp(np.array([0.3, 0, 0, 0, 0.2, 0]))
-    pairs[3] = KeyframePair(pairs[3].first, pairs[3].second, wrong, information)
+    wrong = pairs[3].T_i_j @ se3.exp(np.array([0.3, 0, 0, 0, 0.2, 0]))
+    pairs[3] = RelativePose(pairs[3].i, pairs[3].j, wrong, information)
     robust, plain = refine(truth, pairs, 1.0), refine(truth, pairs, 1e9)
     far = se3.distance(truth, plain.T_map_keyframe)[0].max()
     assert se3.distance(truth, robust.T_map_keyframe)[0].max() < 0.3 * far
@@ -275,7 +276,7 @@ def test_refine_solves_thousands_of_keyframes() -> None:
     truth = chain(k, rng)
     ends = [(i, i + d) for d in (1, 2, 3) for i in range(k - d)] + [(0, k - 1), (100, 1500)]
     information = np.diag([1e4, 1e4, 1e4, 1e5, 1e5, 1e5])
-    pairs = [KeyframePair(i, j, se3.inverse(truth[i]) @ truth[j], information) for i, j in ends]
+    pairs = [RelativePose(i, j, se3.inverse(truth[i]) @ truth[j], information) for i, j in ends]
     drift = np.concatenate([np.zeros((1, 6)), 1e-4 * rng.standard_normal((k - 1, 6)).cumsum(axis=0)])
     found = refine(truth @ se3.exp(drift), pairs, 1e9)
     np.testing.assert_allclose(found.T_map_keyframe, truth, atol=1e-4)

@@ -8,7 +8,7 @@ import pytest
 from duagc.pipeline.config.posegraph import settings
 from duagc.pipeline.network.packets import parse, serialize
 from duagc.pipeline.posegraph.files import read_team_graph
-from duagc.pipeline.team_posegraph import network
+from duagc.pipeline.team_posegraph.agent import PoseGraphAgent
 from tests.posegraph.graphs import helix_edges, write_g2o
 
 
@@ -19,12 +19,10 @@ def test_changed_payloads_crash_nobody(tmp_path, solver):
     refused = changed = 0
     for _ in range(12):
         config = settings(solver, max_rounds=40)
-        agents = {
-            n: network.SOLVERS[solver](team.robots[n], sorted(team.robots), config) for n in team.robots
-        }
+        agents = {n: PoseGraphAgent(team.robots[n], sorted(team.robots), config) for n in team.robots}
         waiting = {name: [] for name in agents}
         for k in range(40):
-            sent = [out for name, agent in agents.items() for out in agent.tick(k, waiting[name])]
+            sent = [out for name, agent in agents.items() for out in agent.tick(k, k, waiting[name])]
             waiting = {name: [] for name in agents}
             for out in sent:
                 packet = parse(out.packet)
@@ -38,7 +36,7 @@ def test_changed_payloads_crash_nobody(tmp_path, solver):
                     changed += 1
                 else:
                     waiting[out.receiver].append(out.packet)
-        refused += sum(len(agent.refused) for agent in agents.values())
+        refused += sum(sum(agent.refused.values()) for agent in agents.values())
         assert all(np.isfinite(agent.T_world_keyframe).all() for agent in agents.values())
     assert changed > 50
     assert refused > 10

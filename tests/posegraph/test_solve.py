@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.posegraph import settings
+from duagc.pipeline.exchange import rounds as session_rounds
 from duagc.pipeline.network.packets import MAX_PACKET_BYTES, parse
 from duagc.pipeline.posegraph.files import read_team_graph
-from duagc.pipeline.team_posegraph import network, solve
-from duagc.pipeline.team_posegraph.network import Traffic, meet
+from duagc.pipeline.team_posegraph import solve
+from duagc.pipeline.team_posegraph import team as team_rounds
+from duagc.pipeline.team_posegraph.agent import PoseGraphAgent
+from duagc.pipeline.team_posegraph.team import Traffic, meet
 from tests.cli.test_cli import assert_one_line, duagc
 from tests.posegraph.graphs import helix_edges, wild_edges, write_g2o, write_team
 
@@ -77,14 +80,14 @@ def test_two_runs_send_the_same_packets(helix_file):
 
 def record(team, config, packets):
     """`meet`, keeping every packet that was sent."""
-    carried = network.LinkModel.fate
+    carried = session_rounds.LinkModel.fate
 
     def fate(self, sender, receiver, sequence, send_ns, size):
         packets.append((sender, receiver, sequence, size))
         return carried(self, sender, receiver, sequence, send_ns, size)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(network.LinkModel, "fate", fate)
+        patch.setattr(session_rounds.LinkModel, "fate", fate)
         return meet(team, config, lambda k, agents, traffic: None)
 
 
@@ -92,19 +95,17 @@ def record(team, config, packets):
 def test_bytes_are_those_of_real_packets_with_their_headers(helix_file, solver):
     team = read_team_graph(helix_file, 3)
     config = settings(solver, max_rounds=40)
-    agents = {
-        name: network.SOLVERS[solver](team.robots[name], sorted(team.robots), config) for name in team.robots
-    }
+    agents = {name: PoseGraphAgent(team.robots[name], sorted(team.robots), config) for name in team.robots}
     waiting, size, count = {name: [] for name in agents}, 0, 0
     for k in range(40):
-        sent = [out for name, agent in agents.items() for out in agent.tick(k, waiting[name])]
+        sent = [out for name, agent in agents.items() for out in agent.tick(k, k, waiting[name])]
         waiting = {name: [] for name in agents}
         for out in sent:
             assert len(out.packet) <= MAX_PACKET_BYTES
             parse(out.packet)
             waiting[out.receiver].append(out.packet)
             size, count = size + len(out.packet), count + 1
-        if all(agent.settled for agent in agents.values()):
+        if all(agent.done for agent in agents.values()):
             break
     seen = Traffic({})
 
@@ -115,18 +116,17 @@ def test_bytes_are_those_of_real_packets_with_their_headers(helix_file, solver):
     assert (seen.bytes, seen.packets) == (size, count)
 
 
-def test_an_agent_is_told_its_own_graph_only(helix_file, monkeypatch):
-    told = {}
-    original = network.SOLVERS["admm"]
+def test_an_agent_gets_its_own_graph_only(helix_file, monkeypatch):
+    given = {}
 
-    def make(graph, team, config):
-        told[graph.name] = (graph, team)
-        return original(graph, team, config)
+    def make(part, team, config):
+        given[part.name] = (part, team)
+        return PoseGraphAgent(part, team, config)
 
-    monkeypatch.setitem(network.SOLVERS, "admm", make)
+    monkeypatch.setattr(team_rounds, "PoseGraphAgent", make)
     team = read_team_graph(helix_file, 4)
     meet(team, settings("admm"), lambda k, agents, traffic: None)
-    for name, (graph, names) in told.items():
+    for name, (graph, names) in given.items():
         assert graph is team.robots[name]
         assert names == sorted(team.robots)
         for factors in (graph.odometry, graph.loops):
@@ -162,7 +162,7 @@ def test_robots_that_never_hear_each_other_keep_their_own_optimum(helix_file, so
     agents, _, rounds = meet(team, settings(solver, loss=1.0, max_rounds=12), watch)
     assert rounds == 12
     for T, agent in zip(alone, agents.values(), strict=True):
-        np.testing.assert_array_equal(T, agent.T_map_keyframe)
+        np.testing.assert_array_equal(T, agent.graph.T_map_keyframe)
     result = solve.solve(helix_file, settings(solver, "gnc", loss=1.0, max_rounds=12), 3)
     assert not result["converged"]
     assert result["rounds_to"]["1e-4"] is None
@@ -197,7 +197,7 @@ def test_the_command_on_a_teams_files(tmp_path):
     assert abs(result["cost"] / result["optimum"] - 1) < 1e-6
     text = duagc("posegraph", folder, "--solver", "elimination").stdout
     assert "centralized optimum" in text
-    assert "all agents hold still" in text
+    assert "all agents have converged" in text
     assert "Examples" in duagc("posegraph", "--help").stdout
 
 

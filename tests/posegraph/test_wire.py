@@ -1,14 +1,16 @@
 """Messages of the set-up and of elimination: what is written is read, what is broken is refused."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from duagc.pipeline.consensus.elimination import Block, Step
-from duagc.pipeline.exchange.wire import elimination_wire
+from duagc.pipeline.exchange.wire import elimination_wire, loop_closing_wire, state_wire
+from duagc.pipeline.exchange.wire.loop_closing_wire import NamedKeyframes
+from duagc.pipeline.exchange.wire.state_wire import State
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.packets import MalformedError
-from duagc.pipeline.team_posegraph import wire
-from duagc.pipeline.team_posegraph.wire import NamedKeyframes, PairFrame, Roster
 
 
 def poses(rng, n):
@@ -17,20 +19,21 @@ def poses(rng, n):
 
 def test_set_up_messages_come_back():
     rng = np.random.default_rng(3)
-    roster = Roster(2, 0b1011)
-    assert wire.read_roster(wire.write_roster(roster), 4) == roster
     named = NamedKeyframes(np.array([1, 5], np.int32), poses(rng, 2), np.array([[0.0, 0.1], [0.5, 0.2]]))
     for precision, atol in (("float32", 1e-5), ("float64", 1e-14)):
-        data = wire.write_keyframes(named, precision)
-        read = wire.read_keyframes(data, named.keyframes, precision)
-        np.testing.assert_allclose(read.T_map_keyframe, named.T_map_keyframe, atol=atol)
+        data = loop_closing_wire.write_keyframes(named, precision)
+        read = loop_closing_wire.read_keyframes(data, named.keyframes, precision)
+        np.testing.assert_allclose(read.T_first_keyframe, named.T_first_keyframe, atol=atol)
     np.testing.assert_allclose(read.drift, named.drift, rtol=1e-6)
-    keep = np.array([True, False, True] * 5)
-    np.testing.assert_array_equal(wire.read_verdict(wire.write_verdict(keep), 15), keep)
-    frame = PairFrame(1, 3, 12, poses(rng, 1)[0])
-    back = wire.read_frame(wire.write_frame(frame), 4)
-    assert (back.lower, back.higher, back.support) == (1, 3, 12)
-    np.testing.assert_allclose(back.T_lower_higher, frame.T_lower_higher, atol=1e-5)
+    nothing = np.full(4, state_wire.NOBODY, np.uint8)
+    for revoked in (0, 0b10):
+        state = State(0b110001, revoked, 3, 255, agreed=True, done=False, sources=nothing)
+        data = state_wire.write_state(state, short=True)
+        back, poses_of_round = state_wire.read_state(data + b"poses", 4)
+        assert poses_of_round == b"poses"
+        np.testing.assert_array_equal(back.sources, nothing)
+        assert dataclasses.replace(back, sources=nothing) == dataclasses.replace(state, sources=nothing)
+        assert len(data) == 4 + bool(revoked)
     front = {(0, 4): 0b11, (2, 1): 0, (0, 9): 0b101}
     assert elimination_wire.read_front(elimination_wire.write_front(front), 3) == front
 
@@ -76,13 +79,10 @@ def test_what_is_cut_short_or_does_not_fit_is_refused():
     block = Block(np.eye(12), np.zeros(12), 1.0, 0.0, reweighted=False, unsure=False)
     step = Step(0, accepted=True, finished=False, fresh=False, damping=0.0, delta=np.zeros((2, 6)))
     messages = [
-        (wire.write_roster(Roster(0, 2)), lambda d: wire.read_roster(d, 2)),
         (
-            wire.write_keyframes(named, "float32"),
-            lambda d: wire.read_keyframes(d, named.keyframes, "float32"),
+            loop_closing_wire.write_keyframes(named, "float32"),
+            lambda d: loop_closing_wire.read_keyframes(d, named.keyframes, "float32"),
         ),
-        (wire.write_verdict(np.ones(9, bool)), lambda d: wire.read_verdict(d, 9)),
-        (wire.write_frame(PairFrame(0, 1, 2, np.eye(4))), lambda d: wire.read_frame(d, 2)),
         (elimination_wire.write_front({(0, 1): 3}), lambda d: elimination_wire.read_front(d, 2)),
         (elimination_wire.write_block(0, block, "float64"), lambda d: elimination_wire.read_block(d, 2)),
         (elimination_wire.write_step(step), lambda d: elimination_wire.read_step(d, 2)),
@@ -92,7 +92,11 @@ def test_what_is_cut_short_or_does_not_fit_is_refused():
         for broken in (data[:-1], data + b"\0"):
             with pytest.raises(MalformedError):
                 read(broken)
-    with pytest.raises(MalformedError, match="team"):
-        wire.read_roster(wire.write_roster(Roster(0, 0b1000)), 3)
+    with pytest.raises(MalformedError, match="outside the team"):
+        state_wire.read_state(bytes([0, 0, 4, 0b11111111]), 3)
+    with pytest.raises(MalformedError, match="name"):
+        loop_closing_wire.read_keyframes(
+            loop_closing_wire.write_keyframes(named, "float32"), np.array([1, 6], np.int32), "float32"
+        )
     with pytest.raises(MalformedError, match="expected 3"):
         elimination_wire.read_block(elimination_wire.write_block(0, block, "float64"), 3)

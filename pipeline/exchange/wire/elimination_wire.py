@@ -74,15 +74,15 @@ _ACCEPTED, _FINISHED, _FRESH = 1, 2, 4
 _UPPER = np.triu_indices(6)
 
 
-def write_front(everybody: Mapping[Variable, int]) -> bytes:
+def write_front(variables: Mapping[Variable, int]) -> bytes:
     """Bytes of FRONT, 14 per variable: owner, keyframe, mask of all robots that have it (0: owner not below)."""
-    names = sorted(everybody)
+    names = sorted(variables)
     return b"".join(
         [
             _FRONT.pack(Code.FRONT, len(names)),
             array_bytes([owner for owner, _ in names], "uint16"),
             array_bytes([keyframe for _, keyframe in names], "uint32"),
-            array_bytes(np.array([everybody[v] for v in names], dtype=np.uint64), "uint64"),
+            array_bytes(np.array([variables[v] for v in names], dtype=np.uint64), "uint64"),
         ]
     )
 
@@ -104,7 +104,7 @@ def read_front(data: bytes, team: int) -> dict[Variable, int]:
 
 
 def write_block(exchange: int, block: Block, precision: str) -> bytes:
-    """Bytes of BLOCK. Of H the upper triangle, and of its 6x6 parts beside the diagonal those that are not zero.
+    """Bytes of BLOCK. Of H the upper triangle, and of its 6x6 parts others the diagonal those that are not zero.
 
     precision: float32 or float64, of H; the gradient, which decides where the iteration ends, is always float64.
     """
@@ -115,8 +115,8 @@ def write_block(exchange: int, block: Block, precision: str) -> bytes:
     if block.H is None:
         return head + array_bytes(block.g, "float64")
     parts = block.H.reshape(n, 6, n, 6).transpose(0, 2, 1, 3)
-    beside = parts[np.triu_indices(n, 1)].reshape(-1, 36)
-    filled = beside.any(axis=1)
+    others = parts[np.triu_indices(n, 1)].reshape(-1, 36)
+    filled = others.any(axis=1)
     diagonal = parts[np.arange(n), np.arange(n)][:, _UPPER[0], _UPPER[1]]
     return b"".join(
         [
@@ -124,7 +124,7 @@ def write_block(exchange: int, block: Block, precision: str) -> bytes:
             array_bytes(block.g, "float64"),
             array_bytes(diagonal, precision),
             np.packbits(filled, bitorder="little").tobytes(),
-            array_bytes(beside[filled], precision),
+            array_bytes(others[filled], precision),
         ]
     )
 
@@ -146,10 +146,10 @@ def _read_matrix(reader: Reader, n: int, precision: str) -> Array:
     diagonal = reader.array(precision, (n, 21))
     off = n * (n - 1) // 2
     filled = np.unpackbits(reader.array("uint8", (-(-off // 8),)), count=off, bitorder="little").astype(bool)
-    beside = reader.array(precision, (int(filled.sum()), 6, 6))
+    others = reader.array(precision, (int(filled.sum()), 6, 6))
     parts = np.zeros((n, n, 6, 6))
     rows, columns = (index[filled] for index in np.triu_indices(n, 1))
-    parts[rows, columns], parts[columns, rows] = beside, beside.transpose(0, 2, 1)
+    parts[rows, columns], parts[columns, rows] = others, others.transpose(0, 2, 1)
     own = np.arange(n)[:, None]
     parts[own, own, _UPPER[0], _UPPER[1]] = parts[own, own, _UPPER[1], _UPPER[0]] = diagonal
     return np.ascontiguousarray(parts.transpose(0, 2, 1, 3)).reshape(6 * n, 6 * n)

@@ -58,7 +58,7 @@ def record_dtype(kind: Kind) -> np.dtype[Any]:
 
 
 def to_body(kind: Kind, records: NDArray[Any]) -> NDArray[Any]:
-    """Records as they stand in a packet of this kind. Rounding happens here, once: a body is handed on as it is."""
+    """Records as a packet of this kind has them. Rounding happens here, once: a body is passed on unchanged."""
     return encode(records) if kind is Kind.EVIDENCE else records
 
 
@@ -116,7 +116,7 @@ def read_evidence(kind: Kind, data: bytes, team: int) -> tuple[int, NDArray[Any]
             raise MalformedError("evidence: not a finite number")
     records = from_body(kind, body)
     check_evidence(records)
-    if kind is not Kind.EVIDENCE:  # the factors of the compact kind cannot say anything impossible
+    if kind is not Kind.EVIDENCE:  # the factors of the compact kind are always possible
         check_information(records["information"].astype(np.float64))
     return owner, body, records
 

@@ -14,11 +14,11 @@ from duagc.pipeline.network.packets import MalformedError
 
 _POSES = struct.Struct("<IIBHH2f")
 _CONVERGED, _CURVATURE, _PENALTIES, _POSE_DOUBLE, _POSE_FIXED = 1, 2, 4, 8, 16
-_NUMBERS = {0: 24, _POSE_DOUBLE: 48, _POSE_FIXED: 30}  # bytes of a pose beside its two bits, by its flag
+_NUMBERS = {0: 24, _POSE_DOUBLE: 48, _POSE_FIXED: 30}  # bytes of a pose without its two bits, by its flag
 _FIXED_BYTES = 6
 _OTHERS = np.array(
     [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]
-)  # components that are sent beside the largest
+)  # components that are sent, all but the largest
 
 
 def write_poses(packet: PosePacket, first: int, count: int, decides: bool) -> bytes:
@@ -121,4 +121,13 @@ def read_poses(data: bytes, shared: NDArray[np.int32], from_decider: bool) -> Po
     penalties = pair if from_decider else np.zeros(2, dtype=np.float32)
     curvature, converged = pair if flags & _CURVATURE else None, bool(flags & _CONVERGED)
     keyframes = shared[first : first + n]
-    return PosePacket(sequence, version, keyframes, quats, translations, penalties, curvature, converged)
+    return PosePacket(
+        sequence=sequence,
+        version=version,
+        keyframes=keyframes,
+        quats_wxyz=quats,
+        translations=translations,
+        penalties=penalties,
+        curvature=curvature,
+        converged=converged,
+    )

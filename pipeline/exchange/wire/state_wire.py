@@ -1,8 +1,8 @@
-"""Bytes of messages, and their strict reading: state, frames, final poses, space seen, matches. Little-endian.
+"""Bytes of messages, and their strict reading: state, relative frames, final poses, space, matches. Little-endian.
 
 Readers trust nothing: every count is checked against the bytes that are there, every index against its limit, every
 number that enters the mathematics must be finite. What does not fit raises MalformedError with the reason. Others:
-`places_wire`, `poses_wire`, `tree_wire`, `evidence_wire`.
+`loop_closing_wire`, `poses_wire`, `tree_wire`, `evidence_wire`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph.cycle_consistency import Proposal
 
@@ -57,6 +58,15 @@ class Reader:
             raise MalformedError(f"{self.what}: a pose is not a rigid motion")
         return T
 
+    def motions(self, n: int, precision: str) -> Array:
+        """Motions [n, 4, 4] from quaternions and translations, all quaternions first."""
+        quats_wxyz = self.array(precision, (n, 4)).astype(np.float64)
+        translations = self.array(precision, (n, 3)).astype(np.float64)
+        off = np.abs((quats_wxyz**2).sum(axis=1) - 1).max(initial=0.0)
+        if off > 1e-3 or np.abs(translations).max(initial=0.0) > MAX_COORDINATE:
+            raise MalformedError(f"{self.what}: not a rigid motion, or beyond {MAX_COORDINATE:g} m")
+        return se3.from_quat_translation(quats_wxyz, translations)
+
     def done(self) -> None:
         """Check that nothing is left."""
         if self.position != len(self.data):
@@ -80,24 +90,34 @@ def pose_bytes(T: Array) -> bytes:
     return array_bytes(np.asarray(T)[..., :3, :], "float64")
 
 
+def motion_bytes(T: Array, precision: str) -> bytes:
+    """Motions [n, 4, 4] as quaternions and translations, all quaternions first."""
+    return array_bytes(so3.to_quat_wxyz(T[:, :3, :3]), precision) + array_bytes(T[:, :3, 3], precision)
+
+
 # --- state: once per link and round
 
 
 @dataclass(frozen=True)
 class State:
-    """Where an agent stands, as it tells its neighbors in every round.
+    """The state of an agent, which it sends to its neighbors in every round.
 
-    links: pairs of robots whose relative frame it knows. parted: those of them that it knows to have been parted; what
-    else is told holds for the team without them. Both are bit masks over the pairs of the team (`pair_bit`).
-    frames_hops, still_hops: how many hops around it everybody has decided on all links, and holds still; 0 = not
-    itself. agreed: its poses are final. done: it needs nothing more. sources: uint8 [team], for each owner of
-    evidence where it comes from: a neighbor's index, COMPLETE or NOBODY.
+    Attributes:
+        links: pairs of robots whose relative frame it knows, a bit mask over the pairs of the team (`pair_bit`).
+        revoked_links: those of them that it knows to be revoked, likewise; the rest of the state is about the team
+            without them.
+        alignment_hops: all agents within fewer hops have decided on all their links and know the same frames; 0: this
+            one has not.
+        converged_hops: all agents within fewer hops have converged; 0: this one has not.
+        agreed: its poses are final.
+        done: it needs nothing more.
+        sources: uint8 [team], where it gets the evidence of each owner from: a neighbor's index, COMPLETE or NOBODY.
     """
 
     links: int
-    parted: int
-    frames_hops: int
-    still_hops: int
+    revoked_links: int
+    alignment_hops: int
+    converged_hops: int
     agreed: bool
     done: bool
     sources: NDArray[np.uint8]
@@ -106,6 +126,8 @@ class State:
 COMPLETE, NOBODY = 254, 255
 MAX_TEAM = 64
 _STATE = struct.Struct("<BBBB")
+_SHORT_STATE = struct.Struct("<BBB")
+_AGREED, _DONE, _SHORT, _REVOKED = 1, 2, 4, 8  # flags
 
 
 def pair_bit(a: int, b: int) -> int:
@@ -130,85 +152,150 @@ def _read_pairs(reader: Reader, team: int) -> int:
     return pairs
 
 
-def write_state(state: State) -> bytes:
-    """Bytes of a state; the poses of the round may follow."""
-    flags, team = int(state.agreed) | 2 * int(state.done), len(state.sources)
-    head = _STATE.pack(state.frames_hops, state.still_hops, flags, team)
-    masks = _pairs_bytes(state.links, team) + _pairs_bytes(state.parted, team)
+def write_state(state: State, *, short: bool = False) -> bytes:
+    """Bytes of a state; the poses of the round may follow.
+
+    Args:
+        state: of this round.
+        short: leave out the sources, and revoked links if there are none: for a team that shares no evidence.
+    """
+    flags, team = _AGREED * int(state.agreed) | _DONE * int(state.done), len(state.sources)
+    if short:
+        flags |= _SHORT | _REVOKED * bool(state.revoked_links)
+        revoked = _pairs_bytes(state.revoked_links, team) if state.revoked_links else b""
+        head = _SHORT_STATE.pack(state.alignment_hops, state.converged_hops, flags)
+        return head + _pairs_bytes(state.links, team) + revoked
+    head = _STATE.pack(state.alignment_hops, state.converged_hops, flags, team)
+    masks = _pairs_bytes(state.links, team) + _pairs_bytes(state.revoked_links, team)
     return head + array_bytes(state.sources, "uint8") + masks
 
 
 def read_state(data: bytes, team: int) -> tuple[State, bytes]:
     """A state and the bytes that follow it."""
     reader = Reader(data, "state")
-    frames_hops, still_hops, flags, n = reader.fields(_STATE)
+    if len(data) > 2 and data[2] & _SHORT:
+        return _read_short_state(reader, team)
+    alignment_hops, converged_hops, flags, n = reader.fields(_STATE)
     if n != team:
         raise MalformedError(f"state: about a team of {n}, expected {team}")
     if flags > 3:
         raise MalformedError("state: unknown flags")
     sources = reader.array("uint8", (n,))
-    links, parted = _read_pairs(reader, team), _read_pairs(reader, team)
-    state = State(links, parted, frames_hops, still_hops, bool(flags & 1), bool(flags & 2), sources)
+    links, revoked = _read_pairs(reader, team), _read_pairs(reader, team)
+    state = State(
+        links=links,
+        revoked_links=revoked,
+        alignment_hops=alignment_hops,
+        converged_hops=converged_hops,
+        agreed=bool(flags & _AGREED),
+        done=bool(flags & _DONE),
+        sources=sources,
+    )
     return state, data[reader.position :]
 
 
-def write_labeled(parted: int, team: int, payload: bytes) -> bytes:
+def _read_short_state(reader: Reader, team: int) -> tuple[State, bytes]:
+    """A state without sources, and the bytes that follow it."""
+    alignment_hops, converged_hops, flags = reader.fields(_SHORT_STATE)
+    if flags > _AGREED | _DONE | _SHORT | _REVOKED:
+        raise MalformedError("state: unknown flags")
+    links = _read_pairs(reader, team)
+    revoked = _read_pairs(reader, team) if flags & _REVOKED else 0
+    sources = np.full(team, NOBODY, np.uint8)
+    state = State(
+        links=links,
+        revoked_links=revoked,
+        alignment_hops=alignment_hops,
+        converged_hops=converged_hops,
+        agreed=bool(flags & _AGREED),
+        done=bool(flags & _DONE),
+        sources=sources,
+    )
+    return state, reader.data[reader.position :]
+
+
+def write_labeled(revoked: int, team: int, payload: bytes) -> bytes:
     """Bytes of TREE: a message of the solver, for the team without these links."""
-    return _pairs_bytes(parted, team) + payload
+    return _pairs_bytes(revoked, team) + payload
 
 
 def read_labeled(data: bytes, team: int) -> tuple[int, bytes]:
-    """From TREE: the parted links, and the message."""
+    """From TREE: the revoked links, and the message."""
     reader = Reader(data, "elimination")
     return _read_pairs(reader, team), data[reader.position :]
 
 
-# --- frames and final poses
+# --- relative frames and final poses
 
 
 _FRAME = struct.Struct("<HHB")
 _PROPOSAL = struct.Struct("<Iddd")
+_SHORT_PROPOSAL = struct.Struct("<Ifff")
+_SHORT_PROPOSALS = 128  # added to their number: all in float32
 MAX_PROPOSALS = 8
 
 
 @dataclass(frozen=True)
-class PairFrames:
-    """What the closures of two robots say of their relative frame, best supported first; lower index first."""
+class RelativeFrames:
+    """The relative frame of two robots by their loop closures.
+
+    Attributes:
+        lower: lower index of the two.
+        higher: higher index.
+        proposals: best supported first.
+    """
 
     lower: int
     higher: int
     proposals: tuple[Proposal, ...]
 
 
-def write_frames(frames: PairFrames) -> bytes:
-    """Bytes of FRAME."""
-    parts = [_FRAME.pack(frames.lower, frames.higher, len(frames.proposals))]
+def write_relative_frames(frames: RelativeFrames, *, short: bool = False) -> bytes:
+    """Bytes of RELATIVE_FRAME: 129 for one proposal, 49 if it is short.
+
+    Args:
+        frames: of one pair.
+        short: round to float32, for a team that shares no evidence.
+    """
+    count = len(frames.proposals) + _SHORT_PROPOSALS * short
+    parts = [_FRAME.pack(frames.lower, frames.higher, count)]
     for p in frames.proposals:
+        if short:
+            parts += [
+                _SHORT_PROPOSAL.pack(p.support, *p.variance, p.agreement),
+                motion_bytes(p.T_a_b[None], "float32"),
+            ]
+            continue
         parts += [_PROPOSAL.pack(p.support, *p.variance, p.agreement), pose_bytes(p.T_a_b)]
     return b"".join(parts)
 
 
-def read_frames(data: bytes, team: int) -> PairFrames:
+def read_relative_frames(data: bytes, team: int) -> RelativeFrames:
     """From FRAME."""
     reader = Reader(data, "frame")
-    lower, higher, n = reader.fields(_FRAME)
+    lower, higher, count = reader.fields(_FRAME)
+    n, short = count % _SHORT_PROPOSALS, count >= _SHORT_PROPOSALS
     if not lower < higher < team or not 1 <= n <= MAX_PROPOSALS:
         raise MalformedError("frame: the two robots must be in the team, lower first, and have a frame")
     proposals = []
     for _ in range(n):
-        support, *variance, agreement = reader.fields(_PROPOSAL)
+        support, *variance, agreement = reader.fields(_SHORT_PROPOSAL if short else _PROPOSAL)
         if not (all(0 < v < MAX_COORDINATE**2 for v in variance) and 0 <= agreement <= 1):
             raise MalformedError("frame: impossible variance or agreement")
-        proposals.append(Proposal(support, reader.poses(1)[0], (variance[0], variance[1]), agreement))
+        T = reader.motions(1, "float32")[0] if short else reader.poses(1)[0]
+        proposals.append(Proposal(support, T, (variance[0], variance[1]), agreement))
     reader.done()
-    return PairFrames(lower, higher, tuple(proposals))
+    return RelativeFrames(lower, higher, tuple(proposals))
 
 
 @dataclass(frozen=True)
 class Anchors:
-    """Agreed poses of one robot's keyframes in the common frame of the consensus, and of the first in its own map.
+    """Agreed poses of one robot.
 
-    T_common_keyframe: [n, 4, 4]. T_map_first: [4, 4].
+    Attributes:
+        owner: index of the robot.
+        T_common_keyframe: [n, 4, 4], its keyframes in the common frame of the consensus.
+        T_map_first: [4, 4], its first keyframe in its own map.
     """
 
     owner: int
@@ -275,9 +362,13 @@ _PAIRS = struct.Struct("<HHHI")
 
 @dataclass(frozen=True)
 class PairList:
-    """Matched Gaussians of two robots, lower index first.
+    """Matched Gaussians of two robots.
 
-    ids: int64 [n, 2]. version: of the list; a later one replaces an earlier one.
+    Attributes:
+        lower: lower index of the two.
+        higher: higher index.
+        version: of the list; a later one replaces an earlier one.
+        ids: int64 [n, 2], lower index first.
     """
 
     lower: int

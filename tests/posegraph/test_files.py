@@ -4,22 +4,23 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.config.consensus import ClosureConfig
-from duagc.pipeline.posegraph import factors as pose_factors
-from duagc.pipeline.posegraph.central import team_graph
-from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.config.consensus import LoopClosureConfig
+from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.files import read_team_graph
+from duagc.pipeline.posegraph.pose_graph import PoseGraph
+from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, RelativePoses
 from tests.posegraph.graphs import KAPPA, TAU, g2o_line, helix, helix_edges, symbol, write_g2o, write_team
 
-EXACT = ClosureConfig(sigma_floor_m=0, sigma_floor_rad=0)
+EXACT = LoopClosureConfig(sigma_floor_m=0, sigma_floor_rad=0)
 
 
 def team_cost(team, T_by_robot):
     """Cost of all that all robots were told, each closure once."""
-    own = {r: Factors.concatenate([g.odometry, g.loops]) for r, g in team.robots.items()}
-    closures = [(a, b, team.robots[a].closures[b]) for a, b in team.pairs]
-    whole = team_graph(T_by_robot, own, closures, EXACT)
-    return pose_factors.cost(whole.factors, whole.T_start), len(whole.factors)
+    own = {r: RelativePoses.concatenate([g.odometry, g.loops]) for r, g in team.robots.items()}
+    pairs = [(a, b, team.robots[a].closures[b]) for a, b in team.pairs]
+    closures = [HeldLoopClosures(a, b, held, np.ones(len(held))) for a, b, held in pairs]
+    whole = PoseGraph.of_team(T_by_robot, own, closures, EXACT)
+    return least_squares.cost(whole.relative_poses, whole.T_start), len(whole.relative_poses)
 
 
 def chordal_cost(rows, T):

@@ -1,4 +1,4 @@
-"""A link whose closures are all false must not join two robots: it is parted, and they end as if they had not met."""
+"""A link whose closures are all false must not join two robots: it is revoked, and they end as if they had not met."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import pytest
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.network import LinkConfig
-from duagc.pipeline.exchange.loop_closing import LowerEnd
+from duagc.pipeline.exchange.detected_loop_closures import Verifier
 from duagc.pipeline.exchange.replay import replay_agent_of
 from duagc.pipeline.exchange.session import run_session_of
 from duagc.pipeline.exchange.verification import Verdict
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import read_log
-from duagc.pipeline.runs.robot_data import AgentResult, RobotData
+from duagc.pipeline.runs.robot_data import RobotData, SessionResult
 
 NAMES = ("alpha", "bravo", "charlie")
 TRUE = np.eye(4)
@@ -38,11 +38,11 @@ def falsify(
 
     A frame `TRUE` leaves the closure as it is.
     """
-    decide = LowerEnd._decide
+    decide = Verifier._decide
 
-    def decide_falsely(self: LowerEnd, send: Any) -> None:
+    def decide_falsely(self: Verifier, send: Any) -> None:
         if {self.own, self.peer} == set(pair):
-            assert self.book is not None
+            assert self.peer_keyframes is not None
             count = 0
             for at, t in enumerate(self.tried):
                 closure = t.result.closure
@@ -50,8 +50,8 @@ def falsify(
                     continue
                 frame = frame_of(count)
                 count += 1
-                own = self.places.T_first_keyframe[closure.own_keyframe]
-                peer = self.book.T_first_keyframe[closure.peer_keyframe]
+                own = self.database.graph.T_first_keyframe[closure.own_keyframe]
+                peer = self.peer_keyframes.T_frame_keyframe[closure.peer_keyframe]
                 if frame is not None and frame is not TRUE:
                     T_own_peer = se3.inverse(own) @ frame @ peer
                     closure = dataclasses.replace(closure, T_own_peer=T_own_peer)
@@ -60,10 +60,10 @@ def falsify(
             assert count >= 2, "the test needs two closures to make false ones of"
         decide(self, send)
 
-    monkeypatch.setattr(LowerEnd, "_decide", decide_falsely)
+    monkeypatch.setattr(Verifier, "_decide", decide_falsely)
 
 
-def meet(team: Team, names: tuple[str, ...], folder: Path, **config: Any) -> dict[str, AgentResult]:
+def meet(team: Team, names: tuple[str, ...], folder: Path, **config: Any) -> dict[str, SessionResult]:
     return run_session_of(
         [team[name][0] for name in names],
         ExchangeConfig(**config),
@@ -73,7 +73,7 @@ def meet(team: Team, names: tuple[str, ...], folder: Path, **config: Any) -> dic
     )
 
 
-def is_alone(result: AgentResult, data: RobotData) -> bool:
+def is_alone(result: SessionResult, data: RobotData) -> bool:
     """Whether a robot ended as if it had met nobody, bit for bit."""
     return (
         result.component == (data.robot,)
@@ -156,7 +156,7 @@ def test_a_false_link_is_parted_and_the_others_stay(
     assert all(c.weight == 0.0 and c.verdict != "kept" for c in false)
     if wrong_m > 1 and topology == "full":  # the cycle of the three robots knew it before any weight
         assert all(
-            "off the way by bravo" in c.detail for c in false if "when the link was parted" in c.detail
+            "off the path by bravo" in c.detail for c in false if "when the link was revoked" in c.detail
         )
     rounds = [r.message() for r in read_log(tmp_path / "consensus.mcap", ["/alpha/consensus/agent"])]
     assert rounds[-1].revoked_links == 1
@@ -194,7 +194,7 @@ def test_where_nothing_tells_which_link_is_false_nobody_is_put_anywhere(
 ) -> None:
     """Rooms that are alike in every image: the cycle of the three does not close, and that is all that is known."""
     more_false_than_true(monkeypatch)
-    monkeypatch.setattr("duagc.pipeline.exchange.loop_closing.agreement", lambda *_: 0.6)
+    monkeypatch.setattr("duagc.pipeline.exchange.detected_loop_closures.surface_agreement", lambda *_: 0.6)
     config = {"link": LinkConfig(loss_probability=loss)}
     results = meet(team, NAMES, tmp_path, **config)
     for name in NAMES:
@@ -206,4 +206,4 @@ def test_where_nothing_tells_which_link_is_false_nobody_is_put_anywhere(
     closures = [c for r in results.values() for c in r.closures if c.T_own_peer is not None]
     assert len(closures) > 4
     assert {c.verdict for c in closures} == {Verdict.UNDECIDED.value}
-    assert all("nothing tells which is false (alpha-bravo" in c.detail for c in closures)
+    assert all("which link is false is open (alpha-bravo" in c.detail for c in closures)

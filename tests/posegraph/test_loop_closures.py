@@ -2,23 +2,27 @@
 
 import numpy as np
 
+from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.posegraph import factors as pose_factors
-from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.loop_closures import (
-    Closure,
-    ClosureConfig,
-    chain_frames,
-    closure_factors,
+    KeyframePoses,
     consistent,
     drift,
     holder,
     plausible,
     robust_frame,
 )
-from tests.consensus.worlds import random_information, random_poses
+from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, closures_as_relative_poses
+from duagc.pipeline.posegraph.spanning_tree import chain_frames
+from tests.posegraph.worlds import random_information, random_poses
 
-CONFIG = ClosureConfig()
+CONFIG = LoopClosureConfig()
+
+
+def agreeing(closures, own, peer, grown):
+    """`consistent` with the same drift at both ends."""
+    return consistent(closures, KeyframePoses(own, grown), KeyframePoses(peer, grown), CONFIG)
 
 
 def pair(seed, good=8, bad=6, aliased=0):
@@ -31,8 +35,8 @@ def pair(seed, good=8, bad=6, aliased=0):
         for _ in range(count):
             i, j = int(rng.integers(12)), int(rng.integers(12))
             T = random_poses(rng, 1)[0] if frame is None else se3.inverse(own[i]) @ frame @ peer[j]
-            closures.append(Closure(i, j, T @ se3.exp(sigma * rng.normal(size=6)), 1e5 * np.eye(6)))
-    chain = Factors(
+            closures.append(LoopClosure(i, j, T @ se3.exp(sigma * rng.normal(size=6)), 1e5 * np.eye(6)))
+    chain = RelativePoses(
         np.arange(11), np.arange(1, 12), se3.inverse(own[:-1]) @ own[1:], np.tile(1e5 * np.eye(6), (11, 1, 1))
     )
     truth = np.arange(len(closures)) < good
@@ -41,7 +45,7 @@ def pair(seed, good=8, bad=6, aliased=0):
 
 def test_the_consistent_group_is_found_among_outliers():
     closures, own, peer, grown, truth, T_own_peer = pair(0, good=8, bad=12, aliased=4)
-    found = consistent(closures, own, peer, grown, grown, CONFIG)
+    found = agreeing(closures, own, peer, grown)
     np.testing.assert_array_equal(found.keep, truth)
     assert found.support == 8
     meters, radians = se3.distance(found.T_ownmap_peermap, T_own_peer)
@@ -53,50 +57,54 @@ def test_the_consistent_group_is_found_among_outliers():
 def test_the_group_does_not_depend_on_the_order_or_the_end():
     closures, own, peer, grown, truth, _ = pair(1)
     order = np.random.default_rng(2).permutation(len(closures))
-    found = consistent([closures[k] for k in order], own, peer, grown, grown, CONFIG)
+    found = consistent(
+        [closures[k] for k in order], KeyframePoses(own, grown), KeyframePoses(peer, grown), CONFIG
+    )
     np.testing.assert_array_equal(found.keep, truth[order])
-    turned = consistent([c.reversed() for c in closures], peer, own, grown, grown, CONFIG)
+    turned = consistent(
+        [c.reversed() for c in closures], KeyframePoses(peer, grown), KeyframePoses(own, grown), CONFIG
+    )
     np.testing.assert_array_equal(turned.keep, truth)
-    both = turned.T_ownmap_peermap @ consistent(closures, own, peer, grown, grown, CONFIG).T_ownmap_peermap
+    both = turned.T_ownmap_peermap @ agreeing(closures, own, peer, grown).T_ownmap_peermap
     np.testing.assert_allclose(both, np.eye(4), atol=0.02)  # the mean is taken in either frame
 
 
 def test_one_closure_alone_is_not_enough():
     closures, own, peer, grown, _, _ = pair(3, good=1, bad=5)
-    found = consistent(closures, own, peer, grown, grown, CONFIG)
+    found = agreeing(closures, own, peer, grown)
     assert not found.keep.any()
     assert found.T_ownmap_peermap is None
     assert "needs 2" in found.reasons[0]
-    assert consistent([], own, peer, grown, grown, CONFIG).T_ownmap_peermap is None
+    assert agreeing([], own, peer, grown).T_ownmap_peermap is None
 
 
 def test_long_odometry_between_closures_forgives_more():
     """The same disagreement is an outlier between neighbors and drift between far keyframes."""
     own = np.tile(np.eye(4), (101, 1, 1))
     offset = se3.exp(np.array([0.1, 0, 0, 0, 0, 0]))
-    near = [Closure(0, 0, np.eye(4), 1e6 * np.eye(6)), Closure(0, 1, offset, 1e6 * np.eye(6))]
-    far = [near[0], Closure(0, 100, offset, 1e6 * np.eye(6))]
-    grown = drift(Factors.empty(), 1, CONFIG)
+    near = [LoopClosure(0, 0, np.eye(4), 1e6 * np.eye(6)), LoopClosure(0, 1, offset, 1e6 * np.eye(6))]
+    far = [near[0], LoopClosure(0, 100, offset, 1e6 * np.eye(6))]
+    grown = drift(RelativePoses.empty(), 1, CONFIG)
     assert grown.tolist() == [[0, 0]]
     information = np.tile(1e6 * np.eye(6), (100, 1, 1))
-    chain = Factors(np.arange(100), np.arange(1, 101), np.tile(np.eye(4), (100, 1, 1)), information)
+    chain = RelativePoses(np.arange(100), np.arange(1, 101), np.tile(np.eye(4), (100, 1, 1)), information)
     grown = drift(chain, 101, CONFIG)
     assert np.all(np.diff(grown, axis=0) > 0)
-    assert not consistent(near, own, own, grown, grown, CONFIG).keep.any()
-    assert consistent(far, own, own, grown, grown, CONFIG).keep.all()
+    assert not agreeing(near, own, own, grown).keep.any()
+    assert agreeing(far, own, own, grown).keep.all()
 
 
 def test_drift_follows_the_keyframe_that_was_tracked_against():
     """Keyframe 2 was tracked against 0, not against 1: it is as sure as its own factor."""
     information = np.tile(1e6 * np.eye(6), (2, 1, 1))
-    star = Factors([0, 0], [1, 2], np.tile(np.eye(4), (2, 1, 1)), information)
+    star = RelativePoses([0, 0], [1, 2], np.tile(np.eye(4), (2, 1, 1)), information)
     grown = drift(star, 3, CONFIG)
     np.testing.assert_allclose(grown[2], grown[1])
     assert grown[2, 0] < 1e-3
 
 
 def test_unmeasured_steps_count_as_far_drift():
-    grown = drift(Factors.empty(), 3, CONFIG)
+    grown = drift(RelativePoses.empty(), 3, CONFIG)
     assert np.all(np.diff(grown, axis=0) >= 1.0)
 
 
@@ -113,11 +121,11 @@ def test_robust_frame_ignores_a_minority():
 def test_a_closure_says_the_same_from_both_ends():
     rng = np.random.default_rng(5)
     poses, information = random_poses(rng, 2), random_information(rng, 1)[0]
-    closure = Closure(0, 1, random_poses(rng, 1)[0], information)
+    closure = LoopClosure(0, 1, random_poses(rng, 1)[0], information)
     back = closure.reversed()
     assert (back.own_keyframe, back.peer_keyframe, back.measured_from_peer) == (1, 0, True)
-    one = pose_factors.cost(closure_factors([closure], [0], [1], CONFIG), poses)
-    other = pose_factors.cost(closure_factors([back], [1], [0], CONFIG), poses)
+    one = least_squares.cost(closures_as_relative_poses([closure], [0], [1], CONFIG), poses)
+    other = least_squares.cost(closures_as_relative_poses([back], [1], [0], CONFIG), poses)
     np.testing.assert_allclose(one, other, rtol=1e-12)
     again = back.reversed()
     np.testing.assert_allclose(again.T_own_peer, closure.T_own_peer, atol=1e-15)
@@ -125,7 +133,7 @@ def test_a_closure_says_the_same_from_both_ends():
 
 
 def test_holder_is_the_end_that_copies_fewer_keyframes():
-    star = [Closure(k, 7, np.eye(4), np.eye(6)) for k in range(4)]
+    star = [LoopClosure(k, 7, np.eye(4), np.eye(6)) for k in range(4)]
     assert holder("bravo", "alpha", star) == "bravo"
     assert holder("alpha", "bravo", [c.reversed() for c in star]) == "bravo"
     assert holder("bravo", "alpha", star[:1]) == "alpha"
@@ -145,11 +153,12 @@ def test_frames_chain_along_the_best_supported_tree():
 def test_plausible_is_what_fits_to_where_frames_put_the_robots():
     """The wrong group is large enough to be consistent by itself; frames from elsewhere say that it is wrong."""
     closures, own, peer, grown, truth, T_own_peer = pair(3, good=4, bad=0, aliased=8)
-    assert consistent(closures, own, peer, grown, grown, CONFIG).keep.tolist() == (~truth).tolist()
+    assert agreeing(closures, own, peer, grown).keep.tolist() == (~truth).tolist()
     T_world_own = random_poses(np.random.default_rng(4), 1)[0]
-    found = plausible(closures, T_world_own @ own, T_world_own @ T_own_peer @ peer, grown, grown, CONFIG)
+    placed = KeyframePoses(T_world_own @ own, grown)
+    found = plausible(closures, placed, KeyframePoses(T_world_own @ T_own_peer @ peer, grown), CONFIG)
     np.testing.assert_array_equal(found, truth)
     drifted = T_own_peer @ se3.exp([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])  # well within eleven steps of odometry
-    assert plausible(closures, T_world_own @ own, T_world_own @ drifted @ peer, grown, grown, CONFIG)[
+    assert plausible(closures, placed, KeyframePoses(T_world_own @ drifted @ peer, grown), CONFIG)[
         truth
     ].all()

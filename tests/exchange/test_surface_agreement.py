@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from duagc.pipeline.exchange.convergence import agreement, coarse_depth
+from duagc.pipeline.exchange.surface_agreement import coarse_depth, surface_agreement
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.runs.robot_data import RobotData
 
@@ -19,7 +19,7 @@ def judged(own: RobotData, T_own: np.ndarray, peer: RobotData, T_peer: np.ndarra
         points = peer.camera.rays() * peer.images(k).depth_m[..., None]
         samples.append(points[::9, ::9].reshape(-1, 3))
     depths = [coarse_depth(own.images(k).depth_m) for k in range(own.keyframes)]
-    return agreement(depths, own.camera, T_own, samples, T_peer @ off)
+    return surface_agreement(depths, own.camera, T_own, samples, T_peer @ off)
 
 
 def test_maps_agree_where_they_lie_and_nowhere_else(make_robot: Any) -> None:
@@ -43,4 +43,4 @@ def test_who_sees_nothing_of_it_says_nothing(make_robot: Any, blind: str) -> Non
         T_sample = T_own[:1] @ se3.exp([0.0, 0.0, -6.0, 0.0, 0.0, 0.0])
     else:
         samples, T_sample = [], np.zeros((0, 4, 4))
-    assert agreement(depths, own.camera, T_own, samples, T_sample) == 0.0
+    assert surface_agreement(depths, own.camera, T_own, samples, T_sample) == 0.0

@@ -10,17 +10,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.consensus.pose_admm import PoseAgent, PoseConsensusConfig
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.posegraph import factors as pose_factors
-from duagc.pipeline.posegraph.central import CentralSolution, solve_central, team_graph
-from duagc.pipeline.posegraph.factors import Factors
+from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.files import read_team_graph
 from duagc.pipeline.posegraph.initialization import chordal
-from duagc.pipeline.posegraph.loop_closures import Closure, ClosureConfig, chain_frames, holder, robust_frame
+from duagc.pipeline.posegraph.loop_closures import holder, robust_frame
+from duagc.pipeline.posegraph.pose_graph import PoseGraph, PoseGraphSolution, solve_pose_graph
+from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, LoopClosure, RelativePoses
+from duagc.pipeline.posegraph.spanning_tree import chain_frames
 
 Array = NDArray[np.float64]
-EXACT = ClosureConfig(sigma_floor_m=0, sigma_floor_rad=0, min_support=1, frame_sigma_m=1.0)
+EXACT = LoopClosureConfig(sigma_floor_m=0, sigma_floor_rad=0, min_support=1, frame_sigma_m=1.0)
 POSE_GRAPHS = Path(__file__).resolve().parents[3] / "shared" / "data" / "pose_graphs"
 
 
@@ -42,8 +44,8 @@ class TeamWorld:
     """What the robots of a small team know: maps in frames of their own, odometry, closures by pair (a < b)."""
 
     maps: dict[str, Array]
-    odometry: dict[str, Factors]
-    closures: dict[tuple[str, str], list[Closure]]
+    odometry: dict[str, RelativePoses]
+    closures: dict[tuple[str, str], list[LoopClosure]]
 
     def agents(
         self, config: PoseConsensusConfig, keep: dict[tuple[str, str], Sequence[bool]] | None = None
@@ -70,13 +72,15 @@ class TeamWorld:
                 agents[a].add_link(b, shared=agents[b].add_link(a, turned, keep=start))
         return agents
 
-    def optimum(self, agents: dict[str, PoseAgent]) -> tuple[Factors, CentralSolution]:
+    def optimum(self, agents: dict[str, PoseAgent]) -> tuple[RelativePoses, PoseGraphSolution]:
         """The same factors in one graph, and their minimum from the same start."""
-        closures = [(a, b, held) for (a, b), held in self.closures.items()]
+        closures = [
+            HeldLoopClosures(a, b, held, np.ones(len(held))) for (a, b), held in self.closures.items()
+        ]
         config = next(iter(agents.values())).config.closures
         starts = {r: agent.T_world_keyframe for r, agent in agents.items()}
-        team = team_graph(starts, {r: agent.odometry for r, agent in agents.items()}, closures, config)
-        return team.factors, solve_central(team.factors, team.T_start)
+        team = PoseGraph.of_team(starts, {r: agent.odometry for r, agent in agents.items()}, closures, config)
+        return team.relative_poses, solve_pose_graph(team.relative_poses, team.T_start)
 
 
 def make_team(
@@ -97,7 +101,7 @@ def make_team(
         for step in steps:
             chain.append(chain[-1] @ step)
         maps[name] = np.array(chain)
-        odometry[name] = Factors(np.arange(keyframes - 1), np.arange(1, keyframes), steps, information)
+        odometry[name] = RelativePoses(np.arange(keyframes - 1), np.arange(1, keyframes), steps, information)
     pairs = [(names[k], names[k + 1]) for k in range(robots - 1)]
     if ring and robots > 2:
         pairs.append((names[0], names[-1]))
@@ -109,7 +113,7 @@ def make_team(
             information = random_information(rng, 1)[0]
             noise_ij = np.linalg.solve(np.linalg.cholesky(information).T, rng.normal(size=6))
             T = se3.inverse(truth[a][i]) @ truth[b][j] @ se3.exp(noise_ij)
-            held.append(Closure(i, j, T, information))
+            held.append(LoopClosure(i, j, T, information))
         found[a, b] = held
     return TeamWorld(maps, odometry, found)
 
@@ -166,13 +170,14 @@ def benchmark(name: str, robots: int | None = None) -> TeamWorld:
     if not path.exists():
         pytest.skip(f"needs {name} in ../shared/data/pose_graphs, which is not distributed with the project")
     team = read_team_graph(path, robots)
-    odometry = {r: Factors.concatenate([g.odometry, g.loops]) for r, g in team.robots.items()}
+    odometry = {r: RelativePoses.concatenate([g.odometry, g.loops]) for r, g in team.robots.items()}
     maps = {
-        r: solve_central(odometry[r], chordal(odometry[r], g.keyframes)).poses for r, g in team.robots.items()
+        r: solve_pose_graph(odometry[r], chordal(odometry[r], g.keyframes)).poses
+        for r, g in team.robots.items()
     }
     return TeamWorld(maps, odometry, {(a, b): team.robots[a].closures[b] for a, b in team.pairs})
 
 
-def team_cost(factors: Factors, agents: dict[str, PoseAgent]) -> float:
+def team_cost(factors: RelativePoses, agents: dict[str, PoseAgent]) -> float:
     """The central cost at the agents' own estimates."""
-    return pose_factors.cost(factors, np.concatenate([agents[r].T_world_keyframe for r in sorted(agents)]))
+    return least_squares.cost(factors, np.concatenate([agents[r].T_world_keyframe for r in sorted(agents)]))

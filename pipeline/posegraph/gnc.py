@@ -1,7 +1,7 @@
 """Graduated non-convexity with truncated least squares: robust weights that need no message of their own.
 
-Whoever holds a factor weighs it from its own estimate. The control parameter mu grows with what arrives, not with
-time, so that loss slows the schedule and does not starve it. Source: Yang, Antonante, Tzoumas, Carlone 2020.
+The robot that holds a loop closure weighs it from its own estimate. The control parameter mu grows with what arrives,
+not with time, so that loss slows the schedule and does not starve it. Source: Yang, Antonante, Tzoumas, Carlone 2020.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 
 Array = NDArray[np.float64]
-COUNTS = 0.5
-"""Robust weight from which a closure counts as kept."""
+INLIER_WEIGHT = 0.5
+"""Robust weight from which a relative pose counts as an inlier."""
 _LEAST_PACKETS = 2  # per step: the other end has answered to the last weights
 
 
@@ -43,9 +43,11 @@ def controls(config: PoseConsensusConfig) -> list[float]:
 
 
 class RobustWeights:
-    """The weights of one group of factors and how far their schedule is.
+    """The weights of one group of relative poses and how far their schedule is.
 
-    weights: [m], the start until the warm-up is over. done: they are final.
+    Attributes:
+        weights: [m], the start until the warm-up is over.
+        done: they are final.
     """
 
     def __init__(self, start: Array, config: PoseConsensusConfig) -> None:
@@ -70,7 +72,7 @@ class RobustWeights:
             return False
         squared = squared_residuals()
         if self._mu is None:
-            if c.robust_skip and np.all(squared <= c2):  # nothing is in doubt: every truncated weight is one
+            if c.robust_skip and np.all(squared <= c2):  # no outlier: every truncated weight is one
                 return self._finish(np.ones(len(squared)))
             self._mu = first_control(squared, c)
         else:
@@ -86,7 +88,7 @@ class RobustWeights:
 
     @property
     def graduated(self) -> bool:
-        """Whether the schedule ran, and was not skipped because nothing was in doubt."""
+        """Whether the schedule ran, and was not skipped because there were no outliers."""
         return self._mu is not None
 
     def _finish(self, weights: Array) -> bool:

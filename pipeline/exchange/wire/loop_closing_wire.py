@@ -1,4 +1,4 @@
-"""Bytes of what two robots say when they meet: places, samples of keyframes, the verdict. Strict as `wire`."""
+"""Bytes of loop closing: descriptors, samples of keyframes, the verdict, named keyframes. Strict as `state_wire`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes
-from duagc.pipeline.exchange.wire.state_wire import MAX_KEYFRAMES, Reader, array_bytes, pose_bytes
+from duagc.pipeline.exchange.wire.state_wire import (
+    MAX_KEYFRAMES,
+    Reader,
+    array_bytes,
+    motion_bytes,
+    pose_bytes,
+)
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.registration import Reference, ReferenceLevel
 from duagc.pipeline.registration.features import DIMENSIONS, Descriptors, Features
@@ -27,12 +33,13 @@ def read_digest(data: bytes) -> bytes:
 
 
 @dataclass(frozen=True)
-class PlaceBook:
-    """What a robot tells its neighbor to let it recognize places.
+class DescriptorSet:
+    """What a robot sends to its neighbor for place recognition.
 
-    descriptors: one array per keyframe. T_first_keyframe: [n, 4, 4], as seen from its
-    first keyframe. drift: [n, 2], accumulated variance of its
-    odometry from keyframe 0 (m^2, rad^2).
+    Attributes:
+        descriptors: one array per keyframe.
+        T_first_keyframe: [n, 4, 4], as seen from its first keyframe.
+        drift: [n, 2], accumulated variance of its odometry from keyframe 0 (m^2, rad^2).
     """
 
     descriptors: list[Descriptors]
@@ -43,20 +50,20 @@ class PlaceBook:
 _COUNT = struct.Struct("<I")
 
 
-def write_places(book: PlaceBook) -> bytes:
+def write_descriptors(own: DescriptorSet) -> bytes:
     """Bytes of DESCRIPTORS."""
     return b"".join(
         [
-            _COUNT.pack(len(book.descriptors)),
-            pose_bytes(book.T_first_keyframe),
-            array_bytes(book.drift, "float64"),
-            array_bytes([len(d) for d in book.descriptors], "uint16"),
-            *(array_bytes(d, "uint8") for d in book.descriptors),
+            _COUNT.pack(len(own.descriptors)),
+            pose_bytes(own.T_first_keyframe),
+            array_bytes(own.drift, "float64"),
+            array_bytes([len(d) for d in own.descriptors], "uint16"),
+            *(array_bytes(d, "uint8") for d in own.descriptors),
         ]
     )
 
 
-def read_places(data: bytes) -> PlaceBook:
+def read_descriptors(data: bytes) -> DescriptorSet:
     """From DESCRIPTORS."""
     reader = Reader(data, "descriptors")
     n = _keyframe_count(reader)
@@ -64,9 +71,9 @@ def read_places(data: bytes) -> PlaceBook:
     if n and (drift.min() < 0 or drift.max() > 1e12 or np.diff(drift, axis=0).min(initial=0.0) < 0):
         raise MalformedError("descriptors: the drift of the odometry must grow from zero")
     counts = reader.array("uint16", (n,)).tolist()
-    book = PlaceBook([reader.array("uint8", (count, DIMENSIONS)) for count in counts], T, drift)
+    own = DescriptorSet([reader.array("uint8", (count, DIMENSIONS)) for count in counts], T, drift)
     reader.done()
-    return book
+    return own
 
 
 def _keyframe_count(reader: Reader) -> int:
@@ -96,11 +103,14 @@ def read_indices(data: bytes, limit: int) -> list[int]:
 
 @dataclass(frozen=True)
 class Verdicts:
-    """What the lower-named end found out about a pair.
+    """What the verifier found out about a pair.
 
-    candidates, verified, consistent: pairs of keyframes that were tried, that became closures, that agree.
-    joined: the two robots share a frame. shared: then, the keyframes of the higher end that the lower one copies, and
-    their metric.
+    Attributes:
+        candidates: pairs of keyframes that were tried.
+        verified: those that became loop closures.
+        consistent: those that agree.
+        joined: the two robots share a frame.
+        shared: then, the keyframes of the provider that the verifier copies, and their metric.
     """
 
     candidates: int
@@ -141,12 +151,63 @@ def read_verdicts(data: bytes, limit: int) -> Verdicts:
     return Verdicts(candidates, verified, consistent, bool(joined), SharedKeyframes(keyframes, metric))
 
 
+# --- keyframes that known loop closures name
+
+
+@dataclass(frozen=True)
+class NamedKeyframes:
+    """Some keyframes of a robot.
+
+    Attributes:
+        keyframes: int32 [s], their indices, ascending.
+        T_first_keyframe: [s, 4, 4], as seen from its first keyframe.
+        drift: [s, 2], accumulated variance of its odometry from keyframe 0 (m^2, rad^2).
+    """
+
+    keyframes: NDArray[np.int32]
+    T_first_keyframe: Array
+    drift: Array
+
+
+def write_keyframes(named: NamedKeyframes, precision: str) -> bytes:
+    """Bytes of KEYFRAMES: 40 per keyframe with poses in float32, 68 in float64."""
+    return b"".join(
+        [
+            _COUNT.pack(len(named.keyframes)),
+            array_bytes(named.keyframes, "int32"),
+            motion_bytes(named.T_first_keyframe, precision),
+            array_bytes(named.drift, "float32"),
+        ]
+    )
+
+
+def read_keyframes(data: bytes, expected: NDArray[np.int32], precision: str) -> NamedKeyframes:
+    """From KEYFRAMES about exactly the keyframes that the loop closures name."""
+    reader = Reader(data, "keyframes")
+    (n,) = reader.fields(_COUNT)
+    if n != len(expected):
+        raise MalformedError(f"keyframes: {n}, the loop closures name {len(expected)}")
+    keyframes = reader.array("int32", (n,))
+    T = reader.motions(n, precision)
+    drift = reader.array("float32", (n, 2)).astype(np.float64)
+    reader.done()
+    if not np.array_equal(keyframes, expected) or drift.min(initial=0.0) < 0:
+        raise MalformedError("keyframes: not those that the loop closures name, or a negative variance")
+    return NamedKeyframes(keyframes, T, drift)
+
+
 # --- one keyframe
 
 
 @dataclass(frozen=True)
 class KeyframeSample:
-    """What is needed of a keyframe to verify a closure with it: features, and samples for the registration."""
+    """What is needed of a keyframe to verify a loop closure with it.
+
+    Attributes:
+        keyframe: its index.
+        features: with 3-D points.
+        reference: samples for the registration.
+    """
 
     keyframe: int
     features: Features

@@ -7,7 +7,7 @@ import pytest
 
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.cycle_consistency import Proposal, place
-from tests.consensus.worlds import random_poses
+from tests.posegraph.worlds import random_poses
 
 NAMES = ["alpha", "bravo", "charlie", "delta"]
 VARIANCE = (0.02**2, 0.01**2)
@@ -85,7 +85,7 @@ def test_a_false_link_with_more_closures_gives_way_to_true_ones_whose_images_agr
     assert_placed(found, T)
     assert not found.undecided
     assert found.chosen["alpha", "charlie"] is None
-    assert "off the way by bravo" in found.contradictions["alpha", "charlie"]
+    assert "off the path by bravo" in found.contradictions["alpha", "charlie"]
 
 
 @pytest.mark.parametrize("supports", [(5, 5, 5), (5, 6, 9), (3, 4, 9)])
@@ -95,6 +95,14 @@ def test_where_images_agree_everywhere_no_link_of_a_cycle_that_does_not_close_co
     assert set(found.undecided) == set(pairs)
     weight = 0.6 * supports[2] ** 0.5
     assert all(f"alpha-charlie {weight:.2f}" in reason for reason in found.undecided.values())
+
+
+def test_a_link_that_is_stronger_by_far_is_not_undecided():
+    """One of two weak links must be false; the third has five times their loop closures."""
+    T, pairs = triangle(5, (5, 1, 1), 0.6)
+    found = place(pairs, list(T), 4.0)
+    assert set(found.undecided) == {pair for pair in pairs if pairs[pair][0].support == 1}
+    assert len(found.undecided) == 2
 
 
 def test_links_that_another_cycle_confirms_are_not_in_doubt():
