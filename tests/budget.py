@@ -30,7 +30,7 @@ BUDGET_S = {
     "golden": 40,
     "information": 10,
     "kernels": 20,
-    "posegraph": 10,
+    "posegraph": 18,
     "recording": 20,
     "registration": 15,
     "report": 10,
