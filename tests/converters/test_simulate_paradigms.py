@@ -164,7 +164,7 @@ def test_lines_cross_or_run_side_by_side(room):
 
 
 def test_the_same_figure_again(room):
-    kind = ("leader-follower", 0.8, 4)
+    kind = ("crossing", 0.3, 2)
     pairs = zip(ways_of(room, *kind), planned(room, *kind), strict=True)
     assert all(np.array_equal(a, b) for a, b in pairs)
 

@@ -115,9 +115,9 @@ def gaps(
 @pytest.mark.parametrize(
     ("robots", "link"),
     [
-        (2, {}),
-        (2, {"loss_probability": 0.3, **BURSTS}),
         (3, {"topology": "chain", "loss_probability": 0.3}),
+        pytest.param(2, {}, marks=pytest.mark.slow),
+        pytest.param(2, {"loss_probability": 0.3, **BURSTS}, marks=pytest.mark.slow),
         pytest.param(4, {"topology": "ring", "loss_probability": 0.6}, marks=pytest.mark.slow),
         pytest.param(4, {"topology": "full", "loss_probability": 0.9}, marks=pytest.mark.slow),
         pytest.param(8, {"topology": "chain"}, marks=pytest.mark.slow),
@@ -142,9 +142,9 @@ def test_the_team_is_at_the_oracle(
 @pytest.mark.parametrize(
     ("robots", "link"),
     [
-        (2, {}),
-        (2, {"loss_probability": 0.3, **BURSTS}),
         (3, {"topology": "chain", "loss_probability": 0.3}),
+        pytest.param(2, {}, marks=pytest.mark.slow),
+        pytest.param(2, {"loss_probability": 0.3, **BURSTS}, marks=pytest.mark.slow),
         pytest.param(2, {"loss_probability": 0.9}, marks=pytest.mark.slow),
         pytest.param(4, {"topology": "ring", "loss_probability": 0.6}, marks=pytest.mark.slow),
         pytest.param(4, {"topology": "ring", "loss_probability": 0.9}, marks=pytest.mark.slow),

@@ -1,4 +1,4 @@
-"""The golden runs: three small recordings, and what they are run with."""
+"""The golden runs: small recordings, and what they are run with. `make test` makes the smallest of them."""
 
 import json
 from collections.abc import Callable
@@ -35,6 +35,10 @@ def _lossy(recording: Path) -> None:
     simulate(recording, robots=3, frames=32, size=(160, 120), noise="kinect", seed=5, workers=SCRIPT_WORKERS)
 
 
+def _tiny(recording: Path) -> None:
+    simulate(recording, robots=3, frames=16, size=(160, 120), noise="kinect", seed=5, overlap=0.9, workers=1)
+
+
 @dataclass(frozen=True)
 class GoldenRun:
     """One golden run.
@@ -54,6 +58,17 @@ RUNS = {
     "demo": GoldenRun(_demo),
     "redkitchen60": GoldenRun(_red_kitchen, needs=RED_KITCHEN),
     "lossy3": GoldenRun(_lossy, ("exchange.link.loss_probability=0.3",)),
+    "tiny3": GoldenRun(
+        _tiny,
+        (
+            "exchange.link.loss_probability=0.3",
+            "exchange.max_rounds=400",
+            "frontend.mapping.max_gaussians=2000",
+            "frontend.mapping.iterations=6",
+            "frontend.mapping.final_iterations=6",
+            "fusion.refine.steps_per_view=2",
+        ),
+    ),
 }
 
 

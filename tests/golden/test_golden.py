@@ -1,0 +1,76 @@
+"""Golden runs compute what is stored, and a change is named by stage, topic, message and field."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from duagc.pipeline.recording import LogWriter, log_metadata, read_log
+from tests.golden.command import differences
+from tests.golden.runs import RUNS, make_run
+
+QUICK = "tiny3"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The golden run that is small enough for `make test`."""
+    return make_run(QUICK, tmp_path_factory.mktemp(QUICK))
+
+
+def test_the_small_run_is_as_stored(run: Path) -> None:
+    assert differences(QUICK, run) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(set(RUNS) - {QUICK}))
+def test_every_run_is_as_stored(name: str, tmp_path: Path) -> None:
+    needs = RUNS[name].needs
+    if needs is not None and not needs.is_dir():
+        pytest.skip(f"needs {needs}")
+    assert differences(name, make_run(name, tmp_path)) == []
+
+
+def changed_log(path: Path, topic: str, index: int, **fields: Any) -> int:
+    """Write a log again with other values in one message of a topic.
+
+    Args:
+        path: of the log.
+        topic: of the message.
+        index: of the message among those of its topic.
+        fields: its new values, by name.
+    Returns:
+        Time of the message.
+    """
+    records, metadata = list(read_log(path)), log_metadata(path)
+    chosen = [record for record in records if record.topic == topic][index]
+    with LogWriter(path, metadata.pop("robot"), metadata) as log:
+        for record in records:
+            message = record.proto()
+            if record is chosen:
+                for name, value in fields.items():
+                    setattr(message, name, value)
+            log.write(record.topic, message, record.log_time_ns, record.publish_time_ns)
+    return chosen.log_time_ns
+
+
+def test_a_changed_message_is_named(run: Path, tmp_path: Path) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    log = tmp_path / "run" / "robots" / "alpha" / "frontend.mcap"
+    time_ns = changed_log(log, "/alpha/odometry", 5, overlap=0.125)
+    assert differences(QUICK, tmp_path / "run") == [
+        "frontend: robots/alpha/frontend.mcap: /alpha/odometry; "
+        f"first message that differs: 5 at {time_ns} ns; fields overlap"
+    ]
+
+
+def test_a_changed_metric_is_named(run: Path, tmp_path: Path) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    path = tmp_path / "run" / "metrics.json"
+    metrics = json.loads(path.read_text())
+    metrics["team"]["ate_rmse_m"] += 0.25
+    path.write_text(json.dumps(metrics))
+    (line,) = differences(QUICK, tmp_path / "run")
+    assert line.startswith("evaluation: team.ate_rmse_m: 0.2")
