@@ -133,7 +133,7 @@ def test_what_is_not_decided_lists_its_candidates(tmp_path: Path) -> None:
         ("", r"found no \[robots.NAME\]"),
         ("[robots]\n", r"found no \[robots.NAME\]"),
         ("x = ", "not valid TOML"),
-        ('color = "/a"\n[robots.a]\nlogs = ["a.mcap"]\n', "color is no option; expected perhaps color"),
+        ('colo = "/a"\n[robots.a]\nlogs = ["a.mcap"]\n', "colo is no option; expected perhaps color"),
         (
             '[robots.a]\nlogs = ["a.mcap"]\ndept = "/a"\n',
             r"\[robots.a\] dept is no option; expected perhaps depth",
