@@ -24,8 +24,6 @@ from duagc.pipeline.viewing.inspection import Inspector, format_facts
 
 SMALL = (
     "frontend.mapping.max_gaussians=3000",
-    "frontend.mapping.iterations=12",
-    "frontend.mapping.final_iterations=12",
     "exchange.max_rounds=400",
     "fusion.refine.steps_per_view=2",
 )
@@ -48,7 +46,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def recording(folder: Path) -> Path:
     out = folder / "recording"
-    simulate(out, robots=2, frames=20, size=(160, 120), seed=1, overlap=0.9, workers=1)
+    simulate(out, robots=2, frames=24, size=(240, 180), seed=1, overlap=0.9, workers=2)
     return out
 
 
