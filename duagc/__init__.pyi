@@ -32,6 +32,11 @@ from .pipeline.kernels import Rasterizer as Rasterizer
 from .pipeline.kernels.autograd import rasterize as rasterize
 from .pipeline.network.link_model import LinkModel as LinkModel
 from .pipeline.posegraph.files import read_team_graph as read_team_graph
+from .pipeline.posegraph.pose_graph import PoseGraphSolution as PoseGraphSolution
+from .pipeline.posegraph.pose_graph import solve_pose_graph as solve_pose_graph
+from .pipeline.posegraph.relative_poses import LoopClosure as LoopClosure
+from .pipeline.posegraph.relative_poses import RelativePose as RelativePose
+from .pipeline.posegraph.relative_poses import RelativePoses as RelativePoses
 from .pipeline.recording import LogWriter as LogWriter
 from .pipeline.recording import Recording as Recording
 from .pipeline.recording import RgbdFrame as RgbdFrame

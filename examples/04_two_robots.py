@@ -17,7 +17,7 @@ def main() -> None:
     """Simulate, run all stages, and print what the robots agreed on."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(temporary)
-        duagc.simulate(folder / "recording", robots=2, frames=24, size=(160, 120))
+        duagc.simulate(folder / "recording", robots=2, frames=20, size=(160, 120))
         config = duagc.load_config(duagc.RunConfig, overrides=["exchange.link.loss_probability=0.2"])
         duagc.run(folder / "recording", folder / "run", config)
         metrics = json.loads((folder / "run" / "metrics.json").read_text())
