@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -58,20 +58,16 @@ class PosePacket:
 
     def part(self, index: slice | NDArray[np.int64]) -> PosePacket:
         """The packet with some of its keyframes only."""
-        return PosePacket(
-            self.sequence,
-            self.version,
-            self.keyframes[index],
-            self.quats_wxyz[index],
-            self.translations[index],
-            self.penalties,
-            self.curvature,
-            self.converged,
+        return replace(
+            self,
+            keyframes=self.keyframes[index],
+            quats_wxyz=self.quats_wxyz[index],
+            translations=self.translations[index],
         )
 
 
 @dataclass
-class Link:
+class AdmmEdge:
     """One end of a link. Arrays over its s shared keyframes, which belong to the end that holds no closures."""
 
     peer: str

@@ -44,7 +44,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Step:
+class BackSubstitution:
     """The root's answer to the blocks of one exchange.
 
     accepted: the last step lowered the cost; else everybody goes back to where it was before. finished: this is the
@@ -125,7 +125,7 @@ def _lanes(slots: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def damped(
-    factors: RelativePoses, jacobians: tuple[Array, Array], n: int, damping: float, anchor: int | None
+    factors: RelativePoses, jacobians: tuple[Array, Array], n: int, *, damping: float, anchor: int | None
 ) -> sparse.csc_matrix:
     """Gauss-Newton matrix of a robot's own factors over its n variables, damped relative to its diagonal.
 

@@ -40,7 +40,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from duagc.pipeline.config.consensus import PoseConsensusConfig
-from duagc.pipeline.consensus.admm_edge import BLOCK, Link, PosePacket, SharedKeyframes, link_metric, rounded
+from duagc.pipeline.consensus.admm_edge import (
+    BLOCK,
+    AdmmEdge,
+    PosePacket,
+    SharedKeyframes,
+    link_metric,
+    rounded,
+)
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.spd import add_covariance
 from duagc.pipeline.posegraph import least_squares
@@ -86,7 +93,7 @@ class PoseAgent:
         kept = np.ones(len(self.loops)) if keep_loops is None else np.array(keep_loops, dtype=np.float64)
         self.loop_weights = RobustWeights(kept, config)
         self.T_world_map = np.eye(4)
-        self.links: dict[str, Link] = {}
+        self.links: dict[str, AdmmEdge] = {}
         self.rounds = self.factorizations = 0
         self.step_change = np.inf
         self._copies_start: dict[str, Array] = {}
@@ -143,7 +150,7 @@ class PoseAgent:
                 keyframes.astype(np.int32), link_metric(closures, keyframes, self.config.closures)
             )
             self._copies_start[peer] = self._copies(closures, kept, keyframes, T_world_keyframe_peer or {})
-        self.links[peer] = Link(
+        self.links[peer] = AdmmEdge(
             peer=peer,
             decides=self.robot < peer,
             keyframes=np.asarray(shared.keyframes, dtype=np.int32),
@@ -294,7 +301,7 @@ class PoseAgent:
 
     # ---- penalties ----
 
-    def _curvature(self, link: Link) -> Array | None:
+    def _curvature(self, link: AdmmEdge) -> Array | None:
         """Stiffness [2] met on the way since the last change of penalties: |change of force| / |change of pose|.
 
         In the metric, for translation and rotation apart; None before enough was received or if nothing moved.
@@ -317,13 +324,13 @@ class PoseAgent:
             stiffness.append(changed / moved)
         return np.array(stiffness)
 
-    def _mark(self, link: Link) -> None:
+    def _mark(self, link: AdmmEdge) -> None:
         """Begin a new window of the curvature."""
         link.reference = (link.force(), self._x[link.slots].copy())
         link.received = 0.0
         link.peer_curvature = None
 
-    def _decide(self, link: Link) -> None:
+    def _decide(self, link: AdmmEdge) -> None:
         """At the lower end: take new penalties once both ends have met enough of the path in this version."""
         if not link.decides:
             return
@@ -338,7 +345,7 @@ class PoseAgent:
         penalties = np.clip(penalties, c.penalty_min, c.penalty_max).astype(np.float32).astype(np.float64)
         self._change_penalties(link, penalties, link.version + 1)
 
-    def _change_penalties(self, link: Link, penalties: Array, version: int) -> None:
+    def _change_penalties(self, link: AdmmEdge, penalties: Array, version: int) -> None:
         """Change W and move y so that the force W (x - y) stays."""
         link.offset = link.offset * (link.penalties / penalties)[BLOCK]
         link.penalties, link.version = penalties, version
@@ -347,7 +354,7 @@ class PoseAgent:
 
     # ---- robust weights of held closures ----
 
-    def _weigh(self, link: Link) -> None:
+    def _weigh(self, link: AdmmEdge) -> None:
         """Robust weights of a link's held closures, paced by what arrives on it."""
 
         def squared() -> Array:
@@ -377,7 +384,7 @@ class PoseAgent:
             for link in self.links.values():
                 link.adapting_from = link.received_total
 
-    def _steady(self, link: Link) -> bool:
+    def _steady(self, link: AdmmEdge) -> bool:
         """Whether a link has left its start behind."""
         return link.received_total >= self.config.penalty_period and link.largest_change() < _STEADY
 

@@ -15,14 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.consensus import PoseConsensusConfig
-from duagc.pipeline.consensus.elimination import Block, Front, Step, Variable, damped, shared_variables
+from duagc.pipeline.consensus.elimination import (
+    BackSubstitution,
+    Block,
+    Front,
+    Variable,
+    damped,
+    shared_variables,
+)
 from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.gnc import RobustWeights
 from duagc.pipeline.posegraph.least_squares import retract
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
 
 Array = NDArray[np.float64]
-Message = dict[Variable, int] | tuple[int, Block] | Step
+Message = dict[Variable, int] | tuple[int, Block] | BackSubstitution
 """Up: which robots have which variables, or a block and its exchange. Down: a step."""
 _SLOW = 0.5  # share of the step before from which the matrices are too old
 _ROUNDING = 1e-10  # relative rise of the cost that is no rise
@@ -107,7 +114,7 @@ class TreeNode:
             raise ValueError("block without its first matrix")
         self._blocks[child] = block
 
-    def take_step(self, sender: int, step: Step) -> None:
+    def take_step(self, sender: int, step: BackSubstitution) -> None:
         """The parent's answer."""
         if sender != self.place.parent:
             raise ValueError("step: not from the parent")
@@ -178,7 +185,9 @@ class TreeNode:
         stale = moved or reweighted or self._damping != self._damped
         if stale:
             anchor = 0 if self.place.parent is None else None
-            self._H_own = damped(self._factors, jacobians, len(self.poses), self._damping, anchor)
+            self._H_own = damped(
+                self._factors, jacobians, len(self.poses), damping=self._damping, anchor=anchor
+            )
             self._moved_rad, self._damped = 0.0, self._damping
         if not stale and all(block.H is None for block in self._blocks.values()):
             return None
@@ -196,9 +205,9 @@ class TreeNode:
         fresh = not accepted or block.largest_step > _SLOW * self._step_before
         self._step_before = block.largest_step if self.exchange else np.inf
         finished = small and not block.unsure
-        self._descend(Step(self.exchange, accepted, finished, fresh, damping, np.zeros((0, 6))))
+        self._descend(BackSubstitution(self.exchange, accepted, finished, fresh, damping, np.zeros((0, 6))))
 
-    def _descend(self, step: Step) -> None:
+    def _descend(self, step: BackSubstitution) -> None:
         """Move, and hand the children their part of the step."""
         if step.exchange != self.exchange or self._sent != self.exchange or self._front is None:
             raise ValueError(f"step of exchange {step.exchange} in exchange {self.exchange}")
@@ -212,7 +221,9 @@ class TreeNode:
             delta, self.poses = np.zeros((0, 6)), self._before
         for child in self.place.children:
             part = delta[self._front.child_slots[child]] if step.accepted else delta
-            answer = Step(step.exchange, step.accepted, step.finished, step.fresh, step.damping, part)
+            answer = BackSubstitution(
+                step.exchange, step.accepted, step.finished, step.fresh, step.damping, part
+            )
             self.outbox.append((child, answer))
         if step.fresh:
             self._moved_rad = np.inf

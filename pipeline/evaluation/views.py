@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.evaluation import image_metrics
 from duagc.pipeline.evaluation.results import Absent, mean
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.splat import losses
 from duagc.pipeline.splat.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -74,9 +74,9 @@ def score_view(
     l1_m, completeness = _depth(render, depth_m, "recorded")
     side = min(image.shape[:2])
     return ViewScore(
-        psnr_db=min(losses.psnr(render.color, image), PSNR_CEILING_DB),
-        ssim=losses.ssim(render.color, image),
-        ms_ssim=losses.ms_ssim(render.color, image)
+        psnr_db=min(image_metrics.psnr(render.color, image), PSNR_CEILING_DB),
+        ssim=image_metrics.ssim(render.color, image),
+        ms_ssim=image_metrics.ms_ssim(render.color, image)
         if side >= MS_SSIM_MIN_SIDE_PX
         else Absent(f"the shorter side is {side} px; five scales need {MS_SSIM_MIN_SIDE_PX} px"),
         depth_l1_m=l1_m,
@@ -97,7 +97,9 @@ def _layer(layer_m: NDArray[np.float32], depth_m: NDArray[np.float32]) -> Score:
 
 def _common(render: Render, depth_m: NDArray[np.float32], common: NDArray[np.bool_]) -> Score:
     """L1 over the pixels that all compared maps cover."""
-    l1_m, completeness = losses.depth_error(render, np.where(common, depth_m, np.float32(0)), MIN_ALPHA)
+    l1_m, completeness = image_metrics.depth_error(
+        render, np.where(common, depth_m, np.float32(0)), MIN_ALPHA
+    )
     return l1_m if completeness > 0 else Absent("no pixel with recorded depth is covered by all maps")
 
 
@@ -106,7 +108,7 @@ def _depth(render: Render, reference_m: NDArray[np.float32], name: str) -> tuple
     if not np.any(reference_m > 0):
         absent = Absent(f"the {name} depth image has no valid pixel")
         return absent, absent
-    l1_m, completeness = losses.depth_error(render, reference_m, MIN_ALPHA)
+    l1_m, completeness = image_metrics.depth_error(render, reference_m, MIN_ALPHA)
     if completeness == 0.0:
         return Absent(f"no pixel has both a rendered and a {name} depth"), 0.0
     return l1_m, completeness

@@ -255,7 +255,7 @@ class Mapper:
             if config.exposure:
                 view.exposure = _first_exposure(render, color, view.mask)
             color = self._as_drawn(view, color, render)
-            wanted = unexplained(render, color, depth_m, config.seeding, view.depth_sigma_m)
+            wanted = unexplained(render, color, depth_m, config.seeding, depth_sigma_m=view.depth_sigma_m)
         new = self._discs(view, color, depth_m, wanted, budget)
         excess = len(self._gaussians) + len(new) - config.max_gaussians
         self._measure(self._covisible(view, config.sweep_keyframes))
@@ -277,11 +277,11 @@ class Mapper:
             depth_m,
             wanted,
             self.cameras[0],
-            view.T_map_camera,
-            budget,
-            self._next_id,
-            view.index,
-            self.config.seeding,
+            T_map_camera=view.T_map_camera,
+            budget=budget,
+            first_id=self._next_id,
+            anchor=view.index,
+            config=self.config.seeding,
         )
 
     def _append(self, new: Gaussians) -> None:
@@ -305,7 +305,7 @@ class Mapper:
             color, depth_m = view.images(0)
             color = self._as_drawn(view, color, render)
             budget = min(budget, depth_m.size // (8 * self.config.seeding.cell_sizes_px[-1] ** 2))
-            wanted = worst_drawn(render, color, depth_m, budget, self.config.seeding)
+            wanted = worst_drawn(render, color, depth_m, count=budget, config=self.config.seeding)
             new = self._discs(view, color, depth_m, wanted, budget)
             self._append(new)
             inserted += len(new)

@@ -115,6 +115,7 @@ def weighted_move(
     values: Array,
     first: Index,
     prior: float,
+    *,
     free: Array | None = None,
 ) -> Array:
     """How far the fused value of each group lies from its reference: (prior + sum W)^-1 sum W (value - reference).
@@ -273,7 +274,7 @@ def fused_moves(members: TrackMembers, config: FusionConfig, thickness_floor_m: 
     prior_position, prior_shape = PRIOR[config.association]
     move = np.zeros((len(first), THETA_SIZE))
     move[:, MEAN] = weighted_move(position, delta[:, MEAN], first, prior_position)
-    move[:, LOG_COVARIANCE] = weighted_move(shape, delta[:, LOG_COVARIANCE], first, prior_shape, free)
+    move[:, LOG_COVARIANCE] = weighted_move(shape, delta[:, LOG_COVARIANCE], first, prior_shape, free=free)
     move[:, COLOR] = _weighted_move_diagonal(color, delta[:, COLOR], first)
     move[:, OPACITY] = _weighted_move_diagonal(opacity[:, None], delta[:, OPACITY, None], first)[:, 0]
     return move

@@ -98,7 +98,7 @@ class OwnMap:
 
 
 @dataclass(frozen=True)
-class _Team:
+class _TeamEvidence:
     """Evidence of all robots in common colors, one robot after the other, in order of name.
 
     Attributes:
@@ -118,12 +118,14 @@ class _Team:
     start: Index
 
     @staticmethod
-    def of(robot: str, evidence: Mapping[str, Evidence], pairs: Pairs, context: MapContext) -> _Team:
+    def of(robot: str, evidence: Mapping[str, Evidence], pairs: Pairs, context: MapContext) -> _TeamEvidence:
         names = tuple(sorted(evidence))
         cameras = team_colors(evidence, pairs, context.matching.colors)
         common = {n: cameras.to_common(n).of(evidence[n]) for n in names}
         start = np.concatenate([[0], np.cumsum([len(common[n]) for n in names])]).astype(np.int64)
-        return _Team(robot, names, common, cameras, EvidenceRows.of([common[n] for n in names]), start)
+        return _TeamEvidence(
+            robot, names, common, cameras, EvidenceRows.of([common[n] for n in names]), start
+        )
 
     @property
     def own_rows(self) -> Index:
@@ -181,7 +183,7 @@ def fuse(
     """
     ids = own.gaussians.ids
     ordered = {n: _in_order_of(ids, e) if n == own.robot else e for n, e in evidence.items()}
-    team = _Team.of(own.robot, ordered, pairs, context)
+    team = _TeamEvidence.of(own.robot, ordered, pairs, context)
     matched = _fuse_tracks(team, pairs, _in_order_of(ids, self_information), context)
     absorbed = matched.absorbed.copy()
     for name, against in (contradicted or {}).items():
@@ -203,7 +205,9 @@ def fuse(
     return _fused_map(team, matched, moved, added)
 
 
-def _fuse_tracks(team: _Team, pairs: Pairs, self_information: Evidence, context: MapContext) -> _Tracks:
+def _fuse_tracks(
+    team: _TeamEvidence, pairs: Pairs, self_information: Evidence, context: MapContext
+) -> _Tracks:
     """Fuse all tracks; the receiver's row stands for a track, else that of the robot of the lowest name."""
     rows, me = team.rows, team.names.index(team.robot)
     found = tracks(team.evidence, pairs, context.matching)
@@ -233,7 +237,7 @@ def _fuse_tracks(team: _Team, pairs: Pairs, self_information: Evidence, context:
     return _Tracks(move, members, sums, absorbed)
 
 
-def _fused_map(team: _Team, matched: _Tracks, own_world: Gaussians, added: Index) -> FusedMap:
+def _fused_map(team: _TeamEvidence, matched: _Tracks, own_world: Gaussians, added: Index) -> FusedMap:
     """The receiver's Gaussians as moved, then the imported ones, in the receiver's colors."""
     rows, own_rows, robot = team.rows, team.own_rows, team.robot
     common = team.cameras.to_common(robot)

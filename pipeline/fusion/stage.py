@@ -155,7 +155,7 @@ def _fuse(own: RobotData, result: SessionResult, views: Sequence[PosedRgbd], con
         color_sigma=own.information.color_sigma,
         pixels_per_sample=own.information.color_pixels_per_sample,
     )
-    return _Fusion(fused, _finetuned(own, result, fused, valid, views, context), valid.checks)
+    return _Fusion(fused, _finetuned(own, result, fused, valid, views=views, context=context), valid.checks)
 
 
 def _finetuned(
@@ -163,6 +163,7 @@ def _finetuned(
     result: SessionResult,
     fused: FusedMap,
     valid: ValidatedPeers,
+    *,
     views: Sequence[PosedRgbd],
     context: MapContext,
 ) -> Gaussians | None:

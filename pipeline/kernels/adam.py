@@ -38,8 +38,9 @@ class CompiledAdam(Adam):
         )
         step_lengths = np.array([getattr(rates, name) for name in names], np.float32)
         touched_by = (gradients.colors, gradients.opacity_logits)
-        counts = (self._steps, self._corrections)
-        _raster.adam(self.isa, *arrays, step_lengths, _CONSTANTS, *touched_by, *counts, self.threads)
+        state = (self._steps, self._corrections)
+        arguments = (*arrays, step_lengths, _CONSTANTS, *touched_by, *state, self.threads)
+        _raster.adam(self.isa, *arguments)
         return gaussians.replace(**dict(zip(names, out, strict=True)))
 
 

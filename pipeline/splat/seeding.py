@@ -28,11 +28,17 @@ def unexplained(
     color: Image,
     depth_m: Image,
     config: SeedingConfig,
+    *,
     depth_sigma_m: Image | None = None,
 ) -> NDArray[np.bool_]:
     """Measured pixels [H, W] whose opacity, depth or color the rendered map does not explain.
 
-    depth_sigma_m: where known, depth within three of these is explained.
+    Args:
+        render: of the map.
+        color: of the image, RGB 0..1 [H, W, 3].
+        depth_m: of the image, meters [H, W], 0 where nothing was measured.
+        config: thresholds.
+        depth_sigma_m: [H, W], standard deviation of the depth; depth within three of these is explained.
     """
     from scipy.ndimage import uniform_filter
 
@@ -47,9 +53,17 @@ def unexplained(
 
 
 def worst_drawn(
-    render: Rendered, color: Image, depth_m: Image, count: int, config: SeedingConfig
+    render: Rendered, color: Image, depth_m: Image, *, count: int, config: SeedingConfig
 ) -> NDArray[np.bool_]:
-    """Pixels [H, W] of the `count` finest cells with the largest squared color error, of those measured throughout."""
+    """Pixels [H, W] of the finest cells with the largest squared color error, of those measured throughout.
+
+    Args:
+        render: of the map.
+        color: of the image, RGB 0..1 [H, W, 3].
+        depth_m: of the image, meters [H, W], 0 where nothing was measured.
+        count: of the cells.
+        config: size of the cells.
+    """
     side = config.cell_sizes_px[-1]
     h, w = (length // side for length in depth_m.shape)
 
@@ -87,6 +101,7 @@ def seed_discs(
     depth_m: Image,
     wanted: NDArray[np.bool_],
     camera: PinholeCamera,
+    *,
     T_map_camera: NDArray[np.float64],
     budget: int,
     first_id: int,
@@ -96,14 +111,18 @@ def seed_discs(
     """At most `budget` discs for the wanted pixels, in the map frame.
 
     Args:
-        color, depth_m: the image, RGB 0..1 [H, W, 3] and meters [H, W].
+        color: of the image, RGB 0..1 [H, W, 3].
+        depth_m: of the image, meters [H, W].
         wanted: pixels [H, W] to be explained.
+        camera: of the image.
         T_map_camera: pose of the camera.
+        budget: most discs.
         first_id: ids count up from here, in the order of the cells (coarse to fine, row by row).
-        anchor: keyframe index the Gaussians hang on.
+        anchor: index of the keyframe that the Gaussians are anchored to.
+        config: sizes of cells and discs.
     """
     depth_m = np.where((depth_m >= config.min_depth_m) & (depth_m <= config.max_depth_m), depth_m, 0)
-    cells = quadtree(color, depth_m, wanted & (depth_m > 0), budget, config)
+    cells = quadtree(color, depth_m, wanted & (depth_m > 0), budget=budget, config=config)
     normals = surface_normals(depth_m, cells, camera)
     rays = np.stack(
         [
@@ -134,7 +153,7 @@ def seed_discs(
 
 
 def quadtree(
-    color: Image, depth_m: Image, wanted: NDArray[np.bool_], budget: int, config: SeedingConfig
+    color: Image, depth_m: Image, wanted: NDArray[np.bool_], *, budget: int, config: SeedingConfig
 ) -> Cells:
     """Leaves that hold wanted pixels, at most `budget` of them.
 

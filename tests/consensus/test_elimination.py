@@ -57,7 +57,7 @@ def test_fronts_take_the_step_of_the_whole_graph(tree, damping):
         shared[a] = shared_variables(known, subtree[a])
         fronts[a] = Front(variables, {c: shared[c] for c in children}, shared[a])
         gradient, jacobians = least_squares.gradient(own, np.ones(len(own)), T[poses])
-        H_own = damped(own, jacobians, len(poses), damping, 0 if a == 0 else None)
+        H_own = damped(own, jacobians, len(poses), damping=damping, anchor=0 if a == 0 else None)
         H[a] = fronts[a].factorize(H_own, {c: H[c] for c in children})
         g[a] = fronts[a].eliminate(gradient, {c: g[c] for c in children})
     assert shared[0] == []
@@ -75,7 +75,7 @@ def test_fronts_take_the_step_of_the_whole_graph(tree, damping):
             if v[0] < a:
                 np.testing.assert_allclose(step, steps[v[1]], rtol=1e-9, atol=1e-12)
     whole_gradient, jacobians = least_squares.gradient(factors, np.ones(len(factors)), T)
-    whole = damped(factors, jacobians, len(T), damping, 0).toarray()
+    whole = damped(factors, jacobians, len(T), damping=damping, anchor=0).toarray()
     expected = -np.linalg.solve(whole, whole_gradient.ravel()).reshape(-1, 6)
     expected -= expected[0]  # both hold pose 0, one with a stiffer spring
     np.testing.assert_allclose(steps[1:] - steps[0], expected[1:], rtol=1e-6, atol=1e-8)

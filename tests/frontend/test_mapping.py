@@ -7,13 +7,13 @@ import pytest
 
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import DepthKind, MapLossConfig, SurfaceLossConfig
+from duagc.pipeline.evaluation.image_metrics import depth_error, psnr
 from duagc.pipeline.frontend.mapping import Mapper, MappingStats
 from duagc.pipeline.frontend.mapping_views import overlap
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.losses import depth_error, psnr
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 31.5, 23.5)
 PLANES = (

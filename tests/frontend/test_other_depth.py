@@ -17,13 +17,13 @@ from duagc.converters.simulate.team import camera_of
 from duagc.converters.simulate.trajectories import loops
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.evaluation.image_metrics import depth_error
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.trajectory import align
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.recording import RgbdLog, read_log
-from duagc.pipeline.splat.losses import depth_error
 
 CAMERA = camera_of((240, 180))
 FRAMES = 20

@@ -10,6 +10,7 @@ from duagc.pipeline.config.fusion import FusionConfig, RefineConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.evaluation.image_metrics import psnr
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.finetune import finetune_map, num_steps
 from duagc.pipeline.fusion.peer_views import peer_views
@@ -18,7 +19,6 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
-from duagc.pipeline.splat.losses import psnr
 
 CAMERA = PinholeCamera(64, 48, 55.0, 55.0, 31.5, 23.5)
 ALL = np.ones(400, bool)

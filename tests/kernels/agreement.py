@@ -163,7 +163,7 @@ def loss_outputs(
     cotangents: tuple[Any, ...] = ()
     if floors:
         render = rasterizer.forward(*view, scene.background, **options)
-        wanted = rgbd_loss(render, color, depth_m, LOSS, EXPOSURE, options["mask"])
+        wanted = rgbd_loss(render, color, depth_m, LOSS, exposure=EXPOSURE, mask=options["mask"])
         cotangents = wanted.d_color, wanted.d_depth, wanted.d_alpha
     out: Outputs = {"loss": (np.array([loss.value, loss.color, loss.depth]), IMAGE_BAR, 0.0)}
     out["loss by exposure"] = (np.array(loss.d_exposure), GRADIENT_BAR, ROUNDING)  # means of slopes up to 1

@@ -442,7 +442,7 @@ def test_view_gradients_are_forward_loss_and_backward(rasterizer, scene, exposur
         pose=True,
     )
     render = draw(rasterizer, scene, depth_kind=depth, mask=mask)
-    wanted = rgbd_loss(render, color, depth_m, LOSS, exposure, mask)
+    wanted = rgbd_loss(render, color, depth_m, LOSS, exposure=exposure, mask=mask)
     rtol = 1e-12 if isinstance(rasterizer, ReferenceRasterizer) else 2e-6
     np.testing.assert_allclose(
         [loss.value, loss.color, loss.depth], [wanted.value, wanted.color, wanted.depth], rtol=rtol
@@ -458,7 +458,7 @@ def test_view_gradients_are_forward_loss_and_backward(rasterizer, scene, exposur
     for _ in range(5):
         half_ulp = 2.0**-24 * rng.choice([-1.0, 1.0], render.depth.shape)
         moved = dataclasses.replace(render, depth=render.depth * (1 + half_ulp))
-        other = backward_of(rasterizer, rgbd_loss(moved, color, depth_m, LOSS, exposure, mask))
+        other = backward_of(rasterizer, rgbd_loss(moved, color, depth_m, LOSS, exposure=exposure, mask=mask))
         for name in drift:
             if getattr(separate, name) is not None:
                 change = np.linalg.norm(getattr(other, name) - getattr(separate, name))

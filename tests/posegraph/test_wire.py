@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from duagc.pipeline.consensus.elimination import Block, Step
+from duagc.pipeline.consensus.elimination import BackSubstitution, Block
 from duagc.pipeline.exchange.wire import elimination_wire, loop_closing_wire, state_wire
 from duagc.pipeline.exchange.wire.loop_closing_wire import NamedKeyframes
 from duagc.pipeline.exchange.wire.state_wire import State
@@ -61,7 +61,9 @@ def test_blocks_and_steps_come_back_and_zeros_cost_nothing(precision):
     short = elimination_wire.write_block(10, same, precision)
     assert len(short) < 400
     assert elimination_wire.read_block(short, n)[1].H is None
-    step = Step(4, accepted=True, finished=False, fresh=True, damping=1e-3, delta=rng.normal(size=(3, 6)))
+    step = BackSubstitution(
+        4, accepted=True, finished=False, fresh=True, damping=1e-3, delta=rng.normal(size=(3, 6))
+    )
     back = elimination_wire.read_step(elimination_wire.write_step(step), 3)
     np.testing.assert_array_equal(back.delta, step.delta)
     assert (back.exchange, back.accepted, back.finished, back.fresh, back.damping) == (
@@ -77,7 +79,9 @@ def test_what_is_cut_short_or_does_not_fit_is_refused():
     rng = np.random.default_rng(5)
     named = NamedKeyframes(np.array([1, 5], np.int32), poses(rng, 2), np.zeros((2, 2)))
     block = Block(np.eye(12), np.zeros(12), 1.0, 0.0, reweighted=False, unsure=False)
-    step = Step(0, accepted=True, finished=False, fresh=False, damping=0.0, delta=np.zeros((2, 6)))
+    step = BackSubstitution(
+        0, accepted=True, finished=False, fresh=False, damping=0.0, delta=np.zeros((2, 6))
+    )
     messages = [
         (
             loop_closing_wire.write_keyframes(named, "float32"),

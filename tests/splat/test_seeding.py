@@ -29,7 +29,17 @@ def stripes() -> np.ndarray:
 
 def seeded(depth: np.ndarray, color: np.ndarray, budget: int = 10_000, **config: float) -> Gaussians:
     wanted = depth > 0
-    return seed_discs(color, depth, wanted, CAMERA, T_MAP_CAMERA, budget, 100, 3, SeedingConfig(**config))
+    return seed_discs(
+        color,
+        depth,
+        wanted,
+        CAMERA,
+        T_map_camera=T_MAP_CAMERA,
+        budget=budget,
+        first_id=100,
+        anchor=3,
+        config=SeedingConfig(**config),
+    )
 
 
 @pytest.mark.parametrize("normal", [(0.0, 0.0, -1.0), (0.6, 0.0, -1.0), (-0.3, 0.7, -1.0)])

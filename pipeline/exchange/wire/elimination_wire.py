@@ -9,7 +9,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.consensus.elimination import Block, Step, Variable
+from duagc.pipeline.consensus.elimination import BackSubstitution, Block, Variable
 from duagc.pipeline.consensus.tree import Message, TreeNode
 from duagc.pipeline.exchange.wire.state_wire import MAX_TEAM, Reader, array_bytes
 from duagc.pipeline.network.packets import MalformedError
@@ -27,7 +27,7 @@ class Code(IntEnum):
 
 def write_message(message: Message, precision: str) -> bytes:
     """Bytes of a message; precision: of matrices."""
-    if isinstance(message, Step):
+    if isinstance(message, BackSubstitution):
         return write_step(message)
     if isinstance(message, tuple):
         return write_block(*message, precision)
@@ -155,14 +155,14 @@ def _read_matrix(reader: Reader, n: int, precision: str) -> Array:
     return np.ascontiguousarray(parts.transpose(0, 2, 1, 3)).reshape(6 * n, 6 * n)
 
 
-def write_step(step: Step) -> bytes:
+def write_step(step: BackSubstitution) -> bytes:
     """Bytes of STEP: 48 per shared variable."""
     flags = _ACCEPTED * step.accepted + _FINISHED * step.finished + _FRESH * step.fresh
     head = _STEP.pack(Code.STEP, step.exchange, flags, step.damping, len(step.delta))
     return head + array_bytes(step.delta, "float64")
 
 
-def read_step(data: bytes, variables: int) -> Step:
+def read_step(data: bytes, variables: int) -> BackSubstitution:
     """From STEP over so many variables; without steps if it was not accepted."""
     reader = Reader(data, "step")
     _, exchange, flags, damping, n = reader.fields(_STEP)
@@ -171,7 +171,7 @@ def read_step(data: bytes, variables: int) -> Step:
     accepted = bool(flags & _ACCEPTED)
     if flags >= 2 * _FRESH or n != accepted * variables or not damping >= 0:
         raise MalformedError(f"step: over {n} variables, expected {variables}; or impossible numbers")
-    return Step(exchange, accepted, bool(flags & _FINISHED), bool(flags & _FRESH), damping, delta)
+    return BackSubstitution(exchange, accepted, bool(flags & _FINISHED), bool(flags & _FRESH), damping, delta)
 
 
 assert MAX_TEAM <= 64  # masks of robots are 64 bits
