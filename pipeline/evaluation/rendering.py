@@ -223,15 +223,15 @@ class RenderTask:
 
 def _views(
     log: RgbdLog, indices: list[int], exact: Mapping[int, Any] | Absent, recorded_is_exact: bool
-) -> Iterator[views.View]:
+) -> Iterator[views.ScoredFrame]:
     for index in indices:
         frame = log.frame(index)
         if recorded_is_exact:
-            yield views.View(frame, frame.depth)
+            yield views.ScoredFrame(frame, frame.depth)
         elif isinstance(exact, Absent):
-            yield views.View(frame, exact)
+            yield views.ScoredFrame(frame, exact)
         else:
-            yield views.View(frame, exact.get(frame.stamp_ns, Absent("the frame has no exact depth")))
+            yield views.ScoredFrame(frame, exact.get(frame.stamp_ns, Absent("the frame has no exact depth")))
 
 
 def poses_by_stamp(trajectory: Trajectory) -> dict[int, NDArray[np.float64]]:

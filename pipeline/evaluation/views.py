@@ -115,8 +115,13 @@ def _depth(render: Render, reference_m: NDArray[np.float32], name: str) -> tuple
 
 
 @dataclass(frozen=True)
-class View:
-    """A frame to be rendered: its image and depth, and the exact depth or why there is none."""
+class ScoredFrame:
+    """A frame that maps are rendered at and compared with.
+
+    Attributes:
+        frame: its image and depth.
+        exact_depth_m: [h, w] in meters, or Absent with the reason.
+    """
 
     frame: RgbdFrame
     exact_depth_m: Any
@@ -125,7 +130,7 @@ class View:
 def score_maps(
     maps: Mapping[str, tuple[Gaussians, Mapping[int, NDArray[np.float64]]]],
     camera: PinholeCamera,
-    views: Iterable[View],
+    views: Iterable[ScoredFrame],
     threads: int,
     depth: DepthKind = "blended",
     compared: Sequence[str] = (),
@@ -146,7 +151,7 @@ def score_maps(
 
     own = local()
 
-    def score(view: View) -> tuple[int, dict[str, ViewScore | Absent]]:
+    def score(view: ScoredFrame) -> tuple[int, dict[str, ViewScore | Absent]]:
         if not hasattr(own, "rasterizer"):
             own.rasterizer = Rasterizer(threads=1)
         frame, drawn = view.frame, {}
@@ -172,7 +177,7 @@ def score_maps(
         return frame.index, scores
 
     with ThreadPoolExecutor(threads) as pool:
-        batch: list[View] = []
+        batch: list[ScoredFrame] = []
         for view in views:  # frames are read by this thread only, a few at a time
             batch.append(view)
             if len(batch) == 4 * threads:
