@@ -35,7 +35,7 @@ class PoseConsensusConfig(Config):
     """The decentralized solver of the team's keyframe poses."""
 
     relaxation: float = Field(default=0.9, gt=0.0, lt=1.0)
-    """Share of the way that an edge variable goes to what arrived (0.5 is the textbook's, slower)."""
+    """Share by which an edge variable moves to an arrived value (0.5 is the textbook's, slower)."""
     penalty_start: float = Field(default=0.3, gt=0.0)
     """First penalty, as a multiple of the metric (the information of the pair's closures)."""
     penalty_min: float = Field(default=0.015, gt=0.0)
@@ -53,7 +53,7 @@ class PoseConsensusConfig(Config):
     step_limit_rad: float = Field(default=0.3, gt=0.0)
     """A step that turns some keyframe more than this is shortened; nonlinearity makes longer ones worthless."""
     tolerance: float = Field(default=2e-6, gt=0.0)
-    """An end is settled when its steps and edge variables change less than this (m, rad)."""
+    """An end has converged when its steps and edge variables change less than this (m, rad)."""
     wire: Literal["fixed", "float32", "float64"] = "fixed"
     """Poses in a packet: rotations in float32 and translations in steps of 7.5 nm, wherever the world has its origin;
     all in float32, which is 15 um a kilometer from there; or not rounded at all."""
@@ -64,8 +64,8 @@ class PoseConsensusConfig(Config):
     robust_warm_up: int = Field(default=40, ge=0)
     """Packets received with the start weights before the graduated weights begin (fewer if the link is steady)."""
     robust_skip: bool = True
-    """A link on which nothing is in doubt after the warm-up skips the graduated weights. That saves rounds; in a larger
-    team a false closure may fit until others' weights have changed."""
+    """A link without ambiguous loop closures after the warm-up skips the graduated weights. That saves rounds; in a
+    larger team a false loop closure may fit until others' weights have changed."""
     robust_packets: int = Field(default=5, ge=1)
     """Most packets received per step of the graduated weights; a link that is steady takes two."""
     robust_growth: float = Field(default=1.4, gt=1.0)

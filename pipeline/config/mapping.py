@@ -8,7 +8,7 @@ from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.training import DepthKind, LearningRates, MapLossConfig
 
 THICKNESS_FLOOR_M = 1e-3
-"""Thickness below which no splat is told from a plane: log-scales stop here, and carry no information there."""
+"""Thickness below which no splat differs from a plane: log-scales stop here, and have no information there."""
 
 
 class SeedingConfig(Config):
@@ -51,7 +51,7 @@ class MappingConfig(Config):
     candidates: int = 24
     """Most older keyframes, by the places they look at, whose overlap with a new one is computed."""
     random_keyframes: int = 2
-    """Older keyframes added to the window by lot, against forgetting."""
+    """Older keyframes added to the window at random, against forgetting."""
     iterations: int = 24
     """Optimization steps (one view each) at a keyframe; every second one is on the newest keyframe."""
     iterations_level: int = 0
@@ -74,7 +74,7 @@ class MappingConfig(Config):
     """Depth of a Gaussian at a pixel: that of its center (`blended`), or of its disc along the ray (`ray_plane`).
     `auto`: `ray_plane` where the measured noise of the depth images is below `exact_depth_m`."""
     exact_depth_m: float = Field(default=0.002, ge=0.0)
-    """Depth that agrees this well from frame to frame tells the surface of every single Gaussian."""
+    """Depth that agrees this well from frame to frame determines the surface of every single Gaussian."""
     loss: MapLossConfig = MapLossConfig()
     seeding: SeedingConfig = SeedingConfig()
     min_opacity: float = 0.03
@@ -94,7 +94,7 @@ class MappingConfig(Config):
     exposure_rate: float = 2e-3
 
     def depth_kind(self, depth_noise_m: float | None) -> DepthKind:
-        """How the Gaussians' depth is drawn; depth_noise_m: of the depth images, None: nobody knows."""
+        """How the Gaussians' depth is drawn; depth_noise_m: of the depth images, None: unknown."""
         if self.depth != "auto":
             return self.depth
         return "ray_plane" if depth_noise_m is not None and depth_noise_m < self.exact_depth_m else "blended"

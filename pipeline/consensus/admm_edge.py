@@ -20,16 +20,17 @@ STEP_M = 2.0**-27
 BLOCK = [0, 0, 0, 1, 1, 1]
 """Translation, rotation -> the six rows of a tangent."""
 REMEMBERED = 8
-"""Arrivals that must have changed little before an end holds still."""
+"""Arrivals that must have changed little before an end has converged."""
 
 
 @dataclass(frozen=True)
 class SharedKeyframes:
-    """Set-up message of a link, from the end that holds the closures to the end that owns the keyframes.
+    """Set-up message of a link, from the end that holds the loop closures to the end that owns the keyframes.
 
-    keyframes: int32 [s], indices of the receiver's keyframes, ascending. metric: float32 [s, 6], diagonal of the
-    information (translation, rotation) that the pair's closures have about each, isotropic per block, so that it
-    holds in every frame; both ends must use the same numbers.
+    Attributes:
+        keyframes: int32 [s], indices of the receiver's keyframes, ascending.
+        metric: float32 [s, 6], diagonal of the information (translation, rotation) that the pair's loop closures have
+            on each, isotropic per block, so that it is the same in every frame; both ends must use the same numbers.
     """
 
     keyframes: NDArray[np.int32]
@@ -40,11 +41,15 @@ class SharedKeyframes:
 class PosePacket:
     """One direction of one link in one round. It may be cut by keyframe; every part is useful alone.
 
-    sequence: counts the sender's packets on this link. version: of the penalties. keyframes: int32 [s], indices of
-    the non-holder's keyframes. quats_wxyz [s, 4], translations [s, 3] (m): 2 x - y in the sender's world frame; both
-    float32, both float64, or translations alone float64: multiples of STEP_M.
-    penalties: float32 [2] (translation, rotation) of this version. curvature: float32 [2] or None, the stiffness that
-    the sender met in this version. converged: the sender is settled.
+    Attributes:
+        sequence: counts the sender's packets on this link.
+        version: of the penalties.
+        keyframes: int32 [s], indices of the non-holder's keyframes.
+        quats_wxyz: [s, 4], of 2 x - y in the sender's world frame; float32 or float64.
+        translations: [s, 3], of the same, meters; float32, or float64 in multiples of STEP_M.
+        penalties: float32 [2] (translation, rotation) of this version.
+        curvature: float32 [2] or None, the curvature that the sender measured in this version.
+        converged: the sender has converged.
     """
 
     sequence: int
@@ -68,13 +73,13 @@ class PosePacket:
 
 @dataclass
 class AdmmEdge:
-    """One end of a link. Arrays over its s shared keyframes, which belong to the end that holds no closures."""
+    """One end of a link. Arrays over its s shared keyframes, which belong to the end that holds no loop closures."""
 
     peer: str
     decides: bool
     keyframes: NDArray[np.int32]
     metric: Array
-    slots: NDArray[np.int64]  # [s] where the shared keyframes stand among this robot's variables
+    slots: NDArray[np.int64]  # [s] index of the shared keyframes among this robot's variables
     closures: tuple[LoopClosure, ...]  # held ones; none at the other end
     factors: RelativePoses  # the same, between this robot's variables
     robust: RobustWeights  # of the same
@@ -99,7 +104,7 @@ class AdmmEdge:
 
     @property
     def holds(self) -> bool:
-        """Whether this end has the closures of the pair."""
+        """Whether this end has the loop closures of the pair."""
         return bool(self.closures)
 
     def penalty(self) -> Array:
@@ -121,14 +126,19 @@ class AdmmEdge:
     def largest_recent_change(self) -> float:
         """The same over the last arrivals; infinite before there were so many.
 
-        A neighbor that has not heard since says nearly the same again: the less arrives, the less a single small
-        change means.
+        A neighbor that has received nothing since repeats nearly the same values: the less arrives, the less a single
+        small change means.
         """
         return float(self.changes.max())
 
 
 def rounded(T: Array, wire: str) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Poses [s, 4, 4] as they stand in a packet: quats_wxyz [s, 4] and translations [s, 3], see `PosePacket`."""
+    """Poses [s, 4, 4] as they are sent in a packet: quats_wxyz [s, 4] and translations [s, 3], see `PosePacket`.
+
+    Args:
+        T: poses.
+        wire: as `PoseConsensusConfig.wire`.
+    """
     quats_wxyz, translations = so3.to_quat_wxyz(T[:, :3, :3]), T[:, :3, 3]
     if wire == "fixed":
         return quats_wxyz.astype(np.float32), np.asarray(np.rint(translations / STEP_M) * STEP_M)
@@ -138,7 +148,15 @@ def rounded(T: Array, wire: str) -> tuple[NDArray[Any], NDArray[Any]]:
 def link_metric(
     closures: Sequence[LoopClosure], keyframes: NDArray[np.int64], config: LoopClosureConfig
 ) -> NDArray[np.float32]:
-    """Information [s, 6] of the closures about each copied keyframe, averaged over directions per block."""
+    """Information [s, 6] of the loop closures on each copied keyframe, averaged over directions per block.
+
+    Args:
+        closures: of one pair of robots.
+        keyframes: [s], indices of the copied keyframes, ascending.
+        config: floors of the covariances.
+    Raises:
+        ValueError: a loop closure without information.
+    """
     position = np.searchsorted(keyframes, [c.peer_keyframe for c in closures])
     information = closures_as_relative_poses(closures, np.zeros(len(closures)), position, config).information
     blocks = np.diagonal(information, axis1=-2, axis2=-1).reshape(-1, 2, 3).mean(axis=-1)

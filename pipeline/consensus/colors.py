@@ -1,14 +1,14 @@
 """How the cameras of a team see the same colors, from matched Gaussians alone.
 
 Every robot keeps the colors of its own camera; there is no right one. Per channel, a camera shows the color s of a
-surface as c = (s - b) / a: gain (exposure, white balance) and offset. Of every pair of robots their matched Gaussians
-tell the ratio of the gains and the colors that correspond; over the team these make one linear problem. Everybody who
-holds the same evidence and pair lists solves the same problem, so nothing more is sent, and what a robot reads from a
-neighbor it puts into its own colors (`ColorMap`).
+surface as c = (s - b) / a: gain (exposure, white balance) and offset. The matched Gaussians of every pair of robots
+give the ratio of the gains and the colors that correspond; over the team these make one linear problem. All robots with
+the same evidence and pair lists solve the same problem, so nothing more is sent, and a robot converts what it received
+from a peer to its own colors (`ColorMap`).
 
 Two robots' splats of one place differ in color by noise in both, so a regression of one on the other would find a gain
 below one between equal cameras. The gain here is the ratio of the spreads (reduced major axis), which is the same
-whoever is asked; exact if noise grows with the gain. It lies between the two regressions, ratio * r and ratio / r with
+for both robots; exact if noise grows with the gain. It lies between the two regressions, ratio * r and ratio / r with
 r the correlation, and counts as spread evenly between them (Frisch 1934): that is most of its standard deviation.
 """
 
@@ -35,10 +35,14 @@ _LEAST_CORRELATION = 0.05
 
 @dataclass(frozen=True)
 class ColorMap:
-    """How one camera's colors c look to another: gain * c + offset, by channel [3]; their standard deviations.
+    """How another camera shows one camera's colors c: gain * c + offset; the identity where nothing was compared.
 
-    sigma_gain: relative. sigma_offset: of the other camera's color in the middle of the colors that were compared.
-    matches: pairs of Gaussians behind it, of these two robots. Where nothing was compared it is the identity.
+    Attributes:
+        gain: [3], by channel.
+        offset: [3], colors 0..1.
+        sigma_gain: [3], relative standard deviation.
+        sigma_offset: [3], standard deviation of the other camera's color in the middle of the compared colors.
+        matches: pairs of Gaussians of these two robots that were compared.
     """
 
     gain: Array
@@ -57,7 +61,7 @@ class ColorMap:
         return np.asarray(self.gain * colors + self.offset, dtype=np.float64)
 
     def from_other(self, colors: NDArray[np.floating]) -> Array:
-        """The way back: colors [n, 3] of the other camera as this one shows them."""
+        """Colors [n, 3] of the other camera as this one shows them."""
         return np.asarray((colors - self.offset) / self.gain, dtype=np.float64)
 
     def of(self, evidence: Evidence) -> Evidence:
@@ -72,10 +76,18 @@ class ColorMap:
 
 @dataclass(frozen=True)
 class TeamColors:
-    """Every robot's way from its own colors c to common ones, scale * c + shift, by name, [3] each.
+    """Every robot's map from its own colors c to common ones: scale * c + shift.
 
-    The common colors have no meaning but that everybody computes the same: those in which nobody's gain and offset
-    is far from one and zero. Covariances [r, r, 3] between robots, in order of name, of log scale and of shift.
+    The common colors only serve that all robots compute the same: in them no robot's gain and offset is far from one
+    and zero.
+
+    Attributes:
+        robots: names, sorted.
+        scale: [3] by name.
+        shift: [3] by name.
+        covariance_scale: [r, r, 3], between robots, of the log scale.
+        covariance_shift: [r, r, 3], between robots, of the shift.
+        matches: by pair of robots, compared pairs of Gaussians.
     """
 
     robots: tuple[str, ...]
@@ -125,8 +137,10 @@ def team_colors(evidence: Mapping[str, Evidence], pairs: Pairs, config: ColorCon
     """How the cameras of a team differ.
 
     Args:
-        evidence: of every robot. pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians; those that
-            `evidence` lacks, or whose colors one of the two knows nothing of, are left out.
+        evidence: of every robot.
+        pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians; those that `evidence` lacks, or of whose
+            colors one of the two has no information, are left out.
+        config: limits and priors.
     """
     robots = tuple(sorted(evidence))
     matches: dict[tuple[str, str], int] = {}

@@ -2,7 +2,7 @@
 
 Every robot has its own keyframes and copies of neighbors' keyframes, as in edge-ADMM: a *variable* is named
 (owner, keyframe), and several robots may have it. Each robot linearizes its own factors. From the leaves to the root,
-a robot adds what its children sent, eliminates every variable that nobody outside its subtree has, and sends the rest
+a robot adds what its children sent, eliminates every variable that no robot outside its subtree has, and sends the rest
 up: a dense quadratic form over the variables that its subtree shares with others. The root solves; the answer comes
 down, and every robot finds its eliminated variables from the shared ones. This is the multifrontal method with robots
 as fronts: the step is that of the centralized solver, up to rounding.
@@ -22,7 +22,7 @@ from duagc.pipeline.posegraph.relative_poses import RelativePoses
 
 Array = NDArray[np.float64]
 Variable = tuple[int, int]  # index of the owner in the team, its keyframe
-_FLOOR = 1e-12  # of the largest diagonal entry: keeps a matrix definite where nothing holds a variable
+_FLOOR = 1e-12  # of the largest diagonal entry: keeps a matrix definite where a variable has no factor
 _ANCHOR = 1e6  # of the largest diagonal entry, on the root's first keyframe; only fixes the gauge
 
 
@@ -30,9 +30,13 @@ _ANCHOR = 1e6  # of the largest diagonal entry, on the root's first keyframe; on
 class Block:
     """Quadratic form that is left of a subtree: 1/2 d' H d + g' d over its shared variables, H [6 b, 6 b], g [6 b].
 
-    H is None if it is that of the last block: nothing below was linearized anew.
-    cost: the subtree's |r|^2 at the linearization point. largest_step: largest component of its last step (m, rad).
-    reweighted: some weight below has changed since the last block. unsure: some weight below is not final.
+    Attributes:
+        H: [6 b, 6 b]; None if it is that of the last block: nothing below was linearized anew.
+        g: [6 b].
+        cost: the subtree's |r|^2 at the linearization point.
+        largest_step: largest component of its last step (m, rad).
+        reweighted: whether some weight below has changed since the last block.
+        unsure: whether some weight below is not final.
     """
 
     H: Array | None
@@ -47,9 +51,13 @@ class Block:
 class BackSubstitution:
     """The root's answer to the blocks of one exchange.
 
-    accepted: the last step lowered the cost; else everybody goes back to where it was before. finished: this is the
-    last message. fresh: everybody linearizes anew. damping: for the next blocks. delta: [s, 6], steps of the variables
-    shared with the parent.
+    Attributes:
+        exchange: number of the exchange.
+        accepted: whether the last step lowered the cost; else all robots return to their poses before it.
+        finished: whether this is the last message.
+        fresh: whether all robots linearize anew.
+        damping: for the next blocks.
+        delta: [s, 6], steps of the variables shared with the parent.
     """
 
     exchange: int
@@ -63,7 +71,7 @@ class BackSubstitution:
 class Front:
     """The variables of one robot's subtree, and one linear step over them.
 
-    `shared` are those that go up: in the order that the parent was told.
+    `shared` are those that go up, in the order in which they were sent to the parent.
     """
 
     def __init__(
@@ -72,7 +80,13 @@ class Front:
         children: Mapping[int, Sequence[Variable]],
         shared: Sequence[Variable],
     ) -> None:
-        """own: variables of the robot's own factors, copies included. children: by child, its shared variables."""
+        """Lay out the variables.
+
+        Args:
+            own: variables of the robot's own factors, copies included.
+            children: by child, its shared variables.
+            shared: variables that other robots outside the subtree have.
+        """
         everything = [*own, *(v for child in sorted(children) for v in children[child])]
         up = set(shared)
         eliminated = [v for v in dict.fromkeys(everything) if v not in up]
@@ -130,7 +144,11 @@ def damped(
     """Gauss-Newton matrix of a robot's own factors over its n variables, damped relative to its diagonal.
 
     Args:
-        anchor: own variable that is held, at the root: it only fixes the gauge.
+        factors: of the robot.
+        jacobians: of the factors.
+        n: number of variables.
+        damping: relative to the diagonal.
+        anchor: own variable that is held, at the root: it only fixes the gauge; None: none.
     """
     H = least_squares.curvature_matrix(factors, jacobians, np.zeros((n, 6)))
     scale = H.diagonal().reshape(-1, 6)
@@ -140,11 +158,11 @@ def damped(
     return (H + sparse.diags(diagonal.ravel())).tocsc()
 
 
-def shared_variables(everybody: Mapping[Variable, int], subtree: int) -> list[Variable]:
-    """Variables that somebody outside a subtree has, sorted.
+def shared_variables(owners: Mapping[Variable, int], subtree: int) -> list[Variable]:
+    """Variables that a robot outside a subtree has, sorted.
 
     Args:
-        everybody: variable -> bit mask of all robots that have it, as its owner says; 0 if the owner is not below.
+        owners: variable -> bit mask of all robots that have it, by its owner's account; 0 if the owner is not below.
         subtree: bit mask of the subtree's robots.
     """
-    return sorted(v for v, mask in everybody.items() if mask == 0 or mask & ~subtree)
+    return sorted(v for v, mask in owners.items() if mask == 0 or mask & ~subtree)

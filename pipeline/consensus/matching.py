@@ -6,11 +6,12 @@ The distance of two Gaussians in the flat chart is, with Delta the difference of
 
 with colors as degree-0 spherical-harmonic coefficients and l = delta, the search radius: (6) adds square meters to
 squares without a unit, which would make the position count for nothing within 5 cm (l = 1 m gives (6) as printed).
-How thin a Gaussian is says nothing where it is as thin as the mapper lets it be: against one that is thicker, that
+The thickness of a Gaussian has no meaning where it is at the mapper's floor: against one that is thicker, that
 component of log Sigma, e e' with e the axis, is left out; two at the floor are equally thin. Tilts stay in.
 
 Two cameras may see colors differently. So the Gaussians are first matched without their colors, which is enough to
-tell gain and offset (`consensus.colors`), and the other robot's colors are compared as the own camera would show them.
+estimate gain and offset (`consensus.colors`), and the other robot's colors are compared as the own camera would show
+them.
 """
 
 from __future__ import annotations
@@ -104,7 +105,7 @@ def gaussian_distance(a: Evidence, i: Index, b: Evidence, j: Index, *, config: M
 
 
 def threshold(own: Evidence, config: MatchingConfig) -> float:
-    """tau_G of a map: what its own neighbors differ by; 0 if no two are within the radius."""
+    """tau_G of a map: how much its own neighboring Gaussians differ; 0 if no two are within the radius."""
     if len(own) < 2:
         return 0.0
     means = own.theta[:, MEAN]
@@ -122,8 +123,9 @@ def match(own: Evidence, peer: Evidence, config: MatchingConfig) -> Index:
     """Matched Gaussians of two robots: within the radius, d_G below tau_G, and each the other's best.
 
     Args:
-        own: all evidence of the computing robot, in the world frame; tau_G is taken over it.
+        own: all evidence of the computing robot, in the world frame; gives tau_G.
         peer: evidence of the other robot, in the world frame, in its own camera's colors.
+        config: radius and scales of the distance.
     Returns:
         int64 [m, 2], ids of (own, peer), ascending; each id at most once.
     """
@@ -180,8 +182,13 @@ def _first_of_each(group: Index, d: Array, tie: Index) -> Index:
 class Tracks:
     """Groups of matched Gaussians over all robots, at most one of each robot in a group.
 
-    robots: names, sorted. track: int64 [r], ascending. robot: int64 [r], index into robots. row: int64 [r], row in
-    that robot's evidence. Rows of a track follow in order of robot.
+    Rows of a track follow in order of robot.
+
+    Attributes:
+        robots: names, sorted.
+        track: int64 [r], ascending.
+        robot: int64 [r], index into robots.
+        row: int64 [r], row in that robot's evidence.
     """
 
     robots: tuple[str, ...]
@@ -199,6 +206,7 @@ def tracks(evidence: Mapping[str, Evidence], pairs: Pairs, config: MatchingConfi
         evidence: of every robot, in the world frame.
         pairs: (robot a, robot b) -> ids int64 [m, 2]; pairs of Gaussians that `evidence` lacks are left out, which
             is what a robot does that has not received them.
+        config: scales of the distance.
     """
     robots = tuple(sorted(evidence))
     first = dict(zip(robots, np.cumsum([0, *(len(evidence[r]) for r in robots)]).tolist(), strict=False))

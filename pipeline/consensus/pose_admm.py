@@ -1,7 +1,7 @@
 """Pose consensus of one robot: relaxed edge-ADMM (Douglas-Rachford form) with per-pair adaptive penalties.
 
-Every closure between two robots is held by one of them, which keeps a *copy* of the other's keyframe beside its own
-poses. For every copied keyframe there is one edge variable y at each end of the link. Per round a robot
+Every loop closure between two robots is held by one of them, which keeps a *copy* of the other's keyframe in addition
+to its own poses. For every copied keyframe there is one edge variable y at each end of the link. Per round a robot
 
     1. takes one Gauss-Newton step on  f(x) + 1/2 sum over links |x - y|_W^2,   W = penalty * metric,
     2. sends                           m = 2 x - y,
@@ -23,7 +23,7 @@ receiver of the same version.
       once it has received enough in this version.
     * The decider, having received enough itself and holding a curvature of this version, takes new penalties, moves
       its y so that its force W d stays, and counts the version up.
-    * The follower takes over penalties and version from the first newer packet that reaches it, keeping its force
+    * The follower adopts penalties and version from the first newer packet that reaches it, keeping its force
       likewise, and then uses that packet.
 
 So the ends differ by at most one version (the decider cannot decide again before it has heard the follower in the new
@@ -56,13 +56,13 @@ from duagc.pipeline.posegraph.least_squares import difference, retract
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, closures_as_relative_poses
 
 Array = NDArray[np.float64]
-_STEADY = 1e-3  # m, rad: a link that moves less has left its start behind
+_STEADY = 1e-3  # m, rad: a link that moves less is past its initial transient
 
 
 class PoseAgent:
-    """One robot's side of the pose consensus: own keyframes, copies of the neighbors', and what packets brought.
+    """One robot's side of the pose consensus: own keyframes, copies of the neighbors', and the state of its links.
 
-    Robots have names that sort; the lower name of a pair decides on penalties. Nobody is held during the iteration;
+    Robots have names that sort; the lower name of a pair decides on penalties. The gauge is free during the iteration;
     results may be expressed in any frame afterward (`docs/explanation/pose-consensus.md`, gauge).
     """
 
@@ -83,7 +83,7 @@ class PoseAgent:
             T_map_keyframe: [n, 4, 4], keyframes in its own map; also the start of the iteration.
             odometry: factors between own keyframes (by index) that are trusted.
             config: the same at all robots.
-            loops: factors between own keyframes that get robust weights like closures do; default none.
+            loops: factors between own keyframes that get robust weights as loop closures do; default none.
             keep_loops: bool per loop, start of the robust weights (default: all).
         """
         self.robot, self.config = robot, config
@@ -126,11 +126,11 @@ class PoseAgent:
 
         Args:
             peer: the neighbor's name.
-            closures_held: all closures of the pair, if this end holds them.
+            closures_held: all loop closures of the pair, if this end holds them.
             shared: what the neighbor's `add_link` returned, if it holds them.
-            keep: bool per closure, start of the robust weights (default: all).
-            T_world_keyframe_peer: start of the copies by peer keyframe index, in this robot's idea of the world
-                frame; default: from the first kept closure that names it.
+            keep: bool per loop closure, start of the robust weights (default: all).
+            T_world_keyframe_peer: start of the copies by peer keyframe index, in this robot's estimate of the
+                world frame; default: from the first kept loop closure that names it.
         Returns:
             What the neighbor needs for its own `add_link` (with `shared`: the same again).
         """
@@ -228,7 +228,7 @@ class PoseAgent:
             diagonal = np.zeros_like(g)
             for link in self.links.values():
                 diagonal[link.slots] += link.penalty()
-            diagonal += 1e-9 * diagonal.max()  # a variable that nothing holds stays where it is
+            diagonal += 1e-9 * diagonal.max()  # a variable without any factor stays where it is
             H = least_squares.curvature_matrix(self._factors, jacobians, diagonal)
             self._solve, self._moved_rad = least_squares.factorized(H), 0.0
             self.factorizations += 1
@@ -267,7 +267,7 @@ class PoseAgent:
         )
 
     def receive(self, peer: str, packet: PosePacket) -> bool:
-        """Use a neighbor's packet; False if it was of another version or brought nothing newer."""
+        """Use a neighbor's packet; False if it was of another version or had nothing newer."""
         if not self._started:
             self._start()
         link = self.links[peer]
@@ -302,7 +302,7 @@ class PoseAgent:
     # ---- penalties ----
 
     def _curvature(self, link: AdmmEdge) -> Array | None:
-        """Stiffness [2] met on the way since the last change of penalties: |change of force| / |change of pose|.
+        """Curvature [2] measured since the last change of penalties: |change of force| / |change of pose|.
 
         In the metric, for translation and rotation apart; None before enough was received or if nothing moved.
         """
@@ -331,7 +331,7 @@ class PoseAgent:
         link.peer_curvature = None
 
     def _decide(self, link: AdmmEdge) -> None:
-        """At the lower end: take new penalties once both ends have met enough of the path in this version."""
+        """At the end of the lower name: new penalties once both ends have measured a curvature in this version."""
         if not link.decides:
             return
         own = self._curvature(link)
@@ -352,10 +352,10 @@ class PoseAgent:
         self._solve = None
         self._mark(link)
 
-    # ---- robust weights of held closures ----
+    # ---- robust weights of held loop closures ----
 
     def _weigh(self, link: AdmmEdge) -> None:
-        """Robust weights of a link's held closures, paced by what arrives on it."""
+        """Robust weights of a link's loop closures, paced by what arrives on it."""
 
         def squared() -> Array:
             return least_squares.squared_residuals(link.factors, self._x)
@@ -385,14 +385,14 @@ class PoseAgent:
                 link.adapting_from = link.received_total
 
     def _steady(self, link: AdmmEdge) -> bool:
-        """Whether a link has left its start behind."""
+        """Whether a link is past its initial transient."""
         return link.received_total >= self.config.penalty_period and link.largest_change() < _STEADY
 
     # ---- results ----
 
     @property
     def robust_done(self) -> bool:
-        """Whether the weights of all held closures and own loops are final."""
+        """Whether the weights of all held loop closures and own loops are final."""
         return self.loop_weights.done and all(link.robust.done for link in self.links.values())
 
     @property
@@ -402,13 +402,13 @@ class PoseAgent:
 
     @property
     def settled(self) -> bool:
-        """This end changes less than the tolerance, by the last arrivals too, and its weights are final."""
+        """Whether this end changes less than the tolerance, by the last arrivals too, and its weights are final."""
         recent = [link.largest_recent_change() for link in self.links.values()]
         return self.robust_done and max([self.step_change, *recent]) < self.config.tolerance
 
     @property
     def agreed(self) -> bool:
-        """This end and, by their last packets, all neighbors are settled."""
+        """Whether this end and, by their last packets, all neighbors have converged."""
         return self.settled and all(link.peer_converged for link in self.links.values())
 
     @property
@@ -421,20 +421,20 @@ class PoseAgent:
         return self._x[: len(self.T_map_keyframe)].copy()
 
     def weights(self, peer: str) -> Array:
-        """Weight [m] of every closure held with a neighbor, in the order given."""
+        """Weight [m] of every loop closure held with a neighbor, in the order given."""
         return self.links[peer].robust.weights.copy()
 
     def refuted(self, peer: str) -> bool:
-        """Whether the closures held with a neighbor join nobody any more: final weights, too few of which count.
+        """Whether the loop closures held with a neighbor no longer connect it: final weights, too few of them inliers.
 
-        It takes `closures.min_support` to join two robots, and as many to keep them joined.
+        It takes `closures.min_support` to connect two robots, and as many to keep them connected.
         """
         link = self.links[peer]
         kept = int(np.count_nonzero(link.robust.weights >= INLIER_WEIGHT))
         return link.holds and link.robust.done and kept < self.config.closures.min_support
 
     def residuals(self) -> dict[str, Any]:
-        """What a round looked like, for the record.
+        """Residuals and state of a round, for the record.
 
         primal: largest |2 x_peer - y_peer - y| over links, the disagreement (m, rad). dual: largest change of a force
         in the last step, over the root of the metric (no unit). cost: own factors, weighted. step: largest component
@@ -456,6 +456,6 @@ class PoseAgent:
 
 
 def with_floor(odometry: RelativePoses, config: PoseConsensusConfig) -> RelativePoses:
-    """Odometry as it counts in the objective: its covariance plus the floor of the settings."""
+    """Odometry as the objective uses it: its covariance plus the floor of the settings."""
     floor = np.repeat([config.odometry_floor_m**2, config.odometry_floor_rad**2], 3) * np.eye(6)
     return RelativePoses(odometry.i, odometry.j, odometry.T_i_j, add_covariance(odometry.information, floor))

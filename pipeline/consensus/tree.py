@@ -1,9 +1,9 @@
-"""One robot's node in the elimination along a tree of robots: what it makes of the messages of its neighbors there.
+"""One robot's node in the elimination along a tree of robots: how it answers the messages of its neighbors there.
 
 One exchange is a block up and a step down every link of the tree: a Gauss-Newton step of the whole team, damped after
 Levenberg and Marquardt where it would not lower the cost. A matrix is sent again only where rotations below moved (or
 weights or damping changed); gradients always. The root only adds and decides on the damping; it sees a quadratic form
-over shared keyframes, nobody's graph.
+over shared keyframes, no robot's graph.
 """
 
 from __future__ import annotations
@@ -37,7 +37,14 @@ _ROUNDING = 1e-10  # relative rise of the cost that is no rise
 
 @dataclass(frozen=True)
 class TreePlace:
-    """A robot's place: own index, parent (None: it is the root), children, and bit mask of all robots below."""
+    """A robot's place in the tree.
+
+    Attributes:
+        own: own index.
+        parent: index of the parent; None: it is the root.
+        children: indices.
+        subtree: bit mask of all robots below, itself included.
+    """
 
     own: int
     parent: int | None
@@ -58,19 +65,23 @@ class TreePlace:
 
 @dataclass(frozen=True)
 class TreeGraph:
-    """What one robot knows of the team's graph.
+    """The part of the team's graph that one robot has.
 
-    variables: own keyframes, then copies of neighbors' keyframes. poses: [v, 4, 4], where they start; a copy must
-    start where its owner starts, to the last bit but a few, because every step moves both alike. shared: variables
-    that others have too, with the mask of all robots that have them as far as their owner knows; 0 for copies.
-    trusted: factors of weight one. doubted: groups of factors with robust weights.
+    Attributes:
+        variables: own keyframes, then copies of neighbors' keyframes.
+        poses: [v, 4, 4], initial values; a copy must start where its owner starts, up to rounding, because every step
+            moves both alike.
+        shared: variables that others have too, with the mask of all robots that have them as far as their owner knows;
+            0 for copies.
+        trusted: factors of weight one.
+        robust: groups of factors with robust weights.
     """
 
     variables: Sequence[Variable]
     poses: Array
     shared: Mapping[Variable, int]
     trusted: RelativePoses
-    doubted: Sequence[tuple[RelativePoses, RobustWeights]]
+    robust: Sequence[tuple[RelativePoses, RobustWeights]]
 
 
 class TreeNode:
@@ -79,14 +90,21 @@ class TreeNode:
     def __init__(
         self, place: TreePlace, graph: TreeGraph, config: PoseConsensusConfig, tolerance: float
     ) -> None:
-        """tolerance: the steps end when nothing moves more than this (m, rad)."""
+        """Start at exchange 0.
+
+        Args:
+            place: in the tree.
+            graph: the robot's part of it.
+            config: the same at all robots.
+            tolerance: the steps end when nothing moves more than this (m, rad).
+        """
         self.place, self.graph, self.config, self.tolerance = place, graph, config, tolerance
         self.poses = self._before = np.array(graph.poses)
         self.exchange, self.finished = 0, False
         self.outbox: list[tuple[int, Message]] = []
         self.largest_step = 0.0
         self.factorizations = 0
-        self._factors = RelativePoses.concatenate([graph.trusted, *(factors for factors, _ in graph.doubted)])
+        self._factors = RelativePoses.concatenate([graph.trusted, *(factors for factors, _ in graph.robust)])
         self._front: Front | None = None
         self._fronts: dict[int, dict[Variable, int]] = {}
         self._blocks: dict[int, Block] = {}
@@ -98,11 +116,11 @@ class TreeNode:
 
     # --- messages
 
-    def take_front(self, child: int, everybody: dict[Variable, int]) -> None:
+    def take_front(self, child: int, owners: dict[Variable, int]) -> None:
         """A child's subtree shares these variables with others."""
         if child not in self.place.children or child in self._fronts:
-            raise ValueError("front: not from a child, or told before")
-        self._fronts[child] = everybody
+            raise ValueError("front: not from a child, or received before")
+        self._fronts[child] = owners
 
     def take_block(self, child: int, exchange: int, block: Block) -> None:
         """What is left of a child's subtree in this exchange."""
@@ -121,7 +139,7 @@ class TreeNode:
         self._descend(step)
 
     def waits_for_front(self, child: int) -> bool:
-        """Whether a child has not yet told what it shares."""
+        """Whether a child has not yet sent its shared variables."""
         return child in self.place.children and child not in self._fronts
 
     def variables_of(self, child: int) -> int:
@@ -133,13 +151,13 @@ class TreeNode:
     def variables_above(self) -> int:
         """How many variables a step of the parent is about."""
         if self._front is None:
-            raise ValueError("step: before all children have told what they share")
+            raise ValueError("step: before all children have sent their shared variables")
         return len(self._front.shared)
 
     # --- one exchange
 
     def advance(self) -> None:
-        """Lay out once all children have said what they share; send a block up once theirs are here."""
+        """Lay out once all children have sent their shared variables; send a block up once theirs are here."""
         if self._front is None and set(self._fronts) == set(self.place.children):
             self._lay_out()
         here = set(self._blocks) == set(self.place.children)
@@ -147,7 +165,7 @@ class TreeNode:
             self._reduce(self._front)
 
     def _lay_out(self) -> None:
-        """All children have said what they share: say the same to the parent."""
+        """All children have sent their shared variables: send the own ones to the parent."""
         known = dict(self.graph.shared)
         for child in self.place.children:
             for v, mask in self._fronts[child].items():
@@ -236,7 +254,7 @@ class TreeNode:
     def _weigh(self) -> bool:
         """Take the next robust weights; True if some changed."""
         received, changed = float(self.exchange * self.config.robust_packets), False
-        for factors, robust in self.graph.doubted:
+        for factors, robust in self.graph.robust:
 
             def squared(factors: RelativePoses = factors) -> Array:
                 return least_squares.squared_residuals(factors, self.poses)
@@ -245,13 +263,13 @@ class TreeNode:
         return changed
 
     def _weights(self) -> Array:
-        doubted = [robust.weights for _, robust in self.graph.doubted]
-        return np.concatenate([np.ones(len(self.graph.trusted)), *doubted])
+        graduated = [robust.weights for _, robust in self.graph.robust]
+        return np.concatenate([np.ones(len(self.graph.trusted)), *graduated])
 
     @property
     def robust_done(self) -> bool:
         """Whether the weights of all own factors are final."""
-        return all(robust.done for _, robust in self.graph.doubted)
+        return all(robust.done for _, robust in self.graph.robust)
 
     @property
     def cost(self) -> float:

@@ -1,4 +1,4 @@
-"""Information of matched Gaussians as blocks: what weighs a value of theta."""
+"""Information of matched Gaussians as blocks: the weights of values of theta."""
 
 from __future__ import annotations
 
@@ -16,7 +16,14 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Weights:
-    """Information of n values of theta: position [n, 3, 3], shape [n, 6, 6], color [n, 3], opacity [n]."""
+    """Information of n values of theta.
+
+    Attributes:
+        position: [n, 3, 3], 1/m^2.
+        shape: [n, 6, 6], over vec log Sigma.
+        color: [n, 3], the diagonal.
+        opacity: [n].
+    """
 
     position: Array
     shape: Array
@@ -25,7 +32,7 @@ class Weights:
 
     @staticmethod
     def of(evidence: Evidence) -> Weights:
-        """Weights of evidence, which must stand in the common frame."""
+        """Weights of evidence in the common frame."""
         return Weights(
             evidence.position_information(),
             evidence.shape_information(),
@@ -75,7 +82,7 @@ class Weights:
         )
 
     def inverse(self) -> Weights:
-        """W^+, zero in directions that nothing is known of."""
+        """W^+, zero in directions without information."""
         return Weights(
             _pseudo_inverse(self.position),
             _pseudo_inverse(self.shape),

@@ -27,12 +27,16 @@ _SHAPES: dict[str, tuple[type, tuple[int, ...]]] = {
 
 @dataclass(frozen=True)
 class Gaussians:
-    """n Gaussians with covariance R(q) diag(exp 2 s) R(q)^T, in one frame named by whoever holds them.
+    """n Gaussians with covariance R(q) diag(exp 2 s) R(q)^T, in one frame.
 
-    ids: int64 [n], unique within their owner and stable. anchors: int32 [n], index of the owner's keyframe they
-    hang on. means: float32 [n, 3], meters. quats_wxyz: float32 [n, 4], any non-zero length. log_scales: float32
-    [n, 3], log of meters. colors: float32 [n, 3], RGB as in the image, 0..1 (training may leave the range).
-    opacity_logits: float32 [n].
+    Attributes:
+        ids: int64 [n], unique within their owner and stable.
+        anchors: int32 [n], index of the owner's keyframe that each is anchored to.
+        means: float32 [n, 3], meters.
+        quats_wxyz: float32 [n, 4], any non-zero length.
+        log_scales: float32 [n, 3], log of meters.
+        colors: float32 [n, 3], RGB as in the image, 0..1 (training may leave the range).
+        opacity_logits: float32 [n].
     """
 
     ids: NDArray[np.int64]

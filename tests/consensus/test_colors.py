@@ -126,7 +126,7 @@ def test_what_nobody_compared_stays():
 
 
 def test_without_contrast_the_gain_stays_unsure():
-    """A gray wall tells where the middle lies, and of gains only noise, here three times as much in one robot."""
+    """A gray wall determines the middle, and of the gains only noise, here three times as much in one robot."""
     rng = np.random.default_rng(0)
     evidence, pairs = world(gain={k: GAIN[k] for k in ("alpha", "bravo")})
     for e in evidence.values():

@@ -82,6 +82,6 @@ def test_fronts_take_the_step_of_the_whole_graph(tree, damping):
 
 
 def test_a_variable_stays_until_all_who_have_it_are_below():
-    everybody = {(0, 1): 0b011, (1, 4): 0, (1, 5): 0b111, (1, 6): 0b110}
-    assert shared_variables(everybody, 0b011) == [(1, 4), (1, 5), (1, 6)]
-    assert shared_variables(everybody, 0b111) == [(1, 4)]
+    owners = {(0, 1): 0b011, (1, 4): 0, (1, 5): 0b111, (1, 6): 0b110}
+    assert shared_variables(owners, 0b011) == [(1, 4), (1, 5), (1, 6)]
+    assert shared_variables(owners, 0b111) == [(1, 4)]

@@ -78,10 +78,10 @@ def test_anchored_and_back_in_the_map_is_what_the_map_said():
     axes = so3.from_quat_wxyz(gaussians.quats_wxyz.astype(np.float64))
     normal = np.take_along_axis(axes, gaussians.log_scales.argmin(axis=1)[:, None, None], axis=2)
     measured = normal @ normal.swapaxes(1, 2) / sums.deviation_m[:, None, None] ** 2
-    told = np.linalg.inv(np.linalg.inv(geometry[:, :3, :3] + measured) + off)
-    np.testing.assert_allclose(back.position_information(), told, atol=1e-9)
-    told = np.linalg.inv(np.linalg.inv(geometry[:, 3:, 3:]) + SHAPE_FLOOR**2 * np.eye(6))
-    np.testing.assert_allclose(back.shape_information(), told, atol=1e-9)
+    shared = np.linalg.inv(np.linalg.inv(geometry[:, :3, :3] + measured) + off)
+    np.testing.assert_allclose(back.position_information(), shared, atol=1e-9)
+    shared = np.linalg.inv(np.linalg.inv(geometry[:, 3:, 3:]) + SHAPE_FLOOR**2 * np.eye(6))
+    np.testing.assert_allclose(back.shape_information(), shared, atol=1e-9)
     np.testing.assert_array_equal(back.color_information(), sums.color)
     np.testing.assert_array_equal(back.opacity_information(), sums.opacity)
 
@@ -98,11 +98,11 @@ def test_what_is_told_is_never_surer_than_the_deviation_and_nothing_stays_nothin
     gaussians, sums, T_map_keyframe = random_map(8)
     sums.geometry[::2] *= 1e12
     sums.geometry[1::4] = 0.0
-    told = Evidence.from_map("alpha", gaussians, sums, T_map_keyframe)
-    sigma_m = 1 / np.sqrt(np.maximum(np.linalg.eigvalsh(told.position_information())[:, -1], 1e-300))
+    shared = Evidence.from_map("alpha", gaussians, sums, T_map_keyframe)
+    sigma_m = 1 / np.sqrt(np.maximum(np.linalg.eigvalsh(shared.position_information())[:, -1], 1e-300))
     assert np.all(sigma_m >= sums.deviation_m * (1 - 1e-9))
     np.testing.assert_allclose(sigma_m[::2], sums.deviation_m[::2], rtol=1e-3)
-    assert not told.information[1::4, :27].any()
+    assert not shared.information[1::4, :27].any()
 
 
 def test_depth_images_say_how_far_a_surface_is_where_the_sums_know_nothing_of_a_splat():

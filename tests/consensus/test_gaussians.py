@@ -99,7 +99,7 @@ def gap_sigma(team: Team, agents: dict[str, GaussianAgent], shares: Shares) -> f
 def rounds_to(
     team: Team, config: GaussianConsensusConfig, sigma: float, most: int, loss: float = 0.0, delay: int = 0
 ) -> tuple[int, float]:
-    """Rounds until nobody is farther from the optimum than so many sigma, and the gap then."""
+    """Rounds until no robot is farther from the optimum than so many sigma, and the gap then."""
     agents, shares = team.agents(config)
     rng = np.random.default_rng(9)
     air: list[tuple[int, int, str, str, Any]] = []

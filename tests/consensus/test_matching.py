@@ -93,8 +93,8 @@ def test_a_far_wall_or_an_empty_map_matches_nothing():
     a = surface("alpha", 9)
     far = Evidence("bravo", a.ids, a.anchors, a.theta + np.eye(13)[2], a.information)
     assert match(a, far, CONFIG).shape == (0, 2)
-    nobody = a.select(slice(0, 0))
-    assert match(a, nobody, CONFIG).shape == match(nobody, a, CONFIG).shape == (0, 2)
+    empty = a.select(slice(0, 0))
+    assert match(a, empty, CONFIG).shape == match(empty, a, CONFIG).shape == (0, 2)
     assert threshold(a.select(slice(0, 1)), CONFIG) == 0.0
 
 

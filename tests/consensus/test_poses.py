@@ -53,7 +53,7 @@ def test_rounded_packets_stay_within_their_rounding(wire, atol):
 
 
 def test_a_team_agrees_however_far_away_its_world_has_its_origin():
-    """In float32 a position 30 km away has steps of 2 mm, and nobody would ever hold still."""
+    """In float32 a position 30 km away has steps of 2 mm, and no robot would ever converge."""
     world = make_team(1, robots=2)
     _, best = world.optimum(world.agents(PLAIN))
     agents = world.agents(PLAIN)
@@ -142,7 +142,7 @@ def test_alone_a_robot_keeps_its_odometry_bit_for_bit():
 
 
 def test_a_cut_link_leaves_both_ends_near_their_odometry():
-    """Nothing ever arrives: nobody agrees, and own edge variables pull nowhere."""
+    """Nothing ever arrives: no robot agrees, and own edge variables pull nowhere."""
     world = make_team(8, robots=2)
     agents = world.agents(PLAIN)
     start = {r: agents[r].T_world_keyframe for r in agents}

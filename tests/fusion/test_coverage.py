@@ -1,4 +1,4 @@
-"""What a robot takes over from its neighbors: what its own keyframes and its own map do not explain, once."""
+"""What a robot imports from its neighbors: what its own keyframes and its own map do not explain, once."""
 
 import numpy as np
 
@@ -43,7 +43,7 @@ def test_neighbors_unmatched_gaussians_fill_only_unseen_space():
         [[-0.5, 0, 1.0], [-0.5, 0, 2.1], [-0.5, 0, 2.5], [0.5, 0, 1.0], [0, 0, -1.0], [9, 0, 1.0]]
     )
     seen = explained(points, np.eye(4)[None], [(0, depth)], CAMERA, config=CONFIG)
-    # in front of the wall, at it, behind it, where nothing was measured, behind the camera, beside the image
+    # in front of the wall, at it, behind it, where nothing was measured, behind the camera, outside the image
     assert seen.tolist() == [True, True, False, False, False, False]
     theta = np.zeros((6, 13))
     theta[:, MEAN], theta[:, LOG_COVARIANCE] = points, -8 * np.array([1, 1, 1, 0, 0, 0])
@@ -61,12 +61,12 @@ def test_neighbors_unmatched_gaussians_fill_only_unseen_space():
     np.testing.assert_array_equal(found.source_ids[N:], [2, 3, 4, 5])
     assert [found.robots[s] for s in found.source[N:]] == ["bravo"] * 4
     assert len(np.unique(found.gaussians.ids)) == N + 4
-    beside = np.array([[0.05, 0, 1.0], [0.3, 0, 1.0]])  # 2 and 15 pixels beside the wall's outline
+    outside = np.array([[0.05, 0, 1.0], [0.3, 0, 1.0]])  # 2 and 15 pixels from the wall's outline
     for px, count in ((4, 1), (0, 2)):
-        taken = theta[:2].copy()
-        taken[:, MEAN] = beside
+        imported = theta[:2].copy()
+        imported[:, MEAN] = outside
         near = given["evidence"] | {
-            "bravo": Evidence("bravo", np.arange(2), np.zeros(2), taken, information(rng, 2))
+            "bravo": Evidence("bravo", np.arange(2), np.zeros(2), imported, information(rng, 2))
         }
         config = CONFIG.model_copy(update={"explained_px": px})
         assert world.fuse("alpha", config, [(0, depth)], **(given | {"evidence": near})).added == count
@@ -94,7 +94,7 @@ def test_the_own_map_explains_where_depth_is_missing():
         "bravo": Evidence("bravo", np.arange(3), np.zeros(3), theta, np.ones((3, 31))),
     }
     poses, nothing = {"alpha": origin, "bravo": origin}, np.zeros((CAMERA.height, CAMERA.width), np.float32)
-    taken = {
+    imported = {
         opacity: fused(
             OwnMap("alpha", own, origin, origin),
             evidence=evidence,
@@ -107,7 +107,7 @@ def test_the_own_map_explains_where_depth_is_missing():
         .tolist()
         for opacity in (0.5, 1.0)
     }
-    assert taken == {0.5: [2], 1.0: [0, 1, 2]}
+    assert imported == {0.5: [2], 1.0: [0, 1, 2]}
 
 
 def test_a_surface_that_the_own_map_hardly_draws_is_not_explained():
@@ -135,7 +135,7 @@ def test_a_surface_that_the_own_map_hardly_draws_is_not_explained():
     assert found.source_ids[n:].tolist() == [1]
 
 
-def test_what_two_neighbors_share_is_taken_over_once():
+def test_what_two_neighbors_share_is_imported_once():
     world = World(14)
     pair = {("bravo", "charlie"): world.pairs["bravo", "charlie"]}
     found = world.fuse("alpha", pairs=pair)  # bravo's, with what charlie says about them

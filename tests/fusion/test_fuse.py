@@ -11,7 +11,7 @@ from duagc.pipeline.fusion.association import association_covariance, weighted_m
 from duagc.pipeline.fusion.fuse import OwnMap
 from duagc.pipeline.geometry import se3, so3, spd
 from duagc.pipeline.splat.gaussians import Gaussians
-from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, pack_information
+from duagc.pipeline.splat.information import COLOR, COLOR_INFORMATION, LOG_COVARIANCE, MEAN, pack_information
 from tests.fusion.worlds import (
     ALIKE,
     CONFIG,
@@ -85,7 +85,7 @@ def tinted(world, **cameras):
         e, m = evidence[name], maps[name]
         theta, sums = e.theta.copy(), e.information.copy()
         theta[:, COLOR] = gain * theta[:, COLOR] + offset
-        sums[:, 27:30] /= np.square(gain)
+        sums[:, COLOR_INFORMATION] /= np.square(gain)
         colors = gain * m.colors + offset
         maps[name], evidence[name] = (
             m.replace(colors=colors.astype(np.float32)),
@@ -119,8 +119,8 @@ def test_every_robot_keeps_its_own_colors_and_the_maps_agree():
         np.testing.assert_allclose(there.gain, true, rtol=0.03)
     in_alphas = differ["alpha"].colors["bravo"].to_other(differ["bravo"].gaussians.colors)
     np.testing.assert_allclose(in_alphas, differ["alpha"].gaussians.colors, atol=1e-6)
-    told = differ["alpha"].information[:, 27:30] * differ["alpha"].colors["bravo"].gain ** 2
-    np.testing.assert_allclose(told, differ["bravo"].information[:, 27:30], rtol=1e-6)
+    converted = differ["alpha"].information[:, COLOR_INFORMATION] * differ["alpha"].colors["bravo"].gain ** 2
+    np.testing.assert_allclose(converted, differ["bravo"].information[:, COLOR_INFORMATION], rtol=1e-6)
 
 
 def test_order_of_arrival_does_not_change_a_bit():
@@ -227,7 +227,7 @@ def test_turning_the_world_turns_the_fused_map():
 
 
 def test_unknown_directions_keep_the_own_value():
-    """One axis known to both, one to the neighbor only, one to nobody."""
+    """One axis known to both, one to the neighbor only, one to none."""
     weights = np.array([np.diag([1.0, 0.0, 0.0]), np.diag([3.0, 2.0, 0.0])])
     values = np.array([[0.0, 0.0, 0.0], [4.0, 5.0, 6.0]])
     move = weighted_move(weights, values, np.array([0]), 1e-12)

@@ -157,10 +157,12 @@ def test_alone_everything_stays(robot, tmp_path):
     assert (tmp_path / "fused.ply").read_bytes() == (tmp_path / "own.ply").read_bytes()
     for name in ("odometry.tum", "trajectory.tum"):  # messages hold unit quaternions: a turn of rounding
         np.testing.assert_allclose(read_tum(tmp_path / name).poses, robot.T_map_camera, atol=1e-14)
-    told = robot.evidence().in_world(robot.T_map_keyframe).information
+    expected_information = robot.evidence().in_world(robot.T_map_keyframe).information
     geometry = said[GaussianMap].information.geometry
-    np.testing.assert_allclose(geometry[:, [0, 9, 17]], told[:, [0, 3, 5]], rtol=1e-5)  # diagonals
-    np.testing.assert_allclose(geometry[:, [24, 44]], told[:, [6, 26]], rtol=1e-5)
+    np.testing.assert_allclose(
+        geometry[:, [0, 9, 17]], expected_information[:, [0, 3, 5]], rtol=1e-5
+    )  # diagonals
+    np.testing.assert_allclose(geometry[:, [24, 44]], expected_information[:, [6, 26]], rtol=1e-5)
     assert said[CorrectedKeyframes].component == ["bravo"]
     assert read_peer_colors(tmp_path / "fused.mcap", "bravo") == {}
 
@@ -168,8 +170,8 @@ def test_alone_everything_stays(robot, tmp_path):
 def test_frames_and_gaussians_move_with_their_keyframes(robot, tmp_path):
     moves = se3.exp(np.array([[1.0, 0, 0, 0, 0, 0.3], [1.0, 0.1, 0, 0, 0, 0.3]]))
     T_world = moves @ robot.T_map_keyframe
-    nobody = robot.evidence().select(slice(0, 0))
-    other = Evidence("alpha", nobody.ids, nobody.anchors, nobody.theta, nobody.information)
+    none_of_it = robot.evidence().select(slice(0, 0))
+    other = Evidence("alpha", none_of_it.ids, none_of_it.anchors, none_of_it.theta, none_of_it.information)
     result = result_of(robot, T_world, alpha=other)
     said = fuse_files(robot, result, tmp_path)
     poses = read_tum(tmp_path / "trajectory.tum").poses
@@ -185,11 +187,13 @@ def test_frames_and_gaussians_move_with_their_keyframes(robot, tmp_path):
     ]
     np.testing.assert_allclose(fused.gaussians.means, by_anchor, atol=1e-6)
     trace = [0, 9, 17]  # of the position block in the upper triangle of 9x9: what a turn leaves
-    told = np.trace(robot.evidence().position_information(), axis1=1, axis2=2)
-    np.testing.assert_allclose(fused.information.geometry[:, trace].sum(axis=1), told, rtol=1e-5)
+    expected_information = np.trace(robot.evidence().position_information(), axis1=1, axis2=2)
+    np.testing.assert_allclose(
+        fused.information.geometry[:, trace].sum(axis=1), expected_information, rtol=1e-5
+    )
 
 
-def test_what_only_a_neighbor_saw_is_taken_over(robot, tmp_path):
+def test_what_only_a_neighbor_saw_is_imported(robot, tmp_path):
     """A Gaussian of alpha behind bravo's cameras, and one on the wall that they measured."""
     theta = np.zeros((2, 13))
     theta[:, :3] = [[0, 0, -3.0], [0, 0, 2.0]]
@@ -199,12 +203,12 @@ def test_what_only_a_neighbor_saw_is_taken_over(robot, tmp_path):
     fused = fuse_files(robot, result, tmp_path)[GaussianMap]
     assert len(fused.gaussians) == len(fused.information.ids) == N + 1
     np.testing.assert_allclose(fused.gaussians.means[-1], [0, 0, -3.0])
-    told = read_peer_colors(tmp_path / "fused.mcap", "bravo")[
+    colors = read_peer_colors(tmp_path / "fused.mcap", "bravo")[
         "alpha"
-    ]  # nothing matched: as if alike, and nobody knows
-    assert told.is_identity
-    assert told.matches == 0
-    np.testing.assert_allclose(told.sigma_gain, np.sqrt(2) * ColorConfig().prior_gain)
+    ]  # nothing matched: as if alike, and none_of_it knows
+    assert colors.is_identity
+    assert colors.matches == 0
+    np.testing.assert_allclose(colors.sigma_gain, np.sqrt(2) * ColorConfig().prior_gain)
 
 
 def test_a_neighbor_that_contradicts_own_images_is_left_out(robot, tmp_path):

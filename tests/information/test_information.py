@@ -66,16 +66,16 @@ def views_of(gaussians: Gaussians, color_noise: float = 0.0, depth_factor: float
     return out
 
 
-def test_noise_that_the_log_tells_takes_the_place_of_the_model() -> None:
-    """Twice the sigma, a quarter of what depth says; a factor of the residuals on top; color is as before."""
+def test_noise_of_the_log_replaces_the_model() -> None:
+    """Twice the sigma, a quarter of the information of depth; times the factor of the residuals; color as before."""
     gaussians, config = wall(), InformationConfig()
     plain = views_of(gaussians)
     tight, loose = (
         [replace(v, depth_sigma_m=np.full(v.depth_m.shape, sigma, np.float32)) for v in plain]
         for sigma in (0.01, 0.02)
     )
-    told = ImageNoise(1e6, SENSOR, from_log=True)  # color says nothing
-    sums = [sum_information(MapViews(gaussians, CAMERA, views), told, config) for views in (tight, loose)]
+    logged = ImageNoise(1e6, SENSOR, from_log=True)  # no information in the color
+    sums = [sum_information(MapViews(gaussians, CAMERA, views), logged, config) for views in (tight, loose)]
     assert sums[0].geometry.any()
     np.testing.assert_allclose(sums[0].geometry, 4 * sums[1].geometry, rtol=1e-4, atol=1e-3)
     r = np.random.default_rng(2)

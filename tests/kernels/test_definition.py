@@ -1,4 +1,4 @@
-"""What the outputs mean, told without the code that computes them: closed forms, differences, sums over pixels."""
+"""What the outputs mean, without the code that computes them: closed forms, differences, sums over pixels."""
 
 import dataclasses
 

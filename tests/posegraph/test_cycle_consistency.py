@@ -119,7 +119,7 @@ def test_without_a_cycle_the_largest_group_counts():
     pairs = {("alpha", "bravo"): [right("alpha", "bravo", 4), Proposal(2, WRONG, VARIANCE, 0.6)]}
     found = place(pairs, list(T), 4.0)
     assert found.chosen == {("alpha", "bravo"): 0}
-    assert np.array_equal(found.T_world_map["charlie"], np.eye(4))  # nobody met it
+    assert np.array_equal(found.T_world_map["charlie"], np.eye(4))  # no robot met it
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))

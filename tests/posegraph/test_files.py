@@ -15,7 +15,7 @@ EXACT = LoopClosureConfig(sigma_floor_m=0, sigma_floor_rad=0)
 
 
 def team_cost(team, T_by_robot):
-    """Cost of all that all robots were told, each closure once."""
+    """Cost of the measurements of all robots, each loop closure once."""
     own = {r: RelativePoses.concatenate([g.odometry, g.loops]) for r, g in team.robots.items()}
     pairs = [(a, b, team.robots[a].closures[b]) for a, b in team.pairs]
     closures = [HeldLoopClosures(a, b, held, np.ones(len(held))) for a, b, held in pairs]

@@ -35,10 +35,10 @@ def views(seed: int = 0, h: int = 5, w: int = 7) -> tuple[Drawn, np.ndarray, np.
 
 @pytest.mark.parametrize("exposure", [(0.0, 0.0), (0.2, -0.05)])
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("told", [False, True])
-def test_cotangents_are_derivatives(exposure: tuple[float, float], masked: bool, told: bool) -> None:
+@pytest.mark.parametrize("uncertain", [False, True])
+def test_cotangents_are_derivatives(exposure: tuple[float, float], masked: bool, uncertain: bool) -> None:
     drawn, color, depth = views()
-    sure = np.random.default_rng(2).uniform(0.05, 1.0, depth.shape) if told else None
+    sure = np.random.default_rng(2).uniform(0.05, 1.0, depth.shape) if uncertain else None
     mask = np.random.default_rng(1).random(depth.shape) > 0.3 if masked else None
     config = LossConfig(color_huber=0.3, depth_huber_m=0.08)
 
