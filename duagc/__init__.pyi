@@ -20,6 +20,9 @@ from .pipeline.exchange.agent import Agent as Agent
 from .pipeline.exchange.session import run_session as run_session
 from .pipeline.frontend.mapping import Mapper as Mapper
 from .pipeline.frontend.tracking import Tracker as Tracker
+from .pipeline.fusion.context import MapContext as MapContext
+from .pipeline.fusion.fuse import FusedMap as FusedMap
+from .pipeline.fusion.fuse import OwnMap as OwnMap
 from .pipeline.fusion.fuse import fuse as fuse
 from .pipeline.geometry import se3 as se3
 from .pipeline.geometry import so3 as so3

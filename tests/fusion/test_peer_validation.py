@@ -15,8 +15,8 @@ from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY, theta_of
-from tests.fusion.test_refine import CAMERA, POSES
-from tests.fusion.test_refine import wall as speckled
+from tests.fixtures.speckled_wall import CAMERA, POSES
+from tests.fixtures.speckled_wall import wall as speckled
 
 
 def wall() -> Gaussians:

@@ -15,12 +15,11 @@ from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.finetune import finetune_map, num_steps
 from duagc.pipeline.fusion.peer_views import peer_views
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
+from tests.fixtures.speckled_wall import CAMERA, POSES, wall
 
-CAMERA = PinholeCamera(64, 48, 55.0, 55.0, 31.5, 23.5)
 ALL = np.ones(400, bool)
 
 
@@ -32,23 +31,6 @@ def context(
 
 
 ALIKE = {"zulu": ColorMap(np.ones(3), np.zeros(3), np.zeros(3), np.zeros(3), 0)}
-POSES = [se3.exp(np.array([0.05 * k, 0.02 * k, 0, 0, -0.02 * k, 0])) for k in range(6)]
-
-
-def wall(n: int = 400) -> Gaussians:
-    """Discs on a wall 2 m away, and ten behind the camera."""
-    rng = np.random.default_rng(0)
-    means = np.column_stack([rng.uniform(-1.6, 1.6, n), rng.uniform(-1.2, 1.2, n), np.full(n, 2.0)])
-    means[-10:, 2] = -3.0
-    return Gaussians(
-        np.arange(n),
-        np.zeros(n, np.int32),
-        means,
-        np.tile([1.0, 0, 0, 0], (n, 1)),
-        np.tile(np.log([0.08, 0.08, 0.001]), (n, 1)),
-        rng.uniform(0.1, 0.9, (n, 3)),
-        np.full(n, 1.5),
-    )
 
 
 @pytest.fixture(scope="module")

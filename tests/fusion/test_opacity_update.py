@@ -13,7 +13,7 @@ from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import OPACITY, OPACITY_INFORMATION, theta_of
-from tests.fusion.test_refine import CAMERA, POSES, wall
+from tests.fixtures.speckled_wall import CAMERA, POSES, wall
 
 CONFIG = FusionConfig()
 SIGMA = 0.02
