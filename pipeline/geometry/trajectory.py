@@ -33,7 +33,12 @@ class Trajectory:
 
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
-    """Write `timestamp tx ty tz qx qy qz qw`, seconds with nine decimals, then full double precision."""
+    """Write a trajectory as `timestamp tx ty tz qx qy qz qw`: seconds with nine decimals, full double precision.
+
+    Args:
+        path: file to write; it appears when it is complete.
+        trajectory: T_reference_body over time, meters.
+    """
     quats = so3.to_quat_wxyz(trajectory.poses[:, :3, :3])
     lines = ["# timestamp tx ty tz qx qy qz qw"]
     for stamp, t, q in zip(trajectory.stamps_ns.tolist(), trajectory.positions, quats, strict=True):
@@ -44,7 +49,15 @@ def write_tum(path: Path, trajectory: Trajectory) -> None:
 
 
 def read_tum(path: Path) -> Trajectory:
-    """Read a TUM trajectory. Raises DuagError for a line that is not eight finite numbers."""
+    """Read a TUM trajectory.
+
+    Args:
+        path: text file with lines `timestamp tx ty tz qx qy qz qw`; `#` starts a comment.
+    Returns:
+        T_reference_body over time, meters.
+    Raises:
+        DuagError: the file cannot be read, or a line is not eight finite numbers.
+    """
     stamps, rows = [], []
     text = read_text(path, "a TUM trajectory")
     for number, line in enumerate(text.splitlines(), start=1):
@@ -111,7 +124,12 @@ def align(points_a: ArrayLike, points_b: ArrayLike) -> Array:
 
 
 def ate_rmse_m(positions_true: ArrayLike, positions_estimated: ArrayLike) -> float:
-    """Absolute trajectory error after SE(3) alignment: root of the mean squared distance, meters."""
+    """Absolute trajectory error after SE(3) alignment: root of the mean squared distance, meters.
+
+    Args:
+        positions_true: [n, 3], meters.
+        positions_estimated: [n, 3], meters, at the same times, in any frame.
+    """
     true, estimated = np.asarray(positions_true), np.asarray(positions_estimated)
     T = align(true, estimated)
     return float(np.sqrt(np.mean(np.sum((true - se3.transform(T, estimated)) ** 2, axis=1))))

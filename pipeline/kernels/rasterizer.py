@@ -59,6 +59,14 @@ class Rasterizer:
     """
 
     def __init__(self, isa: str = "auto", threads: int = 1) -> None:
+        """Choose how to compute.
+
+        Args:
+            isa: instruction set, one of `available_isas()`; "auto" takes the fastest of this machine.
+            threads: of every call, 1 or more; changes no bit of any result.
+        Raises:
+            ValueError: an instruction set that this machine lacks, or a number of threads out of range.
+        """
         if not isinstance(isa, str) or isa not in ("auto", *available_isas()):
             raise ValueError(f"isa is {isa!r}, available here: auto, {', '.join(available_isas())}")
         if not isinstance(threads, (int, np.integer)) or not 1 <= threads <= MAX_THREADS:

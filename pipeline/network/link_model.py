@@ -101,6 +101,12 @@ class LinkModel:
     """Decides the fate of every packet. Packets of one directed link must be given in the order of sending."""
 
     def __init__(self, config: LinkConfig, seed: int) -> None:
+        """Start at the beginning of a session.
+
+        Args:
+            config: of all links.
+            seed: of the run; every directed link draws from a stream of its own.
+        """
         self.config, self.seed = config, seed
         self._radios: dict[tuple[str, str], _Radio] = {}
         self._tracks = {

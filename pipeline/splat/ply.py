@@ -28,6 +28,9 @@ _HEADER_LIMIT_BYTES = 1 << 16
 def write_ply(path: str | Path, gaussians: Gaussians) -> None:
     """Write Gaussians to `path` atomically; the file is re-read and checked before it takes its name.
 
+    Args:
+        path: file to write, in the degree-0 layout that 3DGS viewers read.
+        gaussians: n Gaussians; ids and anchors are not kept.
     Raises:
         DuagError: a parameter is not finite or a quaternion has no length; the message names the file.
     """
@@ -61,8 +64,10 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
 
 
 def read_ply(path: str | Path) -> Gaussians:
-    """Read a degree-0 INRIA-style .ply; ids count from 0 in file order and every anchor is 0.
+    """Read a degree-0 3DGS .ply; ids count from 0 in file order and every anchor is 0.
 
+    Args:
+        path: file to read.
     Raises:
         DuagError: not such a file, or values out of range (scales or opacity that were already activated).
     """
