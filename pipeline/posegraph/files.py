@@ -1,13 +1,10 @@
 """Pose graphs of a team as the field distributes them: `.g2o`, one `.g2o` per robot, Kimera-Multi csv.
 
-Weights are SE-Sync's: tau = 3 / trace of the covariance's translation block, kappa = 3 / (2 trace of its rotation
-block), so that costs compare with certified optima. A closure that both ends' files hold counts once; both ends know
-it, as in these files.
+A loop closure that both ends' files hold counts once; both ends know it, as in these files.
 """
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -18,50 +15,23 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
-from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph.edges import Edges, Key, read_g2o, read_kimera
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, isotropic_information
 
 Array = NDArray[np.float64]
-SYMBOL_BITS = 56  # a gtsam symbol is a character in the highest byte and an index below it
-_IGNORED_TAGS = {
-    "VERTEX_SE3:QUAT",
-    "FIX",
-    "PARAMS_SE3OFFSET",
-}  # start values and gauge: agents find their own
 _REFERENCES = ("reference_inliers.csv", "gt_info.xml")
-
-Key = tuple[str, int]  # robot (or "" before a graph is cut), index
-
-
-@dataclass(frozen=True)
-class Edges:
-    """Measured relative poses as a file lists them.
-
-    i, j: keys of the two poses. T_i_j [m, 4, 4]. kappa, tau [m]: SE-Sync's weights. inlier: bool [m], what a file
-    beside it names as true, for the evaluation; None if there is none.
-    """
-
-    i: list[Key]
-    j: list[Key]
-    T_i_j: Array
-    kappa: Array
-    tau: Array
-    inlier: NDArray[np.bool_] | None = None
-
-    def select(self, keep: NDArray[np.bool_]) -> Edges:
-        """The edges of a mask."""
-        at = np.flatnonzero(keep).tolist()
-        inlier = None if self.inlier is None else self.inlier[keep]
-        i, j = [self.i[k] for k in at], [self.j[k] for k in at]
-        return Edges(i, j, self.T_i_j[keep], self.kappa[keep], self.tau[keep], inlier)
 
 
 @dataclass(frozen=True)
 class RobotGraph:
-    """All that one robot is told.
+    """One robot's part of a pose graph.
 
-    keyframes: how many. odometry: factors between own keyframes that are trusted: consecutive ones. loops: all other
-    own factors. closures: by neighbor, from this robot's side.
+    Attributes:
+        name: of the robot.
+        keyframes: how many.
+        odometry: relative poses between own keyframes that are trusted: consecutive ones.
+        loops: all other own relative poses.
+        closures: loop closures by neighbor, from this robot's side.
     """
 
     name: str
@@ -73,10 +43,14 @@ class RobotGraph:
 
 @dataclass(frozen=True)
 class TeamGraph:
-    """What the robots know, by name, and what only the evaluation knows.
+    """What the robots know, and what only the evaluation knows.
 
-    loops_true: by robot, bool per loop; closures_true: by pair (a < b), bool per closure; both None without reference.
-    ignored: files of the folder that were not read.
+    Attributes:
+        robots: their parts, by name.
+        loops_true: by robot, bool per loop; None without reference.
+        closures_true: by pair (a < b), bool per loop closure; None without reference.
+        reference: name of the reference file.
+        ignored: files of the folder that were not read.
     """
 
     robots: dict[str, RobotGraph]
@@ -87,11 +61,11 @@ class TeamGraph:
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
-        """Pairs (a < b) of robots with closures, sorted."""
+        """Pairs (a < b) of robots with loop closures, sorted."""
         return sorted((a, b) for a, robot in self.robots.items() for b in robot.closures if a < b)
 
     def components(self) -> list[tuple[str, ...]]:
-        """Robots that closures connect, each group and the list of groups sorted."""
+        """Robots that loop closures connect, each group and the list of groups sorted."""
         left, found = set(self.robots), []
         while left:
             reached, border = set(), {min(left)}
@@ -111,7 +85,7 @@ def read_team_graph(path: Path, robots: int | None = None, *, only_reference: bo
             `robot*/measurements.csv`; or a folder with one `.g2o`.
         robots: cut a single graph into so many blocks of consecutive keys (default 4); for a team's own files, at most
             a check.
-        only_reference: leave out loops and closures that the reference beside the graph does not name as true.
+        only_reference: leave out loops and loop closures that the reference next to the graph does not name as true.
     Raises:
         DuagError: nothing of the kind is there, a line is not understood, or the graph is two-dimensional.
     """
@@ -126,7 +100,7 @@ def read_team_graph(path: Path, robots: int | None = None, *, only_reference: bo
     edges, reference = _with_reference(edges, path)
     if only_reference:
         if edges.inlier is None:
-            raise DuagError(f"{path}: no reference beside it, expected {' or '.join(_REFERENCES)}")
+            raise DuagError(f"{path}: no reference next to it, expected {' or '.join(_REFERENCES)}")
         edges = edges.select(edges.inlier | _consecutive(edges))
     return _team(edges, reference, ignored, path)
 
@@ -158,104 +132,6 @@ def _read(path: Path) -> tuple[Edges, tuple[str, ...]]:
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Sort key that puts robot10 behind robot9."""
     return [(int(word), "") if word.isdigit() else (-1, word) for word in re.split(r"(\d+)", str(path))]
-
-
-def read_g2o(path: Path) -> Edges:
-    """Edges of one `.g2o` file in 3-D; keys with a gtsam symbol name their robot by its character.
-
-    Raises:
-        DuagError: names the line that is not understood.
-    """
-    i: list[Key] = []
-    j: list[Key] = []
-    rows: list[list[float]] = []
-    for number, line in enumerate(read_text(path, "a pose graph").splitlines(), start=1):
-        words = line.split()
-        if not words or words[0].startswith("#") or words[0] in _IGNORED_TAGS:
-            continue
-        if "SE2" in words[0] or words[0] in ("VERTEX2", "EDGE2"):
-            raise DuagError(f"{path}: line {number} is {words[0]}: a 2-D graph, expected 3-D (EDGE_SE3:QUAT)")
-        if words[0] != "EDGE_SE3:QUAT":
-            raise DuagError(f"{path}: line {number} is {words[0]}, expected VERTEX_SE3:QUAT or EDGE_SE3:QUAT")
-        try:
-            keys, row = [int(word) for word in words[1:3]], [float(word) for word in words[3:]]
-        except ValueError:
-            raise DuagError(f"{path}: line {number} holds something that is not a number") from None
-        sound = len(row) == 28 and np.isfinite(row).all() and min(keys) >= 0 and max(keys) < 1 << 64
-        if not sound or not any(row[3:7]):
-            raise DuagError(
-                f"{path}: line {number} is not an edge: 2 keys of 64 bits and 28 finite numbers expected"
-            )
-        i.append(_symbol(keys[0]))
-        j.append(_symbol(keys[1]))
-        rows.append(row)
-    if not rows:
-        raise DuagError(f"{path}: no EDGE_SE3:QUAT in this file")
-    values = np.array(rows)
-    kappa, tau = _isotropic(values[:, 7:], path)
-    return Edges(i, j, se3.from_quat_translation(values[:, [6, 3, 4, 5]], values[:, :3]), kappa, tau)
-
-
-def _symbol(key: int) -> Key:
-    character = key >> SYMBOL_BITS
-    return (chr(character), key & ((1 << SYMBOL_BITS) - 1)) if character else ("", key)
-
-
-def _isotropic(upper: Array, path: Path) -> tuple[Array, Array]:
-    """SE-Sync's kappa and tau [m] from the upper triangles [m, 21] of the information matrices."""
-    at = np.triu_indices(6)
-    full = np.zeros((len(upper), 6, 6))
-    full[:, at[0], at[1]] = full[:, at[1], at[0]] = upper
-    for block in (full[:, :3, :3], full[:, 3:, 3:]):
-        bad = np.linalg.eigvalsh(block)[:, 0] <= 0
-        if bad.any():
-            raise DuagError(
-                f"{path}: the information of edge {int(np.argmax(bad)) + 1} is not positive definite"
-            )
-    tau = 3 / np.trace(np.linalg.inv(full[:, :3, :3]), axis1=1, axis2=2)
-    kappa = 3 / (2 * np.trace(np.linalg.inv(full[:, 3:, 3:]), axis1=1, axis2=2))
-    return kappa, tau
-
-
-def read_kimera(path: Path) -> Edges:
-    """Edges of one robot's `measurements.csv` of Kimera-Multi; `weight` and `is_known_inlier` are ignored."""
-    needed = [
-        "robot_src",
-        "pose_src",
-        "robot_dst",
-        "pose_dst",
-        "qx",
-        "qy",
-        "qz",
-        "qw",
-        "tx",
-        "ty",
-        "tz",
-        "kappa",
-        "tau",
-    ]
-    reader = csv.DictReader(read_text(path, "a pose graph").splitlines())
-    missing = [name for name in needed if name not in (reader.fieldnames or [])]
-    if missing:
-        raise DuagError(f"{path}: no column {missing[0]}, expected {', '.join(needed)}")
-    i: list[Key] = []
-    j: list[Key] = []
-    rows: list[list[float]] = []
-    for number, fields in enumerate(reader, start=2):
-        try:
-            ids = [int(fields[name]) for name in needed[:4]]
-            row = [float(fields[name]) for name in needed[4:]]
-        except (TypeError, ValueError):
-            raise DuagError(f"{path}: line {number} holds something that is not a number") from None
-        if min(ids) < 0 or not np.isfinite(row).all() or min(row[7:]) <= 0 or not any(row[:4]):
-            raise DuagError(f"{path}: line {number} is not a measurement with positive kappa and tau")
-        i.append((f"robot{ids[0]}", ids[1]))
-        j.append((f"robot{ids[2]}", ids[3]))
-        rows.append(row)
-    if not rows:
-        raise DuagError(f"{path}: no measurements in this file")
-    v = np.array(rows)
-    return Edges(i, j, se3.from_quat_translation(v[:, [3, 0, 1, 2]], v[:, 4:7]), v[:, 7], v[:, 8])
 
 
 def _merge(graphs: Sequence[Edges]) -> Edges:
@@ -290,7 +166,7 @@ def _cut(edges: Edges, robots: int, path: Path) -> Edges:
 
 
 def _with_reference(edges: Edges, path: Path) -> tuple[Edges, str | None]:
-    """Mark what a file beside the graph names as true; for the evaluation only."""
+    """Mark what a file next to the graph names as true; for the evaluation only."""
     folder = path if path.is_dir() else path.parent
     found = [folder / name for name in _REFERENCES if (folder / name).is_file()]
     if not found:
@@ -370,7 +246,7 @@ def _team(edges: Edges, reference: str | None, ignored: tuple[str, ...], path: P
 
     robots = {}
     for name in at:
-        _tie(own[name], edges, at[name], name, path)
+        _tie(own[name], edges, at[name], name=name, path=path)
         closures = {
             (b if a == name else a): [closure(k, name) for k in rows]
             for (a, b), rows in sorted(pairs.items())
@@ -390,7 +266,7 @@ def _team(edges: Edges, reference: str | None, ignored: tuple[str, ...], path: P
     )
 
 
-def _tie(own: _Own, edges: Edges, at: dict[int, int], name: str, path: Path) -> None:
+def _tie(own: _Own, edges: Edges, at: dict[int, int], *, name: str, path: Path) -> None:
     """Trust loops without which a robot's own keyframes fall apart: nothing could contradict them.
 
     Raises:

@@ -34,8 +34,15 @@ _TRUNCATIONS = 30
 class _Component:
     """One group of connected robots: its whole graph in one place, and what was seen of its agents.
 
-    factors: odometry and loops by robot, then closures by pair. trusted: bool per factor. true: bool per factor that
-    may be false, whether the reference has it.
+    Attributes:
+        robots: their names.
+        graph: odometry and loops by robot, then loop closures by pair.
+        trusted: bool per relative pose.
+        true: bool per relative pose that may be false, whether the reference has it; None without reference.
+        closures: number of loop closures.
+        optimum: the solution in one place.
+        trace: round, cost, and bytes by these robots.
+        setup: last round before all of them iterated, and bytes until then.
     """
 
     robots: tuple[str, ...]
@@ -66,10 +73,12 @@ def solve(
         for component in components:
             component.optimum = _central(component)
     began = time.perf_counter()
-    agents, traffic, rounds = meet(graph, config, lambda k, a, t: _watch(components, k, a, t, c2))
+    agents, traffic, rounds = meet(graph, config, lambda k, a, t: _watch(components, k, a, t, c2=c2))
     seconds = time.perf_counter() - began
     results = [_result(component, agents, config, c2) for component in components]
-    return _summary(graph, path, config, results, agents, traffic, rounds, seconds)
+    return _summary(
+        graph, path, config, results, agents=agents, traffic=traffic, rounds=rounds, seconds=seconds
+    )
 
 
 # --- the graph in one place
@@ -132,6 +141,7 @@ def _watch(
     k: int,
     agents: dict[str, PoseGraphAgent],
     traffic: Traffic,
+    *,
     c2: float | None,
 ) -> None:
     """After round k: costs of all components that are past their set-up."""
@@ -258,6 +268,7 @@ def _summary(
     path: Path,
     config: PoseGraphConfig,
     components: list[dict[str, Any]],
+    *,
     agents: dict[str, PoseGraphAgent],
     traffic: Traffic,
     rounds: int,

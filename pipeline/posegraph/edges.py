@@ -1,0 +1,155 @@
+"""Edges of public pose graphs: `.g2o` and the csv of Kimera-Multi.
+
+Weights are SE-Sync's: tau = 3 / trace of the covariance's translation block, kappa = 3 / (2 trace of its rotation
+block), so that costs compare with certified optima.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import read_text
+from duagc.pipeline.geometry import se3
+
+Array = NDArray[np.float64]
+SYMBOL_BITS = 56  # a gtsam symbol is a character in the highest byte and an index below it
+_IGNORED_TAGS = {
+    "VERTEX_SE3:QUAT",
+    "FIX",
+    "PARAMS_SE3OFFSET",
+}  # start values and gauge: agents find their own
+
+Key = tuple[str, int]
+"""Robot (or "" before a graph is cut), index."""
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Measured relative poses as a file lists them.
+
+    Attributes:
+        i: key of the pose that each is seen from.
+        j: key of the pose that is seen.
+        T_i_j: [m, 4, 4], pose j's frame to pose i's.
+        kappa: [m], SE-Sync's weight of the rotation.
+        tau: [m], SE-Sync's weight of the translation, 1/m^2.
+        inlier: bool [m], what a reference file names as true, for the evaluation; None if there is none.
+    """
+
+    i: list[Key]
+    j: list[Key]
+    T_i_j: Array
+    kappa: Array
+    tau: Array
+    inlier: NDArray[np.bool_] | None = None
+
+    def select(self, keep: NDArray[np.bool_]) -> Edges:
+        """The edges of a mask."""
+        at = np.flatnonzero(keep).tolist()
+        inlier = None if self.inlier is None else self.inlier[keep]
+        i, j = [self.i[k] for k in at], [self.j[k] for k in at]
+        return Edges(i, j, self.T_i_j[keep], self.kappa[keep], self.tau[keep], inlier)
+
+
+def read_g2o(path: Path) -> Edges:
+    """Edges of one `.g2o` file in 3-D; keys with a gtsam symbol name their robot by its character.
+
+    Raises:
+        DuagError: names the line that is not understood.
+    """
+    i: list[Key] = []
+    j: list[Key] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(read_text(path, "a pose graph").splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#") or words[0] in _IGNORED_TAGS:
+            continue
+        if "SE2" in words[0] or words[0] in ("VERTEX2", "EDGE2"):
+            raise DuagError(f"{path}: line {number} is {words[0]}: a 2-D graph, expected 3-D (EDGE_SE3:QUAT)")
+        if words[0] != "EDGE_SE3:QUAT":
+            raise DuagError(f"{path}: line {number} is {words[0]}, expected VERTEX_SE3:QUAT or EDGE_SE3:QUAT")
+        try:
+            keys, row = [int(word) for word in words[1:3]], [float(word) for word in words[3:]]
+        except ValueError:
+            raise DuagError(f"{path}: line {number} holds something that is not a number") from None
+        sound = len(row) == 28 and np.isfinite(row).all() and min(keys) >= 0 and max(keys) < 1 << 64
+        if not sound or not any(row[3:7]):
+            raise DuagError(
+                f"{path}: line {number} is not an edge: 2 keys of 64 bits and 28 finite numbers expected"
+            )
+        i.append(_symbol(keys[0]))
+        j.append(_symbol(keys[1]))
+        rows.append(row)
+    if not rows:
+        raise DuagError(f"{path}: no EDGE_SE3:QUAT in this file")
+    values = np.array(rows)
+    kappa, tau = _isotropic(values[:, 7:], path)
+    return Edges(i, j, se3.from_quat_translation(values[:, [6, 3, 4, 5]], values[:, :3]), kappa, tau)
+
+
+def _symbol(key: int) -> Key:
+    character = key >> SYMBOL_BITS
+    return (chr(character), key & ((1 << SYMBOL_BITS) - 1)) if character else ("", key)
+
+
+def _isotropic(upper: Array, path: Path) -> tuple[Array, Array]:
+    """SE-Sync's kappa and tau [m] from the upper triangles [m, 21] of the information matrices."""
+    at = np.triu_indices(6)
+    full = np.zeros((len(upper), 6, 6))
+    full[:, at[0], at[1]] = full[:, at[1], at[0]] = upper
+    for block in (full[:, :3, :3], full[:, 3:, 3:]):
+        bad = np.linalg.eigvalsh(block)[:, 0] <= 0
+        if bad.any():
+            raise DuagError(
+                f"{path}: the information of edge {int(np.argmax(bad)) + 1} is not positive definite"
+            )
+    tau = 3 / np.trace(np.linalg.inv(full[:, :3, :3]), axis1=1, axis2=2)
+    kappa = 3 / (2 * np.trace(np.linalg.inv(full[:, 3:, 3:]), axis1=1, axis2=2))
+    return kappa, tau
+
+
+def read_kimera(path: Path) -> Edges:
+    """Edges of one robot's `measurements.csv` of Kimera-Multi; `weight` and `is_known_inlier` are ignored."""
+    needed = [
+        "robot_src",
+        "pose_src",
+        "robot_dst",
+        "pose_dst",
+        "qx",
+        "qy",
+        "qz",
+        "qw",
+        "tx",
+        "ty",
+        "tz",
+        "kappa",
+        "tau",
+    ]
+    reader = csv.DictReader(read_text(path, "a pose graph").splitlines())
+    missing = [name for name in needed if name not in (reader.fieldnames or [])]
+    if missing:
+        raise DuagError(f"{path}: no column {missing[0]}, expected {', '.join(needed)}")
+    i: list[Key] = []
+    j: list[Key] = []
+    rows: list[list[float]] = []
+    for number, fields in enumerate(reader, start=2):
+        try:
+            ids = [int(fields[name]) for name in needed[:4]]
+            row = [float(fields[name]) for name in needed[4:]]
+        except (TypeError, ValueError):
+            raise DuagError(f"{path}: line {number} holds something that is not a number") from None
+        if min(ids) < 0 or not np.isfinite(row).all() or min(row[7:]) <= 0 or not any(row[:4]):
+            raise DuagError(f"{path}: line {number} is not a measurement with positive kappa and tau")
+        i.append((f"robot{ids[0]}", ids[1]))
+        j.append((f"robot{ids[2]}", ids[3]))
+        rows.append(row)
+    if not rows:
+        raise DuagError(f"{path}: no measurements in this file")
+    v = np.array(rows)
+    return Edges(i, j, se3.from_quat_translation(v[:, [3, 0, 1, 2]], v[:, 4:7]), v[:, 7], v[:, 8])
