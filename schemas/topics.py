@@ -16,7 +16,15 @@ class Scope(Enum):
 
 @dataclass(frozen=True)
 class Topic:
-    """One row: `pattern` with <robot> for the robot's name, full name of the schema, who writes, who reads."""
+    """One topic.
+
+    Attributes:
+        pattern: name of the topic, with <robot> for the robot's name.
+        schema: full name of the schema of its messages.
+        producer: stage that writes it.
+        scope: who may read it.
+        meaning: in words.
+    """
 
     pattern: str
     schema: str
