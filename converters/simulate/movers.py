@@ -31,7 +31,7 @@ class Mover:
     folder: Path
     poses: Array
 
-    def eye(self, camera: PinholeCamera) -> MeshRenderer:
+    def renderer(self, camera: PinholeCamera) -> MeshRenderer:
         """A renderer of the figure alone."""
         return MeshRenderer(Caster(meshes.load(self.folder)), camera)
 
@@ -46,22 +46,27 @@ class Mover:
 
 
 def walk(
-    count: int, space: FreeSpace, caster: Caster, ways: list[Array], seed: int, cache: Path
+    count: int, space: FreeSpace, caster: Caster, trajectories: list[Array], *, seed: int, cache: Path
 ) -> list[Mover]:
     """Figures that walk through the free space, clear of the robots and in their view as long as can be found.
 
     Args:
-        caster: of the scene. ways: of the robots, T_world_camera [frames, 4, 4]. cache: an existing folder.
+        count: how many.
+        space: where they can stand.
+        caster: of the scene.
+        trajectories: of the robots, T_world_camera [frames, 4, 4].
+        seed: of their paths and colors.
+        cache: an existing folder, gets their triangles.
     """
-    graph, frames = space.graph.tocsr(), len(ways[0])
-    cameras = np.stack(ways)
+    graph, frames = space.graph.tocsr(), len(trajectories[0])
+    cameras = np.stack(trajectories)
     movers = []
     for k in range(count):
         best: tuple[float, Array] | None = None
         for attempt in range(TRIES):
             rng = random_streams.generator(seed, "simulate.mover", mover=k, attempt=attempt)
-            way = route(space, graph, frames * STEP_M + 1.0, rng)
-            spline = CubicSpline(0.025 * np.arange(len(way)), way)
+            path = route(space, graph, frames * STEP_M + 1.0, rng)
+            spline = CubicSpline(0.025 * np.arange(len(path)), path)
             floor = spline(0.5 + STEP_M * np.arange(frames))
             middle = np.column_stack([floor, np.full(frames, space.floor_m + 1.1)])
             gap = np.linalg.norm(cameras[:, :, :2, 3] - floor, axis=2).min()

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from duagc.converters.simulate.stages import set_up
-from duagc.converters.simulate.team import FRAME_RATE_HZ, camera_of, scene_of
+from duagc.converters.simulate.settings import FRAME_RATE_HZ, camera_of, scene_of
+from duagc.converters.simulate.simulated_scenes import set_up
 from duagc.converters.simulate.trajectories import loops, paradigms
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
@@ -42,14 +42,16 @@ def run(
         about = scene_of(scene, up)[1]
         with tempfile.TemporaryDirectory(prefix="duagc-scene-") as cache:
             stage = set_up(scene, about.get("up", ""), seed, Path(cache), as_meshes=False)
-            small = stage.eye(camera.scaled(*loops.OVERLAP_IMAGE))
+            small = stage.renderer(camera.scaled(*loops.OVERLAP_IMAGE))
             stage.free_space()
             for figure, count, asked in track(list(product(figures, robots, overlaps)), f"plan {scene}"):
                 row: Row = {"scene": about["scene"], "paradigm": figure, "robots": count, "asked": asked}
                 rows.append(row)
                 start = time.process_time()
                 try:
-                    ways = paradigms.plan(stage, figure, count, frames, asked, camera, seed)
+                    ways = paradigms.plan(
+                        stage, figure, robots=count, frames=frames, overlap=asked, camera=camera, seed=seed
+                    )
                 except DuagError as error:
                     row["refused"] = str(error)
                     continue

@@ -271,7 +271,8 @@ def bench_paths(
 
     Example: `duagc bench paths --scenes scans/house --robots 3`
     """
-    from duagc.converters.simulate.team import MAX_ROBOTS, PARADIGMS
+    from duagc.converters.simulate.settings import MAX_ROBOTS
+    from duagc.converters.simulate.trajectories.paradigms import PARADIGMS
     from duagc.pipeline.bench import paths
 
     for name in paradigms.split(","):

@@ -59,7 +59,7 @@ def simulate(
     `duagc simulate --scene office --robots 4 --paradigm crossing --preview office.png --out recordings/office`,
     `duagc simulate --scene scans/house --width 640 --height 480 --frames 300 --out recordings/house`
     """
-    from duagc.converters.simulate.team import Rig
+    from duagc.converters.simulate.sensors.rig import Rig
     from duagc.converters.simulate.team import simulate as simulate_recording
 
     simulate_recording(

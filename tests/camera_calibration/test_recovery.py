@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from duagc.converters.datasets.seven_scenes import Options
 from duagc.converters.simulate.sensors.noise import gray_noise, kinect_depth
-from duagc.converters.simulate.stages import Stage, set_up
+from duagc.converters.simulate.simulated_scenes import SimulatedScene, set_up
 from duagc.pipeline.base import determinism, random_streams
 from duagc.pipeline.camera_calibration.rig import DEPTH, NAMES, ROTATION
 from duagc.pipeline.cli import app
@@ -52,13 +52,13 @@ def measured(depth: np.ndarray) -> np.ndarray:
     return np.where((depth > 0) & (inverse > 0), 1 / np.maximum(inverse, 1e-9), 0)
 
 
-def write_sequence(folder: Path, stage: Stage) -> np.ndarray:
+def write_sequence(folder: Path, stage: SimulatedScene) -> np.ndarray:
     """A robot's walk in the files of the dataset; returns the poses T_world_depth [FRAMES, 4, 4]."""
     folder.mkdir()
     way = stage.wander(1, BARE + FRAMES, 0.6, DEPTH_CAMERA)[0][BARE:]
     rays = rays_of_the_lens().astype(np.float32)
     columns, rows = rays[..., 0] * WIDE.fx + WIDE.cx, rays[..., 1] * WIDE.fy + WIDE.cy
-    color_eye, depth_eye = stage.eye(WIDE), stage.eye(DEPTH_CAMERA)
+    color_eye, depth_eye = stage.renderer(WIDE), stage.renderer(DEPTH_CAMERA)
     turned = T_DEPTH_COLOR @ se3.from_rotation_translation(R_COLOR_DEPTH.T, np.zeros(3))
     for k, T in enumerate(way):
         before, after = max(k - 1, 0), min(k + 1, FRAMES - 1)
@@ -81,11 +81,11 @@ def command(*arguments: object) -> str:
     return result.stdout
 
 
-def errors(folder: Path, stage: Stage, way: np.ndarray) -> tuple[float, float]:
+def errors(folder: Path, stage: SimulatedScene, way: np.ndarray) -> tuple[float, float]:
     """Median errors of a recording's depth (m) and gray values, against what its camera would have seen."""
     depths, grays = [], []
     with open_rgbd(Recording(folder).log("alpha")) as log:
-        eye = stage.eye(log.camera)
+        eye = stage.renderer(log.camera)
         for k in range(0, FRAMES, EVERY):
             frame, exact = log.frame(k), eye.render(way[k] @ T_DEPTH_COLOR)
             known = (frame.depth > 0) & (exact.depth > 0)

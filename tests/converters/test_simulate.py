@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
+from duagc.converters.simulate.ply import write_points
 from duagc.converters.simulate.render import bake
 from duagc.converters.simulate.render.renderer import Renderer
 from duagc.converters.simulate.scenes.catalog import build
 from duagc.converters.simulate.scenes.scene import Scene
 from duagc.converters.simulate.sensors import noise
-from duagc.converters.simulate.team import camera_of, simulate, write_points
+from duagc.converters.simulate.settings import camera_of
+from duagc.converters.simulate.team import simulate
 from duagc.converters.simulate.trajectories import loops
 from duagc.pipeline import messages
 from duagc.pipeline.base import random_streams

@@ -13,8 +13,9 @@ import pytest
 
 from duagc.converters.simulate.render import meshes
 from duagc.converters.simulate.render.raycast import Caster, MeshRenderer
-from duagc.converters.simulate.stages import MeshStage
-from duagc.converters.simulate.team import camera_of, simulate
+from duagc.converters.simulate.settings import camera_of
+from duagc.converters.simulate.simulated_scenes import SimulatedMeshes
+from duagc.converters.simulate.team import simulate
 from duagc.converters.simulate.trajectories import walks
 from duagc.converters.simulate.trajectories.loops import look_at, shared_view
 from duagc.pipeline.base.errors import DuagError
@@ -37,13 +38,13 @@ from tests.fixtures.sampling import sampled
 
 
 @pytest.fixture(scope="module", params=sorted(WRITERS))
-def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> MeshStage:
+def stage(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> SimulatedMeshes:
     where = tmp_path_factory.mktemp("scene")
     folder = folder_of(where / "room", request.param)
     files = meshes.mesh_files(folder)
     (where / "cache").mkdir()
     meshes.read(folder, meshes.up_axis(files, "auto"), where / "cache")
-    return MeshStage(0, where / "cache")
+    return SimulatedMeshes(0, where / "cache")
 
 
 def true_view(origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -11,10 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
-from duagc.converters.simulate.stages import MeshStage, RoomStage, set_up
-from duagc.converters.simulate.team import PARADIGMS, camera_of, simulate
+from duagc.converters.simulate.settings import camera_of
+from duagc.converters.simulate.simulated_scenes import SimulatedMeshes, SimulatedRoom, set_up
+from duagc.converters.simulate.team import simulate
 from duagc.converters.simulate.trajectories import figures, paradigms, walks
 from duagc.converters.simulate.trajectories.loops import OVERLAP_IMAGE, shared_view
+from duagc.converters.simulate.trajectories.paradigms import PARADIGMS
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.bench import paths
 from duagc.pipeline.geometry import se3
@@ -29,12 +31,14 @@ CAMERA = camera_of((160, 120))
 
 
 @pytest.fixture(scope="module")
-def room() -> RoomStage:
-    return RoomStage(0)
+def room() -> SimulatedRoom:
+    return SimulatedRoom(0)
 
 
-def planned(room: RoomStage, paradigm: str, overlap: float, robots: int) -> list[np.ndarray]:
-    return paradigms.plan(room, paradigm, robots, FRAMES, overlap, CAMERA, 0)
+def planned(room: SimulatedRoom, paradigm: str, overlap: float, robots: int) -> list[np.ndarray]:
+    return paradigms.plan(
+        room, paradigm, robots=robots, frames=FRAMES, overlap=overlap, camera=CAMERA, seed=0
+    )
 
 
 ways_of = cache(planned)  # several tests look at the same ways
@@ -52,7 +56,7 @@ ways_of = cache(planned)  # several tests look at the same ways
 )
 def test_paths_are_smooth_clear_and_overlap_as_asked(room, paradigm, robots, overlap):
     ways = ways_of(room, paradigm, overlap, robots)
-    eye = room.eye(CAMERA.scaled(*OVERLAP_IMAGE))
+    eye = room.renderer(CAMERA.scaled(*OVERLAP_IMAGE))
     shared = [shared_view(eye, a, b) for a, b in pairwise(ways)]
     assert np.mean(shared) == pytest.approx(overlap, abs=0.05)
     assert np.abs(np.array(shared) - overlap).max() < 0.15
@@ -70,23 +74,24 @@ def test_paths_are_smooth_clear_and_overlap_as_asked(room, paradigm, robots, ove
 
 
 @pytest.fixture
-def box(tmp_path: Path) -> MeshStage:
+def box(tmp_path: Path) -> SimulatedMeshes:
     """A small room with a table, of meshes."""
     (tmp_path / "cache").mkdir()
     folder = folder_of(tmp_path / "flat", "obj")
     stage = set_up(str(folder), "y", 0, tmp_path / "cache", as_meshes=True)
-    assert isinstance(stage, MeshStage)
+    assert isinstance(stage, SimulatedMeshes)
     return stage
 
 
 def test_who_asks_for_too_many_is_told_how_many_fit(box, monkeypatch):
     monkeypatch.setattr(paradigms, "DRAWS", 16)
+    kind = {"frames": 60, "overlap": 0.5, "camera": CAMERA, "seed": 0}
     with pytest.raises(
         DuagError, match=r"no room for crossing paths of 8 robots.* expected at most \d$"
     ) as told:
-        paradigms.plan(box, "crossing", 8, 60, 0.5, CAMERA, 0)
+        paradigms.plan(box, "crossing", robots=8, **kind)
     fit = int(str(told.value)[-1])
-    assert len(paradigms.plan(box, "crossing", fit, 60, 0.5, CAMERA, 0)) == fit
+    assert len(paradigms.plan(box, "crossing", robots=fit, **kind)) == fit
 
 
 def test_an_overlap_that_cannot_be_is_the_nearest_one_and_said(tmp_path):
@@ -102,7 +107,7 @@ def test_a_survey_says_what_was_reached(room, monkeypatch):
     rows = paths.run(["room"], ["crossing"], [2], [0.3], FRAMES, 0, "auto")
     ways = ways_of(room, "crossing", 0.3, 2)
     assert rows[0]["robots_apart_m"] == paradigms.least_apart(ways)
-    eye = room.eye(camera_of((480, 360)).scaled(*OVERLAP_IMAGE))
+    eye = room.renderer(camera_of((480, 360)).scaled(*OVERLAP_IMAGE))
     assert rows[0]["shared"] == shared_view(eye, *ways)
     rows.append({"scene": "room", "paradigm": "parallel", "robots": 8, "cpu_s": 1.0, "refused": "too many"})
     table = " ".join(paths.format_table(rows).split())
@@ -176,7 +181,7 @@ def check_depth(out: Path, scene: str, cache: Path) -> None:
     for robot in recording.robots:
         poses = true_poses(recording, robot)
         with open_rgbd(recording.log(robot)) as log:
-            eye = stage.eye(log.camera)
+            eye = stage.renderer(log.camera)
             for frame, pose in zip(log.frames(), poses, strict=True):
                 depth = eye.render(pose).depth
                 exact = np.where(depth < 65535 * stage.depth_scale_m, depth, 0)

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from duagc.converters.simulate.movers import Mover, walk
-from duagc.converters.simulate.sensors.rig import RANGE_SIGMA_M, T_CAMERA_LIDAR, MovingCamera, with_gain
-from duagc.converters.simulate.stages import MeshStage, set_up
-from duagc.converters.simulate.team import Rig, _twists, camera_of, simulate
+from duagc.converters.simulate.sensors.rig import RANGE_SIGMA_M, T_CAMERA_LIDAR, MovingCamera, Rig, with_gain
+from duagc.converters.simulate.settings import camera_of
+from duagc.converters.simulate.simulated_scenes import SimulatedMeshes, set_up
+from duagc.converters.simulate.team import simulate, twists_of
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
@@ -27,16 +28,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def stage(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> MeshStage:
+def stage(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> SimulatedMeshes:
     stage = set_up(str(folder), "y", 0, tmp_path_factory.mktemp("cache"), as_meshes=True)
-    assert isinstance(stage, MeshStage)
+    assert isinstance(stage, SimulatedMeshes)
     return stage
 
 
 @pytest.fixture(scope="module")
-def movers(stage: MeshStage, tmp_path_factory: pytest.TempPathFactory) -> list[Mover]:
+def movers(stage: SimulatedMeshes, tmp_path_factory: pytest.TempPathFactory) -> list[Mover]:
     ways = [np.tile(pose, (4, 1, 1)) for pose in some_poses()]
-    return walk(2, stage.free_space(), stage.caster, ways, 0, tmp_path_factory.mktemp("movers"))
+    return walk(2, stage.free_space(), stage.caster, ways, seed=0, cache=tmp_path_factory.mktemp("movers"))
 
 
 def alike(one: np.ndarray, other: np.ndarray) -> bool:
@@ -46,7 +47,7 @@ def alike(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def test_a_camera_that_stands_still_sees_what_a_plain_one_sees(stage):
-    eye = stage.eye(CAMERA)
+    eye = stage.renderer(CAMERA)
     for T in some_poses():
         view, still = MovingCamera(eye, Rig(readout_s=0.02), []).render(T, np.zeros(6), 0)
         plain = eye.render(T)
@@ -56,7 +57,7 @@ def test_a_camera_that_stands_still_sees_what_a_plain_one_sees(stage):
 
 
 def test_every_row_of_a_rolling_shutter_is_a_view_of_its_own_time(stage):
-    eye, T = stage.eye(CAMERA), some_poses()[0]
+    eye, T = stage.renderer(CAMERA), some_poses()[0]
     view, _ = MovingCamera(eye, Rig(readout_s=0.03), []).render(T, TWIST, 0)
     assert np.array_equal(view.depth, eye.render(T).depth)  # depth is of one moment
     for row in (0, 17, 59):
@@ -66,7 +67,7 @@ def test_every_row_of_a_rolling_shutter_is_a_view_of_its_own_time(stage):
 
 
 def test_motion_blur_is_the_mean_over_the_exposure(stage):
-    eye, T = stage.eye(CAMERA), some_poses()[1]
+    eye, T = stage.renderer(CAMERA), some_poses()[1]
     view, _ = MovingCamera(eye, Rig(exposure_s=0.03), []).render(T, TWIST, 0)
     times = (np.arange(16) + 0.5) / 16 * 0.03 - 0.015
     mean = np.mean([eye.render(T @ se3.exp(t * TWIST)).color for t in times], axis=0)
@@ -75,7 +76,7 @@ def test_motion_blur_is_the_mean_over_the_exposure(stage):
 
 
 def test_the_mask_is_where_something_moves(stage, movers):
-    eye = stage.eye(CAMERA)
+    eye = stage.renderer(CAMERA)
     hidden = 0
     for T in some_poses():
         for frame in range(4):
@@ -99,7 +100,7 @@ def test_movers_keep_clear_of_walls_and_robots(stage, movers):
 
 def test_lidar_points_lie_on_surfaces(stage):
     for T in some_poses():
-        points = MovingCamera(stage.eye(CAMERA), Rig(sensor="lidar"), []).sweep(
+        points = MovingCamera(stage.renderer(CAMERA), Rig(sensor="lidar"), []).sweep(
             T, 0, random_streams.generator(0, "test")
         )
         world = se3.transform(T @ T_CAMERA_LIDAR, points)
@@ -146,7 +147,7 @@ def test_stereo_depth_is_as_good_as_its_sigma_says(folder, tmp_path):
     stage = set_up(str(folder), "y", 0, tmp_path / "cache", as_meshes=True)
     with open_rgbd(recording.log("alpha")) as log:
         frames = list(log.frames())
-        eye = stage.eye(log.camera)
+        eye = stage.renderer(log.camera)
     for frame, pose in zip(frames, true_poses(recording, "alpha"), strict=True):
         assert frame.depth_sigma is not None
         seen = frame.depth > 0
@@ -172,9 +173,9 @@ def test_all_together_do_not_depend_on_the_number_of_workers(folder, tmp_path):
         assert all(frame.mask is not None for frame in log.frames())
 
 
-def test_twists_lead_to_the_next_pose():
+def testtwists_of_lead_to_the_next_pose():
     way = np.stack([se3.exp(k * TWIST / 30) for k in range(4)])
-    twists = _twists(way)
+    twists = twists_of(way)
     assert way[1] @ se3.exp(twists[1] / 30) == pytest.approx(way[2], abs=1e-12)
     assert np.array_equal(twists[-1], twists[-2])
 

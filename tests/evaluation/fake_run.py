@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from duagc import schemas
-from duagc.converters.simulate.team import write_points
+from duagc.converters.simulate.ply import write_points
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.exchange.wire.state_wire import PairList, write_pairs
 from duagc.pipeline.geometry import se3

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from duagc import schemas
-from duagc.converters.simulate.team import write_points
+from duagc.converters.simulate.ply import write_points
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation import map_errors, views
 from duagc.pipeline.evaluation.groundtruth import Surface, surface

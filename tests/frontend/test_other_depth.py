@@ -13,7 +13,7 @@ from duagc.converters.layouts.stereo import StereoRig
 from duagc.converters.simulate.render import bake
 from duagc.converters.simulate.render.renderer import Renderer
 from duagc.converters.simulate.scenes.catalog import build
-from duagc.converters.simulate.team import camera_of
+from duagc.converters.simulate.settings import camera_of
 from duagc.converters.simulate.trajectories import loops
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.config.frontend import FrontendConfig

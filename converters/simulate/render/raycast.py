@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from duagc.converters.simulate.render.meshes import LEVELS, MeshScene
-from duagc.converters.simulate.render.renderer import View
+from duagc.converters.simulate.render.renderer import RenderedView
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
@@ -82,7 +82,7 @@ class MeshRenderer:
         shape = (self.camera.height, self.camera.width)
         return depth.reshape(shape), triangle.reshape(shape)
 
-    def render(self, T_world_camera: ArrayLike) -> View:
+    def render(self, T_world_camera: ArrayLike) -> RenderedView:
         """Color and depth from a camera pose T_world_camera [4, 4]."""
         depth, triangle = self.depth(T_world_camera)
         T = np.asarray(T_world_camera, dtype=np.float64)
@@ -93,7 +93,9 @@ class MeshRenderer:
         uneven = np.flatnonzero(np.abs(one - other).max(axis=1) > UNEVEN_GRAY)
         _, more = self.shade(T[:3, 3], np.concatenate([each[uneven] for each in directions[1:3]]))
         mean[uneven] = 0.5 * mean[uneven] + 0.25 * more.reshape(2, -1, 3).sum(axis=0)
-        return View(np.clip(np.rint(mean), 0, 255).astype(np.uint8).reshape(*depth.shape, 3), depth, triangle)
+        return RenderedView(
+            np.clip(np.rint(mean), 0, 255).astype(np.uint8).reshape(*depth.shape, 3), depth, triangle
+        )
 
     def shade(
         self, origins: Array, directions: NDArray[np.float32]

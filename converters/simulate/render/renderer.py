@@ -28,7 +28,7 @@ BORDER_OFFSETS = np.array(
 
 
 @dataclass(frozen=True)
-class View:
+class RenderedView:
     """What a camera sees: color uint8 [h, w, 3] RGB; depth float64 [h, w], z in m, 0 = nothing; surface its index."""
 
     color: NDArray[np.uint8]
@@ -36,7 +36,7 @@ class View:
     surface: NDArray[np.integer]
 
 
-class Eye(Protocol):
+class CameraRenderer(Protocol):
     """Renders one scene with one camera."""
 
     camera: PinholeCamera
@@ -44,7 +44,7 @@ class Eye(Protocol):
     def depth(self, T_world_camera: ArrayLike) -> tuple[Array, Any]:
         """Depth (z, m, [h, w]; 0 = nothing) at the pixel centers, and what is seen there (-1 = nothing)."""
 
-    def render(self, T_world_camera: ArrayLike) -> View:
+    def render(self, T_world_camera: ArrayLike) -> RenderedView:
         """Color and depth from a camera pose T_world_camera [4, 4]."""
 
 
@@ -79,7 +79,7 @@ class Renderer:
         np.divide(1.0, inverse, out=depth, where=inverse > 0)
         return depth, surface
 
-    def render(self, T_world_camera: ArrayLike) -> View:
+    def render(self, T_world_camera: ArrayLike) -> RenderedView:
         """Color and exact depth from a camera pose T_world_camera [4, 4]."""
         pose = _Pose(self, T_world_camera)
         inverse, surface = self._nearest(pose)
@@ -95,7 +95,7 @@ class Renderer:
         if at.size:
             color[at] = self._border(pose, at, surface)
         image = np.clip(np.rint(color), 0, 255).astype(np.uint8).reshape(*surface.shape, 3)
-        return View(image, depth, surface)
+        return RenderedView(image, depth, surface)
 
     def _nearest(self, pose: "_Pose") -> tuple[Array, NDArray[np.int16]]:
         """Greatest inverse depth and its surface at every pixel center."""

@@ -11,10 +11,15 @@ from duagc.pipeline.base.errors import DuagError
 
 
 @dataclass(frozen=True)
-class Manner:
-    """texel_m: of the texture. step_m: way of a robot per frame. depth_scale_m: meters per unit of depth images.
+class SceneSettings:
+    """How robots move and measure in a scene.
 
-    sky: there is a sky above instead of a ceiling. solid: things are closed, and only their fronts can be seen.
+    Attributes:
+        texel_m: of the texture.
+        step_m: translation of a robot per frame.
+        depth_scale_m: meters per unit of depth images.
+        sky: whether there is a sky above instead of a ceiling.
+        solid: whether things are closed, so that only their fronts can be seen.
     """
 
     texel_m: float = 0.005
@@ -24,12 +29,12 @@ class Manner:
     solid: bool = True
 
 
-MESHES = Manner(solid=False)
-SCENES: dict[str, tuple[Callable[[int], Scene], Manner]] = {
-    "room": (room, Manner(texel_m=0.004, step_m=0.022)),
-    "office": (office, Manner()),
-    "corridor": (corridor, Manner()),
-    "outdoor": (outdoor, Manner(texel_m=0.01, step_m=0.06, depth_scale_m=1 / 1000, sky=True)),
+MESHES = SceneSettings(solid=False)
+SCENES: dict[str, tuple[Callable[[int], Scene], SceneSettings]] = {
+    "room": (room, SceneSettings(texel_m=0.004, step_m=0.022)),
+    "office": (office, SceneSettings()),
+    "corridor": (corridor, SceneSettings()),
+    "outdoor": (outdoor, SceneSettings(texel_m=0.01, step_m=0.06, depth_scale_m=1 / 1000, sky=True)),
 }
 
 

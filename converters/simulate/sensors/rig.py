@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from duagc.converters.simulate.movers import Mover
 from duagc.converters.simulate.render.raycast import OFFSETS, MeshRenderer
-from duagc.converters.simulate.render.renderer import View
+from duagc.converters.simulate.render.renderer import RenderedView
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -86,11 +86,13 @@ def with_gain(
 class MovingCamera:
     """Renders meshes and movers with a camera that has a rolling shutter and an exposure."""
 
-    def __init__(self, eye: MeshRenderer, rig: Rig, movers: list[Mover]) -> None:
-        self.eye, self.rig, self.camera = eye, rig, eye.camera
-        self.movers = [(mover, mover.eye(eye.camera)) for mover in movers]
+    def __init__(self, renderer: MeshRenderer, rig: Rig, movers: list[Mover]) -> None:
+        self.renderer, self.rig, self.camera = renderer, rig, renderer.camera
+        self.movers = [(mover, mover.renderer(renderer.camera)) for mover in movers]
 
-    def render(self, T_world_camera: Array, twist: Array, frame: int) -> tuple[View, NDArray[np.bool_]]:
+    def render(
+        self, T_world_camera: Array, twist: Array, frame: int
+    ) -> tuple[RenderedView, NDArray[np.bool_]]:
         """Color and depth, and where nothing moves, [h, w].
 
         Args:
@@ -112,15 +114,15 @@ class MovingCamera:
         t, _, moved = self._trace(*_rays(self.camera, still, 0.0, 0.0), frame)
         depth = np.where(np.isfinite(t), t, 0.0).astype(np.float64).reshape(shape)
         color = np.clip(np.rint(total / len(shares)), 0, 255).astype(np.uint8)
-        return View(color, depth, np.zeros(shape, dtype=np.int64)), ~(moving | moved.reshape(shape))
+        return RenderedView(color, depth, np.zeros(shape, dtype=np.int64)), ~(moving | moved.reshape(shape))
 
     def _trace(
         self, origins: Array, directions: NDArray[np.float32], frame: int
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         """z, color and whether it moves, of what rays meet first."""
-        t, colors = self.eye.shade(origins, directions)
+        t, colors = self.renderer.shade(origins, directions)
         moving = np.zeros(len(t), dtype=np.bool_)
-        for mover, eye in self.movers:
+        for mover, renderer in self.movers:
             T = mover.poses[frame]
             near = np.flatnonzero(mover.near(T, origins, directions))
             if near.size:
@@ -128,7 +130,7 @@ class MovingCamera:
                     (origins[near] - T[:3, 3]) @ T[:3, :3],
                     directions[near] @ T[:3, :3].astype(np.float32),
                 )
-                t_mover, paint = eye.shade(start, np.asarray(way, dtype=np.float32))
+                t_mover, paint = renderer.shade(start, np.asarray(way, dtype=np.float32))
                 ahead = t_mover < t[near]
                 t[near[ahead]], colors[near[ahead]], moving[near[ahead]] = t_mover[ahead], paint[ahead], True
         return t, colors, moving

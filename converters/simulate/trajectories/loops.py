@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from duagc.converters.simulate.render.renderer import Eye, Renderer
+from duagc.converters.simulate.render.renderer import CameraRenderer, Renderer
 from duagc.converters.simulate.scenes.scene import UP, Scene
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.errors import DuagError
@@ -142,7 +142,7 @@ def _loop(scene: Scene, robot: int) -> Loop:
 
 
 @dataclass(frozen=True)
-class Views:
+class PathViews:
     """What a camera sees on its path: poses T_world_camera [n, 4, 4], depths [n, h, w], world points [n * h * w, 3]."""
 
     poses: Array
@@ -150,7 +150,7 @@ class Views:
     points: Array
 
 
-def look(renderer: Eye, path: Array) -> Views:
+def look(renderer: CameraRenderer, path: Array) -> PathViews:
     """Some views, evenly spread, along a path T_world_camera [frames, 4, 4]."""
     poses = path[np.unique(np.linspace(0, len(path) - 1, OVERLAP_VIEWS).round().astype(np.int64))]
     depths = np.stack([renderer.depth(T)[0] for T in poses])
@@ -158,10 +158,10 @@ def look(renderer: Eye, path: Array) -> Views:
     points = [
         se3.transform(T, (rays * d[..., None]).reshape(-1, 3)) for T, d in zip(poses, depths, strict=True)
     ]
-    return Views(poses, depths, np.concatenate(points))
+    return PathViews(poses, depths, np.concatenate(points))
 
 
-def shared(camera: PinholeCamera, a: Views, b: Views) -> float:
+def shared(camera: PinholeCamera, a: PathViews, b: PathViews) -> float:
     """Share of the pixels of views a whose points views b see too, and the other way round, averaged."""
     shares = []
     for one, other in ((a, b), (b, a)):
@@ -172,7 +172,7 @@ def shared(camera: PinholeCamera, a: Views, b: Views) -> float:
     return float(np.mean(shares))
 
 
-def shared_view(renderer: Eye, path_a: Array, path_b: Array) -> float:
+def shared_view(renderer: CameraRenderer, path_a: Array, path_b: Array) -> float:
     """Share of the pixels along path a [n, 4, 4] whose points path b sees too, and the other way round, averaged."""
     return shared(renderer.camera, look(renderer, path_a), look(renderer, path_b))
 

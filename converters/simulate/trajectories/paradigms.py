@@ -13,9 +13,9 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.converters.simulate.render.renderer import Eye
+from duagc.converters.simulate.render.renderer import CameraRenderer
 from duagc.converters.simulate.trajectories.figures import APART_M, SHAPES, Figure, Ground, Way, apart
-from duagc.converters.simulate.trajectories.loops import Views, look, shared
+from duagc.converters.simulate.trajectories.loops import PathViews, look, shared
 from duagc.converters.simulate.trajectories.walks import (
     LEAST_MEDIAN_M,
     MAX_HOLE_SHARE,
@@ -54,7 +54,7 @@ class _Member:
     way: Way
     gaze_rad: float
     path: Array
-    views: Views
+    views: PathViews
     surplus: float  # of the overlap with the robot before, over what was asked for
 
     @property
@@ -65,6 +65,7 @@ class _Member:
 def plan(
     terrain: Terrain,
     paradigm: str,
+    *,
     robots: int,
     frames: int,
     overlap: float,
@@ -109,8 +110,8 @@ class _Search:
         self.ground = Ground(terrain, frames, seed)
         self.paradigm, self.shape, self.overlap = paradigm, SHAPES[paradigm], overlap
         self.sky, self.full_m = terrain.sky, (frames - 1) * terrain.step_m
-        self.sketch = terrain.sketch(camera.scaled(*SKETCH))
-        self.eye = terrain.eye(camera.scaled(*VIEW_IMAGE))
+        self.sketch_renderer = terrain.sketch_renderer(camera.scaled(*SKETCH))
+        self.renderer = terrain.renderer(camera.scaled(*VIEW_IMAGE))
         self.looks = 0  # along paths, so far
 
     def best(self, robots: int) -> list[Array] | None:
@@ -123,14 +124,14 @@ class _Search:
             for error, paths in self._teams(robots, size):
                 if error > NEAR_ENOUGH:
                     near.append((error, paths))
-                elif (shown := _shown(self.eye, paths, self.sky)) is not None:
+                elif (shown := _shown(self.renderer, paths, self.sky)) is not None:
                     good.append((shown, paths))
                 if len(good) * robots >= SHOWN:
                     break
             if good:
                 return max(good, key=lambda each: each[0])[1]
         near.sort(key=lambda each: each[0])
-        seen = (paths for _, paths in near if _shown(self.eye, paths, self.sky) is not None)
+        seen = (paths for _, paths in near if _shown(self.renderer, paths, self.sky) is not None)
         return next(seen, None)
 
     def _teams(self, robots: int, size: float) -> Iterator[tuple[float, list[Array]]]:
@@ -187,12 +188,12 @@ class _Search:
         """A robot that looks aside of its way by an angle; None if it faces holes or something near."""
         path = way.poses(gaze_rad)
         self.looks += 1
-        views = look(self.sketch, path)
+        views = look(self.sketch_renderer, path)
         if not _open(views, self.sky):
             return None
         surplus = 0.0
         if before is not None:
-            surplus = shared(self.sketch.camera, before.views, views) - self.overlap
+            surplus = shared(self.sketch_renderer.camera, before.views, views) - self.overlap
         return _Member(spread, way, gaze_rad, path, views, surplus)
 
     def _next(self, figure: Figure, robots: int, team: list[_Member]) -> _Member | None:
@@ -238,7 +239,7 @@ class _Search:
         return best
 
 
-def _open(views: Views, sky: bool) -> bool:
+def _open(views: PathViews, sky: bool) -> bool:
     """Whether no view faces holes or something near."""
     for depth in views.depths:
         seen = depth > 0
@@ -249,11 +250,11 @@ def _open(views: Views, sky: bool) -> bool:
     return True
 
 
-def _shown(eye: Eye, paths: list[Array], sky: bool) -> float | None:
+def _shown(renderer: CameraRenderer, paths: list[Array], sky: bool) -> float | None:
     """Share of edges in the dullest view of all paths; None if one shows holes or something near."""
     least = 1.0
     for path in paths:
-        shown = least_shown(eye, path, sky)
+        shown = least_shown(renderer, path, sky)
         if shown is None:
             return None
         least = min(least, shown)

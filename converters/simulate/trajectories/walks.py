@@ -20,7 +20,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from duagc.converters.simulate.render.raycast import Caster
-from duagc.converters.simulate.render.renderer import Eye
+from duagc.converters.simulate.render.renderer import CameraRenderer
 from duagc.converters.simulate.trajectories.loops import HEIGHTS_M, OVERLAP_IMAGE, look_at, shared_view
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.errors import DuagError
@@ -78,10 +78,10 @@ class Terrain(Protocol):
     step_m: float  # way of a robot per frame
     sky: bool  # there is no ceiling
 
-    def eye(self, camera: PinholeCamera) -> Eye:
+    def renderer(self, camera: PinholeCamera) -> CameraRenderer:
         """A renderer."""
 
-    def sketch(self, camera: PinholeCamera) -> Eye:
+    def sketch_renderer(self, camera: PinholeCamera) -> CameraRenderer:
         """A renderer for depth alone, the quickest there is."""
 
     def clearance(self, points: Array) -> Array:
@@ -107,7 +107,7 @@ def plan(
         DuagError: there is no free space, or no walk in it that keeps clear and sees something.
     """
     space = terrain.free_space()
-    small = terrain.eye(camera.scaled(*OVERLAP_IMAGE))
+    small = terrain.renderer(camera.scaled(*OVERLAP_IMAGE))
     walks: list[Array] = []
     for robot in track(range(robots), "plan walks"):
         found = _candidates(terrain, space, robot, frames, camera, seed)
@@ -229,7 +229,7 @@ def _candidates(
 ) -> list[tuple[float, Array]]:
     """Walks of a robot that keep clear and see something, each with how much its dullest view shows."""
     graph = space.graph.tocsr()
-    eye = terrain.eye(camera.scaled(*VIEW_IMAGE))
+    renderer = terrain.renderer(camera.scaled(*VIEW_IMAGE))
     found: list[tuple[float, Array]] = []
     reasons = {"too near to something": 0, "turns too fast": 0, "sees holes or a near wall": 0}
     for attempt in range(TRIES):
@@ -243,7 +243,7 @@ def _candidates(
         ):
             reasons["too near to something"] += 1
         else:
-            shown = least_shown(eye, poses, terrain.sky)
+            shown = least_shown(renderer, poses, terrain.sky)
             if shown is None:
                 reasons["sees holes or a near wall"] += 1
             else:
@@ -320,11 +320,11 @@ def _look_ahead(
     return None
 
 
-def least_shown(eye: Eye, poses: Array, sky: bool) -> float | None:
+def least_shown(renderer: CameraRenderer, poses: Array, sky: bool) -> float | None:
     """Share of edges in the view of a walk that has fewest of them; None if a view shows holes or a near wall."""
     least = 1.0
     for k in np.unique(np.linspace(0, len(poses) - 1, VIEWS).round().astype(np.int64)):
-        depth, _ = eye.depth(poses[k])
+        depth, _ = renderer.depth(poses[k])
         seen = depth > 0
         if (
             1 - seen.mean() > (MAX_SKY_SHARE if sky else MAX_HOLE_SHARE)
@@ -334,7 +334,7 @@ def least_shown(eye: Eye, poses: Array, sky: bool) -> float | None:
         if np.median(depth[seen]) < LEAST_MEDIAN_M:
             return None
     for k in np.unique(np.linspace(0, len(poses) - 1, VIEWS).round().astype(np.int64)):
-        gray = eye.render(poses[k]).color.astype(np.float64).mean(axis=2)
+        gray = renderer.render(poses[k]).color.astype(np.float64).mean(axis=2)
         edges = np.hypot(*np.gradient(gray)) > EDGE_GRAY / 2
         least = min(least, float(edges.mean()))
     return least

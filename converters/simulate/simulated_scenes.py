@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from duagc.converters.simulate.render import bake, meshes, triangles
 from duagc.converters.simulate.render.raycast import Caster, MeshRenderer
-from duagc.converters.simulate.render.renderer import Eye, Renderer
-from duagc.converters.simulate.scenes.catalog import MESHES, SCENES, Manner, build
+from duagc.converters.simulate.render.renderer import CameraRenderer, Renderer
+from duagc.converters.simulate.scenes.catalog import MESHES, SCENES, SceneSettings, build
 from duagc.converters.simulate.trajectories import loops, walks
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -23,7 +23,7 @@ ROOM_POINTS = 200_000
 POINTS_PER_M2, MOST_POINTS = 2000, 2_000_000  # of meshes; the room has about as many on a square meter
 
 
-class Stage(walks.Terrain, Protocol):
+class SimulatedScene(walks.Terrain, Protocol):
     """A scene that is ready to be rendered."""
 
     depth_scale_m: float
@@ -34,49 +34,54 @@ class Stage(walks.Terrain, Protocol):
     def points(self) -> Points:
         """Points spread evenly over the surfaces: positions (m, world), unit normals, colors, [n, 3] each."""
 
-    def store(self, folder: Path) -> "OnDisk":
+    def store(self, folder: Path) -> "SceneOnDisk":
         """Write what other processes need."""
 
 
-class OnDisk(Protocol):
-    """A stage whose large parts lie in a folder; small enough to be sent to another process."""
+class SceneOnDisk(Protocol):
+    """A simulated scene whose large parts lie in a folder; small enough to be sent to another process."""
 
-    def open(self) -> Stage:
-        """The stage."""
+    def open(self) -> SimulatedScene:
+        """The scene, ready to be rendered."""
 
 
-def set_up(scene: str, up: str, seed: int, cache: Path, as_meshes: bool) -> Stage:
-    """The stage of a procedural scene or of a folder of meshes; meshes are read into `cache`, an empty folder.
+def set_up(scene: str, up: str, seed: int, cache: Path, *, as_meshes: bool) -> SimulatedScene:
+    """A procedural scene or a folder of meshes, ready to be rendered.
 
-    The room has a renderer of its own, which knows rays from one point only; `as_meshes` makes triangles of it too.
+    Args:
+        scene: one of `SCENES`, or else a folder of textured meshes.
+        up: of meshes, the axis that is up in the files, "y" or "z".
+        seed: of the scene.
+        cache: an empty folder, into which meshes are read.
+        as_meshes: make triangles of the room too, whose own renderer knows rays from one point only.
     """
     if scene not in SCENES:
         meshes.read(Path(scene), up, cache)
-        return MeshStage(seed, cache)
+        return SimulatedMeshes(seed, cache)
     if scene == "room" and not as_meshes:
-        return RoomStage(seed)
-    manner = SCENES[scene][1]
-    triangles.write(build(scene, seed), manner.texel_m, cache)
-    return MeshStage(seed, cache, manner)
+        return SimulatedRoom(seed)
+    settings = SCENES[scene][1]
+    triangles.write(build(scene, seed), settings.texel_m, cache)
+    return SimulatedMeshes(seed, cache, settings)
 
 
 @dataclass(frozen=True)
 class RoomOnDisk:
-    """A procedural room whose baked texture lies in a folder; `open` gives the stage in any process."""
+    """A procedural room whose baked texture lies in a folder; `open` gives the scene in any process."""
 
     seed: int
     folder: Path
     levels: int
     origin: Array
 
-    def open(self) -> "RoomStage":
-        """The stage."""
+    def open(self) -> "SimulatedRoom":
+        """The scene, ready to be rendered."""
         files = [self.folder / f"{k}.npy" for k in range(self.levels)]
         maps = [np.asarray(np.load(path, mmap_mode="r")) for path in files]
-        return RoomStage(self.seed, bake.Atlas(maps, self.origin, ROOM.texel_m))
+        return SimulatedRoom(self.seed, bake.Atlas(maps, self.origin, ROOM.texel_m))
 
 
-class RoomStage:
+class SimulatedRoom:
     """The procedural room, without triangles: its depth is exact in float64."""
 
     step_m, depth_scale_m, sky = ROOM.step_m, ROOM.depth_scale_m, ROOM.sky
@@ -90,10 +95,10 @@ class RoomStage:
             np.save(folder / f"{k}.npy", level)
         return RoomOnDisk(self.scene.seed, folder, len(self.atlas.levels), self.atlas.origin)
 
-    def eye(self, camera: PinholeCamera) -> Eye:
+    def renderer(self, camera: PinholeCamera) -> CameraRenderer:
         return Renderer(self.scene, self.atlas, camera)
 
-    def sketch(self, camera: PinholeCamera) -> Eye:
+    def sketch_renderer(self, camera: PinholeCamera) -> CameraRenderer:
         return MeshRenderer(Caster(triangles.unpainted(self.scene)), camera)
 
     def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
@@ -114,39 +119,41 @@ class RoomStage:
 
 @dataclass(frozen=True)
 class MeshesOnDisk:
-    """Meshes that lie, read, in a folder; `open` gives the stage in any process."""
+    """Meshes that lie, read, in a folder; `open` gives the scene in any process."""
 
     seed: int
     folder: Path
-    manner: Manner
+    settings: SceneSettings
 
-    def open(self) -> "MeshStage":
-        """The stage."""
-        return MeshStage(self.seed, self.folder, self.manner)
+    def open(self) -> "SimulatedMeshes":
+        """The scene, ready to be rendered."""
+        return SimulatedMeshes(self.seed, self.folder, self.settings)
 
 
-class MeshStage:
-    """A scene of meshes."""
+class SimulatedMeshes:
+    """A scene of meshes, ready to be rendered."""
 
-    def __init__(self, seed: int, folder: Path, manner: Manner = MESHES) -> None:
+    def __init__(self, seed: int, folder: Path, settings: SceneSettings = MESHES) -> None:
         """Args:
-        seed: of walks and points. folder: where `meshes.read` or `triangles.write` has written the scene.
+        seed: of paths and points.
+        folder: where `meshes.read` or `triangles.write` has written the scene.
+        settings: how robots move and measure in it.
         """
-        self.seed, self.folder, self.manner = seed, folder, manner
-        self.step_m, self.depth_scale_m, self.sky = manner.step_m, manner.depth_scale_m, manner.sky
+        self.seed, self.folder, self.settings = seed, folder, settings
+        self.step_m, self.depth_scale_m, self.sky = settings.step_m, settings.depth_scale_m, settings.sky
         self.scene = meshes.load(folder)
         self.caster = Caster(self.scene)
         self._space: walks.FreeSpace | None = None
 
     def store(self, folder: Path) -> MeshesOnDisk:
-        """All is on disk already."""
-        return MeshesOnDisk(self.seed, self.folder, self.manner)
+        """Everything is on disk already."""
+        return MeshesOnDisk(self.seed, self.folder, self.settings)
 
-    def eye(self, camera: PinholeCamera) -> Eye:
+    def renderer(self, camera: PinholeCamera) -> CameraRenderer:
         return MeshRenderer(self.caster, camera, self.sky)
 
-    def sketch(self, camera: PinholeCamera) -> Eye:
-        return self.eye(camera)
+    def sketch_renderer(self, camera: PinholeCamera) -> CameraRenderer:
+        return self.renderer(camera)
 
     def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
         return walks.plan(self, robots, frames, overlap, camera, self.seed)
@@ -164,7 +171,7 @@ class MeshStage:
         count = int(np.clip(POINTS_PER_M2 * areas.sum(), ROOM_POINTS, MOST_POINTS))
         rng = random_streams.generator(self.seed, "simulate.points")
         points, normals, colors = meshes.surface_points(self.scene, areas, count, rng)
-        if not self.manner.solid:
+        if not self.settings.solid:
             return points, normals, colors
         hit = self.caster.hits(points + 0.002 * normals, normals.astype(np.float32))
         inside = np.isfinite(hit["t"]) & (np.einsum("ij,ij->i", hit["normals"], normals) > 0)  # sees a back
