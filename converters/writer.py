@@ -50,36 +50,11 @@ from duagc.schemas import topics
 OPTIONS_FILE: ContextVar[dict[str, str] | None] = ContextVar("options_file", default=None)
 """Name and text of the file that the converter's options came from; recordings keep it."""
 
-ROBOT_NAMES = (
-    *(
-        "alpha",
-        "bravo",
-        "charlie",
-        "delta",
-        "echo",
-        "foxtrot",
-        "golf",
-        "hotel",
-        "india",
-        "juliett",
-        "kilo",
-        "lima",
-    ),
-    *(
-        "mike",
-        "november",
-        "oscar",
-        "papa",
-        "quebec",
-        "romeo",
-        "sierra",
-        "tango",
-        "uniform",
-        "victor",
-        "whiskey",
-    ),
-    *("xray", "yankee", "zulu"),
-)
+SPELLING_ALPHABET = """
+    alpha bravo charlie delta echo foxtrot golf hotel india juliett kilo lima mike november oscar papa quebec romeo
+    sierra tango uniform victor whiskey xray yankee zulu
+"""
+ROBOT_NAMES = tuple(SPELLING_ALPHABET.split())
 NANOSECONDS = 1_000_000_000
 MAX_SIDE_PX, MAX_FOCAL_PX = 16_384, 1e6
 FAR_M = 1e9  # from the origin of a world; geocentric coordinates are 6e6
@@ -140,9 +115,8 @@ class RobotWriter:
         self._log = LogWriter(self.folder / f"{name}.mcap", name, self.sensors)
         self._truth: LogWriter | None = None
         self._has_depth = self._has_exact_depth = self._has_sigma = False
-        self._sensors: dict[
-            str, NDArray[np.float64]
-        ] = {}  # topic of a pose in the camera that is still to be written
+        # topic of a sensor's pose in the camera that is still to be written
+        self._sensors: dict[str, NDArray[np.float64]] = {}
         self._stamps: list[int] = []
         self._positions: list[NDArray[np.float64]] = []
 
@@ -156,6 +130,7 @@ class RobotWriter:
         color: bytes,
         color_format: str,
         depth: NDArray[np.uint16] | None,
+        *,
         T_world_camera: NDArray[np.float64] | None = None,
         exact_depth: NDArray[np.uint16] | None = None,
         mask: NDArray[np.bool_] | None = None,
@@ -165,7 +140,8 @@ class RobotWriter:
 
         Args:
             stamp_ns: time of the recording, increasing.
-            color: the encoded color image as it is; color_format: "jpeg" or "png".
+            color: the encoded color image as it is.
+            color_format: "jpeg" or "png".
             depth: uint16 [H, W] in units of depth_scale along z, registered to color, 0 = none. None: the depth is
                 that of another camera or a LiDAR.
             T_world_camera: true pose [4, 4] of the color camera in the world that all robots share, where known.
@@ -173,14 +149,11 @@ class RobotWriter:
             mask: bool [H, W], False where a pixel must not be used (a moving object); None = all may.
             depth_sigma_m: [H, W], standard deviation of the depth in meters, where it is known pixel by pixel: then
                 with every frame. It is kept to 3 %, and from 0.1 mm to 6.5 m.
+        Raises:
+            ValueError: an image has another size than the camera, or the time does not increase.
+            DuagError: the true pose is beyond FAR_M.
         """
-        for image in (depth, mask, depth_sigma_m):
-            if image is not None:
-                self._check_size(image)
-        if color_format not in ("jpeg", "png"):
-            raise ValueError(f"color format {color_format!r}, expected 'jpeg' or 'png'")
-        if self._stamps and stamp_ns <= self._stamps[-1]:
-            raise ValueError(f"frame at {stamp_ns} ns comes after one at {self._stamps[-1]} ns")
+        self._check_frame(stamp_ns, color_format, (depth, mask, depth_sigma_m))
         name = self.name
         if not self._stamps:
             calibration = messages.pack_calibration(stamp_ns, name, self.camera)
@@ -190,59 +163,88 @@ class RobotWriter:
             topics.COLOR.of(name), messages.pack_color(stamp_ns, name, color, color_format), stamp_ns
         )
         if depth is not None:
-            if not self._has_depth:
-                text = {DEPTH_SCALE_KEY: repr(self.depth_scale)}
-                self._log.channel(topics.DEPTH.of(name), topics.DEPTH.schema, text)
-                self._has_depth = True
-            self._log.write(topics.DEPTH.of(name), messages.pack_depth(stamp_ns, name, depth), stamp_ns)
-            if depth_sigma_m is not None:
-                self._add_sigma(stamp_ns, depth, depth_sigma_m)
+            self._add_registered_depth(stamp_ns, depth, depth_sigma_m)
         if mask is not None:
             self._log.write(topics.MASK.of(name), messages.pack_mask(stamp_ns, name, mask), stamp_ns)
         if T_world_camera is not None:
-            far_m = float(np.abs(np.asarray(T_world_camera)[:3, 3]).max())
-            if not far_m < FAR_M:
-                raise DuagError(
-                    f"robot {name}: the true pose at {stamp_ns} ns is {far_m:.3g} m away, "
-                    f"expected less than {FAR_M:.0e} m"
-                )
-            pose = messages.pack_pose_in_frame(stamp_ns, messages.WORLD_FRAME, T_world_camera)
-            self._truth_log().write(topics.GROUNDTRUTH_POSE.of(name), pose, stamp_ns)
-            self._positions.append(np.asarray(T_world_camera, dtype=np.float64)[:3, 3].copy())
+            self._add_true_pose(stamp_ns, np.asarray(T_world_camera))
         if exact_depth is not None:
-            self._check_size(exact_depth)
-            truth, topic = self._truth_log(), topics.GROUNDTRUTH_DEPTH.of(name)
-            if not self._has_exact_depth:
-                truth.channel(
-                    topic, topics.GROUNDTRUTH_DEPTH.schema, {DEPTH_SCALE_KEY: repr(self.depth_scale)}
-                )
-                self._has_exact_depth = True
-            truth.write(topic, messages.pack_depth(stamp_ns, name, exact_depth), stamp_ns)
+            self._add_exact_depth(stamp_ns, exact_depth)
+
+    def _check_frame(self, stamp_ns: int, color_format: str, images: tuple[NDArray[Any] | None, ...]) -> None:
+        for image in images:
+            if image is not None:
+                self._check_size(image)
+        if color_format not in ("jpeg", "png"):
+            raise ValueError(f"color format {color_format!r}, expected 'jpeg' or 'png'")
+        if self._stamps and stamp_ns <= self._stamps[-1]:
+            raise ValueError(f"frame at {stamp_ns} ns comes after one at {self._stamps[-1]} ns")
+
+    def _add_registered_depth(
+        self, stamp_ns: int, depth: NDArray[np.uint16], sigma_m: NDArray[np.floating] | None
+    ) -> None:
+        topic = topics.DEPTH.of(self.name)
+        if not self._has_depth:
+            self._log.channel(topic, topics.DEPTH.schema, {DEPTH_SCALE_KEY: repr(self.depth_scale)})
+            self._has_depth = True
+        self._log.write(topic, messages.pack_depth(stamp_ns, self.name, depth), stamp_ns)
+        if sigma_m is not None:
+            self._add_sigma(stamp_ns, depth, sigma_m)
+
+    def _add_true_pose(self, stamp_ns: int, T_world_camera: NDArray[np.float64]) -> None:
+        far_m = float(np.abs(T_world_camera[:3, 3]).max())
+        if not far_m < FAR_M:
+            raise DuagError(
+                f"robot {self.name}: the true pose at {stamp_ns} ns is {far_m:.3g} m away, "
+                f"expected less than {FAR_M:.0e} m"
+            )
+        pose = messages.pack_pose_in_frame(stamp_ns, messages.WORLD_FRAME, T_world_camera)
+        self._truth_log().write(topics.GROUNDTRUTH_POSE.of(self.name), pose, stamp_ns)
+        self._positions.append(T_world_camera.astype(np.float64)[:3, 3].copy())
+
+    def _add_exact_depth(self, stamp_ns: int, exact_depth: NDArray[np.uint16]) -> None:
+        self._check_size(exact_depth)
+        truth, topic = self._truth_log(), topics.GROUNDTRUTH_DEPTH.of(self.name)
+        if not self._has_exact_depth:
+            truth.channel(topic, topics.GROUNDTRUTH_DEPTH.schema, {DEPTH_SCALE_KEY: repr(self.depth_scale)})
+            self._has_exact_depth = True
+        truth.write(topic, messages.pack_depth(stamp_ns, self.name, exact_depth), stamp_ns)
 
     def _add_sigma(self, stamp_ns: int, depth: NDArray[np.uint16], sigma_m: NDArray[np.floating]) -> None:
         topic = topics.DEPTH_SIGMA.of(self.name)
         if not self._has_sigma:
             self._log.channel(topic, topics.DEPTH_SIGMA.schema, {DEPTH_SCALE_KEY: repr(SIGMA_SCALE_M)})
             self._has_sigma = True
-        told = (depth > 0) & (np.asarray(sigma_m) > 0)
+        is_known = (depth > 0) & (np.asarray(sigma_m) > 0)
         most = np.iinfo(np.uint16).max
         units = np.clip(np.rint(np.asarray(sigma_m, dtype=np.float64) / SIGMA_SCALE_M), 1, most)
         # five binary digits say all that a sigma can, and take a third of the space
         step = 2.0 ** np.maximum(np.frexp(units)[1] - 5, 0)
-        raw = np.where(told, np.minimum(np.rint(units / step) * step, most), 0).astype(np.uint16)
+        raw = np.where(is_known, np.minimum(np.rint(units / step) * step, most), 0).astype(np.uint16)
         self._log.write(topic, messages.pack_depth(stamp_ns, self.name, raw), stamp_ns)
 
     def set_depth_camera(
         self, camera: PinholeCamera, T_camera_depth: NDArray[np.float64], depth_scale: float
     ) -> None:
-        """Announce a depth camera of its own: intrinsics, T_camera_depth [4, 4], meters per unit of its images."""
+        """Announce a depth camera of its own.
+
+        Args:
+            camera: its intrinsics.
+            T_camera_depth: its pose [4, 4] in the color camera.
+            depth_scale: meters per unit of its images.
+        """
         self._depth_camera = camera
         self._sensors[topics.RAW_DEPTH_TRANSFORM.of(self.name)] = T_camera_depth
         text = {DEPTH_SCALE_KEY: repr(float(depth_scale))}
         self._log.channel(topics.RAW_DEPTH.of(self.name), topics.RAW_DEPTH.schema, text)
 
     def add_depth(self, stamp_ns: int, depth: NDArray[np.uint16]) -> None:
-        """Append an image of the depth camera, uint16 [h, w] along its z, 0 = none; not registered to color."""
+        """Append an image of the depth camera, not registered to color.
+
+        Args:
+            stamp_ns: its time, not before that of the message before.
+            depth: uint16 [h, w] along the depth camera's z, 0 = none.
+        """
         if depth.shape != (self._depth_camera.height, self._depth_camera.width):
             raise ValueError(f"an image is {depth.shape}, expected that of {self._depth_camera}")
         if self._announce(topics.RAW_DEPTH_TRANSFORM, stamp_ns, "depth_camera"):
@@ -253,31 +255,56 @@ class RobotWriter:
         )
 
     def set_lidar(self, T_camera_lidar: NDArray[np.float64], range_sigma_m: float | None) -> None:
-        """Announce a LiDAR: T_camera_lidar [4, 4] and the standard deviation of its ranges, None if not known."""
+        """Announce a LiDAR.
+
+        Args:
+            T_camera_lidar: its pose [4, 4] in the color camera.
+            range_sigma_m: standard deviation of its ranges, None if not known.
+        """
         self._sensors[topics.LIDAR_TRANSFORM.of(self.name)] = T_camera_lidar
         text = {} if range_sigma_m is None else {RANGE_SIGMA_KEY: repr(float(range_sigma_m))}
         self._log.channel(topics.LIDAR.of(self.name), topics.LIDAR.schema, text)
 
     def add_points(self, stamp_ns: int, points_lidar: NDArray[np.floating]) -> None:
-        """Append a sweep of the LiDAR: points [n, 3], meters, all as of the one time."""
+        """Append a sweep of the LiDAR.
+
+        Args:
+            stamp_ns: its time, at which all points were measured.
+            points_lidar: [n, 3], m, LiDAR frame.
+        """
         self._announce(topics.LIDAR_TRANSFORM, stamp_ns, "lidar")
         points = messages.pack_points(stamp_ns, f"{self.name}/lidar", points_lidar)
         self._log.write(topics.LIDAR.of(self.name), points, stamp_ns)
 
     def set_imu(self, T_camera_imu: NDArray[np.float64]) -> None:
-        """Announce an IMU: T_camera_imu [4, 4]."""
+        """Announce an IMU.
+
+        Args:
+            T_camera_imu: its pose [4, 4] in the color camera.
+        """
         self._sensors[topics.IMU_TRANSFORM.of(self.name)] = T_camera_imu
 
     def add_imu(
         self, stamp_ns: int, rates_rad_s: NDArray[np.float64], accelerations_m_s2: NDArray[np.float64]
     ) -> None:
-        """Append a reading of the IMU: angular velocity [3] and acceleration with gravity [3], about its own axes."""
+        """Append a reading of the IMU.
+
+        Args:
+            stamp_ns: its time.
+            rates_rad_s: angular velocity [3], IMU frame.
+            accelerations_m_s2: acceleration with gravity [3], IMU frame.
+        """
         self._announce(topics.IMU_TRANSFORM, stamp_ns, "imu")
         reading = messages.pack_imu(stamp_ns, self.name, rates_rad_s, accelerations_m_s2)
         self._log.write(topics.IMU.of(self.name), reading, stamp_ns)
 
     def add_odometry(self, stamp_ns: int, T_odometry_camera: NDArray[np.float64]) -> None:
-        """Append a pose [4, 4] of the camera by another odometry, in a frame of its own."""
+        """Append a pose of the camera by another odometry.
+
+        Args:
+            stamp_ns: its time.
+            T_odometry_camera: [4, 4], in a frame of that odometry.
+        """
         pose = messages.pack_pose_in_frame(stamp_ns, f"{self.name}/odometry_prior", T_odometry_camera)
         self._log.write(topics.ODOMETRY_PRIOR.of(self.name), pose, stamp_ns)
 
@@ -346,6 +373,7 @@ class RecordingWriter:
         name: str = "",
         source: Mapping[str, Any] | None = None,
         converter: str = "",
+        *,
         parameters: Mapping[str, Any] | None = None,
         force: bool = False,
     ) -> None:
@@ -355,15 +383,15 @@ class RecordingWriter:
         source: what it was made from; no absolute paths.
         converter: what made it.
         parameters: the settings it was made with.
+        force: replace a recording that is there.
         """
         self.out = Path(out)
         self.name = name or self.out.resolve().name
         self.warnings: list[str] = []
         self.parameters = dict(parameters or {})
         self.checks: dict[str, Any] = {}
-        self.clocks: dict[
-            str, Any
-        ] = {}  # by robot: how its clock differs from the first robot's, where that was asked
+        # by robot: how its clock differs from the first robot's, where that was asked
+        self.clocks: dict[str, Any] = {}
         self._source, self._converter, self._force = dict(source or {}), converter, force
         self._robots: dict[str, dict[str, Any]] = {}
         self._open: list[RobotWriter] = []
@@ -377,13 +405,24 @@ class RecordingWriter:
     def robot(
         self, name: str, camera: PinholeCamera, depth_scale: float, sensors: Mapping[str, str] | None = None
     ) -> RobotWriter:
-        """The writer of one robot's logs, to be used as a context manager within this one."""
+        """The writer of one robot's logs, to be used as a context manager within this one.
+
+        Args:
+            name: of the robot.
+            camera: of color and depth alike.
+            depth_scale: meters per unit of the depth images.
+            sensors: as of `RobotWriter`.
+        """
         writer = RobotWriter(self.folder, name, camera, depth_scale, sensors)
         self._open.append(writer)
         return writer
 
     def add(self, summary: Mapping[str, Any]) -> None:
-        """Take in a robot whose logs another `RobotWriter` has written into `folder`, by its summary."""
+        """Add a robot whose logs another `RobotWriter` has written into `folder`.
+
+        Args:
+            summary: that writer's summary.
+        """
         row = dict(summary)
         robot = row.pop("robot")
         if robot in self._robots:
@@ -391,7 +430,11 @@ class RecordingWriter:
         self._robots[robot] = row
 
     def add_geometry(self, write: Callable[[Path], None]) -> None:
-        """Add the true geometry of the scene: `write` is called with the path of a .ply file to write."""
+        """Add the true geometry of the scene.
+
+        Args:
+            write: is called with the path of a .ply file to write.
+        """
         self._geometry = "groundtruth.ply"
         write(self.folder / self._geometry)
 

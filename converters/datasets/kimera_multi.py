@@ -92,7 +92,9 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
             "parts": [r.files for r in found],
         }
         parameters = {"robots": len(found), **settings.model_dump()}
-        with RecordingWriter(out, "", source, "kimera-multi", parameters, force) as recording:
+        with RecordingWriter(
+            out, "", source, "kimera-multi", parameters=parameters, force=force
+        ) as recording:
             logs = {robot.name: _robot_log(robot, settings, src) for robot in found}
             settle_clocks(recording, logs)
             for robot in found:

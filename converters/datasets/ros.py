@@ -60,7 +60,10 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
         row["truth_file"] = Path(row["truth_file"]).name  # no paths of this machine
     parameters = {"robots": said}
     source = {"dataset": "ros", "folder": src.resolve().name, "parts": [s.label for s in sources]}
-    with RecordingWriter(out, "", source, "ros", parameters, force) as recording, ExitStack() as opened:
+    with (
+        RecordingWriter(out, "", source, "ros", parameters=parameters, force=force) as recording,
+        ExitStack() as opened,
+    ):
         robot_logs = {}
         for part in sources:
             log = opened.enter_context(open_log(part.paths, part.name))
@@ -135,7 +138,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
         at_ns, encoded = source.written_ns(stamp_ns), (picture.color, picture.color_format)
         if picture.points_lidar is not None:
             robot.add_points(at_ns, picture.points_lidar)
-        robot.add_frame(at_ns, *encoded, picture.depth, T, depth_sigma_m=picture.depth_sigma_m)
+        robot.add_frame(at_ns, *encoded, picture.depth, T_world_camera=T, depth_sigma_m=picture.depth_sigma_m)
         if check.needs(index, T):
             check.add(index, source.depth_m(picture), T)
         empty += 0 if picture.depth is None else picture.depth.size - int(np.count_nonzero(picture.depth))

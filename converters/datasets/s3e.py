@@ -95,7 +95,7 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
         origin = np.floor(known[0]) if known else np.zeros(3)
         parameters = {**settings.model_dump(), "calibration": folder.name, "origin_m": origin.tolist()}
         source = {"dataset": "s3e", "sequence": src.resolve().name, "vehicles": vehicles}
-        with RecordingWriter(out, "", source, "s3e", parameters, force) as recording:
+        with RecordingWriter(out, "", source, "s3e", parameters=parameters, force=force) as recording:
             for name, vehicle in zip(robot_names(len(vehicles)), vehicles, strict=True):
                 one = _Vehicle(log, vehicle, calibrations[vehicle], fixes[vehicle], origin, settings)
                 with recording.robot(name, one.rig.camera, STEREO_SCALE_M, one.sensors()) as robot:
@@ -354,12 +354,14 @@ class _Vehicle:
                 color = self.rig.rectify_left(
                     self.frames.sized(decoded(parts[self.left].read(), self.where), self.where)
                 )
-                robot.add_frame(stamp, png(color), "png", None, self.truth.get(stamp))
+                robot.add_frame(stamp, png(color), "png", None, T_world_camera=self.truth.get(stamp))
                 continue
             image, depth, sigma_m = self.frames.frame(
                 parts[self.left].read(), parts[self.right].read(), self.where
             )
-            robot.add_frame(stamp, image, "png", depth, self.truth.get(stamp), depth_sigma_m=sigma_m)
+            robot.add_frame(
+                stamp, image, "png", depth, T_world_camera=self.truth.get(stamp), depth_sigma_m=sigma_m
+            )
             empty += int((depth == 0).sum())
             if len(points):
                 scale.add(points, depth)

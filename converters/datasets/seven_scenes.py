@@ -152,7 +152,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     references = [_reference(Path(src), sequence, frames, settings) for sequence, frames in parts]
     parameters = {"robots": robots, **settings.model_dump()}
     parameters["reference_poses"] = Path(settings.reference_poses).name
-    with RecordingWriter(out, "", source, "7scenes", parameters, force) as recording:
+    with RecordingWriter(out, "", source, "7scenes", parameters=parameters, force=force) as recording:
         recording.warnings += skipped
         recording.warnings.append(
             f"no time stamps in the dataset: made from frame numbers at {settings.rate_hz} Hz"
@@ -285,7 +285,7 @@ def _write_robot(
         check.add(index, depth, T_world_camera)
         stamp_ns = (files.number - frames[0].number) * NANOSECONDS // options.rate_hz
         raw = np.rint(depth / DEPTH_SCALE).astype(np.uint16)
-        robot.add_frame(stamp_ns, color, color_format, raw, T_world_camera)
+        robot.add_frame(stamp_ns, color, color_format, raw, T_world_camera=T_world_camera)
         holes += _count_holes(raw)
         invalid += int((raw == 0).sum())
     pixels = len(frames) * WIDTH * HEIGHT

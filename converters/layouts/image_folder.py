@@ -89,7 +89,7 @@ def write(
     """
     determinism.configure_opencv()
     source = {"dataset": dataset, "folder": src.resolve().name, "parts": [c.label for c in clips if c.label]}
-    with RecordingWriter(out, "", source, dataset, dict(parameters), force) as recording:
+    with RecordingWriter(out, "", source, dataset, parameters=dict(parameters), force=force) as recording:
         recording.warnings += warnings
         for name, clip in zip(names or robot_names(len(clips)), clips, strict=True):
             sensors = {"part": clip.label, **clip.sensors}
@@ -113,7 +113,9 @@ def _write_clip(robot: RobotWriter, clip: Clip, label: str) -> dict[str, Any]:
         raw = read_depth(files.depth, size)
         raw = lens.depth(np.where(np.isin(raw, clip.no_depth), 0, raw).astype(np.uint16))
         color, color_format = lens.color(files.color)
-        robot.add_frame(files.stamp_ns - start_ns, color, color_format, raw, files.T_world_camera)
+        robot.add_frame(
+            files.stamp_ns - start_ns, color, color_format, raw, T_world_camera=files.T_world_camera
+        )
         check.add(index, raw.astype(np.float64) * clip.depth_scale, files.T_world_camera)
         empty += int((raw == 0).sum())
     pixels = len(clip.frames) * size[0] * size[1]

@@ -196,7 +196,7 @@ def still_recording(folder: Path, contrast: int = 255) -> Path:
     depth = np.full((240, 320), 1500, np.uint16) + (np.arange(320) // 4).astype(np.uint16)
     with RecordingWriter(folder) as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
         for k in range(20):
-            robot.add_frame(k * 33_000_000, png, "png", depth, None)
+            robot.add_frame(k * 33_000_000, png, "png", depth)
     return folder
 
 

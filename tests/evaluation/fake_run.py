@@ -181,7 +181,9 @@ def _write_recording(
                         if truth and depth_noise != "none"
                         else None
                     )
-                    log.add_frame(k * INTERVAL_NS, png.tobytes(), "png", depth, pose, exact)
+                    log.add_frame(
+                        k * INTERVAL_NS, png.tobytes(), "png", depth, T_world_camera=pose, exact_depth=exact
+                    )
         if truth:
             recording.add_geometry(_write_wall)
 

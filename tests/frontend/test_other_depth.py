@@ -81,12 +81,12 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
                     z = z[pixels[:, 1], pixels[:, 0], None]
                     points = rays * z + units * rng.normal(0, RANGE_SIGMA_M, z.shape)
                     robot.add_points(stamp_ns, points[z[:, 0] > 0] @ R_CAMERA_LIDAR)
-                    robot.add_frame(stamp_ns, png, "png", None, T)
+                    robot.add_frame(stamp_ns, png, "png", None, T_world_camera=T)
                     continue
                 gray = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, other))
                 depth_m, sigma_m = rig.depth(*gray)
                 raw = np.rint(depth_m / 0.001).astype(np.uint16)
-                robot.add_frame(stamp_ns, png, "png", raw, T, depth_sigma_m=sigma_m)
+                robot.add_frame(stamp_ns, png, "png", raw, T_world_camera=T, depth_sigma_m=sigma_m)
     logs = {kind: out / kind / "alpha.mcap" for kind in ("stereo", "lidar")}
     return Walk(logs, poses, [view.depth for view in views])
 

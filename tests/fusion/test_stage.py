@@ -100,7 +100,7 @@ def robot(tmp_path_factory):
         recording.robot("bravo", CAMERA, 0.001, {"depth_noise": "none"}) as log,
     ):
         for k in range(FRAMES):
-            log.add_frame(k * 10**8, png.tobytes(), "png", np.full((24, 32), 2000, np.uint16), None, None)
+            log.add_frame(k * 10**8, png.tobytes(), "png", np.full((24, 32), 2000, np.uint16))
     gaussians = Gaussians(
         np.arange(N),
         np.arange(N) % 2,

@@ -44,7 +44,7 @@ def large_recording(out: Path) -> Path:
                 for index in range(9):
                     color = png(rng.integers(0, 255, (240, 320, 3), dtype=np.uint8))
                     depth = rng.integers(0, 5000, (240, 320), dtype=np.uint16)
-                    robot.add_frame(index * FRAME_NS, color, "png", depth, np.eye(4))
+                    robot.add_frame(index * FRAME_NS, color, "png", depth, T_world_camera=np.eye(4))
     return out
 
 
