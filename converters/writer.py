@@ -19,33 +19,23 @@ written by a process of its own:
 from __future__ import annotations
 
 import json
-import math
-import re
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from contextvars import ContextVar
-from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from duagc import __version__
-from duagc.pipeline import messages
+from duagc.converters.robot_writer import RobotWriter
 from duagc.pipeline.base.atomic_folder import RECORDING, new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import (
-    DEPTH_SCALE_KEY,
-    RANGE_SIGMA_KEY,
     RECORDING_FILE,
     RECORDING_FORMAT,
     RECORDING_SCHEMA,
-    LogWriter,
 )
-from duagc.schemas import topics
 
 OPTIONS_FILE: ContextVar[dict[str, str] | None] = ContextVar("options_file", default=None)
 """Name and text of the file that the converter's options came from; recordings keep it."""
@@ -55,10 +45,6 @@ SPELLING_ALPHABET = """
     sierra tango uniform victor whiskey xray yankee zulu
 """
 ROBOT_NAMES = tuple(SPELLING_ALPHABET.split())
-NANOSECONDS = 1_000_000_000
-MAX_SIDE_PX, MAX_FOCAL_PX = 16_384, 1e6
-FAR_M = 1e9  # from the origin of a world; geocentric coordinates are 6e6
-SIGMA_SCALE_M = 1e-4  # of the images of standard deviations
 UNITS = {"time": "ns", "length": "m", "depth": "depth_scale_m per unit, along z, 0 = none", "angle": "rad"}
 
 
@@ -67,301 +53,6 @@ def robot_names(count: int) -> list[str]:
     if not 1 <= count <= len(ROBOT_NAMES):
         raise DuagError(f"{count} robots, expected 1 to {len(ROBOT_NAMES)}")
     return list(ROBOT_NAMES[:count])
-
-
-def check_camera(camera: PinholeCamera, where: str) -> None:
-    """Refuse intrinsics that no camera has: they came from a file."""
-    sides, focals = (camera.width, camera.height), (camera.fx, camera.fy)
-    sound = all(1 <= side <= MAX_SIDE_PX for side in sides)
-    sound = sound and all(0 < focal < MAX_FOCAL_PX for focal in focals)
-    sound = sound and all(abs(center) < MAX_FOCAL_PX for center in (camera.cx, camera.cy))
-    if not sound:
-        raise DuagError(
-            f"{where}: camera {camera}, expected sides up to {MAX_SIDE_PX} px and sound intrinsics"
-        )
-
-
-class RobotWriter:
-    """Writes the logs of one robot into the folder of a recording; a context manager.
-
-    Frames and messages of other sensors are appended in the order of their times, all together. `summary` is, after a
-    clean exit, what `recording.json` says about the robot: plain numbers and text.
-    """
-
-    def __init__(
-        self,
-        folder: Path,
-        name: str,
-        camera: PinholeCamera,
-        depth_scale: float,
-        sensors: Mapping[str, str] | None = None,
-    ) -> None:
-        """Args:
-        folder: `RecordingWriter.folder`.
-        name: of the robot: lower-case letters, digits, underscores.
-        camera: of color and depth alike.
-        depth_scale: meters per unit of the depth images.
-        sensors: what is known about the sensors, for example {"depth_noise": "none"}; kept in the log's metadata.
-        """
-        if not re.fullmatch(topics.ROBOT_NAME, name):
-            raise DuagError(f"robot {name!r}: expected lower-case letters, digits and underscores")
-        check_camera(camera, f"robot {name}")
-        if not (math.isfinite(depth_scale) and depth_scale > 0):
-            raise DuagError(f"robot {name}: a unit of depth is {depth_scale} m, expected a positive number")
-        self.folder, self.name, self.camera, self.depth_scale = Path(folder), name, camera, float(depth_scale)
-        self.sensors = dict(sensors or {})
-        self.summary: dict[str, Any] = {}
-        self._files = ExitStack()
-        self._log = LogWriter(self.folder / f"{name}.mcap", name, self.sensors)
-        self._truth: LogWriter | None = None
-        self._has_depth = self._has_exact_depth = self._has_sigma = False
-        # topic of a sensor's pose in the camera that is still to be written
-        self._sensors: dict[str, NDArray[np.float64]] = {}
-        self._stamps: list[int] = []
-        self._positions: list[NDArray[np.float64]] = []
-
-    def __enter__(self) -> RobotWriter:
-        self._files.enter_context(self._log)
-        return self
-
-    def add_frame(
-        self,
-        stamp_ns: int,
-        color: bytes,
-        color_format: str,
-        depth: NDArray[np.uint16] | None,
-        *,
-        T_world_camera: NDArray[np.float64] | None = None,
-        exact_depth: NDArray[np.uint16] | None = None,
-        mask: NDArray[np.bool_] | None = None,
-        depth_sigma_m: NDArray[np.floating] | None = None,
-    ) -> None:
-        """Append one frame.
-
-        Args:
-            stamp_ns: time of the recording, increasing.
-            color: the encoded color image as it is.
-            color_format: "jpeg" or "png".
-            depth: uint16 [H, W] in units of depth_scale along z, registered to color, 0 = none. None: the depth is
-                that of another camera or a LiDAR.
-            T_world_camera: true pose [4, 4] of the color camera in the world that all robots share, where known.
-            exact_depth: like depth, without noise, where that differs and is known.
-            mask: bool [H, W], False where a pixel must not be used (a moving object); None = all may.
-            depth_sigma_m: [H, W], standard deviation of the depth in meters, where it is known pixel by pixel: then
-                with every frame. It is kept to 3 %, and from 0.1 mm to 6.5 m.
-        Raises:
-            ValueError: an image has another size than the camera, or the time does not increase.
-            DuagError: the true pose is beyond FAR_M.
-        """
-        self._check_frame(stamp_ns, color_format, (depth, mask, depth_sigma_m))
-        name = self.name
-        if not self._stamps:
-            calibration = messages.pack_calibration(stamp_ns, name, self.camera)
-            self._log.write(topics.CALIBRATION.of(name), calibration, stamp_ns)
-        self._stamps.append(int(stamp_ns))
-        self._log.write(
-            topics.COLOR.of(name), messages.pack_color(stamp_ns, name, color, color_format), stamp_ns
-        )
-        if depth is not None:
-            self._add_registered_depth(stamp_ns, depth, depth_sigma_m)
-        if mask is not None:
-            self._log.write(topics.MASK.of(name), messages.pack_mask(stamp_ns, name, mask), stamp_ns)
-        if T_world_camera is not None:
-            self._add_true_pose(stamp_ns, np.asarray(T_world_camera))
-        if exact_depth is not None:
-            self._add_exact_depth(stamp_ns, exact_depth)
-
-    def _check_frame(self, stamp_ns: int, color_format: str, images: tuple[NDArray[Any] | None, ...]) -> None:
-        for image in images:
-            if image is not None:
-                self._check_size(image)
-        if color_format not in ("jpeg", "png"):
-            raise ValueError(f"color format {color_format!r}, expected 'jpeg' or 'png'")
-        if self._stamps and stamp_ns <= self._stamps[-1]:
-            raise ValueError(f"frame at {stamp_ns} ns comes after one at {self._stamps[-1]} ns")
-
-    def _add_registered_depth(
-        self, stamp_ns: int, depth: NDArray[np.uint16], sigma_m: NDArray[np.floating] | None
-    ) -> None:
-        topic = topics.DEPTH.of(self.name)
-        if not self._has_depth:
-            self._log.channel(topic, topics.DEPTH.schema, {DEPTH_SCALE_KEY: repr(self.depth_scale)})
-            self._has_depth = True
-        self._log.write(topic, messages.pack_depth(stamp_ns, self.name, depth), stamp_ns)
-        if sigma_m is not None:
-            self._add_sigma(stamp_ns, depth, sigma_m)
-
-    def _add_true_pose(self, stamp_ns: int, T_world_camera: NDArray[np.float64]) -> None:
-        far_m = float(np.abs(T_world_camera[:3, 3]).max())
-        if not far_m < FAR_M:
-            raise DuagError(
-                f"robot {self.name}: the true pose at {stamp_ns} ns is {far_m:.3g} m away, "
-                f"expected less than {FAR_M:.0e} m"
-            )
-        pose = messages.pack_pose_in_frame(stamp_ns, messages.WORLD_FRAME, T_world_camera)
-        self._truth_log().write(topics.GROUNDTRUTH_POSE.of(self.name), pose, stamp_ns)
-        self._positions.append(T_world_camera.astype(np.float64)[:3, 3].copy())
-
-    def _add_exact_depth(self, stamp_ns: int, exact_depth: NDArray[np.uint16]) -> None:
-        self._check_size(exact_depth)
-        truth, topic = self._truth_log(), topics.GROUNDTRUTH_DEPTH.of(self.name)
-        if not self._has_exact_depth:
-            truth.channel(topic, topics.GROUNDTRUTH_DEPTH.schema, {DEPTH_SCALE_KEY: repr(self.depth_scale)})
-            self._has_exact_depth = True
-        truth.write(topic, messages.pack_depth(stamp_ns, self.name, exact_depth), stamp_ns)
-
-    def _add_sigma(self, stamp_ns: int, depth: NDArray[np.uint16], sigma_m: NDArray[np.floating]) -> None:
-        topic = topics.DEPTH_SIGMA.of(self.name)
-        if not self._has_sigma:
-            self._log.channel(topic, topics.DEPTH_SIGMA.schema, {DEPTH_SCALE_KEY: repr(SIGMA_SCALE_M)})
-            self._has_sigma = True
-        is_known = (depth > 0) & (np.asarray(sigma_m) > 0)
-        most = np.iinfo(np.uint16).max
-        units = np.clip(np.rint(np.asarray(sigma_m, dtype=np.float64) / SIGMA_SCALE_M), 1, most)
-        # five binary digits say all that a sigma can, and take a third of the space
-        step = 2.0 ** np.maximum(np.frexp(units)[1] - 5, 0)
-        raw = np.where(is_known, np.minimum(np.rint(units / step) * step, most), 0).astype(np.uint16)
-        self._log.write(topic, messages.pack_depth(stamp_ns, self.name, raw), stamp_ns)
-
-    def set_depth_camera(
-        self, camera: PinholeCamera, T_camera_depth: NDArray[np.float64], depth_scale: float
-    ) -> None:
-        """Announce a depth camera of its own.
-
-        Args:
-            camera: its intrinsics.
-            T_camera_depth: its pose [4, 4] in the color camera.
-            depth_scale: meters per unit of its images.
-        """
-        self._depth_camera = camera
-        self._sensors[topics.RAW_DEPTH_TRANSFORM.of(self.name)] = T_camera_depth
-        text = {DEPTH_SCALE_KEY: repr(float(depth_scale))}
-        self._log.channel(topics.RAW_DEPTH.of(self.name), topics.RAW_DEPTH.schema, text)
-
-    def add_depth(self, stamp_ns: int, depth: NDArray[np.uint16]) -> None:
-        """Append an image of the depth camera, not registered to color.
-
-        Args:
-            stamp_ns: its time, not before that of the message before.
-            depth: uint16 [h, w] along the depth camera's z, 0 = none.
-        """
-        if depth.shape != (self._depth_camera.height, self._depth_camera.width):
-            raise ValueError(f"an image is {depth.shape}, expected that of {self._depth_camera}")
-        if self._announce(topics.RAW_DEPTH_TRANSFORM, stamp_ns, "depth_camera"):
-            calibration = messages.pack_calibration(stamp_ns, self.name, self._depth_camera)
-            self._log.write(topics.RAW_DEPTH_CALIBRATION.of(self.name), calibration, stamp_ns)
-        self._log.write(
-            topics.RAW_DEPTH.of(self.name), messages.pack_depth(stamp_ns, self.name, depth), stamp_ns
-        )
-
-    def set_lidar(self, T_camera_lidar: NDArray[np.float64], range_sigma_m: float | None) -> None:
-        """Announce a LiDAR.
-
-        Args:
-            T_camera_lidar: its pose [4, 4] in the color camera.
-            range_sigma_m: standard deviation of its ranges, None if not known.
-        """
-        self._sensors[topics.LIDAR_TRANSFORM.of(self.name)] = T_camera_lidar
-        text = {} if range_sigma_m is None else {RANGE_SIGMA_KEY: repr(float(range_sigma_m))}
-        self._log.channel(topics.LIDAR.of(self.name), topics.LIDAR.schema, text)
-
-    def add_points(self, stamp_ns: int, points_lidar: NDArray[np.floating]) -> None:
-        """Append a sweep of the LiDAR.
-
-        Args:
-            stamp_ns: its time, at which all points were measured.
-            points_lidar: [n, 3], m, LiDAR frame.
-        """
-        self._announce(topics.LIDAR_TRANSFORM, stamp_ns, "lidar")
-        points = messages.pack_points(stamp_ns, f"{self.name}/lidar", points_lidar)
-        self._log.write(topics.LIDAR.of(self.name), points, stamp_ns)
-
-    def set_imu(self, T_camera_imu: NDArray[np.float64]) -> None:
-        """Announce an IMU.
-
-        Args:
-            T_camera_imu: its pose [4, 4] in the color camera.
-        """
-        self._sensors[topics.IMU_TRANSFORM.of(self.name)] = T_camera_imu
-
-    def add_imu(
-        self, stamp_ns: int, rates_rad_s: NDArray[np.float64], accelerations_m_s2: NDArray[np.float64]
-    ) -> None:
-        """Append a reading of the IMU.
-
-        Args:
-            stamp_ns: its time.
-            rates_rad_s: angular velocity [3], IMU frame.
-            accelerations_m_s2: acceleration with gravity [3], IMU frame.
-        """
-        self._announce(topics.IMU_TRANSFORM, stamp_ns, "imu")
-        reading = messages.pack_imu(stamp_ns, self.name, rates_rad_s, accelerations_m_s2)
-        self._log.write(topics.IMU.of(self.name), reading, stamp_ns)
-
-    def add_odometry(self, stamp_ns: int, T_odometry_camera: NDArray[np.float64]) -> None:
-        """Append a pose of the camera by another odometry.
-
-        Args:
-            stamp_ns: its time.
-            T_odometry_camera: [4, 4], in a frame of that odometry.
-        """
-        pose = messages.pack_pose_in_frame(stamp_ns, f"{self.name}/odometry_prior", T_odometry_camera)
-        self._log.write(topics.ODOMETRY_PRIOR.of(self.name), pose, stamp_ns)
-
-    def _announce(self, transform: topics.Topic, stamp_ns: int, sensor: str) -> bool:
-        """Write the pose of a sensor in the camera before its first message; whether this was that."""
-        T_camera_sensor = self._sensors.pop(transform.of(self.name), None)
-        if T_camera_sensor is None:
-            return False
-        frames = messages.camera_frame(self.name), f"{self.name}/{sensor}"
-        message = messages.pack_transform(stamp_ns, *frames, T_camera_sensor)
-        self._log.write(transform.of(self.name), message, stamp_ns)
-        return True
-
-    def _check_size(self, image: NDArray[Any]) -> None:
-        if image.shape != (self.camera.height, self.camera.width):
-            raise ValueError(f"an image is {image.shape}, expected {(self.camera.height, self.camera.width)}")
-
-    def _truth_log(self) -> LogWriter:
-        """The ground-truth log, opened when there is something to say."""
-        if self._truth is None:
-            truth = LogWriter(self.folder / f"{self.name}.groundtruth.mcap", self.name)
-            self._truth = self._files.enter_context(truth)
-        return self._truth
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._files.__exit__(kind, error, trace)
-        if kind is None:
-            self.summary = self._summarize()
-
-    def _summarize(self) -> dict[str, Any]:
-        if not self._stamps:
-            raise DuagError(f"robot {self.name}: found no frame, expected at least one")
-        gaps = np.diff(self._stamps) if len(self._stamps) > 1 else np.zeros(1, np.int64)
-        summary: dict[str, Any] = {
-            "robot": self.name,
-            "log": self._log.path.name,
-            "groundtruth": self._truth.path.name if self._truth else None,
-            "frames": len(self._stamps),
-            "start_ns": self._stamps[0],
-            "end_ns": self._stamps[-1],
-            "longest_interval_ns": int(gaps.max()),
-            "camera": asdict(self.camera),
-            "depth_scale_m": self.depth_scale,
-            "sensors": self.sensors,
-            "digests": {self._log.path.name: self._log.digest},
-            "path": None,
-        }
-        if self._truth:
-            summary["digests"][self._truth.path.name] = self._truth.digest
-        if self._positions:
-            positions = np.array(self._positions)
-            length = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
-            low, high = positions.min(axis=0).tolist(), positions.max(axis=0).tolist()
-            summary["path"] = {"length_m": length, "low_m": low, "high_m": high}
-        return summary
 
 
 class RecordingWriter:

@@ -30,7 +30,8 @@ from duagc.converters.logs.derived import Picture, Sweeps
 from duagc.converters.logs.options import LogOptions
 from duagc.converters.logs.robot_log import RobotLog
 from duagc.converters.logs.sources import sources_of
-from duagc.converters.writer import NANOSECONDS, RecordingWriter, RobotWriter
+from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
+from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image

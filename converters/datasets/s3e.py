@@ -40,7 +40,8 @@ from duagc.converters.logs import open_log
 from duagc.converters.logs.entries import Entry
 from duagc.converters.logs.files import Log
 from duagc.converters.logs.gather import gathered, nearest
-from duagc.converters.writer import NANOSECONDS, RecordingWriter, RobotWriter, robot_names
+from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
+from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text

@@ -22,7 +22,8 @@ from duagc.converters.layouts import reference_poses
 from duagc.converters.layouts.calibrated import ColorLens, correct, numbers, resampled
 from duagc.converters.layouts.image_files import options_of, read_color, read_depth, rigid
 from duagc.converters.layouts.self_check import ReprojectionCheck
-from duagc.converters.writer import NANOSECONDS, RecordingWriter, RobotWriter, robot_names
+from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
+from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text

@@ -13,7 +13,7 @@ from duagc.converters.layouts.ros_images import color_bytes
 from duagc.converters.layouts.ros_points import as_of, points_of
 from duagc.converters.layouts.stereo import RowCheck, StereoRig
 from duagc.converters.logs.entries import Entry
-from duagc.converters.writer import RobotWriter
+from duagc.converters.robot_writer import RobotWriter
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image
 from duagc.pipeline.recording.lidar import lidar_depth

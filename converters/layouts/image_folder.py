@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from duagc.converters.layouts.image_files import read_color, read_depth
 from duagc.converters.layouts.self_check import ReprojectionCheck
-from duagc.converters.writer import NANOSECONDS, RecordingWriter, RobotWriter, robot_names
+from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
+from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from duagc.converters.layouts.image_folder import FrameFiles
-from duagc.converters.writer import NANOSECONDS
+from duagc.converters.robot_writer import NANOSECONDS
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.config.base import Config

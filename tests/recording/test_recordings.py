@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from duagc.converters.writer import RecordingWriter, RobotWriter, robot_names
+from duagc.converters.robot_writer import RobotWriter
+from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from duagc.converters.writer import RecordingWriter, RobotWriter
+from duagc.converters.robot_writer import RobotWriter
+from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
