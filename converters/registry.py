@@ -68,7 +68,8 @@ def convert(
 
     Args:
         dataset: a name in `DATASETS`, or a Python file with a converter like those.
-        src: where its files are. out: the folder to write.
+        src: where its files are.
+        out: the folder to write.
         robots: how many robots to make of it; None: one, or as many as the dataset has.
         force: replace a recording that is there.
         options: `name=value` of the converter, values in TOML notation.

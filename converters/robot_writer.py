@@ -57,12 +57,14 @@ class RobotWriter:
         depth_scale: float,
         sensors: Mapping[str, str] | None = None,
     ) -> None:
-        """Args:
-        folder: `RecordingWriter.folder`.
-        name: of the robot: lower-case letters, digits, underscores.
-        camera: of color and depth alike.
-        depth_scale: meters per unit of the depth images.
-        sensors: what is known about the sensors, for example {"depth_noise": "none"}; kept in the log's metadata.
+        """Initialize.
+
+        Args:
+            folder: `RecordingWriter.folder`.
+            name: of the robot: lower-case letters, digits, underscores.
+            camera: of color and depth alike.
+            depth_scale: meters per unit of the depth images.
+            sensors: what is known about the sensors, for example {"depth_noise": "none"}; kept in the log's metadata.
         """
         if not re.fullmatch(topics.ROBOT_NAME, name):
             raise DuagError(f"robot {name!r}: expected lower-case letters, digits and underscores")

@@ -68,13 +68,15 @@ class RecordingWriter:
         parameters: Mapping[str, Any] | None = None,
         force: bool = False,
     ) -> None:
-        """Args:
-        out: the folder; must not exist, unless `force` and it is a recording.
-        name: of the recording; the name of the folder if empty.
-        source: what it was made from; no absolute paths.
-        converter: what made it.
-        parameters: the settings it was made with.
-        force: replace a recording that is there.
+        """Initialize.
+
+        Args:
+            out: the folder; must not exist, unless `force` and it is a recording.
+            name: of the recording; the name of the folder if empty.
+            source: what it was made from; no absolute paths.
+            converter: what made it.
+            parameters: the settings it was made with.
+            force: replace a recording that is there.
         """
         self.out = Path(out)
         self.name = name or self.out.resolve().name

@@ -93,7 +93,8 @@ def correct(depth_m: Array, camera: PinholeCamera, coefficients: Numbers) -> Arr
     """Depth without its smooth error (`duagc.pipeline.geometry.depth_error`); what that puts too far away is unknown.
 
     Args:
-        depth_m: [h, w] of `camera`, 0 = none. coefficients: c0 .. c5, 1/m; empty: nothing is changed.
+        depth_m: [h, w] of `camera`, 0 = none.
+        coefficients: c0 .. c5, 1/m; empty: nothing is changed.
     """
     if not any(coefficients):
         return depth_m

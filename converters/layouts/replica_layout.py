@@ -57,7 +57,8 @@ def convert_team(
     """Convert a scene with a folder for each robot.
 
     Args:
-        part: of the folders' names; its first group is their number. camera: of images of the published size.
+        part: of the folders' names; its first group is their number.
+        camera: of images of the published size.
         sensors, warnings: what is known of all parts.
     Raises:
         DuagError: names the file, what was found and what was expected.

@@ -68,8 +68,9 @@ class ReprojectionCheck:
         """Median residual and median depth in meters, None where too little overlaps.
 
         Args:
-            label: of the source, for the message. max_ratio: largest residual as a share of the depth; more where the
-                true poses are known to be rough.
+            label: of the source, for the message.
+            max_ratio: largest residual as a share of the depth; more where the true poses are known to be
+                rough.
         Raises:
             DuagError: the residual is too large: poses, depth and intrinsics do not belong together.
         """

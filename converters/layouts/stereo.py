@@ -274,7 +274,9 @@ def disparity_sigma_m(
     """Standard deviation of a depth by that of its disparity: sigma_z = z^2 sigma_d / (f b), meters.
 
     Args:
-        depth_m: meters. sigma_px: of the disparity, pixels. focal_baseline: f b, px m.
+        depth_m: meters.
+        sigma_px: of the disparity, pixels.
+        focal_baseline: f b, px m.
     """
     return np.square(np.asarray(depth_m, dtype=np.float64)) * sigma_px / focal_baseline
 

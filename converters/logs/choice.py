@@ -45,8 +45,11 @@ class Chooser:
     """Chooses among the topics of one robot; reads the first message of every topic of images."""
 
     def __init__(self, log: Log, namespace: str = "", wanted: Mapping[str, str] | None = None) -> None:
-        """Args:
-        namespace: only topics below it. wanted: topics by name of the option ("color", ...), "" = not told.
+        """Initialize.
+
+        Args:
+            namespace: only topics below it.
+            wanted: topics by name of the option ("color", ...), "" = not told.
         """
         self.log, self.namespace, self._wanted = log, namespace.rstrip("/"), dict(wanted or {})
         self.images: dict[str, Any] = {

@@ -73,7 +73,8 @@ def drift(stamps_ns: NDArray[np.int64], delays_ns: NDArray[np.int64]) -> Drift |
     """The line through the least delays of pieces of a log; its slope is the median of those between two of them.
 
     Args:
-        stamps_ns: times of headers [n]. delays_ns: time of recording less those [n].
+        stamps_ns: times of headers [n].
+        delays_ns: time of recording less those [n].
     Returns:
         None for a log that is too short to tell.
     """

@@ -45,7 +45,8 @@ def as_ros(schema: str, message: Any, where: str) -> Any:
     """A message with ROS's fields; of a schema that is not Foxglove's, or has none in ROS, the message itself.
 
     Args:
-        schema: by its plain name. message: attributes by Foxglove's names.
+        schema: by its plain name.
+        message: attributes by Foxglove's names.
     Raises:
         DuagError: a field is missing or of another kind.
     """

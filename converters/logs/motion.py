@@ -133,8 +133,11 @@ class MotionReader:
         color_frame: str,
         time_ns: Callable[[Entry], int],
     ) -> None:
-        """Args:
-        color_frame: of the color camera. time_ns: the time of a message by the clock that the options choose.
+        """Initialize.
+
+        Args:
+            color_frame: of the color camera.
+            time_ns: the time of a message by the clock that the options choose.
 
         Raises:
             DuagError: a topic that was asked for is not there, or the file of true poses cannot be read.

@@ -50,7 +50,8 @@ def sources_of(src: Path, options: Mapping[str, Any]) -> list[Source]:
     """Logs, namespace and settings of every robot, in order of its name.
 
     Args:
-        src: a log, a folder or a TOML file. options: what was said on the command line; it has the last word.
+        src: a log, a folder or a TOML file.
+        options: what was said on the command line; it has the last word.
     Raises:
         DuagError: there is no log, or something is said that is not known.
     """

@@ -101,9 +101,11 @@ class FrameRenderer:
     """Renders, disturbs and encodes frames; what it makes of a job depends on nothing but the job."""
 
     def __init__(self, scene: SimulatedScene, settings: FrameSettings) -> None:
-        """Args:
-        scene: what is seen.
-        settings: what all frames have in common.
+        """Initialize.
+
+        Args:
+            scene: what is seen.
+            settings: what all frames have in common.
         """
         self.settings, self.depth_scale_m = settings, scene.depth_scale_m
         self.renderer = scene.renderer(settings.camera)
@@ -181,10 +183,12 @@ class RenderPool:
     """Frame renderers in worker processes, which share one scene on disk; a single worker renders in this process."""
 
     def __init__(self, scene: SimulatedScene, settings: FrameSettings, workers: int) -> None:
-        """Args:
-        scene: what is seen.
-        settings: what all frames have in common.
-        workers: how many processes.
+        """Initialize.
+
+        Args:
+            scene: what is seen.
+            settings: what all frames have in common.
+            workers: how many processes.
         """
         self.scene, self.settings, self.workers = scene, settings, workers
         self._pool: ProcessPoolExecutor | None = None

@@ -26,9 +26,13 @@ class Preview:
     """Collects what the sheet shows."""
 
     def __init__(self, title: str, names: list[str], ways: list[Array], walks: list[Array]) -> None:
-        """Args:
-        title: one line over the sheet. names: of the robots. ways: T_world_camera [frames, 4, 4] of each.
-        walks: poses [frames, 4, 4] of what moves besides.
+        """Initialize.
+
+        Args:
+            title: one line over the sheet.
+            names: of the robots.
+            ways: T_world_camera [frames, 4, 4] of each.
+            walks: poses [frames, 4, 4] of what moves besides.
         """
         self.title, self.names, self.ways, self.walks = title, names, ways, walks
         frames = len(ways[0])

@@ -134,10 +134,12 @@ class SimulatedMeshes:
     """A scene of meshes, ready to be rendered."""
 
     def __init__(self, seed: int, folder: Path, settings: SceneSettings = MESHES) -> None:
-        """Args:
-        seed: of paths and points.
-        folder: where `meshes.read` or `triangles.write` has written the scene.
-        settings: how robots move and measure in it.
+        """Initialize.
+
+        Args:
+            seed: of paths and points.
+            folder: where `meshes.read` or `triangles.write` has written the scene.
+            settings: how robots move and measure in it.
         """
         self.seed, self.folder, self.settings = seed, folder, settings
         self.step_m, self.depth_scale_m, self.sky = settings.step_m, settings.depth_scale_m, settings.sky

@@ -25,7 +25,8 @@ def read(files: list[Path], up: str, cache: Path) -> None:
     """Read meshes and write them as one scene into `cache`, an empty folder.
 
     Args:
-        files: of the meshes, all in one folder. up: the axis that is up in them, "y" or "z".
+        files: of the meshes, all in one folder.
+        up: the axis that is up in them, "y" or "z".
     Raises:
         DuagError: a file that cannot be read, or not within the limits of `duagc.converters.layouts.mesh_reader`.
     """

@@ -59,7 +59,8 @@ class MeshScene:
         """Colors [k, 3], 0 to 255, of points on triangles.
 
         Args:
-            triangle: [k]. weights: of the second and the third corner, [k, 2].
+            triangle: [k].
+            weights: of the second and the third corner, [k, 2].
             level: mip level, [k], between 0 (finest) and LEVELS - 1; in between, both levels are blended.
         """
         colors = np.empty((len(triangle), 3), dtype=np.float32)

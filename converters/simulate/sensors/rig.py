@@ -97,7 +97,8 @@ class MovingCamera:
 
         Args:
             T_world_camera: [4, 4], of the middle of the exposure of the middle row.
-            twist: [6], right tangent (m, rad) per second. frame: index, for the movers.
+            twist: [6], right tangent (m, rad) per second.
+            frame: index, for the movers.
         """
         shape = (self.camera.height, self.camera.width)
         rounds = BLUR_ROUNDS if self.rig.exposure_s > 0 else 1

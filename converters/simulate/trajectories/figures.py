@@ -142,8 +142,11 @@ class Ground:
     """The free floor of a terrain, and ways on it."""
 
     def __init__(self, terrain: Terrain, frames: int, seed: int) -> None:
-        """Args:
-        frames: of every way. seed: of figures, and of how cameras waver.
+        """Initialize.
+
+        Args:
+            frames: of every way.
+            seed: of figures, and of how cameras waver.
         """
         self.terrain, self.space, self.frames, self.seed = terrain, terrain.free_space(), frames, seed
         self.ways = 0  # worked out so far

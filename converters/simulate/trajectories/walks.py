@@ -161,8 +161,9 @@ def space_between(
     """The largest connected free space on a grid from `low` to `high` (x, y).
 
     Args:
-        floor: its height. distance: of points [..., 3] to the nearest surface. closed: whether places [n, 2] are
-            inside the scene.
+        floor: its height.
+        distance: of points [..., 3] to the nearest surface.
+        closed: whether places [n, 2] are inside the scene.
     """
     cell_m = CELL_M if np.prod(high - low) < LARGE_M2 else 2 * CELL_M
     nx, ny = np.maximum(np.ceil((high - low) / cell_m).astype(np.int64), 1)
