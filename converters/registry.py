@@ -60,6 +60,7 @@ def convert(
     src: Path,
     out: Path,
     robots: int | None = None,
+    *,
     force: bool = False,
     options: Sequence[str] = (),
     options_file: Path | None = None,

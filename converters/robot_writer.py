@@ -55,6 +55,7 @@ class RobotWriter:
         name: str,
         camera: PinholeCamera,
         depth_scale: float,
+        *,
         sensors: Mapping[str, str] | None = None,
     ) -> None:
         """Initialize.

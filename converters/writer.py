@@ -106,7 +106,7 @@ class RecordingWriter:
             depth_scale: meters per unit of the depth images.
             sensors: as of `RobotWriter`.
         """
-        writer = RobotWriter(self.folder, name, camera, depth_scale, sensors)
+        writer = RobotWriter(self.folder, name, camera, depth_scale, sensors=sensors)
         self._open.append(writer)
         return writer
 

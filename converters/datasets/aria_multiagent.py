@@ -14,16 +14,17 @@ from typing import Any
 from duagc.converters.layouts import replica_layout
 from duagc.pipeline.geometry.camera import PinholeCamera
 
-CAMERA = PinholeCamera(512, 512, 280.0, 280.0, 255.5, 255.5)
-DEPTH_SCALE = 10 / 65535
-PART = re.compile(r"agent_(\d+)")
-SENSORS = {"color": "rolling shutter", "depth": "rendered ground truth"}
-WARNINGS: tuple[str, ...] = ("the robots were not recorded at the same time",)
+DATASET = replica_layout.TeamDataset(
+    "aria-multiagent",
+    re.compile(r"agent_(\d+)"),
+    PinholeCamera(512, 512, 280.0, 280.0, 255.5, 255.5),
+    depth_scale=10 / 65535,
+    sensors={"color": "rolling shutter", "depth": "rendered ground truth"},
+    warnings=("the robots were not recorded at the same time",),
+)
 Options = replica_layout.TeamOptions
 
 
 def convert(src: Path, out: Path, robots: int = 3, force: bool = False, **options: Any) -> None:
     """Convert a scene, one robot for each folder; see `replica_layout.convert_team`."""
-    replica_layout.convert_team(
-        "aria-multiagent", src, out, robots, force, options, PART, CAMERA, DEPTH_SCALE, SENSORS, WARNINGS
-    )
+    replica_layout.convert_team(DATASET, src, out, robots, force=force, options=options)

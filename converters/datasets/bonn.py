@@ -63,7 +63,9 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         sensors={"moving_objects": "in color and depth; no masks"},
     )
     parameters = {"robots": robots, **settings.model_dump()}
-    image_folder.write(out, "bonn", src, clip.cut(robots, src), parameters, warnings, force)
+    image_folder.write(
+        out, "bonn", src, clip.cut(robots, src), parameters=parameters, warnings=warnings, force=force
+    )
 
 
 def camera_pose(T_marker: np.ndarray) -> np.ndarray:

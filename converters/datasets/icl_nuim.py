@@ -60,7 +60,9 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         warnings.append("poses count from 1, images from 0")
     clip = Clip("", frames, CAMERA, DEPTH_SCALE, sensors={"depth": "rendered"})
     parameters = {"robots": robots, **settings.model_dump()}
-    image_folder.write(out, "icl-nuim", src, clip.cut(robots, src), parameters, warnings, force)
+    image_folder.write(
+        out, "icl-nuim", src, clip.cut(robots, src), parameters=parameters, warnings=warnings, force=force
+    )
 
 
 def _read_associations(path: Path) -> dict[int, tuple[Path, Path]]:

@@ -98,7 +98,9 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
             logs = {robot.name: _robot_log(robot, settings, src) for robot in found}
             settle_clocks(recording, logs)
             for robot in found:
-                write_robot(recording, robot.name, logs[robot.name], robot.files, TRUTH_RATIO, TRUTH_GAP)
+                write_robot(
+                    recording, robot.name, logs[robot.name], robot.files, max_ratio=TRUTH_RATIO, gap=TRUTH_GAP
+                )
 
 
 @dataclass

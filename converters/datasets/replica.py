@@ -29,9 +29,11 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     """
     settings = options_of(Options, options, "replica")
     camera, depth_scale = _read_camera(src)
-    clip, warnings = replica_layout.read_part(src, "", camera, depth_scale, settings)
+    clip, warnings = replica_layout.read_part(src, "", camera, depth_scale, options=settings)
     parameters = {"robots": robots, **settings.model_dump()}
-    image_folder.write(out, "replica", src, clip.cut(robots, src), parameters, warnings, force)
+    image_folder.write(
+        out, "replica", src, clip.cut(robots, src), parameters=parameters, warnings=warnings, force=force
+    )
 
 
 def _read_camera(src: Path) -> tuple[PinholeCamera, float]:

@@ -13,16 +13,16 @@ from typing import Any
 from duagc.converters.layouts import replica_layout
 from duagc.pipeline.geometry.camera import PinholeCamera
 
-CAMERA = PinholeCamera(1200, 680, 600.0, 600.0, 599.5, 339.5)
-DEPTH_SCALE = 1 / 6553.5
-PART = re.compile(r".*_part(\d+)")
-SENSORS = {"depth": "rendered"}
-WARNINGS: tuple[str, ...] = ()
+DATASET = replica_layout.TeamDataset(
+    "replica-multiagent",
+    re.compile(r".*_part(\d+)"),
+    PinholeCamera(1200, 680, 600.0, 600.0, 599.5, 339.5),
+    depth_scale=1 / 6553.5,
+    sensors={"depth": "rendered"},
+)
 Options = replica_layout.TeamOptions
 
 
 def convert(src: Path, out: Path, robots: int = 2, force: bool = False, **options: Any) -> None:
     """Convert a scene, one robot for each folder; see `replica_layout.convert_team`."""
-    replica_layout.convert_team(
-        "replica-multiagent", src, out, robots, force, options, PART, CAMERA, DEPTH_SCALE, SENSORS, WARNINGS
-    )
+    replica_layout.convert_team(DATASET, src, out, robots, force=force, options=options)

@@ -101,6 +101,7 @@ def write_robot(
     name: str,
     source: RobotLog,
     label: str,
+    *,
     max_ratio: float = MAX_RATIO,
     gap: int = GAP,
 ) -> None:

@@ -275,7 +275,7 @@ class _Vehicle:
         self.left, self.right, self.points, self.imu = (f"/{vehicle}/{t}" for t in (LEFT, RIGHT, POINTS, IMU))
         self.where = f"{log.name}: {self.left}"
         c = calibration
-        self.rig = StereoRig.of(c.left, c.right, c.T_right_left, c.where, settings)
+        self.rig = StereoRig.of(c.left, c.right, c.T_right_left, c.where, options=settings)
         self.frames = StereoFrames(self.rig, (c.left.width, c.left.height))
         T_camera_left = se3.from_rotation_translation(self.rig.R_rectified_left, np.zeros(3))
         self.T_camera_imu = T_camera_left @ c.T_left_imu

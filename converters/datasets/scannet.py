@@ -55,7 +55,9 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     ]
     clip = Clip("", frames, camera, DEPTH_SCALE, color_camera=color_camera)
     parameters = {"robots": robots, **settings.model_dump()}
-    image_folder.write(out, "scannet", src, clip.cut(robots, src), parameters, warnings, force)
+    image_folder.write(
+        out, "scannet", src, clip.cut(robots, src), parameters=parameters, warnings=warnings, force=force
+    )
 
 
 def _numbered(folder: Path) -> dict[int, Path]:

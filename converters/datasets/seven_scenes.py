@@ -163,7 +163,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         ):
             sensors = {"depth": "Kinect v1, registered to color by the converter", "sequence": sequence}
             with recording.robot(name, settings.color_camera(), DEPTH_SCALE, sensors) as robot:
-                check = _write_robot(robot, frames, reference, settings, str(src))
+                check = _write_robot(robot, frames, reference, settings, label=str(src))
             recording.checks[name] = {
                 "first_frame": frames[0].number,
                 "last_frame": frames[-1].number,
@@ -269,7 +269,7 @@ def _reference(src: Path, sequence: str, frames: list[FrameFiles], options: Opti
 
 
 def _write_robot(
-    robot: RobotWriter, frames: list[FrameFiles], reference: Reference | None, options: Options, label: str
+    robot: RobotWriter, frames: list[FrameFiles], reference: Reference | None, options: Options, *, label: str
 ) -> dict[str, Any]:
     """Write all frames of a robot; returns what the self-check measured."""
     register = Registration(options.depth_camera(), options.color_camera(), options.baseline_m)

@@ -58,7 +58,9 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         sensors={"depth": "Kinect v1, registered to color by the dataset"},
     )
     parameters = {"robots": robots, **settings.model_dump()}
-    image_folder.write(out, "tum", src, clip.cut(robots, src), parameters, warnings, force)
+    image_folder.write(
+        out, "tum", src, clip.cut(robots, src), parameters=parameters, warnings=warnings, force=force
+    )
 
 
 def _which(src: Path, settings: Options) -> str:

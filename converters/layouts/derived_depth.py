@@ -40,7 +40,7 @@ class Lidar:
         """Points [n, 3] of a sweep with this stamp, all as of one time."""
         points, seconds = points_of(message, where)
         times_ns = stamp_ns + np.rint(seconds * 1e9).astype(np.int64)
-        return as_of(at_ns, points, times_ns, self.T_camera_lidar, self.motion)
+        return as_of(at_ns, points, times_ns, self.T_camera_lidar, motion=self.motion)
 
 
 def decoded(message: Any, where: str) -> Image:

@@ -76,6 +76,7 @@ def write(
     dataset: str,
     src: Path,
     clips: Sequence[Clip],
+    *,
     parameters: Mapping[str, Any],
     warnings: Sequence[str],
     force: bool,

@@ -186,7 +186,7 @@ def _parts(path: Path) -> Iterator[tuple[_Part, NDArray[np.uint8] | None]]:
     painted = any(image is not None for image in images) or any(m.has_vertex_colors() for m, _, _ in meshes)
     for (mesh, index, name), image in zip(meshes, images, strict=True):
         flat = _flat_color(path, materials, index) if painted else None
-        yield _part(path, name, mesh, image, flat), image
+        yield _part(path, name, mesh, image, flat=flat), image
 
 
 class _Complaints:
@@ -250,7 +250,7 @@ def _flat_color(path: Path, materials: list[Any], index: int) -> NDArray[np.uint
 
 
 def _part(
-    path: Path, name: str, mesh: Any, image: NDArray[np.uint8] | None, flat: NDArray[np.uint8] | None
+    path: Path, name: str, mesh: Any, image: NDArray[np.uint8] | None, *, flat: NDArray[np.uint8] | None
 ) -> _Part:
     """A part as arrays; `flat` is its color if it has neither a texture nor colors of its vertices."""
     vertices = np.asarray(mesh.vertices, dtype=np.float64)

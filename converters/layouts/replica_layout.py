@@ -1,4 +1,4 @@
-"""The layout of the iMAP / NICE-SLAM renders of Replica, which other datasets took over.
+"""The layout of the iMAP / NICE-SLAM renders of Replica, which other datasets use as well.
 
 A part is a folder with `results/frameNNNNNN.jpg`, `results/depthNNNNNN.png` (16 bit) and `traj.txt`: one line of 16
 numbers per frame, camera to world, x right, y down, z forward. There are no time stamps.
@@ -7,8 +7,8 @@ numbers per frame, camera to world, x right, y down, z forward. There are no tim
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,29 +41,44 @@ class TeamOptions(LayoutOptions):
     """Of the images, WIDTHxHEIGHT, if they were scaled; the camera is that of the published size, scaled."""
 
 
+@dataclass(frozen=True)
+class TeamDataset:
+    """What all scenes of a dataset have in common that holds a folder for each robot.
+
+    Attributes:
+        name: of the dataset.
+        folder: pattern of the folders' names; its first group is their number.
+        camera: of images of the published size.
+        depth_scale: meters per unit of the depth images.
+        sensors: what is known about the sensors.
+        warnings: what users should know about every recording.
+    """
+
+    name: str
+    folder: re.Pattern[str]
+    camera: PinholeCamera
+    depth_scale: float
+    sensors: Mapping[str, str]
+    warnings: tuple[str, ...] = ()
+
+
 def convert_team(
-    dataset: str,
-    src: Path,
-    out: Path,
-    robots: int,
-    force: bool,
-    options: Mapping[str, Any],
-    part: re.Pattern[str],
-    camera: PinholeCamera,
-    depth_scale: float,
-    sensors: Mapping[str, str],
-    warnings: Sequence[str] = (),
+    dataset: TeamDataset, src: Path, out: Path, robots: int, *, force: bool, options: Mapping[str, Any]
 ) -> None:
     """Convert a scene with a folder for each robot.
 
     Args:
-        part: of the folders' names; its first group is their number.
-        camera: of images of the published size.
-        sensors, warnings: what is known of all parts.
+        dataset: what its scenes have in common.
+        src: the folder of the scene.
+        out: the folder to write.
+        robots: how many folders are expected.
+        force: replace a recording that is there.
+        options: of `TeamOptions`.
     Raises:
         DuagError: names the file, what was found and what was expected.
     """
-    settings = options_of(TeamOptions, options, dataset)
+    settings = options_of(TeamOptions, options, dataset.name)
+    part, camera = dataset.folder, dataset.camera
     if not src.is_dir():
         raise DuagError(f"{src}: no such folder, expected folders {part.pattern} in it")
     folders = {int(m[1]): p for p in sorted(src.iterdir()) if (m := part.fullmatch(p.name)) and p.is_dir()}
@@ -75,13 +90,23 @@ def convert_team(
             else f"{src}: found no folder {part.pattern}, expected one for each robot"
         )
     if settings.size:
-        camera = _scaled(camera, settings.size, dataset)
-    clips, notes = [], list(warnings)
+        camera = _scaled(camera, settings.size, dataset.name)
+    clips, notes = [], list(dataset.warnings)
     for number in sorted(folders):
-        clip, told = read_part(folders[number], folders[number].name, camera, depth_scale, settings)
-        clips.append(replace(clip, sensors=sensors))
-        notes += told
-    write(out, dataset, src, clips, {"robots": robots, **settings.model_dump()}, notes, force)
+        clip, remarks = read_part(
+            folders[number], folders[number].name, camera, dataset.depth_scale, options=settings
+        )
+        clips.append(replace(clip, sensors=dataset.sensors))
+        notes += remarks
+    write(
+        out,
+        dataset.name,
+        src,
+        clips,
+        parameters={"robots": robots, **settings.model_dump()},
+        warnings=notes,
+        force=force,
+    )
 
 
 def _scaled(camera: PinholeCamera, size: str, dataset: str) -> PinholeCamera:
@@ -93,7 +118,7 @@ def _scaled(camera: PinholeCamera, size: str, dataset: str) -> PinholeCamera:
 
 
 def read_part(
-    folder: Path, label: str, camera: PinholeCamera, depth_scale: float, options: LayoutOptions
+    folder: Path, label: str, camera: PinholeCamera, depth_scale: float, *, options: LayoutOptions
 ) -> tuple[Clip, list[str]]:
     """The clip of one part, and warnings about what does not fit together.
 

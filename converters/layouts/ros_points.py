@@ -70,6 +70,7 @@ def as_of(
     points_lidar: Array,
     times_ns: NDArray[np.int64],
     T_camera_lidar: Array,
+    *,
     motion: MotionPrior | None,
 ) -> Array:
     """Points [n, 3] of a moving LiDAR, each measured at its time [n], as it would see them all at one time.

@@ -75,6 +75,7 @@ class StereoRig:
         baseline_m: float,
         options: StereoOptions | None = None,
         maps: tuple[tuple[Depth, Depth], tuple[Depth, Depth]] | None = None,
+        *,
         R_rectified_left: Array | None = None,
     ) -> None:
         """Of images that are rectified already, unless `maps` rectify the left and the right ones."""
@@ -93,6 +94,7 @@ class StereoRig:
         right: RawCamera,
         T_right_left: Array,
         where: str,
+        *,
         options: StereoOptions | None = None,
     ) -> StereoRig:
         """Rectify a pair by its calibration.
@@ -133,7 +135,9 @@ class StereoRig:
         ]
         focal, u0, v0 = float(P_left[0, 0]), float(P_left[0, 2]), float(P_left[1, 2])
         camera = PinholeCamera(*size, focal, focal, u0, v0)
-        return StereoRig(camera, -P_right[0, 3] / P_right[0, 0], options, (maps[0], maps[1]), R_left)
+        return StereoRig(
+            camera, -P_right[0, 3] / P_right[0, 0], options, (maps[0], maps[1]), R_rectified_left=R_left
+        )
 
     @staticmethod
     def rectified(
@@ -141,6 +145,7 @@ class StereoRig:
         right: PinholeCamera,
         baseline_m: float,
         where: str,
+        *,
         options: StereoOptions | None = None,
     ) -> StereoRig:
         """A pair whose images are rectified already.
@@ -161,6 +166,7 @@ class StereoRig:
         right: RawCamera,
         R: Sequence[Array],
         P: Sequence[Array],
+        *,
         where: str,
         options: StereoOptions | None = None,
     ) -> StereoRig:
@@ -173,7 +179,7 @@ class StereoRig:
             )
             for p in P
         )
-        rig = StereoRig.rectified(a, b, -float(P[1][0, 3]) / float(P[1][0, 0]), where, options)
+        rig = StereoRig.rectified(a, b, -float(P[1][0, 3]) / float(P[1][0, 0]), where, options=options)
         model: Any = cv2.fisheye if left.fisheye else cv2
         size, turns = (left.width, left.height), [np.asarray(r, dtype=np.float64).reshape(3, 3) for r in R]
         maps = [
@@ -182,7 +188,7 @@ class StereoRig:
             )
             for c, turn, p in zip((left, right), turns, P, strict=True)
         ]
-        return StereoRig(a, rig.baseline_m, options, (maps[0], maps[1]), turns[0])
+        return StereoRig(a, rig.baseline_m, options, (maps[0], maps[1]), R_rectified_left=turns[0])
 
     def rectify_left(self, image: Image) -> Image:
         """A left image, gray or color, as the rectified camera sees it."""

@@ -80,7 +80,7 @@ class Chooser:
             others = [t for t, m in self.images.items() if t != left and not is_depth(m)]
             return self._one("depth", [t for t in others if "depth" not in t.lower()], RIGHT, "right")
         if source == "lidar":
-            return self._one("depth", self.clouds, (), "point", self.clouds)
+            return self._one("depth", self.clouds, (), "point", known=self.clouds)
         found = [t for t, m in self.images.items() if is_depth(m)]
         sure = [t for t in found if getattr(self.images[t], "encoding", "") != "mono16"]
         choice = self._one("depth", sure or found, REGISTERED)
@@ -117,6 +117,7 @@ class Chooser:
         found: Sequence[str],
         hints: Sequence[str],
         called: str = "",
+        *,
         known: Sequence[str] = (),
     ) -> Choice:
         """The topic that was told, the only one, or the only one with the first hint that decides.

@@ -235,6 +235,7 @@ def lag(
     speed_a: Array,
     stamps_b_ns: NDArray[np.int64],
     speed_b: Array,
+    *,
     most_s: float = 2.0,
 ) -> tuple[float, float] | None:
     """How much later b turns than a, by angular speeds (rad/s) that one body shows to two sensors.

@@ -120,6 +120,7 @@ def stereo_of(
     color: tuple[str, str, RosCamera],
     right: tuple[str, str, RosCamera],
     rectified: bool,
+    *,
     transforms: Transforms,
     settings: LogOptions,
 ) -> Stereo:
@@ -142,7 +143,7 @@ def stereo_of(
     ]
     if settings.T_color_depth:
         T_right_left = se3.inverse(extrinsics_of("T_color_depth", settings.T_color_depth))
-        return Stereo(StereoRig.of(raw[0], raw[1], T_right_left, where, settings), size, where)
+        return Stereo(StereoRig.of(raw[0], raw[1], T_right_left, where, options=settings), size, where)
     infos = [log.first(topic) for topic in (color[1], right[1])]
     R, P = (
         [np.array(getattr(m, name if hasattr(m, name) else name.lower()), dtype=np.float64) for m in infos]
@@ -151,9 +152,13 @@ def stereo_of(
     if P[1][3] != 0:
         if rectified:
             return Stereo(
-                StereoRig.rectified(cameras[0], cameras[1], -P[1][3] / P[1][0], where, settings), size, where
+                StereoRig.rectified(cameras[0], cameras[1], -P[1][3] / P[1][0], where, options=settings),
+                size,
+                where,
             )
-        rig = StereoRig.projected(raw[0], raw[1], R, [p.reshape(3, 4) for p in P], where, settings)
+        rig = StereoRig.projected(
+            raw[0], raw[1], R, [p.reshape(3, 4) for p in P], where=where, options=settings
+        )
         return Stereo(rig, size, where)
     T_left_right = transforms.lookup(color[2].frame_id, right[2].frame_id)
     if T_left_right is None:
@@ -161,7 +166,7 @@ def stereo_of(
             f"{where}: P of {right[1]} has no base line, and /tf_static does not tie {right[2].frame_id!r} to "
             f"{color[2].frame_id!r}; expected --set T_color_depth='x y z qw qx qy qz' of the right camera"
         )
-    rig = StereoRig.of(raw[0], raw[1], se3.inverse(T_left_right), where, settings)
+    rig = StereoRig.of(raw[0], raw[1], se3.inverse(T_left_right), where, options=settings)
     return Stereo(rig, size, where)
 
 
@@ -170,6 +175,7 @@ def sweeps_of(
     color: tuple[str, RosCamera],
     topic: str,
     transforms: Transforms,
+    *,
     motion: MotionPrior | None,
     settings: LogOptions,
 ) -> Sweeps:

@@ -116,7 +116,9 @@ class RobotLog:
         if s.depth_from == "stereo":
             right = self._info(self.depth, "depth_info", chooser)
             other = self.depth, right, self._camera(self.depth, "depth_info", chooser)
-            return stereo_of(self.log, color, other, _is_rectified(self.color), self.transforms, s)
+            return stereo_of(
+                self.log, color, other, _is_rectified(self.color), transforms=self.transforms, settings=s
+            )
         if s.max_difference_s == 0:
             self.settings = s.model_copy(update={"max_difference_s": HALF_TURN_S})
         motion = self.odometry.prior() if self.odometry else self.imu.prior() if self.imu else None
@@ -125,7 +127,7 @@ class RobotLog:
                 "sweeps hold what the LiDAR moved meanwhile; expected --set imu=TOPIC or odometry=TOPIC to take it out"
             )
         camera = self.color, self.color_camera
-        return sweeps_of(self.log, camera, self.depth, self.transforms, motion, s)
+        return sweeps_of(self.log, camera, self.depth, self.transforms, motion=motion, settings=s)
 
     @property
     def T_color_camera(self) -> Array:  # noqa: N802 (a transform)

@@ -78,7 +78,7 @@ class Preview:
         low = np.percentile(points[:, :2], 0.2, axis=0) - 0.3
         high = np.percentile(points[:, :2], 99.8, axis=0) + 0.3
         scale = float(min(np.array(MAP_SIZE) / (high - low)))
-        image = _from_above(points, colors, low, high, scale)
+        image = _from_above(points, colors, low, high, scale=scale)
 
         def pixel(p: Array) -> tuple[int, int]:
             return round(scale * (p[0] - low[0])), round(scale * (high[1] - p[1]))
@@ -110,7 +110,7 @@ class Preview:
         return image
 
 
-def _from_above(points: Array, colors: NDArray[np.uint8], low: Array, high: Array, scale: float) -> Image:
+def _from_above(points: Array, colors: NDArray[np.uint8], low: Array, high: Array, *, scale: float) -> Image:
     """Points seen from above, the highest of each place; places without one have the color of their surroundings."""
     whole = tuple(max(1, int(n)) for n in scale * (high - low))
     scale = min(scale, float(np.sqrt(len(points) / np.prod(high - low) / POINTS_PER_PIXEL)))

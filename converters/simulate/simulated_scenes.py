@@ -102,13 +102,13 @@ class SimulatedRoom:
         return MeshRenderer(Caster(triangles.unpainted(self.scene)), camera)
 
     def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
-        return loops.plan(self.scene, robots, frames, overlap, camera)
+        return loops.plan(self.scene, robots, frames, overlap, camera=camera)
 
     def free_space(self) -> walks.FreeSpace:
         def closed(places: Array) -> NDArray[np.bool_]:
             return np.ones(len(places), dtype=np.bool_)
 
-        return walks.space_between(np.zeros(2), self.scene.size[:2], 0.0, self.clearance, closed)
+        return walks.space_between(np.zeros(2), self.scene.size[:2], 0.0, self.clearance, closed=closed)
 
     def clearance(self, points: Array) -> Array:
         return self.scene.clearance(points)
@@ -158,7 +158,7 @@ class SimulatedMeshes:
         return self.renderer(camera)
 
     def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
-        return walks.plan(self, robots, frames, overlap, camera, self.seed)
+        return walks.plan(self, robots, frames, overlap, camera=camera, seed=self.seed)
 
     def free_space(self) -> walks.FreeSpace:
         if self._space is None:

@@ -35,7 +35,7 @@ TEXT = " ".join(f"{v:.12f}" for v in (*T_LEFT_RIGHT[:3, 3], *so3.to_quat_wxyz(T_
 
 def raw_rig() -> StereoRig:
     cameras = [RawCamera(c.matrix(), D, c.width, c.height) for c, D in ((LEFT, D_LEFT), (RIGHT, D_RIGHT))]
-    return StereoRig.of(cameras[0], cameras[1], T_RIGHT_LEFT, "here", StereoOptions(min_depth_m=1.5))
+    return StereoRig.of(cameras[0], cameras[1], T_RIGHT_LEFT, "here", options=StereoOptions(min_depth_m=1.5))
 
 
 def poses() -> list[np.ndarray]:

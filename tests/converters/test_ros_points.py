@@ -141,10 +141,12 @@ def test_points_of_a_moving_lidar_come_to_one_time() -> None:
             ]
         )
         expected = se3.transform(se3.inverse(pose(at_ns, moves) @ T_camera_lidar), landmarks)
-        found = as_of(at_ns, measured, times, T_camera_lidar, prior)
+        found = as_of(at_ns, measured, times, T_camera_lidar, motion=prior)
         before, after = (np.linalg.norm(p - expected, axis=1).max() for p in (measured, found))
         assert before > 0.1
         assert after < 0.01  # within a moment of 2 ms
-        np.testing.assert_array_equal(as_of(at_ns, measured, times, T_camera_lidar, None), measured)
-        far = as_of(at_ns, measured, times + 10**9, T_camera_lidar, prior)  # where the prior does not reach
+        np.testing.assert_array_equal(as_of(at_ns, measured, times, T_camera_lidar, motion=None), measured)
+        far = as_of(
+            at_ns, measured, times + 10**9, T_camera_lidar, motion=prior
+        )  # where the prior does not reach
         np.testing.assert_array_equal(far, measured)

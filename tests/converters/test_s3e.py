@@ -50,7 +50,9 @@ def rig_of(name: str, shrink: int) -> StereoRig:
         RawCamera(c.matrix(), (*D, 0.0), c.width, c.height)
         for c, D in ((LEFT, D_LEFT), (RIGHTS[name], D_RIGHT))
     ]
-    return StereoRig.of(cameras[0], cameras[1], T_right_left_of(name), name, StereoOptions(shrink=shrink))
+    return StereoRig.of(
+        cameras[0], cameras[1], T_right_left_of(name), name, options=StereoOptions(shrink=shrink)
+    )
 
 
 def checks_of(recording: Path) -> list[str]:

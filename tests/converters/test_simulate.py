@@ -46,7 +46,7 @@ def camera() -> PinholeCamera:
 
 @pytest.fixture(scope="module")
 def ways(room: Scene, camera: PinholeCamera) -> list[np.ndarray]:
-    return loops.plan(room, 3, 150, 0.6, camera)
+    return loops.plan(room, 3, 150, 0.6, camera=camera)
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,7 @@ def test_paths_are_smooth_clear_and_long(room, ways):
 @pytest.mark.parametrize("overlap", [0.5, 0.7])
 def test_neighbors_share_as_much_of_the_view_as_asked(room, camera, overlap):
     small = Renderer(room, None, camera.scaled(*loops.OVERLAP_IMAGE))
-    one, other = loops.plan(room, 2, 150, overlap, camera)
+    one, other = loops.plan(room, 2, 150, overlap, camera=camera)
     assert loops.shared_view(small, one, other) == pytest.approx(overlap, abs=0.04)
     apart, _ = se3.distance(one[:, None], other[None])
     assert apart.min(axis=0).max() > 0.2  # and not from the same places

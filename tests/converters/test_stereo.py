@@ -24,7 +24,7 @@ def raw(camera: PinholeCamera, distortion: tuple[float, ...]) -> RawCamera:
 
 
 def rig(options: StereoOptions = OPTIONS) -> StereoRig:
-    return StereoRig.of(raw(LEFT, D_LEFT), raw(RIGHT, D_RIGHT), T_RIGHT_LEFT, "here", options)
+    return StereoRig.of(raw(LEFT, D_LEFT), raw(RIGHT, D_RIGHT), T_RIGHT_LEFT, "here", options=options)
 
 
 def pair(T_world_left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,7 +107,7 @@ def test_rows_are_tested_on_the_images() -> None:
     assert found["matched_features"] > 100
 
     turned_back = se3.from_rotation_translation(T_RIGHT_LEFT[:3, :3].T, T_RIGHT_LEFT[:3, 3])
-    wrong = StereoRig.of(raw(LEFT, D_LEFT), raw(RIGHT, D_RIGHT), turned_back, "here", OPTIONS)
+    wrong = StereoRig.of(raw(LEFT, D_LEFT), raw(RIGHT, D_RIGHT), turned_back, "here", options=OPTIONS)
     check = RowCheck()
     check.add(*rectified(wrong, path(1)[0]))
     with pytest.raises(DuagError, match=r"here: matched features lie .* px apart in rows"):

@@ -59,7 +59,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Walk:
     """A room filmed by a stereo rig with a LiDAR on top, gray values and ranges with noise."""
     room = build("room", 0)
     eye, wide = Renderer(room, bake.bake(room, 0.02), CAMERA), Renderer(room, None, WIDE)
-    poses = loops.plan(room, 1, 160, 0.6, CAMERA)[0][:FRAMES]
+    poses = loops.plan(room, 1, 160, 0.6, camera=CAMERA)[0][:FRAMES]
     pixels, rng, rig = beams(16, 720), np.random.default_rng(1), StereoRig(CAMERA, BASELINE_M)
     rays = WIDE.rays()[pixels[:, 1], pixels[:, 0]]
     units = rays / np.linalg.norm(rays, axis=1, keepdims=True)

@@ -69,7 +69,7 @@ def bake(scene: Scene, texel_m: float, blocked: Blocked | None = None) -> Atlas:
     lights = _lights(scene, blocked)
     atlas = np.zeros((height, ATLAS_WIDTH, 3), dtype=np.uint8)
     for surface, shape, light, (x, y) in zip(scene.surfaces, shapes, lights, corners, strict=True):
-        tile = _tile(scene, surface, shape, light, texel_m)
+        tile = _tile(scene, surface, shape, light, texel_m=texel_m)
         wrap = cv2.BORDER_REPLICATE if isinstance(surface, Flat) else cv2.BORDER_WRAP
         m = MARGIN
         wide = cv2.copyMakeBorder(tile, 0, 0, m, m, wrap)
@@ -99,7 +99,7 @@ def _pack(shapes: list[tuple[int, int]]) -> tuple[list[tuple[int, int]], int]:
 
 
 def _tile(
-    scene: Scene, surface: Surface, shape: tuple[int, int], light: NDArray[np.float32], texel_m: float
+    scene: Scene, surface: Surface, shape: tuple[int, int], light: NDArray[np.float32], *, texel_m: float
 ) -> NDArray[np.uint8]:
     """Lit colors of one surface, uint8 [h, w, 3]; `light` is its coarse grid of brightness."""
     rng = random_streams.generator(scene.seed, "simulate.texture", scene=scene.name, surface=surface.name)
@@ -190,7 +190,9 @@ def _ambient(scene: Scene, start: Array, normals: Array, blocked: Blocked | None
     return 0.35 + 0.65 * open_ / np.maximum(weight, 1e-9)
 
 
-def _blocked(scene: Scene, start: Array, way: Array, reach: float, walls: bool = False) -> NDArray[np.bool_]:
+def _blocked(
+    scene: Scene, start: Array, way: Array, reach: float, *, walls: bool = False
+) -> NDArray[np.bool_]:
     """Whether anything that casts shadows meets start + q way for 0 < q < reach, [n]."""
     end = start + reach * way
     blocked = np.zeros(len(start), dtype=np.bool_)

@@ -35,17 +35,17 @@ def office(seed: int) -> Scene:
     lamps = [(x, (low + high) / 2) for x in (1.6, 4.8, 8.0, 11.2)]
     lamps += [(x, low / 2) for x in (2.2, 6.8, 11.4)] + [(x, (high + d) / 2) for x in (1.5, 3.7, 7.3, 11.5)]
     _shell(scene, rng, lamps, tex.carpet())
-    _wall_along_x(scene, rng, "south", 0.0, w, low, doors=(3.3, 8.2, 12.2))
-    _wall_along_x(scene, rng, "north", 0.0, w, high, doors=(1.2, 8.3, 10.5))
+    _wall_along_x(scene, rng, "south", 0.0, x1=w, y=low, doors=(3.3, 8.2, 12.2))
+    _wall_along_x(scene, rng, "north", 0.0, x1=w, y=high, doors=(1.2, 8.3, 10.5))
     for k, x in enumerate(across["south"]):
-        _wall_along_y(scene, rng, f"south{k}", x, 0.0, low - WALL_M)
+        _wall_along_y(scene, rng, f"south{k}", x, y0=0.0, y1=low - WALL_M)
     for k, x in enumerate(across["north"]):
-        _wall_along_y(scene, rng, f"north{k}", x, high + WALL_M, d)
-    _study(scene, rng, "a", (0, 0, 4.4, low), SOUTH)
-    _study(scene, rng, "b", (4.4 + WALL_M, 0, 9.2, low), SOUTH)
-    _study(scene, rng, "c", (9.2 + WALL_M, 0, w, low), SOUTH)
+        _wall_along_y(scene, rng, f"north{k}", x, y0=high + WALL_M, y1=d)
+    _study(scene, rng, "a", (0, 0, 4.4, low), window=SOUTH)
+    _study(scene, rng, "b", (4.4 + WALL_M, 0, 9.2, low), window=SOUTH)
+    _study(scene, rng, "c", (9.2 + WALL_M, 0, w, low), window=SOUTH)
     _meeting(scene, rng, (0, high + WALL_M, 5.2, d))
-    _study(scene, rng, "d", (5.2 + WALL_M, high + WALL_M, 9.4, d), NORTH)
+    _study(scene, rng, "d", (5.2 + WALL_M, high + WALL_M, 9.4, d), window=NORTH)
     _lounge(scene, rng, (9.4 + WALL_M, high + WALL_M, w, d))
     fur.plant(Place(scene, "corridor/plant", 0.35, (low + high) / 2), rng, 1.15)
     fur.cooler(Place(scene, "corridor/cooler", 6.9, high, NORTH), rng)
@@ -145,6 +145,7 @@ def _wall_along_x(
     rng: np.random.Generator,
     name: str,
     x0: float,
+    *,
     x1: float,
     y: float,
     doors: tuple[float, ...],
@@ -170,7 +171,9 @@ def _wall_along_x(
         scene.box(f"{name}/door{k}", corner, (0.04, 0.95, DOOR_HEIGHT_M - 0.02), trim, left=leaf, right=leaf)
 
 
-def _wall_along_y(scene: Scene, rng: np.random.Generator, name: str, x: float, y0: float, y1: float) -> None:
+def _wall_along_y(
+    scene: Scene, rng: np.random.Generator, name: str, x: float, *, y0: float, y1: float
+) -> None:
     """A wall without doors between two rooms, from `x` to the east."""
     h = float(scene.size[2])
     paints = [tex.plaster(PAINTS[int(k)]) for k in rng.integers(0, len(PAINTS), 2)]
@@ -180,7 +183,7 @@ def _wall_along_y(scene: Scene, rng: np.random.Generator, name: str, x: float, y
     scene.box(f"{name}/partition", (x, y0, 0), (WALL_M, y1 - y0, h), paints[0], **faces)
 
 
-def _study(scene: Scene, rng: np.random.Generator, name: str, room: Rect, window: float) -> None:
+def _study(scene: Scene, rng: np.random.Generator, name: str, room: Rect, *, window: float) -> None:
     """Two desks at the side walls, a shelf or a cabinet at the outer wall, something in the corners."""
     x0, y0, x1, y1 = room
     outer = y0 if window == SOUTH else y1

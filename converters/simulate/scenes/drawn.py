@@ -43,22 +43,22 @@ def _landscape(rng: np.random.Generator, h: int, w: int, texel_m: float) -> Imag
     image = np.ascontiguousarray(
         (1 - sky) * flat((h, w), (110, 158, 208)) + sky * flat((h, w), (238, 208, 166))
     )
-    image *= (1 + 0.10 * cloud(rng, (h, w), 0.14 / texel_m, 4, 0.6, stretch=2.0))[..., None]
+    image *= (1 + 0.10 * cloud(rng, (h, w), 0.14 / texel_m, 4, gain=0.6, stretch=2.0))[..., None]
     center = (int(rng.uniform(0.15, 0.85) * w), int(rng.uniform(0.1, 0.35) * h))
     cv2.circle(image, center, max(2, int(0.07 * h)), (250, 232, 170), -1, cv2.LINE_AA)
     rows = np.arange(h, dtype=np.float32)[:, None]
     for k in range(4):
-        ridge = cloud(rng, (1, w), 0.28 / texel_m / (k + 1), 4, 0.6)[0]
+        ridge = cloud(rng, (1, w), 0.28 / texel_m / (k + 1), 4, gain=0.6)[0]
         top = h * (0.42 + 0.15 * k) + 0.09 * h * ridge
         hill = np.clip(rows - top[None] + 0.5, 0, 1)[..., None]
         tint = flat((h, w), shaded(rng, (96 - 14 * k, 124 - 12 * k, 92 - 14 * k), 0.12))
-        tint *= (1 + 0.16 * cloud(rng, (h, w), 0.04 / texel_m, 3, 0.8))[..., None]
+        tint *= (1 + 0.16 * cloud(rng, (h, w), 0.04 / texel_m, 3, gain=0.8))[..., None]
         image = (1 - hill) * image + hill * tint
     return np.ascontiguousarray(image, dtype=np.float32)
 
 
 def _map(rng: np.random.Generator, h: int, w: int, texel_m: float) -> Image:
-    height = cloud(rng, (h, w), 0.32 / texel_m, 5, 0.6)
+    height = cloud(rng, (h, w), 0.32 / texel_m, 5, gain=0.6)
     steps = np.array(
         [(150, 186, 206), (172, 202, 214), (206, 206, 160), (178, 190, 128), (198, 168, 118), (150, 112, 86)]
     )
@@ -154,7 +154,7 @@ def carton(rng: np.random.Generator, width_m: float, height_m: float, texel_m: f
     """Cardboard with tape, a label and print."""
     h, w = shape_of(width_m, height_m, texel_m)
     image = flat((h, w), shaded(rng, (178, 140, 98), 0.05))
-    image *= (1 + 0.06 * cloud(rng, (h, w), 0.08 / texel_m, 4, 0.8))[..., None]
+    image *= (1 + 0.06 * cloud(rng, (h, w), 0.08 / texel_m, 4, gain=0.8))[..., None]
     tape = max(3, round(0.05 / texel_m))
     image[:, w // 2 - tape // 2 : w // 2 + tape // 2] = shaded(rng, (206, 184, 140), 0.04)
     x, y = round(rng.uniform(0.05, 0.5) * w), round(rng.uniform(0.1, 0.5) * h)

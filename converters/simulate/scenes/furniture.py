@@ -249,6 +249,7 @@ def decorated(
     width: float,
     height: float,
     rng: np.random.Generator,
+    *,
     free: tuple[float, float] = (0.0, 0.0),
 ) -> tex.Material:
     """A wall with a skirting board and pictures at eye height; none of them between the two `free` ends (m)."""

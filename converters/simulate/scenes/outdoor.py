@@ -172,7 +172,7 @@ def asphalt(rng: np.random.Generator, width_m: float, height_m: float, texel_m: 
     """Dark, with patches, cracks and stains."""
     h, w = tex.shape_of(width_m, height_m, texel_m)
     image = tex.flat((h, w), (104, 104, 106))
-    image *= (1 + 0.10 * tex.cloud(rng, (h, w), 0.5 / texel_m, 5, 0.8))[..., None]
+    image *= (1 + 0.10 * tex.cloud(rng, (h, w), 0.5 / texel_m, 5, gain=0.8))[..., None]
     for _ in range(int(0.08 * width_m * height_m)):
         x, y = int(rng.integers(0, w)), int(rng.integers(0, h))
         size = rng.uniform(0.4, 2.2, 2) / texel_m
@@ -195,7 +195,7 @@ def lawn(rng: np.random.Generator, width_m: float, height_m: float, texel_m: flo
     """Grass of uneven green with flowers, in a border of stone."""
     h, w = tex.shape_of(width_m, height_m, texel_m)
     image = tex.flat((h, w), (84, 116, 58))
-    image *= (1 + 0.22 * tex.cloud(rng, (h, w), 0.25 / texel_m, 4, 0.9))[..., None]
+    image *= (1 + 0.22 * tex.cloud(rng, (h, w), 0.25 / texel_m, 4, gain=0.9))[..., None]
     for _ in range(int(9 * width_m * height_m)):
         at = (int(rng.integers(0, w)), int(rng.integers(0, h)))
         cv2.circle(image, at, max(1, round(0.025 / texel_m)), tex.vivid(rng), -1, cv2.LINE_AA)
@@ -206,7 +206,7 @@ def lawn(rng: np.random.Generator, width_m: float, height_m: float, texel_m: flo
 def stripes(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> tex.Image:
     """A crossing: white bars on asphalt, along the shorter side."""
     image = asphalt(rng, width_m, height_m, texel_m)
-    wear = 1 + 0.08 * tex.cloud(rng, image.shape[:2], 0.3 / texel_m, 3, 0.8)
+    wear = 1 + 0.08 * tex.cloud(rng, image.shape[:2], 0.3 / texel_m, 3, gain=0.8)
     step = 1.0 / texel_m
     for k in range(int(max(image.shape[:2]) / step) + 1):
         bar = slice(round(k * step), round((k + 0.5) * step))
@@ -250,7 +250,7 @@ def pane(rng: np.random.Generator, width_m: float, height_m: float, texel_m: flo
     """A window from outside: dark glass, curtains, bars."""
     h, w = tex.shape_of(width_m, height_m, texel_m)
     image = tex.flat((h, w), tex.shaded(rng, (58, 70, 84), 0.3))
-    image *= (1 + 0.2 * tex.cloud(rng, (h, w), 0.4 / texel_m, 3, 0.7))[..., None]
+    image *= (1 + 0.2 * tex.cloud(rng, (h, w), 0.4 / texel_m, 3, gain=0.7))[..., None]
     curtain = tex.shaded(rng, tex.vivid(rng, 0.5), 0.1)
     side = round(rng.uniform(0.12, 0.38) * w)
     folds = (1 + 0.12 * np.sin(np.arange(w) * texel_m * 2 * np.pi / 0.09)).astype(np.float32)

@@ -92,6 +92,7 @@ def _bookshelf(
     rng: np.random.Generator,
     low: tuple[float, float],
     width: float,
+    *,
     height: float,
     depth: float,
 ) -> None:
@@ -109,7 +110,14 @@ def _bookshelf(
             x = x0 + board + column * (bay + board)
             scene.box(f"shelf/board{k}.{column}", (x, y0, k * step), (bay, depth - 0.02, board), oak)
             if k < shelves:
-                _books(scene, rng, f"shelf/books{k}.{column}", (x, y0, k * step + board), bay, step - board)
+                _books(
+                    scene,
+                    rng,
+                    f"shelf/books{k}.{column}",
+                    (x, y0, k * step + board),
+                    bay=bay,
+                    clear=step - board,
+                )
 
 
 def _books(
@@ -117,6 +125,7 @@ def _books(
     rng: np.random.Generator,
     name: str,
     low: tuple[float, float, float],
+    *,
     bay: float,
     clear: float,
 ) -> None:

@@ -36,6 +36,7 @@ def cloud(
     shape: tuple[int, int],
     wave: float,
     octaves: int = 4,
+    *,
     gain: float = 0.6,
     stretch: float = 1.0,
 ) -> Image:
@@ -71,8 +72,8 @@ def vivid(rng: np.random.Generator, saturation: float = 0.8) -> tuple[float, flo
 
 def _grain(rng: np.random.Generator, shape: tuple[int, int], texel_m: float) -> Image:
     """Streaks of wood along the columns' direction (x), [h, w]."""
-    broad = cloud(rng, shape, 0.045 / texel_m, 3, 0.7, stretch=9.0)
-    bend = cloud(rng, shape, 0.25 / texel_m, 2, 0.5, stretch=3.0)
+    broad = cloud(rng, shape, 0.045 / texel_m, 3, gain=0.7, stretch=9.0)
+    bend = cloud(rng, shape, 0.25 / texel_m, 2, gain=0.5, stretch=3.0)
     y = np.arange(shape[0], dtype=np.float32)[:, None] * np.float32(texel_m)
     rings = np.sin(y * np.float32(2 * np.pi / 0.055) + 2.5 * bend)
     return np.asarray(0.55 * broad + 0.6 * rings, dtype=np.float32)
@@ -148,7 +149,7 @@ def bricks(color: Color = (158, 84, 62), mortar: Color = (186, 178, 166)) -> Mat
                 if x1 > x0:
                     image[y0:y1, x0:x1] = shaded(rng, color, 0.2)
                 x += length
-        image *= (1 + 0.10 * cloud(rng, (h, w), 0.05 / texel_m, 3, 0.8))[..., None]
+        image *= (1 + 0.10 * cloud(rng, (h, w), 0.05 / texel_m, 3, gain=0.8))[..., None]
         return image * (1 + 0.08 * smooth_noise(rng, (h, w), 0.7 / texel_m, 0.5 / texel_m))[..., None]
 
     return paint
@@ -159,7 +160,7 @@ def plaster(color: Color = (206, 198, 180), contrast: float = 0.06) -> Material:
 
     def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
         h, w = shape_of(width_m, height_m, texel_m)
-        tone = contrast * cloud(rng, (h, w), 0.16 / texel_m, 4, 0.85)
+        tone = contrast * cloud(rng, (h, w), 0.16 / texel_m, 4, gain=0.85)
         hue = 0.2 * contrast * smooth_noise(rng, (h, w), 0.5 / texel_m, 0.5 / texel_m)
         image = flat((h, w), color) * (1 + tone)[..., None]
         image[..., 0] *= 1 + hue
@@ -179,7 +180,7 @@ def wallpaper(color: Color = (150, 172, 166), motif: Color = (104, 132, 126)) ->
 
     def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
         h, w = shape_of(width_m, height_m, texel_m)
-        image = flat((h, w), color) * (1 + 0.035 * cloud(rng, (h, w), 0.2 / texel_m, 4, 0.7))[..., None]
+        image = flat((h, w), color) * (1 + 0.035 * cloud(rng, (h, w), 0.2 / texel_m, 4, gain=0.7))[..., None]
         for _ in range(int(26 * width_m * height_m)):
             x, y = float(rng.uniform(0, w)), float(rng.uniform(0, h))
             turn, length = float(rng.uniform(0, 360)), rng.uniform(0.03, 0.075) / texel_m
@@ -209,7 +210,7 @@ def fabric(color: Color = (96, 110, 136), stripe: Color = (146, 128, 96)) -> Mat
                 tint = np.array(shaded(rng, stripe, 0.18), dtype=np.float32)
                 image[tuple(band)] = 0.45 * image[tuple(band)] + 0.55 * tint
                 at += width + rng.uniform(0.03, 0.13) / texel_m
-        return image * (1 + 0.10 * cloud(rng, (h, w), 0.06 / texel_m, 3, 0.8))[..., None]
+        return image * (1 + 0.10 * cloud(rng, (h, w), 0.06 / texel_m, 3, gain=0.8))[..., None]
 
     return paint
 
@@ -241,7 +242,7 @@ def rug(rng: np.random.Generator, width_m: float, height_m: float, texel_m: floa
         y += band
     edge = max(2, round(0.05 / texel_m))
     cv2.rectangle(image, (0, 0), (w - 1, h - 1), (206, 192, 164), edge)
-    return image * (1 + 0.07 * cloud(rng, (h, w), 0.03 / texel_m, 2, 0.8))[..., None]
+    return image * (1 + 0.07 * cloud(rng, (h, w), 0.03 / texel_m, 2, gain=0.8))[..., None]
 
 
 def front(color: Color, columns: int, rows: int, knob: Color = (206, 192, 150)) -> Material:
@@ -292,7 +293,10 @@ def lamp(rng: np.random.Generator, width_m: float, height_m: float, texel_m: flo
 def skirting(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
     """A painted board along the foot of a wall."""
     h, w = shape_of(width_m, height_m, texel_m)
-    image = flat((h, w), (214, 208, 196)) * (1 + 0.04 * cloud(rng, (h, w), 0.08 / texel_m, 3, 0.8))[..., None]
+    image = (
+        flat((h, w), (214, 208, 196))
+        * (1 + 0.04 * cloud(rng, (h, w), 0.08 / texel_m, 3, gain=0.8))[..., None]
+    )
     image[: max(2, round(0.008 / texel_m))] = (120, 112, 100)
     return image
 
@@ -317,9 +321,9 @@ def marbled(color: Color, vein: Color, wave_m: float = 0.12) -> Material:
 
     def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
         h, w = shape_of(width_m, height_m, texel_m)
-        mix = np.clip(0.5 + 2.2 * cloud(rng, (h, w), wave_m / texel_m, 4, 0.6), 0, 1)[..., None]
+        mix = np.clip(0.5 + 2.2 * cloud(rng, (h, w), wave_m / texel_m, 4, gain=0.6), 0, 1)[..., None]
         image = (1 - mix) * flat((h, w), color) + mix * flat((h, w), vein)
-        return image * (1 + 0.06 * cloud(rng, (h, w), 0.05 / texel_m, 3, 0.8))[..., None]
+        return image * (1 + 0.06 * cloud(rng, (h, w), 0.05 / texel_m, 3, gain=0.8))[..., None]
 
     return paint
 
@@ -330,7 +334,7 @@ def carpet(color: Color = (146, 146, 150), tile_m: float = 0.5) -> Material:
     def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
         h, w = shape_of(width_m, height_m, texel_m)
         image = flat((h, w), color)
-        flecks = cloud(rng, (h, w), 0.06 / texel_m, 3, 0.85)
+        flecks = cloud(rng, (h, w), 0.06 / texel_m, 3, gain=0.85)
         for y in np.arange(0, h, tile_m / texel_m):
             for x in np.arange(0, w, tile_m / texel_m):
                 some = (
@@ -350,7 +354,7 @@ def tiles(color: Color = (188, 180, 164), tile_m: float = 0.3, joint: Color = (1
     def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
         h, w = shape_of(width_m, height_m, texel_m)
         image = flat((h, w), joint)
-        veins = cloud(rng, (h, w), 0.1 / texel_m, 4, 0.75)
+        veins = cloud(rng, (h, w), 0.1 / texel_m, 4, gain=0.75)
         gap, step = max(1, round(0.008 / texel_m)), tile_m / texel_m
         for y in np.arange(0, h, step):
             for x in np.arange(0, w, step):

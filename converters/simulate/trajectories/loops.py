@@ -86,7 +86,7 @@ def look_at(positions: Array, targets: Array) -> Array:
     return se3.from_rotation_translation(np.stack([right, down, forward], axis=-1), positions)
 
 
-def plan(scene: Scene, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
+def plan(scene: Scene, robots: int, frames: int, overlap: float, *, camera: PinholeCamera) -> list[Array]:
     """Paths T_world_camera [frames, 4, 4] of every robot.
 
     Args:

@@ -85,7 +85,7 @@ def plan(
     Raises:
         DuagError: there is no room for so many.
     """
-    search = _Search(terrain, paradigm, frames, overlap, camera, seed)
+    search = _Search(terrain, paradigm, frames, overlap, camera=camera, seed=seed)
     paths = search.best(robots)
     if paths is not None:
         return paths
@@ -105,7 +105,14 @@ class _Search:
     """Looks for a place for a figure, and for each robot's part in it."""
 
     def __init__(
-        self, terrain: Terrain, paradigm: str, frames: int, overlap: float, camera: PinholeCamera, seed: int
+        self,
+        terrain: Terrain,
+        paradigm: str,
+        frames: int,
+        overlap: float,
+        *,
+        camera: PinholeCamera,
+        seed: int,
     ) -> None:
         self.ground = Ground(terrain, frames, seed)
         self.paradigm, self.shape, self.overlap = paradigm, SHAPES[paradigm], overlap

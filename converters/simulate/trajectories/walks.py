@@ -92,7 +92,7 @@ class Terrain(Protocol):
 
 
 def plan(
-    terrain: Terrain, robots: int, frames: int, overlap: float, camera: PinholeCamera, seed: int
+    terrain: Terrain, robots: int, frames: int, overlap: float, *, camera: PinholeCamera, seed: int
 ) -> list[Array]:
     """Walks T_world_camera [frames, 4, 4] of every robot.
 
@@ -110,7 +110,7 @@ def plan(
     small = terrain.renderer(camera.scaled(*OVERLAP_IMAGE))
     walks: list[Array] = []
     for robot in track(range(robots), "plan walks"):
-        found = _candidates(terrain, space, robot, frames, camera, seed)
+        found = _candidates(terrain, space, robot, frames, camera=camera, seed=seed)
         if robot == 0:
             walks.append(max(found, key=lambda each: each[0])[1])
         else:
@@ -148,7 +148,7 @@ def free_space(caster: Caster, sky: bool = False) -> FreeSpace:
     def closed(places: Array) -> NDArray[np.bool_]:
         return _closed_in(caster, places, floor, 0.0 if sky else CLOSED_SHARE)
 
-    return space_between(low, high, floor, caster.clearance, closed)
+    return space_between(low, high, floor, caster.clearance, closed=closed)
 
 
 def space_between(
@@ -156,6 +156,7 @@ def space_between(
     high: Array,
     floor: float,
     distance: Callable[[Array], Array],
+    *,
     closed: Callable[[Array], NDArray[np.bool_]],
 ) -> FreeSpace:
     """The largest connected free space on a grid from `low` to `high` (x, y).
@@ -226,7 +227,7 @@ def _graph(inside: NDArray[np.bool_], clearance: Array, cell_m: float) -> coo_ar
 
 
 def _candidates(
-    terrain: Terrain, space: FreeSpace, robot: int, frames: int, camera: PinholeCamera, seed: int
+    terrain: Terrain, space: FreeSpace, robot: int, frames: int, *, camera: PinholeCamera, seed: int
 ) -> list[tuple[float, Array]]:
     """Walks of a robot that keep clear and see something, each with how much its dullest view shows."""
     graph = space.graph.tocsr()
@@ -236,7 +237,7 @@ def _candidates(
     for attempt in range(TRIES):
         rng = random_streams.generator(seed, "simulate.walk", robot=robot, attempt=attempt)
         floor_way = route(space, graph, frames * terrain.step_m + 2 * AHEAD_M + 1.0, rng)
-        poses = _look_ahead(floor_way, space.floor_m, robot, frames, terrain.step_m, rng)
+        poses = _look_ahead(floor_way, space.floor_m, robot, frames, step_m=terrain.step_m, rng=rng)
         if poses is None:
             reasons["turns too fast"] += 1
         elif (
@@ -288,7 +289,7 @@ def _resampled(way: Array, step_m: float) -> Array:
 
 
 def _look_ahead(
-    way: Array, floor: float, robot: int, frames: int, step_m: float, rng: np.random.Generator
+    way: Array, floor: float, robot: int, frames: int, *, step_m: float, rng: np.random.Generator
 ) -> Array | None:
     """Poses [frames, 4, 4] along a way, step_m apart, or None if they turn too fast or the way is too short."""
     along = 0.025 * np.arange(len(way))
