@@ -57,14 +57,7 @@ def test_a_converter_of_ones_own_takes_a_file(tmp_path: Path) -> None:
     (src / "camera.txt").write_text("160 120 140 140 79.5 59.5\n")
     np.savetxt(src / "poses.txt", np.reshape(poses, (-1, 16)))
     (tmp_path / "slow.toml").write_text("rate_hz = 10\n")
-    convert(
-        tmp_path / "mine.py",
-        src,
-        "--options",
-        tmp_path / "slow.toml",
-        force="--out",
-        options=tmp_path / "rec",
-    )
+    convert(tmp_path / "mine.py", src, "--options", tmp_path / "slow.toml", "--out", tmp_path / "rec")
     assert description(tmp_path / "rec")["parameters"]["rate_hz"] == 10  # type: ignore[index]
 
 
