@@ -247,7 +247,7 @@ def filmed(seed: int, frames: int, camera: PinholeCamera) -> list[Shot]:
     """
     room = build("room", seed)
     renderer = Renderer(room, bake.bake(room, 0.008), camera)
-    path = loops.plan(room, 1, 160, 0.6, camera)[0]
+    path = loops.plan(room, 1, 160, 0.6, camera=camera)[0]
     views = [renderer.render(T) for T in path[:frames]]
     return [Shot(k, k * FRAME_NS, view.color, view.depth.astype(np.float32)) for k, view in enumerate(views)]
 

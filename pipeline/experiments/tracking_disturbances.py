@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from duagc.converters.simulate.team import camera_of
+from duagc.converters.simulate.settings import camera_of
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.evaluation import groundtruth
 from duagc.pipeline.evaluation.results import Absent

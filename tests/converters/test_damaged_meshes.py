@@ -135,7 +135,7 @@ def test_several_files_in_the_order_of_their_names(tmp_path):
 def test_the_reader_ends_with_whoever_started_it(tmp_path, end: signal.Signals):
     pipe(tmp_path / "scene")
     (tmp_path / "cache").mkdir()
-    code = "import sys; from pathlib import Path; from duagc.converters.simulate.team import meshes; "
+    code = "import sys; from pathlib import Path; from duagc.converters.simulate.render import meshes; "
     code += "meshes.read(Path(sys.argv[1]), 'y', Path(sys.argv[2]))"
     command = [sys.executable, "-c", code, str(tmp_path / "scene"), str(tmp_path / "cache")]
     caller = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE)
