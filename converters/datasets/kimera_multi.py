@@ -65,7 +65,7 @@ class Options(AssociationOptions):
     robots_used: str = ""
     """Names of the robots to convert, separated by commas; all that are found if empty."""
     ground_truth: str = ""
-    """Folder of `<robot>_gt_odom.csv`, or "none"; by default `ground_truth/<sequence>` in SRC or beside it."""
+    """Folder of `<robot>_gt_odom.csv`, or "none"; by default `ground_truth/<sequence>` in SRC or next to it."""
     max_pose_gap_s: float = Field(2.0, gt=0.0)
     """Poses are interpolated between two true ones that are no further apart; never beyond the ends."""
     imu: bool = True
@@ -214,7 +214,7 @@ def _truth_file(robot: _Robot, settings: Options, src: Path) -> Path | None:
 
 
 def _truth_places(folder: Path, robot: _Robot, name: str) -> Iterator[Path]:
-    """Where the ground truth may be: `ground_truth/1014`, or `ground_truth`, in the folder of the bags or beside it."""
+    """Where the ground truth may be: `ground_truth/1014`, or `ground_truth`, with the bags or next to their folder."""
     match = re.match(r"(\d\d)_(\d\d)_", robot.paths[0].name)
     for place in (folder, folder.resolve().parent):
         if match:

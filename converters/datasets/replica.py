@@ -1,6 +1,6 @@
 """Replica as rendered for iMAP and NICE-SLAM: one camera in one of eight rooms, exact depth and poses.
 
-SRC is a scene, for example `Replica/room0`; `cam_params.json` lies beside it. The original Replica release has no
+SRC is a scene, for example `Replica/room0`; `cam_params.json` lies next to it. The original Replica release has no
 `traj.txt` and is another dataset; Replica-V2 (vMAP) has another layout.
 """
 
@@ -37,7 +37,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
 
 
 def _read_camera(src: Path) -> tuple[PinholeCamera, float]:
-    """Camera and meters per unit of depth, from cam_params.json in the scene or beside it."""
+    """Camera and meters per unit of depth, from cam_params.json in the scene or next to it."""
     path = next((f / "cam_params.json" for f in (src, src.parent) if (f / "cam_params.json").is_file()), None)
     if path is None:
         raise DuagError(f"{src.parent / 'cam_params.json'}: not found, expected the camera of the renders")

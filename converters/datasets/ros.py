@@ -199,7 +199,7 @@ def _check_size(where: str, found: tuple[int, int], camera: PinholeCamera) -> No
 
 
 def _truth_lag(source: RobotLog) -> dict[str, float]:
-    """How much later the true poses turn than what the robot itself measured; nothing where that cannot be told."""
+    """How much later the true poses turn than what the robot itself measured; nothing where that is not known."""
     if source.truth is None or (source.imu is None and source.odometry is None):
         return {}
     true = angular_speed(source.truth.body.stamps_ns, source.truth.body.T_world_body)

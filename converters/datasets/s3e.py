@@ -1,6 +1,6 @@
 """S3E v1: three ground vehicles with stereo cameras and a LiDAR, all of a sequence in one bag of ROS 2.
 
-SRC is the folder of a sequence: a `.db3` of all robots, `metadata.yaml`, `<robot>_gt.txt`, and beside it
+SRC is the folder of a sequence: a `.db3` of all robots, `metadata.yaml`, `<robot>_gt.txt`, and next to it
 `Calibration/<robot>.yaml`. The bags of v2 hold no camera and are refused. The calibration files are not what they look
 like: `RIGHT.R` is the rotation from the left to the right camera and the last column of `RIGHT.P` its translation in
 millimeters, no rectification; the cameras are rectified here, and that is tested on the images.
@@ -65,7 +65,7 @@ class Options(StereoOptions):
     depth: Literal["stereo", "lidar"] = "stereo"
     """Depth of the stereo pair, or sweeps of the LiDAR."""
     calibration: str = ""
-    """Folder of the calibration files; empty: Calibration beside the sequence."""
+    """Folder of the calibration files; empty: Calibration next to the sequence."""
     shrink: int = Field(default=2, ge=1, le=8)
     """Side of the blocks of rectified pixels that become one: 2 makes 612x512 of 1224x1024."""
     min_depth_m: float = Field(default=1.5, gt=0)

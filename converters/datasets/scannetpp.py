@@ -1,6 +1,6 @@
 """ScanNet++: rooms photographed with a DSLR camera, depth rendered from a laser scan.
 
-SRC is a scene. Used are `dslr/nerfstudio/transforms_undistorted.json` and, beside it, `dslr/undistorted_images` and
+SRC is a scene. Used are `dslr/nerfstudio/transforms_undistorted.json` and, next to it, `dslr/undistorted_images` and
 `dslr/undistorted_depths` (16 bit, millimeters), which are not shipped: make them with the dataset's toolbox. Poses are
 camera to world with OpenGL axes. Photographs are not a video: consecutive ones may be far apart.
 """

@@ -234,7 +234,7 @@ def list_frames(folder: Path) -> tuple[list[FrameFiles], list[int]]:
         if match and (match[2] == "pose") == (match[3] == "txt"):
             other = files[match[2]].setdefault(int(match[1]), path)
             if other != path:
-                raise DuagError(f"{path}: found beside {other.name}, expected one of them")
+                raise DuagError(f"{path}: found together with {other.name}, expected one of them")
     numbers = sorted(set().union(*files.values()))
     if not numbers:
         raise DuagError(f"{folder}: found no frame-NNNNNN.color.png or .jpg, expected a sequence of 7-Scenes")
@@ -243,7 +243,9 @@ def list_frames(folder: Path) -> tuple[list[FrameFiles], list[int]]:
         for number in numbers:
             if number not in files[kind]:
                 there = next(files[k][number] for k in KINDS if number in files[k])
-                raise DuagError(f"{there}: has no {kind} beside it, expected frame-{number:06d}.{kind}.*")
+                raise DuagError(
+                    f"{there}: has no {kind} in the same folder, expected frame-{number:06d}.{kind}.*"
+                )
     missing = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers))
     return [
         FrameFiles(n, files["color"][n], files["depth"][n], files["pose"].get(n)) for n in numbers

@@ -190,7 +190,7 @@ def _parts(path: Path) -> Iterator[tuple[_Part, NDArray[np.uint8] | None]]:
 
 
 class _Complaints:
-    """What libraries have written since this was made: nothing else tells of a texture that is torn or not there."""
+    """What libraries have written since this was made: nothing else reports a texture that is torn or missing."""
 
     def __init__(self) -> None:
         sys.stdout = self.open3d = io.StringIO()
@@ -240,7 +240,7 @@ def _texture(path: Path, materials: Any, index: int) -> NDArray[np.uint8] | None
 
 
 def _flat_color(path: Path, materials: list[Any], index: int) -> NDArray[np.uint8] | None:
-    """The one color of a material, uint8 [3]; for parts without texture beside others that have one."""
+    """The one color of a material, uint8 [3]; for parts without texture among others that have one."""
     if not 0 <= index < len(materials):
         return None
     color = np.clip(np.asarray(materials[index].base_color, dtype=np.float64)[:3], 0, 1)

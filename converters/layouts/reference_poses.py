@@ -49,7 +49,7 @@ def read(path: Path, sequence: str) -> dict[int, NDArray[np.float64]]:
         raise DuagError(f"{path}: found no pose, expected {EXPECTED}")
     if not sequence and len(names) > 1:
         found, asked = ", ".join(names), f"--set reference_sequence={names[0]}"
-        raise DuagError(f"{path}: found poses of {found}, expected to be told which, as with {asked}")
+        raise DuagError(f"{path}: found poses of {found}, expected the choice of one, as with {asked}")
     if sequence and sequence not in poses:
         raise DuagError(f"{path}: found poses of {', '.join(names)}, expected some of {sequence}")
     return poses[sequence or names[0]]

@@ -135,7 +135,7 @@ def read_part(
     color, depth = files["frame"], files["depth"]
     for number in sorted(set(color) ^ set(depth)):
         there, kind = (color[number], "depth") if number in color else (depth[number], "frame")
-        raise DuagError(f"{there}: has no partner, expected {kind}{number:06d}.* beside it")
+        raise DuagError(f"{there}: has no partner, expected {kind}{number:06d}.* in the same folder")
     if not color:
         raise DuagError(f"{results}: found no frameNNNNNN.jpg, expected images")
     poses = _read_poses(path)

@@ -53,7 +53,7 @@ DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
 
 
 def encoded_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height that a JPEG or PNG tells, without decoding; None if it is cut short or neither."""
+    """Width and height in the header of a JPEG or PNG, without decoding; None if it is cut short or neither."""
     if data.startswith(b"\x89PNG"):
         whole = len(data) > 24 and b"IEND" in data[-64:]
         return (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) if whole else None

@@ -237,7 +237,7 @@ class StereoRig:
         """Disparity [h, w], px, of rectified gray images; 0 where no match is certain."""
         import cv2
 
-        # the matcher leaves out as many columns as it tries disparities: give it those, and believe no match in them
+        # the matcher leaves out as many columns as it tries disparities: give it those, and use no match in them
         n = self.disparities
         wide = [cv2.copyMakeBorder(side, 0, 0, n, 0, cv2.BORDER_REPLICATE) for side in (left, right)]
         found = self._matcher.compute(*wide)[:, n:].astype(np.float32) / np.float32(SUBPIXELS)

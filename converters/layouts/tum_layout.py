@@ -1,4 +1,4 @@
-"""The layout of TUM RGB-D, which other datasets took over: lists of images with times, poses with times."""
+"""The layout of TUM RGB-D, which other datasets use as well: lists of images with times, poses with times."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ class Poses:
         return Poses(np.array(stamps, dtype=np.int64), T, unusable)
 
     def at(self, stamp_ns: int, max_gap_s: float) -> Array | None:
-        """Pose [4, 4] at a time: on the way between two measured ones; None where there are none near."""
+        """Pose [4, 4] at a time: interpolated between two measured ones; None where there are none near."""
         k = int(np.searchsorted(self.stamps_ns, stamp_ns))
         if k < len(self.stamps_ns) and self.stamps_ns[k] == stamp_ns:
             return self.T_world_body[k]

@@ -69,7 +69,7 @@ def _of_bag(reader: Any, connections: list[Any], heads: Collection[str]) -> Iter
 
 
 def _announced(reader: Any, entries: Iterator[Any]) -> Iterator[Any]:
-    """Entries of the index; the system is told of some in advance, and a disk answers many questions at a time."""
+    """Entries of the index; the system is asked for some in advance, and a disk answers many questions at a time."""
     while some := list(itertools.islice(entries, AHEAD)):
         for entry in some:
             place = reader.chunks[entry.chunk_pos].datapos + entry.offset

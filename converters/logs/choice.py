@@ -49,7 +49,7 @@ class Chooser:
 
         Args:
             namespace: only topics below it.
-            wanted: topics by name of the option ("color", ...), "" = not told.
+            wanted: topics by name of the option ("color", ...), "" = not given.
         """
         self.log, self.namespace, self._wanted = log, namespace.rstrip("/"), dict(wanted or {})
         self.images: dict[str, Any] = {
@@ -120,9 +120,9 @@ class Chooser:
         *,
         known: Sequence[str] = (),
     ) -> Choice:
-        """The topic that was told, the only one, or the only one with the first hint that decides.
+        """The topic that was given, the only one, or the only one with the first hint that decides.
 
-        kind: the option. called: what kind of images these are, if not that. known: what may be told, if not images.
+        kind: the option. called: what kind of images these are, if not that. known: what may be given, if not images.
         """
         if self._wanted.get(kind):
             return self._told(kind, known or list(self.images))
@@ -148,7 +148,7 @@ class Chooser:
             raise DuagError(
                 f"{self.log.name}: {option} topic {wanted} not found, {closest(wanted, known, 'a topic')}"
             )
-        return Choice(wanted, "told", tuple(known))
+        return Choice(wanted, "given", tuple(known))
 
 
 def video_words(log: Log, namespace: str) -> str:

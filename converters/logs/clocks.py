@@ -3,8 +3,8 @@
 - One recorder wrote the messages of several robots: its times are common to all. Headers of a robot lie before them by
   the time that messages take, at least; the least of it is taken to be the same for every robot.
 - Each robot has its own recorder, and some messages stand in both logs: their times of recording differ by the clocks'
-  difference and by the way from one robot to the other. Messages in both directions bound the difference from
-  both sides; from one direction the way cannot be told apart.
+  difference and by the transmission from one robot to the other. Messages in both directions bound the difference from
+  both sides; from one direction the time of transmission cannot be separated.
 - Otherwise nothing can be said: robots that do not see each other move independently.
 - Within one log, the least delay between header and recording changes evenly if the clocks of the two run at different
   rates (`drift`).
@@ -120,7 +120,7 @@ class RobotClock:
 
 @dataclass(frozen=True)
 class Offset:
-    """What to add to a robot's times to have them on the reference's clock; None where nothing tells.
+    """What to add to a robot's times to have them on the reference's clock; None where it is not known.
 
     low_s, high_s: bounds, None if that side is open. how: in words.
     """
@@ -132,7 +132,7 @@ class Offset:
 
     @property
     def matters(self) -> bool:
-        """Whether it is known, and larger than what cannot be told from zero."""
+        """Whether it is known, and larger than its uncertainty."""
         if self.seconds is None or abs(self.seconds) < LEAST_OFFSET_S:
             return False
         return not (self.low_s is not None and self.high_s is not None and self.low_s <= 0 <= self.high_s)
@@ -201,7 +201,10 @@ def _recorder_offset(a: RobotClock, b: RobotClock) -> Offset:
     if low is not None or high is not None:
         one = low if low is not None else high
         return Offset(
-            one, low, high, f"{len(rows)} messages that both recorded, sent by one: less the way between them"
+            one,
+            low,
+            high,
+            f"{len(rows)} messages that both recorded, sent by one: less the transmission between them",
         )
     middle = float(np.median(differences))
     ends = float(differences.min()), float(differences.max())

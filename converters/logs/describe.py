@@ -233,8 +233,8 @@ def _log_lines(name: str, log: Mapping[str, Any]) -> list[str]:
     for topic, t in log["topics"].items():
         rate = f"{t['rate_hz']:8.2f} Hz" if t["rate_hz"] else " " * 11
         delay = t["recorded_after_header_s"]
-        told = "" if delay is None else f"  recorded {delay:.3f} s after its header"
-        lines.append(f"  {topic:<{width}}  {t['messages']:>7}  {rate}  {t['type']}{told}")
+        text = "" if delay is None else f"  recorded {delay:.3f} s after its header"
+        lines.append(f"  {topic:<{width}}  {t['messages']:>7}  {rate}  {t['type']}{text}")
     return lines
 
 
@@ -253,8 +253,8 @@ def _robot_lines(robot: str, row: Mapping[str, Any]) -> list[str]:
             lines.append(f"  {kind + '?':<10}  {', '.join(found)}")
     clock = row.get("clock")
     if clock and clock["how"] != "the reference":
-        told = "not known" if clock["offset_s"] is None else f"add {clock['offset_s']:.6f} s"
-        lines.append(f"  clock       {told} ({clock['how']})")
+        text = "not known" if clock["offset_s"] is None else f"add {clock['offset_s']:.6f} s"
+        lines.append(f"  clock       {text} ({clock['how']})")
     return lines
 
 
@@ -263,7 +263,7 @@ def toml_text(content: Mapping[str, Any]) -> str:
     sources = sorted({s for log in content["logs"].values() for s in log["time_sources"]})
     lines = [
         "# duagc convert ros THIS_FILE --out RECORDING",
-        "# `duagc convert --list` has all options; above [robots] they hold for all. Paths: full, or beside this.",
+        "# `duagc convert --list` has all options; above [robots] they hold for all. Paths: full, or from this file's.",
         f'time_source = "header"  # {", ".join(sources)}',
     ]
     for robot, row in content["robots"].items():

@@ -28,7 +28,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Entry:
-    """One message. log_ns: when it was recorded; publish_ns: when it was sent, where the container tells.
+    """One message. log_ns: when it was recorded; publish_ns: when it was sent, where the container records it.
 
     data: as it stands in the container. read: the message, with ROS's fields. header_ns: the time in its header, 0
     where it has none.

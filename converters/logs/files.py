@@ -1,4 +1,4 @@
-"""One way to read every container: what topics there are, and their messages in order of recording.
+"""One interface to every container: what topics there are, and their messages in order of recording.
 
     with open_log([Path("a_0.bag"), Path("a_1.bag")]) as log:
         for topic in log.topics.values():

@@ -140,8 +140,8 @@ class McapFile:
         if chunk.compression == "zstd":
             import zstandard
 
-            told = zstandard.get_frame_parameters(chunk.data).content_size
-            size = max(size, told if told < zstandard.CONTENTSIZE_UNKNOWN else 0)
+            stated = zstandard.get_frame_parameters(chunk.data).content_size
+            size = max(size, stated if stated < zstandard.CONTENTSIZE_UNKNOWN else 0)
         elif chunk.compression == "lz4":
             import lz4.frame
 
@@ -203,7 +203,7 @@ class _Ros:
         self._deserialize: Any = None
 
     def _store(self) -> Any:
-        """Understood when the first message is read: definitions that nobody needs may be beyond the parser."""
+        """Understood when the first message is read: definitions that are not needed may be beyond the parser."""
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
         text = self.schema.data.decode()

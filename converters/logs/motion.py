@@ -171,14 +171,14 @@ class MotionReader:
         self.take.append((readings.topic, readings.take))
         return readings
 
-    def _body_camera(self, option: str, told: str) -> Array:
-        """T_body_color [4, 4] of the body that poses are of. option: truth or odometry. told: its frame in the log."""
+    def _body_camera(self, option: str, frame_in_log: str) -> Array:
+        """T_body_color [4, 4] of the body of poses. option: truth or odometry. frame_in_log: of its messages."""
         setting = f"T_{option}_color"
         text = getattr(self._settings, setting)
         if text:
             return extrinsics_of(setting, text)
         frame = frame_name(
-            (self._settings.truth_frame if option == "truth" else "") or told or self.color_frame
+            (self._settings.truth_frame if option == "truth" else "") or frame_in_log or self.color_frame
         )
         if frame in ("camera", frame_name(self.color_frame)):
             return np.eye(4)

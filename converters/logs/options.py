@@ -59,7 +59,7 @@ class LogOptions(AssociationOptions, StereoOptions):
     clock_offset_s: float = Field(default=0.0, allow_inf_nan=False)
     """Seconds to add to all times of the robot, for clocks that differ between robots."""
     clocks: Literal["as_recorded", "estimated", "from_zero"] = "as_recorded"
-    """What becomes of the robots' clocks: kept (their difference is estimated and told), corrected by the estimated
+    """What becomes of the robots' clocks: kept (their difference is estimated and reported), corrected by the estimated
     difference where it matters, or every robot starts at time 0."""
     pieces: bool = False
     """All logs of the folder belong to one robot, or to several in different namespaces."""

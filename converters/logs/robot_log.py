@@ -73,7 +73,7 @@ class RobotLog:
         # added to all times when they are written
         self.shift_ns = round(settings.clock_offset_s * NANOSECONDS)
         self._rate, self._origin_ns = 0.0, 0  # of the clock, see `settle_drift`
-        # by topic of a CameraInfo: the camera as first told, and whether its images are rectified
+        # by topic of a CameraInfo: the camera of its first message, and whether its images are rectified
         self._cameras: dict[str, tuple[RosCamera, bool]] = {}
         self.transforms = Transforms(log, self.namespace)
         self._choose()
@@ -210,7 +210,7 @@ class RobotLog:
         return T
 
     def _realsense_extrinsics(self) -> Array | None:
-        """T_color_depth [4, 4] of a recording by RealSense's own software: each stream tells T_stream_reference."""
+        """T_color_depth [4, 4] of a recording by RealSense's own software: each stream states T_stream_reference."""
         found = []
         for image in (self.color, self.depth):
             topic = f"{image.removesuffix('/image/data')}/tf/0"
@@ -280,7 +280,7 @@ class RobotLog:
 
     @cached_property
     def drift(self) -> Drift | None:
-        """How the clocks of headers and recorder differ in rate; None if that cannot be told, or was not asked for."""
+        """How the clocks of headers and recorder differ in rate; None if that is not known, or was not asked for."""
         self._seen  # noqa: B018
         return drift(self._image_ns, self._delays_ns) if self.settings.time_source == "header" else None
 

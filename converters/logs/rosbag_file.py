@@ -58,10 +58,10 @@ class RosBag:
     def _topics(self) -> dict[str, Topic]:
         topics: dict[str, Topic] = {}
         for c in self._reader.connections:
-            told = c.topic, c.msgtype, c.msgcount  # of a bag of ROS 2 they stand in its metadata
-            if not all(map(isinstance, told, (str, str, int))):
+            connection = c.topic, c.msgtype, c.msgcount  # of a bag of ROS 2 they stand in its metadata
+            if not all(map(isinstance, connection, (str, str, int))):
                 raise DuagError(
-                    f"{self.path}: found {told}, expected a topic, its type and number of messages"
+                    f"{self.path}: found {connection}, expected a topic, its type and number of messages"
                 )
             before = topics.get(c.topic)
             if before is not None and before.schema != c.msgtype:

@@ -3,7 +3,7 @@
 time_source = "header"            # options for all robots
 
 [robots.jackal]
-logs = ["jackal_0.bag", "jackal_1.bag"]      # beside this file; one log in several pieces
+logs = ["jackal_0.bag", "jackal_1.bag"]      # next to this file; one log in several pieces
 namespace = "/jackal"                        # only topics below it
 color = "/jackal/camera/color/image_raw"     # options for this robot
 """

@@ -25,17 +25,17 @@ MARGIN, PAPER, INK = 12, (250, 250, 248), (40, 40, 44)
 class Preview:
     """Collects what the sheet shows."""
 
-    def __init__(self, title: str, names: list[str], ways: list[Array], walks: list[Array]) -> None:
+    def __init__(self, title: str, names: list[str], trajectories: list[Array], walks: list[Array]) -> None:
         """Initialize.
 
         Args:
             title: one line over the sheet.
             names: of the robots.
-            ways: T_world_camera [frames, 4, 4] of each.
+            trajectories: T_world_camera [frames, 4, 4] of each.
             walks: poses [frames, 4, 4] of what moves besides.
         """
-        self.title, self.names, self.ways, self.walks = title, names, ways, walks
-        frames = len(ways[0])
+        self.title, self.names, self.trajectories, self.walks = title, names, trajectories, walks
+        frames = len(trajectories[0])
         self.shown = np.unique(np.linspace(0, frames - 1, THUMBS).round().astype(np.int64)).tolist()
         self._thumbs: dict[tuple[str, int], Image] = {}
 
@@ -72,7 +72,7 @@ class Preview:
 
     def _map(self, points: Array, colors: NDArray[np.uint8]) -> Image:
         """The scene from above, cut below the ceiling, with all paths and where the cameras look."""
-        cameras = np.concatenate([way[:, :3, 3] for way in self.ways])
+        cameras = np.concatenate([path[:, :3, 3] for path in self.trajectories])
         below = points[:, 2] < cameras[:, 2].min() + CUT_M
         points, colors = points[below], colors[below]
         low = np.percentile(points[:, :2], 0.2, axis=0) - 0.3
@@ -87,21 +87,23 @@ class Preview:
             dots = [pixel(p) for p in walk[:: max(1, len(walk) // 20), :2, 3]]
             for dot in dots:
                 cv2.circle(image, dot, 3, INK, -1, cv2.LINE_AA)
-        for k, way in enumerate(self.ways):
+        for k, path in enumerate(self.trajectories):
             color = COLORS[k % len(COLORS)]
-            line = np.array([pixel(p) for p in way[:, :2, 3]], dtype=np.int32)[:, None]
-            wide = 3 + round(6 * (len(self.ways) - 1 - k) / len(self.ways))  # who goes over others hides none
+            line = np.array([pixel(p) for p in path[:, :2, 3]], dtype=np.int32)[:, None]
+            wide = 3 + round(
+                6 * (len(self.trajectories) - 1 - k) / len(self.trajectories)
+            )  # no path hides another
             cv2.polylines(image, [line], False, (255, 255, 255), wide + 2, cv2.LINE_AA)
             cv2.polylines(image, [line], False, color, wide, cv2.LINE_AA)
             for index in self.shown:
-                at = way[index, :2, 3]
+                at = path[index, :2, 3]
                 for side in (-0.5, 0.5):  # half the opening angle of a camera, about
                     c, s = np.cos(side), np.sin(side)
-                    end = at + 28 / scale * (np.array([[c, -s], [s, c]]) @ way[index, :2, 2])
+                    end = at + 28 / scale * (np.array([[c, -s], [s, c]]) @ path[index, :2, 2])
                     cv2.line(image, pixel(at), pixel(end), color, 1, cv2.LINE_AA)
-            cv2.circle(image, pixel(way[0, :2, 3]), 7, color, -1, cv2.LINE_AA)
+            cv2.circle(image, pixel(path[0, :2, 3]), 7, color, -1, cv2.LINE_AA)
             cv2.putText(
-                image, self.names[k][0], pixel(way[0, :2, 3] + 10 / scale), 0, 0.6, color, 2, cv2.LINE_AA
+                image, self.names[k][0], pixel(path[0, :2, 3] + 10 / scale), 0, 0.6, color, 2, cv2.LINE_AA
             )
         meters = 10.0 ** np.floor(np.log10(200 / scale))
         bottom = image.shape[0] - 14

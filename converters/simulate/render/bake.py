@@ -55,7 +55,7 @@ class Atlas:
         return np.asarray(colors, dtype=np.uint8).reshape(-1, 3)[:n]
 
 
-# whether anything lies between points [n, 3] and points + way [n, 3]
+# whether anything lies between points [n, 3] and points + offset [n, 3]
 Blocked = Callable[[Array, Array], NDArray[np.bool_]]
 
 
@@ -142,17 +142,17 @@ def exposure(scene: Scene, points: Array, normals: Array, blocked: Blocked | Non
         facing = np.cross(lamp.half_a, lamp.half_b)
         facing = facing / np.linalg.norm(facing)
         for a, b in ((-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)):
-            way = lamp.center + a * lamp.half_a + b * lamp.half_b - start
-            distance2 = np.sum(way**2, axis=1)
-            cosine = np.maximum(np.sum(way * normals, axis=1), 0.0) / np.sqrt(distance2)
-            from_lamp = np.abs(way @ facing) / np.sqrt(distance2)
+            offset = lamp.center + a * lamp.half_a + b * lamp.half_b - start
+            distance2 = np.sum(offset**2, axis=1)
+            cosine = np.maximum(np.sum(offset * normals, axis=1), 0.0) / np.sqrt(distance2)
+            from_lamp = np.abs(offset @ facing) / np.sqrt(distance2)
             shine = lamp.strength / 4 * 3.2 * cosine * (0.3 + 0.7 * from_lamp) / (distance2 + 1.2)
             lit = np.flatnonzero(shine > 1e-3)
             # just short of the lamp: it is no obstacle to its own light
             hidden = (
-                blocked(start[lit], 0.97 * way[lit])
+                blocked(start[lit], 0.97 * offset[lit])
                 if blocked
-                else _blocked(scene, start[lit], way[lit], 1.0)
+                else _blocked(scene, start[lit], offset[lit], 1.0)
             )
             shine[lit] *= ~hidden
             total += shine
@@ -164,11 +164,11 @@ def _sunlight(sun: Array, start: Array, normals: Array, blocked: Blocked | None)
     strength = float(np.linalg.norm(sun))
     total = np.zeros(len(start))
     for across in ((0.01, 0.0), (-0.01, 0.0), (0.0, 0.01), (0.0, -0.01)):
-        way = sun / strength + np.array([*across, 0.0])
-        shine = strength / 4 * np.maximum(normals @ way, 0.0)
+        offset = sun / strength + np.array([*across, 0.0])
+        shine = strength / 4 * np.maximum(normals @ offset, 0.0)
         lit = np.flatnonzero(shine > 0)
         if blocked:
-            shine[lit] *= ~blocked(start[lit], np.broadcast_to(SUN_REACH_M * way, (len(lit), 3)))
+            shine[lit] *= ~blocked(start[lit], np.broadcast_to(SUN_REACH_M * offset, (len(lit), 3)))
         total += shine
     return total
 
@@ -183,18 +183,20 @@ def _ambient(scene: Scene, start: Array, normals: Array, blocked: Blocked | None
     for direction in sphere:
         cosine = normals @ direction
         up = np.flatnonzero(cosine > 0.05)
-        way = np.broadcast_to(reach_m * direction, (len(up), 3))
+        offset = np.broadcast_to(reach_m * direction, (len(up), 3))
         weight[up] += cosine[up]
-        hidden = blocked(start[up], way) if blocked else _blocked(scene, start[up], way, 1.0, walls=True)
+        hidden = (
+            blocked(start[up], offset) if blocked else _blocked(scene, start[up], offset, 1.0, walls=True)
+        )
         open_[up] += cosine[up] * ~hidden
     return 0.35 + 0.65 * open_ / np.maximum(weight, 1e-9)
 
 
 def _blocked(
-    scene: Scene, start: Array, way: Array, reach: float, *, walls: bool = False
+    scene: Scene, start: Array, offset: Array, reach: float, *, walls: bool = False
 ) -> NDArray[np.bool_]:
-    """Whether anything that casts shadows meets start + q way for 0 < q < reach, [n]."""
-    end = start + reach * way
+    """Whether anything that casts shadows meets start + q offset for 0 < q < reach, [n]."""
+    end = start + reach * offset
     blocked = np.zeros(len(start), dtype=np.bool_)
     if walls:
         blocked |= ((end < 0) | (end > scene.size)).any(axis=1)
@@ -204,7 +206,7 @@ def _blocked(
             center, radius = _bounds(solid)
             near = ~blocked & ((low < center + radius) & (high > center - radius)).all(axis=1)
             some = np.flatnonzero(near)
-            blocked[some] = _meets(solid, start[some], way[some], reach)
+            blocked[some] = _meets(solid, start[some], offset[some], reach)
     return blocked
 
 
@@ -220,17 +222,17 @@ def _bounds(solid: Solid) -> tuple[Array, Array]:
     return solid.center, np.full(3, solid.radius)
 
 
-def _meets(solid: Solid, start: Array, way: Array, reach: float) -> NDArray[np.bool_]:
+def _meets(solid: Solid, start: Array, offset: Array, reach: float) -> NDArray[np.bool_]:
     """Whether rays meet a solid; a cylinder counts as the narrower box in it."""
     if isinstance(solid, Box):
-        p, d, half = solid.local(start), solid.turned(way), solid.half
+        p, d, half = solid.local(start), solid.turned(offset), solid.half
     elif isinstance(solid, Cylinder):
         center, half = _bounds(solid)
-        p, d, half = start - center, way, half * np.array([0.85, 0.85, 1.0])
+        p, d, half = start - center, offset, half * np.array([0.85, 0.85, 1.0])
     else:
         p = start - solid.center
-        q = np.clip(-np.sum(p * way, axis=1) / np.sum(way**2, axis=1), 0, reach)
-        return np.sum((p + q[:, None] * way) ** 2, axis=1) < 0.97 * solid.radius**2
+        q = np.clip(-np.sum(p * offset, axis=1) / np.sum(offset**2, axis=1), 0, reach)
+        return np.sum((p + q[:, None] * offset) ** 2, axis=1) < 0.97 * solid.radius**2
     d = np.where(np.abs(d) < 1e-12, 1e-12, d)
     a, b = (-half - p) / d, (half - p) / d
     enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)

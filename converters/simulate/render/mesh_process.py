@@ -16,7 +16,7 @@ from duagc.pipeline.base.progress import track
 Answer = dict[str, str]
 Process = subprocess.Popen[bytes]
 
-BESIDE = (".obj", ".gltf")  # may take materials, buffers and textures from other files
+COMPOUND = (".obj", ".gltf")  # may take materials, buffers and textures from other files
 OTHERS = (".mtl", ".bin", ".png", ".jpg", ".jpeg")
 IDLE_S = 4  # without any work: it waits for something that does not come
 
@@ -30,12 +30,12 @@ def read(files: list[Path], up: str, cache: Path) -> None:
     Raises:
         DuagError: a file that cannot be read, or not within the limits of `duagc.converters.layouts.mesh_reader`.
     """
-    with _started() as (process, told, tell):
-        job = {"tell": tell, "files": _with_sizes(files), "up": up, "cache": str(cache)}
+    with _started() as (process, answers_fd, reader_fd):
+        job = {"tell": reader_fd, "files": _with_sizes(files), "up": up, "cache": str(cache)}
         assert process.stdin is not None
         with suppress(BrokenPipeError):  # its end is noticed below
             process.stdin.write(json.dumps(job).encode() + b"\n")
-        answers = _answers(process, told)
+        answers = _answers(process, answers_fd)
         for path in track(files, "read meshes"):
             _check(next(answers), path)
         _check(next(answers), files[0].parent)
@@ -44,7 +44,7 @@ def read(files: list[Path], up: str, cache: Path) -> None:
 @contextmanager
 def _started() -> Iterator[tuple[Process, int, int]]:
     """The process, a pipe from it, and the number of the other end there; it is gone afterward."""
-    told, tell = os.pipe()
+    answers_fd, reader_fd = os.pipe()
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join(os.path.abspath(entry) for entry in sys.path),
         "MALLOC_ARENA_MAX": "2",  # each takes 64 MB of the address space, which is limited
@@ -57,43 +57,44 @@ def _started() -> Iterator[tuple[Process, int, int]]:
                 stdin=subprocess.PIPE,  # it ends when this does
                 stdout=subprocess.DEVNULL,  # libraries write there what is said in one line here
                 stderr=subprocess.DEVNULL,
-                pass_fds=[tell],
+                pass_fds=[reader_fd],
                 env=environment,
             )
         finally:
-            os.close(tell)
+            os.close(reader_fd)
         with process:
             try:
-                yield process, told, tell
+                yield process, answers_fd, reader_fd
             finally:
                 process.kill()
     finally:
-        os.close(told)
+        os.close(answers_fd)
 
 
 def _with_sizes(files: list[Path]) -> list[tuple[str, int]]:
     """Every file with the number of bytes that belong to it: the limits grow with them."""
-    beside = 0
-    if any(path.suffix.lower() in BESIDE for path in files):
+    other_bytes = 0
+    if any(path.suffix.lower() in COMPOUND for path in files):
         for folder, _, names in os.walk(files[0].parent):
             paths = (os.path.join(folder, name) for name in names if name.lower().endswith(OTHERS))
-            beside += sum(os.path.getsize(path) for path in paths if os.path.isfile(path))
+            other_bytes += sum(os.path.getsize(path) for path in paths if os.path.isfile(path))
     return [
-        (str(path), path.stat().st_size + (beside if path.suffix.lower() in BESIDE else 0)) for path in files
+        (str(path), path.stat().st_size + (other_bytes if path.suffix.lower() in COMPOUND else 0))
+        for path in files
     ]
 
 
-def _answers(process: Process, told: int) -> Iterator[Answer]:
-    """What the process tells; {"end": ...} when it ended, or had to be, without a word."""
+def _answers(process: Process, answers_fd: int) -> Iterator[Answer]:
+    """What the process reports; {"end": ...} when it ended, or had to be, without a word."""
     rest, idle_s, before = b"", 0, -1
     while True:
-        if not select.select([told], [], [], 1.0)[0]:
+        if not select.select([answers_fd], [], [], 1.0)[0]:
             asleep, work = _state(process.pid)
             idle_s, before = (idle_s + 1 if asleep and work == before else 0), work
             if idle_s >= IDLE_S:
                 yield {"end": "waits for something that does not come (is a texture a pipe?)"}
             continue
-        data = os.read(told, 1 << 16)
+        data = os.read(answers_fd, 1 << 16)
         if not data:
             yield {"end": _end(process.wait())}
         idle_s, (*lines, rest) = 0, (rest + data).split(b"\n")

@@ -52,9 +52,9 @@ class Caster:
             "normals": hit["primitive_normals"].numpy(),
         }
 
-    def blocked(self, start: Array, way: Array) -> NDArray[np.bool_]:
-        """Whether anything lies between start [n, 3] and start + way [n, 3]."""
-        rays = np.concatenate([start, way], axis=1).astype(np.float32)
+    def blocked(self, start: Array, offset: Array) -> NDArray[np.bool_]:
+        """Whether anything lies between start [n, 3] and start + offset [n, 3]."""
+        rays = np.concatenate([start, offset], axis=1).astype(np.float32)
         hidden = self._embree.test_occlusions(self._tensor(rays), tnear=0.0, tfar=1.0, nthreads=1)
         return np.asarray(hidden.numpy(), dtype=np.bool_)
 
@@ -112,7 +112,7 @@ class MeshRenderer:
         return t, colors
 
     def _directions(self, T_world_camera: Array, du: float, dv: float) -> NDArray[np.float32]:
-        """World directions [h * w, 3] of rays beside the pixel centers by (du, dv) px, one meter along z.
+        """World directions [h * w, 3] of rays next to the pixel centers by (du, dv) px, one meter along z.
 
         Column by column: a product of matrices so narrow takes twenty times as long.
         """
@@ -131,7 +131,7 @@ class MeshRenderer:
         directions: NDArray[np.float32],
         normals: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Mip level [n] whose texels are as large as samples are apart on the surface (geometric mean of both ways)."""
+        """Mip level [n] whose texels are as large as samples are apart on the surface (geometric mean)."""
         length = np.sqrt(np.einsum("ij,ij->i", directions, directions))
         cosine = np.abs(np.einsum("ij,ij->i", normals, directions)) / length
         focal = np.sqrt(self.camera.fx * self.camera.fy)

@@ -2,7 +2,7 @@
 
 A flat surface seen by a pinhole camera has an inverse depth D = 1/z that is linear in the pixel (u, v), and so are
 s D and t D of its coordinates (s, t). Visibility is a maximum of D over surfaces, in float64, at pixel centers.
-Color takes 2 x 2 samples of the surface at the center, or, beside a border between surfaces, 4 x 4 samples of
+Color takes 2 x 2 samples of the surface at the center, or, next to a border between surfaces, 4 x 4 samples of
 whatever each of them hits; textures are read at the mip level whose texels are as large as the samples are apart.
 """
 

@@ -1,4 +1,4 @@
-"""What stands in offices and corridors: pieces that are put against a wall or into the open, turned any way."""
+"""What stands in offices and corridors: pieces that are put against a wall or into the open, in any direction."""
 
 from dataclasses import dataclass
 from typing import Any

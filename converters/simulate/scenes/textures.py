@@ -368,7 +368,7 @@ def tiles(color: Color = (188, 180, 164), tile_m: float = 0.3, joint: Color = (1
 
 
 def panels(color: Color = (214, 212, 204), panel_m: float = 0.6) -> Material:
-    """A hung ceiling: square panels with dark joints and specks."""
+    """A suspended ceiling: square panels with dark joints and specks."""
 
     def paint(rng: np.random.Generator, width_m: float, height_m: float, texel_m: float) -> Image:
         image = tiles(color, panel_m, (150, 148, 142))(rng, width_m, height_m, texel_m)

@@ -127,11 +127,11 @@ class MovingCamera:
             T = mover.poses[frame]
             near = np.flatnonzero(mover.near(T, origins, directions))
             if near.size:
-                start, way = (
+                start, direction = (
                     (origins[near] - T[:3, 3]) @ T[:3, :3],
                     directions[near] @ T[:3, :3].astype(np.float32),
                 )
-                t_mover, paint = renderer.shade(start, np.asarray(way, dtype=np.float32))
+                t_mover, paint = renderer.shade(start, np.asarray(direction, dtype=np.float32))
                 ahead = t_mover < t[near]
                 t[near[ahead]], colors[near[ahead]], moving[near[ahead]] = t_mover[ahead], paint[ahead], True
         return t, colors, moving
@@ -143,16 +143,16 @@ class MovingCamera:
             np.broadcast_arrays(np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)), axis=-1
         ).reshape(-1, 3)
         T_world_lidar = T_world_camera @ T_CAMERA_LIDAR
-        ways = (beams @ T_world_lidar[:3, :3].T).astype(np.float32)
-        origins = np.broadcast_to(T_world_lidar[:3, 3], ways.shape)
-        ranges, _, _ = self._trace(origins, ways, frame)
+        directions = (beams @ T_world_lidar[:3, :3].T).astype(np.float32)
+        origins = np.broadcast_to(T_world_lidar[:3, 3], directions.shape)
+        ranges, _, _ = self._trace(origins, directions, frame)
         measured = ranges + RANGE_SIGMA_M * rng.standard_normal(len(ranges))
         seen = np.isfinite(ranges) & (ranges < FARTHEST_M)
         return np.asarray(measured[seen, None] * beams[seen])
 
 
 def _rays(camera: PinholeCamera, poses: Array, du: float, dv: float) -> tuple[Array, NDArray[np.float32]]:
-    """Origins and directions [h * w, 3] of rays beside the pixel centers; poses [h, 4, 4], one for every row."""
+    """Origins and directions [h * w, 3] of rays next to the pixel centers; poses [h, 4, 4], one for every row."""
     x = (np.arange(camera.width) + du - camera.cx) / camera.fx
     y = (np.arange(camera.height) + dv - camera.cy) / camera.fy
     ahead = poses[:, None, :3, 0] * x[:, None] + (poses[:, :3, 1] * y[:, None] + poses[:, :3, 2])[:, None]

@@ -1,7 +1,7 @@
-"""Figures that the ways of a team draw on the free floor: concentric circles, one route, crossing or parallel lines.
+"""Figures that the paths of a team draw on the free floor: concentric circles, one route, crossing or parallel lines.
 
 A figure has a place and a size; every robot's curve follows from those of the robots before it by one number, its
-spread, 0 to 1. Curves give way to what stands near them.
+spread, 0 to 1. Curves bend around what stands near them.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,15 +20,15 @@ from duagc.pipeline.geometry import se3
 Array = NDArray[np.float64]
 
 GIVE_WAY_M, GIVE_WAY_SMOOTH = 0.4, 3.0  # what a curve may be moved by what stands there; smooth over points
-KEPT_SHARE = 0.7  # of its length, at least, when a curve gives way
+KEPT_SHARE = 0.7  # of its length, at least, when a curve bends around something
 SMOOTH_GAZE_M = 0.35
 PITCH_RAD = np.deg2rad(-7.0)
 POINT_M = 0.05  # between the points of a curve
-RESERVE_M = 0.1  # of a curve at both ends: giving way can make it shorter
+RESERVE_M = 0.1  # of a curve at both ends: bending can make it shorter
 LEAST_CLEARANCE_M = MIN_CLEARANCE_M - 0.04
 APART_M = 0.4  # between robots on the floor at the same time
 LINES_APART_M = 0.45
-CROSSING_GAP_M = (0.45, 0.6)  # by which a robot is behind the one before, on its way through the middle
+CROSSING_GAP_M = (0.45, 0.6)  # by which a robot is behind the one before, on its path through the middle
 CROSSING_ONE_POINT = 4  # so many robots at most go through one point, one after the other
 CROSSING_RAD = np.deg2rad((20.0, 80.0))
 CIRCLE_TURN_RAD = 0.8 * MAX_TURN_RAD  # per frame; a robot on a small circle goes more slowly
@@ -37,9 +37,9 @@ FARTHEST_BEHIND_M = 5.0, 15.0  # a follower, and the last one behind the first
 
 @dataclass(frozen=True)
 class Figure:
-    """Where a figure is drawn: its middle (x, y, m), direction, the length of a way, and the size of the whole.
+    """Where a figure is drawn: its middle (x, y, m), direction, the length of a path, and the size of the whole.
 
-    frames: of a way. route: [n, 2], of a figure of followers, the curve that all go along.
+    frames: of a path. route: [n, 2], of a figure of followers, the curve that all go along.
     """
 
     middle: Array
@@ -50,7 +50,7 @@ class Figure:
     route: Array | None = None
 
 
-# of the figure, the number of robots, and the spreads up to one robot: its curve [n, 2], and how long a way along
+# of the figure, the number of robots, and the spreads up to one robot: its curve [n, 2], and how long a path along
 # the middle of it shall be
 Shape = Callable[[Figure, int, Sequence[float]], tuple[Array, float]]
 
@@ -66,7 +66,7 @@ def circle(figure: Figure, robots: int, spreads: Sequence[float]) -> tuple[Array
 
 
 def crossing(figure: Figure, robots: int, spreads: Sequence[float]) -> tuple[Array, float]:
-    """A straight way through the middle, later than the one before, and in another direction.
+    """A straight path through the middle, later than the one before, and in another direction.
 
     Many robots go at the same time, in evenly spread directions, and leave the middle to their left, as at a
     roundabout; the spread says how many directions on from the robot before.
@@ -83,7 +83,7 @@ def crossing(figure: Figure, robots: int, spreads: Sequence[float]) -> tuple[Arr
 
 
 def parallel(figure: Figure, robots: int, spreads: Sequence[float]) -> tuple[Array, float]:
-    """A straight way beside the one before, with the spread farther from it, and behind and ahead of it by turns."""
+    """A straight path next to the one before, with the spread farther from it, and behind and ahead of it by turns."""
     k, widest = len(spreads) - 1, max(LINES_APART_M, 2 * figure.reach_m / max(robots - 1, 1))
     aside = k * LINES_APART_M + sum(spreads) * (widest - LINES_APART_M) - figure.reach_m
     ahead = 0.8 * figure.length_m * sum((-1) ** i * spread for i, spread in enumerate(spreads))
@@ -115,7 +115,7 @@ def longest_lag(length_m: float, robots: int) -> float:
 
 
 def _line(figure: Figure, turn_rad: float, aside_m: float, along_m: float) -> Array:
-    """A straight way [n, 2] of the length of the figure, moved aside and along."""
+    """A straight path [n, 2] of the length of the figure, moved aside and along."""
     heading = figure.heading_rad + turn_rad
     ahead = np.array([np.cos(heading), np.sin(heading)])
     left = np.array([-ahead[1], ahead[0]])
@@ -125,31 +125,31 @@ def _line(figure: Figure, turn_rad: float, aside_m: float, along_m: float) -> Ar
 
 
 @dataclass(frozen=True)
-class Way:
-    """A robot's way: positions [frames, 3] and the direction in which it goes, rad, [frames]."""
+class GroundPath:
+    """A robot's path on the floor: positions [frames, 3] and the direction in which it goes, rad, [frames]."""
 
     position: Array
     heading_rad: Array
 
     def poses(self, gaze_rad: float) -> Array:
-        """T_world_camera [frames, 4, 4], looking aside of the way by `gaze_rad`, a little down."""
+        """T_world_camera [frames, 4, 4], looking to the side of the path by `gaze_rad`, a little down."""
         yaw = self.heading_rad + gaze_rad
         gaze = np.stack([np.cos(yaw), np.sin(yaw), np.full(len(yaw), np.tan(PITCH_RAD))], axis=1)
         return look_at(self.position, self.position + gaze)
 
 
 class Ground:
-    """The free floor of a terrain, and ways on it."""
+    """The free floor of a terrain, and paths on it."""
 
     def __init__(self, terrain: Terrain, frames: int, seed: int) -> None:
         """Initialize.
 
         Args:
-            frames: of every way.
+            frames: of every path.
             seed: of figures, and of how cameras waver.
         """
         self.terrain, self.space, self.frames, self.seed = terrain, terrain.free_space(), frames, seed
-        self.ways = 0  # worked out so far
+        self.planned = 0  # worked out so far
         self._graph = self.space.graph.tocsr()
         inside = np.pad(self.space.inside, 1)
         out, into = distance_transform_edt(~inside), distance_transform_edt(inside)
@@ -158,7 +158,7 @@ class Ground:
         self._fields = np.stack([margin, *slope], axis=-1)
 
     def figure(self, paradigm: str, robots: int, size: float, attempt: int) -> Figure:
-        """A figure drawn by lot, its ways `size` times as long as frames and steps would make them."""
+        """A figure drawn at random, its paths `size` times as long as frames and steps would make them."""
         space, length = self.space, size * (self.frames - 1) * self.terrain.step_m
         rng = random_streams.generator(
             self.seed, "simulate.figure", paradigm=paradigm, size=str(size), attempt=attempt
@@ -178,9 +178,11 @@ class Ground:
             reach = max(reach, 0.5 * LINES_APART_M * (robots - 1))
         return Figure(middle, float(rng.uniform(0, 2 * np.pi)), length, reach, self.frames, curve)
 
-    def way(self, shape: Shape, figure: Figure, robots: int, spreads: Sequence[float]) -> Way | None:
-        """The way of the robot that has the last of the spreads; None if it is not free."""
-        self.ways += 1
+    def ground_path(
+        self, shape: Shape, figure: Figure, robots: int, spreads: Sequence[float]
+    ) -> GroundPath | None:
+        """The path of the robot that has the last of the spreads; None if it is not free."""
+        self.planned += 1
         curve, length = shape(figure, robots, spreads)
         if len(curve) < 8 or self.margin(curve).min() < -GIVE_WAY_M:
             return None
@@ -211,11 +213,11 @@ class Ground:
                 break
             moved = gaussian_filter1d(moved + lack * at[:, 1:], GIVE_WAY_SMOOTH, axis=0, mode="nearest")
             at = self._at(curve + moved)
-        way = curve + moved
+        ground_path = curve + moved
         free = at[:, 0].min() > 0.0 and np.linalg.norm(moved, axis=1).max() < GIVE_WAY_M
-        return way if free and _length(way) > KEPT_SHARE * _length(curve) else None
+        return ground_path if free and _length(ground_path) > KEPT_SHARE * _length(curve) else None
 
-    def _steps(self, curve: Array, length_m: float, robot: int) -> Way | None:
+    def _steps(self, curve: Array, length_m: float, robot: int) -> GroundPath | None:
         """Even steps along the middle of a curve [n, 2], at the robot's height; None if too sharp or not clear."""
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
         length_m = min(length_m, float(along[-1]))
@@ -233,14 +235,16 @@ class Ground:
         bob, swing = (a * np.sin(2 * np.pi * s / p + f) for a, p, f in zip(*waves, strict=True))
         height = HEIGHTS_M[robot % len(HEIGHTS_M)] + 0.06 * (robot // len(HEIGHTS_M)) + bob
         position = np.column_stack([spline(s), self.space.floor_m + height])
-        way = Way(position, heading + swing)
-        turns = se3.distance(*(way.poses(0.0)[k] for k in (slice(None, -1), slice(1, None))))[1]
+        ground_path = GroundPath(position, heading + swing)
+        turns = se3.distance(*(ground_path.poses(0.0)[k] for k in (slice(None, -1), slice(1, None))))[1]
         if turns.max() > MAX_TURN_RAD:
             return None
         tight = position[
             self.margin(position[:, :2]) < 2 * self.space.cell_m
         ]  # elsewhere the floor says enough
-        return way if not len(tight) or self.terrain.clearance(tight).min() > LEAST_CLEARANCE_M else None
+        return (
+            ground_path if not len(tight) or self.terrain.clearance(tight).min() > LEAST_CLEARANCE_M else None
+        )
 
 
 def _length(curve: Array) -> float:
@@ -248,6 +252,6 @@ def _length(curve: Array) -> float:
     return float(np.linalg.norm(np.diff(curve, axis=0), axis=1).sum())
 
 
-def apart(one: Way, other: Way) -> float:
+def apart(one: GroundPath, other: GroundPath) -> float:
     """Least distance (m) on the floor between two robots at the same time."""
     return float(np.linalg.norm(one.position[:, :2] - other.position[:, :2], axis=1).min())

@@ -33,7 +33,7 @@ HEIGHTS_M = (1.48, 1.22, 1.62, 1.34)
 
 @dataclass(frozen=True)
 class Loop:
-    """One robot's way round the room; angles count from east, in radians.
+    """One robot's path around the room; angles count from east, in radians.
 
     radii: half axes of the loop. waver, phases: size and phase of its deviations (radius, height, gaze).
     direction: +1 counter-clockwise. gaze_m: half axes of the curve, across the room, on which the gaze rests.
@@ -117,7 +117,7 @@ def plan(scene: Scene, robots: int, frames: int, overlap: float, *, camera: Pinh
 
 
 def _loop(scene: Scene, robot: int) -> Loop:
-    """Draw loops of one robot until one keeps clear all the way round and never turns too fast."""
+    """Draw loops of one robot until one keeps clear all around and never turns too fast."""
     rng = random_streams.generator(scene.seed, "simulate.path", scene=scene.name, robot=robot)
     middle = scene.size[:2] / 2
     around = int(np.ceil(2 * np.pi * middle.max() / STEP_M))
@@ -162,7 +162,7 @@ def look(renderer: CameraRenderer, path: Array) -> PathViews:
 
 
 def shared(camera: PinholeCamera, a: PathViews, b: PathViews) -> float:
-    """Share of the pixels of views a whose points views b see too, and the other way round, averaged."""
+    """Share of the pixels of views a whose points views b see too, and vice versa, averaged."""
     shares = []
     for one, other in ((a, b), (b, a)):
         seen = np.zeros(len(one.points), dtype=bool)
@@ -173,7 +173,7 @@ def shared(camera: PinholeCamera, a: PathViews, b: PathViews) -> float:
 
 
 def shared_view(renderer: CameraRenderer, path_a: Array, path_b: Array) -> float:
-    """Share of the pixels along path a [n, 4, 4] whose points path b sees too, and the other way round, averaged."""
+    """Share of the pixels along path a [n, 4, 4] whose points path b sees too, and vice versa, averaged."""
     return shared(renderer.camera, look(renderer, path_a), look(renderer, path_b))
 
 

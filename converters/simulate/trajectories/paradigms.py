@@ -1,9 +1,9 @@
 """Paths of a team that draw a figure together: concentric circles, leader and followers, crossing or parallel lines.
 
-A figure (`figures.py`) is put where it is free, the longest ways first. Then robot after robot gets the spread and
-the direction of gaze, ahead or aside of its way, with which it shares as much of the view with the robot before as was
-asked for. What two robots share is measured. Of a few figures that come near enough, the one whose dullest view shows
-most is taken; if there is none, the nearest.
+A figure (`figures.py`) is put where it is free, the longest paths first. Then robot after robot gets the spread and
+the direction of gaze, ahead or to the side of its path, with which it shares as much of the view with the robot before
+as was asked for. What two robots share is measured. Of a few figures that come near enough, the one whose dullest view
+shows most is taken; if there is none, the nearest.
 """
 
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.converters.simulate.render.renderer import CameraRenderer
-from duagc.converters.simulate.trajectories.figures import APART_M, SHAPES, Figure, Ground, Way, apart
+from duagc.converters.simulate.trajectories.figures import APART_M, SHAPES, Figure, Ground, GroundPath, apart
 from duagc.converters.simulate.trajectories.loops import PathViews, look, shared
 from duagc.converters.simulate.trajectories.walks import (
     LEAST_MEDIAN_M,
@@ -32,26 +32,26 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 Array = NDArray[np.float64]
 
 PARADIGMS = ("wander", *SHAPES)
-SIZES = (1.0, 0.8, 0.64, 0.5, 0.4, 0.3, 0.2, 0.14, 0.1)  # of the way that frames and step would make
-LEAST_LENGTH_M = 1.0  # ways become no shorter than that by going more slowly
+SIZES = (1.0, 0.8, 0.64, 0.5, 0.4, 0.3, 0.2, 0.14, 0.1)  # of the length that frames and step would make
+LEAST_LENGTH_M = 1.0  # paths become no shorter than that by going more slowly
 DRAWS = 160  # figures per size
 PLACES = 4  # figures with room for all that are looked at from the cameras
 SPREADS, HALVINGS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0), 4
 FIRST_SPREADS = (0.4, 0.6, 0.2, 0.8, 0.0, 1.0)  # to see whether there is room
-GAZE_STEP_RAD, GAZES = np.deg2rad(40.0), (0, 1, -1, 2, -2)  # aside of the way, to the left
+GAZE_STEP_RAD, GAZES = np.deg2rad(40.0), (0, 1, -1, 2, -2)  # from the path's direction, to the left
 CLOSE, NEAR_ENOUGH = 0.015, 0.03  # to the overlap asked for: of two robots, to search no more; of every two
 SHOWN = 12  # paths near enough of which the one with most to see is taken: robots times figures
-EFFORT = 250  # per size and robot: a way counts one, a path that is looked along LOOK_EFFORT
+EFFORT = 250  # per size and robot: planning a path counts one, rendering along it LOOK_EFFORT
 LOOK_EFFORT = 5
 SKETCH = (28, 21)  # pixels of the views that a planner looks at
 
 
 @dataclass(frozen=True)
 class _Member:
-    """A robot of a team: its spread, way and direction of gaze, its path T_world_camera, and what it sees."""
+    """A robot of a team: its spread, path on the floor and direction of gaze, its T_world_camera, and what it sees."""
 
     spread: float
-    way: Way
+    on_floor: GroundPath
     gaze_rad: float
     path: Array
     views: PathViews
@@ -162,27 +162,27 @@ class _Search:
                 return
 
     def _effort(self) -> int:
-        return self.ground.ways + LOOK_EFFORT * self.looks
+        return self.ground.planned + LOOK_EFFORT * self.looks
 
     def _has_room(self, figure: Figure, robots: int) -> bool:
-        """Whether all robots find a way in a figure, at some spreads."""
+        """Whether all robots find a path in a figure, at some spreads."""
         spreads: list[float] = []
-        ways: list[Way] = []
+        floor_paths: list[GroundPath] = []
         for robot in range(robots):
             for spread in FIRST_SPREADS if robot else (0.0,):
-                way = self.ground.way(self.shape, figure, robots, [*spreads, spread])
-                if way is not None and all(apart(way, other) >= APART_M for other in ways):
+                on_floor = self.ground.ground_path(self.shape, figure, robots, [*spreads, spread])
+                if on_floor is not None and all(apart(on_floor, other) >= APART_M for other in floor_paths):
                     spreads.append(spread)
-                    ways.append(way)
+                    floor_paths.append(on_floor)
                     break
             else:
                 return False
         return True
 
     def _team(self, figure: Figure, robots: int, gaze_rad: float, worst: float) -> list[_Member]:
-        """A team whose first robot looks that way; empty if there is none whose error is below `worst`."""
-        way = self.ground.way(self.shape, figure, robots, [0.0])
-        first = None if way is None else self._member(0.0, way, gaze_rad, None)
+        """A team whose first robot looks in that direction; empty if there is none whose error is below `worst`."""
+        on_floor = self.ground.ground_path(self.shape, figure, robots, [0.0])
+        first = None if on_floor is None else self._member(0.0, on_floor, gaze_rad, None)
         team = [] if first is None else [first]
         while team and len(team) < robots:
             after = self._next(figure, robots, team)
@@ -191,9 +191,11 @@ class _Search:
             team.append(after)
         return team
 
-    def _member(self, spread: float, way: Way, gaze_rad: float, before: _Member | None) -> _Member | None:
-        """A robot that looks aside of its way by an angle; None if it faces holes or something near."""
-        path = way.poses(gaze_rad)
+    def _member(
+        self, spread: float, on_floor: GroundPath, gaze_rad: float, before: _Member | None
+    ) -> _Member | None:
+        """A robot that looks to the side of its path by an angle; None if it faces holes or something near."""
+        path = on_floor.poses(gaze_rad)
         self.looks += 1
         views = look(self.sketch_renderer, path)
         if not _open(views, self.sky):
@@ -201,42 +203,46 @@ class _Search:
         surplus = 0.0
         if before is not None:
             surplus = shared(self.sketch_renderer.camera, before.views, views) - self.overlap
-        return _Member(spread, way, gaze_rad, path, views, surplus)
+        return _Member(spread, on_floor, gaze_rad, path, views, surplus)
 
     def _next(self, figure: Figure, robots: int, team: list[_Member]) -> _Member | None:
         """The robot after a team: of those that keep apart from it, the one nearest to the overlap asked for."""
         before, spreads = team[-1], [member.spread for member in team]
 
-        def free(spread: float) -> Way | None:
-            way = self.ground.way(self.shape, figure, robots, [*spreads, spread])
-            clear = way is not None and all(apart(way, member.way) >= APART_M for member in team)
-            return way if clear else None
+        def free(spread: float) -> GroundPath | None:
+            on_floor = self.ground.ground_path(self.shape, figure, robots, [*spreads, spread])
+            clear = on_floor is not None and all(
+                apart(on_floor, member.on_floor) >= APART_M for member in team
+            )
+            return on_floor if clear else None
 
         def halved(one: _Member, other: _Member) -> Iterator[_Member]:
             for _ in range(HALVINGS):
                 spread = (one.spread + other.spread) / 2
-                way = one.way if one.spread == other.spread else free(spread)
-                middle = way and self._member(spread, way, (one.gaze_rad + other.gaze_rad) / 2, before)
+                on_floor = one.on_floor if one.spread == other.spread else free(spread)
+                middle = on_floor and self._member(
+                    spread, on_floor, (one.gaze_rad + other.gaze_rad) / 2, before
+                )
                 if not middle:
                     return
                 yield middle
                 one, other = (middle, other) if middle.surplus * one.surplus > 0 else (one, middle)
 
-        ways = {spread: way for spread in SPREADS if (way := free(spread)) is not None}
-        tried = sorted({*ways}, key=list(ways).index)
+        floor_paths = {spread: on_floor for spread in SPREADS if (on_floor := free(spread)) is not None}
+        tried = sorted({*floor_paths}, key=list(floor_paths).index)
         tried = [tried[k] for k in sorted({0, len(tried) // 2, len(tried) - 1})] if tried else []
         seen: dict[tuple[float, int], _Member] = {}
         best: _Member | None = None
         own = round(before.gaze_rad / GAZE_STEP_RAD)
         for gaze in sorted(GAZES, key=lambda g: abs(g - own)):
             for k, spread in enumerate(tried):
-                member = self._member(spread, ways[spread], gaze * GAZE_STEP_RAD, before)
+                member = self._member(spread, floor_paths[spread], gaze * GAZE_STEP_RAD, before)
                 if member is None:
                     continue
                 seen[spread, gaze] = member
-                beside = [(spread, gaze - 1), (spread, gaze + 1)] + [(tried[k - 1], gaze)] * (k > 0)
+                neighbors = [(spread, gaze - 1), (spread, gaze + 1)] + [(tried[k - 1], gaze)] * (k > 0)
                 across = [
-                    seen[key] for key in beside if key in seen and seen[key].surplus * member.surplus < 0
+                    seen[key] for key in neighbors if key in seen and seen[key].surplus * member.surplus < 0
                 ]
                 for found in chain([member], *(halved(member, other) for other in across)):
                     if best is None or found.error < best.error:

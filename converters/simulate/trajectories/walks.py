@@ -1,8 +1,9 @@
 """Smooth walks through the free space of a scene of meshes, looking ahead, overlapping in what the cameras see.
 
 Free is where a robot can stand: the scene closes round it, and from 0.6 m above the floor up to its head nothing is
-nearer than MIN_CLEARANCE_M. A walk visits places drawn by the seed, along the middle of rooms and doors (shortest way
-on a grid, dear beside obstacles), and is then smoothed. The camera looks at the way ahead, wavers, and turns slowly.
+nearer than MIN_CLEARANCE_M. A walk visits places drawn by the seed, along the middle of rooms and doors (shortest path
+on a grid, costly near obstacles), and is then smoothed. The camera looks along the path,
+wavers, and turns slowly.
 Walks that come too near to something, or look at a hole or a bare wall from close by, are drawn again. Of the walks
 that pass, the first robot takes the one whose dullest view shows most; each other robot the one that shares the asked
 part of its view with the robot before.
@@ -34,7 +35,7 @@ STEP_M = 0.028
 MAX_TURN_RAD = np.deg2rad(1.5)
 MIN_CLEARANCE_M = 0.3
 CELL_M, LARGE_M2 = 0.1, 600.0  # scenes larger than that have cells twice as wide
-BODY_HEIGHTS_M = (0.6, 1.75, 0.23)  # above the floor, from, to, step: where a robot is in the way
+BODY_HEIGHTS_M = (0.6, 1.75, 0.23)  # above the floor, from, to, step: where a robot takes up space
 FLOOR_BIN_M = 0.05
 FLOOR_COSINE = 0.95
 FLOOR_SHARE = 0.25  # of the largest level; the lowest of the levels so large is the floor
@@ -59,7 +60,7 @@ class FreeSpace:
     """Where a robot can stand.
 
     floor_m: height of the floor. cells: [n, 2], x and y (m) of the middles of free cells, all connected. clearance:
-    [n], m. graph: cost of the way between neighboring cells. inside: [nx, ny], whether a cell of the whole grid is
+    [n], m. graph: cost of the path between neighboring cells. inside: [nx, ny], whether a cell of the whole grid is
     free. low: [2], middle (m) of its first cell; cell_m: its width.
     """
 
@@ -75,7 +76,7 @@ class FreeSpace:
 class Terrain(Protocol):
     """What a planner must know of a scene."""
 
-    step_m: float  # way of a robot per frame
+    step_m: float  # translation of a robot per frame
     sky: bool  # there is no ceiling
 
     def renderer(self, camera: PinholeCamera) -> CameraRenderer:
@@ -263,7 +264,7 @@ def _candidates(
 
 
 def route(space: FreeSpace, graph: coo_array, length_m: float, rng: np.random.Generator) -> Array:
-    """A way over the floor [n, 2] of at least a length, through places drawn at random, smoothed, 25 mm apart."""
+    """A path over the floor [n, 2] of at least a length, through places drawn at random, smoothed, 25 mm apart."""
     here = int(rng.integers(len(space.cells)))
     cells, total = [here], 0.0
     while total < length_m:
@@ -276,24 +277,24 @@ def route(space: FreeSpace, graph: coo_array, length_m: float, rng: np.random.Ge
         cells += leg[-2::-1]
         here = cells[-1]
         total = float(np.linalg.norm(np.diff(space.cells[cells], axis=0), axis=1).sum())
-    way = _resampled(space.cells[cells], 0.025)
-    return _resampled(gaussian_filter1d(way, SMOOTH_M / 0.025, axis=0, mode="nearest"), 0.025)
+    path = _resampled(space.cells[cells], 0.025)
+    return _resampled(gaussian_filter1d(path, SMOOTH_M / 0.025, axis=0, mode="nearest"), 0.025)
 
 
-def _resampled(way: Array, step_m: float) -> Array:
+def _resampled(path: Array, step_m: float) -> Array:
     """Points of a polyline [n, 2] at equal distances along it."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     keep = np.concatenate([[True], np.diff(along) > 1e-9])
     wanted = np.arange(0.0, along[-1], step_m)
-    return np.stack([np.interp(wanted, along[keep], way[keep, k]) for k in range(2)], axis=1)
+    return np.stack([np.interp(wanted, along[keep], path[keep, k]) for k in range(2)], axis=1)
 
 
 def _look_ahead(
-    way: Array, floor: float, robot: int, frames: int, *, step_m: float, rng: np.random.Generator
+    path: Array, floor: float, robot: int, frames: int, *, step_m: float, rng: np.random.Generator
 ) -> Array | None:
-    """Poses [frames, 4, 4] along a way, step_m apart, or None if they turn too fast or the way is too short."""
-    along = 0.025 * np.arange(len(way))
-    spline = CubicSpline(along, way)
+    """Poses [frames, 4, 4] along a path, step_m apart, or None if they turn too fast or the path is too short."""
+    along = 0.025 * np.arange(len(path))
+    spline = CubicSpline(along, path)
     start = AHEAD_M
     margin = max(GAZE_SMOOTH_FRAMES)
     index = np.arange(-margin, frames + margin)
