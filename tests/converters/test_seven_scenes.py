@@ -149,10 +149,10 @@ def write_image(name: str, array: np.ndarray) -> Callable[[Path], object]:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (lambda f: (f / "frame-000003.depth.png").unlink(), "frame-000003.color.jpg: has no depth beside it"),
-        (lambda f: (f / "frame-000003.color.jpg").unlink(), "frame-000003.depth.png: has no color beside it"),
-        (lambda f: (f / "frame-000003.pose.txt").unlink(), "frame-000003.color.jpg: has no pose beside it"),
-        (lambda f: (f / "frame-000003.color.png").touch(), "frame-000003.color.png: found beside"),
+        (lambda f: (f / "frame-000003.depth.png").unlink(), "frame-000003.color.jpg: has no depth in the same folder"),
+        (lambda f: (f / "frame-000003.color.jpg").unlink(), "frame-000003.depth.png: has no color in the same folder"),
+        (lambda f: (f / "frame-000003.pose.txt").unlink(), "frame-000003.color.jpg: has no pose in the same folder"),
+        (lambda f: (f / "frame-000003.color.png").touch(), "frame-000003.color.png: found together with"),
         (
             lambda f: (f / "frame-000003.color.jpg").write_bytes(b""),
             "frame-000003.color.jpg: 0 bytes that no decoder",
@@ -443,7 +443,7 @@ def test_the_sequence_of_other_poses_is_named_by_the_folder_or_the_user(
     path = reference_file(tmp_path / "sfm.txt")
     kitchen = tmp_path / "kitchen"
     shutil.copytree(sequence, kitchen)
-    with pytest.raises(DuagError, match="found poses of seq-01, seq-02, expected to be told which"):
+    with pytest.raises(DuagError, match="found poses of seq-01, seq-02, expected the choice of one"):
         convert(kitchen, tmp_path / "rec", reference_poses=str(path))
     with pytest.raises(DuagError, match="found poses of seq-01, seq-02, expected some of seq-03"):
         convert(kitchen, tmp_path / "rec", reference_poses=str(path), reference_sequence="seq-03")
