@@ -149,9 +149,18 @@ def write_image(name: str, array: np.ndarray) -> Callable[[Path], object]:
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (lambda f: (f / "frame-000003.depth.png").unlink(), "frame-000003.color.jpg: has no depth in the same folder"),
-        (lambda f: (f / "frame-000003.color.jpg").unlink(), "frame-000003.depth.png: has no color in the same folder"),
-        (lambda f: (f / "frame-000003.pose.txt").unlink(), "frame-000003.color.jpg: has no pose in the same folder"),
+        (
+            lambda f: (f / "frame-000003.depth.png").unlink(),
+            "frame-000003.color.jpg: has no depth in the same folder",
+        ),
+        (
+            lambda f: (f / "frame-000003.color.jpg").unlink(),
+            "frame-000003.depth.png: has no color in the same folder",
+        ),
+        (
+            lambda f: (f / "frame-000003.pose.txt").unlink(),
+            "frame-000003.color.jpg: has no pose in the same folder",
+        ),
         (lambda f: (f / "frame-000003.color.png").touch(), "frame-000003.color.png: found together with"),
         (
             lambda f: (f / "frame-000003.color.jpg").write_bytes(b""),
