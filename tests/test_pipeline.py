@@ -12,6 +12,7 @@ from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.evaluation import evaluate
 from duagc.pipeline.evaluation.network import Session
+from duagc.pipeline.evaluation.results import reason_of
 from duagc.pipeline.exchange.record import read_session
 from duagc.pipeline.exchange.session import run_session
 from duagc.pipeline.experiments import pose_reference, team_faults
@@ -20,7 +21,7 @@ from duagc.pipeline.replay import replay
 from duagc.pipeline.runner import agent_input, run
 from duagc.pipeline.runs.digest import digest, digest_file, result_files
 from duagc.pipeline.runs.folder import RunFolder
-from duagc.pipeline.viewing.inspection import Inspector, format_facts
+from duagc.pipeline.viewing.inspection import Inspector, format_facts, format_loop_closures
 
 SMALL = (
     "frontend.mapping.max_gaussians=3000",
@@ -88,7 +89,7 @@ def test_neither_workers_nor_ground_truth_change_a_bit(folder: Path, recording: 
     assert digest(other) == digest(finished)
     metrics = json.loads((other / "metrics.json").read_text())
     assert metrics["team"]["ate_rmse_m"] is None
-    assert "team.ate_rmse_m" in metrics["reasons"]
+    assert reason_of(metrics["reasons"], "team.ate_rmse_m")
 
 
 def test_each_robot_replays_bit_for_bit(recording: Path, finished: Path) -> None:
@@ -199,13 +200,20 @@ def test_what_happened_can_be_asked_for(finished: Path) -> None:
 
 
 def test_every_candidate_of_a_run_can_be_asked_for_with_its_reason(finished: Path) -> None:
-    facts = Inspector(RunFolder(finished)).closures()
-    candidates = [c for of_pair in facts.values() for c in of_pair]
-    assert len(facts) == 1  # one end of the pair decided
+    inspector = Inspector(RunFolder(finished))
+    facts = inspector.loop_closures()
+    candidates = facts["candidates"]
+    assert len({c["robot"] for c in candidates}) == 1  # one end of the pair decided
     assert any(c["verdict"] == "kept" and c["weight"] == 1.0 for c in candidates)
     assert all(c["verdict"] for c in candidates)
     assert all(c["detail"] for c in candidates if c["verdict"] != "kept")
-    assert "verdict kept" in format_facts(facts)
+    assert sum(facts["verdicts"].values()) == len(candidates)
+    assert inspector.loop_closures("alpha") == inspector.loop_closures("bravo") == facts
+    with pytest.raises(DuagError, match="no robot 'zulu', expected one of alpha, bravo"):
+        inspector.loop_closures("zulu")
+    lines = format_loop_closures(facts).splitlines()
+    assert lines[0].split()[:4] == ["Robot", "Peer", "Keyframes", "Descriptors"]
+    assert len(lines) == 1 + len(candidates) + 2 + len(facts["verdicts"])
 
 
 def test_the_exchange_of_a_run_can_be_repeated_under_faults(finished: Path, recording: Path) -> None:
@@ -232,7 +240,7 @@ def test_what_the_images_allow_is_told_beside_the_error_of_the_team(finished: Pa
     result = pose_reference.run(RunFolder(finished), Recording(recording), config)
     metrics = json.loads((finished / "metrics.json").read_text())
     told = metrics["team"]["ate_rmse_m"]
-    assert result["closures"] == metrics["team"]["inter_robot_closures"] > 0
+    assert result["closures"] == metrics["team"]["inter_robot_loop_closures"] > 0
     rows = {row["poses"]: row for row in result["rows"]}
     assert rows["the run"]["team_ate_rmse_m"] == pytest.approx(told, abs=1e-9)
     assert rows["the run"]["own_ate_rmse_m"] <= told

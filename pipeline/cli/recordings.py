@@ -7,7 +7,17 @@ from typing import Annotated
 import typer
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.cli.common import EXIT_FAILED, ConfigFile, Force, Json, Out, Overrides, app, say
+from duagc.pipeline.cli.common import (
+    EXIT_DIFFERENT,
+    EXIT_FAILED,
+    ConfigFile,
+    Force,
+    Json,
+    Out,
+    Overrides,
+    app,
+    say,
+)
 
 
 @app.command()
@@ -256,11 +266,16 @@ def recover(
     out: Out,
     force: Force = False,
 ) -> None:
-    """Save every message that is whole in a log that is cut or damaged, and say what is lost.
+    """Save every message that is whole in a log that is cut or damaged, and list what is lost.
+
+    Exit code 3 if something was lost.
 
     Examples: `duagc recover broken/alpha.mcap --out alpha.mcap`, `duagc recover broken --out recordings/saved`
     """
     from duagc.pipeline.recording import recovery
 
-    for salvage in recovery.recover(source, out, force):
+    salvaged = recovery.recover(source, out, force)
+    for salvage in salvaged:
         print(salvage.line())
+    if not all(salvage.whole for salvage in salvaged):
+        raise typer.Exit(EXIT_DIFFERENT)

@@ -127,9 +127,16 @@ def evaluate(
     from duagc.pipeline.runs.folder import RunFolder
     from duagc.pipeline.runs.stages import EVALUATION
 
-    source = recording or RunFolder(run_folder).recording
+    run = RunFolder(run_folder)
+    source, threads = recording or run.recording, threads_per_worker(1)
+    longer = None
+    if own_longer:
+        from duagc.pipeline.experiments.own_longer import own_longer as train_longer
+        from duagc.pipeline.recording import Recording
+
+        longer = train_longer(run, Recording(source), threads)
     with EVALUATION.running(run_folder):
-        metrics = evaluate_run(run_folder, source, threads=threads_per_worker(1), own_longer=own_longer)
+        metrics = evaluate_run(run_folder, source, threads=threads, own_longer=longer)
     if as_json:
         print(json.dumps(metrics, indent=2))
         return

@@ -80,17 +80,17 @@ class Link:
     size_bytes: int
 
 
-def counts(closure: Any) -> bool:
-    """Whether a closure counted in the end: it took part, and the robust weight did not turn it off."""
-    return closure.weight >= INLIER_WEIGHT
+def is_inlier(decision: Any) -> bool:
+    """Whether a loop closure is an inlier in the end: it took part, and the robust weight did not turn it off."""
+    return decision.weight >= INLIER_WEIGHT
 
 
-def measured(closure: Any) -> bool:
+def measured(decision: Any) -> bool:
     """Whether a candidate got as far as geometry: a motion between the two keyframes was sought and some matches fit.
 
     Keyframes that resemble nothing, or that the budget of requests left out, did not.
     """
-    return closure.measured or closure.inliers > 0
+    return decision.measured or decision.inliers > 0
 
 
 class Session:
@@ -162,15 +162,15 @@ class Session:
         return self._log("consensus.mcap", topics.CONSENSUS_ROUND)
 
     @cached_property
-    def closures(self) -> list[Any]:
-        """Every duagc.v1.LoopClosureDecision: candidates for closures between robots and what became of them."""
+    def loop_closures(self) -> list[Any]:
+        """Every duagc.v1.LoopClosureDecision, in order of the log: inter-robot candidates and their verdicts."""
         return self._log("consensus.mcap", topics.LOOP_CLOSURE_DECISION)
 
-    def closure_counts(self) -> dict[str, int]:
-        """Closures between robots that counted in the end, and candidates that were measured and did not."""
-        kept = sum(counts(closure) for closure in self.closures)
-        tried = sum(counts(closure) or measured(closure) for closure in self.closures)
-        return {"inter_robot_closures": kept, "inter_robot_closures_rejected": tried - kept}
+    def loop_closure_counts(self) -> dict[str, int]:
+        """Inter-robot loop closures that are inliers in the end, and measured candidates that are not."""
+        kept = sum(is_inlier(decision) for decision in self.loop_closures)
+        tried = sum(is_inlier(decision) or measured(decision) for decision in self.loop_closures)
+        return {"inter_robot_loop_closures": kept, "inter_robot_loop_closures_rejected": tried - kept}
 
     @cached_property
     def pairs(self) -> dict[tuple[str, str], NDArray[np.int64]]:
@@ -229,7 +229,7 @@ class Session:
 
     def consensus_section(self) -> dict[str, Any]:
         """The section `consensus` of metrics.json."""
-        gap = gap_to_oracle(self.run, self.closures, self.pairs)
+        gap = gap_to_oracle(self.run, self.loop_closures, self.pairs)
         gaps = {
             "gap_to_oracle_sigma": gap if isinstance(gap, Absent) else gap.sigma,
             "gap_to_oracle_sigma_p99": gap if isinstance(gap, Absent) else gap.sigma_p99,
@@ -247,13 +247,13 @@ class Session:
         elif together - set(agreed):
             late = ", ".join(sorted(together - set(agreed)))
             ticks = Absent(f"{late} did not get there in {self.summary.rounds} rounds")
-        solver = SOLVERS[self.run.config.get("exchange", {}).get("solver", "admm")]
+        solver = SOLVERS[self.run.config.exchange.solver]
         return {"solver": solver, "converged": self.summary.converged, "rounds_to_tolerance": ticks, **gaps}
 
     @property
     def period_ns(self) -> int:
         """Length of a round."""
-        return int(self.run.config.get("exchange", {}).get("period_ns", 100_000_000))
+        return self.run.config.exchange.period_ns
 
     def series_by_round(self) -> Mapping[str, Series]:
         """Curves over rounds: "change" and "primal" per robot (m and rad), "bytes" per purpose."""

@@ -14,13 +14,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.config.base import Model
-from duagc.pipeline.config.consensus import MatchingConfig, PoseConsensusConfig
-from duagc.pipeline.config.exchange import ExchangeConfig
-from duagc.pipeline.config.fusion import FusionConfig
+from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.pose_admm import with_floor
 from duagc.pipeline.consensus.weighting import in_world, self_information, shared_evidence
@@ -71,7 +66,7 @@ def gap_to_oracle(
     Raises:
         DuagError: the settings of the run are not what they should be.
     """
-    config = section_of(run, PoseConsensusConfig, "exchange", "consensus")
+    config = run.config.exchange.consensus
     claims = {robot.component for robot in run.robots.values() if len(robot.component) > 1}
     gaps = []
     for members in sorted(claims):
@@ -133,7 +128,7 @@ def _gaussian_gaps(
     pairs: Mapping[tuple[str, str], NDArray[np.int64]],
 ) -> Array:
     """Largest |x - x*| sqrt(diagonal of the information at x*) of each of a robot's matched Gaussians [m]."""
-    weights = section_of(run, ExchangeConfig, "exchange").weights
+    weights = run.config.exchange.weights
     evidence = {
         name: in_world(shared_evidence(*_map_of(run.robots[name]), kind=weights), central[name], weights)
         for name in members
@@ -141,8 +136,8 @@ def _gaussian_gaps(
     _, own, _, T_map_keyframe = mine = _map_of(run.robots[robot])
     context = MapContext(
         PinholeCamera(2, 2, 1.0, 1.0, 0.5, 0.5),  # looks at nothing: what is imported is not compared
-        section_of(run, FusionConfig, "fusion").model_copy(update={"coverage": "overlap"}),
-        section_of(run, MatchingConfig, "exchange", "matching"),
+        run.config.fusion.model_copy(update={"coverage": "overlap"}),
+        run.config.exchange.matching,
         weights=weights,
     )
     best = fuse(
@@ -214,16 +209,3 @@ def _closures(members: Sequence[str], decisions: Sequence[Any]) -> list[HeldLoop
         closure = LoopClosure(d.own_keyframe, d.peer_keyframe, unpack_pose(d.pose_own_peer), information)
         out.append(HeldLoopClosures(d.robot, d.peer, (closure,), (d.weight,)))
     return out
-
-
-def section_of(run: RunFolder, model: type[Model], *names: str) -> Model:
-    """One section of the run's settings."""
-    section = run.config
-    for name in names:
-        section = section.get(name, {})
-    try:
-        return model.model_validate(section)
-    except ValidationError as error:
-        first = error.errors()[0]
-        setting = ".".join([*names, *(str(part) for part in first["loc"])])
-        raise DuagError(f"{run.path / 'config.toml'}: {setting}: {first['msg']}") from error

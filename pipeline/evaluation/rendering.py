@@ -1,4 +1,4 @@
-"""What the maps show where cameras stood: own, fused, refined, and if asked own trained longer, on the same pixels.
+"""Renders of the maps where cameras stood: own, fused, refined, and if given own trained longer, on the same pixels.
 
 Every robot's maps are drawn at its own held-out views, at those of the robots that share its world (`peers`), and both
 together are the views of the team (`team`). A map has the colors of its own robot's camera; at peers' views it is
@@ -15,28 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.progress import track
-from duagc.pipeline.config.consensus import MatchingConfig
-from duagc.pipeline.config.fusion import FusionConfig, RefineConfig
-from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.evaluation import groundtruth, views
-from duagc.pipeline.evaluation.oracle import section_of
 from duagc.pipeline.evaluation.results import Absent, Row
-from duagc.pipeline.fusion.context import MapContext
-from duagc.pipeline.fusion.finetune import finetune_map, num_steps
-from duagc.pipeline.fusion.stage import training_views
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import Recording, RgbdLog, open_rgbd
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
 from duagc.pipeline.runs.peer_colors import read_peer_colors
-from duagc.pipeline.runs.robot_data import AgentInput
 from duagc.pipeline.splat.gaussians import Gaussians
 
 COMPARED = ("own", "own_longer", "fused", "refined")
 IN_EVERY_RUN = ("own", "fused", "refined")
 COMPARED_SETS = ("held_out", "peers", "team")
-NOBODY_MET = "no robot met another"
+NONE_MET = "no robot met another"
 NOT_ASKED = "not asked for: duagc evaluate --own-longer"
 REASONS = {
     "held_out": "there is no such view",
@@ -80,22 +72,47 @@ class _Found:
         elif kind == "own_longer" and not self.longer:
             reason = NOT_ASKED
         else:
-            reason = NOBODY_MET if kind in ("own_longer", "refined") else REASONS[view_set]
+            reason = NONE_MET if kind in ("own_longer", "refined") else REASONS[view_set]
         return views.summary([s for r in robots for s in self.of(r, kind, view_set)], reason)
 
 
-def rendering_sections(
-    run: RunFolder, source: Recording, threads: int, progress: bool, longer: bool, rows: list[Row]
-) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Scores of all maps over all sets of views: of all robots together, and of each; one row per view and score.
+@dataclass(frozen=True)
+class RenderingSections:
+    """Scores of rendered views.
 
-    `longer`: train the own maps as long as the refined ones, and score them too.
+    Attributes:
+        team: means over all robots, by map and set of views.
+        robots: the same of each robot, by name.
+        rows: every score of every view.
     """
-    found = _Found(rows, longer)
+
+    team: dict[str, Any]
+    robots: dict[str, dict[str, Any]]
+    rows: list[Row]
+
+
+def rendering_sections(
+    run: RunFolder,
+    source: Recording,
+    *,
+    threads: int,
+    progress: bool,
+    own_longer: Mapping[str, Gaussians],
+) -> RenderingSections:
+    """Scores of all maps over all sets of views: of all robots together, and of each.
+
+    Args:
+        run: the run.
+        source: its recording.
+        threads: views rendered at the same time; changes no bit of the result.
+        progress: show it on standard error.
+        own_longer: own maps that were trained longer, by robot, in the robots' map frames; scored as the own maps are.
+    """
+    found = _Found([], bool(own_longer))
     for name, robot in run.robots.items():
         maps = _maps(robot)
-        if longer and robot.refined_map is not None:
-            maps["own_longer"] = own_longer(run, robot, source, threads)
+        if name in own_longer:
+            maps["own_longer"] = own_longer[name]
         own = {kind: PosedMap(g, _own_trajectory(robot, kind)) for kind, g in maps.items()}
         task = RenderTask(own, robot, "held_out", robot.own_map.depth)
         for index, scores in task.scores(source, threads, f"render maps of {name}" if progress else None):
@@ -117,15 +134,15 @@ def rendering_sections(
             for index, scores in task.scores(source, threads, title):
                 for kind, score in scores.items():
                     found.add(name, kind, "peers", index, score)
-    everybody = list(run.robots)
+    robots_of_run = list(run.robots)
     sets: dict[str, tuple[str, ...]] = dict.fromkeys(COMPARED, COMPARED_SETS)
     sets |= {"own_unrefined": ("held_out",)} | dict.fromkeys(("own", "fused"), (*COMPARED_SETS, "training"))
-    team = {kind: {s: found.summary(everybody, kind, s) for s in sets[kind]} for kind in sets}
+    team = {kind: {s: found.summary(robots_of_run, kind, s) for s in sets[kind]} for kind in sets}
     robots = {
         name: {kind: {s: found.summary([name], kind, s) for s in COMPARED_SETS} for kind in COMPARED}
         for name in run.robots
     }
-    return team, robots
+    return RenderingSections(team, robots, found.rows)
 
 
 def mates(run: RunFolder, robot: RobotRun) -> list[RobotRun]:
@@ -142,38 +159,6 @@ def _maps(robot: RobotRun) -> dict[str, Gaussians]:
     if robot.refined_map is not None:
         maps["refined"] = robot.refined_map.gaussians
     return maps
-
-
-def own_longer(run: RunFolder, robot: RobotRun, source: Recording, threads: int) -> Gaussians:
-    """The own map trained again as the refined one was, with as many steps, on own images at own poses alone.
-
-    Without it nobody could tell what the refined map owes to the team and what to more training.
-    """
-    log = source.log(robot.robot)
-    files = AgentInput(robot.robot, log, robot.folder / "frontend.mcap", robot.folder / "information.mcap")
-    frames = [f for f in robot.frames if f.status != "lost"]
-    config = section_of(run, RefineConfig, "fusion", "refine")
-    poses = np.array([f.T_map_camera for f in frames])
-    own = robot.own_map
-    with open_rgbd(log) as camera_log:
-        camera = camera_log.camera
-    views = training_views(
-        files,
-        frames,
-        poses,
-        num_support=config.support_views,
-        moving=section_of(run, MovingConfig, "frontend", "moving"),
-    )
-    steps = sum(num_steps(config, len(views), 1))
-    context = MapContext(
-        camera,
-        FusionConfig(refine=config.model_copy(update={"steps_per_view": steps, "steps_max": steps})),
-        section_of(run, MatchingConfig, "exchange", "matching"),
-        own.depth,
-        threads=threads,
-        seed=run.config["seed"],
-    )
-    return finetune_map(own.gaussians, views, context)
 
 
 def _own_trajectory(robot: RobotRun, kind: str) -> Trajectory:

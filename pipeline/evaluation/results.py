@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,12 @@ class Absent:
 
 def split_reasons(tree: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
     """Replace every Absent leaf of nested mappings by None and collect its reason under its dotted path.
+
+    Args:
+        tree: numbers, texts and Absent, in nested mappings.
+
+    Returns:
+        The tree with None for every Absent, and the reasons by dotted name.
 
     Raises:
         ValueError: a leaf is None (absent without a reason) or not a finite number: both are bugs of the caller.
@@ -42,6 +49,70 @@ def split_reasons(tree: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, st
         return node
 
     return walk(tree, ()), reasons
+
+
+def group_reasons(reasons: Mapping[str, str], robots: Collection[str]) -> dict[str, list[str]]:
+    """Every reason once, with patterns of the names that it explains; `reason_of` reads them.
+
+    Args:
+        reasons: reason by dotted name, of all absent values.
+        robots: names below "robots."; what all of them lack for the same reason is one pattern.
+
+    Returns:
+        Patterns by reason. `*.lpips` is that name anywhere, `team.*` is every absent value below "team".
+    """
+    patterns: dict[str, str] = {}
+    rest = dict(reasons)
+    for key in sorted({name.rpartition(".")[2] for name in reasons}):
+        alike = [name for name in reasons if name.endswith(f".{key}")]
+        if len(alike) > 1 and len({reasons[name] for name in alike}) == 1:
+            patterns[f"*.{key}"] = reasons[alike[0]]
+            rest = {name: reason for name, reason in rest.items() if name not in alike}
+    for name, reason in list(rest.items()):
+        _, _, value = name.removeprefix("robots.").partition(".")
+        alike = [f"robots.{robot}.{value}" for robot in robots]
+        if len(alike) > 1 and name in alike and all(rest.get(other) == reason for other in alike):
+            rest = {other: why for other, why in rest.items() if other not in alike}
+            rest[f"robots.*.{value}"] = reason
+    patterns |= _prefixes(rest, ())
+    grouped: dict[str, list[str]] = {}
+    for pattern, reason in patterns.items():
+        grouped.setdefault(reason, []).append(pattern)
+    for name, reason in reasons.items():
+        if reason_of(grouped, name) != reason:  # a pattern of another reason comes first
+            grouped[reason].append(name)
+    return grouped
+
+
+def _prefixes(reasons: Mapping[str, str], prefix: tuple[str, ...]) -> dict[str, str]:
+    """Names below a prefix as few patterns: `prefix.*` where all have one reason."""
+    if len(reasons) > 1 and prefix and len(set(reasons.values())) == 1:
+        return {".".join((*prefix, "*")): next(iter(reasons.values()))}
+    if len(reasons) == 1:
+        return dict(reasons)
+    children: dict[str, dict[str, str]] = {}
+    for name, reason in reasons.items():
+        children.setdefault(name.split(".")[len(prefix)], {})[name] = reason
+    return {
+        pattern: reason
+        for child, below in children.items()
+        for pattern, reason in _prefixes(below, (*prefix, child)).items()
+    }
+
+
+def reason_of(grouped: Mapping[str, Sequence[str]], name: str) -> str:
+    """Why the value of a dotted name is absent; "" if no reason names it.
+
+    The name itself counts before a key anywhere (`*.lpips`), and that before a pattern with a prefix.
+    """
+    for reason, patterns in grouped.items():
+        if name in patterns:
+            return reason
+    for anywhere in (True, False):
+        for reason, patterns in grouped.items():
+            if any(p.startswith("*.") == anywhere and fnmatchcase(name, p) for p in patterns):
+                return reason
+    return ""
 
 
 def leaves(tree: Mapping[str, Any], prefix: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:

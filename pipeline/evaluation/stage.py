@@ -25,6 +25,7 @@ from duagc.pipeline.evaluation.rendering import poses_by_stamp, rendering_sectio
 from duagc.pipeline.evaluation.results import (
     Absent,
     Row,
+    group_reasons,
     leaves,
     mean,
     split_reasons,
@@ -34,7 +35,8 @@ from duagc.pipeline.evaluation.results import (
 from duagc.pipeline.evaluation.trajectory_errors import Paired, TeamError
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import Recording
-from duagc.pipeline.runs.folder import SCHEMA, RobotRun, RunFolder
+from duagc.pipeline.runs.folder import METRICS_SCHEMA, RobotRun, RunFolder
+from duagc.pipeline.splat.gaussians import Gaussians
 
 PROTOCOL = {
     "alignment": "se3",
@@ -69,46 +71,57 @@ PROTOCOL = {
 
 
 def evaluate(
-    run_dir: Path, recording: Path, threads: int = 2, progress: bool = True, own_longer: bool = False
+    run_dir: Path,
+    recording: Path,
+    *,
+    threads: int = 2,
+    progress: bool = True,
+    own_longer: Mapping[str, Gaussians] | None = None,
 ) -> dict[str, Any]:
     """Measure a run against its recording and write metrics.json and metrics.parquet into its folder.
 
     Args:
-        run_dir: folder of the run. recording: folder of its recording; its ground truth is optional.
+        run_dir: folder of the run.
+        recording: folder of its recording; its ground truth is optional.
         threads: views rendered at the same time; changes no bit of the result.
-        progress: say on standard error how far it is.
-        own_longer: also score the own maps trained as long as the final ones; takes as long as that training.
+        progress: show it on standard error.
+        own_longer: own maps trained as long as the final ones, by robot, to be scored too
+            (`experiments.own_longer`).
+
     Returns:
         The content of metrics.json.
+
     Raises:
         DuagError: the run or the recording is incomplete or they do not fit together.
     """
     run, source = RunFolder(run_dir), Recording(recording)
-    strangers = sorted(set(run.robots) - set(source.robots))
-    if strangers:
-        raise DuagError(f"{recording}: has no robot {strangers[0]}, expected the robots of {run_dir}")
+    unknown = sorted(set(run.robots) - set(source.robots))
+    if unknown:
+        raise DuagError(f"{recording}: has no robot {unknown[0]}, expected the robots of {run_dir}")
     truth, session = TruePaths.of(run, source), Session(run)
     rows: list[Row] = []
-    rendering, rendering_of = rendering_sections(run, source, threads, progress, own_longer, rows)
+    rendering = rendering_sections(
+        run, source, threads=threads, progress=progress, own_longer=own_longer or {}
+    )
     tree = {
-        "schema": SCHEMA,
+        "schema": METRICS_SCHEMA,
         "robots": {
             name: _robot_section(robot, truth)
             | _agreement_section(robot, source, truth)
-            | {"camera": cameras.section(robot), "rendering": rendering_of[name]}
+            | {"camera": cameras.section(robot), "rendering": rendering.robots[name]}
             for name, robot in run.robots.items()
         },
-        "team": _team_section(run, truth) | session.closure_counts(),
-        "rendering": rendering,
+        "team": _team_section(run, truth) | session.loop_closure_counts(),
+        "rendering": rendering.team,
         "calibration": _calibration_section(run, source, truth, rows),
         "exchange": session.exchange_section(),
         "consensus": session.consensus_section(),
         "protocol": PROTOCOL,
     }
     metrics, reasons = split_reasons(tree)
-    metrics["reasons"] = reasons
+    metrics["reasons"] = group_reasons(reasons, run.robots)
     write_json(run_dir / "metrics.json", metrics)
-    write_parquet(run_dir / "metrics.parquet", [*_rows_of(tree), *rows])
+    write_parquet(run_dir / "metrics.parquet", [*_rows_of(tree), *rendering.rows, *rows])
     return metrics
 
 

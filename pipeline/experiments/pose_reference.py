@@ -19,7 +19,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.bench.tables import markdown
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.evaluation import depth_agreement, groundtruth, trajectory_errors
-from duagc.pipeline.evaluation.network import Session, counts
+from duagc.pipeline.evaluation.network import Session, is_inlier
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.trajectory_errors import Paired
 from duagc.pipeline.frontend import bundle
@@ -153,7 +153,7 @@ class _Team:
             for k in robot.run.keyframes
             if k.previous_index >= 0
         }
-        closures = [c for c in Session(run_folder).closures if counts(c)]
+        closures = [c for c in Session(run_folder).loop_closures if is_inlier(c)]
         for c in closures:
             a, b = first[c.robot] + c.own_keyframe, first[c.peer] + c.peer_keyframe
             self.ends.add((min(a, b), max(a, b)))

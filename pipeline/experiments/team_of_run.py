@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.config.consensus import MatchingConfig
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.network import LinkConfig
 from duagc.pipeline.consensus.evidence import Evidence
@@ -13,7 +12,6 @@ from duagc.pipeline.consensus.matching import tracks
 from duagc.pipeline.consensus.weighting import shared_evidence
 from duagc.pipeline.consensus.weights import Weights
 from duagc.pipeline.evaluation.network import Session
-from duagc.pipeline.evaluation.oracle import section_of
 from duagc.pipeline.experiments.consensus_modes import Team
 from duagc.pipeline.experiments.gaussian_consensus import COORDINATES
 from duagc.pipeline.fusion.association import association_covariance
@@ -38,9 +36,9 @@ def team_of_run(run: RunFolder, topology: str) -> Team:
         T_map = np.array([k.T_map_camera for k in robot.keyframes])
         T_world[name] = robot.corrected.T_world_keyframe
         own = shared_evidence(name, robot.own_map.gaussians, robot.information, T_map, kind="block")
-        evidence[name] = _with_sampling(own.in_world(T_world[name]), section_of(run, FusionConfig, "fusion"))
+        evidence[name] = _with_sampling(own.in_world(T_world[name]), run.config.fusion)
     pairs = {key: ids for key, ids in Session(run).pairs.items() if key[0] in names and key[1] in names}
-    found = tracks(evidence, pairs, section_of(run, MatchingConfig, "exchange", "matching"))
+    found = tracks(evidence, pairs, run.config.exchange.matching)
     if not len(found.track):
         raise DuagError(f"{run.path}: no Gaussians were matched, expected a run in which robots met")
     count = int(found.track[-1]) + 1

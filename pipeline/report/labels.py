@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from duagc.pipeline.evaluation.rendering import COMPARED, COMPARED_SETS
-from duagc.pipeline.evaluation.results import unit_of
+from duagc.pipeline.evaluation.results import reason_of, unit_of
 
 NONE = "–"
 
@@ -62,8 +63,8 @@ TEAM = {
     "ate_rmse_m_mean_of_robots": ("Mean robot ATE", "each robot aligned by itself: blind to errors between robots"),
     "robots": ("Robots", "robots in this run"),
     "robots_in_largest_component": ("Largest component", "robots that agree on one common world"),
-    "inter_robot_closures": ("Closures between robots", "places that two robots recognized, counted in the end"),
-    "inter_robot_closures_rejected": ("Closures rejected", "measured, then refused by geometry or outvoted"),
+    "inter_robot_loop_closures": ("Inter-robot loop closures", "places that two robots recognized; inliers in the end"),
+    "inter_robot_loop_closures_rejected": ("Loop closures rejected", "measured, then refused by geometry or outliers"),
 }  # fmt: skip
 
 ROBOT = {
@@ -116,13 +117,13 @@ RENDERING = {
 
 EXCHANGE = {
     "sessions": ("Sessions", "meetings of the team"),
-    "rounds": ("Rounds", "ticks of the agents until the session ended"),
+    "rounds": ("Rounds", "rounds until the session ended"),
     "messages": ("Messages", "what the robots had to say, before cutting into packets"),
     "packets_sent": ("Packets sent", "of at most 1200 bytes, all attempts"),
     "packets_dropped": ("Packets lost", "by the simulated radio"),
     "bytes_sent": ("Bytes sent", "all attempts, headers included"),
     "bytes_delivered": ("Bytes delivered", "what arrived, headers included"),
-    "bytes_setup": ("Set-up bytes", "descriptors, samples, closures, frames, agreed poses, pair lists"),
+    "bytes_setup": ("Set-up bytes", "descriptors, samples, loop closures, relative frames, agreed poses, pair lists"),
     "bytes_per_round_per_robot_pair": ("Bytes per round and pair", "both directions, mean over the session"),
     "bytes_raw_alternative": ("Raw alternative", "maps with information and pose graphs to every other robot, once"),
     "bytes_raw_alternative_maps_only": ("Raw maps", "the same without the information: to look at, not to fuse"),
@@ -156,67 +157,146 @@ CALIBRATION = {
 }  # fmt: skip
 
 
+LOOP_CLOSURE = {
+    "robot": ("Robot", "the robot that decided"),
+    "peer": ("Peer", "whose keyframe it was"),
+    "keyframes": ("Keyframes", "of the robot and of the peer"),
+    "score": ("Descriptors", "compact descriptors that match: how alike the two places look"),
+    "matches": ("Matches", "between all features of the two keyframes"),
+    "inliers": ("Inliers", "matches that agree on one motion between the two cameras"),
+    "weight": ("Weight", "robust weight at the end: 1 inlier, 0 outlier; a dash if it took no part"),
+    "verdict": ("Verdict", "what became of the candidate"),
+    "detail": ("Detail", "the numbers behind the verdict"),
+}  # fmt: skip
+
+
+def loop_closures(decisions: Sequence[Any]) -> list[dict[str, Any]]:
+    """Candidates for loop closures as rows with the names of LOOP_CLOSURE, in the order given.
+
+    Args:
+        decisions: duagc.v1.LoopClosureDecision messages.
+    """
+    return [
+        {
+            "robot": d.robot,
+            "peer": d.peer,
+            "keyframes": f"{d.own_keyframe} and {d.peer_keyframe}",
+            "score": d.score,
+            "matches": d.matches,
+            "inliers": d.inliers,
+            "weight": None if d.weight < 0 else d.weight,
+            "verdict": d.verdict,
+            "detail": d.detail,
+        }
+        for d in decisions
+    ]
+
+
+def verdict_counts(rows: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    """How many candidates have each verdict, the most frequent first."""
+    return dict(Counter(row["verdict"] for row in rows).most_common())
+
+
 def rows(
-    section: dict[str, Any], words: dict[str, tuple[str, str]], reasons: dict[str, str], path: str
+    section: Mapping[str, Any],
+    words: Mapping[str, tuple[str, str]],
+    reasons: Mapping[str, Sequence[str]],
+    path: str,
 ) -> list[dict[str, str]]:
-    """Label, value with unit, meaning and, if the value is absent, the reason: one row per metric that is known."""
+    """Label, value with unit, meaning and, if the value is absent, the reason: one row per metric that is known.
+
+    Args:
+        section: of metrics.json.
+        words: label and meaning by name.
+        reasons: `reasons` of metrics.json.
+        path: of the section, for example "exchange".
+    """
     return [
         {
             "label": label,
             "value": text(name, section[name]),
             "meaning": meaning,
-            "reason": reasons.get(f"{path}.{name}", ""),
+            "reason": reason_of(reasons, f"{path}.{name}") if section[name] is None else "",
         }
         for name, (label, meaning) in words.items()
         if name in section
     ]
 
 
-def is_scored(metrics: dict[str, Any], kind: str) -> bool:
-    """Whether a map was evaluated; `own_longer` is only if asked for."""
-    return kind != "own_longer" or bool(metrics["rendering"][kind]["held_out"]["views"])
+def is_scored(metrics: Mapping[str, Any], kind: str) -> bool:
+    """Whether a map exists in this run and was rendered at some view."""
+    return any(found["views"] for found in metrics["rendering"][kind].values())
 
 
-def _compared(metrics: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
+def compared_sets(metrics: Mapping[str, Any]) -> list[str]:
+    """Sets of views at which some map was rendered: a robot alone has no peers' views."""
+    sections = [metrics["rendering"][kind] for kind in COMPARED]
+    return [s for s in COMPARED_SETS if any(section[s]["views"] for section in sections)]
+
+
+def without_empty(
+    columns: Mapping[str, tuple[str, str]], sections: Sequence[Mapping[str, Any]]
+) -> dict[str, tuple[str, str]]:
+    """The columns that have a value in at least one section: a column of dashes says nothing."""
+    return {name: words for name, words in columns.items() if any(s.get(name) is not None for s in sections)}
+
+
+def _compared(metrics: Mapping[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Of all robots together and of each: name, map, its scores by set of views."""
     kinds = [kind for kind in COMPARED if is_scored(metrics, kind)]
-    yield from (("all robots", kind, metrics["rendering"][kind]) for kind in kinds)
-    for name, robot in metrics["robots"].items():
+    robots = metrics["robots"]
+    if len(robots) > 1:
+        yield from (("all robots", kind, metrics["rendering"][kind]) for kind in kinds)
+    for name, robot in robots.items():
         yield from ((name, kind, robot["rendering"][kind]) for kind in kinds)
 
 
-def comparison_rows(metrics: dict[str, Any]) -> list[dict[str, Any]]:
-    """A robot's maps beside each other, for all robots and for each: own views, peers' views, both.
+def comparison_columns(metrics: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
+    """The columns of COMPARISON that have a value in this run."""
+    sets = compared_sets(metrics)
+    return without_empty(COMPARISON, [found[s] for _, _, found in _compared(metrics) for s in sets])
+
+
+def comparison_rows(metrics: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """A robot's maps side by side, for all robots and for each: own views, peers' views, both.
 
     Returns:
-        Rows of "robot", "map", "first" (of its robot) and "values": the columns of COMPARISON for each set of views.
+        Rows of "robot", "map", "first" (of its robot) and "values": `comparison_columns` for each of `compared_sets`.
     """
+    sets, columns = compared_sets(metrics), comparison_columns(metrics)
     return [
         {
             "robot": name,
             "map": MAPS[kind],
             "first": kind == COMPARED[0],
-            "values": [
-                text(column, found[view_set][column]) for view_set in COMPARED_SETS for column in COMPARISON
-            ],
+            "values": [text(column, found[view_set][column]) for view_set in sets for column in columns],
         }
         for name, kind, found in _compared(metrics)
     ]
 
 
-def comparison_text(metrics: dict[str, Any]) -> str:
+def comparison_text(metrics: Mapping[str, Any]) -> str:
     """The same as lines of text, without units: dB, mm, mm, %; for own, peers' and team's views."""
     scale = {"psnr_db": (1.0, 2), "depth_completeness": (100.0, 1)}
-    heads = ("PSNR, dB", "depth L1, mm", "one layer, mm", "covered, %")
-    width = 8 * len(COMPARED_SETS)
-    lines = [" " * 24 + "".join(head.rjust(width) for head in heads)]
-    lines.append(" " * 24 + "".join(s.rjust(8) for _ in heads for s in ("own", "peers", "team")))
+    heads = {
+        "psnr_db": "PSNR, dB",
+        "depth_l1_common_m": "depth L1, mm",
+        "depth_l1_layer_m": "one layer, mm",
+        "depth_completeness": "covered, %",
+    }
+    short = {"held_out": "own", "peers": "peers", "team": "team"}
+    sets, columns = compared_sets(metrics), comparison_columns(metrics)
+    width = max(8 * len(sets), 15)
+    cell = width // max(len(sets), 1)
+    lines = [" " * 24 + "".join(heads[column].rjust(width) for column in columns)]
+    if len(sets) > 1:
+        lines.append(" " * 24 + "".join(short[s].rjust(cell) for _ in columns for s in sets))
     for name, kind, found in _compared(metrics):
         line = f"{name if kind == COMPARED[0] else '':<12}{kind:<12}"
-        for column in COMPARISON:
+        for column in columns:
             factor, digits = scale.get(column, (1e3, 1))
-            for view_set in COMPARED_SETS:
+            for view_set in sets:
                 value = found[view_set][column]
-                line += (NONE if value is None else f"{factor * value:.{digits}f}").rjust(8)
+                line += (NONE if value is None else f"{factor * value:.{digits}f}").rjust(cell)
         lines.append(line)
     return "\n".join(lines)

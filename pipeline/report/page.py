@@ -14,14 +14,15 @@ from duagc.pipeline.base.files import new_file
 from duagc.pipeline.evaluation.cameras import CHANNELS
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.paths import Path3, paths, top_view_axes
-from duagc.pipeline.evaluation.rendering import COMPARED_SETS
-from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.evaluation.results import Absent, reason_of
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.report import figures, labels, pictures
 from duagc.pipeline.report.renders import rendered_views
 from duagc.pipeline.runs.folder import RunFolder
 
 TEMPLATE = "page.html.j2"
+TEAM_ONLY = ("team.ate_rmse_m", "rendering.fused.peers.psnr_db", "rendering.refined.peers.psnr_db")
+"""Values that a run of one robot cannot have: it shows no card for them."""
 
 SECTIONS = (
     ("paths", "Paths"),
@@ -79,11 +80,10 @@ def content(run: RunFolder, source: Recording) -> dict[str, Any]:
         "sections": SECTIONS,
         "cards": _cards(metrics, reasons),
         **_paths_content(run, source, metrics),
-        "comparison_sets": [labels.VIEW_SETS[s] for s in COMPARED_SETS],
-        "comparison_columns": list(labels.COMPARISON.values()),
+        "comparison_sets": [labels.VIEW_SETS[s] for s in labels.compared_sets(metrics)],
+        "comparison_columns": list(labels.comparison_columns(metrics).values()),
         "comparison": labels.comparison_rows(metrics),
-        "rendering_columns": list(labels.RENDERING.values()),
-        "rendering": _rendering_rows(metrics),
+        **_rendering_content(metrics),
         "own_longer": labels.is_scored(metrics, "own_longer"),
         "exposure_note": " ".join(["No exposure is fitted to a view.", *_cameras(metrics)]),
         "views": shown_views,
@@ -140,7 +140,7 @@ def _known(metrics: dict[str, Any]) -> str:
     ]
 
 
-def _cards(metrics: dict[str, Any], reasons: dict[str, str]) -> list[dict[str, str]]:
+def _cards(metrics: dict[str, Any], reasons: dict[str, list[str]]) -> list[dict[str, str]]:
     """The few numbers to look at first."""
     own = metrics["rendering"]["own"]
     final = "fused" if metrics["rendering"]["refined"]["held_out"]["psnr_db"] is None else "refined"
@@ -159,22 +159,25 @@ def _cards(metrics: dict[str, Any], reasons: dict[str, str]) -> list[dict[str, s
             "Depth L1",
             meaning("held_out", "depth_l1_common_m", "views never mapped, pixels that all maps cover"),
         ),
-        ("team.inter_robot_closures", *labels.TEAM["inter_robot_closures"]),
+        ("team.inter_robot_loop_closures", *labels.TEAM["inter_robot_loop_closures"]),
         ("exchange.bytes_sent", *labels.EXCHANGE["bytes_sent"]),
         ("exchange.rounds", *labels.EXCHANGE["rounds"]),
     )
+    alone = len(metrics["robots"]) < 2
     cards = []
     for path, label, what in chosen:
         value: Any = metrics
         for part in path.split("."):
             value = value[part]
+        if value is None and alone and path in TEAM_ONLY:
+            continue
         name = path.rsplit(".", 1)[1]
         cards.append(
             {
                 "label": label,
                 "value": labels.text(name, value),
                 "meaning": what,
-                "reason": reasons.get(path, ""),
+                "reason": reason_of(reasons, path) if value is None else "",
             }
         )
     return cards
@@ -196,11 +199,7 @@ def _paths_content(run: RunFolder, source: Recording, metrics: dict[str, Any]) -
             if all(isinstance(way.true, Absent) for way in shown)
             else " Ground truth is missing for some robots."
         )
-    columns = {
-        name: word
-        for name, word in labels.ROBOT.items()
-        if any(name in r for r in metrics["robots"].values())
-    }
+    columns = labels.without_empty(labels.ROBOT, list(metrics["robots"].values()))
     return {
         "paths_lead": lead,
         "paths_chart": pictures.svg_uri(_top_view(shown, list(run.robots))),
@@ -235,27 +234,37 @@ def _top_view(ways: Sequence[Path3], names: Sequence[str]) -> str:
 # --- views -------------------------------------------------------------------------------------------------------
 
 
-def _rendering_rows(metrics: dict[str, Any]) -> list[dict[str, Any]]:
-    return [
-        {
-            "map": word,
-            "view_set": labels.VIEW_SETS[view_set],
-            "values": [
-                labels.text(name, metrics["rendering"][kind][view_set][name]) for name in labels.RENDERING
-            ],
-        }
+def _rendering_content(metrics: dict[str, Any]) -> dict[str, Any]:
+    """All scores of the maps that exist at the sets of views that have views, without columns of dashes."""
+    found = [
+        (word, labels.VIEW_SETS[view_set], metrics["rendering"][kind][view_set])
         for kind, word in labels.MAPS.items()
         for view_set in labels.VIEW_SETS
-        if view_set in metrics["rendering"][kind] and labels.is_scored(metrics, kind)
+        if view_set in metrics["rendering"][kind] and metrics["rendering"][kind][view_set]["views"]
     ]
+    columns = labels.without_empty(labels.RENDERING, [scores for _, _, scores in found])
+    return {
+        "rendering_columns": list(columns.values()),
+        "rendering": [
+            {
+                "map": word,
+                "view_set": view_set,
+                "values": [labels.text(name, scores[name]) for name in columns],
+            }
+            for word, view_set, scores in found
+        ],
+    }
 
 
 # --- agreement and exchange --------------------------------------------------------------------------------------
 
 
-def _agreement_content(session: Session, metrics: dict[str, Any], reasons: dict[str, str]) -> dict[str, Any]:
+def _agreement_content(
+    session: Session, metrics: dict[str, Any], reasons: dict[str, list[str]]
+) -> dict[str, Any]:
     series = session.series_by_round()
-    tolerance = session.run.config.get("exchange", {}).get("consensus", {}).get("tolerance")
+    candidates = labels.loop_closures(session.loop_closures)
+    tolerance = session.run.config.exchange.consensus.tolerance
     charts = [
         {
             "title": title,
@@ -270,26 +279,20 @@ def _agreement_content(session: Session, metrics: dict[str, Any], reasons: dict[
     if metrics["team"]["robots_in_largest_component"] < 2:
         lead = "No two robots share a world, so there was nothing to agree on."
     elif metrics["consensus"]["converged"]:
-        lead = "The robots adjusted the poses of their keyframes until nobody moved any more."
+        lead = (
+            "The robots adjusted the poses of their keyframes until no pose moved by more than the tolerance."
+        )
     else:
-        lead = "The session ended before everybody had agreed: the results are those of its last round."
+        lead = "The session ended before all robots had agreed: the results are those of its last round."
     return {
         "agreement_lead": lead,
         "agreement_charts": charts,
         "consensus": labels.rows(metrics["consensus"], labels.CONSENSUS, reasons, "consensus"),
-        "closure_columns": ("Robots", "Keyframes", "Matches", "Agreeing", "Verdict", "Why", "Weight"),
-        "closures": [
-            (
-                f"{c.robot} – {c.peer}",
-                f"{c.own_keyframe} – {c.peer_keyframe}",
-                c.matches,
-                c.inliers,
-                c.verdict,
-                c.detail,
-                "not used" if c.weight < 0 else f"{c.weight:.2f}",
-            )
-            for c in session.closures
+        "loop_closure_columns": list(labels.LOOP_CLOSURE.values()),
+        "loop_closures": [
+            [labels.text(name, row[name]) for name in labels.LOOP_CLOSURE] for row in candidates
         ],
+        "verdicts": [(count, verdict) for verdict, count in labels.verdict_counts(candidates).items()],
     }
 
 
@@ -368,9 +371,6 @@ def _timing_content(run: RunFolder) -> dict[str, Any]:
     return {"timing": rows, "timing_chart": pictures.svg_uri(chart)}
 
 
-def _absent(reasons: dict[str, str]) -> list[tuple[str, str]]:
-    """(reason, the values that it explains), in order of the values."""
-    by_reason: dict[str, list[str]] = {}
-    for path, reason in reasons.items():
-        by_reason.setdefault(reason, []).append(path)
-    return [(reason, ", ".join(names)) for reason, names in by_reason.items()]
+def _absent(reasons: dict[str, list[str]]) -> list[tuple[str, str]]:
+    """(reason, the values that it explains)."""
+    return [(reason, ", ".join(names)) for reason, names in reasons.items()]

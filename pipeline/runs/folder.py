@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,23 +13,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.base import load_config
+from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.geometry.trajectory import Trajectory, read_tum
 from duagc.pipeline.messages import CorrectedKeyframes, GaussianInformation, GaussianMap, Keyframe, Odometry
 from duagc.pipeline.recording import read_log
 from duagc.pipeline.runs.digest import digest_file
 from duagc.schemas import topics
 
-SCHEMA = 1  # of manifest.json and metrics.json
+SCHEMA = 1  # of manifest.json
+METRICS_SCHEMA = 2  # of metrics.json; 1 had a reason for every name, and other names of loop closures
 
 
 @dataclass(frozen=True)
 class RobotRun:
-    """What a run says about one robot; files are read when they are asked for, and once."""
+    """The results of one robot; files are read when they are asked for, and once.
+
+    Attributes:
+        robot: its name.
+        folder: robots/<robot> of the run.
+        digests: digest of every result file by its name, as the manifest has it; empty while the run is being made.
+    """
 
     robot: str
     folder: Path
     digests: Mapping[str, str] = field(default_factory=dict)
-    """Digest of every result file by its name, as the manifest has it; empty while the run is being made."""
 
     @cached_property
     def odometry(self) -> Trajectory:
@@ -80,13 +87,13 @@ class RobotRun:
 
     @cached_property
     def refined_map(self) -> GaussianMap | None:
-        """The robot's final map: the fused one after training, world frame; None if it met nobody."""
+        """The robot's final map: the fused one after training, world frame; None if it met no other robot."""
         maps = self._all("fused.mcap", topics.REFINED_MAP)
         return maps[-1] if maps else None
 
     @cached_property
     def corrected(self) -> CorrectedKeyframes:
-        """Keyframe poses after consensus, and the component that the robot believes to be in."""
+        """Keyframe poses after consensus, and the component that the robot counts itself in."""
         return self._last("fused.mcap", topics.CORRECTED_KEYFRAMES)
 
     @property
@@ -121,7 +128,11 @@ class RobotRun:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A run: its robots in order of their names, its settings and timings."""
+    """A run: its robots in order of their names, its settings and timings.
+
+    Attributes:
+        path: the folder.
+    """
 
     path: Path
 
@@ -143,7 +154,7 @@ class RunFolder:
     def largest_component(self) -> tuple[str, ...]:
         """The robots that agree to share one world, most robots first, then lowest names.
 
-        A robot counts as a member if its own belief about the component is the same as that of the others.
+        A robot is a member if its own estimate of the component is the same as that of the others.
         """
         claims = [robot.component for robot in self.robots.values()]
         members = {
@@ -178,9 +189,9 @@ class RunFolder:
         path = self.path / "config.toml"
         if not path.is_file():
             raise DuagError(f"{path}: no such file, expected the configuration of the run")
-        told = self._json("manifest.json").get("config")
-        if told is not None and (found := digest_file(path)) != told:
-            raise DuagError(f"{path}: has digest {found[:12]}, expected {told[:12]} as in manifest.json")
+        expected = self._json("manifest.json").get("config")
+        if expected is not None and (found := digest_file(path)) != expected:
+            raise DuagError(f"{path}: has digest {found[:12]}, expected {expected[:12]} as in manifest.json")
         return path
 
     @property
@@ -188,13 +199,14 @@ class RunFolder:
         """The resolved configuration as TOML."""
         return self.config_file.read_text(encoding="utf-8")
 
-    @property
-    def config(self) -> dict[str, Any]:
-        """The resolved configuration, nested by section."""
-        try:
-            return tomllib.loads(self.config_text)
-        except tomllib.TOMLDecodeError as error:
-            raise DuagError(f"{self.path / 'config.toml'}: not valid TOML: {error}") from error
+    @cached_property
+    def config(self) -> RunConfig:
+        """The settings of the run.
+
+        Raises:
+            DuagError: config.toml is missing, not what the run was made with, or names an unknown setting.
+        """
+        return load_config(RunConfig, self.config_file)
 
     @property
     def timing(self) -> dict[str, dict[str, Any]]:
@@ -204,14 +216,14 @@ class RunFolder:
     @property
     def metrics(self) -> dict[str, Any]:
         """metrics.json; empty if the run was not evaluated."""
-        return self._json("metrics.json")
+        return self._json("metrics.json", METRICS_SCHEMA)
 
     def _digests(self, robot: str) -> dict[str, str]:
         outputs = self._json("manifest.json").get("outputs", {})
         start = f"robots/{robot}/"
         return {name.removeprefix(start): d for name, d in outputs.items() if name.startswith(start)}
 
-    def _json(self, name: str) -> dict[str, Any]:
+    def _json(self, name: str, schema: int = SCHEMA) -> dict[str, Any]:
         path = self.path / name
         if not path.is_file():
             return {}
@@ -221,8 +233,8 @@ class RunFolder:
             raise DuagError(f"{path}: not valid JSON: {error}") from error
         if not isinstance(content, dict):
             raise DuagError(f"{path}: found a {type(content).__name__}, expected a JSON object")
-        if content.get("schema", SCHEMA) != SCHEMA:
-            raise DuagError(f"{path}: schema is {content['schema']}, expected {SCHEMA}")
+        if content.get("schema", schema) != schema:
+            raise DuagError(f"{path}: schema is {content['schema']}, expected {schema}")
         return content
 
 

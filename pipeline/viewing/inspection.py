@@ -26,6 +26,7 @@ from duagc.pipeline.network.packets import (
     payload_bytes,
 )
 from duagc.pipeline.recording import read_log
+from duagc.pipeline.report import labels
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY, theta_of
 from duagc.schemas import topics
@@ -93,7 +94,7 @@ class Inspector:
                         "penalty_translation": link.penalty_translation,
                         "penalty_rotation": link.penalty_rotation,
                         "version": link.version,
-                        "closure_weights": list(link.weights),
+                        "loop_closure_weights": list(link.weights),
                     }
                     for link in m.links
                 },
@@ -119,24 +120,32 @@ class Inspector:
             link["kinds"], link["dropped"] = dict(link["kinds"]), dict(link["dropped"])
         return out
 
-    # --- closures
+    # --- loop closures
 
-    def closures(self) -> Facts:
-        """Every candidate for a closure by the pair of robots, with what became of it and why."""
-        out: Facts = {}
-        for robot in self.run.robots:
-            for m in self._consensus(topics.LOOP_CLOSURE_DECISION, robot):
-                facts = {
-                    "keyframes": f"{m.own_keyframe} and {m.peer_keyframe}",
-                    "descriptors": m.score,
-                    "matches": m.matches,
-                    "inliers": m.inliers,
-                    "weight": None if m.weight < 0 else m.weight,
-                    "verdict": m.verdict,
-                    "detail": m.detail,
-                }
-                out.setdefault(f"{robot} of {m.peer}", []).append(facts)
-        return out
+    def loop_closures(self, robot: str | None = None) -> Facts:
+        """Every candidate for an inter-robot loop closure, with what became of it and why.
+
+        Args:
+            robot: only candidates that this robot took part in, as the one that decided or as its peer.
+
+        Returns:
+            "candidates": rows with the names of `labels.LOOP_CLOSURE`; "verdicts": how many candidates have each.
+
+        Raises:
+            DuagError: the run has no such robot.
+        """
+        if robot is not None and robot not in self.run.robots:
+            raise DuagError(
+                f"{self.run.path}: no robot {robot!r}, expected one of {', '.join(self.run.robots)}"
+            )
+        decisions = [
+            decision
+            for name in self.run.robots
+            for decision in self._consensus(topics.LOOP_CLOSURE_DECISION, name)
+            if robot in (None, decision.robot, decision.peer)
+        ]
+        rows = labels.loop_closures(decisions)
+        return {"candidates": rows, "verdicts": labels.verdict_counts(rows)}
 
     # --- one packet
 
@@ -285,6 +294,19 @@ def _described(theta: np.ndarray) -> Facts:
         "color": theta[COLOR].tolist(),
         "opacity_logit": float(theta[OPACITY]),
     }
+
+
+def format_loop_closures(facts: Facts) -> str:
+    """Candidates for loop closures as a table, then how many have each verdict."""
+    rows = facts["candidates"]
+    if not rows:
+        return "no candidates: no keyframe of one robot resembled one of another"
+    cells = [[label for label, _ in labels.LOOP_CLOSURE.values()]]
+    cells += [[labels.text(name, row[name]) for name in labels.LOOP_CLOSURE] for row in rows]
+    widths = [max(len(row[column]) for row in cells) for column in range(len(labels.LOOP_CLOSURE))]
+    lines = ["  ".join(v.ljust(w) for v, w in zip(row, widths, strict=True)).rstrip() for row in cells]
+    counts = [f"{count:6} {verdict}" for verdict, count in facts["verdicts"].items()]
+    return "\n".join([*lines, "", f"{len(rows):6} candidates, of which", *counts])
 
 
 def format_facts(facts: Facts, indent: int = 0) -> str:

@@ -1,5 +1,6 @@
 """What a user sees when something is wrong: one line, exit code 1, nothing half-written."""
 
+import json
 import os
 import signal
 import subprocess
@@ -8,11 +9,13 @@ import time
 from pathlib import Path
 
 import pytest
+from tests.recording.logs import write_camera
 
 from duagc.pipeline import cli
 from duagc.pipeline.base.atomic_folder import new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
+from tests.evaluation import fake_run
 
 ROOT = Path(__file__).parents[2]
 
@@ -198,3 +201,32 @@ def test_a_folder_appears_only_when_it_is_finished(tmp_path: Path) -> None:
         (folder / "whole").write_text("")
         assert not out.exists()
     assert [p.name for p in out.iterdir()] == ["whole"]
+
+
+def test_recover_exits_with_3_if_something_was_lost(tmp_path: Path) -> None:
+    whole = write_camera(tmp_path / "whole.mcap", frames=2500)  # chunks of 1 MiB
+    result = duagc("recover", whole, "--out", tmp_path / "copy.mcap")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert "nothing lost" in result.stdout
+    cut = tmp_path / "cut.mcap"
+    data = whole.read_bytes()
+    cut.write_bytes(data[: len(data) * 3 // 4])
+    result = duagc("recover", cut, "--out", tmp_path / "saved.mcap")
+    assert result.returncode == 3
+    assert "lost in between, and all after the cut" in result.stdout
+    assert (tmp_path / "saved.mcap").is_file()
+
+
+def test_a_user_finds_why_a_loop_closure_was_rejected(tmp_path: Path) -> None:
+    fake = fake_run.make(tmp_path)
+    result = duagc("inspect", fake.run, "--loop-closures", "--robot", "bravo")
+    assert result.returncode == 0, result.stderr
+    lines = [line.split() for line in result.stdout.splitlines()]
+    assert lines[0][:3] == ["Robot", "Peer", "Keyframes"]
+    rejected = next(line for line in lines if "inconsistent" in line)
+    assert rejected[:2] == ["alpha", "bravo"]
+    assert rejected[-5:] == ["30", "of", "50", "matches", "agree"]
+    listed = json.loads(duagc("inspect", fake.run, "--loop-closures", "--json").stdout)
+    assert listed["verdicts"] == {"outvoted": 1, "kept": 1, "inconsistent": 1, "few_matches": 1}
+    assert listed["candidates"][1]["weight"] == 1.0
+    assert_one_line(duagc("inspect", fake.run, "--loop-closures", "--robot", "zulu"), "no robot 'zulu'")

@@ -2,12 +2,16 @@ import json
 
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from duagc.pipeline.evaluation.results import (
     Absent,
     Row,
+    group_reasons,
     leaves,
     mean,
+    reason_of,
     split_reasons,
     unit_of,
     write_json,
@@ -25,6 +29,34 @@ def test_an_absent_value_becomes_null_with_its_reason():
         ("team", "robots"): 1,
         ("robots", "alpha", "frames"): 3,
     }
+
+
+def test_every_reason_stands_once():
+    maps = [f"robots.{robot}.{kind}" for robot in ("a", "b") for kind in ("own", "fused")]
+    nulls = {f"{name}.{key}": "no peers" for name in maps for key in ("psnr", "depth")}
+    nulls |= {f"{name}.lpips": "no weights" for name in (*maps, "team")}
+    nulls |= {"team.psnr": "none met", "team.depth": "none met", "robots.a.ate": "no truth of a"}
+    assert group_reasons(nulls, ["a", "b"]) == {
+        "no weights": ["*.lpips"],
+        "no peers": ["robots.*.*"],
+        "none met": ["team.*"],
+        "no truth of a": ["robots.a.ate"],
+    }
+
+
+_WORDS = st.sampled_from(["robots", "a", "b", "own", "team", "ate", "lpips"])
+_NAMES = st.lists(_WORDS, min_size=1, max_size=4).map(".".join)
+
+
+@given(st.dictionaries(_NAMES, st.sampled_from(["no truth", "no peers", "no weights"]), max_size=12))
+def test_a_grouped_reason_is_found_by_every_name(nulls):
+    nulls = {
+        n: r for n, r in nulls.items() if not any(other.startswith(f"{n}.") for other in nulls)
+    }  # leaves
+    grouped = group_reasons(nulls, ["a", "b"])
+    assert {name: reason_of(grouped, name) for name in nulls} == nulls
+    assert reason_of(grouped, "nothing.of.this.name") == ""
+    assert set(grouped) == set(nulls.values())
 
 
 @pytest.mark.parametrize("bad", [None, float("nan"), float("inf")])

@@ -165,3 +165,27 @@ def test_the_charts_name_what_they_show(html):
         "frontend, alpha",
     ):
         assert any(expected in chart for chart in charts), expected
+
+
+def test_a_run_of_one_robot_shows_no_columns_of_dashes(tmp_path):
+    fake = make(tmp_path, joined=False)
+    metrics = evaluate(fake.run, fake.recording, progress=False)
+    text = labels.comparison_text(metrics)
+    assert "peers" not in text
+    assert "team" not in text
+    assert labels.NONE not in text.split()
+    assert labels.compared_sets(metrics) == ["held_out"]
+    for row in labels.comparison_rows(metrics):
+        assert labels.NONE not in row["values"]
+    page = write_report(fake.run, fake.recording).read_text()
+    table = page[
+        page.index("<h3>All scores</h3>") : page.index("</table>", page.index("<h3>All scores</h3>"))
+    ]
+    assert f">{labels.NONE}<" not in table
+    assert "peers" not in table
+
+
+def test_the_page_says_why_every_loop_closure_was_kept_or_rejected(html):
+    text = re.sub(r"<[^>]+>", " ", html)
+    assert "Every candidate and why it was kept or rejected (4)" in text
+    assert "few_matches" in text

@@ -46,7 +46,7 @@ def cut_table(run: Path) -> None:
     [
         (remove_exchange, "exchange.mcap: not found"),
         (remove_robot, "robots/bravo: no such folder, expected the results that manifest.json names"),
-        (make_newer, "metrics.json: schema is 99, expected 1"),
+        (make_newer, "metrics.json: schema is 99, expected 2"),
         (cut_table, "metrics.parquet: is no Parquet file that can be read"),
     ],
 )
