@@ -16,14 +16,14 @@ def section(robot: RobotRun) -> dict[str, Any]:
     """What this robot's camera makes of a color c of the first robot of its component: gain * c + offset."""
     first = robot.component[0]
     names = [f"{value}_{channel}" for value in VALUES for channel in CHANNELS]
-    told = read_peer_colors(robot.folder / "fused.mcap", robot.robot).get(first)
+    seen = read_peer_colors(robot.folder / "fused.mcap", robot.robot).get(first)
     if len(robot.component) < 2:
-        reason = Absent("this robot met nobody")
+        reason = Absent("this robot met no other robot")
     elif first == robot.robot:
         reason = Absent("the others' cameras are held against this one")
     else:
         reason = Absent("the run has not recorded how cameras differ")
-    if told is None:
+    if seen is None:
         return dict.fromkeys(names, reason) | {"matches": reason}
-    values = [float(x) for value in VALUES for x in getattr(told, value)]
-    return dict(zip(names, values, strict=True)) | {"matches": told.matches}
+    values = [float(x) for value in VALUES for x in getattr(seen, value)]
+    return dict(zip(names, values, strict=True)) | {"matches": seen.matches}

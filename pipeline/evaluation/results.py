@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -61,42 +62,63 @@ def group_reasons(reasons: Mapping[str, str], robots: Collection[str]) -> dict[s
     Returns:
         Patterns by reason. `*.lpips` is that name anywhere, `team.*` is every absent value below "team".
     """
+    anywhere: list[str] = []
+    patterns = _patterns(reasons, robots, anywhere)
+    frequent = Counter(name.rpartition(".")[2] for name in reasons).most_common()
+    for key, count in frequent:
+        alike = {why for name, why in reasons.items() if name.endswith(f".{key}")}
+        useful = count > 1 and len(alike) == 1
+        shorter = _patterns(reasons, robots, [*anywhere, key]) if useful else patterns
+        if len(shorter) < len(patterns):
+            anywhere.append(key)
+            patterns = shorter
+    grouped: dict[str, list[str]] = {}
+    for pattern, reason in patterns.items():
+        grouped.setdefault(reason, []).append(pattern)
+    for name, reason in reasons.items():
+        if reason_of(grouped, name) != reason:  # a pattern of another reason comes first
+            grouped.setdefault(reason, []).append(name)
+    return grouped
+
+
+def _patterns(
+    reasons: Mapping[str, str], robots: Collection[str], anywhere: Collection[str]
+) -> dict[str, str]:
+    """Reason by pattern, with the keys of `anywhere`, which have one reason each, as `*.key`."""
     patterns: dict[str, str] = {}
-    rest = dict(reasons)
-    for key in sorted({name.rpartition(".")[2] for name in reasons}):
-        alike = [name for name in reasons if name.endswith(f".{key}")]
-        if len(alike) > 1 and len({reasons[name] for name in alike}) == 1:
-            patterns[f"*.{key}"] = reasons[alike[0]]
-            rest = {name: reason for name, reason in rest.items() if name not in alike}
+    rest: dict[str, str] = {}
+    for name, reason in reasons.items():
+        key = name.rpartition(".")[2]
+        if key in anywhere and key != name:
+            patterns[f"*.{key}"] = reason
+        else:
+            rest[name] = reason
     for name, reason in list(rest.items()):
         _, _, value = name.removeprefix("robots.").partition(".")
         alike = [f"robots.{robot}.{value}" for robot in robots]
         if len(alike) > 1 and name in alike and all(rest.get(other) == reason for other in alike):
             rest = {other: why for other, why in rest.items() if other not in alike}
             rest[f"robots.*.{value}"] = reason
-    patterns |= _prefixes(rest, ())
-    grouped: dict[str, list[str]] = {}
-    for pattern, reason in patterns.items():
-        grouped.setdefault(reason, []).append(pattern)
-    for name, reason in reasons.items():
-        if reason_of(grouped, name) != reason:  # a pattern of another reason comes first
-            grouped[reason].append(name)
-    return grouped
+    covered = {name: reason for name, reason in reasons.items() if name.rpartition(".")[2] not in anywhere}
+    return patterns | _prefixes(rest, (), covered)
 
 
-def _prefixes(reasons: Mapping[str, str], prefix: tuple[str, ...]) -> dict[str, str]:
-    """Names below a prefix as few patterns: `prefix.*` where all have one reason."""
-    if len(reasons) > 1 and prefix and len(set(reasons.values())) == 1:
-        return {".".join((*prefix, "*")): next(iter(reasons.values()))}
+def _prefixes(
+    reasons: Mapping[str, str], prefix: tuple[str, ...], covered: Mapping[str, str]
+) -> dict[str, str]:
+    """Names below a prefix as few patterns: `prefix.*` where all names of `covered` below it have one reason."""
     if len(reasons) == 1:
         return dict(reasons)
+    pattern = ".".join((*prefix, "*"))
+    if prefix and len({reason for name, reason in covered.items() if fnmatchcase(name, pattern)}) == 1:
+        return {pattern: next(iter(reasons.values()))}
     children: dict[str, dict[str, str]] = {}
     for name, reason in reasons.items():
         children.setdefault(name.split(".")[len(prefix)], {})[name] = reason
     return {
         pattern: reason
         for child, below in children.items()
-        for pattern, reason in _prefixes(below, (*prefix, child)).items()
+        for pattern, reason in _prefixes(below, (*prefix, child), covered).items()
     }
 
 

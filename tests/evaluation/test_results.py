@@ -38,7 +38,7 @@ def test_every_reason_stands_once():
     nulls |= {"team.psnr": "none met", "team.depth": "none met", "robots.a.ate": "no truth of a"}
     assert group_reasons(nulls, ["a", "b"]) == {
         "no weights": ["*.lpips"],
-        "no peers": ["robots.*.*"],
+        "no peers": ["robots.*.own.*", "robots.*.fused.*"],
         "none met": ["team.*"],
         "no truth of a": ["robots.a.ate"],
     }
