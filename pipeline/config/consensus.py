@@ -1,4 +1,4 @@
-"""Settings of closures, pose consensus and matching."""
+"""Settings of loop closures, pose consensus and matching."""
 
 from typing import Literal
 
@@ -10,10 +10,10 @@ WeightKind = Literal["uniform", "observation_count", "residual_magnitude", "scal
 
 
 class LoopClosureConfig(Config):
-    """Trust in single closures and in their mutual agreement."""
+    """Noise of loop closures and tests of their mutual consistency."""
 
     sigma_floor_m: float = Field(default=0.005, ge=0.0)
-    """Added to every closure's covariance: registration reports only the noise of its pixels, not its bias (m)."""
+    """Added to every loop closure's covariance: registration reports only the noise of its pixels, not its bias (m)."""
     sigma_floor_rad: float = Field(default=0.003, ge=0.0)
     """The same for its rotation (rad)."""
     drift_floor_m: float = Field(default=0.005, ge=0.0)
@@ -24,7 +24,7 @@ class LoopClosureConfig(Config):
     """Factor on the variances of the pairwise test; fitted on two public data sets
     (`docs/explanation/pose-consensus.md`)."""
     min_support: int = Field(default=2, ge=1)
-    """Closures that must agree before two robots are put into one frame: one alone cannot be checked."""
+    """Loop closures that must agree before two robots are put into one frame: one alone cannot be checked."""
     frame_sigma_m: float = Field(default=0.1, gt=0.0)
     """Scale of the Cauchy weights of the relative frame, translation."""
     frame_sigma_rad: float = Field(default=0.05, gt=0.0)
@@ -37,7 +37,7 @@ class PoseConsensusConfig(Config):
     relaxation: float = Field(default=0.9, gt=0.0, lt=1.0)
     """Share by which an edge variable moves to an arrived value (0.5 is the textbook's, slower)."""
     penalty_start: float = Field(default=0.3, gt=0.0)
-    """First penalty, as a multiple of the metric (the information of the pair's closures)."""
+    """First penalty, as a multiple of the metric (the information of the pair's loop closures)."""
     penalty_min: float = Field(default=0.015, gt=0.0)
     """Least penalty; below it one Gauss-Newton step per round can diverge."""
     penalty_max: float = Field(default=3.0, gt=0.0)
@@ -58,9 +58,9 @@ class PoseConsensusConfig(Config):
     """Poses in a packet: rotations in float32 and translations in steps of 7.5 nm, wherever the world has its origin;
     all in float32, which is 15 um a kilometer from there; or not rounded at all."""
     robust: bool = True
-    """Weigh closures by graduated non-convexity, truncated least squares; if not, `keep` decides alone."""
+    """Weight loop closures by graduated non-convexity, truncated least squares; if not, `keep` decides alone."""
     truncation: float = Field(default=7.5, gt=0.0)
-    """A closure whose whitened residual is longer than this counts as an outlier."""
+    """A loop closure whose whitened residual is longer than this counts as an outlier."""
     robust_warm_up: int = Field(default=40, ge=0)
     """Packets received with the start weights before the graduated weights begin (fewer if the link is steady)."""
     robust_skip: bool = True
@@ -73,13 +73,13 @@ class PoseConsensusConfig(Config):
     robust_mu: tuple[float, float] = (1e-5, 300.0)
     """Least first and greatest last mu. The schedule ends when all weights of a link are zero or one."""
     robust_convexity: float = Field(default=0.1, ge=0.0)
-    """It begins at this share of the mu at which the worst closure is just convex; 0: always at the least."""
+    """It begins at this share of the mu at which the worst loop closure is just convex; 0: always at the least."""
     odometry_floor_m: float = Field(default=0.002, ge=0.0)
     """Added to the covariance of every odometry factor: registration does not report its bias (m)."""
     odometry_floor_rad: float = Field(default=0.001, ge=0.0)
     """The same for rotations (rad)."""
     closures: LoopClosureConfig = LoopClosureConfig()
-    """Trust in closures."""
+    """Noise and consistency of loop closures."""
 
 
 class ColorConfig(Config):

@@ -11,7 +11,7 @@ from duagc.pipeline.config.registration import GeometricVerificationConfig, Regi
 
 
 class PlacesConfig(Config):
-    """Place descriptors and candidates for closures."""
+    """Place descriptors and candidates for loop closures."""
 
     features_per_place: int = Field(default=80, ge=4)
     """Descriptors of one keyframe that a neighbor gets to recognize the place (128 bytes each)."""
@@ -58,13 +58,13 @@ class InjectionConfig(Config):
     """Faults made on purpose; all off unless asked for."""
 
     false_closures: float = Field(default=0.0, ge=0.0, lt=1.0)
-    """Share of false ones among all closures of a pair of robots that found any."""
+    """Share of false ones among all loop closures of a pair of robots that found any."""
     false_closure_m: float = Field(default=3.0, gt=0.0)
-    """Largest coordinate of the translation of a false closure; its rotation is any."""
+    """Largest coordinate of the translation of a false loop closure; its rotation is any."""
     false_matches: float = Field(default=0.0, ge=0.0, le=1.0)
     """Share of the matched Gaussians of a pair of robots whose partners are exchanged."""
     pose_dropouts: float = Field(default=0.0, ge=0.0, lt=1.0)
-    """Chance that a robot says nothing of its poses to a neighbor in a round."""
+    """Probability that a robot sends no poses to a neighbor in a round."""
 
 
 class ExchangeConfig(Config):
@@ -80,11 +80,11 @@ class ExchangeConfig(Config):
     elimination_wire: Literal["float32", "float64"] = "float64"
     """Precision of the matrices of elimination on the wire."""
     coverage: Literal["all", "overlap"] = "all"
-    """Send every Gaussian to everybody, or only those in space that the receiver's keyframes saw."""
+    """Send every Gaussian to all robots, or only those in space that the receiver's keyframes saw."""
     evidence_wire: Literal["compact", "float32", "float64"] = "compact"
     """100 bytes per Gaussian, rounded far below its uncertainty, or 188, or 364 bytes and not rounded at all."""
     weights: WeightKind = "block"
-    """How sure a robot says it is of a Gaussian: its information, or one of the simpler kinds to compare with
+    """Weight of a robot's Gaussian: its information, or one of the simpler kinds to compare with
     (`docs/explanation/information.md`)."""
     evidence_order: Literal["gain", "paper"] = "gain"
     """Which Gaussians go first: those that promise the receiver most information per byte, or by the paper's (4)."""

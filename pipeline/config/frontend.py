@@ -20,6 +20,7 @@ class LoopConfig(GeometricVerificationConfig):
     """Loop closures within the robot's own path."""
 
     enabled: bool = True
+    """Look for loop closures within the robot's own path."""
     min_gap: int = 3
     """Keyframes that lie between the two at least, less one."""
     known_overlap: float = 0.3
@@ -106,8 +107,8 @@ class FailureConfig(Config):
     max_intruders: float = 0.1
     """Largest share of such points in a frame that becomes a keyframe, or by which a lost camera is found again."""
     max_sigma_obstructed_m: float = 0.01
-    """Largest standard deviation of the position of a frame with more of them than that: what is left beside a hand
-    may tell little, and its errors are several of these."""
+    """Largest standard deviation of the position of a frame with more of them than that: what a hand leaves visible
+    may determine little, and its errors are several of these."""
     min_told: float = 0.65
     """Share of a frame's points that its keyframe must be able to judge to say that what stood before it is gone."""
     min_overlap_unlike: float = 0.7
@@ -121,15 +122,18 @@ class FailureConfig(Config):
 
 
 class MotionPriorConfig(Config):
-    """How far a motion prior of the log is believed: standard deviations of a motion between two frames."""
+    """Accuracy of a motion prior of the log: standard deviations of a motion between two frames."""
 
     odometry_sigma_m: float = 0.005
+    """Translation by another odometry."""
     odometry_sigma_of_path: float = 0.05
     """Plus this share of the path."""
     odometry_sigma_rad: float = 0.005
+    """Rotation by another odometry."""
     odometry_sigma_of_angle: float = 0.05
     """Plus this share of the angle."""
     gyro_sigma_rad: float = 0.002
+    """Rotation by the integrated rates of a gyroscope."""
     gyro_sigma_rad_per_s: float = 0.01
     """Plus this for every second: the bias."""
 
@@ -152,13 +156,14 @@ class RelocalizationConfig(GeometricVerificationConfig):
     min_overlap: float = Field(default=0.5, ge=0.0, le=1.0)
     """Overlap with its keyframe that a plausible pose must have."""
     max_contradiction_m: float = 0.03
-    """Largest distance between a place that was found and where a later keyframe, not believed itself, has it."""
+    """Largest distance between a place that was found and where a later keyframe, not accepted itself, has it."""
     max_conflict: float = 0.1
-    """Largest fraction of a keyframe's seen samples in space that the frame saw to be free, to be believed."""
+    """Largest fraction of a keyframe's seen samples in space that the frame saw to be free, to be accepted."""
     max_gray_rms: float = 0.03
-    """Largest gray residual of a place that is believed, plus `max_gray_rms_of_usual` times the usual one: that of the
+    """Largest gray residual of a place that is accepted, plus `max_gray_rms_of_usual` times the usual one: that of the
     frames tracked before. Rooms built alike agree in shape, not in their pictures."""
     max_gray_rms_of_usual: float = 2.0
+    """Factor on the usual gray residual that is added to `max_gray_rms`."""
     confirmations: int = 1
     """Later frames that must be tracked from there before the camera counts as found."""
 
@@ -179,13 +184,13 @@ class TrackingConfig(Config):
     strides: tuple[int, ...] = (4, 2, 1, 1)
     """Pixels between samples of a keyframe, per pyramid level, finest first."""
     max_extrapolation_s: float = 0.2
-    """Longest gap in time over which the last velocity is believed."""
+    """Longest gap in time over which the last velocity is used."""
     equalize_from_gain: float = 1.2
     """A frame that failed is tried again with brightness and contrast brought to those of the keyframe if the contrast
     differs by more than this factor."""
     max_keyframe_gain: float = 1.5
     """A frame brighter or darker than its keyframe by more than this factor, or with a gray residual that would not be
-    believed of a place found again, becomes a keyframe only below `relocalization.min_overlap`, and only if little of
+    accepted of a place found again, becomes a keyframe only below `relocalization.min_overlap`, and only if little of
     it is saturated."""
     max_saturated: float = 0.1
     """Share of black and white pixels up to which that is so."""

@@ -27,6 +27,7 @@ class SeedingConfig(Config):
     depth_error_m: float = 0.04
     """Depth error above which a pixel is not explained, plus depth_error_relative times the depth."""
     depth_error_relative: float = 0.02
+    """Share of the depth that is added to `depth_error_m`."""
     opacity: float = 0.7
     """Initial opacity."""
     spread: float = 0.55
@@ -34,7 +35,9 @@ class SeedingConfig(Config):
     thickness_m: float = THICKNESS_FLOOR_M
     """Standard deviation across the surface at first; also the floor of every log-scale while mapping."""
     min_depth_m: float = 0.2
+    """Nearer depth gets no Gaussian."""
     max_depth_m: float = 10.0
+    """Farther depth gets no Gaussian."""
 
 
 class MappingConfig(Config):
@@ -88,10 +91,13 @@ class MappingConfig(Config):
     """Gaussians whose removal changes all keyframes together by less are pruned in the first half of the final
     refinement: the squared change of half-size images, in units of the noise below."""
     contribution_color_sigma: float = 0.03
+    """Noise of colors (0..1) by which a change of an image is measured."""
     contribution_depth_sigma_m: float = 0.02
+    """Noise of depth by which a change of an image is measured."""
     exposure: bool = False
     """Fit a gain and an offset per view; the map ends in the mean exposure of its keyframes."""
     exposure_rate: float = 2e-3
+    """Learning rate of the gains and offsets."""
 
     def depth_kind(self, depth_noise_m: float | None) -> DepthKind:
         """How the Gaussians' depth is drawn; depth_noise_m: of the depth images, None: unknown."""

@@ -35,7 +35,7 @@ class LinkConfig(Config):
     """The simulated radio between two robots."""
 
     enabled: bool = True
-    """False: nobody talks to anybody, whatever the topology."""
+    """False: no robot has a link, whatever the topology."""
     topology: Literal["full", "ring", "chain", "star", "none", "range", "listed"] = "full"
     """Who can talk to whom: laid over the robots in alphabetical order (the center of the star is the first), by
     distance (`range`, needs range_m and waypoints), or as `windows` say (`listed`)."""

@@ -24,7 +24,7 @@ class RegistrationConfig(Config):
     huber_sigmas: float = 1.5
     """Residuals beyond this many sigmas count linearly."""
     depth_sigma_base_m: float = 0.0012
-    """Depth noise sigma(z) = base + slope * (z - 0.4)^2, where the log does not tell it pixel by pixel; only its shape
+    """Depth noise sigma(z) = base + slope * (z - 0.4)^2, where the log does not have it pixel by pixel; only its shape
     counts, its scale is estimated."""
     depth_sigma_quadratic_per_m: float = 0.0019
     """See depth_sigma_base_m (Nguyen, Izadi and Lovell 2012)."""
@@ -93,6 +93,7 @@ class MovingConfig(Config):
     """Finding what moves by depth alone."""
 
     enabled: bool = True
+    """Look for moving objects and keep them out of the map."""
     gate_m: float = 0.15
     """A point nearer by this than all that another view measured around its place stands in free space."""
     gate_relative: float = 0.1

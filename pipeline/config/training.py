@@ -29,16 +29,22 @@ class SurfaceLossConfig(LossConfig):
     """The same where depth is exact: every single Gaussian belongs on the surface."""
 
     depth_weight: float = 0.25
+    """Weight of one meter of depth error against one unit of color."""
     depth_huber_m: float = 0.01
+    """Depth residual in meters where the loss turns from quadratic to linear; the slope beyond is 1."""
     alpha_weight: float = 0.02
+    """Weight of missing opacity (1 - alpha) where a surface was measured."""
     surface_weight: float = 0.5
+    """Weight of one meter between a Gaussian's own depth and the measured one, by its share in the pixel."""
 
 
 class MapLossConfig(Config):
     """The loss of a map, by the depth that its Gaussians are drawn with."""
 
     blended: LossConfig = LossConfig()
+    """Of Gaussians that are drawn with the depth of their centers."""
     ray_plane: SurfaceLossConfig = SurfaceLossConfig()
+    """Of Gaussians that are drawn with the depth of their planes."""
 
     def of(self, depth: DepthKind) -> LossConfig:
         """The loss of maps of a kind."""
@@ -53,9 +59,11 @@ class LearningRates(Config):
     quats_wxyz: float = 2e-2
     """Of a unit quaternion."""
     log_scales: float = 0.08
+    """Logarithms of the scales in meters."""
     colors: float = 2e-2
     """RGB in 0..1."""
     opacity_logits: float = 6e-2
+    """Logits of the opacity."""
 
     def times(self, factor: float) -> LearningRates:
         """All rates scaled."""

@@ -9,13 +9,13 @@ import time
 from pathlib import Path
 
 import pytest
-from tests.recording.logs import write_camera
 
 from duagc.pipeline import cli
 from duagc.pipeline.base.atomic_folder import new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
 from tests.evaluation import fake_run
+from tests.fixtures.recording_logs import write_camera
 
 ROOT = Path(__file__).parents[2]
 
