@@ -182,10 +182,10 @@ def measure(log: Path, folder: Path, config: FrontendConfig, seed: int, threads:
     """Run the front end on a log into folder/frontend.mcap, in a fresh process; times and peak memory."""
     from duagc.pipeline.frontend.stage import run_frontend
 
-    whole = {"frame": ("tracking.Tracker", "track"), "poses": ("stage", "_refine")}
+    whole = {"frame": ("tracking.Tracker", "track"), "poses": ("stage", "_optimize_poses")}
     if config.mapping_enabled:
-        whole |= {"keyframe": ("mapping.Mapper", "add_keyframe"), "final": ("mapping.Mapper", "finish")}
-        whole |= {"model": ("model.ModelTracker", "refine")}
+        whole |= {"keyframe": ("mapping.Mapper", "add_keyframe"), "final": ("mapping.Mapper", "finalize")}
+        whole |= {"model": ("model.ModelTracker", "register")}
     counts = _functions(COUNTED)
     with ExitStack() as stack:
         steps = stack.enter_context(counted(counts["frame"], counts["step"]))

@@ -1,4 +1,4 @@
-"""A color and a depth camera: how they differ from what a recording says of them.
+"""A color and a depth camera: how they differ from those of a recording.
 
 In a recording depth is registered to a pinhole color camera. Here the camera that took the color images has a lens,
 is turned against the registered depth and took its images later; the depth has a smooth error in 1/z.
@@ -42,7 +42,7 @@ class Rig:
 
     @staticmethod
     def of(camera: PinholeCamera) -> Rig:
-        """As the recording says: a pinhole, not turned, at the same time, exact depth.
+        """As in the recording: a pinhole, not turned, at the same time, exact depth.
 
         Args:
             camera: of the recording.

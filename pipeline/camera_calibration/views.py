@@ -100,7 +100,7 @@ def track_log(path: Path, robot: str, config: FrontendConfig) -> Tracked:
         robot: its name.
         config: of the front end.
     """
-    failure = config.tracking.failure.model_copy(update={"doubtful_gray_of_usual": math.inf})
+    failure = config.tracking.failure.model_copy(update={"color_check_gray_of_usual": math.inf})
     tracking = config.tracking.model_copy(update={"failure": failure})
     config = config.model_copy(update={"mapping_enabled": False, "tracking": tracking})
     with tempfile.TemporaryDirectory(prefix="duagc-calibrate-") as folder:
@@ -161,9 +161,11 @@ def load_views(tracked: Tracked, first: int, last: int, most: int) -> Views:
             w = pyramid.levels[0].inverse_depth
             inverse.append(np.where(w > 0, w, np.float32(np.nan)))
             normals.append(pyramid.levels[NORMALS_LEVEL].normals)
-            samples.append(_samples(normals[-1], depth, tracked.robot, int(index), tracked.path))
+            samples.append(
+                _samples(normals[-1], depth, robot=tracked.robot, index=int(index), path=tracked.path)
+            )
     T = tracked.T_map_camera[chosen]
-    view, landmark, pixel, points = _landmarks(pixels, descriptors, depths, camera, T)
+    view, landmark, pixel, points = _landmarks(pixels, descriptors, depths, camera=camera, T=T)
     return Views(
         name=name,
         camera=camera,
@@ -213,11 +215,11 @@ def _velocities(tracked: Tracked, chosen: NDArray[np.int64]) -> Array:
 
 
 def _samples(
-    normals: NDArray[np.float32], depth: NDArray[np.float32], robot: str, index: int, path: Path
+    normals: NDArray[np.float32], depth: NDArray[np.float32], *, robot: str, index: int, path: Path
 ) -> NDArray[np.int64]:
     row, column = np.nonzero((depth > 0) & (depth < FARTHEST_SAMPLE_M))
-    sound = np.abs(normals[coarse(row, normals.shape[0]), coarse(column, normals.shape[1])]).sum(axis=-1) > 0
-    row, column = row[sound], column[sound]
+    known = np.abs(normals[coarse(row, normals.shape[0]), coarse(column, normals.shape[1])]).sum(axis=-1) > 0
+    row, column = row[known], column[known]
     if len(row) < SAMPLES:
         raise DuagError(
             f"{path}: depth of frame {index} shows a surface at {len(row)} pixels, expected {SAMPLES}"
@@ -231,6 +233,7 @@ def _landmarks(
     pixels: Sequence[Array],
     descriptors: Sequence[NDArray[np.uint8]],
     depths: Sequence[Array],
+    *,
     camera: PinholeCamera,
     T: Array,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
@@ -241,7 +244,7 @@ def _landmarks(
     offsets = np.concatenate([[0], np.cumsum([len(p) for p in pixels])])
     edges = [
         np.stack([offsets[a] + found[:, 0], offsets[b] + found[:, 1]], axis=-1)
-        for a, b, found in _matched(pixels, descriptors, depths, camera, T)
+        for a, b, found in _matched(pixels, descriptors, depths, camera=camera, T=T)
     ]
     if not edges:
         none = np.zeros(0, dtype=np.int64)
@@ -272,6 +275,7 @@ def _matched(
     pixels: Sequence[Array],
     descriptors: Sequence[NDArray[np.uint8]],
     depths: Sequence[Array],
+    *,
     camera: PinholeCamera,
     T: Array,
 ) -> Iterator[tuple[int, int, NDArray[np.int64]]]:

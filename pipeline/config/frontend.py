@@ -22,9 +22,9 @@ class LoopConfig(GeometricVerificationConfig):
     enabled: bool = True
     """Look for loop closures within the robot's own path."""
     min_gap: int = 3
-    """Keyframes that lie between the two at least, less one."""
+    """Least difference between the indices of the two keyframes."""
     known_overlap: float = 0.3
-    """Overlap by the tracked poses from which a pair needs no recognition."""
+    """Overlap by the tracked poses from which a pair is compared anyway."""
     compared: int = 32
     """Earlier keyframes, those that share most visual words, whose features are compared."""
     features_compared: int = 120
@@ -42,7 +42,7 @@ class LoopConfig(GeometricVerificationConfig):
 
 
 class KeyframeConfig(Config):
-    """When a frame becomes a keyframe, and how keyframe poses are refined together."""
+    """When a frame becomes a keyframe, and how keyframe poses are optimized together."""
 
     min_overlap: float = 0.8
     """A frame that sees less of its keyframe than this becomes the next one."""
@@ -55,12 +55,17 @@ class KeyframeConfig(Config):
     neighbor_overlap: float = 0.5
     """Least overlap, predicted and found, of such a registration."""
     huber_sigmas: float = 3.0
-    """Registrations that disagree by more than this with the refined poses count linearly."""
+    """Registrations that disagree by more than this with the optimized poses count linearly."""
     local_optimization: bool = True
     """Optimize all keyframe poses jointly on the images; without, only the registrations made in tracking count."""
     optimization_rounds: int = 10
     """Rounds over all keyframes at most; they end when no pose moves by more than 0.1 mm and 0.1 mrad, and look again
     only at pairs that moved by as much."""
+    coarse_rounds: int = 2
+    """Rounds on smaller images before those at full size, if some registration contradicts the start: far from the
+    minimum small images converge faster."""
+    coarse_from: float = 0.02
+    """Distance (m) or angle (rad) between a registration and the start from which that is so."""
     optimization_overlap: float = 0.3
     """Least overlap, at the present poses, of two keyframes that are compared."""
     optimization_candidates: int = 24
@@ -71,46 +76,50 @@ class KeyframeConfig(Config):
 
 
 class FailureConfig(Config):
-    """Tests of whether what the camera shows can be true."""
+    """Tests of whether the images of a camera can be used and a pose can be true."""
 
     max_frames_without_depth: int = 15
-    """Frames in a row that are tracked by color alone, because their depth is missing or stuck."""
+    """Frames in a row that are tracked by color alone, because their depth is missing or frozen."""
     min_view_without_depth: float = 0.6
-    """Share of the last such frame's samples that must be seen: color alone is poor where little is shared."""
-    max_way_without_depth_m: float = 0.12
-    """Distance from the last frame with depth up to which color alone is followed: it errs by up to a quarter
-    of it."""
-    sigma_of_way_without_depth: float = 0.07
-    """Standard deviation of that error per axis, as a share of the distance; counted in the information."""
-    doubtful_gray_of_usual: float = 1.75
+    """Share of the samples of the last frame with depth that must be in view: color alone is poor where little is
+    shared."""
+    max_translation_without_depth_m: float = 0.12
+    """Distance from the last frame with depth up to which color alone is followed: its error is up to a quarter of
+    that distance."""
+    sigma_of_translation_without_depth: float = 0.07
+    """Standard deviation of that error per axis, as a share of the distance; part of the information."""
+    color_check_gray_of_usual: float = 1.75
     """A frame whose gray residual is larger than this many times the usual one is also registered by color alone."""
-    max_contradiction_m: float = 0.01
-    """Largest distance between that answer and the usual one."""
-    max_contradiction_of_way: float = 0.5
-    """The same as a share of the way from the last sound frame; the larger limit holds."""
+    max_depth_color_m: float = 0.01
+    """Largest distance between that pose and the one by depth and color."""
+    max_depth_color_of_translation: float = 0.5
+    """The same as a share of the distance from the last good frame; the larger limit holds."""
+    share_after_contradiction: float = 0.5
+    """Factor on that share once depth and color have contradicted each other: late depth is a smaller share of a longer
+    translation."""
     max_frames_without_color: int = 3
-    """Frames in a row that are tracked by depth alone, because their color is stuck; walls do not hold it long."""
-    stuck_share: float = 0.99
-    """An image is stuck if this share of its measured pixels has the very values of the image before."""
-    stuck_gray_change: float = 0.08
+    """Frames in a row that are tracked by depth alone, because their color is frozen: on walls depth drifts soon."""
+    frozen_share: float = 0.99
+    """An image is frozen if this share of its measured pixels has the very values of the image before."""
+    frozen_gray_change: float = 0.08
     """Change of a gray value of the coarsest image, in standard deviations of that image, that counts as one."""
-    stuck_gray_share: float = 0.02
-    """Share of changed gray values from which a stuck depth image no longer belongs to the color."""
-    stuck_depth_change: float = 0.01
+    frozen_gray_share: float = 0.02
+    """Share of changed gray values from which a frozen depth image no longer belongs to the color."""
+    frozen_depth_change: float = 0.01
     """Relative change of a depth of the coarsest image that counts as one."""
-    stuck_depth_share: float = 0.1
-    """Share of changed depths from which a stuck color image no longer belongs to the depth."""
-    intruder_gate_m: float = 0.15
-    """A point nearer by this than what a keyframe saw there stands in space that was free."""
-    intruder_gate_relative: float = 0.1
+    frozen_depth_share: float = 0.1
+    """Share of changed depths from which a frozen color image no longer belongs to the depth."""
+    free_space_gate_m: float = 0.15
+    """A point nearer by this than what a keyframe measured there is in space that was free."""
+    free_space_gate_relative: float = 0.1
     """The same as a fraction of the depth; the larger limit holds."""
-    max_intruders: float = 0.1
-    """Largest share of such points in a frame that becomes a keyframe, or by which a lost camera is found again."""
-    max_sigma_obstructed_m: float = 0.01
-    """Largest standard deviation of the position of a frame with more of them than that: what a hand leaves visible
-    may determine little, and its errors are several of these."""
-    min_told: float = 0.65
-    """Share of a frame's points that its keyframe must be able to judge to say that what stood before it is gone."""
+    max_free_space_violations: float = 0.1
+    """Largest share of such points in a frame that becomes a keyframe, or by which a lost camera is relocalized."""
+    max_sigma_occluded_m: float = 0.01
+    """Largest standard deviation of the position of a frame with a larger share: what an object in front of the camera
+    leaves visible may determine little, and its errors are several of these."""
+    min_visible: float = 0.65
+    """Share of a frame's points that its keyframe must be able to judge before an object counts as gone."""
     min_overlap_unlike: float = 0.7
     """Least overlap by which a frame is followed that looks unlike its keyframe, as where the exposure jumps."""
     max_speed_m_s: float = 3.0
@@ -118,11 +127,19 @@ class FailureConfig(Config):
     slack_m: float = 0.1
     """Added to that distance."""
     slack_rad: float = 0.1
-    """With `slack_m`, how far from where it was expected a camera may be found on a surface without features."""
+    """With `slack_m`, how far from where it was predicted a camera may be found on a surface without features."""
+    min_features_of_inliers: int = 3
+    """Times `relocalization.min_inliers`: a keyframe with fewer features cannot decide where a view is."""
+    usual_frames: int = 50
+    """Last frames that were followed, whose median gray residual is the usual one."""
+    interval_frames: int = 50
+    """Last frames whose median interval is the usual one."""
+    gap_intervals: float = 3
+    """Median times between frames without any that count as a gap."""
 
 
 class MotionPriorConfig(Config):
-    """Accuracy of a motion prior of the log: standard deviations of a motion between two frames."""
+    """Uncertainty of the motion prior of the log: standard deviations of a motion between two frames."""
 
     odometry_sigma_m: float = 0.005
     """Translation by another odometry."""
@@ -139,7 +156,7 @@ class MotionPriorConfig(Config):
 
 
 class RelocalizationConfig(GeometricVerificationConfig):
-    """Finding a lost camera again by features of its image."""
+    """Finding a lost camera by the features of its image."""
 
     features: int = 400
     """Features kept per keyframe."""
@@ -155,13 +172,14 @@ class RelocalizationConfig(GeometricVerificationConfig):
     """Matches that must agree on one motion."""
     min_overlap: float = Field(default=0.5, ge=0.0, le=1.0)
     """Overlap with its keyframe that a plausible pose must have."""
-    max_contradiction_m: float = 0.03
-    """Largest distance between a place that was found and where a later keyframe, not accepted itself, has it."""
+    max_keyframe_disagreement_m: float = 0.03
+    """Largest distance between a place that was found and the registration to a later keyframe that is not plausible
+    itself."""
     max_conflict: float = 0.1
-    """Largest fraction of a keyframe's seen samples in space that the frame saw to be free, to be accepted."""
+    """Largest fraction of a keyframe's visible samples in space that the frame saw to be free."""
     max_gray_rms: float = 0.03
-    """Largest gray residual of a place that is accepted, plus `max_gray_rms_of_usual` times the usual one: that of the
-    frames tracked before. Rooms built alike agree in shape, not in their pictures."""
+    """Largest gray residual, plus `max_gray_rms_of_usual` times the usual one: that of the frames tracked before. Rooms
+    built alike agree in shape, not in their pictures."""
     max_gray_rms_of_usual: float = 2.0
     """Factor on the usual gray residual that is added to `max_gray_rms`."""
     confirmations: int = 1
@@ -181,16 +199,22 @@ class TrackingConfig(Config):
         max_rotation_rad=0.6,
     )
     """The second attempt: one more pyramid level, wider gates; its result is checked by the usual registration."""
+    stable_rounds: int = 3
+    """Usual registrations at most, after one with wide gates or from a far guess, until one stays where it began."""
+    stable_m: float = 0.01
+    """A registration that moves less than this from its start stays there."""
+    stable_rad: float = 0.01
+    """The same for the rotation."""
     strides: tuple[int, ...] = (4, 2, 1, 1)
     """Pixels between samples of a keyframe, per pyramid level, finest first."""
     max_extrapolation_s: float = 0.2
-    """Longest gap in time over which the last velocity is used."""
+    """Longest gap in time over which the last velocity predicts."""
     equalize_from_gain: float = 1.2
     """A frame that failed is tried again with brightness and contrast brought to those of the keyframe if the contrast
     differs by more than this factor."""
     max_keyframe_gain: float = 1.5
-    """A frame brighter or darker than its keyframe by more than this factor, or with a gray residual that would not be
-    accepted of a place found again, becomes a keyframe only below `relocalization.min_overlap`, and only if little of
+    """A frame brighter or darker than its keyframe by more than this factor, or with a gray residual that would be too
+    large for relocalization, becomes a keyframe only below `relocalization.min_overlap`, and only if little of
     it is saturated."""
     max_saturated: float = 0.1
     """Share of black and white pixels up to which that is so."""
@@ -203,10 +227,10 @@ class ModelConfig(Config):
     """Registering frames between keyframes to the map, once it is grown."""
 
     enabled: bool = False
-    """Gains a little on RedKitchen for twice the time of a frame, and spoils the depth of a small stereo rig."""
+    """Gains a little on RedKitchen for twice the time of a frame, and harms the depth of a small stereo rig."""
     max_sigma_ratio: float = 3.0
-    """A frame is moved only if the map knows its position no worse than this many times what the keyframe knows: exact
-    depth it knows 50 times worse, simulated Kinect noise 9 times, RedKitchen about equally well."""
+    """A frame is moved only if the map determines its position no worse than this many times the keyframe's standard
+    deviation: 50 times worse for exact depth, 9 times with simulated Kinect noise, about equally well in RedKitchen."""
     patience: int = 60
     """Frames in a row that are not moved after which no other is tried."""
     level: int = 1
@@ -227,4 +251,4 @@ class FrontendConfig(Config):
     mapping: MappingConfig = MappingConfig()
     model: ModelConfig = ModelConfig()
     moving: MovingConfig = MovingConfig()
-    """What moves, by depth: not mapped, in no Fisher sum, not trained on after fusion."""
+    """Moving objects, by depth: not mapped, in no Fisher sum, not in the fine-tuning after fusion."""

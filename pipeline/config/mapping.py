@@ -12,7 +12,7 @@ THICKNESS_FLOOR_M = 1e-3
 
 
 class SeedingConfig(Config):
-    """Where Gaussians are put and what they look like at first."""
+    """Where Gaussians are inserted and what they look like at first."""
 
     cell_sizes_px: tuple[int, ...] = (8, 4, 2)
     """Sides of the quadtree's cells, coarse to fine, each half of the one before."""
@@ -60,19 +60,19 @@ class MappingConfig(Config):
     iterations_level: int = 0
     """Image pyramid level of these steps: 0 full size, 1 half size."""
     final_iterations: int = 90
-    """Steps of the final refinement for every keyframe, at full size, shared by all views."""
+    """Steps of the final optimization for every keyframe, at full size, shared by all views."""
     final_iterations_max: int = 6000
-    """Most steps of the final refinement in all."""
+    """Most steps of the final optimization in all."""
     support_views: int = 40
-    """Most tracked frames between keyframes that take part in the final refinement; 0: keyframes only."""
+    """Most tracked frames between keyframes that take part in the final optimization; 0: keyframes only."""
     densify_rounds: int = 4
-    """Times, in the first half of the final refinement, that Gaussians that contribute nothing are pruned and the
+    """Times, in the first half of the final optimization, that Gaussians that contribute nothing are pruned and the
     room below the cap is seeded where the keyframes are drawn worst; 0: never. The last round fills the cap."""
     rates: LearningRates = LearningRates()
     final_rate_decay: float = 0.03
-    """The final refinement's learning rates fall to this share: slowly, fast, slowly."""
+    """The final optimization's learning rates fall to this share: slowly, fast, slowly."""
     stable_steps: int = 0
-    """Steps after which a Gaussian is stable: frozen until the final refinement; 0: never."""
+    """Steps after which a Gaussian is stable: frozen until the final optimization; 0: never."""
     depth: DepthKind | Literal["auto"] = "auto"
     """Depth of a Gaussian at a pixel: that of its center (`blended`), or of its disc along the ray (`ray_plane`).
     `auto`: `ray_plane` where the measured noise of the depth images is below `exact_depth_m`."""
@@ -85,11 +85,11 @@ class MappingConfig(Config):
     max_scale_m: float = 0.5
     """Gaussians that grew beyond are pruned."""
     sweep_keyframes: int = 6
-    """Keyframes, the newest and those that see most of what it sees, in whose images every keyframe measures again
-    what the Gaussians contribute."""
+    """Keyframes, the newest and those that see most of what it sees, in whose images the contributions of the Gaussians
+    are measured at every keyframe."""
     min_contribution: float = 0.25
     """Gaussians whose removal changes all keyframes together by less are pruned in the first half of the final
-    refinement: the squared change of half-size images, in units of the noise below."""
+    optimization: the squared change of half-size images, in units of the noise below."""
     contribution_color_sigma: float = 0.03
     """Noise of colors (0..1) by which a change of an image is measured."""
     contribution_depth_sigma_m: float = 0.02

@@ -24,14 +24,14 @@ class RegistrationConfig(Config):
     huber_sigmas: float = 1.5
     """Residuals beyond this many sigmas count linearly."""
     depth_sigma_base_m: float = 0.0012
-    """Depth noise sigma(z) = base + slope * (z - 0.4)^2, where the log does not have it pixel by pixel; only its shape
+    """Depth noise sigma(z) = base + slope * (z - 0.4)^2, where the log does not hold it pixel by pixel; only its shape
     counts, its scale is estimated."""
     depth_sigma_quadratic_per_m: float = 0.0019
     """See depth_sigma_base_m (Nguyen, Izadi and Lovell 2012)."""
     depth_sigma_floor: float = 0.05
     """Smallest estimated scale of the depth noise at the finest level, as a multiple of sigma(z). Four times more at
     each coarser one, where edges are blurred: without noise the depth would else outweigh the gray values so far
-    that the way to the minimum becomes a narrow valley, which takes hundreds of steps."""
+    that the path to the minimum becomes a narrow valley, which takes hundreds of steps."""
     gray_sigma_floor: float = 0.002
     """Smallest estimated noise of gray values (about half a step of 8 bits)."""
     gray_sigma_of_depth: float = 0.03
@@ -54,7 +54,7 @@ class RegistrationConfig(Config):
     """The gain must lie between 1 / max_gain and max_gain; else RESIDUAL (covered lens, other scene)."""
     max_sigma_m: float = 0.03
     """Directions with a larger standard deviation at the median depth are weak: they stay at the guess, or where the
-    prior pulls them, and carry no information. The outcome is ILL_CONDITIONED unless the prior knows them better."""
+    prior pulls them, and carry no information. The outcome is ILL_CONDITIONED unless the prior knows better."""
     max_translation_m: float = 0.3
     """Largest correction of the guess; more is JUMP."""
     max_rotation_rad: float = 0.35
@@ -90,7 +90,7 @@ class GeometricVerificationConfig(Config):
 
 
 class MovingConfig(Config):
-    """Finding what moves by depth alone."""
+    """Finding moving objects by depth alone."""
 
     enabled: bool = True
     """Look for moving objects and keep them out of the map."""
@@ -99,7 +99,7 @@ class MovingConfig(Config):
     gate_relative: float = 0.1
     """The same as a fraction of the depth; the larger limit holds."""
     views: int = 16
-    """Other views asked at most, those that look at the nearest places."""
+    """Other views compared at most, those that look at the nearest places."""
     min_views: int = 2
     """Views that must have looked through a point; and they must be more than those that saw it there."""
     min_region: float = 0.002

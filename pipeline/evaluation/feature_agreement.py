@@ -73,7 +73,7 @@ def _matched(ours: Features, theirs: Features, a: int, b: int) -> tuple[Array, A
         return None
     points_a, points_b = ours.points[pairs[:, 0]].astype(float), theirs.points[pairs[:, 1]].astype(float)
     rng = random_streams.generator(0, "evaluation.feature_agreement", first=a, second=b)
-    _, agree = ransac(points_a, points_b, INLIER_M, HYPOTHESES, rng)
+    _, agree = ransac(points_a, points_b, inlier_m=INLIER_M, hypotheses=HYPOTHESES, rng=rng)
     if agree.sum() < max(MIN_MATCHES, MIN_SHARE * len(pairs)):
         return None
     return points_a[agree], points_b[agree]

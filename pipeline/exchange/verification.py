@@ -83,8 +83,8 @@ def verify(
         VerificationView(own, images=lambda: own_pyramid),
         VerificationView(sample.features, sample.reference),
         config,
-        config.registration,
-        rng,
+        registration=config.registration,
+        rng=rng,
     )
     verdict, detail = _VERDICTS[found.failure], _detail(found)
     closure = None

@@ -163,7 +163,9 @@ class _Team:
         robot, row = self.where[keyframe]
         frame = robot.log.frame(int(robot.frame_index[row]))
         color = frame.color * np.float32(1 / 255)
-        return RgbdPyramid.build(color, frame.usable_depth, robot.log.camera, levels, frame.depth_sigma)
+        return RgbdPyramid.build(
+            color, frame.usable_depth, robot.log.camera, levels, depth_sigma_m=frame.depth_sigma
+        )
 
     def optimized(self, start: Poses, residuals: Literal["joint", "depth"]) -> Poses:
         """Where all images together put everybody, from a start."""
@@ -172,7 +174,9 @@ class _Team:
         tracked = [RelativePose(a, b, se3.inverse(T[a]) @ T[b], np.eye(6)) for a, b in sorted(self.ends)]
         registration = self.config.tracking.registration.model_copy(update={"residuals": residuals})
         settings = self.config.keyframes
-        found, _ = bundle.optimize(T, self.views, self.images, tracked, settings, registration)
+        found, _ = bundle.optimize(
+            T, self.views, self.images, tracked, config=settings, registration=registration
+        )
         out, placed = {}, iter(found.T_map_keyframe)
         for robot in self.robots:
             new = {row: next(placed) for row in robot.keyframes}

@@ -55,9 +55,9 @@ def _summary(trials: Sequence[Sequence[Row]]) -> str:
     rows = [row for trial in trials for row in trial]
     disturbed = [row for row in rows if row.shot.disturbed]
     worst_m = max((row.moved_m for row in rows if row.good and not row.shot.foreign), default=0.0)
-    sound = [[row.good for row in trial if not row.shot.disturbed] for trial in trials]
-    after = [good.index(True) for good in sound if True in good]
-    missing = sum(bool(good) and True not in good for good in sound)
+    undisturbed = [[row.good for row in trial if not row.shot.disturbed] for trial in trials]
+    after = [good.index(True) for good in undisturbed if True in good]
+    missing = sum(bool(good) and True not in good for good in undisturbed)
     good = f"{sum(row.good for row in disturbed)} of {len(disturbed)}"
     wrong = f"{sum(row.wrong for row in rows)} in {sum(any(row.wrong for row in t) for t in trials)}"
     return f"{good:>14} {wrong:>12} {1e3 * worst_m:9.0f} {max(after, default=0):18} {missing:10}"

@@ -2,7 +2,7 @@
 
 `optimize` minimizes the sum of the photometric and point-to-plane costs of all pairs of keyframes that see the same
 surfaces. The cost of a pair is expanded to a quadratic at the present poses (`registration.linearize`), and quadratics
-are solved together; a registration of each pair by itself would settle into its own minimum first, and pairs with
+are solved together; a registration of each pair by itself would converge to its own minimum first, and pairs with
 little overlap find wrong ones. A pair is expanded again only when the motion between its keyframes has changed. The
 quadratics at the answer are the factors of the robot's pose graph.
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.config.frontend import KeyframeConfig
-from duagc.pipeline.frontend.keyframe_graph import Refined, overlap, refine
+from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes, overlap, solve_pose_graph
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration import (
@@ -36,21 +36,27 @@ from duagc.pipeline.registration.features import Features
 
 Array = NDArray[np.float64]
 Ends = tuple[int, int]  # of a pair: the earlier keyframe, the later one
-SETTLED = 1e-4  # m, rad: Gauss-Newton steps shrink fast, what is left after such a one is far smaller
-COARSE_ROUNDS = 2  # on levels 2 and 1, after a loop: far from the minimum small images lead there faster
-FAR = 0.02  # m, rad: a registration that contradicts the start by more says that it is far
+CONVERGED = 1e-4  # m, rad: Gauss-Newton steps shrink fast, what is left after such a one is far smaller
 UNUSABLE = (Outcome.LOW_OVERLAP, Outcome.RESIDUAL)  # weak directions carry no information and do no harm
 
 
-class View(Protocol):
-    """What is kept of a keyframe in memory: samples at all levels, the coarsest image, features."""
+class KeyframeView(Protocol):
+    """What is kept of a keyframe in memory."""
 
     @property
-    def reference(self) -> Reference: ...
+    def reference(self) -> Reference:
+        """Samples at all levels."""
+        ...
+
     @property
-    def coarsest(self) -> Level: ...
+    def coarsest(self) -> Level:
+        """The coarsest image."""
+        ...
+
     @property
-    def features(self) -> Features: ...
+    def features(self) -> Features:
+        """Features with depth."""
+        ...
 
 
 Images = Callable[[int, int], RgbdPyramid]
@@ -60,47 +66,54 @@ stays bounded."""
 
 def optimize(
     T_map_keyframes: Array,
-    views: Sequence[View],
+    views: Sequence[KeyframeView],
     images: Images,
     tracked: Sequence[RelativePose],
+    *,
     config: KeyframeConfig,
     registration: RegistrationConfig,
-) -> tuple[Refined, list[RelativePose]]:
+) -> tuple[OptimizedKeyframes, list[RelativePose]]:
     """Keyframe poses that explain the images of all overlapping keyframes best; the first keyframe stays.
 
     Args:
-        T_map_keyframes: [k, 4, 4], start. views: of the k keyframes. images: of a keyframe.
-        tracked: registrations that connect the keyframes, and loops; they stay where the images say nothing better.
+        T_map_keyframes: [k, 4, 4], start.
+        views: of the k keyframes.
+        images: reads the images of a keyframe.
+        tracked: registrations that connect the keyframes, and loop closures; they are factors where the images of a
+            pair cannot be compared.
+        config: numbers of rounds and neighbors.
+        registration: settings of the costs.
+
     Returns:
         The poses, and one factor per pair of keyframes: sum of factors = the joint cost at the answer, to second order.
     """
     neighborhood = Neighborhood(views, config)
-    costs = _Costs(views, images, tracked, config, registration)
-    refined = refine(T_map_keyframes, tracked, config.huber_sigmas)
-    coarse_rounds = COARSE_ROUNDS if _far(T_map_keyframes, tracked) else 0
+    costs = _Costs(views, images, tracked, config=config, registration=registration)
+    solution = solve_pose_graph(T_map_keyframes, tracked, config.huber_sigmas)
+    coarse_rounds = config.coarse_rounds if _is_far(T_map_keyframes, tracked, config.coarse_from) else 0
     factors = list(tracked)
     ends: list[Ends] = []
     for index in range(config.optimization_rounds):
-        T = refined.T_map_keyframe
+        T = solution.T_map_keyframe
         if index in (0, coarse_rounds, config.optimization_rounds // 2):
             ends = _in_order({(pair.i, pair.j) for pair in tracked} | set(neighborhood.pairs(T)))
         costs.expand(ends, T, level=max(0, coarse_rounds - index))
         factors = costs.factors(ends)
-        refined = refine(T, factors, config.huber_sigmas)
-        moved_m, turned_rad = se3.distance(T, refined.T_map_keyframe)
-        if index > coarse_rounds and max(moved_m.max(), turned_rad.max()) < SETTLED:
+        solution = solve_pose_graph(T, factors, config.huber_sigmas)
+        moved_m, turned_rad = se3.distance(T, solution.T_map_keyframe)
+        if index > coarse_rounds and max(moved_m.max(), turned_rad.max()) < CONVERGED:
             break
-    return refined, factors
+    return solution, factors
 
 
 def _in_order(pairs: Iterable[Ends]) -> list[Ends]:
     return sorted(pairs, key=lambda pair: (pair[1], pair[0]))
 
 
-def _far(T: Array, pairs: Sequence[RelativePose]) -> bool:
-    """Whether some registration contradicts the poses by more than `FAR`."""
+def _is_far(T: Array, pairs: Sequence[RelativePose], limit: float) -> bool:
+    """Whether some registration contradicts the poses by more than a limit (m, rad)."""
     found = (se3.distance(pair.T_i_j, se3.inverse(T[pair.i]) @ T[pair.j]) for pair in pairs)
-    return any(max(moved_m, turned_rad) > FAR for moved_m, turned_rad in found)
+    return any(max(moved_m, turned_rad) > limit for moved_m, turned_rad in found)
 
 
 class _Costs:
@@ -108,9 +121,10 @@ class _Costs:
 
     def __init__(
         self,
-        views: Sequence[View],
+        views: Sequence[KeyframeView],
         images: Images,
         tracked: Sequence[RelativePose],
+        *,
         config: KeyframeConfig,
         registration: RegistrationConfig,
     ) -> None:
@@ -123,12 +137,22 @@ class _Costs:
         self._exposures: dict[Ends, tuple[float, float]] = {}  # of (reference, target)
 
     def factors(self, ends: Sequence[Ends]) -> list[RelativePose]:
-        """The quadratics of pairs; of one that cannot be compared, what tracking said, if anything."""
+        """The quadratics of pairs; of one that cannot be compared, the registration of tracking, if there is one.
+
+        Args:
+            ends: indices of the keyframes of every pair.
+        """
         found = (self._found.get(pair) or self._tracked.get(pair) for pair in ends)
         return [factor for factor in found if factor is not None]
 
     def expand(self, ends: Sequence[Ends], T: Array, level: int = 0) -> None:
-        """Expand the costs of pairs at the poses T, on an image level, unless that was done there before."""
+        """Expand the costs of pairs at the poses T, on an image level, unless that was done there before.
+
+        Args:
+            ends: indices of the keyframes of every pair.
+            T: [k, 4, 4], poses in the map.
+            level: of the images, 0 = finest.
+        """
         ends = [pair for pair in ends if self._moved(pair, T, level)]
         results: dict[Ends, Registration] = {}
         loaded, pyramid = -1, None
@@ -136,24 +160,28 @@ class _Costs:
             if target != loaded:
                 loaded, pyramid = target, self._images(target, level + 1)
             assert pyramid is not None
-            result = self._linearized(reference, target, pyramid, T, level)
+            result = self._linearized(reference, target, pyramid, T, level=level)
             if self._comparable(result):
                 self._exposures[reference, target] = result.exposure
                 results[reference, target] = result
         for first, second in ends:
             T_first_second = se3.inverse(T[first]) @ T[second]
-            ways = results.get((first, second)), results.get((second, first))
-            self._found[first, second] = _factor(first, second, T_first_second, *ways)
+            self._found[first, second] = _factor(
+                (first, second),
+                T_first_second,
+                forward=results.get((first, second)),
+                backward=results.get((second, first)),
+            )
             self._where[first, second] = T_first_second, level
 
     def _moved(self, pair: Ends, T: Array, level: int) -> bool:
         if pair not in self._where or self._where[pair][1] != level:
             return True
         motion = se3.inverse(T[pair[0]]) @ T[pair[1]]
-        return float(np.max(se3.distance(self._where[pair][0], motion))) >= SETTLED
+        return float(np.max(se3.distance(self._where[pair][0], motion))) >= CONVERGED
 
     def _linearized(
-        self, reference: int, target: int, pyramid: RgbdPyramid, T: Array, level: int
+        self, reference: int, target: int, pyramid: RgbdPyramid, T: Array, *, level: int
     ) -> Registration:
         samples, config = self._views[reference].reference, self._registration
         T_reference_target = se3.inverse(T[reference]) @ T[target]
@@ -161,7 +189,7 @@ class _Costs:
         if known is None:
             # gain and offset first: with wrong ones the weights of the gray values are wrong
             known = linearize(samples, pyramid, T_reference_target, config=config, level=level).exposure
-        return linearize(samples, pyramid, T_reference_target, known, config, level)
+        return linearize(samples, pyramid, T_reference_target, known, config=config, level=level)
 
     def _comparable(self, result: Registration) -> bool:
         """Whether two views show enough of the same surfaces at a pose, and agree there."""
@@ -169,24 +197,28 @@ class _Costs:
 
 
 def _factor(
-    first: int, second: int, T_first_second: Array, forth: Registration | None, back: Registration | None
+    ends: Ends, T_first_second: Array, *, forward: Registration | None, backward: Registration | None
 ) -> RelativePose | None:
-    """Mean of the quadratics of a pair, one way and the other: both are made of the same two images."""
+    """Mean of the quadratics of a pair in both directions: both are made of the same two images."""
     information, force = np.zeros((6, 6)), np.zeros(6)
-    ways = [way for way in (forth, back) if way is not None]
-    if forth is not None:
-        information = information + forth.information
-        force = force + forth.information @ se3.log(se3.inverse(T_first_second) @ forth.T_reference_target)
-    if back is not None:
+    count = (forward is not None) + (backward is not None)
+    if forward is not None:
+        information = information + forward.information
+        force = force + forward.information @ se3.log(
+            se3.inverse(T_first_second) @ forward.T_reference_target
+        )
+    if backward is not None:
         # T_second_first moves by -Ad(T_first_second) x if T_first_second moves by x
         turned = -se3.adjoint(T_first_second)
-        information = information + turned.T @ back.information @ turned
-        force = force + turned.T @ back.information @ se3.log(T_first_second @ back.T_reference_target)
-    if not ways:
+        information = information + turned.T @ backward.information @ turned
+        force = force + turned.T @ backward.information @ se3.log(
+            T_first_second @ backward.T_reference_target
+        )
+    if count == 0:
         return None
-    information, force = 0.5 * (information + information.T) / len(ways), force / len(ways)
+    information, force = 0.5 * (information + information.T) / count, force / count
     step = np.linalg.pinv(information, rcond=1e-10, hermitian=True) @ force
-    return RelativePose(first, second, T_first_second @ se3.exp(step), information)
+    return RelativePose(*ends, T_first_second @ se3.exp(step), information)
 
 
 class Neighborhood:
@@ -196,7 +228,7 @@ class Neighborhood:
     those whose balls are nearest: a robot that stays in one room makes more keyframes there than it can compare.
     """
 
-    def __init__(self, views: Sequence[View], config: KeyframeConfig) -> None:
+    def __init__(self, views: Sequence[KeyframeView], config: KeyframeConfig) -> None:
         self._views, self._config = views, config
         self._centers, self._radii = np.zeros((len(views), 3)), np.zeros(len(views))  # camera frames
         for k, view in enumerate(views):
@@ -207,11 +239,20 @@ class Neighborhood:
                 self._radii[k] = np.quantile(np.linalg.norm(points - self._centers[k], axis=1), 0.9)
 
     def pairs(self, T: Array) -> list[Ends]:
-        """Pairs of keyframes whose overlap, either way, reaches the limit; the best few of each later one."""
+        """Pairs of keyframes whose overlap, in both directions, reaches the limit; the best few of each later one.
+
+        Args:
+            T: [k, 4, 4], poses in the map.
+        """
         return [(first, second) for second in range(1, len(T)) for first in self.before(second, T)]
 
     def before(self, second: int, T: Array) -> list[int]:
-        """Earlier keyframes that overlap with one at the poses T [k, 4, 4], most overlap first; the best few."""
+        """Earlier keyframes that overlap with one, most overlap first; the best few.
+
+        Args:
+            second: index of the keyframe.
+            T: [k, 4, 4], poses in the map.
+        """
         config, views = self._config, self._views
         centers = np.einsum("nij,nj->ni", T[: second + 1, :3, :3], self._centers[: second + 1])
         centers += T[: second + 1, :3, 3]

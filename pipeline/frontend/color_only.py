@@ -25,10 +25,7 @@ from duagc.pipeline.registration import (
 )
 
 Array = NDArray[np.float64]
-SHARE_AFTER_CONTRADICTION = (
-    0.5  # of what a contradiction may be; late depth is a smaller share of a longer way
-)
-OPEN_DIRECTION = 1e-4  # 1/m^2, 1/rad^2: a standard deviation of 100 m says nothing
+OPEN_DIRECTION = 1e-4  # 1/m^2, 1/rad^2: a standard deviation of 100 m is no knowledge
 
 
 @dataclass(frozen=True)
@@ -75,12 +72,16 @@ class LastGoodFrame:
         """
         T_here_guess = se3.inverse(self.T_keyframe_camera) @ T_keyframe_guess
         result = register(
-            self._reference, pyramid.without_depth(), T_here_guess, registration, prior_information
+            self._reference,
+            pyramid.without_depth(),
+            T_here_guess,
+            registration,
+            prior_information=prior_information,
         )
         T = result.T_reference_target
         translation_m = float(np.linalg.norm(T[:3, 3]))
         outcome = result.outcome
-        if result.ok and translation_m > limits.max_way_without_depth_m:
+        if result.ok and translation_m > limits.max_translation_without_depth_m:
             outcome = Outcome.JUMP
         elif result.ok and result.view < limits.min_view_without_depth:
             outcome = Outcome.LOW_OVERLAP
@@ -88,7 +89,7 @@ class LastGoodFrame:
             result,
             outcome=outcome,
             T_reference_target=self.T_keyframe_camera @ T,
-            information=self._information(result, limits.sigma_of_way_without_depth * translation_m),
+            information=self._information(result, limits.sigma_of_translation_without_depth * translation_m),
         )
 
     def translation_m(self, T_keyframe_camera: Array) -> float:
@@ -106,7 +107,7 @@ class LastGoodFrame:
 
         If the two images are of different times, or something moves in front of the camera, the answers differ by as
         much as the camera moves. Those of a good camera differ by a share of it; once the two have contradicted each
-        other, only SHARE_AFTER_CONTRADICTION of that share is allowed.
+        other, less of it is allowed.
 
         Args:
             T_keyframe_camera: [4, 4], by depth and color.
@@ -116,8 +117,9 @@ class LastGoodFrame:
         """
         apart_m = float(se3.distance(T_keyframe_camera, T_color_only)[0])
         translation_m = max(self.translation_m(T_keyframe_camera), self.translation_m(T_color_only))
-        share = limits.max_contradiction_of_way * (SHARE_AFTER_CONTRADICTION if contradicted else 1.0)
-        return apart_m <= max(limits.max_contradiction_m, share * translation_m)
+        factor = limits.share_after_contradiction if contradicted else 1.0
+        share = limits.max_depth_color_of_translation * factor
+        return apart_m <= max(limits.max_depth_color_m, share * translation_m)
 
     def _information(self, result: Registration, sigma_m: float) -> Array:
         """Of the pose in the keyframe: covariances of registration, of this frame's pose and of the translation add."""

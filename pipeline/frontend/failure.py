@@ -34,8 +34,8 @@ class Reason(Enum):
     RESIDUAL = "residual"
     JUMP = "jump"
     NO_DEPTH = "no_depth"
-    FROZEN_DEPTH = "stuck_depth"
-    FROZEN_COLOR = "stuck_color"
+    FROZEN_DEPTH = "frozen_depth"
+    FROZEN_COLOR = "frozen_color"
     OBSTRUCTED = "obstructed"
     CONTRADICTION = "contradiction"
     UNCONFIRMED = "unconfirmed"
@@ -76,8 +76,8 @@ class FrozenImageDetector:
         if not same_color:
             self._inverse_depth_then = coarsest.inverse_depth
         if same_depth:
-            changed = np.abs(_normalized(coarsest.gray) - self._gray_then) > self.config.stuck_gray_change
-            if changed.mean() > self.config.stuck_gray_share:
+            changed = np.abs(_normalized(coarsest.gray) - self._gray_then) > self.config.frozen_gray_change
+            if changed.mean() > self.config.frozen_gray_share:
                 return Reason.FROZEN_DEPTH
         if same_color and _depth_changed(coarsest.inverse_depth, self._inverse_depth_then, self.config):
             return Reason.FROZEN_COLOR
@@ -87,15 +87,19 @@ class FrozenImageDetector:
         """Whether nearly all measured pixels have the very value that they had before."""
         known = int(np.count_nonzero(image))
         same = int(np.count_nonzero((image == before) & (image != 0)))
-        return known > 0 and same >= self.config.stuck_share * known
+        return known > 0 and same >= self.config.frozen_share * known
 
 
 class FrameIntervals:
     """How much time lies between frames."""
 
-    FRAMES = 50  # of which the median is taken
+    def __init__(self, frames: int) -> None:
+        """Begin before the first frame.
 
-    def __init__(self) -> None:
+        Args:
+            frames: number of the last intervals whose median is taken.
+        """
+        self._frames = frames
         self._last_ns: int | None = None
         self._intervals_s: tuple[float, ...] = ()
 
@@ -107,7 +111,7 @@ class FrameIntervals:
         """
         if self._last_ns is not None:
             interval_s = (stamp_ns - self._last_ns) * 1e-9
-            self._intervals_s = (*self._intervals_s[1 - self.FRAMES :], interval_s)
+            self._intervals_s = (*self._intervals_s[1 - self._frames :], interval_s)
         self._last_ns = stamp_ns
 
     @property
@@ -124,8 +128,8 @@ def _normalized(gray: Image) -> Image:
 def _depth_changed(now: Image, then: Image, config: FailureConfig) -> bool:
     """Whether more than a share of the inverse depths known both times has changed."""
     known = (now > 0) & (then > 0)
-    changed = known & (np.abs(now - then) > config.stuck_depth_change * then)
-    return int(changed.sum()) > config.stuck_depth_share * max(int(known.sum()), 1)
+    changed = known & (np.abs(now - then) > config.frozen_depth_change * then)
+    return int(changed.sum()) > config.frozen_depth_share * max(int(known.sum()), 1)
 
 
 def saturated_share(level: Level) -> float:
@@ -168,8 +172,13 @@ def free_space_violations(
     v, u = np.nonzero(level.inverse_depth)
     z = 1 / level.inverse_depth[v, u].astype(np.float64)
     points = se3.transform(T_keyframe_camera, back_project(level.camera, u, v, z))
-    gates = config.intruder_gate_m, config.intruder_gate_relative
-    _, where = free_space(points, largest_of_3x3(keyframe.inverse_depth), level.camera, *gates)
+    _, where = free_space(
+        points,
+        largest_of_3x3(keyframe.inverse_depth),
+        level.camera,
+        gate_m=config.free_space_gate_m,
+        gate_relative=config.free_space_gate_relative,
+    )
     return int(np.count_nonzero(where == FREE)), len(where)
 
 
@@ -218,7 +227,7 @@ class OcclusionDetector:
         occluded, visible = self.judge(view, viewpoint)
         if occluded:
             self.active = True
-        elif visible >= self.config.min_told * int(np.count_nonzero(view.inverse_depth)):
+        elif visible >= self.config.min_visible * int(np.count_nonzero(view.inverse_depth)):
             self.active = False
         if not self.active:
             self._unoccluded = view, viewpoint.T_map_keyframe @ viewpoint.T_keyframe_camera
@@ -236,5 +245,7 @@ class OcclusionDetector:
             before, T_map_before = self._unoccluded
             T_before_camera = se3.inverse(T_map_before) @ viewpoint.T_map_keyframe @ T_keyframe_camera
             found.append(free_space_violations(view, before, T_before_camera, self.config))
-        occluded = any(violations > self.config.max_intruders * visible for violations, visible in found)
+        occluded = any(
+            violations > self.config.max_free_space_violations * visible for violations, visible in found
+        )
         return occluded, max(visible for _, visible in found)

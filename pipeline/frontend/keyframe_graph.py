@@ -1,4 +1,4 @@
-"""Keyframes: which frames become one, and the refinement of their poses by all registrations between them."""
+"""Keyframes: which frames become one, and the solution of their pose graph."""
 
 from __future__ import annotations
 
@@ -18,22 +18,25 @@ from duagc.pipeline.registration import Level, Reference, ReferenceLevel, Regist
 Array = NDArray[np.float64]
 MAX_STEPS = 20
 STEP_TOLERANCE = 1e-9
-OPEN_DIRECTION = 1e-4  # 1/m^2, 1/rad^2: a standard deviation of 100 m says nothing
+OPEN_DIRECTION = 1e-4  # 1/m^2, 1/rad^2: a standard deviation of 100 m is no knowledge
 
 
 @dataclass(frozen=True)
-class Refined:
-    """Keyframe poses after the refinement.
+class OptimizedKeyframes:
+    """Solution of the keyframes' pose graph.
 
-    T_map_keyframe: [k, 4, 4]. normal_matrix: sparse [6k, 6k] of their right tangents, identity for the first, which is
-    held. weights: [m], robust weight of every pair, 0..1. contradiction: factor >= 1 on the covariance, by which the
-    pairs contradict each other more than their information says.
+    Attributes:
+        T_map_keyframe: [k, 4, 4].
+        normal_matrix: sparse [6k, 6k] of their right tangents, identity for the first, which is fixed.
+        weights: [m], robust weight of every pair, 0..1.
+        variance_factor: >= 1, by which the residuals exceed what the information of the pairs predicts; a factor on
+            the covariance.
     """
 
     T_map_keyframe: Array
     normal_matrix: Any
     weights: Array
-    contradiction: float
+    variance_factor: float
 
     @cached_property
     def _factors(self) -> Any:
@@ -43,16 +46,25 @@ class Refined:
         return splu(self.normal_matrix)
 
     def covariance(self, keyframes: Sequence[int]) -> Array:
-        """Joint covariance [6n, 6n] of n keyframes' right tangents; zero for the first keyframe."""
+        """Joint covariance [6n, 6n] of n keyframes' right tangents; zero for the first keyframe.
+
+        Args:
+            keyframes: their indices.
+        """
         rows = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in keyframes])
         columns = np.zeros((self.normal_matrix.shape[0], len(rows)))
         columns[rows, np.arange(len(rows))] = rows >= 6
-        covariance = self._factors.solve(columns)[rows] * self.contradiction
+        covariance = self._factors.solve(columns)[rows] * self.variance_factor
         covariance[rows < 6] = 0.0
         return 0.5 * (covariance + covariance.T)
 
     def relative_information(self, first: int, second: int) -> Array:
-        """Information [6, 6] of T_first_second (right tangent)."""
+        """Information [6, 6] of T_first_second (right tangent).
+
+        Args:
+            first: index of the keyframe that it is seen from.
+            second: index of the keyframe that is seen.
+        """
         T = self.T_map_keyframe
         C = self.covariance([first, second])
         J = np.hstack([-se3.adjoint(se3.inverse(se3.inverse(T[first]) @ T[second])), np.eye(6)])
@@ -64,6 +76,11 @@ def becomes_keyframe(result: Registration, pyramid: RgbdPyramid, config: Keyfram
     """Whether a tracked frame sees too little of its keyframe, or moved or turned too far from it.
 
     Motion is measured by the median depth: a step of 10 cm changes a near view more than a far one.
+
+    Args:
+        result: registration of the frame to its keyframe.
+        pyramid: of the frame.
+        config: the limits.
     """
     if min(result.overlap, result.view) < config.min_overlap:
         return True
@@ -77,18 +94,32 @@ def becomes_keyframe(result: Registration, pyramid: RgbdPyramid, config: Keyfram
 
 
 def predicted_overlap(reference: Reference, pyramid: RgbdPyramid, T_reference_target: Array) -> float:
-    """Fraction of a reference's coarsest samples that a view would see on the same surface (within 10 % of depth)."""
+    """Fraction of a reference's coarsest samples that a view would see on the same surface (within 10 % of depth).
+
+    Args:
+        reference: the samples.
+        pyramid: of the view.
+        T_reference_target: [4, 4], of the view.
+    """
     return overlap(reference.levels[-1], pyramid.levels[len(reference.levels) - 1], T_reference_target)
 
 
 def overlap(samples: ReferenceLevel, level: Level, T_reference_target: Array) -> float:
-    """Fraction of samples that a view would see on the same surface (within 10 % of depth)."""
+    """Fraction of samples that a view would see on the same surface (within 10 % of depth).
+
+    Args:
+        samples: of one level of a reference.
+        level: of the view.
+        T_reference_target: [4, 4], of the view.
+    """
     points = se3.transform(se3.inverse(T_reference_target), samples.points.astype(np.float64))
     return projection.overlap(points, level.camera, inverse_depth=level.inverse_depth)
 
 
-def refine(T_map_keyframes: Array, pairs: Sequence[RelativePose], huber_sigmas: float) -> Refined:
-    """Keyframe poses that agree best with all registrations between them; the first keyframe stays.
+def solve_pose_graph(
+    T_map_keyframes: Array, pairs: Sequence[RelativePose], huber_sigmas: float
+) -> OptimizedKeyframes:
+    """Solve a pose graph: keyframe poses that agree best with all registrations; the first keyframe is fixed.
 
     Gauss-Newton on sum |log(T_first_second^-1 T_map_first^-1 T_map_second)|^2 weighted by the information, with
     Huber weights, in the right tangents of the poses. The normal matrix is sparse: its work grows with the pairs.
@@ -96,6 +127,7 @@ def refine(T_map_keyframes: Array, pairs: Sequence[RelativePose], huber_sigmas: 
     Args:
         T_map_keyframes: [k, 4, 4], start.
         pairs: registrations; every keyframe is connected to the first through them.
+        huber_sigmas: residuals beyond this count linearly.
     """
     from scipy.sparse.linalg import splu
 
@@ -103,7 +135,7 @@ def refine(T_map_keyframes: Array, pairs: Sequence[RelativePose], huber_sigmas: 
     k = len(T)
     H, gradient, squares, weights = _normal_equations(T, pairs, huber_sigmas)
     if k < 2:
-        return Refined(T, H, np.zeros(0), 1.0)
+        return OptimizedKeyframes(T, H, np.zeros(0), 1.0)
     for _ in range(MAX_STEPS):
         step = -splu(H).solve(gradient).reshape(k, 6)
         T = T @ se3.exp(step)
@@ -111,8 +143,8 @@ def refine(T_map_keyframes: Array, pairs: Sequence[RelativePose], huber_sigmas: 
         if np.max(np.abs(step)) < STEP_TOLERANCE:
             break
     redundant = 6 * (len(pairs) - (k - 1))
-    contradiction = max(1.0, float(squares.sum()) / redundant) if redundant > 0 else 1.0
-    return Refined(T, H, weights, contradiction)
+    variance_factor = max(1.0, float(squares.sum()) / redundant) if redundant > 0 else 1.0
+    return OptimizedKeyframes(T, H, weights, variance_factor)
 
 
 def _normal_equations(

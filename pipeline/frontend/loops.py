@@ -1,4 +1,4 @@
-"""Loops inside one robot's path: places recognized by features, believed only if registrations both ways agree."""
+"""Loop closures within one robot's path: places recognized by features and verified geometrically."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.config.frontend import LoopConfig
-from duagc.pipeline.frontend.bundle import Images, View
+from duagc.pipeline.frontend.bundle import Images, KeyframeView
 from duagc.pipeline.frontend.keyframe_graph import overlap
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
@@ -23,20 +23,27 @@ Array = NDArray[np.float64]
 
 def find_loops(
     T_map_keyframes: Array,
-    views: Sequence[View],
+    views: Sequence[KeyframeView],
     images: Images,
+    *,
     config: LoopConfig,
     registration: RegistrationConfig,
     seed: int,
     robot: str,
 ) -> list[RelativePose]:
-    """Pairs of keyframes that show the same place although their poses say that they do not, or not by enough.
+    """Pairs of keyframes that show the same place although by their poses they overlap little or not at all.
 
-    Candidates have many matching features; three-point samples give a motion; registrations from there, one way and
-    the other, must be good and agree. What passes still has only a robust weight in the graph.
+    Candidates have many matching features; they are verified by registrations in both directions. A loop closure still
+    has only a robust weight in the graph.
 
     Args:
-        T_map_keyframes: [k, 4, 4], as tracked. seed, robot: of the random stream.
+        T_map_keyframes: [k, 4, 4], as tracked.
+        views: of the k keyframes.
+        images: reads the images of a keyframe.
+        config: limits.
+        registration: settings of the registrations.
+        seed: of the random stream.
+        robot: of the random stream.
     """
     found = []
     places = Places([view.features.descriptors[: config.features_compared] for view in views])
@@ -47,13 +54,27 @@ def find_loops(
             seen = overlap(views[first].reference.levels[-1], views[second].coarsest, T_first_second)
             if seen >= config.known_overlap:
                 continue  # the joint optimization compares them anyway
-            pair = _verified(views, images, first, second, config, registration, seed, robot)
-            if pair is not None:
-                found.append(pair)
+            rng = random_streams.generator(seed, "frontend.loop", robot=robot, first=first, second=second)
+            verified = verify(
+                _verification_view(views[first], first, images, registration),
+                _verification_view(views[second], second, images, registration),
+                config,
+                registration=registration,
+                rng=rng,
+            )
+            if verified.failure is None:
+                found.append(RelativePose(first, second, verified.T_first_second, verified.information))
     return found
 
 
-def _resembling(views: Sequence[View], second: int, places: Places, config: LoopConfig) -> list[int]:
+def _verification_view(
+    view: KeyframeView, index: int, images: Images, registration: RegistrationConfig
+) -> VerificationView:
+    levels = len(registration.iterations)
+    return VerificationView(view.features, view.reference, lambda: images(index, levels))
+
+
+def _resembling(views: Sequence[KeyframeView], second: int, places: Places, config: LoopConfig) -> list[int]:
     """Earlier keyframes with most matches among the strongest features, ascending.
 
     Features are compared with those of a bounded number of keyframes only, however many there are.
@@ -66,28 +87,3 @@ def _resembling(views: Sequence[View], second: int, places: Places, config: Loop
         if score >= config.min_matches:
             scored.append((-score, first))
     return sorted(first for _, first in sorted(scored)[: config.candidates])
-
-
-def _verified(
-    views: Sequence[View],
-    images: Images,
-    first: int,
-    second: int,
-    config: LoopConfig,
-    registration: RegistrationConfig,
-    seed: int,
-    robot: str,
-) -> RelativePose | None:
-    """The registration of a candidate, if it withstands all tests."""
-    rng = random_streams.generator(seed, "frontend.loop", robot=robot, first=first, second=second)
-    levels = len(registration.iterations)
-    found = verify(
-        VerificationView(views[first].features, views[first].reference, lambda: images(first, levels)),
-        VerificationView(views[second].features, views[second].reference, lambda: images(second, levels)),
-        config,
-        registration,
-        rng,
-    )
-    if found.failure is not None:
-        return None
-    return RelativePose(first, second, found.T_first_second, found.information)

@@ -1,14 +1,14 @@
 """Mapping: one robot's Gaussian map, grown keyframe by keyframe from RGB-D images with known poses.
 
 At a keyframe the map is rendered, discs are seeded where it does not explain the image, and the Gaussians of a
-window of keyframes are optimized by Adam on a robust color and depth loss. `finish` refines the map over all
+window of keyframes are optimized by Adam on a robust color and depth loss. `finalize` optimizes the map over all
 keyframes. Everything is elementwise or summed in a fixed order: the same input gives the same bits on any number of
 threads. See docs/explanation/mapping.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import LearningRates
-from duagc.pipeline.frontend.mapping_views import Bytes, Image, View, overlap
+from duagc.pipeline.frontend.mapping_views import Bytes, Image, View, first_exposure
+from duagc.pipeline.frontend.view_selection import covisible, optimization_window
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import (
@@ -37,7 +38,15 @@ from duagc.pipeline.splat.seeding import seed_discs, unexplained, worst_drawn
 
 @dataclass(frozen=True)
 class MappingStats:
-    """What a keyframe did to the map; losses are those of its own view before and after the optimization."""
+    """Changes of the map at a keyframe.
+
+    Attributes:
+        inserted: number of Gaussians.
+        pruned: number of Gaussians.
+        total: number of Gaussians afterwards.
+        loss_before: of the keyframe's own view, before the optimization.
+        loss_after: the same afterwards.
+    """
 
     inserted: int
     pruned: int
@@ -47,20 +56,25 @@ class MappingStats:
 
 
 class Mapper:
-    """Grow and refine the Gaussian map of one robot."""
+    """Grow and optimize the Gaussian map of one robot."""
 
     def __init__(
         self,
         camera: PinholeCamera,
         config: MappingConfig,
         seed: int,
+        *,
         threads: int = 1,
         depth_noise_m: float | None = None,
     ) -> None:
-        """Args:
-        seed: of the run; the window's lots and the order of the refinement are drawn from it.
-        depth_noise_m: standard deviation of the depth images, meters, for `config.depth` = auto; None: nobody knows.
-        threads: of the rasterizer; changes no bit of the map.
+        """Begin with an empty map.
+
+        Args:
+            camera: of all views.
+            config: how the map is grown and optimized.
+            seed: of the run; random keyframes of the window and the order of the final optimization are drawn from it.
+            threads: of the rasterizer; changes no bit of the map.
+            depth_noise_m: standard deviation of the depth images, meters, for `config.depth` = auto; None: unknown.
         """
         self.config, self.seed = config, seed
         self.cameras = (camera, camera.halved())
@@ -71,7 +85,7 @@ class Mapper:
         self._gaussians = Gaussians.empty()
         self._adam = CompiledAdam(threads=threads)
         self._views: list[View] = []
-        self._support: list[tuple[View, NDArray[np.float64]]] = []  # with T_keyframe_camera
+        self._support: list[View] = []
         self._next_id = 0
         self._contribution = np.zeros(0)  # of every Gaussian, as last measured; infinite if never
 
@@ -79,11 +93,6 @@ class Mapper:
     def gaussians(self) -> Gaussians:
         """The map so far, in the map frame."""
         return self._gaussians
-
-    @property
-    def exposures(self) -> dict[int, tuple[float, float]]:
-        """Keyframe index to (a, b): the image is about exp(a) * rendered + b."""
-        return {view.index: view.exposure for view in self._views}
 
     def add_keyframe(
         self,
@@ -99,47 +108,36 @@ class Mapper:
 
         Args:
             keyframe_index: 0, 1, 2, ... in order of arrival.
-            color: RGB [H, W, 3]. depth_m: meters [H, W], 0 where there is none. Both are kept, not copied.
-            T_map_camera: pose of the camera in the map frame.
+            color: RGB [H, W, 3]; kept, not copied.
+            depth_m: meters [H, W], 0 where there is none; kept, not copied.
+            T_map_camera: [4, 4], pose of the camera in the map frame.
             mask: bool [H, W], False where a pixel neither seeds nor counts in a loss; None = all count.
             depth_sigma_m: [H, W], standard deviation of the depth, meters; None: not known pixel by pixel.
         """
         if keyframe_index != len(self._views):
             raise ValueError(f"keyframe {keyframe_index} added after {len(self._views)} keyframes")
-        huber_m = self._loss_weights.depth_huber_m
-        view = View.of(keyframe_index, color, depth_m, T_map_camera, mask, depth_sigma_m, huber_m)
+        view = View.of(
+            keyframe_index,
+            color,
+            depth_m,
+            T_map_camera,
+            mask=mask,
+            depth_sigma_m=depth_sigma_m,
+            huber_m=self._loss_weights.depth_huber_m,
+        )
         self._views.append(view)
         self._adam.freeze_after(self.config.stable_steps or None)
         inserted, pruned = self._seed(
             view, self.config.first_share if keyframe_index == 0 else self.config.keyframe_share
         )
         before = self._loss(view, self.config.iterations_level)
-        for other in self._window(view):
+        for other in optimization_window(
+            self._views, view, self.config, camera=self.cameras[0], seed=self.seed
+        ):
             self._optimize(other, self.config.iterations_level, self.config.rates)
         pruned += self._prune_degenerate()
         after = self._loss(view, self.config.iterations_level)
         return MappingStats(inserted, pruned, len(self._gaussians), before, after)
-
-    def set_keyframe_poses(
-        self, T_map_keyframe: Mapping[int, NDArray[np.float64]] | NDArray[np.float64]
-    ) -> None:
-        """Move keyframes to refined poses, and every Gaussian with the keyframe it hangs on.
-
-        T_map_keyframe: [k, 4, 4] for keyframes 0..k-1, or index to [4, 4]; keyframes not named stay.
-        """
-        old = np.stack([view.T_map_camera for view in self._views]) if self._views else np.zeros((0, 4, 4))
-        new = old.copy()
-        poses = (
-            T_map_keyframe.items()
-            if isinstance(T_map_keyframe, Mapping)
-            else enumerate(np.asarray(T_map_keyframe))
-        )
-        for index, T in poses:
-            new[index] = T
-            self._views[index].T_map_camera = new[index]
-        for view, T_keyframe_camera in self._support:
-            view.T_map_camera = new[view.index] @ T_keyframe_camera
-        self._gaussians = self._gaussians.moved(old, new)
 
     def add_view(
         self,
@@ -151,26 +149,41 @@ class Mapper:
         mask: NDArray[np.bool_] | None = None,
         depth_sigma_m: Image | None = None,
     ) -> None:
-        """Let a tracked frame that is no keyframe take part in `finish`; it moves with its keyframe.
+        """Let a tracked frame that is no keyframe take part in `finalize`.
 
         It seeds no Gaussians. Never give a frame that is held out for evaluation.
+
+        Args:
+            keyframe_index: the keyframe that it is anchored to.
+            color: RGB [H, W, 3]; kept, not copied.
+            depth_m: meters [H, W], 0 where there is none; kept, not copied.
+            T_keyframe_camera: [4, 4], pose of the camera in the keyframe.
+            mask: bool [H, W], False where a pixel does not count; None = all count.
+            depth_sigma_m: [H, W], standard deviation of the depth, meters; None: not known pixel by pixel.
         """
         T_map_camera = self._views[keyframe_index].T_map_camera @ T_keyframe_camera
-        huber_m = self._loss_weights.depth_huber_m
-        view = View.of(keyframe_index, color, depth_m, T_map_camera, mask, depth_sigma_m, huber_m)
-        self._support.append((view, T_keyframe_camera))
+        view = View.of(
+            keyframe_index,
+            color,
+            depth_m,
+            T_map_camera,
+            mask=mask,
+            depth_sigma_m=depth_sigma_m,
+            huber_m=self._loss_weights.depth_huber_m,
+        )
+        self._support.append(view)
 
-    def finish(self) -> MappingStats:
-        """Refine geometry and color over all views: `final_iterations` steps for each keyframe, at full size.
+    def finalize(self) -> MappingStats:
+        """Optimize geometry and color over all views: `final_iterations` steps for each keyframe, at full size.
 
         The views come in random order, each once before any comes again. In the first half, what contributes
         nothing is replaced `densify_rounds` times by discs where the keyframes are drawn worst.
 
         Returns:
-            Counts of the whole refinement, losses as means over all keyframes at full size.
+            Counts of the whole optimization, losses as means over all keyframes at full size.
         """
         config = self.config
-        views = [*self._views, *(view for view, _ in self._support)]
+        views = [*self._views, *self._support]
         before = self._mean_loss()
         inserted = pruned = 0
         steps = min(config.final_iterations * len(self._views), config.final_iterations_max)
@@ -184,8 +197,8 @@ class Mapper:
                     len(views)
                 )
             if step in rounds:
-                came, went = self._densify(1.0 / (len(rounds) - rounds.index(step)))
-                inserted, pruned = inserted + came, pruned + went
+                added, removed = self._densify(1.0 / (len(rounds) - rounds.index(step)))
+                inserted, pruned = inserted + added, pruned + removed
             elif step == steps // 2:
                 pruned += self._keep(self._contributions(self._views)[0] >= config.min_contribution)
             rates = config.rates.times(smoothstep_decay(step, steps, config.final_rate_decay))
@@ -245,7 +258,7 @@ class Mapper:
     # --- what is in the map -------------------------------------------------------------------------------------
 
     def _seed(self, view: View, share: float) -> tuple[int, int]:
-        """Insert discs for what the map does not explain of a view; returns how many came and how many had to go."""
+        """Insert discs for what the map does not explain of a view; numbers of inserted and pruned Gaussians."""
         config = self.config
         budget = int(share * config.max_gaussians)
         color, depth_m = view.images(0)
@@ -253,12 +266,20 @@ class Mapper:
         if len(self._gaussians):
             render = self._draw(view, 0)
             if config.exposure:
-                view.exposure = _first_exposure(render, color, view.mask)
+                view.exposure = first_exposure(render, color, view.mask)
             color = self._as_drawn(view, color, render)
             wanted = unexplained(render, color, depth_m, config.seeding, depth_sigma_m=view.depth_sigma_m)
-        new = self._discs(view, color, depth_m, wanted, budget)
+        new = self._discs(view, color, depth_m, wanted, budget=budget)
         excess = len(self._gaussians) + len(new) - config.max_gaussians
-        self._measure(self._covisible(view, config.sweep_keyframes))
+        self._measure(
+            covisible(
+                self._views,
+                view,
+                config.sweep_keyframes,
+                candidates=config.candidates,
+                camera=self.cameras[0],
+            )
+        )
         pruned = self._prune_least(excess) if excess > 0 else 0
         self._append(new)
         return len(new), pruned
@@ -266,11 +287,11 @@ class Mapper:
     def _as_drawn(self, view: View, color: Image, render: Render) -> Image:
         """The view's colors in the map's exposure; where the mask forbids a pixel, those of the render."""
         color = (color - np.float32(view.exposure[1])) * np.float32(np.exp(-view.exposure[0]))
-        # errors are smoothed: a masked pixel must not speak through its neighbors
+        # errors are smoothed: a masked pixel must not count through its neighbors
         return color if view.mask is None else np.where(view.mask[..., None], color, render.color)
 
     def _discs(
-        self, view: View, color: Image, depth_m: Image, wanted: NDArray[np.bool_], budget: int
+        self, view: View, color: Image, depth_m: Image, wanted: NDArray[np.bool_], *, budget: int
     ) -> Gaussians:
         return seed_discs(
             color,
@@ -291,7 +312,7 @@ class Mapper:
         self._contribution = np.concatenate([self._contribution, np.full(len(new), np.inf)])
 
     def _densify(self, share: float) -> tuple[int, int]:
-        """Replace what contributes nothing by discs where keyframes are drawn worst; how many came and went.
+        """Replace what contributes nothing by discs where keyframes are drawn worst; numbers inserted and pruned.
 
         `share` of the room below the cap is used. Every keyframe gets an equal part of it, in turn, and sees what
         those before it inserted; no more than an eighth of its finest cells is seeded.
@@ -306,7 +327,7 @@ class Mapper:
             color = self._as_drawn(view, color, render)
             budget = min(budget, depth_m.size // (8 * self.config.seeding.cell_sizes_px[-1] ** 2))
             wanted = worst_drawn(render, color, depth_m, count=budget, config=self.config.seeding)
-            new = self._discs(view, color, depth_m, wanted, budget)
+            new = self._discs(view, color, depth_m, wanted, budget=budget)
             self._append(new)
             inserted += len(new)
         return inserted, pruned
@@ -333,17 +354,17 @@ class Mapper:
         return sums.opacity / transparency**2, sums.observations > 0
 
     def _measure(self, views: Sequence[View]) -> None:
-        """Measure again what the Gaussians that these views see contribute; the others keep what was found before.
+        """Update the contributions of the Gaussians that these views see; the others keep theirs.
 
-        Views that are left out may still need a Gaussian: what it was found to contribute fades by a tenth at a
-        time. What no sweep has seen yet counts as needed.
+        Views that are left out may still need a Gaussian: its last contribution decays by a tenth at a time. A
+        Gaussian that was never measured counts as needed.
         """
         found, seen = self._contributions(views)
         faded = np.where(np.isinf(self._contribution), 0.0, 0.9 * self._contribution)
         self._contribution = np.where(seen, np.maximum(found, faded), self._contribution)
 
     def _prune_least(self, count: int) -> int:
-        """Remove the `count` Gaussians that were last found to contribute least; ties go by position."""
+        """Remove the `count` Gaussians with the least contribution; ties go by position."""
         order = np.argsort(self._contribution, kind="stable")
         keep = np.ones(len(self._gaussians), bool)
         keep[order[:count]] = False
@@ -362,51 +383,3 @@ class Mapper:
             self._adam.select(mask)
             self._contribution = self._contribution[mask]
         return int(np.count_nonzero(~mask))
-
-    # --- which views --------------------------------------------------------------------------------------------
-
-    def _window(self, newest: View) -> list[View]:
-        """The views of this keyframe's iterations: every second one the newest, the others in turn."""
-        chosen = self._covisible(newest, self.config.window)[1:]
-        taken = {view.index for view in chosen}
-        rest = [view for view in self._views[: newest.index] if view.index not in taken]
-        draw = random_streams.generator(self.seed, "mapping.window", keyframe=newest.index)
-        lot = draw.permutation(len(rest))[: self.config.random_keyframes]
-        others = [*chosen, *(rest[k] for k in lot)]
-        steps = self.config.iterations
-        if not others:
-            return [newest] * steps
-        return [newest if k % 2 == 0 else others[(k // 2) % len(others)] for k in range(steps)]
-
-    def _covisible(self, newest: View, count: int) -> list[View]:
-        """A view, the keyframe before it, and the older ones that see most of what it sees, best first.
-
-        `count` in all, ties to the later. Only the `candidates` keyframes whose center of view is nearest are compared.
-        """
-        older = self._views[: newest.index]
-        if len(older) > self.config.candidates:
-            centers = np.stack([view.center_map for view in older])
-            distance = np.linalg.norm(centers - newest.center_map, axis=1)
-            distance[-1] = 0.0
-            nearest = np.sort(np.argsort(distance, kind="stable")[: self.config.candidates])
-            older = [older[k] for k in nearest]
-        overlaps = [
-            overlap(newest.depth_m, newest.T_map_camera, v.depth_m, v.T_map_camera, self.cameras[0])
-            for v in older
-        ]
-        latest = len(older) - 1  # takes part whatever it sees: nobody else saw what it brought
-        ranked = sorted(range(len(older)), key=lambda k: (k != latest, -overlaps[k], -k))
-        return [newest, *(older[k] for k in ranked[: count - 1])]
-
-
-def _first_exposure(
-    render: Render, color: Image, mask: NDArray[np.bool_] | None = None
-) -> tuple[float, float]:
-    """Log gain from the medians over the pixels that the map covers; the offset starts at zero."""
-    covered = render.alpha > 0.9
-    if mask is not None:
-        covered &= mask
-    if np.count_nonzero(covered) < 1000:
-        return 0.0, 0.0
-    ratio = np.median(color[covered]) / max(float(np.median(render.color[covered])), 0.02)
-    return float(np.log(np.clip(ratio, 0.25, 4.0))), 0.0

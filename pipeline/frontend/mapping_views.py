@@ -1,4 +1,4 @@
-"""Views as the mapper keeps them: a keyframe's images in two sizes, and what two views see of each other."""
+"""Views as the mapper keeps them: a keyframe's images in two sizes, and the overlap of two views."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.geometry import projection, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.kernels import Render
 from duagc.pipeline.kernels.training import TrainingView
 from duagc.pipeline.splat.losses import depth_certainty, halve
 from duagc.pipeline.splat.optimizer import BETA_1, BETA_2
@@ -19,10 +20,24 @@ Bytes = NDArray[np.uint8]
 
 @dataclass
 class View:
-    """A keyframe as the mapper keeps it: colors as bytes, depth in meters, 0 also where a mask forbids the pixel.
+    """A keyframe as the mapper keeps it.
 
-    mask, half_mask: pixels that may be used; None = all. certainty, half_certainty: factors of the depth residuals
-    (`splat.losses.depth_certainty`); None = all 1. depth_sigma_m: standard deviation of the depth; None = not told.
+    Attributes:
+        index: of the keyframe.
+        color: uint8 RGB [H, W, 3].
+        depth_m: [H, W], meters, 0 = unknown, also where a mask forbids the pixel.
+        half_color: 0..1, at half size.
+        half_depth_m: at half size.
+        T_map_camera: [4, 4].
+        median_depth_m: meters, 0 without depth.
+        mask: bool [H, W], pixels that may be used; None = all.
+        half_mask: at half size.
+        depth_sigma_m: [H, W], standard deviation of the depth, meters; None = not known pixel by pixel.
+        certainty: [H, W], factors of the depth residuals (`splat.losses.depth_certainty`); None = all 1.
+        half_certainty: at half size.
+        exposure: (a, b): the image is about exp(a) * rendered + b.
+        exposure_moments: of Adam, [2, 2].
+        exposure_steps: number of Adam steps.
     """
 
     index: int
@@ -48,13 +63,21 @@ class View:
         color: Bytes,
         depth_m: Image,
         T_map_camera: NDArray[np.float64],
+        *,
         mask: NDArray[np.bool_] | None,
         depth_sigma_m: Image | None,
         huber_m: float,
     ) -> View:
         """A view of images that are kept, not copied, but for depth where a mask forbids pixels.
 
-        huber_m: depth sigmas up to it change nothing.
+        Args:
+            index: of the keyframe.
+            color: uint8 RGB [H, W, 3].
+            depth_m: [H, W], meters, 0 = unknown.
+            T_map_camera: [4, 4].
+            mask: bool [H, W], pixels that may be used; None = all.
+            depth_sigma_m: [H, W], standard deviation of the depth, meters; None = not known pixel by pixel.
+            huber_m: depth sigmas up to it change nothing.
         """
         if color.dtype != np.uint8:
             raise ValueError(f"color is an array of {color.dtype}, expected uint8")
@@ -84,6 +107,11 @@ class View:
         return self.T_map_camera[:3, 3] + self.median_depth_m * self.T_map_camera[:3, 2]
 
     def images(self, level: int) -> tuple[Image, Image]:
+        """Color 0..1 and depth of a level.
+
+        Args:
+            level: 0 = full size, 1 = half.
+        """
         if level == 0:
             return _from_bytes(self.color), self.depth_m
         return self.half_color, self.half_depth_m
@@ -95,11 +123,20 @@ class View:
         return TrainingView(color, depth_m, self.T_map_camera, self.usable(level), certainty, self.exposure)
 
     def usable(self, level: int) -> NDArray[np.bool_] | None:
-        """The mask of a level; None = all pixels."""
+        """The mask of a level; None = all pixels.
+
+        Args:
+            level: 0 = full size, 1 = half.
+        """
         return self.mask if level == 0 else self.half_mask
 
     def step_exposure(self, gradient: tuple[float, float], rate: float) -> None:
-        """One Adam step of (a, b)."""
+        """One Adam step of the exposure.
+
+        Args:
+            gradient: of the loss by (a, b).
+            rate: learning rate.
+        """
         self.exposure_steps += 1
         g = np.array(gradient)
         first, second = self.exposure_moments
@@ -110,26 +147,43 @@ class View:
         self.exposure = (float(a), float(b))
 
 
-def overlap(
-    depth_m: Image,
-    T_map_camera: NDArray[np.float64],
-    other_depth_m: Image,
-    T_map_other: NDArray[np.float64],
-    camera: PinholeCamera,
-    stride_px: int = 16,
-) -> float:
-    """Share of one view's measured pixels (every `stride_px`-th) that another view measured too.
+def view_overlap(view: View, other: View, camera: PinholeCamera, stride_px: int = 16) -> float:
+    """Share of one view's measured pixels that another view measured too.
 
     A pixel counts if its point projects into the other image and lies within 10 % of the depth measured there.
+
+    Args:
+        view: whose pixels are compared.
+        other: the other view.
+        camera: of both.
+        stride_px: every so many rows and columns, a pixel is compared.
     """
     first = stride_px // 2
-    z = depth_m[first::stride_px, first::stride_px].astype(np.float64)
+    z = view.depth_m[first::stride_px, first::stride_px].astype(np.float64)
     row, column = np.nonzero(z > 0)
-    points = projection.back_project(
-        camera, first + stride_px * column, first + stride_px * row, z[row, column]
-    )
-    seen = se3.transform(se3.inverse(T_map_other) @ T_map_camera, points)
-    return projection.overlap(seen, camera, depth_m=other_depth_m)
+    u, v = first + stride_px * column, first + stride_px * row
+    points = projection.back_project(camera, u, v, z[row, column])
+    seen = se3.transform(se3.inverse(other.T_map_camera) @ view.T_map_camera, points)
+    return projection.overlap(seen, camera, depth_m=other.depth_m)
+
+
+def first_exposure(
+    render: Render, color: Image, mask: NDArray[np.bool_] | None = None
+) -> tuple[float, float]:
+    """Log gain from the medians over the pixels that the map covers; the offset starts at zero.
+
+    Args:
+        render: of the map.
+        color: 0..1 [H, W, 3], of the view.
+        mask: bool [H, W], pixels that may be used; None = all.
+    """
+    covered = render.alpha > 0.9
+    if mask is not None:
+        covered &= mask
+    if np.count_nonzero(covered) < 1000:
+        return 0.0, 0.0
+    ratio = np.median(color[covered]) / max(float(np.median(render.color[covered])), 0.02)
+    return float(np.log(np.clip(ratio, 0.25, 4.0))), 0.0
 
 
 def _from_bytes(color: Bytes) -> Image:

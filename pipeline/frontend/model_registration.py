@@ -1,4 +1,4 @@
-"""Frames registered to the map: the second look at a frame that is no keyframe.
+"""Frames registered to the map: a second registration of frames that are no keyframes.
 
 Tracking registers a frame to one keyframe, whose depth image has the noise of one view. The map is made of all
 keyframes. Drawn where a frame was tracked, with the depth of one layer per pixel, it is a better reference
@@ -35,12 +35,19 @@ class ModelTracker:
         depth: DepthKind,
         camera: PinholeCamera,
         config: ModelConfig,
+        *,
         registration: RegistrationConfig,
         threads: int = 1,
     ) -> None:
-        """Args:
-        gaussians: in the map frame. depth: of a Gaussian at a pixel, as the map was made. camera: of the frames.
-        threads: of the rasterizer; changes no bit.
+        """Prepare the map.
+
+        Args:
+            gaussians: in the map frame.
+            depth: of a Gaussian at a pixel, as the map was made.
+            camera: of the frames.
+            config: how the map is drawn and when a frame is moved.
+            registration: settings of the registrations.
+            threads: of the rasterizer; changes no bit.
         """
         self.config, self._registration = config, registration
         self._gaussians, self._depth, self._full = gaussians, depth, camera
@@ -49,30 +56,32 @@ class ModelTracker:
             self._camera = self._camera.halved()
         self._levels = max(1, len(registration.iterations) - config.level)
         self._rasterizer = Rasterizer(threads=threads)
-        self._in_vain = 0  # frames in a row that gained nothing
+        self._unchanged = 0  # frames in a row that were not moved
 
     @property
-    def pays(self) -> bool:
-        """Whether some of the last frames gained; if none did, the others need not be tried."""
-        return self.config.enabled and self._in_vain < self.config.patience
+    def worthwhile(self) -> bool:
+        """Whether some of the last frames were moved; if none was, the others need not be tried."""
+        return self.config.enabled and self._unchanged < self.config.patience
 
-    def refine(self, tracked: TrackedFrame, frame: RgbdFrame, T_map_keyframe: Array) -> TrackedFrame:
-        """The frame where map and keyframe together say that it is, each by its information.
+    def register(self, tracked: TrackedFrame, frame: RgbdFrame, T_map_keyframe: Array) -> TrackedFrame:
+        """Register a frame to the map, with its tracked pose as the prior.
 
-        As tracked if the map knows that much less well: its errors are not all noise.
+        It stays as tracked if the map determines the pose much less well: its errors are not all noise.
 
         Its information stays that of tracking: map and frame share keyframes, so that adding would count them twice.
 
         Args:
-            tracked: not lost, and no keyframe. frame: its images. T_map_keyframe: [4, 4], of the keyframe it hangs on.
+            tracked: not lost, and no keyframe.
+            frame: its images.
+            T_map_keyframe: [4, 4], of the keyframe that it is anchored to.
         """
         found = self._register(frame, T_map_keyframe @ tracked.T_keyframe_camera, tracked.information)
         if not found.ok or _sigma_m(found.information) > self.config.max_sigma_ratio * _sigma_m(
             tracked.information
         ):
-            self._in_vain += 1
+            self._unchanged += 1
             return tracked
-        self._in_vain = 0
+        self._unchanged = 0
         return replace(tracked, T_keyframe_camera=tracked.T_keyframe_camera @ found.T_reference_target)
 
     def _register(self, frame: RgbdFrame, T_map_camera: Array, information: Array) -> Registration:
@@ -87,9 +96,11 @@ class ModelTracker:
         reference = Reference.from_pyramid(model, self.config.strides[: self._levels])
         image = frame.color * np.float32(1 / 255)
         levels = self._levels + self.config.level
-        seen = RgbdPyramid.build(image, frame.usable_depth, self._full, levels, frame.depth_sigma)
+        seen = RgbdPyramid.build(
+            image, frame.usable_depth, self._full, levels, depth_sigma_m=frame.depth_sigma
+        )
         target = RgbdPyramid(seen.levels[self.config.level :])
-        return register(reference, target, np.eye(4), self._registration, information)
+        return register(reference, target, np.eye(4), self._registration, prior_information=information)
 
 
 def _sigma_m(information: Array) -> float:

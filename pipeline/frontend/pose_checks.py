@@ -17,10 +17,6 @@ from duagc.pipeline.frontend.tracking_state import Candidate, CurrentFrame, Trac
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration.geometric_verification import features_agree
 
-FEATURES_TO_JUDGE = (
-    3  # times the inliers needed: a keyframe with fewer features cannot decide where a view is
-)
-
 
 class PoseCheck(Protocol):
     """One test of a candidate pose."""
@@ -64,7 +60,7 @@ class WellConstrained:
         # along weak directions a prior knows the pose, or the outcome would not be OK
         covariance = np.linalg.pinv(candidate.result.information, rcond=1e-12, hermitian=True)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-        if sigma_m <= state.config.tracking.failure.max_sigma_obstructed_m:
+        if sigma_m <= state.config.tracking.failure.max_sigma_occluded_m:
             return candidate
         occluded, _ = state.occlusion.judge(frame.pyramid.levels[-1], state.viewpoint(candidate))
         return Reason.OBSTRUCTED if occluded else candidate
@@ -100,7 +96,7 @@ class DepthColorConsistency:
 
     def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
         limits = state.config.tracking.failure
-        largest = limits.doubtful_gray_of_usual * state.usual_gray_rms
+        largest = limits.color_check_gray_of_usual * state.usual_gray_rms
         if state.last_good is None or not state.gray_rms or candidate.result.rms_gray <= largest:
             return candidate
         color_only = state.register_color(frame)
@@ -141,7 +137,7 @@ class RespectsFreeSpace:
         limits, keyframe = state.config.tracking.failure, state.keyframes[candidate.keyframe_index]
         T = candidate.result.T_reference_target
         violations, visible = free_space_violations(frame.pyramid.levels[-1], keyframe.coarsest, T, limits)
-        return Reason.OBSTRUCTED if violations > limits.max_intruders * visible else candidate
+        return Reason.OBSTRUCTED if violations > limits.max_free_space_violations * visible else candidate
 
 
 class WithinReach:
@@ -164,7 +160,7 @@ class FeaturesConfirm:
     def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
         limits, relocalization = state.config.tracking.failure, state.config.tracking.relocalization
         features = state.keyframes[candidate.keyframe_index].features
-        if len(features) >= FEATURES_TO_JUDGE * relocalization.min_inliers:
+        if len(features) >= limits.min_features_of_inliers * relocalization.min_inliers:
             T = candidate.result.T_reference_target
             return (
                 candidate

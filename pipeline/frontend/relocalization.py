@@ -104,7 +104,7 @@ class Relocalizer:
         index, last = before.candidate.keyframe_index, before.candidate.result.T_reference_target
         tracking = state.config.tracking
         result = register_until_stable(
-            state.keyframes[index], frame.pyramid, last, tracking, tracking.registration
+            state.keyframes[index], frame.pyramid, last, tracking, first=tracking.registration
         )
         candidate = Candidate(index, result)
         moved_m, _ = se3.distance(last, result.T_reference_target)
@@ -130,7 +130,7 @@ def find_place(state: TrackingState, frame: CurrentFrame) -> Candidate | None:
         frame.features, features, frame.frame_index, tracking.relocalization
     ):
         result = register_until_stable(
-            state.keyframes[index], frame.pyramid, guess, tracking, tracking.registration
+            state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
         )
         found = verify(PLAUSIBLE, state, frame, Candidate(index, result))
         if isinstance(found, Candidate):
@@ -157,11 +157,14 @@ def by_latest_keyframe(state: TrackingState, frame: CurrentFrame, found: Candida
         guess = se3.inverse(keyframe.T_map_keyframe) @ T_map_camera
         if predicted_overlap(keyframe.reference, frame.pyramid, guess) < limits.min_overlap:
             continue
-        result = register_until_stable(keyframe, frame.pyramid, guess, tracking, tracking.registration)
+        result = register_until_stable(keyframe, frame.pyramid, guess, tracking, first=tracking.registration)
         later = verify(PLAUSIBLE, state, frame, Candidate(keyframe.keyframe_index, result))
         if isinstance(later, Candidate):
             return later
-        if result.ok and se3.distance(guess, result.T_reference_target)[0] > limits.max_contradiction_m:
+        if (
+            result.ok
+            and se3.distance(guess, result.T_reference_target)[0] > limits.max_keyframe_disagreement_m
+        ):
             return None
         tried += 1
         if tried == limits.candidates:

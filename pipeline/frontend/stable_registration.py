@@ -13,8 +13,6 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Outcome, Registration, RegistrationConfig, RgbdPyramid, register
 
 Array = NDArray[np.float64]
-STABILITY_ROUNDS = 3
-STABLE_M, STABLE_RAD = 0.01, 0.01  # a registration that moves less from its own answer is stable
 
 
 def register_until_stable(
@@ -22,27 +20,32 @@ def register_until_stable(
     pyramid: RgbdPyramid,
     guess: Array,
     config: TrackingConfig,
+    *,
     first: RegistrationConfig,
 ) -> Registration:
     """Register a view to a keyframe; OK only if the usual registration, started from the answer, stays there.
 
-    Wide gates let wrong surfaces in, and a start too far away ends on the way. The brightness is brought to that
-    of the keyframe first.
+    Wide gates let wrong surfaces in, and from a start too far away a registration ends before the minimum. The
+    brightness is brought to that of the keyframe first.
 
     Args:
-        guess: T_keyframe_camera [4, 4]. first: of the first registration; those that follow are the usual ones.
+        keyframe: the keyframe.
+        pyramid: of the view.
+        guess: T_keyframe_camera [4, 4].
+        config: of tracking; its usual registration follows the first.
+        first: settings of the first registration.
     """
     gain, offset = _equalizing(pyramid, keyframe, config.equalize_from_gain)
     if gain != 1:
         pyramid = pyramid.with_exposure(gain, offset)
     result = register(keyframe.reference, pyramid, guess, first)
-    for _ in range(STABILITY_ROUNDS):
+    for _ in range(config.stable_rounds):
         if not result.ok:
             break
         before = result.T_reference_target
         result = register(keyframe.reference, pyramid, before, config.registration)
         moved_m, turned_rad = se3.distance(before, result.T_reference_target)
-        if moved_m < STABLE_M and turned_rad < STABLE_RAD:
+        if moved_m < config.stable_m and turned_rad < config.stable_rad:
             return _with_exposure(result, gain, offset)
     return replace(result, outcome=Outcome.JUMP) if result.ok else result
 

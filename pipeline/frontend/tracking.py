@@ -2,7 +2,7 @@
 
 Every frame is registered to the latest keyframe from a constant-velocity guess, and the result is checked. If that
 fails, it is tried again from other starts and with wider gates. If all fail the frame is `lost`, with the reason in the
-log. A lost camera is searched for where it was last, and among all keyframes by features; a place found that way counts
+log. A lost camera is searched for where it was last, and among all keyframes by features; such a place counts
 only when the next frame agrees.
 """
 
@@ -24,7 +24,7 @@ from duagc.pipeline.frontend.pose_checks import FOLLOWED, PLAUSIBLE, DepthColorC
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.stable_registration import register_until_stable
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
-from duagc.pipeline.frontend.tracking_state import GRAY_RMS_FRAMES, Candidate, CurrentFrame, TrackingState
+from duagc.pipeline.frontend.tracking_state import Candidate, CurrentFrame, TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.posegraph.relative_poses import RelativePose
@@ -98,7 +98,9 @@ class Tracker:
             depth_m = np.where(mask, depth_m, 0)
         state.intervals.update(stamp_ns)
         state.lost = state.lost or state.is_after_gap(stamp_ns)
-        pyramid = RgbdPyramid.build(image, depth_m, self.camera, len(tracking.strides), depth_sigma_m)
+        pyramid = RgbdPyramid.build(
+            image, depth_m, self.camera, len(tracking.strides), depth_sigma_m=depth_sigma_m
+        )
         frame = CurrentFrame(frame_index, stamp_ns, pyramid, tracking.relocalization)
         missing = self._missing_image(frame)
         if missing is Reason.NONE and not state.keyframes:
@@ -159,7 +161,7 @@ class Tracker:
             frame.pyramid,
             predicted.T_keyframe_camera,
             depth_only,
-            predicted.information,
+            prior_information=predicted.information,
         )
         return (
             Candidate(state.keyframe_index, result, Reason.FROZEN_COLOR) if result.ok else Reason.FROZEN_COLOR
@@ -188,11 +190,17 @@ class Tracker:
             for start in starts:
                 information = predicted.information if start is predicted.T_keyframe_camera else None
                 result = register(
-                    state.keyframe.reference, frame.pyramid, start, tracking.registration, information
+                    state.keyframe.reference,
+                    frame.pyramid,
+                    start,
+                    tracking.registration,
+                    prior_information=information,
                 )
                 yield Candidate(index, result), FOLLOWED
         for start in starts:
-            result = register_until_stable(state.keyframe, frame.pyramid, start, tracking, tracking.recovery)
+            result = register_until_stable(
+                state.keyframe, frame.pyramid, start, tracking, first=tracking.recovery
+            )
             yield Candidate(index, result), _FOUND_NEARBY
 
     # --- update ---------------------------------------------------------------------------------------------------
@@ -268,7 +276,8 @@ class Tracker:
         state.stamp_ns, state.lost = frame.stamp_ns, False
         self._relocalizer.reset()
         if followed and found.without is Reason.NONE:
-            state.gray_rms = [*state.gray_rms[1 - GRAY_RMS_FRAMES :], result.rms_gray]
+            frames = state.config.tracking.failure.usual_frames
+            state.gray_rms = [*state.gray_rms[1 - frames :], result.rms_gray]
 
     def _update_view(self, frame: CurrentFrame, found: Candidate) -> None:
         """What is in front of the camera, by a frame with depth and color; and the last good frame."""

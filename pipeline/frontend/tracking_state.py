@@ -26,8 +26,6 @@ from duagc.pipeline.registration import Registration, RgbdPyramid
 from duagc.pipeline.registration.features import Features, extract_from_pyramid
 
 Array = NDArray[np.float64]
-GRAY_RMS_FRAMES = 50  # frames whose gray residuals make the usual one
-GAP_INTERVALS = 3  # median intervals between frames that make a gap
 
 
 @dataclass(frozen=True)
@@ -107,10 +105,13 @@ class TrackingState:
         velocity: [6], right tangent per second, of the two frames before; zero after a loss.
         lost: whether the last frame has no pose.
         gray_rms: gray residuals of the last frames that were followed.
-        depth_color_inconsistent: whether depth and color disagreed, and nothing has settled it since.
+        depth_color_inconsistent: whether depth and color disagreed, and nothing has resolved it since.
         frames_without_depth: in a row, up to the current one.
         frames_without_color: the same for color.
         last_good: the last frame with depth and color and nothing in front of it.
+        intervals: between frames.
+        frozen: detects frozen images.
+        occlusion: detects objects in front of the camera.
     """
 
     config: FrontendConfig
@@ -127,11 +128,12 @@ class TrackingState:
     frames_without_depth: int = 0
     frames_without_color: int = 0
     last_good: LastGoodFrame | None = None
-    intervals: FrameIntervals = field(default_factory=FrameIntervals)
+    intervals: FrameIntervals = field(init=False)
     frozen: FrozenImageDetector = field(init=False)
     occlusion: OcclusionDetector = field(init=False)
 
     def __post_init__(self) -> None:
+        self.intervals = FrameIntervals(self.config.tracking.failure.interval_frames)
         self.frozen = FrozenImageDetector(self.config.tracking.failure)
         self.occlusion = OcclusionDetector(self.config.tracking.failure)
 
@@ -148,8 +150,8 @@ class TrackingState:
             keyframes=list(self.keyframes),
             pairs=list(self.pairs),
             gray_rms=list(self.gray_rms),
-            intervals=copy.copy(self.intervals),
         )
+        other.intervals = copy.copy(self.intervals)
         other.frozen, other.occlusion = copy.copy(self.frozen), copy.copy(self.occlusion)
         other.frozen.config = other.occlusion.config = config.tracking.failure
         return other
@@ -207,7 +209,10 @@ class TrackingState:
         Args:
             stamp_ns: now.
         """
-        longest_s = max(self.config.tracking.max_extrapolation_s, GAP_INTERVALS * self.intervals.median_s)
+        failure = self.config.tracking.failure
+        longest_s = max(
+            self.config.tracking.max_extrapolation_s, failure.gap_intervals * self.intervals.median_s
+        )
         if not self.keyframes or self.elapsed_s(stamp_ns) <= longest_s:
             return False
         motion = self.motion.between(self.stamp_ns, stamp_ns) if self.motion is not None else None

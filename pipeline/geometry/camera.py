@@ -8,7 +8,16 @@ from numpy.typing import ArrayLike, NDArray
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """Intrinsics in pixels of an undistorted camera; cx, cy count from the center of the first pixel."""
+    """Intrinsics of an undistorted camera.
+
+    Attributes:
+        width: of the image, pixels.
+        height: of the image, pixels.
+        fx: focal length, pixels.
+        fy: focal length, pixels.
+        cx: principal point, pixels from the center of the first one.
+        cy: principal point, pixels from the center of the first one.
+    """
 
     width: int
     height: int
@@ -33,7 +42,12 @@ class PinholeCamera:
         )
 
     def scaled(self, width: int, height: int) -> "PinholeCamera":
-        """The camera of the same view resampled to another size in pixels."""
+        """The camera of the same view resampled to another size in pixels.
+
+        Args:
+            width: of the new image, pixels.
+            height: of the new image, pixels.
+        """
         sx, sy = width / self.width, height / self.height
         return PinholeCamera(
             width,
@@ -49,17 +63,30 @@ class PinholeCamera:
         return self.rays_at(*np.meshgrid(np.arange(self.width), np.arange(self.height)))
 
     def rays_at(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
-        """Rays [..., 3] with z = 1, camera frame, of pixels: columns u [...] and rows v [...], between centers, too."""
+        """Rays [..., 3] with z = 1, camera frame, of pixels, also between their centers.
+
+        Args:
+            u: columns [...].
+            v: rows [...].
+        """
         x, y = (np.asarray(u) - self.cx) / self.fx, (np.asarray(v) - self.cy) / self.fy
         return np.stack([x, y, np.ones(np.shape(x))], axis=-1)
 
     def project(self, points_camera: ArrayLike) -> NDArray[np.float64]:
-        """Pixels [..., 2] of points [..., 3] with z > 0 in the camera frame."""
+        """Pixels [..., 2] of points.
+
+        Args:
+            points_camera: [..., 3] with z > 0, meters, camera frame.
+        """
         p = np.asarray(points_camera, dtype=np.float64)
         return np.stack(
             [self.fx * p[..., 0] / p[..., 2] + self.cx, self.fy * p[..., 1] / p[..., 2] + self.cy], axis=-1
         )
 
     def back_project(self, depth_m: ArrayLike) -> NDArray[np.float64]:
-        """Points [height, width, 3] in the camera frame of a depth image [height, width] (z, not range)."""
+        """Points [height, width, 3] in the camera frame of a depth image.
+
+        Args:
+            depth_m: [height, width], meters along z (not range).
+        """
         return self.rays() * np.asarray(depth_m, dtype=np.float64)[..., None]

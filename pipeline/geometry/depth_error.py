@@ -20,5 +20,11 @@ FARTHEST_M = 100.0  # a correction that puts a depth farther away, or behind the
 
 
 def terms(inverse: Array, x: Array, y: Array) -> Array:
-    """What the coefficients are multiplied by, [..., 6], for measured 1/z [...] at rays (x, y, 1)."""
+    """The terms [..., 6] that the coefficients multiply.
+
+    Args:
+        inverse: measured 1/z, [...].
+        x: of the ray (x, y, 1), [...].
+        y: of the ray, [...].
+    """
     return np.stack([1 - NO_ERROR_M * inverse, x, y, x * x, x * y, y * y], axis=-1)

@@ -96,7 +96,7 @@ def overlap(
 
 
 def free_space(
-    points_camera: Array, nearest: Image, camera: PinholeCamera, gate_m: float, gate_relative: float
+    points_camera: Array, nearest: Image, camera: PinholeCamera, *, gate_m: float, gate_relative: float
 ) -> tuple[Indices, NDArray[np.int8]]:
     """Where points are, as far as a view can judge it: in space that it saw to be free, on a surface, or hidden.
 
@@ -122,7 +122,11 @@ def free_space(
 
 
 def largest_of_3x3(image: Image) -> Image:
-    """Maximum over every pixel's 3x3 neighborhood."""
+    """Maximum over every pixel's 3x3 neighborhood.
+
+    Args:
+        image: [h, w].
+    """
     padded = np.pad(image, 1)
     rows = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
     return np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])

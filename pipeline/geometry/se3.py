@@ -9,7 +9,12 @@ Array = NDArray[np.float64]
 
 
 def from_rotation_translation(R: ArrayLike, t: ArrayLike) -> Array:
-    """Matrix [..., 4, 4] of a rotation [..., 3, 3] and a translation [..., 3]."""
+    """Matrix [..., 4, 4] of a rotation and a translation.
+
+    Args:
+        R: rotation [..., 3, 3].
+        t: translation [..., 3].
+    """
     R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
     T = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
@@ -17,19 +22,33 @@ def from_rotation_translation(R: ArrayLike, t: ArrayLike) -> Array:
 
 
 def from_quat_translation(quat_wxyz: ArrayLike, t: ArrayLike) -> Array:
-    """Matrix [..., 4, 4] of a quaternion wxyz [..., 4] and a translation [..., 3]."""
+    """Matrix [..., 4, 4] of a quaternion and a translation.
+
+    Args:
+        quat_wxyz: [..., 4].
+        t: translation [..., 3].
+    """
     return from_rotation_translation(so3.from_quat_wxyz(quat_wxyz), t)
 
 
 def inverse(T: ArrayLike) -> Array:
-    """Inverse [..., 4, 4]: T_b_a of T_a_b."""
+    """Inverse [..., 4, 4]: T_b_a of T_a_b.
+
+    Args:
+        T: [..., 4, 4], T_a_b.
+    """
     T = np.asarray(T, dtype=np.float64)
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
     return from_rotation_translation(Rt, -(Rt @ T[..., :3, 3:])[..., 0])
 
 
 def transform(T_a_b: ArrayLike, points_b: ArrayLike) -> Array:
-    """Points [..., n, 3] of frame b in frame a."""
+    """Points of frame b in frame a, [..., n, 3].
+
+    Args:
+        T_a_b: [..., 4, 4].
+        points_b: [..., n, 3].
+    """
     T = np.asarray(T_a_b, dtype=np.float64)
     return np.asarray(points_b) @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
 
@@ -47,14 +66,22 @@ def _left_jacobian(w: Array) -> Array:
 
 
 def exp(xi: ArrayLike) -> Array:
-    """Motion [..., 4, 4] of a tangent [..., 6] (translation, rotation)."""
+    """Motion [..., 4, 4] of a tangent.
+
+    Args:
+        xi: [..., 6], translation and rotation.
+    """
     xi = np.asarray(xi, dtype=np.float64)
     v, w = xi[..., :3], xi[..., 3:]
     return from_rotation_translation(so3.exp(w), (_left_jacobian(w) @ v[..., None])[..., 0])
 
 
 def log(T: ArrayLike) -> Array:
-    """Tangent [..., 6] (translation, rotation) of a motion [..., 4, 4]."""
+    """Tangent [..., 6] (translation, rotation) of a motion.
+
+    Args:
+        T: [..., 4, 4].
+    """
     T = np.asarray(T, dtype=np.float64)
     w = so3.log(T[..., :3, :3])
     v = np.linalg.solve(_left_jacobian(w), T[..., :3, 3:])[..., 0]
@@ -62,7 +89,11 @@ def log(T: ArrayLike) -> Array:
 
 
 def adjoint(T: ArrayLike) -> Array:
-    """Ad(T) [..., 6, 6] in (translation, rotation) order: T exp(xi) T^-1 = exp(Ad(T) xi)."""
+    """Ad(T) [..., 6, 6] in (translation, rotation) order: T exp(xi) T^-1 = exp(Ad(T) xi).
+
+    Args:
+        T: [..., 4, 4].
+    """
     T = np.asarray(T, dtype=np.float64)
     R = T[..., :3, :3]
     out = np.zeros((*T.shape[:-2], 6, 6))
@@ -84,6 +115,11 @@ def inverse_information(T_a_b: Array, information: Array) -> Array:
 
 
 def distance(T_a: ArrayLike, T_b: ArrayLike) -> tuple[Array, Array]:
-    """Translation (m) and rotation (rad) between two motions [..., 4, 4], of shape [...]."""
+    """Translation (m) and rotation (rad) between two motions, [...] each.
+
+    Args:
+        T_a: [..., 4, 4].
+        T_b: [..., 4, 4].
+    """
     D = inverse(T_a) @ np.asarray(T_b, dtype=np.float64)
     return np.linalg.norm(D[..., :3, 3], axis=-1), np.linalg.norm(so3.log(D[..., :3, :3]), axis=-1)

@@ -8,7 +8,11 @@ SMALL_ANGLE_RAD = 1e-4
 
 
 def hat(w: ArrayLike) -> Array:
-    """Skew matrix [..., 3, 3] of a vector [..., 3]: hat(w) @ v = w x v."""
+    """Skew matrix [..., 3, 3] of a vector: hat(w) @ v = w x v.
+
+    Args:
+        w: [..., 3].
+    """
     w = np.asarray(w, dtype=np.float64)
     out = np.zeros((*w.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
@@ -17,13 +21,21 @@ def hat(w: ArrayLike) -> Array:
 
 
 def exp(w: ArrayLike) -> Array:
-    """Rotation matrix [..., 3, 3] of a rotation vector [..., 3] in radians (Rodrigues)."""
+    """Rotation matrix [..., 3, 3] of a rotation vector (Rodrigues).
+
+    Args:
+        w: [..., 3], radians.
+    """
     w = np.asarray(w, dtype=np.float64)
     return from_quat_wxyz(quat_from_rotvec(w))
 
 
 def log(R: ArrayLike) -> Array:
-    """Rotation vector [..., 3] in radians, of length at most pi, of a rotation matrix [..., 3, 3]."""
+    """Rotation vector [..., 3] in radians, of length at most pi, of a rotation matrix.
+
+    Args:
+        R: [..., 3, 3].
+    """
     q = to_quat_wxyz(R)
     norm = np.linalg.norm(q[..., 1:], axis=-1)
     angle = 2.0 * np.arctan2(norm, q[..., 0])
@@ -32,7 +44,11 @@ def log(R: ArrayLike) -> Array:
 
 
 def quat_from_rotvec(w: ArrayLike) -> Array:
-    """Unit quaternion wxyz [..., 4] of a rotation vector [..., 3]."""
+    """Unit quaternion wxyz [..., 4] of a rotation vector.
+
+    Args:
+        w: [..., 3], radians.
+    """
     w = np.asarray(w, dtype=np.float64)
     angle = np.linalg.norm(w, axis=-1)
     half = 0.5 * angle
@@ -42,7 +58,11 @@ def quat_from_rotvec(w: ArrayLike) -> Array:
 
 
 def from_quat_wxyz(q: ArrayLike) -> Array:
-    """Rotation matrix [..., 3, 3] of a quaternion wxyz [..., 4] of any non-zero length."""
+    """Rotation matrix [..., 3, 3] of a quaternion.
+
+    Args:
+        q: [..., 4], of any non-zero length.
+    """
     q = np.asarray(q, dtype=np.float64)
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     rows = [
@@ -54,7 +74,11 @@ def from_quat_wxyz(q: ArrayLike) -> Array:
 
 
 def to_quat_wxyz(R: ArrayLike) -> Array:
-    """Unit quaternion wxyz [..., 4] with w >= 0 of a rotation matrix [..., 3, 3] (largest-component rule)."""
+    """Unit quaternion wxyz [..., 4] with w >= 0 of a rotation matrix (largest-component rule).
+
+    Args:
+        R: [..., 3, 3].
+    """
     R = np.asarray(R, dtype=np.float64)
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     squares = 1.0 + np.stack([xx + yy + zz, xx - yy - zz, yy - xx - zz, zz - xx - yy], axis=-1)
@@ -76,7 +100,12 @@ def to_quat_wxyz(R: ArrayLike) -> Array:
 
 
 def multiply_quat_wxyz(a: ArrayLike, b: ArrayLike) -> Array:
-    """Quaternion product a * b, wxyz [..., 4]; its rotation is R(a) @ R(b)."""
+    """Quaternion product a * b, wxyz [..., 4]; its rotation is R(a) @ R(b).
+
+    Args:
+        a: [..., 4].
+        b: [..., 4].
+    """
     a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     aw, ax, ay, az = np.moveaxis(a, -1, 0)
     bw, bx, by, bz = np.moveaxis(b, -1, 0)
@@ -92,7 +121,11 @@ def multiply_quat_wxyz(a: ArrayLike, b: ArrayLike) -> Array:
 
 
 def project(M: ArrayLike) -> Array:
-    """Nearest rotation [..., 3, 3] in the Frobenius norm to a matrix [..., 3, 3]."""
+    """Nearest rotation [..., 3, 3] in the Frobenius norm to a matrix.
+
+    Args:
+        M: [..., 3, 3].
+    """
     U, _, Vt = np.linalg.svd(np.asarray(M, dtype=np.float64))
     U[..., :, -1] *= np.linalg.det(U @ Vt)[..., None]
     return U @ Vt

@@ -17,12 +17,20 @@ _WEIGHT = np.array([1, 1, 1, SQRT2, SQRT2, SQRT2])
 
 
 def sym_to_vec(S: ArrayLike) -> Array:
-    """6-vector [..., 6] of a symmetric matrix [..., 3, 3]."""
+    """6-vector [..., 6] of a symmetric matrix.
+
+    Args:
+        S: [..., 3, 3].
+    """
     return np.asarray(S, dtype=np.float64)[..., _ROW, _COLUMN] * _WEIGHT
 
 
 def vec_to_sym(v: ArrayLike) -> Array:
-    """Symmetric matrix [..., 3, 3] of a 6-vector [..., 6]."""
+    """Symmetric matrix [..., 3, 3] of a 6-vector.
+
+    Args:
+        v: [..., 6].
+    """
     entries = np.asarray(v, dtype=np.float64) / _WEIGHT
     S = np.empty((*entries.shape[:-1], 3, 3))
     S[..., _ROW, _COLUMN] = entries
@@ -31,7 +39,11 @@ def vec_to_sym(v: ArrayLike) -> Array:
 
 
 def sym_rotation(R: ArrayLike) -> Array:
-    """D(R) [..., 6, 6] with vec(R S R^T) = D(R) vec(S); orthogonal when R is."""
+    """D(R) [..., 6, 6] with vec(R S R^T) = D(R) vec(S); orthogonal when R is.
+
+    Args:
+        R: [..., 3, 3].
+    """
     R = np.asarray(R, dtype=np.float64)
     basis = vec_to_sym(np.eye(6))
     rotated = R[..., None, :, :] @ basis @ np.swapaxes(R, -1, -2)[..., None, :, :]
@@ -39,14 +51,23 @@ def sym_rotation(R: ArrayLike) -> Array:
 
 
 def log_covariance(quats_wxyz: ArrayLike, log_scales: ArrayLike) -> Array:
-    """vec log Sigma [..., 6] of Sigma = R diag(exp 2 s) R^T, scales in meters."""
+    """vec log Sigma [..., 6] of Sigma = R diag(exp 2 s) R^T.
+
+    Args:
+        quats_wxyz: [..., 4], of R.
+        log_scales: [..., 3], s, of meters.
+    """
     R = so3.from_quat_wxyz(quats_wxyz)
     s = np.asarray(log_scales, dtype=np.float64)
     return sym_to_vec((R * (2.0 * s)[..., None, :]) @ np.swapaxes(R, -1, -2))
 
 
 def from_log_covariance(vec_log: ArrayLike) -> tuple[Array, Array]:
-    """Quaternion wxyz [..., 4] and log-scales [..., 3], descending, of vec log Sigma [..., 6]."""
+    """Quaternion wxyz [..., 4] and log-scales [..., 3], descending, of vec log Sigma.
+
+    Args:
+        vec_log: [..., 6].
+    """
     values, vectors = np.linalg.eigh(vec_to_sym(vec_log))
     vectors = vectors[..., ::-1].copy()
     vectors[..., :, 2] *= np.linalg.det(vectors)[..., None]

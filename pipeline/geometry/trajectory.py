@@ -17,7 +17,9 @@ Array = NDArray[np.float64]
 class Trajectory:
     """Poses of one body over time.
 
-    stamps_ns: int64 [n], strictly increasing. poses: T_reference_body float64 [n, 4, 4].
+    Attributes:
+        stamps_ns: int64 [n], strictly increasing.
+        poses: T_reference_body float64 [n, 4, 4].
     """
 
     stamps_ns: NDArray[np.int64]

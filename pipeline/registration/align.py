@@ -90,6 +90,7 @@ def register(
     pyramid: RgbdPyramid,
     T_reference_target_guess: Array,
     config: RegistrationConfig | None = None,
+    *,
     prior_information: Array | None = None,
 ) -> Registration:
     """Register a target view to a reference.
@@ -108,15 +109,24 @@ def register(
     """
     config = config or RegistrationConfig()
     guess = _orthonormal(np.asarray(T_reference_target_guess, dtype=np.float64))
-    T, exposure, system = _minimize(reference, pyramid, guess, config, prior_information, _ALL_DIRECTIONS)
+    T, exposure, system = _minimize(
+        reference, pyramid, guess, config, prior_information=prior_information, projection=_ALL_DIRECTIONS
+    )
     found = _Determined.by(system, config)
     if len(found.weak) and system.agreeing >= config.min_samples:
         # once more without the weak directions: what was found along them is noise
         T, exposure, system = _minimize(
-            reference, pyramid, guess, config, prior_information, found.projection
+            reference,
+            pyramid,
+            guess,
+            config,
+            prior_information=prior_information,
+            projection=found.projection,
         )
         found = _Determined.by(system, config).without(found)
-    return _judge(system, found, T, guess, exposure, config, prior_information)
+    return _judge(
+        system, found, T, guess, exposure=exposure, config=config, prior_information=prior_information
+    )
 
 
 def linearize(
@@ -124,6 +134,7 @@ def linearize(
     pyramid: RgbdPyramid,
     T_reference_target: Array,
     exposure: tuple[float, float] = (1.0, 0.0),
+    *,
     config: RegistrationConfig | None = None,
     level: int = 0,
 ) -> Registration:
@@ -144,10 +155,13 @@ def linearize(
     config = config or RegistrationConfig()
     T = _orthonormal(np.asarray(T_reference_target, dtype=np.float64))
     start = np.array(exposure)
-    system = linearize_at(reference, pyramid, level, T, start, config)
+    system = linearize_at(reference, pyramid, level, T, exposure=start, config=config)
     found = _Determined.by(system, config)
-    step = _step(system, T, T, None, found.projection)
-    return _judge(system, found, T @ se3.exp(step[:6]), T, start + step[6:], config, None)
+    step = _step(system, T, T, None, projection=found.projection)
+    T_minimum, exposure_minimum = T @ se3.exp(step[:6]), start + step[6:]
+    return _judge(
+        system, found, T_minimum, T, exposure=exposure_minimum, config=config, prior_information=None
+    )
 
 
 _ALL_DIRECTIONS = np.eye(6)
@@ -158,6 +172,7 @@ def _minimize(
     pyramid: RgbdPyramid,
     guess: Array,
     config: RegistrationConfig,
+    *,
     prior_information: Array | None,
     projection: Array,
 ) -> tuple[Array, Array, Linearization]:
@@ -169,15 +184,15 @@ def _minimize(
     levels = min(len(pyramid.levels), len(config.iterations), len(reference.levels))
     for index in reversed(range(levels)):
         for _ in range(config.iterations[index]):
-            system = linearize_at(reference, pyramid, index, T, exposure, config)
+            system = linearize_at(reference, pyramid, index, T, exposure=exposure, config=config)
             if system.agreeing < config.min_samples:
                 break
-            step = _step(system, T, guess, prior_information, projection)
+            step = _step(system, T, guess, prior_information, projection=projection)
             T = _orthonormal(T @ se3.exp(step[:6]))
             exposure = exposure + step[6:]
             if np.max(np.abs(step[:6])) < (STEP_TOLERANCE if index == 0 else STEP_TOLERANCE_COARSE):
                 break
-    return T, exposure, linearize_at(reference, pyramid, 0, T, exposure, config)
+    return T, exposure, linearize_at(reference, pyramid, 0, T, exposure=exposure, config=config)
 
 
 def _orthonormal(T: Array) -> Array:
@@ -186,7 +201,7 @@ def _orthonormal(T: Array) -> Array:
 
 
 def _step(
-    system: Linearization, T: Array, guess: Array, prior_information: Array | None, projection: Array
+    system: Linearization, T: Array, guess: Array, prior_information: Array | None, *, projection: Array
 ) -> Array:
     """Gauss-Newton step [8], slightly damped, limited to 0.3 m and 0.3 rad."""
     H, gradient = system.normal_equations()
@@ -231,6 +246,7 @@ class _Determined:
 
     @staticmethod
     def by(system: Linearization, config: RegistrationConfig) -> _Determined:
+        """From the residuals, by the limits of a configuration."""
         H, _ = system.normal_equations()
         overconfidence = _overconfidence(system, H)
         # the brightness was estimated with the pose: its uncertainty is the pose's too (Schur complement)
@@ -272,6 +288,7 @@ def _judge(
     found: _Determined,
     T: Array,
     guess: Array,
+    *,
     exposure: Array,
     config: RegistrationConfig,
     prior_information: Array | None,

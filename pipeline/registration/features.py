@@ -157,7 +157,7 @@ def fit(points_a: Array, points_b: Array) -> Array:
 
 
 def ransac(
-    points_a: Array, points_b: Array, inlier_m: float, hypotheses: int, rng: np.random.Generator
+    points_a: Array, points_b: Array, *, inlier_m: float, hypotheses: int, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.bool_]]:
     """The motion that most matched points agree on.
 

@@ -112,7 +112,9 @@ def motion_from_features(
         return FeatureMotion(None, len(pairs), 0, config.min_inliers)
     points_first = first.points[pairs[:, 0]].astype(np.float64)
     points_second = second.points[pairs[:, 1]].astype(np.float64)
-    T, agree = ransac(points_first, points_second, config.inlier_m, config.hypotheses, rng)
+    T, agree = ransac(
+        points_first, points_second, inlier_m=config.inlier_m, hypotheses=config.hypotheses, rng=rng
+    )
     return FeatureMotion(T, len(pairs), int(agree.sum()), _inliers_needed(len(pairs), config))
 
 
@@ -139,6 +141,7 @@ def verify(
     first: VerificationView,
     second: VerificationView,
     config: GeometricVerificationConfig,
+    *,
     registration: RegistrationConfig,
     rng: np.random.Generator,
 ) -> GeometricVerification:
@@ -190,7 +193,9 @@ def verify(
     moved_m, moved_rad = (float(d) for d in se3.distance(guess, T))
     far = moved_m > config.max_refinement_m or moved_rad > config.max_refinement_rad
     failure = Failure.FAR_FROM_FEATURES if far else None
-    return GeometricVerification(failure, found, result, T, information, moved_m, moved_rad)
+    return GeometricVerification(
+        failure, found, result, T, information, correction_m=moved_m, correction_rad=moved_rad
+    )
 
 
 def _inliers_needed(count: int, config: GeometricVerificationConfig) -> int:

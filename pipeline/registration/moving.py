@@ -71,8 +71,13 @@ class FreeSpace:
         points_map = se3.transform(view.T_map_camera, back_project(self._small, u, v, z))
         for other in self._nearest(view):
             points = se3.transform(se3.inverse(other.T_map_camera), points_map)
-            gates = self.config.gate_m, self.config.gate_relative
-            seen, where = free_space(points, other.nearest, self._small, *gates)
+            seen, where = free_space(
+                points,
+                other.nearest,
+                self._small,
+                gate_m=self.config.gate_m,
+                gate_relative=self.config.gate_relative,
+            )
             through[seen] += where == FREE
             there[seen] += where == ON_SURFACE
         found = np.zeros(view.inverse_depth.shape, bool)

@@ -137,6 +137,7 @@ class RgbdPyramid:
         depth_m: Image,
         camera: PinholeCamera,
         levels: int = 3,
+        *,
         depth_sigma_m: Image | None = None,
     ) -> RgbdPyramid:
         """Build the pyramid of a frame.

@@ -103,6 +103,7 @@ def linearize_at(
     pyramid: RgbdPyramid,
     index: int,
     T_reference_target: Array,
+    *,
     exposure: Array,
     config: RegistrationConfig,
 ) -> Linearization:
@@ -140,7 +141,7 @@ def linearize_at(
         free = off >= gate
     m = T_target_reference[:3, :3] @ samples.normals[seen].T
     if config.normal_gate_rad > 0:
-        agree &= _normals_agree(level, u, v, m, config.normal_gate_rad)
+        agree &= _normals_agree(level, u, v, m, limit_rad=config.normal_gate_rad)
     agreeing = np.flatnonzero(agree)
     conflicts, judged = int(free.sum()), int(np.isfinite(z).sum())
     total = len(samples) - (len(seen) - judged)
@@ -155,12 +156,14 @@ def linearize_at(
         # of two views alike it stays the same, as that of the model
         sigma = np.sqrt(np.float32(0.5) * (sigma**2 + samples.depth_sigmas[seen[agreeing]] ** 2))
     floor = config.depth_sigma_floor * 4.0**index
-    depth = _depth_residuals(surface, q, m, sigma, floor, (u, v), config)
+    depth = _depth_residuals(surface, q, m, sigma, floor=floor, pixels=(u, v), config=config)
     if not level.has_depth:
         depth = depth.nothing()
     floor = max(config.gray_sigma_floor, config.gray_sigma_of_depth * depth.scale)
     images = gray, gu, gv
-    photometric = _gray_residuals(camera, images, intensities, q, exposure, floor, (u, v), config)
+    photometric = _gray_residuals(
+        camera, images, intensities, q, exposure=exposure, floor=floor, pixels=(u, v), config=config
+    )
     return Linearization(
         depth.nothing() if config.residuals == "gray" else depth,
         photometric.nothing() if config.residuals == "depth" else photometric,
@@ -188,7 +191,7 @@ def _interpolate(level: Level, u: Floats, v: Floats) -> tuple[Floats, ...]:
 
 
 def _normals_agree(
-    level: Level, u: Floats, v: Floats, normals: Floats, limit_rad: float
+    level: Level, u: Floats, v: Floats, normals: Floats, *, limit_rad: float
 ) -> NDArray[np.bool_]:
     """Whether normals [3, n] are within the limit of the target's at the nearest pixels; unknown ones do not agree."""
     nearest = (v + np.float32(0.5)).astype(np.int32) * level.camera.width + (u + np.float32(0.5)).astype(
@@ -213,6 +216,7 @@ def _depth_residuals(
     q: Floats,
     m: Floats,
     sigma: Floats,
+    *,
     floor: float,
     pixels: tuple[Floats, Floats],
     config: RegistrationConfig,
@@ -222,7 +226,7 @@ def _depth_residuals(
     J[:, 0], J[:, 1], J[:, 2] = m / sigma
     J[:, 3], J[:, 4], J[:, 5] = _cross(surface, m) / sigma
     residual = np.sum(m * (surface - q), axis=0) / sigma
-    return _weighted(J, residual, floor, config.huber_sigmas, pixels)
+    return _weighted(J, residual, floor=floor, huber_sigmas=config.huber_sigmas, pixels=pixels)
 
 
 def _gray_residuals(
@@ -230,6 +234,7 @@ def _gray_residuals(
     images: tuple[Floats, Floats, Floats],
     intensities: Floats,
     q: Floats,
+    *,
     exposure: Array,
     floor: float,
     pixels: tuple[Floats, Floats],
@@ -248,7 +253,7 @@ def _gray_residuals(
     J[:, 3], J[:, 4], J[:, 5] = -_cross(q, d)
     J[:, 6], J[:, 7] = -intensities, -1
     residual = gray - (np.float32(exposure[0]) * intensities + np.float32(exposure[1]))
-    return _weighted(J, residual, floor, config.huber_sigmas, pixels)
+    return _weighted(J, residual, floor=floor, huber_sigmas=config.huber_sigmas, pixels=pixels)
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
@@ -257,7 +262,7 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def _weighted(
-    J: Floats, residual: Floats, floor: float, huber_sigmas: float, pixels: tuple[Floats, Floats]
+    J: Floats, residual: Floats, *, floor: float, huber_sigmas: float, pixels: tuple[Floats, Floats]
 ) -> Residuals:
     """Scale by the median absolute deviation, weights by Huber: w = 1 / (scale^2 max(1, |r| / (k scale)))."""
     magnitude = np.abs(residual)

@@ -1,4 +1,4 @@
-"""Cameras that are known, estimated from what they see; and recordings that do not say enough."""
+"""Cameras that are known, estimated from what they see; and recordings that do not determine them."""
 
 import json
 import tomllib
@@ -168,14 +168,14 @@ def test_noise_of_depth_pushes_no_coefficient() -> None:
 
 
 def test_known_cameras_are_found(views: Views) -> None:
-    """From one walk through the room within what their standard deviations say; and they hold on another walk."""
+    """From one walk through the room within their standard deviations; and they hold on another walk."""
     found = adjust([make_views(1)], Rig.of(CAMERA), True)
     assert found.covariance is not None
     sigma = np.sqrt(np.diag(found.covariance))
     off = np.abs(found.rig.values() - TRUE.values())
     for name, value, limit in zip(NAMES, off, np.maximum(4 * sigma, 1e-3), strict=True):
         assert value < limit, name
-    # what the numbers say together is known much better than each
+    # the numbers together are known much better than each
     p = np.column_stack([np.random.default_rng(0).uniform(-0.45, 0.45, (200, 2)), np.ones(200)])
     true = TRUE.project(p @ TRUE.R_color_depth.T)[0]
     moved = found.rig.project(p @ found.rig.R_color_depth.T)[0] - true
@@ -243,7 +243,7 @@ def test_a_wall_without_texture_is_refused(tmp_path: Path) -> None:
     ):
         calibrate(folder, FrontendConfig(), [])
     pixels, descriptors = [np.zeros((0, 2))] * 2, [np.zeros((0, 128), np.uint8)] * 2
-    found = _landmarks(pixels, descriptors, [np.zeros(0)] * 2, CAMERA, np.array([np.eye(4)] * 2))
+    found = _landmarks(pixels, descriptors, [np.zeros(0)] * 2, camera=CAMERA, T=np.array([np.eye(4)] * 2))
     assert [len(part) for part in found] == [0, 0, 0, 0]
 
 
@@ -252,7 +252,17 @@ def found_by(converter: str, **parameters: object) -> Calibration:
     description = {"name": "kitchen", "converter": {"name": converter}, "parameters": parameters}
     sigma = dict.fromkeys(NAMES, 0.001)
     halves = ["alpha, frames 0 to 9", "bravo, frames 0 to 9"]
-    return Calibration(TRUE, sigma, [TRUE, TRUE], quality, quality, halves, 20, 900, description)
+    return Calibration(
+        rig=TRUE,
+        sigma=sigma,
+        halves=[TRUE, TRUE],
+        before=quality,
+        after=quality,
+        names=halves,
+        views=20,
+        landmarks=900,
+        recording=description,
+    )
 
 
 def test_the_file_of_options_is_one_of_the_converter(tmp_path: Path) -> None:

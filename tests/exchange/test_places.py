@@ -54,7 +54,9 @@ def test_ransac_finds_the_motion_among_false_matches() -> None:
     points_b = rng.uniform([-1, -1, 1], [1, 1, 3], (60, 3))
     points_a = se3.transform(T, points_b) + rng.normal(0, 0.003, (60, 3))
     points_a[:35] = rng.uniform([-1, -1, 1], [1, 1, 3], (35, 3))
-    found, inliers = features.ransac(points_a, points_b, 0.03, 500, random_streams.generator(0, "test"))
+    found, inliers = features.ransac(
+        points_a, points_b, inlier_m=0.03, hypotheses=500, rng=random_streams.generator(0, "test")
+    )
     assert inliers[35:].all()
     assert inliers[:35].sum() <= 2
     assert max(float(d) for d in se3.distance(found, T)) < 0.01

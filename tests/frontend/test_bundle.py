@@ -10,7 +10,7 @@ import pytest
 from duagc.pipeline.config.frontend import KeyframeConfig, LoopConfig, RelocalizationConfig
 from duagc.pipeline.frontend import bundle, loops
 from duagc.pipeline.frontend.bundle import Neighborhood, optimize
-from duagc.pipeline.frontend.keyframe_graph import Refined, refine
+from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes, solve_pose_graph
 from duagc.pipeline.frontend.loops import find_loops
 from duagc.pipeline.frontend.tracking_state import features_of
 from duagc.pipeline.geometry import se3
@@ -83,15 +83,19 @@ def noisy() -> Walk:
 
 
 @pytest.fixture(scope="module")
-def good(noisy: Walk) -> tuple[Refined, list[RelativePose]]:
+def good(noisy: Walk) -> tuple[OptimizedKeyframes, list[RelativePose]]:
     """What the optimization makes of the true poses."""
-    return optimize(noisy.truth, noisy.views, noisy.images, noisy.pairs, CONFIG, REGISTRATION)
+    return optimize(
+        noisy.truth, noisy.views, noisy.images, noisy.pairs, config=CONFIG, registration=REGISTRATION
+    )
 
 
 def test_joint_optimization_is_better_than_the_registrations_alone(noisy: Walk) -> None:
     start = noisy.chained(noisy.pairs)
-    before = refine(start, noisy.pairs, 3.0)
-    after, factors = optimize(start, noisy.views, noisy.images, noisy.pairs, CONFIG, REGISTRATION)
+    before = solve_pose_graph(start, noisy.pairs, 3.0)
+    after, factors = optimize(
+        start, noisy.views, noisy.images, noisy.pairs, config=CONFIG, registration=REGISTRATION
+    )
     assert len(factors) > 2 * len(noisy.pairs)
     assert noisy.error_m(after.T_map_keyframe) < 0.7 * noisy.error_m(before.T_map_keyframe)
     # more images, more information
@@ -100,25 +104,27 @@ def test_joint_optimization_is_better_than_the_registrations_alone(noisy: Walk) 
 
 
 def test_poor_start_ends_where_the_good_one_does(
-    noisy: Walk, good: tuple[Refined, list[RelativePose]]
+    noisy: Walk, good: tuple[OptimizedKeyframes, list[RelativePose]]
 ) -> None:
     rng = np.random.default_rng(2)
     spoilt = [
         RelativePose(p.i, p.j, p.T_i_j @ se3.exp(0.005 * rng.standard_normal(6)), p.information)
         for p in noisy.pairs
     ]
-    poor = optimize(noisy.chained(spoilt), noisy.views, noisy.images, spoilt, CONFIG, REGISTRATION)[0]
+    poor = optimize(
+        noisy.chained(spoilt), noisy.views, noisy.images, spoilt, config=CONFIG, registration=REGISTRATION
+    )[0]
     assert noisy.error_m(noisy.chained(spoilt)) > 0.008
     assert se3.distance(good[0].T_map_keyframe, poor.T_map_keyframe)[0].max() < 1e-3  # of 9 mm
 
 
-def test_factors_say_what_the_optimization_found(good: tuple[Refined, list[RelativePose]]) -> None:
+def test_factors_say_what_the_optimization_found(good: tuple[OptimizedKeyframes, list[RelativePose]]) -> None:
     found, factors = good
     weighted = [
         RelativePose(f.i, f.j, f.T_i_j, w * f.information)
         for f, w in zip(factors, found.weights, strict=True)
     ]
-    again = refine(found.T_map_keyframe, weighted, 1e9)
+    again = solve_pose_graph(found.T_map_keyframe, weighted, 1e9)
     np.testing.assert_allclose(again.T_map_keyframe, found.T_map_keyframe, atol=1e-7)
 
 
@@ -127,7 +133,7 @@ def test_keyframe_that_shows_nothing_keeps_what_tracking_said(noisy: Walk) -> No
     views = [*noisy.views[:7], View.of(dark)]
     images = [*noisy.pyramids[:7], dark]
     found, factors = optimize(
-        noisy.truth, views, lambda k, levels: images[k], noisy.pairs, CONFIG, REGISTRATION
+        noisy.truth, views, lambda k, levels: images[k], noisy.pairs, config=CONFIG, registration=REGISTRATION
     )
     of_dark = [f for f in factors if 7 in (f.i, f.j)]
     assert of_dark == [noisy.pairs[-1]]
@@ -135,8 +141,15 @@ def test_keyframe_that_shows_nothing_keeps_what_tracking_said(noisy: Walk) -> No
     assert se3.distance(moved, noisy.pairs[-1].T_i_j)[0] < 1e-9
 
 
-def test_equal_input_gives_equal_bits(noisy: Walk, good: tuple[Refined, list[RelativePose]]) -> None:
-    a, b = good[0], optimize(noisy.truth, noisy.views, noisy.images, noisy.pairs, CONFIG, REGISTRATION)[0]
+def test_equal_input_gives_equal_bits(
+    noisy: Walk, good: tuple[OptimizedKeyframes, list[RelativePose]]
+) -> None:
+    a, b = (
+        good[0],
+        optimize(
+            noisy.truth, noisy.views, noisy.images, noisy.pairs, config=CONFIG, registration=REGISTRATION
+        )[0],
+    )
     np.testing.assert_array_equal(a.T_map_keyframe, b.T_map_keyframe)
     np.testing.assert_array_equal(a.covariance([3, 5]), b.covariance([3, 5]))
 
@@ -156,13 +169,23 @@ def drifted(circle: Walk) -> tuple[np.ndarray, list[RelativePose]]:
 
 def test_loop_is_found_and_closes_the_drift(circle: Walk) -> None:
     start, wrong = drifted(circle)
-    loops = find_loops(start, circle.views, circle.images, LoopConfig(), REGISTRATION, 0, "alpha")
+    loops = find_loops(
+        start,
+        circle.views,
+        circle.images,
+        config=LoopConfig(),
+        registration=REGISTRATION,
+        seed=0,
+        robot="alpha",
+    )
     assert (0, 16) in [(p.i, p.j) for p in loops]
     for loop in loops:
         truth = se3.inverse(circle.truth[loop.i]) @ circle.truth[loop.j]
         assert se3.distance(truth, loop.T_i_j)[0] < 5e-3
     assert circle.error_m(start) > 0.07
-    closed, _ = optimize(start, circle.views, circle.images, [*wrong, *loops], CONFIG, REGISTRATION)
+    closed, _ = optimize(
+        start, circle.views, circle.images, [*wrong, *loops], config=CONFIG, registration=REGISTRATION
+    )
     # association is projective, rounds converge as ICP does: ten of them end at 6 mm, forty at 2
     assert circle.error_m(closed.T_map_keyframe) < 0.01 < 0.2 * circle.error_m(start)
 
@@ -179,13 +202,23 @@ def test_loops_are_looked_for_among_a_bounded_number(circle: Walk, monkeypatch: 
     compared = []
     monkeypatch.setattr(loops, "matches", lambda *a: compared.append(a) or matches(*a))
     config = LoopConfig(compared=3, min_matches=60)
-    found = find_loops(poses, views, lambda k, _: images[k], config, REGISTRATION, 0, "alpha")
+    found = find_loops(
+        poses, views, lambda k, _: images[k], config=config, registration=REGISTRATION, seed=0, robot="alpha"
+    )
     assert [(p.i, p.j) for p in found] == [(0, 41)]
     assert len(compared) <= 3 * len(views)
 
 
 def test_known_overlaps_and_foreign_places_are_no_loops(circle: Walk) -> None:
-    loops = find_loops(circle.truth, circle.views, circle.images, LoopConfig(), REGISTRATION, 0, "alpha")
+    loops = find_loops(
+        circle.truth,
+        circle.views,
+        circle.images,
+        config=LoopConfig(),
+        registration=REGISTRATION,
+        seed=0,
+        robot="alpha",
+    )
     assert loops == []
     # the other side of the room, said to be elsewhere: nothing there resembles it
     half = [0, 1, 2, 3, 8]
@@ -193,7 +226,18 @@ def test_known_overlaps_and_foreign_places_are_no_loops(circle: Walk) -> None:
     images = [circle.pyramids[k] for k in half]
     far = circle.truth[half]
     far[-1, :3, 3] += 5
-    assert find_loops(far, views, lambda k, levels: images[k], LoopConfig(), REGISTRATION, 0, "alpha") == []
+    assert (
+        find_loops(
+            far,
+            views,
+            lambda k, levels: images[k],
+            config=LoopConfig(),
+            registration=REGISTRATION,
+            seed=0,
+            robot="alpha",
+        )
+        == []
+    )
 
 
 def test_overlapping_pairs_are_those_that_see_each_other(circle: Walk) -> None:
@@ -227,8 +271,8 @@ def test_work_per_keyframe_does_not_grow_with_the_path(noisy: Walk, monkeypatch:
             [noisy.views[k] for k in order],
             counted("images", lambda k, levels: noisy.pyramids[order[k]]),
             tracked,
-            KeyframeConfig(optimization_candidates=8, optimization_neighbors=3, optimization_rounds=3),
-            REGISTRATION,
+            config=KeyframeConfig(optimization_candidates=8, optimization_neighbors=3, optimization_rounds=3),
+            registration=REGISTRATION,
         )
         return {name: count / length for name, count in counts.items()}
 
@@ -251,7 +295,7 @@ def test_a_pair_that_did_not_move_is_not_looked_at_again(noisy: Walk) -> None:
     for limit in (3, 30):
         read.clear()
         config = KeyframeConfig(optimization_rounds=limit)
-        optimize(noisy.truth, noisy.views, images, noisy.pairs, config, REGISTRATION)
+        optimize(noisy.truth, noisy.views, images, noisy.pairs, config=config, registration=REGISTRATION)
         rounds.append(len(read) / len(noisy.views))
     assert rounds[0] <= 3
     assert rounds[1] < 30

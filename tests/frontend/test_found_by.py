@@ -1,4 +1,4 @@
-"""What a disturbed camera is held against: the last sound frame, the latest keyframe, and where it was expected."""
+"""What a disturbed camera is compared with: the last good frame, the latest keyframe, and the prediction."""
 
 from dataclasses import replace
 
@@ -44,10 +44,10 @@ def test_color_alone_goes_on_from_the_last_frame_with_depth(misfit: Undisturbed)
     assert apart_m > 0.005
 
 
-def test_color_alone_is_followed_for_a_short_way(run: Undisturbed) -> None:
-    """The way counts from the last frame with depth; the frames are 22 mm apart."""
+def test_color_alone_is_followed_for_a_short_distance(run: Undisturbed) -> None:
+    """The distance counts from the last frame with depth; the frames are 22 mm apart."""
     short = FrontendConfig.model_validate(
-        {"tracking": {"strides": (2, 1, 1, 1), "failure": {"max_way_without_depth_m": 0.05}}}
+        {"tracking": {"strides": (2, 1, 1, 1), "failure": {"max_translation_without_depth_m": 0.05}}}
     )
     for config, most in ((short, 2), (CONFIG, 5)):
         rows = run.disturbed(START, d.depthless, frames=7, config=config)
@@ -56,10 +56,10 @@ def test_color_alone_is_followed_for_a_short_way(run: Undisturbed) -> None:
 
 
 def test_color_alone_says_how_little_it_knows(run: Undisturbed) -> None:
-    """Its standard deviation holds a share of the way."""
+    """Its standard deviation includes a share of the distance."""
     rows = [row for row in run.disturbed(START, d.depthless, frames=5) if row.good]
     T_sound = run.poses[START - 1]
-    share = CONFIG.tracking.failure.sigma_of_way_without_depth
+    share = CONFIG.tracking.failure.sigma_of_translation_without_depth
     for row in rows:
         way_m = float(np.linalg.norm((se3.inverse(T_sound) @ run.poses[row.shot.index])[:3, 3]))
         covariance = np.linalg.inv(row.frame.information)
@@ -107,7 +107,7 @@ def test_what_looks_unlike_is_followed_only_where_it_was_expected(run: Undisturb
 
 
 def _drifted(run: Undisturbed) -> Tracker:
-    """A tracker whose keyframes after the first have moved by 4 cm in the map, as tracking errs on a long way."""
+    """A tracker whose keyframes after the first have moved by 4 cm in the map, as tracking drifts on a long path."""
     tracker = run.tracker(START)
     drift = se3.exp(np.array([0.04, 0, 0, 0, 0, 0]))
     first, *later = tracker.keyframes
@@ -136,7 +136,7 @@ def test_a_place_counts_from_the_latest_keyframe_that_shows_it(run: Undisturbed)
 
 
 def test_a_later_keyframe_that_has_the_camera_elsewhere_contradicts(run: Undisturbed) -> None:
-    """Without features the later keyframes cannot be believed; whether they agree still counts."""
+    """Without features the later keyframes are not plausible; whether they agree still counts."""
     for tracker, agrees in ((run.tracker(START), True), (_drifted(run), False)):
         first, *later = tracker.keyframes
         none = replace(

@@ -65,17 +65,17 @@ def test_a_covered_lens_is_lost_and_found_again(run: Undisturbed, start: int) ->
 
 
 @pytest.mark.parametrize("start", sampled(STARTS))
-def test_a_hand_before_the_lens_does_not_take_the_pose_along(run: Undisturbed, start: int) -> None:
+def test_a_hand_in_front_of_the_lens_does_not_drag_the_pose(run: Undisturbed, start: int) -> None:
     rows = run.disturbed(start, d.hand)
     assert not any(row.wrong for row in rows)
     assert sum(row.good for row in during(rows)) >= 8
     assert_found_again(rows, within=4)
 
 
-def test_what_a_hand_leaves_must_tell_the_position(run: Undisturbed) -> None:
+def test_what_a_hand_leaves_visible_must_determine_the_position(run: Undisturbed) -> None:
     """With a limit that no image keeps, every frame behind the hand is lost, and no other."""
     strict = FrontendConfig.model_validate(
-        {"tracking": {"strides": (2, 1, 1, 1), "failure": {"max_sigma_obstructed_m": 1e-7}}}
+        {"tracking": {"strides": (2, 1, 1, 1), "failure": {"max_sigma_occluded_m": 1e-7}}}
     )
     rows = run.disturbed(STARTS[0], d.hand, config=strict)
     assert not any(row.good for row in during(rows))
@@ -85,7 +85,7 @@ def test_what_a_hand_leaves_must_tell_the_position(run: Undisturbed) -> None:
 
 
 def test_a_hand_outside_the_keyframe_s_view_is_noticed(run: Undisturbed) -> None:
-    """Near things are soon beside what an old keyframe saw: the frame before must tell, before they become one."""
+    """Near objects are soon outside of what an old keyframe saw: the frame before must show them as occlusion."""
     config = FrontendConfig.model_validate(
         {"tracking": {"strides": (2, 1, 1, 1)}, "keyframes": {"min_overlap": 1.0}}
     )
@@ -93,9 +93,9 @@ def test_a_hand_outside_the_keyframe_s_view_is_noticed(run: Undisturbed) -> None
     *before, current = tracker.keyframes
     blind = replace(current.coarsest, inverse_depth=np.zeros_like(current.coarsest.inverse_depth))
     tracker.state.keyframes = [*before, replace(current, coarsest=blind)]
-    sound, *behind = list(d.hand(run.shots[STARTS[0] : STARTS[0] + 4], np.random.default_rng(0)))
-    frame, _ = d.track(tracker, run.shots[sound.index])
-    assert frame.keyframe_index == len(before) + 1  # every sound frame becomes a keyframe here
+    clear, *behind = list(d.hand(run.shots[STARTS[0] : STARTS[0] + 4], np.random.default_rng(0)))
+    frame, _ = d.track(tracker, run.shots[clear.index])
+    assert frame.keyframe_index == len(before) + 1  # every good frame becomes a keyframe here
     tracker.keyframes[-1] = replace(tracker.keyframes[-1], coarsest=blind)
     assert {d.track(tracker, shot)[0].keyframe_index for shot in behind} == {len(before) + 1}
 
@@ -117,7 +117,7 @@ def test_dropped_frames_change_nothing(run: Undisturbed, start: int) -> None:
 
 
 @pytest.mark.parametrize("start", sampled(STARTS))
-def test_stuck_depth_is_noticed_and_the_color_goes_on(run: Undisturbed, start: int) -> None:
+def test_frozen_depth_is_noticed_and_the_color_goes_on(run: Undisturbed, start: int) -> None:
     rows = run.disturbed(start, d.frozen)
     assert not any(row.wrong for row in rows)
     for row in during(rows)[1:]:  # the first of them is in fact the right one
@@ -137,7 +137,7 @@ def test_without_depth_the_camera_goes_on_for_a_while(run: Undisturbed, start: i
 
 
 @pytest.mark.parametrize("start", sampled(STARTS))
-def test_stuck_color_is_noticed(run: Undisturbed, start: int) -> None:
+def test_frozen_color_is_noticed(run: Undisturbed, start: int) -> None:
     rows = run.disturbed(start, d.frozen_color)
     assert not any(row.wrong for row in rows)
     assert all(row.frame.reason is Reason.FROZEN_COLOR for row in during(rows)[8:])
@@ -161,7 +161,7 @@ def test_nothing_else_makes_it_silently_wrong(run: Undisturbed, disturbance: d.D
 
 
 def test_depth_of_another_time_contradicts_the_color(run: Undisturbed) -> None:
-    """Stuck, but noisy, so that no value repeats; or late."""
+    """Frozen, but noisy, so that no value repeats; or late."""
     for disturbance in (d.noisy_stuck, d.late_depth):
         rows = during(run.disturbed(STARTS[0], disturbance, 8))
         assert Reason.CONTRADICTION in {row.frame.reason for row in rows}
@@ -205,7 +205,7 @@ def test_a_covered_beginning_is_waited_out(run: Undisturbed) -> None:
     assert tracker.keyframes[0].frame_index == 5
 
 
-def test_a_standing_camera_is_not_stuck(run: Undisturbed) -> None:
+def test_images_of_a_standing_camera_are_not_frozen(run: Undisturbed) -> None:
     """Without noise the images of a camera at rest repeat bit by bit, both or one of them."""
     watch = FrozenImageDetector(CONFIG.tracking.failure)
     rng = np.random.default_rng(0)
@@ -220,22 +220,22 @@ def test_a_standing_camera_is_not_stuck(run: Undisturbed) -> None:
         assert watch.update(RgbdPyramid.build(color, depth, CAMERA, 4)) is Reason.NONE
 
 
-def test_intruders_are_what_stands_in_free_space(run: Undisturbed) -> None:
+def test_points_in_space_that_a_keyframe_saw_free_violate_it(run: Undisturbed) -> None:
     limits = CONFIG.tracking.failure
     one, other = (
         RgbdPyramid.build(s.color.astype(np.float32) / 255, s.depth, CAMERA, 4).levels[-1]
         for s in (run.shots[0], run.shots[6])
     )
     T_one_other = se3.inverse(run.poses[0]) @ run.poses[6]
-    intruding, told = free_space_violations(other, one, T_one_other, limits)
-    assert told > 0.7 * other.inverse_depth.size
-    assert intruding < 0.01 * told
+    violations, visible = free_space_violations(other, one, T_one_other, limits)
+    assert visible > 0.7 * other.inverse_depth.size
+    assert violations < 0.01 * visible
     near = other.inverse_depth.copy()
     near[:, : near.shape[1] // 3] = 1 / 0.4
-    intruding, told = free_space_violations(
+    violations, visible = free_space_violations(
         type(other)(other.camera, other.gray, near), one, T_one_other, limits
     )
-    assert intruding > 0.2 * told
+    assert violations > 0.2 * visible
 
 
 @pytest.mark.slow

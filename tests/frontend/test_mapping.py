@@ -9,7 +9,7 @@ from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import DepthKind, MapLossConfig, SurfaceLossConfig
 from duagc.pipeline.evaluation.image_metrics import depth_error, psnr
 from duagc.pipeline.frontend.mapping import Mapper, MappingStats
-from duagc.pipeline.frontend.mapping_views import overlap
+from duagc.pipeline.frontend.mapping_views import View, view_overlap
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import Rasterizer
@@ -61,7 +61,7 @@ def drawn(mapper: Mapper, T_map_camera: np.ndarray) -> tuple[float, float, float
 def test_views_that_were_never_mapped_are_drawn_well() -> None:
     mapper, stats = build(MappingConfig(max_gaussians=4000, iterations=20, final_iterations=15))
     assert all(s.loss_after < s.loss_before for s in stats)
-    final = mapper.finish()
+    final = mapper.finalize()
     assert final.loss_after < final.loss_before
     between = POSES[1] @ se3.exp(0.5 * se3.log(se3.inverse(POSES[1]) @ POSES[2]))
     quality, error_m, completeness = drawn(mapper, between)
@@ -74,7 +74,7 @@ def test_the_same_bits_whatever_the_threads() -> None:
     first, first_stats = build()
     second, second_stats = build(threads=3)
     assert first_stats == second_stats
-    assert first.finish() == second.finish()
+    assert first.finalize() == second.finalize()
     assert same(first.gaussians, second.gaussians)
 
 
@@ -83,9 +83,9 @@ def test_the_seed_matters_and_nothing_else_drew_from_it() -> None:
     for k in range(3):
         other.add_keyframe(k, *shot(POSES[k]), POSES[k])
     mapper, _ = build()
-    assert same(mapper.gaussians, other.gaussians)  # too few keyframes for a lot to be drawn
-    mapper.finish()
-    other.finish()
+    assert same(mapper.gaussians, other.gaussians)  # too few keyframes for random ones
+    mapper.finalize()
+    other.finalize()
     assert not same(mapper.gaussians, other.gaussians)  # the order of the refinement is drawn
 
 
@@ -107,7 +107,7 @@ def test_the_cap_holds_at_every_keyframe_and_ids_are_never_used_twice() -> None:
         seen |= before | new
         pruned += stats.pruned
     assert pruned > 0
-    mapper.finish()
+    mapper.finalize()
     assert len(mapper.gaussians) <= 400
 
 
@@ -119,43 +119,38 @@ def test_a_view_that_is_explained_adds_little() -> None:
     assert again.inserted < 0.05 * len(mapper.gaussians)
 
 
-def test_gaussians_move_with_their_keyframes() -> None:
-    mapper, _ = build(views=2)
-    before = mapper.gaussians
-    change = se3.exp(np.array([0.1, 0.0, -0.05, 0.0, 0.2, 0.0]))
-    mapper.set_keyframe_poses({1: POSES[1] @ change})
-    after = mapper.gaussians
+def test_gaussians_move_with_the_keyframe_that_they_are_anchored_to() -> None:
+    before = build(views=2)[0].gaussians
+    old = np.stack(POSES[:2])
+    new = np.stack([POSES[0], POSES[1] @ se3.exp(np.array([0.1, 0.0, -0.05, 0.0, 0.2, 0.0]))])
+    after = before.moved(old, new)
     first = before.anchors == 0
     assert (~first).any()
     np.testing.assert_allclose(after.means[first], before.means[first], atol=1e-6)
-    in_old = se3.transform(se3.inverse(POSES[1]), before.means[~first])
-    in_new = se3.transform(se3.inverse(POSES[1] @ change), after.means[~first])
+    in_old = se3.transform(se3.inverse(old[1]), before.means[~first])
+    in_new = se3.transform(se3.inverse(new[1]), after.means[~first])
     np.testing.assert_allclose(in_new, in_old, atol=1e-6)
-    mapper.set_keyframe_poses(np.stack(POSES[:2]))
-    np.testing.assert_allclose(mapper.gaussians.means, before.means, atol=1e-6)
+    np.testing.assert_allclose(after.moved(new, old).means, before.means, atol=1e-6)
 
 
-def test_views_between_keyframes_help_and_move_with_their_keyframe() -> None:
+def test_views_between_keyframes_help() -> None:
     config = MappingConfig(max_gaussians=4000, iterations=8, final_iterations=20, densify_rounds=0)
     between = POSES[0] @ se3.exp(0.5 * se3.log(se3.inverse(POSES[0]) @ POSES[3]))
     alone, _ = build(config, views=1)
-    alone.finish()
+    alone.finalize()
     helped, _ = build(config, views=1)
-    offset = np.array([0.2, 0.0, 0.1, 0.0, 0.0, 0.0])
-    helped.set_keyframe_poses({0: POSES[0] @ se3.exp(offset)})
     helped.add_view(0, *shot(between), se3.inverse(POSES[0]) @ between)
-    helped.set_keyframe_poses({0: POSES[0]})
-    helped.finish()
+    helped.finalize()
     assert drawn(helped, between)[0] > drawn(alone, between)[0] + 0.5
 
 
 def test_a_map_without_anything_stays_empty() -> None:
     mapper = Mapper(CAMERA, QUICK, seed=0)
-    assert mapper.finish() == MappingStats(0, 0, 0, 0.0, 0.0)
+    assert mapper.finalize() == MappingStats(0, 0, 0, 0.0, 0.0)
     color, depth = shot(POSES[0])
     stats = mapper.add_keyframe(0, color, np.zeros_like(depth), POSES[0])
     assert (stats.inserted, stats.total) == (0, 0)
-    assert mapper.finish().total == 0
+    assert mapper.finalize().total == 0
 
 
 def test_what_contributes_least_goes_first() -> None:
@@ -208,8 +203,8 @@ def test_refinement_spends_what_is_free_where_images_are_drawn_worst() -> None:
     )
     for mapper in (plain, dense):
         mapper.add_keyframe(0, *shot(POSES[0]), POSES[0])
-    assert plain.finish().inserted == 0
-    stats = dense.finish()
+    assert plain.finalize().inserted == 0
+    stats = dense.finalize()
     assert stats.inserted > 0
     assert stats.total == len(dense.gaussians) <= 900
     assert len(np.unique(dense.gaussians.ids)) == len(dense.gaussians)
@@ -219,7 +214,7 @@ def test_refinement_spends_what_is_free_where_images_are_drawn_worst() -> None:
 @pytest.mark.parametrize("depth", ["blended", "ray_plane"])
 def test_both_depths_of_a_gaussian_make_a_map(depth: DepthKind) -> None:
     mapper, _ = build(MappingConfig(max_gaussians=4000, iterations=20, final_iterations=15, depth=depth))
-    mapper.finish()
+    mapper.finalize()
     color, z = shot(POSES[1])
     render = Rasterizer().forward(mapper.gaussians, CAMERA, se3.inverse(POSES[1]), depth_kind=depth)
     assert psnr(render.color, color / 255) > 28.0
@@ -231,7 +226,7 @@ def test_loss_on_single_gaussians_brings_each_to_its_surface() -> None:
         mapper, _ = build(
             QUICK.model_copy(update={"depth": "ray_plane", "loss": MapLossConfig(ray_plane=loss)})
         )
-        mapper.finish()
+        mapper.finalize()
         rasterizer, depth_m = Rasterizer(), shot(POSES[1])[1]
         rasterizer.forward(mapper.gaussians, CAMERA, se3.inverse(POSES[1]), depth_kind="ray_plane")
         layer_m = rasterizer.layer_depth()
@@ -261,20 +256,26 @@ def test_exposure_is_found() -> None:
         color, depth = shot(POSES[k])
         dimmed = np.rint(color * (0.8 if k == 1 else 1.0)).astype(np.uint8)
         mapper.add_keyframe(k, dimmed, depth, POSES[k])
-    mapper.finish()
-    assert np.allclose(np.mean(list(mapper.exposures.values()), axis=0), 0.0, atol=1e-6)
-    gains = [np.exp(a) * 0.5 + b for a, b in mapper.exposures.values()]  # at mid gray
+    mapper.finalize()
+    exposures = [view.exposure for view in mapper._views]
+    assert np.allclose(np.mean(exposures, axis=0), 0.0, atol=1e-6)
+    gains = [np.exp(a) * 0.5 + b for a, b in exposures]  # at mid gray
     assert gains[1] / gains[0] == pytest.approx(0.8, abs=0.02)
     assert gains[2] / gains[0] == pytest.approx(1.0, abs=0.02)
 
 
 def test_overlap_is_a_share_of_the_first_view() -> None:
-    (_, z0), (_, z3) = shot(POSES[0]), shot(POSES[3])
-    assert overlap(z0, POSES[0], z0, POSES[0], CAMERA, stride_px=4) == 1.0
-    assert 0.5 < overlap(z0, POSES[0], z3, POSES[3], CAMERA, stride_px=4) < 1.0
+    def view(k: int, T: np.ndarray, known: bool = True) -> View:
+        color, depth = shot(POSES[k])
+        depth = depth if known else np.zeros_like(depth)
+        return View.of(k, color, depth, T, mask=None, depth_sigma_m=None, huber_m=0.01)
+
+    first = view(0, POSES[0])
+    assert view_overlap(first, first, CAMERA, stride_px=4) == 1.0
+    assert 0.5 < view_overlap(first, view(3, POSES[3]), CAMERA, stride_px=4) < 1.0
     away = POSES[0] @ se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
-    assert overlap(z0, POSES[0], z0, away, CAMERA, stride_px=4) == 0.0
-    assert overlap(np.zeros_like(z0), POSES[0], z0, POSES[0], CAMERA) == 0.0
+    assert view_overlap(first, view(0, away), CAMERA, stride_px=4) == 0.0
+    assert view_overlap(view(0, POSES[0], known=False), first, CAMERA) == 0.0
 
 
 @pytest.mark.parametrize("index", [1, -1])
@@ -300,7 +301,7 @@ def test_masked_pixels_neither_seed_nor_count() -> None:
             color[~mask], depth[~mask] = (card, 0, 0), 0.5
             mapper.add_keyframe(k, color, depth, POSES[k], mask=mask)
         mapper.add_view(1, color, depth, np.eye(4), mask=mask)
-        mapper.finish()
+        mapper.finalize()
         return mapper
 
     red, black = mapped(255), mapped(0)

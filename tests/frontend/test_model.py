@@ -40,7 +40,18 @@ def tracked(sigma_m: float) -> TrackedFrame:
     """The frame, a few millimeters and milliradians from where it is."""
     information = np.diag([sigma_m**-2.0] * 6)
     T = T_KEYFRAME_FRAME @ OFF
-    return TrackedFrame(1, 10, 0, T, information, Status.OK, 0.9, 0.001, 0.01, Reason.NONE)
+    return TrackedFrame(
+        frame_index=1,
+        stamp_ns=10,
+        keyframe_index=0,
+        T_keyframe_camera=T,
+        information=information,
+        status=Status.OK,
+        overlap=0.9,
+        rms_depth_m=0.001,
+        rms_gray=0.01,
+        reason=Reason.NONE,
+    )
 
 
 def seen(color: np.ndarray | None = None) -> RgbdFrame:
@@ -49,12 +60,14 @@ def seen(color: np.ndarray | None = None) -> RgbdFrame:
 
 
 def tracker(gaussians: Gaussians, config: ModelConfig = CONFIG, threads: int = 1) -> ModelTracker:
-    return ModelTracker(gaussians, "blended", CAMERA, config, RegistrationConfig(), threads)
+    return ModelTracker(
+        gaussians, "blended", CAMERA, config, registration=RegistrationConfig(), threads=threads
+    )
 
 
 def test_a_poor_pose_becomes_a_good_one(gaussians: Gaussians) -> None:
     before = tracked(0.02)
-    after = tracker(gaussians).refine(before, seen(), np.eye(4))
+    after = tracker(gaussians).register(before, seen(), np.eye(4))
     error = [se3.distance(f.T_keyframe_camera, T_KEYFRAME_FRAME) for f in (before, after)]
     assert error[1][0] < 0.4 * error[0][0]
     assert error[1][1] < 0.4 * error[0][1]
@@ -65,19 +78,19 @@ def test_a_poor_pose_becomes_a_good_one(gaussians: Gaussians) -> None:
 def test_a_pose_that_is_known_better_stays(gaussians: Gaussians) -> None:
     model = tracker(gaussians, CONFIG.model_copy(update={"patience": 2}))
     sure = tracked(1e-6)
-    assert model.refine(sure, seen(), np.eye(4)) is sure
-    assert model.pays
-    assert model.refine(sure, seen(), np.eye(4)) is sure
-    assert not model.pays
+    assert model.register(sure, seen(), np.eye(4)) is sure
+    assert model.worthwhile
+    assert model.register(sure, seen(), np.eye(4)) is sure
+    assert not model.worthwhile
 
 
 def test_a_frame_that_the_map_does_not_show_stays(gaussians: Gaussians) -> None:
     poor, elsewhere = tracked(0.02), pose(yaw=np.pi)
-    assert tracker(gaussians).refine(poor, seen(), se3.inverse(KEYFRAME) @ elsewhere) is poor
-    assert tracker(Gaussians.empty()).refine(poor, seen(), np.eye(4)) is poor
+    assert tracker(gaussians).register(poor, seen(), se3.inverse(KEYFRAME) @ elsewhere) is poor
+    assert tracker(Gaussians.empty()).register(poor, seen(), np.eye(4)) is poor
 
 
 def test_threads_change_no_bit_and_the_setting_turns_it_off(gaussians: Gaussians) -> None:
-    one, three = (tracker(gaussians, threads=n).refine(tracked(0.02), seen(), np.eye(4)) for n in (1, 3))
+    one, three = (tracker(gaussians, threads=n).register(tracked(0.02), seen(), np.eye(4)) for n in (1, 3))
     np.testing.assert_array_equal(one.T_keyframe_camera, three.T_keyframe_camera)
-    assert not tracker(gaussians, ModelConfig(enabled=False)).pays
+    assert not tracker(gaussians, ModelConfig(enabled=False)).worthwhile

@@ -124,11 +124,11 @@ def test_it_tracks_and_maps(
 def test_stereo_is_tracked_better_by_its_sigma_than_by_a_sensor_model(
     walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told, _, error_m = followed(walk, "stereo", tmp_path / "told.mcap", False)
+    odometry, _, error_m = followed(walk, "stereo", tmp_path / "stereo.mcap", False)
     frame = RgbdLog.frame
     monkeypatch.setattr(RgbdLog, "frame", lambda log, k: replace(frame(log, k), depth_sigma=None))
     model, _, without_m = followed(walk, "stereo", tmp_path / "model.mcap", False)
-    assert len(told) == FRAMES
+    assert len(odometry) == FRAMES
     print(error_m, without_m, len(model))
     assert error_m < 0.006
     assert without_m > 2 * error_m or len(model) < FRAMES

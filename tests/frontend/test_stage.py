@@ -12,8 +12,9 @@ from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig, Track
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.keyframe_graph import refine
-from duagc.pipeline.frontend.stage import LATENCY_NS, _support, depth_noise_m, run_frontend
+from duagc.pipeline.frontend.keyframe_graph import solve_pose_graph
+from duagc.pipeline.frontend.output import LATENCY_NS
+from duagc.pipeline.frontend.stage import _support, depth_noise_m, run_frontend
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import ate_rmse_m
@@ -62,8 +63,8 @@ def test_every_frame_has_its_final_pose(frontend_log: Path) -> None:
     assert [m.status for m in odometry] == ["ok"] * FRAMES
     assert [m.frame_index for m in odometry if m.held_out] == [4, 12]
     for m in odometry:
-        hangs = keyframes[m.keyframe_index].T_map_camera @ m.T_keyframe_camera
-        np.testing.assert_allclose(m.T_map_camera, hangs, atol=1e-12)
+        composed = keyframes[m.keyframe_index].T_map_camera @ m.T_keyframe_camera
+        np.testing.assert_allclose(m.T_map_camera, composed, atol=1e-12)
     truth = np.array([walk(k)[:3, 3] for k in range(FRAMES)])
     assert ate_rmse_m(truth, np.array([m.T_map_camera[:3, 3] for m in odometry])) < 1.5e-3
 
@@ -95,10 +96,10 @@ def test_registrations_in_the_log_give_the_keyframe_poses(sensor_log: Path, tmp_
         for f in factors
     ]
     poses = np.array([m.T_map_camera for m in keyframes])
-    again = refine(poses, pairs, 1e9)
+    again = solve_pose_graph(poses, pairs, 1e9)
     np.testing.assert_allclose(again.T_map_keyframe, poses, atol=1e-7)
     for m in keyframes[1:]:
-        relative = again.relative_information(m.previous_index, m.keyframe_index) * again.contradiction
+        relative = again.relative_information(m.previous_index, m.keyframe_index) * again.variance_factor
         np.testing.assert_allclose(
             relative, m.information, rtol=1e-4, atol=1e-4 * np.abs(m.information).max()
         )
@@ -147,7 +148,17 @@ def test_held_out_and_lost_frames_never_support_the_map(frontend_log: Path) -> N
     keyframes = messages(frontend_log, topics.KEYFRAME)
     nothing = np.zeros((6, 6))
     frames = [
-        TrackedFrame(k, k, 0, np.eye(4), nothing, Status.LOST if k == 7 else Status.OK, 1.0, 0.0, 0.0)
+        TrackedFrame(
+            frame_index=k,
+            stamp_ns=k,
+            keyframe_index=0,
+            T_keyframe_camera=np.eye(4),
+            information=nothing,
+            status=Status.LOST if k == 7 else Status.OK,
+            overlap=1.0,
+            rms_depth_m=0.0,
+            rms_gray=0.0,
+        )
         for k in range(FRAMES)
     ]
     forbidden = {4, 7, 12, *(m.frame_index for m in keyframes)}
@@ -197,9 +208,20 @@ def test_what_moves_is_not_mapped(tmp_path: Path) -> None:
 
 def test_noise_of_depth_is_that_of_frames_which_were_registered_by_it() -> None:
     def frame(rms_m: float, status: Status = Status.OK, reason: Reason = Reason.NONE) -> TrackedFrame:
-        return TrackedFrame(0, 0, 0, np.eye(4), np.zeros((6, 6)), status, 1.0, rms_m, 0.0, reason)
+        return TrackedFrame(
+            frame_index=0,
+            stamp_ns=0,
+            keyframe_index=0,
+            T_keyframe_camera=np.eye(4),
+            information=np.zeros((6, 6)),
+            status=status,
+            overlap=1.0,
+            rms_depth_m=rms_m,
+            rms_gray=0.0,
+            reason=reason,
+        )
 
     first, lost = frame(0.0), frame(0.5, Status.LOST)
-    by_color = frame(0.5, reason=Reason.STUCK_DEPTH)
-    assert depth_noise_m([first, frame(0.006), lost, by_color, frame(0.008), frame(0.007)]) == 0.007
+    color_only = frame(0.5, reason=Reason.FROZEN_DEPTH)
+    assert depth_noise_m([first, frame(0.006), lost, color_only, frame(0.008), frame(0.007)]) == 0.007
     assert depth_noise_m([first, lost]) is None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig, TrackingConfig, is_held_out
-from duagc.pipeline.frontend.keyframe_graph import refine
+from duagc.pipeline.frontend.keyframe_graph import solve_pose_graph
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
@@ -67,10 +67,10 @@ def test_keyframes_are_made_and_are_never_held_out(walked) -> None:
 def test_refinement_does_not_spoil_exact_tracking(walked) -> None:
     tracker = walked[0]
     start = np.array([k.T_map_keyframe for k in tracker.keyframes])
-    result = refine(start, tracker.pairs, 3.0)
-    refined, covariance = result.T_map_keyframe, result.covariance(range(len(start)))
-    np.testing.assert_array_equal(refined[0], np.eye(4))
-    assert np.max(se3.distance(start, refined)[0]) < 2e-3
+    result = solve_pose_graph(start, tracker.pairs, 3.0)
+    optimized, covariance = result.T_map_keyframe, result.covariance(range(len(start)))
+    np.testing.assert_array_equal(optimized[0], np.eye(4))
+    assert np.max(se3.distance(start, optimized)[0]) < 2e-3
     assert np.linalg.eigvalsh(covariance[6:, 6:])[0] > 0
 
 
@@ -159,7 +159,7 @@ def test_a_prior_carries_over_what_the_images_do_not_tell() -> None:
     moved_m, turned_rad = se3.distance(expected, frames[-1].T_keyframe_camera)
     assert moved_m < 0.003  # 2 % of 7 cm, which is what the prior is wrong by
     assert turned_rad < 0.01
-    # what the images say is their own: nothing along the wall
+    # the information of the images is their own: nothing along the wall
     assert np.linalg.eigvalsh(frames[-1].information)[0] < 1.0
 
 
@@ -230,10 +230,10 @@ def test_refine_finds_poses_and_their_covariance() -> None:
 
     exact = [RelativePose(i, j, se3.inverse(truth[i]) @ truth[j], information) for i, j in ends]
     start = truth @ se3.exp(np.concatenate([np.zeros((1, 6)), 0.05 * rng.standard_normal((5, 6))]))
-    np.testing.assert_allclose(refine(start, exact, 3.0).T_map_keyframe, truth, atol=1e-8)
+    np.testing.assert_allclose(solve_pose_graph(start, exact, 3.0).T_map_keyframe, truth, atol=1e-8)
     chi2 = []
     for _ in range(30):
-        drawn = refine(truth, draw(), 1e9)
+        drawn = solve_pose_graph(truth, draw(), 1e9)
         T = drawn.T_map_keyframe
         error = se3.log(se3.inverse(se3.inverse(T[2]) @ T[5]) @ se3.inverse(truth[2]) @ truth[5])
         chi2.append(error @ drawn.relative_information(2, 5) @ error)
@@ -252,14 +252,14 @@ def test_refine_withstands_a_wrong_pair() -> None:
     ]
     wrong = pairs[3].T_i_j @ se3.exp(np.array([0.3, 0, 0, 0, 0.2, 0]))
     pairs[3] = RelativePose(pairs[3].i, pairs[3].j, wrong, information)
-    robust, plain = refine(truth, pairs, 1.0), refine(truth, pairs, 1e9)
+    robust, plain = solve_pose_graph(truth, pairs, 1.0), solve_pose_graph(truth, pairs, 1e9)
     far = se3.distance(truth, plain.T_map_keyframe)[0].max()
     assert se3.distance(truth, robust.T_map_keyframe)[0].max() < 0.3 * far
     assert np.argmin(robust.weights) == 3
     assert robust.weights[3] < 0.2
     np.testing.assert_array_equal(plain.weights, 1)
-    assert plain.contradiction > robust.contradiction > 1
-    clean = refine(truth, pairs[:3] + pairs[4:], 1.0)
+    assert plain.variance_factor > robust.variance_factor > 1
+    clean = solve_pose_graph(truth, pairs[:3] + pairs[4:], 1.0)
     np.testing.assert_allclose(clean.T_map_keyframe, truth, atol=1e-8)
     # the contradiction shows in the covariance: the first pose's neighbor is known worse than by one pair alone
     assert robust.covariance([1])[0, 0] > 1e-4 / len(pairs)
@@ -278,7 +278,7 @@ def test_refine_solves_thousands_of_keyframes() -> None:
     information = np.diag([1e4, 1e4, 1e4, 1e5, 1e5, 1e5])
     pairs = [RelativePose(i, j, se3.inverse(truth[i]) @ truth[j], information) for i, j in ends]
     drift = np.concatenate([np.zeros((1, 6)), 1e-4 * rng.standard_normal((k - 1, 6)).cumsum(axis=0)])
-    found = refine(truth @ se3.exp(drift), pairs, 1e9)
+    found = solve_pose_graph(truth @ se3.exp(drift), pairs, 1e9)
     np.testing.assert_allclose(found.T_map_keyframe, truth, atol=1e-4)
     assert found.normal_matrix.nnz < 36 * 10 * k
     # the loop holds its ends against each other as one registration does, and better

@@ -1,4 +1,4 @@
-"""Projection, visibility, overlap and free space are what the pinhole model says."""
+"""Projection, visibility, overlap and free space follow the pinhole model."""
 
 import numpy as np
 import pytest
@@ -79,7 +79,7 @@ def test_points_before_a_wall_are_in_free_space_and_those_behind_it_hidden() -> 
         (1.5, projection.HIDDEN),
     ):
         moved = factor * points.reshape(-1, 3)
-        index, found = projection.free_space(moved, nearest, CAMERA, 0.15, 0.1)
+        index, found = projection.free_space(moved, nearest, CAMERA, gate_m=0.15, gate_relative=0.1)
         assert len(index) == CAMERA.width * CAMERA.height - unknown
         assert (found == where).all()
 

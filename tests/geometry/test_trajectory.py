@@ -61,7 +61,7 @@ def test_alignment_says_when_it_is_not_determined() -> None:
         trajectory.align(line[:2], line[:2])
 
 
-@pytest.mark.skipif(not BENCHMARK.is_dir(), reason="the benchmark trajectories are not beside this checkout")
+@pytest.mark.skipif(not BENCHMARK.is_dir(), reason="the benchmark trajectories are not next to this checkout")
 @pytest.mark.parametrize(
     ("truth", "estimate", "expected_m"),
     [

@@ -59,22 +59,28 @@ def checked(found: GeometricVerification) -> None:
 def test_both_directions_confirm_what_the_features_say(
     views: tuple[VerificationView, VerificationView],
 ) -> None:
-    checked(verify(*views, CONFIG, REGISTRATION, rng()))
+    checked(verify(*views, CONFIG, registration=REGISTRATION, rng=rng()))
 
 
 def test_one_direction_is_enough_where_the_other_is_not_possible(
     views: tuple[VerificationView, VerificationView],
 ) -> None:
     first, second = views
-    forward = verify(first, replace(second, reference=None), CONFIG, REGISTRATION, rng())
-    backward = verify(replace(first, reference=None), second, CONFIG, REGISTRATION, rng())
+    forward = verify(first, replace(second, reference=None), CONFIG, registration=REGISTRATION, rng=rng())
+    backward = verify(replace(first, reference=None), second, CONFIG, registration=REGISTRATION, rng=rng())
     checked(forward)
     checked(backward)
     assert not np.array_equal(forward.T_first_second, backward.T_first_second)
     xi = np.linalg.cholesky(np.linalg.inv(backward.information))[:, 0]
     assert xi @ forward.information @ xi == pytest.approx(1, rel=0.5)
     with pytest.raises(ValueError, match="samples"):
-        verify(replace(first, images=None), replace(second, images=None), CONFIG, REGISTRATION, rng())
+        verify(
+            replace(first, images=None),
+            replace(second, images=None),
+            CONFIG,
+            registration=REGISTRATION,
+            rng=rng(),
+        )
 
 
 def test_every_failed_test_has_its_name(views: tuple[VerificationView, VerificationView]) -> None:
@@ -87,7 +93,9 @@ def test_every_failed_test_has_its_name(views: tuple[VerificationView, Verificat
 
     def failure(features: Features = second.features, **changed: float) -> Failure | None:
         config = CONFIG.model_copy(update=changed)
-        return verify(first, replace(second, features=features), config, REGISTRATION, rng()).failure
+        return verify(
+            first, replace(second, features=features), config, registration=REGISTRATION, rng=rng()
+        ).failure
 
     assert failure() is None
     assert failure(min_inliers=1000) is Failure.FEW_MATCHES
@@ -96,7 +104,7 @@ def test_every_failed_test_has_its_name(views: tuple[VerificationView, Verificat
     assert failure(max_disagreement_m=1e-7) is Failure.DIRECTIONS_DISAGREE
     assert failure(moved, **limits) is Failure.FAR_FROM_FEATURES
     strict = REGISTRATION.model_copy(update={"max_gray_rms": 1e-6})
-    assert verify(first, second, CONFIG, strict, rng()).failure is Failure.NOT_REGISTERED
+    assert verify(first, second, CONFIG, registration=strict, rng=rng()).failure is Failure.NOT_REGISTERED
 
 
 def test_images_are_read_only_after_the_features_agree(
@@ -107,7 +115,7 @@ def test_images_are_read_only_after_the_features_agree(
 
     first, second = (replace(view, images=unread) for view in views)
     strict = CONFIG.model_copy(update={"min_inliers": 1000})
-    assert verify(first, second, strict, REGISTRATION, rng()).failure is Failure.FEW_MATCHES
+    assert verify(first, second, strict, registration=REGISTRATION, rng=rng()).failure is Failure.FEW_MATCHES
 
 
 def test_features_agree_at_the_true_motion_only(views: tuple[VerificationView, VerificationView]) -> None:
