@@ -48,7 +48,10 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
     """Convert logs, one robot per log, per folder of logs, or per namespace.
 
     Args:
+        src: a log, a folder of logs, or a TOML file that names them.
+        out: folder of the recording.
         robots: how many there must be; 0: as many as are found.
+        force: replace a recording that is there.
     Raises:
         DuagError: names log and topic, what was found and what was expected.
     """
@@ -108,7 +111,12 @@ def write_robot(
     """Write all frames of a robot, what the self-check measured, and warnings.
 
     Args:
+        recording: gets the logs.
+        name: of the robot.
+        source: its log.
         label: which part of the source it was. max_ratio, gap: see `ReprojectionCheck`.
+        max_ratio: largest residual of the self-check, as a share of the depth.
+        gap: frames between those that the self-check compares.
     """
     sensors = {"part": label, **source.sensors()}
     with recording.robot(name, source.camera, source.depth_scale, sensors) as robot:

@@ -78,7 +78,10 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
     """Convert a sequence, one robot for each vehicle in the bag.
 
     Args:
+        src: folder of the sequence.
+        out: folder of the recording.
         robots: how many there must be; 0: as many as are found.
+        force: replace a recording that is there.
     Raises:
         DuagError: names file and topic, what was found and what was expected.
     """

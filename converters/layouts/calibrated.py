@@ -36,8 +36,11 @@ def numbers(text: str, counts: tuple[int, ...]) -> Numbers:
 class ColorLens:
     """The color camera as it is.
 
-    source: its focal lengths and principal point. distortion: (k1, k2, p1, p2[, k3]) in OpenCV's order, or empty.
-    rotation_rad: rotation vector [3] that takes directions of the depth camera to those of the color camera.
+    Attributes:
+        source: its focal lengths and principal point.
+        distortion: (k1, k2, p1, p2[, k3]) in OpenCV's order, or empty.
+        rotation_rad: rotation vector [3] that takes directions of the depth camera to those of the color
+            camera.
     """
 
     source: PinholeCamera
@@ -94,6 +97,7 @@ def correct(depth_m: Array, camera: PinholeCamera, coefficients: Numbers) -> Arr
 
     Args:
         depth_m: [h, w] of `camera`, 0 = none.
+        camera: of the depth images.
         coefficients: c0 .. c5, 1/m; empty: nothing is changed.
     """
     if not any(coefficients):

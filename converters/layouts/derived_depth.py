@@ -30,7 +30,11 @@ MAX_RATIO_ERROR = 0.02
 
 @dataclass(frozen=True)
 class Lidar:
-    """A LiDAR next to a camera. motion: of that camera, to take out what it moved during a sweep; None: not known."""
+    """A LiDAR next to a camera.
+
+    Attributes:
+        motion: of that camera, to take out what it moved during a sweep; None: not known.
+    """
 
     T_camera_lidar: Array
     range_sigma_m: float

@@ -42,9 +42,13 @@ class FrameFiles:
 class Clip:
     """What one robot saw.
 
-    label: in the dataset. camera: of the depth images, and of the color images unless `color_camera` is given; then
-    color is resampled into `camera` (same place, same axes). depth_scale: meters per unit. no_depth: values that
-    mean none. distortion: (k1, k2, p1, p2, k3) of color and depth alike, removed; empty: none.
+    Attributes:
+        label: in the dataset.
+        camera: of the depth images, and of the color images unless `color_camera` is given; then color is
+            resampled into `camera` (same place, same axes).
+        depth_scale: meters per unit.
+        no_depth: values that mean none.
+        distortion: (k1, k2, p1, p2, k3) of color and depth alike, removed; empty: none.
     """
 
     label: str
@@ -85,6 +89,13 @@ def write(
     """Write a recording of clips, one robot each; all start at time 0, as if they had moved together.
 
     Args:
+        out: folder of the recording.
+        dataset: its name.
+        src: where its files are.
+        clips: one for each robot.
+        parameters: the settings it was made with.
+        warnings: what users should know about the recording.
+        force: replace a recording that is there.
         names: of the robots; alpha, bravo, ... by default.
     Raises:
         DuagError: a file is not what it should be, or depth and poses do not belong together.

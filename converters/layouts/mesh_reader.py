@@ -201,6 +201,7 @@ class _Complaints:
         """Raises DuagError for a texture that was not read whole.
 
         Args:
+            path: of the mesh, for messages.
             unpainted: a part has no texture; if all have, one that was not read is of a kind that is not used.
         """
         self.others.seek(0)

@@ -271,7 +271,11 @@ def _rvl(body: bytes, where: str) -> NDArray[np.uint16]:
 
 @dataclass(frozen=True)
 class RosCamera:
-    """A CameraInfo: the pinhole, and the distortion of its images; fisheye: by the equidistant model."""
+    """A CameraInfo: the pinhole, and the distortion of its images;
+
+    Attributes:
+        fisheye: by the equidistant model.
+    """
 
     camera: PinholeCamera
     distortion: tuple[float, ...]

@@ -100,8 +100,11 @@ class StereoRig:
         """Rectify a pair by its calibration.
 
         Args:
+            left: the left camera.
+            right: the right camera.
             T_right_left: [4, 4], takes coordinates in the left camera to the right one; its x is negative.
             where: begins the line of an error.
+            options: of the matching; by default those of `StereoOptions`.
         Raises:
             DuagError: the cameras are not side by side, left to the left, or no part of the images is rectified.
         """

@@ -23,7 +23,8 @@ REGISTERED = ("aligned_depth_to_color", "depth_registered", "registered", "align
 class Choice:
     """A topic and why it is the one; or no topic, and what keeps from choosing.
 
-    candidates: topics that could have been meant.
+    Attributes:
+        candidates: topics that could have been meant.
     """
 
     topic: str
@@ -48,6 +49,7 @@ class Chooser:
         """Initialize.
 
         Args:
+            log: the log.
             namespace: only topics below it.
             wanted: topics by name of the option ("color", ...), "" = not given.
         """

@@ -42,7 +42,9 @@ MOST_RATE = 1e-3  # by which two clocks differ; more is a recorder that cannot k
 class Drift:
     """How much later, by its header, a message was recorded: at the start and at the end of a log.
 
-    seconds: between the two. scatter_s: how far the least delays lie from a line.
+    Attributes:
+        seconds: between the two.
+        scatter_s: how far the least delays lie from a line.
     """
 
     start_s: float
@@ -103,9 +105,10 @@ def drift(stamps_ns: NDArray[np.int64], delays_ns: NDArray[np.int64]) -> Drift |
 class RobotClock:
     """What the times of one robot's images say.
 
-    files: those that hold images. delays_ns: time of recording less that of the header, [n].
-
-    header: times of the recording are those of headers (not of the recorder).
+    Attributes:
+        files: those that hold images.
+        delays_ns: time of recording less that of the header, [n].
+        header: times of the recording are those of headers (not of the recorder).
     """
 
     robot: str
@@ -122,7 +125,10 @@ class RobotClock:
 class Offset:
     """What to add to a robot's times to have them on the reference's clock; None where it is not known.
 
-    low_s, high_s: bounds, None if that side is open. how: in words.
+    Attributes:
+        low_s: bounds, None if that side is open.
+        high_s: bounds, None if that side is open.
+        how: in words.
     """
 
     seconds: float | None

@@ -14,9 +14,13 @@ LAST_NS = 1 << 62
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a log. type: ROS's name of it ("sensor_msgs/msg/Image"), or the schema's own if it has none.
+    """A topic of a log.
 
-    schema, encoding: as the file names them. count: messages.
+    Attributes:
+        type: ROS's name of it ("sensor_msgs/msg/Image"), or the schema's own if it has none.
+        schema: as the file names them.
+        encoding: as the file names them.
+        count: messages.
     """
 
     name: str
@@ -28,10 +32,14 @@ class Topic:
 
 @dataclass(frozen=True)
 class Entry:
-    """One message. log_ns: when it was recorded; publish_ns: when it was sent, where the container records it.
+    """One message.
 
-    data: as it stands in the container. read: the message, with ROS's fields. header_ns: the time in its header, 0
-    where it has none.
+    Attributes:
+        log_ns: when it was recorded
+        publish_ns: when it was sent, where the container records it.
+        data: as it stands in the container.
+        read: the message, with ROS's fields.
+        header_ns: the time in its header, 0 where it has none.
     """
 
     topic: str

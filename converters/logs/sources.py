@@ -32,7 +32,11 @@ GROUPING = ("namespaces", "pieces")  # options that say which logs are whose, wh
 
 @dataclass(frozen=True)
 class Source:
-    """The logs of one robot, one log in pieces; what the user said about them. label: how the recording calls them."""
+    """The logs of one robot, one log in pieces; what the user said about them.
+
+    Attributes:
+        label: how the recording calls them.
+    """
 
     robot: str
     paths: tuple[Path, ...]

@@ -26,7 +26,12 @@ TRIES = 24
 
 @dataclass(frozen=True)
 class Mover:
-    """A figure. folder: where its triangles lie. poses: T_world_mover [frames, 4, 4], between its feet."""
+    """A figure.
+
+    Attributes:
+        folder: where its triangles lie.
+        poses: T_world_mover [frames, 4, 4], between its feet.
+    """
 
     folder: Path
     poses: Array

@@ -31,8 +31,11 @@ SUN_REACH_M = 200.0
 class Atlas:
     """Colors of all surfaces.
 
-    levels: uint8 [h >> k, w >> k, 3] each, RGB. origin: texel of (s, t) = (0, 0) of every surface, [n, 2] (x, y),
-    where the center of the first texel is 0. texel_m: size of a texel.
+    Attributes:
+        levels: uint8 [h >> k, w >> k, 3] each, RGB.
+        origin: texel of (s, t) = (0, 0) of every surface, [n, 2] (x, y), where the center of the first texel
+            is 0.
+        texel_m: size of a texel.
     """
 
     levels: list[NDArray[np.uint8]]

@@ -27,6 +27,7 @@ def read(files: list[Path], up: str, cache: Path) -> None:
     Args:
         files: of the meshes, all in one folder.
         up: the axis that is up in them, "y" or "z".
+        cache: an existing folder, gets the arrays.
     Raises:
         DuagError: a file that cannot be read, or not within the limits of `duagc.converters.layouts.mesh_reader`.
     """

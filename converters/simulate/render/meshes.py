@@ -30,10 +30,14 @@ ARRAYS = ("vertices", "triangles", "texels", "texture_of", "colors")
 class MeshScene:
     """A scene of n vertices and m triangles.
 
-    vertices: float64 [n, 3], m, world. triangles: int32 [m, 3]. texels: float32 [m, 3, 2], where the corners of a
-    triangle lie in its texture (x right, y down; the center of the first texel is 0). texture_of: int32 [m], index
-    into `textures`, or NO_TEXTURE for the colors of the vertices. colors: uint8 [n, 3] RGB. textures: per texture
-    its mip levels, uint8 [h, w, 3] RGB each, the finest first.
+    Attributes:
+        vertices: float64 [n, 3], m, world.
+        triangles: int32 [m, 3].
+        texels: float32 [m, 3, 2], where the corners of a triangle lie in its texture (x right, y down; the
+            center of the first texel is 0).
+        texture_of: int32 [m], index into `textures`, or NO_TEXTURE for the colors of the vertices.
+        colors: uint8 [n, 3] RGB.
+        textures: per texture its mip levels, uint8 [h, w, 3] RGB each, the finest first.
     """
 
     vertices: Array

@@ -162,8 +162,10 @@ class Lamp:
 class Scene:
     """A room [0, size] with what stands in it.
 
-    even_light: strength of the light from everywhere. sun: vector toward the sun, as long as it is strong; a scene
-    with a sun has a sky instead of a ceiling.
+    Attributes:
+        even_light: strength of the light from everywhere.
+        sun: vector toward the sun, as long as it is strong; a scene with a sun has a sky instead of a
+            ceiling.
     """
 
     name: str

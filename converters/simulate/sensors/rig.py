@@ -36,10 +36,14 @@ BLACK_OF_STOP = 0.04  # of full scale
 class Rig:
     """Sensors of a robot.
 
-    sensor: one of SENSORS. readout_s: from the first to the last row of an image. exposure_s: how long the shutter is
-    open. gain_stops: largest change of the exposure, factors of two. clock_s: largest offset of a robot's clock.
-    camera_stops: how much the cameras of two robots differ: each channel of each takes up to so many factors of two of
-    light more or less, and has a black level of up to so many times BLACK_OF_STOP.
+    Attributes:
+        sensor: one of SENSORS.
+        readout_s: from the first to the last row of an image.
+        exposure_s: how long the shutter is open.
+        gain_stops: largest change of the exposure, factors of two.
+        clock_s: largest offset of a robot's clock.
+        camera_stops: how much the cameras of two robots differ: each channel of each takes up to so many
+            factors of two of light more or less, and has a black level of up to so many times BLACK_OF_STOP.
     """
 
     sensor: str = "rgbd"

@@ -37,9 +37,12 @@ FARTHEST_BEHIND_M = 5.0, 15.0  # a follower, and the last one behind the first
 
 @dataclass(frozen=True)
 class Figure:
-    """Where a figure is drawn: its middle (x, y, m), direction, the length of a path, and the size of the whole.
+    """Where a figure is drawn: its middle (x, y, m), direction, the length of a path, and the size of the
+    whole.
 
-    frames: of a path. route: [n, 2], of a figure of followers, the curve that all go along.
+    Attributes:
+        frames: of a path.
+        route: [n, 2], of a figure of followers, the curve that all go along.
     """
 
     middle: Array
@@ -145,6 +148,7 @@ class Ground:
         """Initialize.
 
         Args:
+            terrain: whose floor it is.
             frames: of every path.
             seed: of figures, and of how cameras waver.
         """

@@ -35,8 +35,12 @@ HEIGHTS_M = (1.48, 1.22, 1.62, 1.34)
 class Loop:
     """One robot's path around the room; angles count from east, in radians.
 
-    radii: half axes of the loop. waver, phases: size and phase of its deviations (radius, height, gaze).
-    direction: +1 counter-clockwise. gaze_m: half axes of the curve, across the room, on which the gaze rests.
+    Attributes:
+        radii: half axes of the loop.
+        waver: size and phase of its deviations (radius, height, gaze).
+        phases: size and phase of its deviations (radius, height, gaze).
+        direction: +1 counter-clockwise.
+        gaze_m: half axes of the curve, across the room, on which the gaze rests.
     """
 
     middle: Array

@@ -59,9 +59,14 @@ EDGE_GRAY = 6.0  # of 255, between neighboring pixels of VIEW_IMAGE
 class FreeSpace:
     """Where a robot can stand.
 
-    floor_m: height of the floor. cells: [n, 2], x and y (m) of the middles of free cells, all connected. clearance:
-    [n], m. graph: cost of the path between neighboring cells. inside: [nx, ny], whether a cell of the whole grid is
-    free. low: [2], middle (m) of its first cell; cell_m: its width.
+    Attributes:
+        floor_m: height of the floor.
+        cells: [n, 2], x and y (m) of the middles of free cells, all connected.
+        clearance: [n], m.
+        graph: cost of the path between neighboring cells.
+        inside: [nx, ny], whether a cell of the whole grid is free.
+        low: [2], middle (m) of its first cell
+        cell_m: its width.
     """
 
     floor_m: float
@@ -163,6 +168,8 @@ def space_between(
     """The largest connected free space on a grid from `low` to `high` (x, y).
 
     Args:
+        low: lower corner (x, y, m) of the floor.
+        high: upper corner.
         floor: its height.
         distance: of points [..., 3] to the nearest surface.
         closed: whether places [n, 2] are inside the scene.
