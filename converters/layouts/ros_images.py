@@ -271,10 +271,10 @@ def _rvl(body: bytes, where: str) -> NDArray[np.uint16]:
 
 @dataclass(frozen=True)
 class RosCamera:
-    """A CameraInfo: the pinhole, and the distortion of its images;
+    """A CameraInfo: the pinhole, and the distortion of its images.
 
     Attributes:
-        fisheye: by the equidistant model.
+        fisheye: whether the distortion is that of the equidistant model.
     """
 
     camera: PinholeCamera

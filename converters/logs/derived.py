@@ -130,9 +130,14 @@ def stereo_of(
     transforms.
 
     Args:
-        color, right: topic, topic of the CameraInfo, camera. rectified: whether the images are so already.
+        log: the log.
+        color: of the left camera: topic, topic of the CameraInfo, camera.
+        right: likewise, of the right camera.
+        rectified: whether the images are rectified already.
+        transforms: between frames of the log.
+        settings: options of the converter.
     Raises:
-        DuagError: nothing says where the right camera is.
+        DuagError: the pose of the right camera is nowhere.
     """
     where = f"{log.name}: {color[0]} and {right[0]}"
     cameras = [c.camera for c in (color[2], right[2])]

@@ -35,7 +35,7 @@ class Entry:
     """One message.
 
     Attributes:
-        log_ns: when it was recorded
+        log_ns: when it was recorded.
         publish_ns: when it was sent, where the container records it.
         data: as it stands in the container.
         read: the message, with ROS's fields.

@@ -47,6 +47,7 @@ def as_ros(schema: str, message: Any, where: str) -> Any:
     Args:
         schema: by its plain name.
         message: attributes by Foxglove's names.
+        where: of the message, for errors.
     Raises:
         DuagError: a field is missing or of another kind.
     """

@@ -136,6 +136,9 @@ class MotionReader:
         """Initialize.
 
         Args:
+            log: the log.
+            settings: options of the converter.
+            transforms: between frames of the log.
             color_frame: of the color camera.
             time_ns: the time of a message by the clock that the options choose.
 

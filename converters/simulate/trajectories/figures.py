@@ -37,8 +37,7 @@ FARTHEST_BEHIND_M = 5.0, 15.0  # a follower, and the last one behind the first
 
 @dataclass(frozen=True)
 class Figure:
-    """Where a figure is drawn: its middle (x, y, m), direction, the length of a path, and the size of the
-    whole.
+    """Where a figure is drawn: its middle (x, y, m), direction, length of a path, and size of the whole.
 
     Attributes:
         frames: of a path.
