@@ -428,7 +428,7 @@ class Agent:
         if self.poses is None:
             if any(_pair(self.own, n.index) not in self.alignment.pairs for n in joined):
                 return  # a forged state counted hops that are not there
-            if undecided := self.alignment.undecided:
+            if self.loop_closing.revokes and (undecided := self.alignment.undecided):
                 self._revoke_links(self.alignment.revoked | undecided)
                 return
             self._start_poses()
@@ -443,7 +443,7 @@ class Agent:
         if self.agreed:
             return
         refuted = sum(pair_bit(self.own, n.index) for n in joined if self.poses.refuted(n.name))
-        if refuted:
+        if refuted and self.loop_closing.revokes:
             self._revoke_links(self.alignment.revoked | refuted)
             return
         self.converged_hops = 0

@@ -120,6 +120,7 @@ class DetectedLoopClosures:
     """Recognizes places in images and verifies what it finds; the source of loop closures in runs."""
 
     trusted = False
+    revokes = True
 
     def __init__(self, data: RobotData, config: ExchangeConfig, seed: int) -> None:
         """Start from a robot's own images.

@@ -31,10 +31,13 @@ class KnownLoopClosures:
 
     Attributes:
         trusted: all loop closures are true.
+        revokes: False; where one loop closure joins two robots, links without inliers are common, and to begin again
+            without one costs more than to carry it with weight zero.
         greeting: None, the roles follow from the loop closures.
     """
 
     greeting = None
+    revokes = False
 
     def __init__(
         self,

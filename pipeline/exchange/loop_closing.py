@@ -128,6 +128,10 @@ class LoopClosing(Protocol):
         """Whether all loop closures are true: then none is left out, and no relative frame contradicts another."""
 
     @property
+    def revokes(self) -> bool:
+        """Whether a link without enough inliers, or that contradicts others, is revoked; else it has no weight."""
+
+    @property
     def greeting(self) -> bytes | None:
         """Payload of HELLO, from which the roles of the two ends follow; None if they are known without."""
 

@@ -160,16 +160,14 @@ def _refuted(cycles: Mapping[Cycle, bool]) -> dict[Pair, float]:
 def _undecided(pairs: Mapping[Pair, Sequence[Proposal]], cycles: Mapping[Cycle, bool]) -> dict[Pair, str]:
     """Links of cycles that do not close, if no other cycle confirms them and none is the weakest by far.
 
-    A single loop closure contradicts nothing: its graduated weight decides. A link with more of them than others may be
-    the false one, because alike places are seen again and again.
+    A link with more loop closures than others may be the false one: alike places are seen again and again.
     """
     confirmed = _confirmed(cycles)
     out: dict[Pair, str] = {}
     for cycle, closed in cycles.items():
         weights = {p: max(k.weight for k in pairs[p]) for p in cycle if p not in confirmed}
         least, *rest = sorted(weights.values()) or [0.0]
-        single = any(max(k.support for k in pairs[p]) == 1 for p in weights)
-        if closed or single or not rest or least < CLEAR * rest[0]:
+        if closed or not rest or least < CLEAR * rest[0]:
             continue
         weighed = ", ".join(f"{a}-{b} {weight:.2f}" for (a, b), weight in sorted(weights.items()))
         reason = f"is in a cycle of three robots that does not close; which link is false is open ({weighed})"
