@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.kernels import reference
+from duagc.pipeline.kernels import definition
 from duagc.pipeline.splat.gaussians import Gaussians
 
 TILE_PX = 16
@@ -25,8 +25,10 @@ def draw(parameters: dict[str, Any], camera: PinholeCamera, T_camera_map: np.nda
     import torch
 
     T = torch.tensor(T_camera_map, dtype=torch.float32)
-    sigma = reference.sigma_of(parameters["quats_wxyz"], parameters["log_scales"])
-    order, z, centers, conics = reference.project(parameters["means"], sigma, T[:3, :3], T[:3, 3], camera)
+    sigma = definition.sigma_of(parameters["quats_wxyz"], parameters["log_scales"])
+    order, z, centers, conics = definition.project(
+        parameters["means"], sigma, T[:3, :3], T[:3, 3], camera=camera
+    )
     opacities = torch.sigmoid(parameters["opacity_logits"][order])
     values = torch.cat([parameters["colors"][order], z[:, None]], dim=1)
     with torch.no_grad():
@@ -46,7 +48,7 @@ def draw(parameters: dict[str, Any], camera: PinholeCamera, T_camera_map: np.nda
                 torch.arange(y, y + height), torch.arange(x, x + width), indexing="ij"
             )
             pixels = torch.stack([columns, rows], -1).reshape(-1, 2).to(torch.float32)
-            weights, _ = reference.blend(pixels, centers[i], conics[i], opacities[i])
+            weights, _ = definition.blend(pixels, centers[i], conics[i], opacities[i])
             tiles.append((weights @ values[i]).reshape(height, width, 4))
     across = -(-camera.width // TILE_PX)
     strips = [torch.cat(tiles[i : i + across], dim=1) for i in range(0, len(tiles), across)]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import reprlib
 from dataclasses import astuple
 from numbers import Real
 from typing import Any
@@ -14,6 +12,24 @@ from numpy.typing import ArrayLike, NDArray
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import _raster
+from duagc.pipeline.kernels.arguments import (
+    NEGATIVE,
+    NOT_FINITE,
+    Image,
+    Status,
+    arrays_of,
+    check_array,
+    check_type,
+    check_wanted,
+    checked_background,
+    checked_camera,
+    checked_exposure,
+    checked_image,
+    checked_mask,
+    checked_pose,
+    complaint_about,
+    refuse_bad_image,
+)
 from duagc.pipeline.kernels.types import (
     FISHER_DIAGONAL_COLUMNS,
     FisherSums,
@@ -26,23 +42,13 @@ from duagc.pipeline.kernels.types import (
 from duagc.pipeline.splat.gaussians import DEPTH_KINDS, Gaussians
 from duagc.pipeline.splat.information import GEOMETRY_SIZE
 
-MAX_SIDE_PX = 16384
 MAX_THREADS = 1024
 MAX_GAUSSIANS = 2**30
-LARGEST_LOG_SCALE = 40.0  # of meters; as in visibility.h
 SAME_LAYER = 0.05  # relative difference of depth
-ROTATION_TOLERANCE = 1e-4  # of R^T R - I; a pose read from six decimals passes
-
-Image = NDArray[np.float32]
 
 _NOTHING = np.zeros(0, dtype=np.float32)  # an optional array that is not given
 _NO_DOUBLES = np.zeros(0)
 _NO_MASK = np.zeros(0, dtype=np.uint8)
-
-_NOT_FINITE = "a NaN or an infinity"
-_NEGATIVE = "a NaN, an infinity or a negative number"
-
-_OK, _BAD_GAUSSIANS, _BAD_FIRST, _BAD_SECOND, _BAD_THIRD, _TOO_MANY = range(6)  # enum Status of frame.h
 
 
 def available_isas() -> list[str]:
@@ -110,7 +116,9 @@ class Rasterizer:
         height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth_kind)
         color, depths, alpha = empty(height, width, 3), empty(height, width), empty(height, width)
         self._finish(
-            gaussians, (height, width), self._raster.forward(*_arrays(gaussians), *view, color, depths, alpha)
+            gaussians,
+            (height, width),
+            self._raster.forward(*arrays_of(gaussians), *view, color, depths, alpha),
         )
         return Render(color, depths, alpha)
 
@@ -160,24 +168,22 @@ class Rasterizer:
         """
         height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth_kind)
         measured = (
-            _checked_image("color", color, (height, width, 3), "the camera"),
-            _checked_image("depth_m", depth_m, (height, width), "the camera"),
+            checked_image("color", color, (height, width, 3), "the camera"),
+            checked_image("depth_m", depth_m, (height, width), "the camera"),
         )
-        gain_and_offset = _checked_exposure(exposure)
-        _check_type("loss", loss, LossWeights)
+        gain_and_offset = checked_exposure(exposure)
+        check_type("loss", loss, LossWeights)
         *of_images, surface_weight = astuple(loss)
         weights = np.array([*of_images, *gain_and_offset, surface_weight], np.float32)
-        _check_wanted(pose, parameters, fisher=False)
+        check_wanted(pose, parameters, fisher=False)
         out = _outputs(gaussians, parameters)
         by_pose, values = np.zeros(6 if pose else 0), np.zeros(6)
-        arguments = [*_arrays(gaussians), *view, *measured, weights, values, *out, by_pose]
+        arguments = [*arrays_of(gaussians), *view, *measured, weights, values, *out, by_pose]
         if depth_certainty is not None:
-            arguments.append(
-                _checked_image("depth_certainty", depth_certainty, (height, width), "the camera")
-            )
+            arguments.append(checked_image("depth_certainty", depth_certainty, (height, width), "the camera"))
         status = self._raster.fit(*arguments)
         self._gaussians = None
-        _refuse_bad_image(status, {"color": _NOT_FINITE, "depth_m": _NEGATIVE, "depth_certainty": _NEGATIVE})
+        refuse_bad_image(status, {"color": NOT_FINITE, "depth_m": NEGATIVE, "depth_certainty": NEGATIVE})
         self._finish(gaussians, (height, width), status)
         of_color, of_depth, missing, by_gain, by_offset, surface = (float(value) for value in values)
         value = (
@@ -201,24 +207,24 @@ class Rasterizer:
         depth_kind: DepthKind,
     ) -> tuple[int, int, tuple[Any, ...]]:
         """Height, width, and what the kernels take of a view, checked."""
-        _check_type("gaussians", gaussians, Gaussians)
-        height, width, intrinsics = _checked_camera(camera)
-        pose = _checked_pose("T_camera_map", T_camera_map)
-        behind = _checked_background(background)
+        check_type("gaussians", gaussians, Gaussians)
+        height, width, intrinsics = checked_camera(camera)
+        pose = checked_pose("T_camera_map", T_camera_map)
+        behind = checked_background(background)
         if not isinstance(depth_kind, str) or depth_kind not in DEPTH_KINDS:
             raise ValueError(f"depth_kind is {depth_kind!r}, expected one of {', '.join(DEPTH_KINDS)}")
         if len(gaussians) > MAX_GAUSSIANS:
             raise ValueError(f"gaussians are {len(gaussians)}, expected at most {MAX_GAUSSIANS}")
-        wanted = _NO_MASK if mask is None else _checked_mask(mask, (height, width))
+        wanted = _NO_MASK if mask is None else checked_mask(mask, (height, width))
         ray_plane = depth_kind == "ray_plane"
         return height, width, (pose, intrinsics, behind, wanted, ray_plane, width, height, self.threads)
 
     def _finish(self, gaussians: Gaussians, size: tuple[int, int], status: int) -> None:
         """Remember what was drawn, or refuse what could not be."""
         self._gaussians = None
-        if status == _BAD_GAUSSIANS:
-            raise ValueError(_complaint_about(gaussians))
-        if status == _TOO_MANY:
+        if status == Status.BAD_GAUSSIANS:
+            raise ValueError(complaint_about(gaussians))
+        if status == Status.TOO_MANY:
             raise ValueError(
                 f"gaussians: {len(gaussians)} are so large on the screen that their tiles do not fit into memory"
             )
@@ -250,19 +256,19 @@ class Rasterizer:
         Raises:
             ValueError: an image of a wrong type, shape or value; the message names it.
         """
-        _check_wanted(pose, parameters, fisher)
+        check_wanted(pose, parameters, fisher)
         gaussians, (height, width) = self._last_forward()
         n = len(gaussians)
         images = (
-            _checked_image("d_color", d_color, (height, width, 3)),
-            _NOTHING if d_depth is None else _checked_image("d_depth", d_depth, (height, width)),
-            _NOTHING if d_alpha is None else _checked_image("d_alpha", d_alpha, (height, width)),
+            checked_image("d_color", d_color, (height, width, 3)),
+            _NOTHING if d_depth is None else checked_image("d_depth", d_depth, (height, width)),
+            _NOTHING if d_alpha is None else checked_image("d_alpha", d_alpha, (height, width)),
         )
         out = _outputs(gaussians, parameters)
         by_pose = np.zeros(6 if pose else 0)
         diagonal = _zeros(n, FISHER_DIAGONAL_COLUMNS) if fisher else _NOTHING
-        status = self._raster.backward(*_arrays(gaussians), *images, *out, diagonal, by_pose)
-        _refuse_bad_image(status, dict.fromkeys(("d_color", "d_depth", "d_alpha"), _NOT_FINITE))
+        status = self._raster.backward(*arrays_of(gaussians), *images, *out, diagonal, by_pose)
+        refuse_bad_image(status, dict.fromkeys(("d_color", "d_depth", "d_alpha"), NOT_FINITE))
         return _gradients(
             out if parameters else None, by_pose if pose else None, diagonal if fisher else None
         )
@@ -283,11 +289,11 @@ class Rasterizer:
         gaussians, size = self._last_forward()
         n = len(gaussians)
         images = (
-            _checked_image("inv_var_color", inv_var_color, size),
-            _checked_image("inv_var_depth", inv_var_depth, size),
-            _NOTHING if residual is None else _checked_image("residual", residual, size),
+            checked_image("inv_var_color", inv_var_color, size),
+            checked_image("inv_var_depth", inv_var_depth, size),
+            _NOTHING if residual is None else checked_image("residual", residual, size),
         )
-        _check_type("sums", sums, FisherSums)
+        check_type("sums", sums, FisherSums)
         expected = {
             "geometry": ((n, GEOMETRY_SIZE), np.float64),
             "color": ((n, 3), np.float64),
@@ -299,7 +305,7 @@ class Rasterizer:
         if sums.diagonal is not None:
             expected["diagonal"] = ((n, FISHER_DIAGONAL_COLUMNS), np.float64)
         for name, (shape, dtype) in expected.items():
-            _check_array(f"sums.{name}", getattr(sums, name), shape, dtype)
+            check_array(f"sums.{name}", getattr(sums, name), shape, dtype)
         diagonal = _NO_DOUBLES if sums.diagonal is None else sums.diagonal
         added = (
             sums.geometry,
@@ -310,8 +316,8 @@ class Rasterizer:
             diagonal,
             sums.observations,
         )
-        status = self._raster.fisher(*_arrays(gaussians), *images, *added)
-        _refuse_bad_image(status, dict.fromkeys(("inv_var_color", "inv_var_depth", "residual"), _NEGATIVE))
+        status = self._raster.fisher(*arrays_of(gaussians), *images, *added)
+        refuse_bad_image(status, dict.fromkeys(("inv_var_color", "inv_var_depth", "residual"), NEGATIVE))
 
     def full_fisher(self, inv_var_color: Image, inv_var_depth: Image) -> NDArray[np.float64]:
         """J^T R^-1 J [n, 14, 14] of the last view with all its cross terms; for validation, not for speed.
@@ -323,11 +329,11 @@ class Rasterizer:
             inv_var_depth: as in `fisher`.
         """
         gaussians, size = self._last_forward()
-        color = _checked_image("inv_var_color", inv_var_color, size)
-        depth = _checked_image("inv_var_depth", inv_var_depth, size)
+        color = checked_image("inv_var_color", inv_var_color, size)
+        depth = checked_image("inv_var_depth", inv_var_depth, size)
         information = np.zeros((len(gaussians), FISHER_DIAGONAL_COLUMNS, FISHER_DIAGONAL_COLUMNS))
-        status = self._raster.full_fisher(*_arrays(gaussians), color, depth, information)
-        _refuse_bad_image(status, dict.fromkeys(("inv_var_color", "inv_var_depth"), _NEGATIVE))
+        status = self._raster.full_fisher(*arrays_of(gaussians), color, depth, information)
+        refuse_bad_image(status, dict.fromkeys(("inv_var_color", "inv_var_depth"), NEGATIVE))
         return information
 
     def contributions(self) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
@@ -388,7 +394,7 @@ def _zeros(*shape: int) -> NDArray[np.float32]:
 
 
 def _outputs(gaussians: Gaussians, parameters: bool) -> list[NDArray[np.float32]]:
-    return [_zeros(*array.shape) if parameters else _NOTHING for array in _arrays(gaussians)]
+    return [_zeros(*array.shape) if parameters else _NOTHING for array in arrays_of(gaussians)]
 
 
 def _gradients(
@@ -400,141 +406,3 @@ def _gradients(
     names = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
     arrays: dict[str, Any] = dict(zip(names, of_parameters or nothing, strict=True))
     return Gradients(**arrays, pose=pose, fisher_diagonal=fisher_diagonal)
-
-
-def _check_wanted(pose: bool, parameters: bool, fisher: bool) -> None:
-    if not parameters and (fisher or not pose):
-        raise ValueError("parameters is False, expected pose=True and fisher=False with it")
-
-
-def _arrays(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:
-    return (
-        gaussians.means,
-        gaussians.quats_wxyz,
-        gaussians.log_scales,
-        gaussians.colors,
-        gaussians.opacity_logits,
-    )
-
-
-def _check_type(name: str, value: object, expected: type) -> None:
-    if not isinstance(value, expected):
-        raise ValueError(f"{name} is {type(value).__name__}, expected {expected.__name__}")
-
-
-def _checked_camera(camera: PinholeCamera) -> tuple[int, int, NDArray[np.float32]]:
-    _check_type("camera", camera, PinholeCamera)
-    for name in ("width", "height"):
-        side = getattr(camera, name)
-        if not isinstance(side, Real) or not 1 <= float(side) <= MAX_SIDE_PX or float(side) % 1:
-            raise ValueError(
-                f"camera.{name} is {side!r}, expected a whole number of 1 to {MAX_SIDE_PX} pixels"
-            )
-    names = ("fx", "fy", "cx", "cy")
-    for name in names:
-        value, smallest = getattr(camera, name), 1e-3 if name in ("fx", "fy") else -1e9
-        if not isinstance(value, Real) or not smallest <= float(value) < 1e9:
-            raise ValueError(
-                f"camera.{name} is {value!r}, expected a finite number of pixels, positive for a focal length"
-            )
-    intrinsics = np.array([getattr(camera, name) for name in names], dtype=np.float32)
-    return int(camera.height), int(camera.width), intrinsics
-
-
-def _real_numbers(name: str, value: ArrayLike, expected: str) -> NDArray[np.float64]:
-    """`value` as an array; refuses what is text, complex, ragged or no array at all."""
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError, RuntimeError):  # ragged, or a tensor that cannot be read
-        array = np.asarray(None)
-    if array.dtype.kind not in "iuf":
-        found = f"an array of {array.dtype}" if isinstance(value, np.ndarray) else reprlib.repr(value)
-        raise ValueError(f"{name} is {found}, expected {expected}")
-    return array.astype(np.float64)
-
-
-def _checked_pose(name: str, T: ArrayLike) -> NDArray[np.float32]:
-    pose = _real_numbers(name, T, "an array of numbers")
-    if pose.shape != (4, 4):
-        raise ValueError(f"{name} has shape {pose.shape}, expected (4, 4)")
-    R = pose[:3, :3]
-    if not (np.abs(pose) < 1e30).all():
-        raise ValueError(f"{name} holds a NaN, an infinity or a number beyond 1e30")
-    if (
-        np.abs(R.T @ R - np.eye(3)).max() > ROTATION_TOLERANCE
-        or np.linalg.det(R) < 0
-        or np.abs(pose[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE
-    ):
-        raise ValueError(f"{name} is not a rigid motion")
-    return np.ascontiguousarray(pose, dtype=np.float32)
-
-
-def _checked_background(background: ArrayLike) -> NDArray[np.float32]:
-    expected = "three numbers within +-1e9"
-    color = _real_numbers("background", background, expected)
-    if color.shape != (3,) or not (np.abs(color) <= 1e9).all():
-        raise ValueError(f"background is {reprlib.repr(background)}, expected {expected}")
-    return color.astype(np.float32)
-
-
-def _checked_mask(mask: object, shape: tuple[int, int]) -> NDArray[np.uint8]:
-    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
-        found = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
-        raise ValueError(f"mask is {found}, expected an array of bool")
-    if mask.shape != shape:
-        raise ValueError(f"mask has shape {mask.shape}, expected {shape}, the size of the camera")
-    return np.ascontiguousarray(mask).view(np.uint8)
-
-
-def _checked_exposure(exposure: tuple[float, float]) -> tuple[float, float]:
-    """Gain and offset of an exposure (a, b)."""
-    expected = "two numbers within +-80 and +-1e9"
-    pair = _real_numbers("exposure", exposure, expected)
-    if pair.shape != (2,) or not (np.abs(pair) <= (80.0, 1e9)).all():
-        raise ValueError(f"exposure is {reprlib.repr(exposure)}, expected {expected}")
-    return math.exp(pair[0]), float(pair[1])
-
-
-def _check_array(name: str, array: object, shape: tuple[int, ...], dtype: type) -> None:
-    if not isinstance(array, np.ndarray) or array.dtype != dtype:
-        found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
-        raise ValueError(f"{name} is {found}, expected an array of {np.dtype(dtype)}")
-    if array.shape != shape:
-        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
-    if not array.flags.c_contiguous or not array.flags.writeable:
-        raise ValueError(f"{name} is not a contiguous, writeable array")
-
-
-def _checked_image(
-    name: str, image: object, shape: tuple[int, ...], given_by: str = "the last forward"
-) -> Image:
-    if not isinstance(image, np.ndarray) or image.dtype != np.float32:
-        found = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
-        raise ValueError(f"{name} is {found}, expected an array of float32")
-    if image.shape != shape:
-        raise ValueError(f"{name} has shape {image.shape}, expected {shape}, the size of {given_by}")
-    return np.ascontiguousarray(image)
-
-
-def _refuse_bad_image(status: int, faults: dict[str, str]) -> None:
-    """faults: what a bad image holds, by its name, in the order of the kernel's arguments."""
-    for code, (name, fault) in zip((_BAD_FIRST, _BAD_SECOND, _BAD_THIRD), faults.items(), strict=False):
-        if status == code:
-            raise ValueError(f"{name} holds {fault}")
-
-
-def _complaint_about(gaussians: Gaussians) -> str:
-    names = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
-    for name, array in zip(names, _arrays(gaussians), strict=True):
-        bad = np.flatnonzero(~np.isfinite(array.reshape(len(gaussians), -1)).all(axis=1))
-        if len(bad):
-            return f"gaussians.{name} holds a NaN or an infinity, first in row {bad[0]}"
-    largest = gaussians.log_scales.max(axis=1)
-    if largest.max() > LARGEST_LOG_SCALE:
-        row = int(np.argmax(largest))
-        return (
-            f"gaussians.log_scales is {largest[row]:.3g} in row {row}, expected at most {LARGEST_LOG_SCALE}"
-        )
-    norm2 = (gaussians.quats_wxyz.astype(np.float64) ** 2).sum(axis=1)
-    row = int(np.argmax(np.maximum(norm2, 1.0 / np.maximum(norm2, 1e-300))))
-    return f"gaussians.quats_wxyz has length {np.sqrt(norm2[row]):.3g} in row {row}, expected 1e-15 to 1e15"

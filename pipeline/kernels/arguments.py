@@ -1,0 +1,197 @@
+"""Checks of the arguments that the compiled kernels take.
+
+Every complaint is a ValueError that names the argument, what was found and what was expected.
+"""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from enum import IntEnum
+from numbers import Real
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.splat.gaussians import Gaussians
+
+Image = NDArray[np.float32]
+MAX_SIDE_PX = 16384
+LARGEST_LOG_SCALE = 40.0  # of meters; as in visibility.h
+ROTATION_TOLERANCE = 1e-4  # of R^T R - I; a pose read from six decimals passes
+NOT_FINITE = "a NaN or an infinity"
+NEGATIVE = "a NaN, an infinity or a negative number"
+
+
+class Status(IntEnum):
+    """What a kernel returns; `enum Status` of frame.h."""
+
+    OK = 0
+    BAD_GAUSSIANS = 1
+    BAD_FIRST = 2
+    BAD_SECOND = 3
+    BAD_THIRD = 4
+    TOO_MANY = 5
+
+
+def check_wanted(pose: bool, parameters: bool, fisher: bool) -> None:
+    """Refuse derivatives that exclude each other."""
+    if not parameters and (fisher or not pose):
+        raise ValueError("parameters is False, expected pose=True and fisher=False with it")
+
+
+def arrays_of(gaussians: Gaussians) -> tuple[NDArray[np.float32], ...]:
+    """The parameters in the order in which the kernels take them."""
+    return (
+        gaussians.means,
+        gaussians.quats_wxyz,
+        gaussians.log_scales,
+        gaussians.colors,
+        gaussians.opacity_logits,
+    )
+
+
+def check_type(name: str, value: object, expected: type) -> None:
+    """Refuse a value of another type."""
+    if not isinstance(value, expected):
+        raise ValueError(f"{name} is {type(value).__name__}, expected {expected.__name__}")
+
+
+def checked_camera(camera: PinholeCamera) -> tuple[int, int, NDArray[np.float32]]:
+    """Height, width and (fx, fy, cx, cy) of a camera."""
+    check_type("camera", camera, PinholeCamera)
+    for name in ("width", "height"):
+        side = getattr(camera, name)
+        if not isinstance(side, Real) or not 1 <= float(side) <= MAX_SIDE_PX or float(side) % 1:
+            raise ValueError(
+                f"camera.{name} is {side!r}, expected a whole number of 1 to {MAX_SIDE_PX} pixels"
+            )
+    names = ("fx", "fy", "cx", "cy")
+    for name in names:
+        value, smallest = getattr(camera, name), 1e-3 if name in ("fx", "fy") else -1e9
+        if not isinstance(value, Real) or not smallest <= float(value) < 1e9:
+            raise ValueError(
+                f"camera.{name} is {value!r}, expected a finite number of pixels, positive for a focal length"
+            )
+    intrinsics = np.array([getattr(camera, name) for name in names], dtype=np.float32)
+    return int(camera.height), int(camera.width), intrinsics
+
+
+def _real_numbers(name: str, value: ArrayLike, expected: str) -> NDArray[np.float64]:
+    """`value` as an array; refuses what is text, complex, ragged or no array at all."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError):  # ragged, or a tensor that cannot be read
+        array = np.asarray(None)
+    if array.dtype.kind not in "iuf":
+        found = f"an array of {array.dtype}" if isinstance(value, np.ndarray) else reprlib.repr(value)
+        raise ValueError(f"{name} is {found}, expected {expected}")
+    return array.astype(np.float64)
+
+
+def checked_pose(name: str, T: ArrayLike) -> NDArray[np.float32]:
+    """A rigid motion [4, 4] in the precision of the kernels."""
+    pose = _real_numbers(name, T, "an array of numbers")
+    if pose.shape != (4, 4):
+        raise ValueError(f"{name} has shape {pose.shape}, expected (4, 4)")
+    R = pose[:3, :3]
+    if not (np.abs(pose) < 1e30).all():
+        raise ValueError(f"{name} holds a NaN, an infinity or a number beyond 1e30")
+    if (
+        np.abs(R.T @ R - np.eye(3)).max() > ROTATION_TOLERANCE
+        or np.linalg.det(R) < 0
+        or np.abs(pose[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE
+    ):
+        raise ValueError(f"{name} is not a rigid motion")
+    return np.ascontiguousarray(pose, dtype=np.float32)
+
+
+def checked_background(background: ArrayLike) -> NDArray[np.float32]:
+    """RGB [3]."""
+    expected = "three numbers within +-1e9"
+    color = _real_numbers("background", background, expected)
+    if color.shape != (3,) or not (np.abs(color) <= 1e9).all():
+        raise ValueError(f"background is {reprlib.repr(background)}, expected {expected}")
+    return color.astype(np.float32)
+
+
+def checked_mask(mask: object, shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """A mask [H, W] as bytes."""
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+        found = mask.dtype if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise ValueError(f"mask is {found}, expected an array of bool")
+    if mask.shape != shape:
+        raise ValueError(f"mask has shape {mask.shape}, expected {shape}, the size of the camera")
+    return np.ascontiguousarray(mask).view(np.uint8)
+
+
+def checked_exposure(exposure: tuple[float, float]) -> tuple[float, float]:
+    """Gain and offset of an exposure (a, b)."""
+    expected = "two numbers within +-80 and +-1e9"
+    pair = _real_numbers("exposure", exposure, expected)
+    if pair.shape != (2,) or not (np.abs(pair) <= (80.0, 1e9)).all():
+        raise ValueError(f"exposure is {reprlib.repr(exposure)}, expected {expected}")
+    return math.exp(pair[0]), float(pair[1])
+
+
+def check_array(name: str, array: object, shape: tuple[int, ...], dtype: type) -> None:
+    """Refuse what the kernels cannot add to in place."""
+    if not isinstance(array, np.ndarray) or array.dtype != dtype:
+        found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
+        raise ValueError(f"{name} is {found}, expected an array of {np.dtype(dtype)}")
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+    if not array.flags.c_contiguous or not array.flags.writeable:
+        raise ValueError(f"{name} is not a contiguous, writeable array")
+
+
+def checked_image(
+    name: str, image: object, shape: tuple[int, ...], given_by: str = "the last forward"
+) -> Image:
+    """A contiguous image of float32.
+
+    Args:
+        name: of the argument, for the message.
+        image: as it was given.
+        shape: expected.
+        given_by: what the shape comes from, for the message.
+    """
+    if not isinstance(image, np.ndarray) or image.dtype != np.float32:
+        found = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
+        raise ValueError(f"{name} is {found}, expected an array of float32")
+    if image.shape != shape:
+        raise ValueError(f"{name} has shape {image.shape}, expected {shape}, the size of {given_by}")
+    return np.ascontiguousarray(image)
+
+
+def refuse_bad_image(status: int, faults: dict[str, str]) -> None:
+    """Refuse an image in which a kernel found what it cannot hold.
+
+    Args:
+        status: of the kernel.
+        faults: what a bad image holds, by its name, in the order of the kernel's arguments.
+    """
+    for code, (name, fault) in zip(
+        (Status.BAD_FIRST, Status.BAD_SECOND, Status.BAD_THIRD), faults.items(), strict=False
+    ):
+        if status == code:
+            raise ValueError(f"{name} holds {fault}")
+
+
+def complaint_about(gaussians: Gaussians) -> str:
+    """Why a kernel refused these Gaussians."""
+    names = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
+    for name, array in zip(names, arrays_of(gaussians), strict=True):
+        bad = np.flatnonzero(~np.isfinite(array.reshape(len(gaussians), -1)).all(axis=1))
+        if len(bad):
+            return f"gaussians.{name} holds a NaN or an infinity, first in row {bad[0]}"
+    largest = gaussians.log_scales.max(axis=1)
+    if largest.max() > LARGEST_LOG_SCALE:
+        row = int(np.argmax(largest))
+        return (
+            f"gaussians.log_scales is {largest[row]:.3g} in row {row}, expected at most {LARGEST_LOG_SCALE}"
+        )
+    norm2 = (gaussians.quats_wxyz.astype(np.float64) ** 2).sum(axis=1)
+    row = int(np.argmax(np.maximum(norm2, 1.0 / np.maximum(norm2, 1e-300))))
+    return f"gaussians.quats_wxyz has length {np.sqrt(norm2[row]):.3g} in row {row}, expected 1e-15 to 1e15"
