@@ -101,7 +101,9 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
         source = {"dataset": "s3e", "sequence": src.resolve().name, "vehicles": vehicles}
         with RecordingWriter(out, "", source, "s3e", parameters=parameters, force=force) as recording:
             for name, vehicle in zip(robot_names(len(vehicles)), vehicles, strict=True):
-                one = _Vehicle(log, vehicle, calibrations[vehicle], fixes[vehicle], origin, settings)
+                one = _Vehicle(
+                    log, vehicle, calibrations[vehicle], fixes[vehicle], origin=origin, settings=settings
+                )
                 with recording.robot(name, one.rig.camera, STEREO_SCALE_M, one.sensors()) as robot:
                     recording.checks[name] = one.write(robot)
                 recording.warnings += [f"{name} ({vehicle}): {text}" for text in one.warnings]
@@ -271,6 +273,7 @@ class _Vehicle:
         vehicle: str,
         calibration: Calibration,
         fixes: Fixes | None,
+        *,
         origin: Array,
         settings: Options,
     ) -> None:

@@ -77,7 +77,7 @@ class _PoseReadings:
     """What messages say about the pose of a body, as they come; of a transform that changes: "/tf world base_link"."""
 
     def __init__(
-        self, said: str, option: str, name: str, of_header: bool, time_ns: Callable[[Entry], int]
+        self, said: str, option: str, name: str, of_header: bool, *, time_ns: Callable[[Entry], int]
     ) -> None:
         self.option, self._name, self._of_header, self._time_ns = option, name, of_header, time_ns
         self.topic, *frames = said.split() if len(said.split()) == 3 else [said]
@@ -131,6 +131,7 @@ class MotionReader:
         settings: LogOptions,
         transforms: Transforms,
         color_frame: str,
+        *,
         time_ns: Callable[[Entry], int],
     ) -> None:
         """Initialize.
@@ -168,7 +169,7 @@ class MotionReader:
 
     def _poses(self, said: str, option: str, time_ns: Callable[[Entry], int]) -> _PoseReadings:
         of_header = self._settings.time_source == "header"
-        readings = _PoseReadings(said, option, self.name, of_header, time_ns)
+        readings = _PoseReadings(said, option, self.name, of_header, time_ns=time_ns)
         types, what = (POSE_TYPES, "poses") if readings.topic == said else (TF_TYPES, "transforms")
         self._check(option, readings.topic, self._log.of_type(*types), what)
         self.take.append((readings.topic, readings.take))

@@ -88,7 +88,9 @@ class RobotLog:
         self.depth = chooser.depth().required(self.log, "depth")
         self.color = chooser.color().required(self.log, "color")
         self.color_camera = self._camera(self.color, "color_info", chooser)
-        self._motion = MotionReader(self.log, s, self.transforms, self.color_camera.frame_id, self.time_ns)
+        self._motion = MotionReader(
+            self.log, s, self.transforms, self.color_camera.frame_id, time_ns=self.time_ns
+        )
         self.T_color_depth: Array | None = None
         self.derived = self._derived(chooser) if s.depth_from != "image" else None
         if self.derived:
@@ -338,7 +340,16 @@ class RobotLog:
         first, last = min(self.pairs), max(self.pairs)
         header = self.settings.time_source == "header"
         files = frozenset(part.path for part in self.log.parts if self.color in part.topics)
-        return RobotClock(robot, self.log, files, self.namespace, self._delays_ns, first, last, header)
+        return RobotClock(
+            robot,
+            self.log,
+            files,
+            self.namespace,
+            delays_ns=self._delays_ns,
+            start_ns=first,
+            end_ns=last,
+            header=header,
+        )
 
     def frames(self) -> Iterator[tuple[int, Any, Any]]:
         """Time, color and depth message of every pair, in order of time; holds no more than it must."""

@@ -234,7 +234,7 @@ class Scene:
         self.surfaces.append(Side(f"{name}/side", material, base, radius, height))
         x, y, _ = np.eye(3)
         lid = base + height * UP - radius * x + radius * y
-        self.surfaces.append(Flat(f"{name}/lid", material, lid, x, -y, (2 * radius, 2 * radius), True))
+        self.surfaces.append(Flat(f"{name}/lid", material, lid, x, -y, (2 * radius, 2 * radius), round=True))
 
     def sphere(self, name: str, center: ArrayLike, radius: float, material: tex.Material) -> None:
         """Put a sphere."""

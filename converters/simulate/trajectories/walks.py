@@ -65,7 +65,7 @@ class FreeSpace:
         clearance: [n], m.
         graph: cost of the path between neighboring cells.
         inside: [nx, ny], whether a cell of the whole grid is free.
-        low: [2], middle (m) of its first cell
+        low: [2], middle (m) of its first cell.
         cell_m: its width.
     """
 
@@ -191,7 +191,9 @@ def space_between(
         )
     inside = parts == 1 + int(np.argmax(sizes))
     graph = _graph(inside, clearance, cell_m)
-    return FreeSpace(floor, places[inside], clearance[inside], graph, inside, places[0, 0], cell_m)
+    return FreeSpace(
+        floor, places[inside], clearance[inside], graph, inside=inside, low=places[0, 0], cell_m=cell_m
+    )
 
 
 def _body_clearance(distance: Callable[[Array], Array], places: Array, floor: float) -> Array:
