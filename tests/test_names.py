@@ -11,13 +11,11 @@ STILL_DOUBLE: frozenset[str] = frozenset(
     [
         "Calibration",
         "Candidate",
-        "Code",
         "Edges",
         "FrameFiles",
         "FreeSpace",
         "Lidar",
         "Message",
-        "Neighbor",
         "Options",
         "Plan",
         "Registration",
@@ -25,11 +23,8 @@ STILL_DOUBLE: frozenset[str] = frozenset(
         "Row",
         "Scene",
         "Session",
-        "Stage",
-        "Team",
         "Topic",
         "View",
-        "Views",
         "Work",
     ]
 )

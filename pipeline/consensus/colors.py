@@ -175,7 +175,7 @@ def team_colors(evidence: Mapping[str, Evidence], pairs: Pairs, config: ColorCon
 
 
 def _colors_of(own: Evidence, other: Evidence, ids: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Colors [m, 3] of matched Gaussians of which both robots know something."""
+    """Colors [m, 3] of matched Gaussians on which both robots have information."""
     i, j = rows_by_id(ids[:, 0], own.ids), rows_by_id(ids[:, 1], other.ids)
     here = (i >= 0) & (j >= 0)
     i, j = i[here], j[here]

@@ -1,4 +1,4 @@
-"""What a robot's own pixels say about its Gaussians, in the flat chart of method section 1, and its change of frame.
+"""A robot's own evidence on its Gaussians, in the flat chart of method section 1, and its change of frame.
 
 theta [13] and information [31] are laid out as in `splat.information`. The cross terms between mean and covariance,
 which the Fisher sums of the information stage hold, are dropped: fusion works per block.

@@ -71,7 +71,7 @@ class TreeGraph:
         variables: own keyframes, then copies of neighbors' keyframes.
         poses: [v, 4, 4], initial values; a copy must start where its owner starts, up to rounding, because every step
             moves both alike.
-        shared: variables that others have too, with the mask of all robots that have them as far as their owner knows;
+        shared: variables that others have too, with the mask of all robots that have them by their owner's account;
             0 for copies.
         trusted: factors of weight one.
         robust: groups of factors with robust weights.

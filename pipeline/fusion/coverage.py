@@ -37,7 +37,7 @@ def select_unseen(
         theta: [n, 13] of the candidates, world frame.
         information: [n, 31] of the candidates.
         T_world_keyframe: [k, 4, 4], own keyframes.
-        surfaces: what the own keyframes know of surfaces (`known_surfaces`).
+        surfaces: depth of known surfaces by own keyframe (`known_surfaces`).
         context: camera and settings.
     """
     config = context.config
@@ -55,7 +55,7 @@ def select_unseen(
 def known_surfaces(
     own_world: Gaussians, T_world_keyframe: Array, depth_images: DepthImages, context: MapContext
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """What own keyframes know of surfaces, where the own map is opaque.
+    """Depth of the surfaces that own keyframes know, where the own map is opaque.
 
     The measured depth, the rendered one where it is missing, and of these the farthest within a few pixels.
 

@@ -301,7 +301,7 @@ def _information(robot: str, fused: FusedMap, stamp_ns: int) -> GaussianInformat
         opacity=fused.information[:, OPACITY_INFORMATION].astype(np.float32),
         observations=fused.members.astype(np.uint32),
         color_sigma=0.0,
-        depth_sigma="as each member said",
+        depth_sigma="as in the map of each member",
         deviation_m=np.zeros(len(fused.gaussians), np.float32),  # included in the members' information
         color_pixels_per_sample=1.0,
         depth_pixels_per_sample=1.0,

@@ -24,7 +24,7 @@ NOT_FINITE = "a NaN or an infinity"
 NEGATIVE = "a NaN, an infinity or a negative number"
 
 
-class Status(IntEnum):
+class KernelStatus(IntEnum):
     """What a kernel returns; `enum Status` of frame.h."""
 
     OK = 0
@@ -173,7 +173,9 @@ def refuse_bad_image(status: int, faults: dict[str, str]) -> None:
         faults: what a bad image holds, by its name, in the order of the kernel's arguments.
     """
     for code, (name, fault) in zip(
-        (Status.BAD_FIRST, Status.BAD_SECOND, Status.BAD_THIRD), faults.items(), strict=False
+        (KernelStatus.BAD_FIRST, KernelStatus.BAD_SECOND, KernelStatus.BAD_THIRD),
+        faults.items(),
+        strict=False,
     ):
         if status == code:
             raise ValueError(f"{name} holds {fault}")

@@ -16,7 +16,7 @@ from duagc.pipeline.kernels.arguments import (
     NEGATIVE,
     NOT_FINITE,
     Image,
-    Status,
+    KernelStatus,
     arrays_of,
     check_array,
     check_type,
@@ -222,9 +222,9 @@ class Rasterizer:
     def _finish(self, gaussians: Gaussians, size: tuple[int, int], status: int) -> None:
         """Remember what was drawn, or refuse what could not be."""
         self._gaussians = None
-        if status == Status.BAD_GAUSSIANS:
+        if status == KernelStatus.BAD_GAUSSIANS:
             raise ValueError(complaint_about(gaussians))
-        if status == Status.TOO_MANY:
+        if status == KernelStatus.TOO_MANY:
             raise ValueError(
                 f"gaussians: {len(gaussians)} are so large on the screen that their tiles do not fit into memory"
             )
@@ -364,7 +364,7 @@ class Rasterizer:
 
     @property
     def visible(self) -> int:
-        """Gaussians on the screen in the last view; `statistics` says more, and counts longer."""
+        """Gaussians on the screen in the last view; `statistics` gives more, and takes longer."""
         self._last_forward()
         return self._raster.visible
 

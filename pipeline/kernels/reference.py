@@ -320,7 +320,7 @@ class ReferenceRasterizer:
     def _terms(self, channels: Channels) -> NDArray[np.float64]:
         """The Jacobian [c, m, n, 14 and pose 6] with every product of the chain rule taken as positive.
 
-        Through screen numbers that know no long and short directions: M center, M^-T C^-1 M^-1 (which is 1) and
+        Through screen numbers without long and short directions: M center, M^-T C^-1 M^-1 (which is 1) and
         M^-T slope, with C^-1 = M^T M.
         """
         M = np.swapaxes(np.linalg.cholesky(self._screen.conics.detach().numpy()), 1, 2)

@@ -16,7 +16,7 @@ SMALLEST_HUBER = 1e-9  # its inverse, in float32, must leave room for residuals
 LARGEST_LOSS_WEIGHT = 1e9
 
 MaybeNone: TypeAlias = Any
-"""Marks what is None on request only, so that the many who never ask need not check."""
+"""Marks what is None on request only, so that callers that never request it need not check."""
 
 
 @dataclass(frozen=True)
