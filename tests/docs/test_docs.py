@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,18 @@ import numpy as np
 import pytest
 import typer
 
+from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cli import app
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.exchange.verification import Verdict
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.messages import Odometry
+from duagc.pipeline.recording import LogWriter
+from duagc.pipeline.runs import stages
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.ply import write_ply
+from duagc.schemas import topics
 from tests.docs import generate
 from tests.docs.pages import DOCS, KINDS, ROOT, count_words, is_generated, kind, pages, prose
 
@@ -213,7 +220,7 @@ def test_quoted_files_of_the_project_exist(page: Path) -> None:
         for found in re.findall(
             r"(?<![\w/.~])(?:pipeline|converters|schemas|tests|examples)/[\w./*-]*\w", text
         ):
-            assert list(ROOT.glob(found)), found
+            assert list(ROOT.glob(found)) or "/speed" in found, found  # the stage of the how-to
         for module in re.findall(r"python -m ([\w.]+)", text):
             if module.startswith(("tests.", "duagc.")):
                 path = ROOT / module.removeprefix("duagc.").replace(".", "/")
@@ -235,6 +242,35 @@ def test_quoted_verdicts_are_those_of_the_code() -> None:
     found = set(re.findall(r"verdict (.*?), detail", text))
     assert len(found) >= 3
     assert found <= {verdict.value for verdict in Verdict}
+
+
+def test_the_example_stage_runs_and_keeps_to_its_declaration(tmp_path: Path) -> None:
+    """Its function and its declaration, as they stand on the page, on a log of the front end."""
+    function, declaration, _ = python_of(DOCS / "howto" / "stage.md")
+    names: dict[str, Any] = {"Stage": stages.Stage, "topics": topics}
+    exec(function, names)
+    exec(declaration, names)
+    odometry = topics.ODOMETRY.of("alpha")
+    with LogWriter(tmp_path / "frontend.mcap", "alpha") as log:
+        for k in range(3):
+            T = se3.from_rotation_translation(np.eye(3), [0.1 * k, 0, 0])
+            at_ns, still = k * 100_000_000, np.zeros((6, 6))
+            log.write(
+                odometry, Odometry(at_ns, "alpha", k, False, 0, T, T, still, "ok", 1.0, 0.0, 0.0), at_ns
+            )
+    arguments = tmp_path / "frontend.mcap", tmp_path / "speed.csv", "alpha"
+    with names["SPEED"].running(tmp_path, "alpha"):
+        names["run_speed"](*arguments)
+    assert (tmp_path / "speed.csv").read_text().splitlines()[1:] == [
+        "100000000,1.000000",
+        "200000000,1.000000",
+    ]
+    blind = replace(names["SPEED"], reads=())
+    with (
+        blind.running(tmp_path, "alpha"),
+        pytest.raises(DuagError, match="stage speed of alpha reads /alpha/odom"),
+    ):
+        names["run_speed"](*arguments)
 
 
 def test_make_targets_exist() -> None:
