@@ -65,7 +65,8 @@ class RobotWriter:
             name: of the robot: lower-case letters, digits, underscores.
             camera: of color and depth alike.
             depth_scale: meters per unit of the depth images.
-            sensors: what is known about the sensors, for example {"depth_noise": "none"}; kept in the log's metadata.
+            sensors: what is known about the sensors, for example {"depth_noise": "none"}; kept in the log's
+                metadata.
         """
         if not re.fullmatch(topics.ROBOT_NAME, name):
             raise DuagError(f"robot {name!r}: expected lower-case letters, digits and underscores")
@@ -106,13 +107,14 @@ class RobotWriter:
             stamp_ns: time of the recording, increasing.
             color: the encoded color image as it is.
             color_format: "jpeg" or "png".
-            depth: uint16 [H, W] in units of depth_scale along z, registered to color, 0 = none. None: the depth is
-                that of another camera or a LiDAR.
-            T_world_camera: true pose [4, 4] of the color camera in the world that all robots share, where known.
+            depth: uint16 [H, W] in units of depth_scale along z, registered to color, 0 = none. None: the
+                depth is that of another camera or a LiDAR.
+            T_world_camera: true pose [4, 4] of the color camera in the world that all robots share, where
+                known.
             exact_depth: like depth, without noise, where that differs and is known.
             mask: bool [H, W], False where a pixel must not be used (a moving object); None = all may.
-            depth_sigma_m: [H, W], standard deviation of the depth in meters, where it is known pixel by pixel: then
-                with every frame. It is kept to 3 %, and from 0.1 mm to 6.5 m.
+            depth_sigma_m: [H, W], standard deviation of the depth in meters, where it is known pixel by
+                pixel: then with every frame. It is kept to 3 %, and from 0.1 mm to 6.5 m.
         Raises:
             ValueError: an image has another size than the camera, or the time does not increase.
             DuagError: the true pose is beyond FAR_M.

@@ -114,7 +114,9 @@ def write_robot(
         recording: gets the logs.
         name: of the robot.
         source: its log.
-        label: which part of the source it was. max_ratio, gap: see `ReprojectionCheck`.
+        label: which part of the source it was.
+        max_ratio: see `ReprojectionCheck`.
+        gap: see `ReprojectionCheck`.
         max_ratio: largest residual of the self-check, as a share of the depth.
         gap: frames between those that the self-check compares.
     """

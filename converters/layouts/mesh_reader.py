@@ -202,7 +202,8 @@ class _Complaints:
 
         Args:
             path: of the mesh, for messages.
-            unpainted: a part has no texture; if all have, one that was not read is of a kind that is not used.
+            unpainted: a part has no texture; if all have, one that was not read is of a kind that is not
+                used.
         """
         self.others.seek(0)
         for line in [*self.open3d.getvalue().splitlines(), *self.others.read().splitlines()]:

@@ -54,7 +54,8 @@ def simulate(
 
     Args:
         out: folder of the recording, made here.
-        robots: how many; each follows a path of its own, 22 mm per frame in the room, 60 mm outdoors, else 28 mm.
+        robots: how many; each follows a path of its own, 22 mm per frame in the room, 60 mm outdoors, else 28
+            mm.
         frames: per robot, at 30 Hz.
         scene: one of `SCENES`, or else a folder of textured meshes.
         size: width and height of the images, pixels.

@@ -27,7 +27,9 @@ def worker_pool(
     """A pool of fresh processes, each kept for all its tasks: replacing them (`max_tasks_per_child`) can hang.
 
     Args:
-        workers: how many. start, arguments: called once in each of them before its first task.
+        workers: how many.
+        start: called once in each of them before its first task.
+        arguments: called once in each of them before its first task.
     Raises:
         DuagError: a process ended before its task did, for example for want of memory.
     """

@@ -68,9 +68,13 @@ COUNTED = {
 class Plan:
     """What to measure.
 
-    config: of the front end; the ablation and the caps change it. caps: numbers of Gaussians, the first is that of the
-    table of times; empty = no mapping. ablation, open3d: whether to run them. threads: of the kernels.
-    robots: names; empty = all of the recording.
+    Attributes:
+        config: of the front end; the ablation and the caps change it.
+        caps: numbers of Gaussians, the first is that of the table of times; empty = no mapping.
+        ablation: whether to run them.
+        open3d: whether to run them.
+        threads: of the kernels.
+        robots: names; empty = all of the recording.
     """
 
     recording: Path

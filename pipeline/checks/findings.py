@@ -38,7 +38,9 @@ class Finding:
 class Report:
     """Everything that `check` found out about a recording.
 
-    robots: what was measured of each, plain numbers and text. estimate: of `duagc run`, see `checks.estimate`.
+    Attributes:
+        robots: what was measured of each, plain numbers and text.
+        estimate: of `duagc run`, see `checks.estimate`.
     """
 
     path: str

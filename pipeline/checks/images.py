@@ -88,8 +88,11 @@ def check_repeats(robot: str, topic: str, repeats: Repeats) -> Iterator[Finding]
 class Sight:
     """What some frames of a robot show.
 
-    depth_m: percentiles 1, 50, 99 of the known depth, NaN if there is none. known, saturated: shares of the pixels.
-    colors: histogram of RGB [BINS, BINS, BINS], sums to 1.
+    Attributes:
+        depth_m: percentiles 1, 50, 99 of the known depth, NaN if there is none.
+        known: shares of the pixels.
+        saturated: shares of the pixels.
+        colors: histogram of RGB [BINS, BINS, BINS], sums to 1.
     """
 
     depth_m: tuple[float, float, float]

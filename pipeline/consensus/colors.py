@@ -138,8 +138,8 @@ def team_colors(evidence: Mapping[str, Evidence], pairs: Pairs, config: ColorCon
 
     Args:
         evidence: of every robot.
-        pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians; those that `evidence` lacks, or of whose
-            colors one of the two has no information, are left out.
+        pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians; those that `evidence` lacks, or of
+            whose colors one of the two has no information, are left out.
         config: limits and priors.
     """
     robots = tuple(sorted(evidence))

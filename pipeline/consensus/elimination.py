@@ -162,7 +162,8 @@ def shared_variables(owners: Mapping[Variable, int], subtree: int) -> list[Varia
     """Variables that a robot outside a subtree has, sorted.
 
     Args:
-        owners: variable -> bit mask of all robots that have it, by its owner's account; 0 if the owner is not below.
+        owners: variable -> bit mask of all robots that have it, by its owner's account; 0 if the owner is not
+            below.
         subtree: bit mask of the subtree's robots.
     """
     return sorted(v for v, mask in owners.items() if mask == 0 or mask & ~subtree)

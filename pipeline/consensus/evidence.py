@@ -115,8 +115,8 @@ class Evidence:
         Args:
             owner: the robot.
             gaussians: its map, in its map frame.
-            information: Fisher sums in the map frame, by id; a Gaussian without has no information, nor has any
-                if None.
+            information: Fisher sums in the map frame, by id; a Gaussian without has no information, nor has
+                any if None.
             T_map_keyframe: [k, 4, 4], by anchor.
         """
         packed, rows = _sums_of(gaussians, information)

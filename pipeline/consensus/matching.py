@@ -204,8 +204,8 @@ def tracks(evidence: Mapping[str, Evidence], pairs: Pairs, config: MatchingConfi
 
     Args:
         evidence: of every robot, in the world frame.
-        pairs: (robot a, robot b) -> ids int64 [m, 2]; pairs of Gaussians that `evidence` lacks are left out, which
-            is what a robot does that has not received them.
+        pairs: (robot a, robot b) -> ids int64 [m, 2]; pairs of Gaussians that `evidence` lacks are left out,
+            which is what a robot does that has not received them.
         config: scales of the distance.
     """
     robots = tuple(sorted(evidence))

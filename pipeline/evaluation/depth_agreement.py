@@ -40,7 +40,8 @@ def depth_agreement(
     No gate: what is hidden counts too, and the median bears it.
 
     Args:
-        depths_m: [h, w] of every view, 0 = unknown. trajectories: T_frame_camera [n, 4, 4] of the same views, by name.
+        depths_m: [h, w] of every view, 0 = unknown.
+        trajectories: T_frame_camera [n, 4, 4] of the same views, by name.
     Returns:
         Number of pairs, and the value of every trajectory.
     """

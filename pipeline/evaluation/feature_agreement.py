@@ -43,7 +43,8 @@ def feature_agreement(
     """Median over pairs of views of the median distance between a moved feature and its partner, pixels.
 
     Args:
-        colors: uint8 RGB [h, w, 3] of every view. depths_m: [h, w], 0 = unknown.
+        colors: uint8 RGB [h, w, 3] of every view.
+        depths_m: [h, w], 0 = unknown.
         trajectories: T_frame_camera [n, 4, 4] of the same views, by name.
     Returns:
         Number of pairs, and the value of every trajectory.

@@ -30,8 +30,10 @@ def section(
     """How well held-out views agree under trajectories, and under the ground truth where there is one.
 
     Args:
-        log_path: sensor log of the robot. held_out: stamp of every held-out frame that was tracked, by its index.
-        paths: by the ending of their names in the result. true: estimate and ground truth, paired.
+        log_path: sensor log of the robot.
+        held_out: stamp of every held-out frame that was tracked, by its index.
+        paths: by the ending of their names in the result.
+        true: estimate and ground truth, paired.
     Returns:
         `depth_agreement_m` and `feature_agreement_px` of every path, and of how many pairs of views.
     """

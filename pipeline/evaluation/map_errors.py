@@ -28,9 +28,11 @@ NAMES = (
 class MapErrors:
     """One row per Gaussian with full position information.
 
-    error_m: distance from the nearest surface. sigma_m: predicted standard deviation of that distance, along the
-    surface normal. paper_uncertainty: 1 / sqrt of the trace of the position information, as the companion code has it.
-    without_information: Gaussians left out, because a direction of their position is not determined.
+    Attributes:
+        error_m: distance from the nearest surface.
+        sigma_m: predicted standard deviation of that distance, along the surface normal.
+        paper_uncertainty: 1 / sqrt of the trace of the position information, as the companion code has it.
+        without_information: Gaussians left out, because a direction of their position is not determined.
     """
 
     error_m: Array
@@ -61,7 +63,8 @@ def map_errors(gaussian_map: GaussianMap, surface: Surface, T_gt_map: Array) -> 
     """Measure a map against the true surface.
 
     Args:
-        gaussian_map: with information, in its frame. T_gt_map: [4, 4], from that frame into the ground-truth world.
+        gaussian_map: with information, in its frame.
+        T_gt_map: [4, 4], from that frame into the ground-truth world.
     """
     means_gt = se3.transform(T_gt_map, gaussian_map.gaussians.means.astype(np.float64))
     error_m, normals_gt = surface.closest(means_gt)

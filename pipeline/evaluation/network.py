@@ -54,7 +54,13 @@ NO_EXCHANGE = Absent("the robots exchanged nothing")
 class Packets:
     """Every packet of a session, one element each, in the order of the log.
 
-    round: when it was sent. sender, receiver, purpose: names. size_bytes: header and payload. delivered: or lost.
+    Attributes:
+        round: when it was sent.
+        sender: names.
+        receiver: names.
+        purpose: names.
+        size_bytes: header and payload.
+        delivered: or lost.
     """
 
     round: NDArray[np.int64]

@@ -21,9 +21,12 @@ Array = NDArray[np.float64]
 class Path3:
     """The ways of one robot in the frame of the component's world.
 
-    component: the robots of that world. before: T_world_camera from the robot's own front end alone, its first camera
-    put where consensus puts it. after: T_world_camera after consensus. true: ground truth moved into the world by the
-    alignment of the evaluation, or why there is none.
+    Attributes:
+        component: the robots of that world.
+        before: T_world_camera from the robot's own front end alone, its first camera put where consensus puts
+            it.
+        after: T_world_camera after consensus.
+        true: ground truth moved into the world by the alignment of the evaluation, or why there is none.
     """
 
     robot: str

@@ -106,7 +106,8 @@ def rendering_sections(
         source: its recording.
         threads: views rendered at the same time; changes no bit of the result.
         progress: show it on standard error.
-        own_longer: own maps that were trained longer, by robot, in the robots' map frames; scored as the own maps are.
+        own_longer: own maps that were trained longer, by robot, in the robots' map frames; scored as the own
+            maps are.
     """
     found = _Found([], bool(own_longer))
     for name, robot in run.robots.items():

@@ -65,7 +65,8 @@ def score_view(
 
     Args:
         render: of the map, at the pose of the frame, black background, no exposure fitted.
-        color: [h, w, 3] RGB. depth_m: recorded depth [h, w], 0 where there is none.
+        color: [h, w, 3] RGB.
+        depth_m: recorded depth [h, w], 0 where there is none.
         exact_m: exact depth [h, w] in meters, or Absent.
         layer_m: depth of one layer per pixel (`Rasterizer.layer_depth`), [h, w] in meters, or Absent.
         common: [h, w], pixels that the maps that this one is compared with cover, too; None: there are none.
@@ -138,8 +139,8 @@ def score_maps(
     """Render maps from every view and score them, in order of the views.
 
     Args:
-        maps: by name, with the T_frame_camera [4, 4] of the views in the map's frame, by time stamp in ns; a map whose
-            poses lack a view is Absent there.
+        maps: by name, with the T_frame_camera [4, 4] of the views in the map's frame, by time stamp in ns; a
+            map whose poses lack a view is Absent there.
         camera: of the views.
         threads: views at a time, each with a rasterizer of one thread; changes no bit of the result.
         depth: of a Gaussian at a pixel, as the maps were made.

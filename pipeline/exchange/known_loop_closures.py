@@ -54,8 +54,8 @@ class KnownLoopClosures:
             own: its keyframes.
             closures: by neighbor, from this robot's side; both ends list those of a pair in the same order.
             config: the same at all robots; if not `robust`, all loop closures are trusted.
-            precision: of keyframes on the wire, float32 or float64. Elimination needs float64: a copy must start
-                where its owner starts.
+            precision: of keyframes on the wire, float32 or float64. Elimination needs float64: a copy must
+                start where its owner starts.
             held_by_both: the solver wants the loop closures at both ends; then they are trusted too.
         """
         self.own, self.closures, self.config = own, closures, config

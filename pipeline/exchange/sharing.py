@@ -166,7 +166,8 @@ class Sharing:
             n: the neighbor.
             arrival: a message of it, or a part of its evidence.
             round_index: the current round.
-            neighbors: all of them, by index; evidence that is complete need not come from the others any more.
+            neighbors: all of them, by index; evidence that is complete need not come from the others any
+                more.
         Raises:
             MalformedError: it is not what it should be.
         """

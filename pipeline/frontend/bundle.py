@@ -79,8 +79,8 @@ def optimize(
         T_map_keyframes: [k, 4, 4], start.
         views: of the k keyframes.
         images: reads the images of a keyframe.
-        tracked: registrations that connect the keyframes, and loop closures; they are factors where the images of a
-            pair cannot be compared.
+        tracked: registrations that connect the keyframes, and loop closures; they are factors where the
+            images of a pair cannot be compared.
         config: numbers of rounds and neighbors.
         registration: settings of the costs.
 

@@ -72,9 +72,11 @@ class Mapper:
         Args:
             camera: of all views.
             config: how the map is grown and optimized.
-            seed: of the run; random keyframes of the window and the order of the final optimization are drawn from it.
+            seed: of the run; random keyframes of the window and the order of the final optimization are drawn
+                from it.
             threads: of the rasterizer; changes no bit of the map.
-            depth_noise_m: standard deviation of the depth images, meters, for `config.depth` = auto; None: unknown.
+            depth_noise_m: standard deviation of the depth images, meters, for `config.depth` = auto; None:
+                unknown.
         """
         self.config, self.seed = config, seed
         self.cameras = (camera, camera.halved())

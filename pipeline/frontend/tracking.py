@@ -90,7 +90,8 @@ class Tracker:
             stamp_ns: time of the frame, increasing.
             image: color [h, w, 3] or gray [h, w], 0..1.
             depth_m: [h, w], meters, 0 = unknown.
-            mask: bool [h, w], False where a pixel must not be used; its depth counts as unknown. None = all may.
+            mask: bool [h, w], False where a pixel must not be used; its depth counts as unknown. None = all
+                may.
             depth_sigma_m: [h, w], standard deviation of the depth, meters; None: that of the sensor model.
         """
         state, tracking = self.state, self.state.config.tracking

@@ -129,8 +129,8 @@ def weighted_move(
         weights: [r, d, d], positive semidefinite; rows of a group follow each other.
         values: [r, d], differences from the group's reference.
         first: [g], first row of every group.
-        prior: information of the reference's own value in every direction, so little that it only decides where
-            no member has information.
+        prior: information of the reference's own value in every direction, so little that it only decides
+            where no member has information.
         free: [g, d, d], shares of each direction in which a group may move, symmetric, eigenvalues 0 to 1.
     Returns:
         [g, d]; exactly zero in directions without information.

@@ -170,14 +170,15 @@ def fuse(
 
     Args:
         own: the receiver's own map.
-        evidence: by robot, in the world frame (`consensus.weighting.in_world`), the receiver's own included (of all
-            its Gaussians, by id).
+        evidence: by robot, in the world frame (`consensus.weighting.in_world`), the receiver's own included
+            (of all its Gaussians, by id).
         pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians.
         context: camera and settings.
-        self_information: the receiver's own evidence for `association = neighbors`, in the world frame, of all its
-            Gaussians (`consensus.weighting.self_information`).
+        self_information: the receiver's own evidence for `association = neighbors`, in the world frame, of
+            all its Gaussians (`consensus.weighting.self_information`).
         depth_images: of own keyframes; for `coverage = all`.
-        contradicted: by robot, bool [n] of its evidence: Gaussians that are not imported, whatever space they are in.
+        contradicted: by robot, bool [n] of its evidence: Gaussians that are not imported, whatever space they
+            are in.
     Raises:
         ValueError: the own evidence is not on the Gaussians of the own map.
     """

@@ -42,7 +42,8 @@ def peer_views(
     Args:
         evidence: of the peers, by name, in the world frame, each in its own colors.
         T_world_keyframe: by name, [k, 4, 4] by anchor.
-        context: the robot's own camera and settings; `config.refine.peer_views` of all views are taken, evenly spread.
+        context: the robot's own camera and settings; `config.refine.peer_views` of all views are taken,
+            evenly spread.
         depth_kinds: as the maps were made, by name.
         colors: from every peer's colors to the own.
     """

@@ -78,8 +78,10 @@ def overlap(
     Args:
         points_camera: [n, 3], meters, samples of another view in the frame of this one.
         camera: of this view.
-        depth_m: [h, w], what this view measured, 0 = unknown; it may differ by SAME_SURFACE of a point's own depth.
-        inverse_depth: instead of it, 1/m, 0 = unknown; a point may differ by SAME_SURFACE of the measured depth.
+        depth_m: [h, w], what this view measured, 0 = unknown; it may differ by SAME_SURFACE of a point's own
+            depth.
+        inverse_depth: instead of it, 1/m, 0 = unknown; a point may differ by SAME_SURFACE of the measured
+            depth.
     """
     if len(points_camera) == 0:
         return 0.0

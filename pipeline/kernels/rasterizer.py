@@ -104,10 +104,10 @@ class Rasterizer:
             camera: pinhole camera that draws; its size is that of the images.
             T_camera_map: [4, 4], takes points of the frame `map` to the camera (x right, y down, z forward).
             background: RGB (0..1) seen where the Gaussians let light through; its depth is 0.
-            depth_kind: depth of a Gaussian at a pixel: that of its center ("blended"), or its mean along the pixel's
-                ray ("ray_plane": of a flat disc, that of its plane).
-            mask: bool [H, W]; where it is False nothing is drawn, all images are 0, and no derivative or information
-                is taken later. None: all pixels.
+            depth_kind: depth of a Gaussian at a pixel: that of its center ("blended"), or its mean along the
+                pixel's ray ("ray_plane": of a flat disc, that of its plane).
+            mask: bool [H, W]; where it is False nothing is drawn, all images are 0, and no derivative or
+                information is taken later. None: all pixels.
         Returns:
             Color [H, W, 3], depth [H, W] (m, not divided by alpha) and alpha [H, W], float32.
         Raises:
@@ -247,8 +247,8 @@ class Rasterizer:
             d_depth: dL/ddepth, float32 [H, W]; None is zero.
             d_alpha: dL/dalpha, float32 [H, W]; None is zero.
             pose: also differentiate by the right tangent of T_map_camera.
-            fisher: also give the `empirical` diagonal, the sum over pixels of (d L_p / d theta)^2 with
-                L_p = <d_color_p, color_p> + d_depth_p depth_p + d_alpha_p alpha_p: pass cotangents without a 1/N in
+            fisher: also give the `empirical` diagonal, the sum over pixels of (d L_p / d theta)^2 with L_p =
+                <d_color_p, color_p> + d_depth_p depth_p + d_alpha_p alpha_p: pass cotangents without a 1/N in
                 front.
             parameters: False takes the derivative of the pose alone, which is cheaper.
         Returns:

@@ -81,11 +81,12 @@ def read_team_graph(path: Path, robots: int | None = None, *, only_reference: bo
     """Read a pose graph and give every robot its own.
 
     Args:
-        path: a `.g2o` file; a folder of one `.g2o` per robot with gtsam symbols as keys; a folder of Kimera-Multi
-            `robot*/measurements.csv`; or a folder with one `.g2o`.
-        robots: cut a single graph into so many blocks of consecutive keys (default 4); for a team's own files, at most
-            a check.
-        only_reference: leave out loops and loop closures that the reference next to the graph does not name as true.
+        path: a `.g2o` file; a folder of one `.g2o` per robot with gtsam symbols as keys; a folder of
+            Kimera-Multi `robot*/measurements.csv`; or a folder with one `.g2o`.
+        robots: cut a single graph into so many blocks of consecutive keys (default 4); for a team's own
+            files, at most a check.
+        only_reference: leave out loops and loop closures that the reference next to the graph does not name
+            as true.
     Raises:
         DuagError: nothing of the kind is there, a line is not understood, or the graph is two-dimensional.
     """

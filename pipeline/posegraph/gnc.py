@@ -61,7 +61,8 @@ class RobustWeights:
 
         Args:
             received: packets so far, parts counted by their share.
-            steady: what the factors join moves little any more; a step need not wait for its full number of packets.
+            steady: what the factors join moves little any more; a step need not wait for its full number of
+                packets.
             squared_residuals: [m], computed only when needed.
         """
         c, c2 = self.config, self.config.truncation**2

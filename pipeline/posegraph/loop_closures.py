@@ -75,7 +75,8 @@ def drift(odometry: RelativePoses, keyframes: int, config: LoopClosureConfig) ->
     """Accumulated variance of the odometry along the keyframes, the input of `consistent`.
 
     Args:
-        odometry: relative poses between own keyframes, each usually to the keyframe that it was tracked against.
+        odometry: relative poses between own keyframes, each usually to the keyframe that it was tracked
+            against.
         keyframes: how many there are.
         config: for the least drift from one keyframe to the next.
     Returns:

@@ -41,8 +41,11 @@ class OdometryPrior:
     """Poses of the camera by another odometry, in a frame of its own, interpolated between its messages."""
 
     def __init__(self, stamps_ns: Sequence[int], T_odometry_camera: Array) -> None:
-        """Args:
-        stamps_ns: increasing. T_odometry_camera: [n, 4, 4].
+        """Set up.
+
+        Args:
+            stamps_ns: increasing.
+            T_odometry_camera: [n, 4, 4].
         """
         self.stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
         self.T_odometry_camera = np.asarray(T_odometry_camera, dtype=np.float64)
@@ -71,8 +74,11 @@ class GyroPrior:
     """Rotation by the integrated rates of a gyroscope; a rate holds from the middle before it to the middle after."""
 
     def __init__(self, stamps_ns: Sequence[int], rates_camera: Array) -> None:
-        """Args:
-        stamps_ns: increasing. rates_camera: [n, 3], rad/s, about the axes of the camera.
+        """Set up.
+
+        Args:
+            stamps_ns: increasing.
+            rates_camera: [n, 3], rad/s, about the axes of the camera.
         """
         self.stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
         self.rates_camera = np.asarray(rates_camera, dtype=np.float64)

@@ -38,7 +38,8 @@ def write_preview(logs: Sequence[Path], out: Path) -> None:
     """Write a PNG: of every robot a line of text, a row of color and a row of depth, evenly spread over its log.
 
     Args:
-        logs: of robots with a camera. out: must not exist.
+        logs: of robots with a camera.
+        out: must not exist.
     """
     import cv2
 

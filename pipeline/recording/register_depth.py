@@ -35,7 +35,8 @@ def register_depth(
     see stays 0.
 
     Args:
-        depth_m: [h, w], meters along z of the depth camera, 0 = unknown. T_camera_depth: [4, 4].
+        depth_m: [h, w], meters along z of the depth camera, 0 = unknown.
+        T_camera_depth: [4, 4].
     Returns:
         float32 [camera.height, camera.width], meters along z of `camera`, 0 = unknown.
     """

@@ -41,10 +41,12 @@ class LogWriter:
     """
 
     def __init__(self, path: Path, robot: str = "", metadata: Mapping[str, str] | None = None) -> None:
-        """Args:
-        path: the file.
-        robot: whose log it is; "" if of the whole team.
-        metadata: further text about the log, for example its configuration; part of the content digest.
+        """Set up.
+
+        Args:
+            path: the file.
+            robot: whose log it is; "" if of the whole team.
+            metadata: further text about the log, for example its configuration; part of the content digest.
         """
         self.path = Path(path)
         self.digest = ""

@@ -97,8 +97,8 @@ def register(
 
     Args:
         reference: samples per level; at least as many levels as `pyramid`.
-        pyramid: the target view. `without_depth`, gray values alone are used, and every sample inside the image
-            counts as seen: overlap is then the view.
+        pyramid: the target view. `without_depth`, gray values alone are used, and every sample inside the
+            image counts as seen: overlap is then the view.
         T_reference_target_guess: where to start, [4, 4].
         config: limits and noise; None: the defaults.
         prior_information: [6, 6] in the right tangent of the guess; pulls toward it, is not part of the

@@ -164,7 +164,8 @@ def ransac(
     Args:
         points_a: [n, 3], n >= 3, camera frame a, meters.
         points_b: [n, 3], the same points in camera frame b.
-        inlier_m: largest distance at one meter of depth; it grows with depth as the noise of a depth camera does.
+        inlier_m: largest distance at one meter of depth; it grows with depth as the noise of a depth camera
+            does.
         hypotheses: three-point samples drawn.
         rng: draws them.
 

@@ -40,7 +40,8 @@ def write_report(run_dir: Path, recording: Path) -> Path:
     """Write report/index.html of an evaluated run: one file that needs no network.
 
     Args:
-        run_dir: folder of the run, with metrics.json. recording: folder of its recording.
+        run_dir: folder of the run, with metrics.json.
+        recording: folder of its recording.
     Returns:
         The path of the page.
     Raises:

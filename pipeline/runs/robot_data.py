@@ -44,10 +44,13 @@ class AgentInput:
 class RobotData:
     """One robot's own results in memory.
 
-    T_map_keyframe: [n, 4, 4] by keyframe index. odometry: from the keyframe that each was tracked against, refined,
-    with its marginal information. registrations: the measurements behind it, independent of each other. images: gives
-    color uint8 RGB [h, w, 3] and depth float32 [h, w] (m, 0 = unknown) of a keyframe. information: of the Gaussians,
-    in the map frame, by the same ids. depth: of a Gaussian at a pixel, as the map was made.
+    Attributes:
+        T_map_keyframe: [n, 4, 4] by keyframe index.
+        odometry: from the keyframe that each was tracked against, refined, with its marginal information.
+        registrations: the measurements behind it, independent of each other.
+        images: gives color uint8 RGB [h, w, 3] and depth float32 [h, w] (m, 0 = unknown) of a keyframe.
+        information: of the Gaussians, in the map frame, by the same ids.
+        depth: of a Gaussian at a pixel, as the map was made.
     """
 
     robot: str
@@ -70,9 +73,13 @@ class RobotData:
 class LoopClosureRecord:
     """One candidate for a closure between two keyframes, and what became of it.
 
-    robot: the end that decided. score: matches of compact descriptors. T_own_peer: [4, 4] if it was measured,
-    with its information [6, 6] (right tangent, as measured, without floor). weight: robust weight at the end, 0 on a
-    link that was revoked; None if it took no part in the pose consensus.
+    Attributes:
+        robot: the end that decided.
+        score: matches of compact descriptors.
+        T_own_peer: [4, 4] if it was measured, with its information [6, 6] (right tangent, as measured,
+            without floor).
+        weight: robust weight at the end, 0 on a link that was revoked; None if it took no part in the pose
+            consensus.
     """
 
     robot: str
@@ -93,15 +100,21 @@ class LoopClosureRecord:
 class SessionResult:
     """One robot after a session, by its own estimate.
 
-    component: names of the robots that share its world frame, sorted; only itself if it met nobody.
-    T_world_keyframe: [n, 4, 4], own keyframes in the map frame of component[0]; exactly those of its own map if it is
-    alone. T_world_keyframe_of: the same of every member, itself included, as far as their agreed poses arrived.
-    own_evidence: as it was sent, sorted by id. evidence: of the other members with agreed poses, by name, as far as
-    it arrived. depth_of: of a Gaussian at a pixel, as their maps were made, by name.
-    pairs: ids of matched Gaussians, int64 [n, 2], by (lower, higher) name.
-    closures: every candidate that this robot decided on. agreed: its poses are final. converged: it also has
-    everything it should have; a robot that is alone has. rounds: ticks it took part in. rounds_to_agreement: None if
-    its poses were not agreed. refused: reasons of packets that could not be used, and how many.
+    Attributes:
+        component: names of the robots that share its world frame, sorted; only itself if it met nobody.
+        T_world_keyframe: [n, 4, 4], own keyframes in the map frame of component[0]; exactly those of its own
+            map if it is alone.
+        T_world_keyframe_of: the same of every member, itself included, as far as their agreed poses arrived.
+        own_evidence: as it was sent, sorted by id.
+        evidence: of the other members with agreed poses, by name, as far as it arrived.
+        depth_of: of a Gaussian at a pixel, as their maps were made, by name.
+        pairs: ids of matched Gaussians, int64 [n, 2], by (lower, higher) name.
+        closures: every candidate that this robot decided on.
+        agreed: its poses are final.
+        converged: it also has everything it should have; a robot that is alone has.
+        rounds: ticks it took part in.
+        rounds_to_agreement: None if its poses were not agreed.
+        refused: reasons of packets that could not be used, and how many.
     """
 
     robot: str
@@ -135,7 +148,8 @@ def registrations_of(
     """Registrations between a robot's keyframes as its refinement weighed them, in order of the log.
 
     Args:
-        frontend: file that both come from, for the complaint. keyframes: in order of their index.
+        frontend: file that both come from, for the complaint.
+        keyframes: in order of their index.
     Raises:
         DuagError: a keyframe that no registration ties to an earlier one, or a registration of none.
     """

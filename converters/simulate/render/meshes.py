@@ -181,7 +181,8 @@ def read(folder: Path, up: str, cache: Path) -> MeshScene:
     Args:
         folder: of the meshes.
         up: the axis that is up in the files, "y" or "z".
-        cache: an empty folder; everything is written there and read back when needed, so that processes share it.
+        cache: an empty folder; everything is written there and read back when needed, so that processes share
+            it.
     Raises:
         DuagError: no folder, no mesh, a file that cannot be read, or one with neither texture nor colors.
     """

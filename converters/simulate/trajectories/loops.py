@@ -97,7 +97,8 @@ def plan(scene: Scene, robots: int, frames: int, overlap: float, *, camera: Pinh
         scene: where they move.
         robots: how many.
         frames: poses per robot.
-        overlap: share, 0 to 1, of what a robot sees that the next one sees as well; met as nearly as the room allows.
+        overlap: share, 0 to 1, of what a robot sees that the next one sees as well; met as nearly as the room
+            allows.
         camera: of all robots.
     Raises:
         DuagError: no path was found that keeps clear of the furniture.

@@ -78,7 +78,8 @@ def plan(
         terrain: where they move.
         paradigm: one of PARADIGMS but the first.
         robots: how many.
-        frames: poses per robot, evenly spaced, at most a step of the terrain apart; less where there is no room.
+        frames: poses per robot, evenly spaced, at most a step of the terrain apart; less where there is no
+            room.
         overlap: share, 0 to 1, of what a robot sees that the next one sees as well; met as nearly as may be.
         camera: of all robots.
         seed: of the figure's place.

@@ -106,7 +106,8 @@ def plan(
         terrain: where they move.
         robots: how many.
         frames: poses per robot, a step of the terrain apart.
-        overlap: share, 0 to 1, of what a robot sees that the one before sees as well; met as nearly as may be.
+        overlap: share, 0 to 1, of what a robot sees that the one before sees as well; met as nearly as may
+            be.
         camera: of all robots.
         seed: of the walks.
     Raises:
