@@ -294,7 +294,7 @@ def _evaluate(folder: Path, recording: Path, timing: Timing) -> None:
 
 def _present(folder: Path, recording: Path, timing: Timing) -> None:
     from duagc.pipeline.report import write_report
-    from duagc.pipeline.viewing.rerun_view import write_rrd
+    from duagc.pipeline.viewing.run_rrd import write_rrd
 
     with timing.stage(stages.REPORT, folder):
         write_report(folder, recording)

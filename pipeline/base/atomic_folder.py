@@ -15,9 +15,9 @@ RECORDING = "a recording", ("recording.json",)
 
 @contextmanager
 def new_folder(out: Path, force: bool, kind: tuple[str, tuple[str, ...]] = RUN) -> Iterator[Path]:
-    """A folder beside `out` that takes its name when the block ends well, and is removed when it does not.
+    """A folder next to `out` that takes its name when the block ends well, and is removed when it does not.
 
-    force: replace what is there, if it is empty or of this kind: its name, and the files that tell.
+    force: replace what is there, if it is empty or of this kind: its name, and the files that mark it.
     """
     _check_out(out, force, kind)
     partial = out.with_name(out.name + ".part")

@@ -56,7 +56,7 @@ def read_text(path: Path, expected: str) -> str:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """A name beside `path` to write to: it becomes `path` when the block ends well, else it is removed.
+    """A name next to `path` to write to: it becomes `path` when the block ends well, else it is removed.
 
     Raises:
         DuagError: it cannot be written there.

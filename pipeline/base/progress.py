@@ -16,7 +16,7 @@ def track(iterable: Iterable[Item], description: str, total: int | None = None) 
     Args:
         iterable: what to walk through.
         description: what is being done, in a few words.
-        total: number of items, if the iterable does not tell it by `len`.
+        total: number of items, if the iterable has no `len`.
     """
     if total is None:
         total = len(iterable) if isinstance(iterable, Sized) else None

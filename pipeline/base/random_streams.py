@@ -1,6 +1,6 @@
 """Named random streams: one seed, one independent counter-based generator per consumer.
 
-A new consumer changes nobody else's draws, and a draw does not depend on what was drawn elsewhere.
+A new consumer changes no other consumer's draws, and a draw does not depend on what was drawn elsewhere.
 """
 
 import hashlib
@@ -14,7 +14,7 @@ def generator(seed: int, name: str, **key: str | int) -> np.random.Generator:
     Args:
         seed: the seed of the run.
         name: the consumer, for example "link".
-        key: what tells this consumer from its siblings, for example robot="alpha", sequence=17.
+        key: what distinguishes this consumer from its siblings, for example robot="alpha", sequence=17.
     Returns:
         A generator that is the same in every process and on every machine.
     """

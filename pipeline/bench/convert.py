@@ -1,4 +1,4 @@
-"""What a conversion costs beside reading and writing alone.
+"""What a conversion costs compared with reading and writing alone.
 
 Reading and writing alone: the log's own library (rosbags, mcap) reads every message of the topics that the conversion
 takes, and the MCAP library writes their bytes as they are, with the settings of our logs. Each of the two runs in a

@@ -1,4 +1,4 @@
-"""Speed of the rasterizer on a synthetic room, beside a plain torch tile rasterizer and the machine's own peak.
+"""Speed of the rasterizer on a synthetic room, next to a plain torch tile rasterizer and the machine's own peak.
 
 Everything is measured in one run. Rounds of all candidates alternate, so that other load on the machine hits them
 alike. One thread: the thread's own CPU time (that of the process would count idle helpers that still spin), the median
@@ -316,7 +316,7 @@ class Work:
     def __init__(self, isa: str, view: View) -> None:
         self.moved_bytes: dict[str, float] = {}
         for name in FLOPS:
-            rasterizer = Rasterizer(isa)  # a new one, whose memory tells what the pass needs
+            rasterizer = Rasterizer(isa)  # a new one, whose memory shows what the pass needs
             passes = view.passes(rasterizer)
             passes["forward"]()
             self.seen: Statistics = rasterizer.statistics()

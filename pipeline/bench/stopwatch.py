@@ -90,7 +90,7 @@ def summary(calls: Calls) -> dict[str, float]:
 
 @dataclass
 class Work:
-    """What is counted beside time: it is the same on every machine. Totals after each call of the whole."""
+    """What is counted besides time: it is the same on every machine. Totals after each call of the whole."""
 
     total: int = 0
     after: list[int] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""A rasterizer in plain torch, tile by tile: what the compiled one is timed beside."""
+"""A rasterizer in plain torch, tile by tile: the baseline of the compiled one."""
 
 from __future__ import annotations
 

@@ -89,14 +89,17 @@ def _check_robot(
 
 
 def _check_digest(recording: Recording, robot: str, file: LogFile) -> Iterator[Finding]:
-    told, found = recording.digest(file.path.name), dict(file.metadata()).get(DIGEST_RECORD, {}).get("sha256")
-    if told not in ("nothing", found):
+    expected, found = (
+        recording.digest(file.path.name),
+        dict(file.metadata()).get(DIGEST_RECORD, {}).get("sha256"),
+    )
+    if expected not in ("nothing", found):
         yield Finding(
             Severity.WARNING,
             "digest",
             robot,
             f"{file.path.name} has digest {str(found)[:12]}",
-            f"{told[:12]} as in recording.json",
+            f"{expected[:12]} as in recording.json",
             "the log is not the one that was converted",
         )
 

@@ -34,7 +34,7 @@ FEW_REGISTERED = 0.5
 # --- scale
 
 SCALES = (0.6, 1.6)  # of lengths by registration relative to those by another sensor
-FAR_ENOUGH_M = 0.004  # a pair that moved less tells no scale
+FAR_ENOUGH_M = 0.004  # a pair that moved less determines no scale
 NEAR_M, FAR_M = 0.1, 100.0
 SENSOR_M = 14.0  # no camera with its own light sees farther
 FAST_M_PER_S = 4.0

@@ -29,7 +29,7 @@ def bench_raster(
     no_torch: Annotated[bool, typer.Option("--no-torch", help="Without the plain torch rasterizer.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Time the rasterizer, beside the machine's own peak and a plain torch rasterizer.
+    """Time the rasterizer, next to the machine's own peak and a plain torch rasterizer.
 
     Lists are separated by commas. Takes about two minutes on an idle machine; a busy one gives other times.
     """
@@ -166,7 +166,7 @@ def bench_reference(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """A team's error beside what its images allow: all keyframes optimized in one place.
+    """A team's error next to what its images allow: all keyframes optimized in one place.
 
     From the run's poses and from the true ones. A run of one robot is also cut in parts. Needs ground truth.
 
@@ -206,7 +206,7 @@ def bench_frontend(
     overrides: Overrides = None,
     as_json: Json = False,
 ) -> None:
-    """Time, memory and accuracy of tracking and mapping, part by part, beside Open3D's odometry.
+    """Time, memory and accuracy of tracking and mapping, part by part, next to Open3D's odometry.
 
     Examples: `duagc bench frontend recordings/house --caps 30k,60k,200k,600k --plot caps.svg`,
     `duagc bench frontend recordings/redkitchen --no-ablation --json`
@@ -300,7 +300,7 @@ def bench_convert(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """What converting a log costs beside reading its messages and writing them as they are.
+    """What converting a log costs compared with reading its messages and writing them as they are.
 
     Needs as much room on the disk as the log has, at most.
 

@@ -24,11 +24,11 @@ def posegraph(
     ] = "admm",
     robust: Annotated[
         Literal["none", "gnc"],
-        typer.Option(help="gnc: closures and loops may be false, odometry is trusted."),
+        typer.Option(help="gnc: loop closures may be outliers, odometry is trusted."),
     ] = "none",
     only_reference: Annotated[
         bool,
-        typer.Option("--only-reference", help="Leave out what the reference beside the graph calls false."),
+        typer.Option("--only-reference", help="Leave out what the reference next to the graph calls false."),
     ] = False,
     max_rounds: Annotated[int, typer.Option(min=1, help="Give up after so many rounds.")] = 5000,
     seed: Annotated[int, typer.Option(help="Of the losses; nothing else is random.")] = 0,

@@ -45,7 +45,7 @@ def simulate(
     noise: Annotated[str, typer.Option(help="none or kinect.")] = "none",
     seed: Annotated[int, typer.Option(help="Seed of scene, paths and noise.")] = 0,
     sensor: Annotated[
-        str, typer.Option(help="rgbd, stereo (depth by matching), or lidar (points beside the images).")
+        str, typer.Option(help="rgbd, stereo (depth by matching), or lidar (points with the images).")
     ] = "rgbd",
     readout_ms: Annotated[float, typer.Option(help="Rolling shutter: from the first row to the last.")] = 0,
     exposure_ms: Annotated[float, typer.Option(help="Motion blur: how long the shutter is open.")] = 0,

@@ -114,7 +114,7 @@ class Surface:
 
 
 def surface(recording: Recording) -> Surface | Absent:
-    """The geometry of the scene, from groundtruth.ply beside the logs.
+    """The geometry of the scene, from groundtruth.ply next to the logs.
 
     Raises:
         DuagError: not a binary .ply of points with normals, cut short, or values that are not finite.

@@ -36,7 +36,7 @@ from duagc.pipeline.splat.information import theta_of
 from duagc.schemas import topics
 
 Array = NDArray[np.float64]
-NOBODY = Absent("no two robots share a world")
+NO_TEAM = Absent("no two robots share a world")
 NO_MATCHES = Absent("no Gaussians were matched")
 NO_INFORMATION = Absent("consensus.mcap does not hold the information of the closures")
 
@@ -46,7 +46,7 @@ class Gap:
     """Largest difference of a keyframe pose from the centralized answer: meters, radians.
 
     sigma, sigma_p99: of the coordinates of matched Gaussians in their standard deviations, the largest and the 99th
-    percentile of each Gaussian's largest; absent where nothing was matched. The largest tells of fusion's own
+    percentile of each Gaussian's largest; absent where nothing was matched. The largest shows fusion's own
     decisions: where members contradict each other, rounding on the wire may tip them.
     """
 
@@ -85,7 +85,7 @@ def gap_to_oracle(
     if len(found) < len(gaps):
         return next(gap for gap in gaps if isinstance(gap, Absent))
     if not found:
-        return NOBODY
+        return NO_TEAM
     return Gap(
         max(gap.meters for gap in found),
         max(gap.radians for gap in found),
@@ -150,7 +150,7 @@ def _gaussian_gaps(
     matched = best.members[: len(own)] > 1
     theta = theta_of(run.robots[robot].fused_map.gaussians.select(slice(0, len(own))))
     information = Evidence("", own.ids, own.anchors, theta, best.information[: len(own)])
-    # where nobody knows a coordinate, rounding may leave a little less than nothing
+    # where no robot knows a coordinate, rounding may leave a little less than nothing
     roots = np.sqrt(np.maximum(Weights.of(information).diagonal(), 0.0))
     gaps = np.abs(theta - theta_of(best.gaussians)[: len(own)]) * roots
     return np.asarray(gaps[matched].max(axis=1, initial=0.0))

@@ -89,7 +89,7 @@ def team_error(pairs_of: Mapping[str, Paired]) -> TeamError | Absent:
     Only a joint alignment sees the error between robots: each robot may lie well by itself and the team lie apart.
     """
     if len(pairs_of) < 2:
-        found = "nobody" if not pairs_of else "only " + ", ".join(sorted(pairs_of))
+        found = "none" if not pairs_of else "only " + ", ".join(sorted(pairs_of))
         return Absent(
             f"a joint alignment needs at least 2 robots with ground truth in one component, found {found}"
         )

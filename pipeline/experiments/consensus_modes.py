@@ -3,7 +3,7 @@
 Teams are made, or those of a finished run (`team_of_run`). In made ones every robot has evidence on every track,
 with information spread over a contrast and a share of it missing. `evidence` travels as in an exchange, over the real
 transport with acknowledgements, compact, in float32 or in float64; `admm` and `paper` send float64 values in every
-round. Loss is drawn by the link model. The optimum is computed with everybody's evidence at hand, which no robot has;
+round. Loss is drawn by the link model. The optimum is computed with the evidence of all robots, which no robot has;
 for `paper`, whose weights are per coordinate, it is that of those weights.
 """
 
@@ -232,7 +232,7 @@ def _rounds(team: Team, model: LinkModel, case: dict[str, Any], plan: Plan) -> _
 
 
 def _evidence(team: Team, model: LinkModel, case: dict[str, Any], plan: Plan) -> _Cost:
-    """Every robot's evidence goes once along the shortest ways to everybody; each sums up what it has."""
+    """Every robot's evidence goes once along the shortest paths to all robots; each sums up what it has."""
     kind = EVIDENCE_MODES[case["mode"]]
     index = {name: k for k, name in enumerate(team.names)}
     children = {owner: _tree(owner, team.linked) for owner in team.names}
@@ -334,7 +334,7 @@ HEAD = (
 LEGEND = """
 Unknown: share of its tracks that a robot knows nothing of. Rounds: until the worst coordinate of any robot is that
 near the optimum, and until the session ended (there, or nothing moved any more, or --max-rounds); "-": not reached.
-Gap: from the optimum with everybody's evidence at hand, largest and at 99 %, in its standard deviations; for paper,
+Gap: from the optimum with the evidence of all robots, largest and at 99 %, in its standard deviations; for paper,
 of its weights. kB: of all robots, headers and lost packets too; as the paper counts: 28 float32 per pair and round."""
 
 

@@ -2,7 +2,7 @@
 
 In the flat chart theta [13] the objective is a sum of squares, F = sum_i 1/2 |theta - theta_i|^2_{W_i} per track, whose
 minimum is theta* = (sum W_i)^+ sum W_i theta_i: method section 4. Mode `evidence` sends (theta_i, W_i) once and lets
-everybody take that sum (`fusion.fuse`). Here robots keep their evidence to themselves and talk in rounds:
+all robots take that sum (`fusion.fuse`). Here robots keep their evidence to themselves and talk in rounds:
 
     admm    x = (W + sum_j rho_j)^-1 (W theta + sum_j rho_j y_j),   sends m = 2 x - y_j,   y_j <- y_j + a (m_j - y_j)
     paper   x <- (w + sum_j w_j)^-1 (w x + sum_j w_j x_j),   sends x and w: (12), with weights per coordinate
@@ -110,7 +110,7 @@ def _connected(group: NDArray[np.bool_], names: list[str], linked: Mapping[str, 
 
 @dataclass(frozen=True)
 class GaussianPacket:
-    """What one robot tells a neighbor in one round, of the tracks that they share, in their order.
+    """What one robot sends to a neighbor in one round, of the tracks that they share, in their order.
 
     sequence: counts up; a value is not replaced by an older one. first: place of the first row among the shared
     tracks. weights: float32 [m, 13], None once the neighbor has them. has_weights: the sender has all of the
@@ -190,7 +190,7 @@ class GaussianAgent:
         """The values now, [n, 13]."""
 
     def outgoing(self, peer: str) -> GaussianPacket:
-        """What to tell a neighbor in this round."""
+        """What to send to a neighbor in this round."""
         link = self._links[peer]
         self._sequence += 1
         values: NDArray[np.floating] | None = None
@@ -276,7 +276,7 @@ def optimum(theta: Sequence[Array], weights: Sequence[Weights], rows: Sequence[I
 
 
 def total_weights(weights: Sequence[Weights], rows: Sequence[Index], tracks: int) -> Weights:
-    """Sum of everybody's weights per track."""
+    """Sum of all robots' weights per track."""
     total = Weights.of_diagonal(np.zeros((tracks, COORDINATES)))
     for w, at in zip(weights, rows, strict=True):
         total.position[at] += w.position

@@ -1,7 +1,8 @@
-"""What a team's error could be: its poses beside those that all images together ask for, and beside the truth.
+"""What a team's error could be: its poses next to those that all images together ask for, and next to the truth.
 
 All keyframes of all robots are optimized in one place by the images themselves, as a front end does with its own, from
-the run's poses and from the true ones; other frames keep their place beside their keyframe. A reference trajectory has
+the run's poses and from the true ones; other frames keep their place relative to their keyframe.
+A reference trajectory has
 errors of its own, and own alignments hide what a common one shows: where every answer of the images, even begun at the
 truth, ends with the same error under one alignment, the exchange does not make it. Ground truth is read here alone.
 """
@@ -48,7 +49,7 @@ class View:
 
 @dataclass(frozen=True)
 class Robot:
-    """One robot's frames that have a true pose. keyframe: [n], the one that a frame hangs on, as a row of the same."""
+    """One robot's frames that have a true pose. keyframe: [n], the row of the one that each is anchored to."""
 
     run: RobotRun
     log: RgbdLog
@@ -168,7 +169,7 @@ class _Team:
         )
 
     def optimized(self, start: Poses, residuals: Literal["joint", "depth"]) -> Poses:
-        """Where all images together put everybody, from a start."""
+        """Where all images together put all robots, from a start."""
         T = np.array([start[robot.run.robot][row] for robot, row in self.where])
         T = se3.inverse(T[0]) @ T
         tracked = [RelativePose(a, b, se3.inverse(T[a]) @ T[b], np.eye(6)) for a, b in sorted(self.ends)]

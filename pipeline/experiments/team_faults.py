@@ -99,15 +99,17 @@ class TeamBench:
         }
 
     def _team_ate(self, found: dict[str, SessionResult], names: dict[str, str]) -> float | None:
-        """One alignment for all; None unless everybody shares one world."""
+        """One alignment for all; None unless all robots share one world."""
         if any(len(r.component) < len(names) for r in found.values()):
             return None
         pairs = {}
         for robot, result in found.items():
             frames = [f for f in self.run.robots[robot].frames if f.status != "lost"]
             stamps = np.array([f.stamp_ns for f in frames], dtype=np.int64)
-            hung = np.array([result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera for f in frames])
-            pairs[robot] = trajectory_errors.pair(self.truth[robot], Trajectory(stamps, hung))
+            T_world_camera = np.array(
+                [result.T_world_keyframe[f.keyframe_index] @ f.T_keyframe_camera for f in frames]
+            )
+            pairs[robot] = trajectory_errors.pair(self.truth[robot], Trajectory(stamps, T_world_camera))
         error = trajectory_errors.team_error(pairs)
         return None if isinstance(error, Absent) else float(error.ate_rmse_m)
 

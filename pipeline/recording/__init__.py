@@ -1,4 +1,4 @@
-"""Logs in, logs out: MCAP files that are checked whole before they are believed, and the recordings made of them.
+"""Logs in, logs out: MCAP files that are checked whole before they are used, and the recordings made of them.
 
 Order of a log: by log time, then by position in the file. `log_time` is when a message was received, `publish_time`
 when it was produced, `sequence` counts per topic from 0; all in the time of the recording, never the wall clock.

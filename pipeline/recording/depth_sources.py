@@ -26,7 +26,7 @@ Value = TypeVar("Value")
 class DepthImage:
     """Depth [h, w], meters along z of the color camera, 0 = unknown, and its standard deviation where the log has it.
 
-    sigma_m: [h, w], meters, 0 where the depth is unknown; None: the sensor's noise is not told.
+    sigma_m: [h, w], meters, 0 where the depth is unknown; None: the log does not have the sensor's noise.
     """
 
     depth_m: NDArray[np.float32]
@@ -79,7 +79,7 @@ class Registered:
                 f"{_where(record)} has no image on {self._sigma_topic}, expected one for each depth image"
             )
         sigma_m = _depth_image(self._log.record_at(self._sigma_topic, entry), self._sigma_scale, self.camera)
-        known = (depth_m > 0) & (sigma_m > 0)  # a depth that nobody vouches for is none
+        known = (depth_m > 0) & (sigma_m > 0)  # a depth without sigma is unknown
         return DepthImage(np.where(known, depth_m, np.float32(0)), np.where(known, sigma_m, np.float32(0)))
 
 
@@ -100,7 +100,7 @@ class OtherCamera:
 
 
 class Lidar:
-    """Sweeps of a LiDAR, filled between their points; with sigma if the log tells the noise of its ranges."""
+    """Sweeps of a LiDAR, filled between their points; with sigma if the log has the noise of its ranges."""
 
     scale = 1.0
 
@@ -108,8 +108,8 @@ class Lidar:
         self.topic, self.camera = topic_table.LIDAR.of(robot), camera
         transform = topic_table.LIDAR_TRANSFORM.of(robot)
         self.T_camera_lidar = np.array(constant(log, transform, transform_rows))
-        told = RANGE_SIGMA_KEY in log.channels[self.topic].metadata
-        self._range_sigma_m = _meters(log, self.topic, RANGE_SIGMA_KEY) if told else None
+        known = RANGE_SIGMA_KEY in log.channels[self.topic].metadata
+        self._range_sigma_m = _meters(log, self.topic, RANGE_SIGMA_KEY) if known else None
 
     def read(self, record: Record) -> DepthImage:
         points = messages.unpack_points(record.proto(), _where(record))

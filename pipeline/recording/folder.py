@@ -35,12 +35,12 @@ class Recording:
         return path
 
     def digest(self, name: str) -> str:
-        """Content digest of a log of the recording as it was written, by the log's file name; "nothing" if not told."""
+        """Content digest of a log as it was written, by the log's file name; "nothing" if recording.json has none."""
         rows = self._robots.values()
-        told = next(
+        digest = next(
             (d[name] for r in rows if isinstance(d := r.get("digests"), dict) and name in d), "nothing"
         )
-        return str(told)
+        return str(digest)
 
     def groundtruth(self, robot: str) -> Path | None:
         """The log of a robot's ground truth, for evaluation only; None where there is none, listed or not."""

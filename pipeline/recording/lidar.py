@@ -1,4 +1,4 @@
-"""Sweeps of a LiDAR as depth images of a camera beside it, with the standard deviation of every pixel.
+"""Sweeps of a LiDAR as depth images of a camera next to it, with the standard deviation of every pixel.
 
 Neighboring beams that meet one surface are joined to triangles, as the LiDAR sees them. Drawn from the camera with a
 z-buffer they say two things: which points the camera cannot see, because a nearer surface hides them, and how deep the
@@ -66,7 +66,7 @@ def _before(points_lidar: Array, T_camera_lidar: Array, camera: PinholeCamera) -
     front = (points[:, 2] > NEAREST_M) & (rays[:, 2] > NEAREST_M)
     points, rays = points[front], rays[front]
     pixels, size = camera.project(points), np.array([camera.width, camera.height])
-    margin = LONGEST_SIDE * camera.fx  # beside the image, for triangles that reach into it
+    margin = LONGEST_SIDE * camera.fx  # around the image, for triangles that reach into it
     near = ((pixels > -margin) & (pixels < size + margin)).all(axis=1)
     return points[near], rays[near]
 

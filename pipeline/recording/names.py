@@ -5,7 +5,7 @@ from duagc import __version__
 MAGIC = b"\x89MCAP0\r\n"
 LIBRARY = f"duagc/{__version__}"
 DIGEST_RECORD = "duagc.digest"  # metadata record with the content digest; itself not part of it
-LOG_RECORD = "duagc.log"  # metadata record with what the writer was told about the log
+LOG_RECORD = "duagc.log"  # metadata record with what was given to the writer
 ROBOT_KEY = "robot"
 DEPTH_SCALE_KEY = "depth_scale"
 RECORDING_FILE = "recording.json"

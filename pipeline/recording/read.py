@@ -346,7 +346,7 @@ def merge(paths: Sequence[Path], topics: Iterable[str] | None = None) -> Iterato
 
 
 def log_metadata(path: Path) -> dict[str, str]:
-    """What the writer was told about the log: the robot and the metadata given to `LogWriter`."""
+    """What was given to the writer of the log: the robot and the metadata given to `LogWriter`."""
     with LogFile(path) as log:
         return dict(log.metadata()).get(LOG_RECORD, {})
 

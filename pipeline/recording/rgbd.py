@@ -27,7 +27,7 @@ class RgbdFrame:
     index: position in the log. stamp_ns: when the color was taken. color: uint8 [H, W, 3], RGB.
     depth: float32 [H, W], meters along z, 0 where nothing was measured. mask: bool [H, W], True = usable, False = a
     moving object or otherwise to be ignored; None = all usable. depth_offset_ns: how much later the depth was taken.
-    depth_sigma: float32 [H, W], standard deviation of the depth in meters, 0 where there is no depth; None = not told.
+    depth_sigma: float32 [H, W], standard deviation of the depth in meters, 0 where there is no depth; None = unknown.
     """
 
     index: int

@@ -133,7 +133,7 @@ def _recording_info(path: Path) -> dict[str, Any]:
 
 
 def _frames_info(path: Path) -> dict[str, Any]:
-    """What the frames of a robot's log are; what recording.json says of them is not believed."""
+    """What the frames of a robot's log are; recording.json is not trusted."""
     with open_rgbd(path) as log:
         stamps = [color for color, _ in log.pairing.pairs]
         return {
@@ -212,12 +212,12 @@ def _robot_lines(robot: str, row: Mapping[str, Any]) -> list[str]:
 
 
 def _clock_lines(clock: Mapping[str, Any] | None) -> list[str]:
-    """How a robot's clock differs from the first one's, where the converter could tell."""
+    """How a robot's clock differs from the first one's, where the converter knows."""
     if not clock or clock["how"] == "the reference":
         return []
     seconds, added = clock["offset_s"], f", {clock['added_s']:.6f} s were added" if clock["added_s"] else ""
-    told = "not known" if seconds is None else f"{seconds:.6f} s behind the first robot's"
-    return [f"    clock {told} ({clock['how']}){added}"]
+    offset = "not known" if seconds is None else f"{seconds:.6f} s behind the first robot's"
+    return [f"    clock {offset} ({clock['how']}){added}"]
 
 
 def _log_lines(log: Mapping[str, Any], indent: str = "") -> list[str]:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
-# Okabe-Ito: told apart with every common color blindness; dark enough on white.
+# Okabe-Ito: distinguishable with every common color blindness; dark enough on white.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F6000", "#444444")
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 INK, FAINT, GRID = "#22303c", "#6b7a87", "#e3e8ec"

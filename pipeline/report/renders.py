@@ -1,4 +1,4 @@
-"""The pictures of a report: maps rendered beside the images of some views, and colored by their uncertainty."""
+"""The pictures of a report: maps rendered next to the images of some views, and colored by their uncertainty."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ UNDETERMINED_GRAY = 0.75
 
 
 def rendered_views(run: RunFolder, source: Recording) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Renders beside images, and the fused map colored by its uncertainty, for a few held-out views per robot, and
-    beside the image of a peer."""
+    """Renders next to images, and the fused map colored by its uncertainty, for a few held-out views per robot, and
+    next to the image of a peer."""
     from duagc.pipeline.kernels import Rasterizer
 
     rasterizer = Rasterizer(threads=1)

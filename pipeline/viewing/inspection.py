@@ -266,8 +266,8 @@ class Inspector:
         for number, p in enumerate(self._session.packets):
             if Kind[p.kind_name] not in EVIDENCE_KINDS:
                 continue
-            told = self._content(_parsed(p))
-            if told.get("owner") == robot and gaussian_id in told["gaussians"]:
+            content = self._content(_parsed(p))
+            if content.get("owner") == robot and gaussian_id in content["gaussians"]:
                 out.append(
                     {
                         "packet": number,

@@ -180,10 +180,10 @@ FAULTS: dict[str, tuple[Change, dict[str, Any], str, str]] = {
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_planted_fault_is_noticed(sound: Path, tmp_path: Path, name: str) -> None:
-    change, how, severity, check = FAULTS[name]
+    change, how, severity, expected = FAULTS[name]
     report = check.check(planted(sound, tmp_path / "rec", change, **how))
     found = {(f.severity.value, f.check) for f in report.findings if f.robot == "bravo"}
-    assert (severity, check) in found, check.format_report(report)
+    assert (severity, expected) in found, check.format_report(report)
     assert report.sound == (severity != "error")
 
 

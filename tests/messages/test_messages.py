@@ -75,6 +75,23 @@ def all_messages(seed: int, n: int) -> list[Any]:
         m.GaussianMap(stamp, "alpha", "world", gaussians(rng, n), gaussian_information(rng, n)),
         m.GaussianMap(stamp, "alpha", "alpha/map", gaussians(rng, n)),
         m.CorrectedKeyframes(stamp, "alpha", component, np.arange(k, dtype=np.int32), T),
+        m.PeerColors(stamp, "alpha", "bravo", *rng.random((4, 3)), matches=n),
+        m.PeerMapReport(
+            stamp_ns=stamp,
+            robot="alpha",
+            peer="bravo",
+            gaussians=n,
+            too_large=1,
+            contradicted=2,
+            matches=3,
+            rejected_matches=1,
+            compared_px=500,
+            own_px=2**31,
+            color_mse=0.125,
+            color_variance=0.5,
+            used=n % 2 == 0,
+            reason="" if n % 2 == 0 else "explains too little",
+        ),
     ]
 
 
@@ -129,7 +146,7 @@ def test_a_message_without_dataclass_stays_as_it_is() -> None:
 def test_broken_messages_say_what_is_wrong(schema: str, fields: dict[str, Any], words: str) -> None:
     message = schemas.new(schema, **fields)
     with pytest.raises(DuagError, match=words):
-        m.estimates.unpack_gaussians(message) if schema == "GaussianArrays" else m.unpack(message)
+        m.maps.unpack_gaussians(message) if schema == "GaussianArrays" else m.unpack(message)
 
 
 def test_wrong_shapes_are_bugs() -> None:

@@ -170,7 +170,7 @@ def test_a_recording_is_recovered_as_a_whole(tmp_path: Path) -> None:
     data = (rec / "alpha.mcap").read_bytes()
     (rec / "alpha.mcap").write_bytes(data[: int(0.55 * len(data))])
     result = CliRunner().invoke(app, ["recover", str(rec), "--out", str(tmp_path / "saved")])
-    assert result.exit_code == 0
+    assert result.exit_code == 3
     assert "and all after the cut" in result.stdout
     saved = Recording(tmp_path / "saved")
     assert saved.robots == ["alpha", "bravo"]

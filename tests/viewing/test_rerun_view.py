@@ -7,7 +7,7 @@ import pytest
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation import evaluate
-from duagc.pipeline.viewing import rerun_view
+from duagc.pipeline.viewing import rerun_view, run_rrd
 from tests.evaluation.fake_run import FRAMES, KEYFRAMES, FakeRun, make, wall
 
 
@@ -64,7 +64,7 @@ def test_a_recording_becomes_a_file_with_depth_in_meters(fake, tmp_path):
 
 def test_a_run_becomes_a_file_with_everything_in_it(fake, tmp_path):
     evaluate(fake.run, fake.recording, progress=False)
-    found = of_rrd(rerun_view.write_rrd(fake.run, fake.recording, tmp_path / "run.rrd"))
+    found = of_rrd(run_rrd.write_rrd(fake.run, fake.recording, tmp_path / "run.rrd"))
     for robot in ("alpha", "bravo"):
         for path in ("before_consensus", "after_consensus", "ground_truth"):
             assert found[f"/world/paths/{robot}/{path}"]["LineStrips3D:strips"] == 1
@@ -84,7 +84,7 @@ def test_a_run_becomes_a_file_with_everything_in_it(fake, tmp_path):
 
 def test_robots_that_never_met_share_no_world(tmp_path):
     fake = make(tmp_path, joined=False, truth=False)
-    found = of_rrd(rerun_view.write_rrd(fake.run, fake.recording, tmp_path / "run.rrd"))
+    found = of_rrd(run_rrd.write_rrd(fake.run, fake.recording, tmp_path / "run.rrd"))
     assert "/world/maps/alpha/fused" in found
     assert "/world_of_bravo/maps/bravo/fused" in found
     assert "/world/paths/alpha/ground_truth" not in found
@@ -94,9 +94,9 @@ def test_thinning_keeps_what_covers_most():
     gaussians = wall()
     large = gaussians.log_scales.copy()
     large[::7] += 1.0
-    chosen = rerun_view.thinned(gaussians.replace(log_scales=large), len(large[::7]))
+    chosen = run_rrd.thinned(gaussians.replace(log_scales=large), len(large[::7]))
     assert np.array_equal(chosen, np.arange(len(gaussians))[::7])
-    assert np.array_equal(rerun_view.thinned(gaussians, 10**6), np.arange(len(gaussians)))
+    assert np.array_equal(run_rrd.thinned(gaussians, 10**6), np.arange(len(gaussians)))
 
 
 def test_a_made_file_is_copied_not_made_again(fake, tmp_path):
