@@ -222,8 +222,8 @@ def test_the_exchange_of_a_run_can_be_repeated_under_faults(finished: Path, reco
     result = team_faults.run(
         RunFolder(finished), Recording(recording), settings.exchange, settings.seed, checks, 1
     )
-    told = json.loads((finished / "metrics.json").read_text())["team"]["ate_rmse_m"]
-    assert result["base"]["team_ate_rmse_m"] == pytest.approx(told, abs=1e-9)
+    stated = json.loads((finished / "metrics.json").read_text())["team"]["ate_rmse_m"]
+    assert result["base"]["team_ate_rmse_m"] == pytest.approx(stated, abs=1e-9)
     rows = {row["case"]: row for row in result["rows"]}
     assert rows["silence"]["as_if_alone"]
     assert rows["silence"]["team_ate_rmse_m"] is None
@@ -239,11 +239,11 @@ def test_what_the_images_allow_is_told_beside_the_error_of_the_team(finished: Pa
     config = load_config(RunConfig, finished / "config.toml", []).frontend
     result = pose_reference.run(RunFolder(finished), Recording(recording), config)
     metrics = json.loads((finished / "metrics.json").read_text())
-    told = metrics["team"]["ate_rmse_m"]
+    stated = metrics["team"]["ate_rmse_m"]
     assert result["closures"] == metrics["team"]["inter_robot_loop_closures"] > 0
     rows = {row["poses"]: row for row in result["rows"]}
-    assert rows["the run"]["team_ate_rmse_m"] == pytest.approx(told, abs=1e-9)
-    assert rows["the run"]["own_ate_rmse_m"] <= told
+    assert rows["the run"]["team_ate_rmse_m"] == pytest.approx(stated, abs=1e-9)
+    assert rows["the run"]["own_ate_rmse_m"] <= stated
     assert rows["the truth"]["team_ate_rmse_m"] == 0.0
     assert result["views"]["within"] > 0
     for start in ("images, from the run", "images, from the truth"):  # exact images lead to the truth

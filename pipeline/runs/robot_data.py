@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 class Images(NamedTuple):
-    """Images of a keyframe: RGB [h, w, 3], depth [h, w] (m, 0 = unknown), its sigma (m) where the log tells it."""
+    """Images of a keyframe: RGB [h, w, 3], depth [h, w] (m, 0 = unknown), its sigma (m) where the log has it."""
 
     color: NDArray[np.uint8]
     depth_m: NDArray[np.float32]

@@ -48,12 +48,12 @@ def planted(
     shutil.copytree(sound, out)
     records = list(read_log(sound / "bravo.mcap"))
     description = json.loads((sound / "recording.json").read_text())
-    told = description["robots"]["bravo"]["depth_scale_m"]
+    stated = description["robots"]["bravo"]["depth_scale_m"]
     if alone:
         del description["robots"]["alpha"]
         (out / "recording.json").write_text(json.dumps(description))
     with LogWriter(out / "bravo.mcap", "bravo") as log:
-        log.channel(DEPTH, topics.DEPTH.schema, {"depth_scale": repr(told * (scale or 1))})
+        log.channel(DEPTH, topics.DEPTH.schema, {"depth_scale": repr(stated * (scale or 1))})
         for record, message, publish_ns in change(records):
             log.write(record.topic, message, record.log_time_ns, publish_ns)
     if not truth:

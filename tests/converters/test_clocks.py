@@ -33,17 +33,17 @@ def start(recording: Path, robot: str) -> int:
 
 
 def test_one_recorder_tells_how_headers_differ(tmp_path: Path) -> None:
-    """Told always, applied only if asked."""
+    """Stated always, applied only if asked."""
     r = Ros(2)
     jackal, husky = both(r)
     bag = r.write(tmp_path / "bag", sorted(jackal + husky, key=lambda x: x[1]), "mcap")
     options = ["namespaces=/jackal,/husky"]
     registry.convert("ros", bag, tmp_path / "kept", options=options)
-    told = clocks_of(tmp_path / "kept")["husky"]
-    assert told["offset_s"] == pytest.approx(HUSKY_LATE_NS / 1e9, abs=1e-6)
-    assert told["low_s"] <= HUSKY_LATE_NS / 1e9 <= told["high_s"]
-    assert told["how"] == "one recorder"
-    assert told["added_s"] == 0
+    stated = clocks_of(tmp_path / "kept")["husky"]
+    assert stated["offset_s"] == pytest.approx(HUSKY_LATE_NS / 1e9, abs=1e-6)
+    assert stated["low_s"] <= HUSKY_LATE_NS / 1e9 <= stated["high_s"]
+    assert stated["how"] == "one recorder"
+    assert stated["added_s"] == 0
     assert start(tmp_path / "kept", "husky") == START_NS + STEP_NS - HUSKY_LATE_NS
     warnings = json.loads((tmp_path / "kept" / "recording.json").read_text())["warnings"]
     assert any("husky: its times" in w and "none in common" in w for w in warnings)
@@ -124,29 +124,29 @@ def two_logs(tmp_path: Path, speakers: tuple[str, ...], namespaces: bool) -> Pat
 def test_messages_in_both_directions_bound_the_difference(tmp_path: Path) -> None:
     team = two_logs(tmp_path, ("jackal", "husky"), namespaces=True)
     registry.convert("ros", team, tmp_path / "rec", options=["clocks=estimated"])
-    told = clocks_of(tmp_path / "rec")["jackal"]  # husky is first by name
-    assert told["low_s"] <= RECORDER_NS / 1e9 <= told["high_s"]
-    assert told["high_s"] - told["low_s"] < 0.025
-    assert told["how"] == "40 messages that both recorded, sent by both"
+    stated = clocks_of(tmp_path / "rec")["jackal"]  # husky is first by name
+    assert stated["low_s"] <= RECORDER_NS / 1e9 <= stated["high_s"]
+    assert stated["high_s"] - stated["low_s"] < 0.025
+    assert stated["how"] == "40 messages that both recorded, sent by both"
     assert abs(start(tmp_path / "rec", "jackal") - start(tmp_path / "rec", "husky")) < 6_000_000
 
 
 def test_one_direction_bounds_one_side(tmp_path: Path) -> None:
     team = two_logs(tmp_path, ("jackal",), namespaces=True)
     registry.convert("ros", team, tmp_path / "rec")
-    told = clocks_of(tmp_path / "rec")["jackal"]
-    assert told["low_s"] is None
-    assert told["high_s"] >= RECORDER_NS / 1e9
-    assert abs(told["offset_s"] - RECORDER_NS / 1e9) < 0.016  # the way takes up to 15 ms
-    assert "sent by one" in told["how"]
+    stated = clocks_of(tmp_path / "rec")["jackal"]
+    assert stated["low_s"] is None
+    assert stated["high_s"] >= RECORDER_NS / 1e9
+    assert abs(stated["offset_s"] - RECORDER_NS / 1e9) < 0.016  # the way takes up to 15 ms
+    assert "sent by one" in stated["how"]
 
 
 def test_without_common_messages_nothing_is_made_up(tmp_path: Path) -> None:
     team = two_logs(tmp_path, (), namespaces=True)
     registry.convert("ros", team, tmp_path / "rec", options=["clocks=estimated"])
-    told = clocks_of(tmp_path / "rec")["jackal"]
-    assert told["offset_s"] is None
-    assert told["added_s"] == 0
+    stated = clocks_of(tmp_path / "rec")["jackal"]
+    assert stated["offset_s"] is None
+    assert stated["added_s"] == 0
     warnings = json.loads((tmp_path / "rec" / "recording.json").read_text())["warnings"]
     assert any("jackal: its clock is kept: recorders of their own" in w for w in warnings)
 
@@ -194,9 +194,9 @@ def test_a_drift_is_told_and_taken_out_if_asked(tmp_path: Path) -> None:
     r = Ros(2)
     bag = r.write(tmp_path / "bag", drifting(r, 120, 400.0), "mcap")
     registry.convert("ros", bag, tmp_path / "kept")
-    (told,) = [w for w in warnings_of(tmp_path / "kept") if "ppm" in w]
-    assert "the recorder's clock gains 4" in told
-    assert "expected one rate, or --set clocks=estimated" in told
+    (stated,) = [w for w in warnings_of(tmp_path / "kept") if "ppm" in w]
+    assert "the recorder's clock gains 4" in stated
+    assert "expected one rate, or --set clocks=estimated" in stated
     assert "ppm" in format_info(info(tmp_path / "kept"))
     (finding,) = [f for f in check(tmp_path / "kept").findings if f.check == "clock"]
     assert "ppm" in finding.found

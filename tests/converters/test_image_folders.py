@@ -83,21 +83,21 @@ def test_lossless_is_lossless(made: dict[str, tuple[Path, Path]], name: str) -> 
 
 
 def test_times_and_warnings(made: dict[str, tuple[Path, Path]]) -> None:
-    def told(name: str) -> str:
+    def stated(name: str) -> str:
         return " ".join(json.loads((made[name][1] / "recording.json").read_text())["warnings"])
 
     with open_rgbd(made["tum"][1] / "alpha.mcap") as log:
         assert len(log) == 5
         assert log.frame(1).stamp_ns == 33_333_000
-    assert "1 of 6 color images have no depth" in told("tum")
-    assert "1 lines of groundtruth.txt hold no pose" in told("tum")
+    assert "1 of 6 color images have no depth" in stated("tum")
+    assert "1 lines of groundtruth.txt hold no pose" in stated("tum")
     with open_rgbd(made["scannet"][1] / "alpha.mcap") as log:
         assert log.frame(3).stamp_ns == 10 * 10**9 // 30
-    assert "1 of 4 frames have no true pose" in told("scannet")
-    assert "1 images are marked as bad" in told("scannetpp")
-    assert "not recorded at the same time" in told("aria-multiagent")
-    assert "poses count from 1" in told("icl-nuim")
-    assert "5 poses for frames up to 3" in told("replica")
+    assert "1 of 4 frames have no true pose" in stated("scannet")
+    assert "1 images are marked as bad" in stated("scannetpp")
+    assert "not recorded at the same time" in stated("aria-multiagent")
+    assert "poses count from 1" in stated("icl-nuim")
+    assert "5 poses for frames up to 3" in stated("replica")
 
 
 def test_association_policies(made: dict[str, tuple[Path, Path]], tmp_path: Path) -> None:

@@ -143,7 +143,7 @@ def test_two_robots_in_one_bag_and_in_two(tmp_path: Path) -> None:
 
 
 def test_times(tmp_path: Path) -> None:
-    """Late depth is no partner; recording times are used only if asked for; times that go back are told."""
+    """Late depth is no partner; recording times are used only if asked for; times that go back are stated."""
     r = Ros(1)
     bag = r.write(tmp_path / "late", scene(r, late_ns=23_000_000), "plain")
     with pytest.raises(DuagError, match=r"no image on /camera/depth/image_rect_raw within 0.02 s"):
@@ -237,7 +237,7 @@ def test_depth_of_a_lens_is_undistorted_before_it_is_moved(tmp_path: Path) -> No
 
 
 def test_infrared_images_are_not_taken_for_depth(tmp_path: Path) -> None:
-    """Of 16UC1 and mono16 the former is depth; depth as JPEG is told as the reason why there is none."""
+    """Of 16UC1 and mono16 the former is depth; depth as JPEG is stated as the reason why there is none."""
     r = Ros(2)
     rows = scene(r)
     infrared = [
@@ -373,7 +373,7 @@ def test_a_real_bag_converts_when_told_that_times_differ(tmp_path: Path) -> None
 
 
 def test_frames_whose_color_is_cut_short_are_left_out(tmp_path: Path) -> None:
-    """Told, not fatal: a camera that was unplugged for a moment must not cost the rest of the log."""
+    """Stated, not fatal: a camera that was unplugged for a moment must not cost the rest of the log."""
     r = Ros(1)
     rows = []
     for topic, log_ns, message in scene(r):
@@ -440,7 +440,7 @@ def test_chunks_that_unpack_into_too_much_are_refused(
 
 
 def test_true_poses_of_a_file(tmp_path: Path) -> None:
-    """In TUM's format and by a clock of their own; of a body whose place the log or an option tells."""
+    """In TUM's format and by a clock of their own; of a body whose place the log or an option shows."""
     r = Ros(2)
     r.write(tmp_path / "bag", scene(r), "mcap")
     T_marker_color = se3.from_rotation_translation(so3.exp([0.1, -0.4, 0.3]), [0.02, -0.03, 0.1])
@@ -451,11 +451,11 @@ def test_true_poses_of_a_file(tmp_path: Path) -> None:
         time = f"{(START_NS + (i + 1) * STEP_NS - 250_000_000) / 1e9:.9f}"
         lines.append(" ".join([time, *map(repr, map(float, (*T_marker[:3, 3], x, y, z, w)))]))
     (tmp_path / "gt.tum").write_text("\n".join(lines))
-    told = " ".join(
+    stated = " ".join(
         repr(float(v)) for v in (*T_marker_color[:3, 3], *so3.to_quat_wxyz(T_marker_color[:3, :3]))
     )
     (tmp_path / "a.toml").write_text(
-        f'[robots.a]\nlogs = ["bag"]\ntruth_file = "gt.tum"\nT_truth_color = "{told}"\ntruth_offset_s = 0.25\n'
+        f'[robots.a]\nlogs = ["bag"]\ntruth_file = "gt.tum"\nT_truth_color = "{stated}"\ntruth_offset_s = 0.25\n'
     )
     registry.convert("ros", tmp_path / "a.toml", tmp_path / "rec")
     records = read_log(tmp_path / "rec" / "a.groundtruth.mcap")
@@ -468,7 +468,7 @@ def test_true_poses_of_a_file(tmp_path: Path) -> None:
 
 
 def test_robots_whose_frames_have_the_same_names(tmp_path: Path) -> None:
-    """Two robots on one /tf_static tie the same frames differently: neither is believed, their own topics are."""
+    """Two robots on one /tf_static tie the same frames differently: neither is trusted, their own topics are."""
     r = Ros(1)
     rows = scene(r)
     static = next(m for t, _, m in rows if t == "/tf_static")

@@ -1,4 +1,4 @@
-"""Logs of ROS without depth images: depth of a stereo pair, however its calibration is told, and of a LiDAR."""
+"""Logs of ROS without depth images: depth of a stereo pair, however its calibration is stated, and of a LiDAR."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def calibrated(info: Any, R: np.ndarray, P: np.ndarray) -> Any:
     return info
 
 
-def stereo_log(folder: Path, told: str) -> Path:
-    """A bag of a pair. told: how ("p", "rect", "tf", "option" or "wrong") the right camera's place is."""
+def stereo_log(folder: Path, stated: str) -> Path:
+    """A bag of a pair. stated: how ("p", "rect", "tf", "option" or "wrong") the right camera's place is."""
     r = Ros(2)
     D = [(*D_LEFT, 0.0), (*D_RIGHT, 0.0)]
     size = (LEFT.width, LEFT.height)
@@ -57,36 +57,36 @@ def stereo_log(folder: Path, told: str) -> Path:
         T_RIGHT_LEFT[:3, 3:], flags=cv2.CALIB_ZERO_DISPARITY, alpha=0,
     )  # fmt: skip
     rig = raw_rig()
-    name = "image_rect" if told == "rect" else "image_raw"
+    name = "image_rect" if stated == "rect" else "image_raw"
     infos = [r.info(START_NS, frame, c, d) for frame, c, d in (("l", LEFT, D[0]), ("r", RIGHT, D[1]))]
-    if told in ("p", "rect", "wrong"):
+    if stated in ("p", "rect", "wrong"):
         infos = [calibrated(infos[k], turns[k], turns[2 + k]) for k in (0, 1)]
-    if told == "wrong":
+    if stated == "wrong":
         infos[1].r = turns[1].T.ravel()
     rows = [
         (f"/eyes/{side}/camera_info", START_NS, info)
         for side, info in zip(("left", "right"), infos, strict=True)
     ]
-    if told == "tf":
+    if stated == "tf":
         rows.append(("/tf_static", START_NS, r.tf(r.transform(START_NS, "l", "r", T_LEFT_RIGHT))))
     for k, T in enumerate(poses()):
         at = START_NS + k * STEP_NS
         images = [render(LEFT, T, D_LEFT)[0], render(RIGHT, right_of(T, T_RIGHT_LEFT), D_RIGHT)[0]]
-        if told == "rect":
+        if stated == "rect":
             images = [rig.rectify_left(images[0]), rig.rectify_right(images[1])]
         for side, frame, image in zip(("left", "right"), "lr", images, strict=True):
             late = 0 if side == "left" else 1_000_000
             message = r.image(at + late, frame, image, "rgb8")
             rows.append((f"/eyes/{side}/{name}", at + 5_000_000 + late, message))
         rows.append(("/odom", at + 6_000_000, odometry(r, at, "l", T)))
-    return r.write(folder / told, rows, "sqlite3")
+    return r.write(folder / stated, rows, "sqlite3")
 
 
-@pytest.mark.parametrize("told", ["p", "rect", "tf", "option"])
-def test_a_stereo_pair(tmp_path: Path, told: str) -> None:
+@pytest.mark.parametrize("stated", ["p", "rect", "tf", "option"])
+def test_a_stereo_pair(tmp_path: Path, stated: str) -> None:
     options = ["depth_from=stereo", "truth=/odom", "min_depth_m=1.5", "max_relative_sigma=0.1"]
-    options += [f"T_color_depth={TEXT}"] if told == "option" else []
-    registry.convert("ros", stereo_log(tmp_path, told), tmp_path / "rec", options=options)
+    options += [f"T_color_depth={TEXT}"] if stated == "option" else []
+    registry.convert("ros", stereo_log(tmp_path, stated), tmp_path / "rec", options=options)
     recording, rig = Recording(tmp_path / "rec"), raw_rig()
     assert recording.description["checks"]["alpha"]["row_difference_px"] < 0.3
     assert recording.description["checks"]["alpha"]["reprojection_median_m"] is not None
@@ -124,8 +124,8 @@ def test_a_lidar_and_what_turns_it(tmp_path: Path) -> None:
         options = ["depth_from=lidar", "truth=/odom", *([motion] if motion else [])]
         registry.convert("ros", log, out, options=options)
         recording = Recording(out)
-        told = any("hold what the LiDAR moved" in text for text in recording.description["warnings"])
-        assert told == (motion == "")
+        stated = any("hold what the LiDAR moved" in text for text in recording.description["warnings"])
+        assert stated == (motion == "")
         assert recording.description["checks"]["alpha"]["reprojection_median_m"] < 0.1
         with open_rgbd(recording.log("alpha")) as found:
             assert len(found) == FRAMES

@@ -88,9 +88,9 @@ def test_who_asks_for_too_many_is_told_how_many_fit(box, monkeypatch):
     kind = {"frames": 60, "overlap": 0.5, "camera": CAMERA, "seed": 0}
     with pytest.raises(
         DuagError, match=r"no room for crossing paths of 8 robots.* expected at most \d$"
-    ) as told:
+    ) as stated:
         paradigms.plan(box, "crossing", robots=8, **kind)
-    fit = int(str(told.value)[-1])
+    fit = int(str(stated.value)[-1])
     assert len(paradigms.plan(box, "crossing", robots=fit, **kind)) == fit
 
 

@@ -275,7 +275,7 @@ def _keyframe(robot: str, index: int, k: int, odometry: np.ndarray, true: np.nda
 
 
 def _factor(robot: str, index: int, k: int, true: np.ndarray) -> KeyframeFactor:
-    """The registration that `_keyframe` tells of."""
+    """The registration behind `_keyframe`."""
     T = se3.inverse(true[KEYFRAMES[index - 1]]) @ true[k]
     return KeyframeFactor(k * INTERVAL_NS, robot, index - 1, index, T, 1e6 * np.eye(6), 1.0)
 

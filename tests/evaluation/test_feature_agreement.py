@@ -38,7 +38,7 @@ def test_exact_poses_agree_and_wrong_ones_do_not(views) -> None:
 
 
 def test_pairs_do_not_depend_on_the_poses(views) -> None:
-    """A trajectory that looks away does not change what the others are told."""
+    """A trajectory that looks away does not change the numbers of the others."""
     away = TRUTH @ se3.exp(np.array([[0, 0, 0, 0, 2.5 * k, 0] for k in range(len(TRUTH))]))
     alone, together = (
         feature_agreement(*views, CAMERA, paths) for paths in ({"true": TRUTH}, {"true": TRUTH, "away": away})

@@ -133,7 +133,7 @@ def quiet(team: list[RobotData]) -> dict[str, SessionResult]:
 
 
 def test_twenty_thousand_damaged_packets_change_nothing(team: list[RobotData], quiet: Any) -> None:
-    """Whatever the CRC or the sequence number tells."""
+    """Whatever the CRC or the sequence number shows."""
     results, agents, count = meet(team, ExchangeConfig(), [flipped, cut, spliced, repeated, invented], 360)
     assert count > 20_000
     assert not moved(results, quiet)
@@ -171,7 +171,7 @@ def test_signatures_change_bytes_and_nothing_else(
 
 @pytest.mark.parametrize("seed", range(3))
 def test_forgeries_that_nothing_betrays_crash_and_hang_nobody(team: list[RobotData], seed: int) -> None:
-    """Without signatures well-formed lies are believed; results may be wrong, but they are there and finite."""
+    """Without signatures well-formed lies are trusted; results may be wrong, but they are there and finite."""
     results, agents, count = meet(team, ExchangeConfig(), [forged], 4, seed=seed)
     assert count > 100
     for name, result in results.items():

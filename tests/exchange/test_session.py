@@ -492,8 +492,8 @@ def test_every_registration_counts_in_the_consensus(team: Any, tmp_path: Path) -
     consensus = PoseConsensusConfig(odometry_floor_m=1e-5, odometry_floor_rad=1e-5)
     away_m = []
     for more in ([], [sure]):
-        told = dataclasses.replace(alpha, registrations=[*alpha.registrations, *more])
-        result = meet({**team, "alpha": (told, truth)}, 2, tmp_path, consensus=consensus)["alpha"]
+        stated = dataclasses.replace(alpha, registrations=[*alpha.registrations, *more])
+        result = meet({**team, "alpha": (stated, truth)}, 2, tmp_path, consensus=consensus)["alpha"]
         assert result.component == ("alpha", "bravo")
         T = result.T_world_keyframe
         away_m.append(float(se3.distance(T_first_last, se3.inverse(T[0]) @ T[last])[0]))

@@ -161,14 +161,14 @@ def _open_files() -> list[str]:
 
 def _batch(reader: Reader, root: Path, numbers: range) -> Iterator[Outcome]:
     """Cases in one process, up to the first that fails."""
-    told, tell = os.pipe()
+    stated, tell = os.pipe()
     child = os.fork()
     if child == 0:
-        os.close(told)
+        os.close(stated)
         _work(reader, root, numbers, tell)
     os.close(tell)
     what, number, outcome = "", numbers.start, None
-    with open(told, "rb", buffering=0) as pipe:
+    with open(stated, "rb", buffering=0) as pipe:
         for line in _lines(pipe, child):
             key, _, text = json.loads(line).partition(" ")
             if key == "damage":
@@ -185,7 +185,7 @@ def _batch(reader: Reader, root: Path, numbers: range) -> Iterator[Outcome]:
 
 
 def _lines(pipe: BinaryIO, child: int) -> Iterator[bytes]:
-    """What a child tells, until it ends, or waits for `IDLE_S` for something that does not come."""
+    """What a child writes, until it ends, or waits for `IDLE_S` for something that does not come."""
     rest, idle_s, before = b"", 0, -1
     while idle_s < IDLE_S:
         if not select.select([pipe], [], [], 1.0)[0]:

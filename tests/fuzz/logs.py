@@ -69,13 +69,15 @@ def mcap_rewritten(path: Path, rng: np.random.Generator) -> bool:
                     text = damaged(text, rng)
                 schemas[schema.id] = writer.register_schema(name, schema.encoding, text)
             if channel.id not in channels:
-                topic, told = channel.topic, dict(channel.metadata)
+                topic, stated = channel.topic, dict(channel.metadata)
                 if kind == 2 and rng.random() < 0.3:
                     topic = damaged(topic.encode(), rng).decode(errors="replace")
                 if kind == 3 and rng.random() < 0.5:
-                    told = {key: damaged(v.encode(), rng).decode(errors="replace") for key, v in told.items()}
+                    stated = {
+                        key: damaged(v.encode(), rng).decode(errors="replace") for key, v in stated.items()
+                    }
                 new = schemas.get(channel.schema_id, 0)
-                channels[channel.id] = writer.register_channel(topic, channel.message_encoding, new, told)
+                channels[channel.id] = writer.register_channel(topic, channel.message_encoding, new, stated)
             if hit and kind in (0, 5):
                 data = content(data, rng)
             if hit and kind == 4:

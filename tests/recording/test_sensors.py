@@ -42,7 +42,9 @@ def test_pixels_that_are_hit_have_exactly_the_depth_of_the_point() -> None:
     at = pixels[inside][hit]
     assert (sigma[at[:, 1], at[:, 0]] == 0).all()
     close = np.isclose(depth[at[:, 1], at[:, 0]], truth[at[:, 1], at[:, 0]], rtol=0.02)
-    assert close.mean() > 0.98  # a point may lie half a pixel beside the center, beyond the edge of the box
+    assert (
+        close.mean() > 0.98
+    )  # a point may lie half a pixel alongside the center, beyond the edge of the box
     filled = depth > 0
     assert filled.mean() > 0.55
     assert np.median(np.abs(depth - truth)[filled]) < 1e-4  # between the points walls are exact
@@ -105,15 +107,15 @@ def test_a_lidar_is_written_and_read(tmp_path: Path) -> None:
     color, _ = render(CAMERA, T)
     points = sweep(T @ T_CAMERA_LIDAR, sigma_m=SIGMA_M)
     frames = {}
-    for told in (SIGMA_M, None):
+    for stated in (SIGMA_M, None):
 
-        def fill(robot: RobotWriter, told: float | None = told) -> None:
-            robot.set_lidar(T_CAMERA_LIDAR, told)
+        def fill(robot: RobotWriter, stated: float | None = stated) -> None:
+            robot.set_lidar(T_CAMERA_LIDAR, stated)
             robot.add_points(3, points)
             robot.add_frame(5, picture(color), "png", None)
 
-        with open_rgbd(record(tmp_path / f"rec{told}", fill)) as log:
-            frames[told] = log.frame(0)
+        with open_rgbd(record(tmp_path / f"rec{stated}", fill)) as log:
+            frames[stated] = log.frame(0)
     depth, sigma = lidar_depth(points.astype(np.float32).astype(float), T_CAMERA_LIDAR, CAMERA, SIGMA_M)
     assert frames[SIGMA_M].depth_offset_ns == -2
     np.testing.assert_allclose(frames[SIGMA_M].depth, depth, atol=1e-5)

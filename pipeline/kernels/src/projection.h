@@ -212,7 +212,7 @@ inline void depth_slopes(const Splat16& s, Vec* g) {
 // and as k and C hold the same Sigma, cotangents come in pairs, with y = P^T q = 2 ln2 N^T e and r = a - P^T m:
 //   of Sigma in own axes   (y r^T + r y^T) / 2
 //   of J                   q (axes S^2 r)^T - m (axes S^2 y)^T, with <d_J, J> = 2 b q . m - g . e, b the blur
-//   of a turn of the camera, in which e_z turns: e_z x axes S^2 y, beside that of J
+//   of a turn of the camera, in which e_z turns: e_z x axes S^2 y, alongside that of J
 // q = 2 ln2 M^T e, m = M^T g.
 struct RayDepth {
     Vec g[2], r[3];

@@ -287,7 +287,7 @@ inline void sum_depth_moments(Cross cross_of, const BatchShape& shape, const Blo
     set_parts(sums + INFO_ZX, half, {X, Y, XX, XY, YY});
 }
 
-// The same for ray_plane, whose own derivative of depth goes as 1, x and y, and what the square of that needs beside INFO_ZZ.
+// The same for ray_plane, whose own derivative of depth goes as 1, x and y, and what the square of that needs alongside INFO_ZZ.
 // cross_of(p), square_of(p): of the part that goes as 1.
 template <class Cross, class Square>
 inline void sum_ray_depth_moments(Cross cross_of, Square square_of, const BatchShape& shape, const Block& block, int half, Vec* sums) {
