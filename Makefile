@@ -5,7 +5,7 @@ TORCH_OPTIONS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
-SOURCES := pyproject.toml CMakeLists.txt $(wildcard pipeline/kernels/src/*)
+SOURCES := pyproject.toml CMakeLists.txt $(wildcard pipeline/kernels/src/*) $(wildcard pipeline/base/stand_ins/*.[ht]*)
 SANITIZED := build/sanitize/.built
 DEMO := outputs/demo
 DOCS_VENV := build/docs-venv
@@ -84,4 +84,4 @@ format: setup
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf build pipeline/kernels/*.so $(STAMP)
+	rm -rf build pipeline/kernels/*.so pipeline/base/stand_ins/*.so $(STAMP)

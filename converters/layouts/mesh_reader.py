@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.open3d_import import import_open3d
 
 Array = NDArray[np.float64]
 
@@ -91,8 +92,7 @@ def _end_with_parent() -> None:
 
 def _read(files: list[tuple[Path, int]], up: str, cache: Path) -> Iterator[Path]:
     """Read meshes and write them into `cache` as one scene; yields each file when it is read."""
-    import open3d  # noqa: F401  before the limits
-
+    import_open3d()  # before the limits
     folder = files[0][0].parent
     parts: list[_Part] = []
     textures = 0
@@ -165,15 +165,14 @@ class _Part:
 
 def _parts(path: Path) -> Iterator[tuple[_Part, NDArray[np.uint8] | None]]:
     """The parts of a file, each with its texture, uint8 [h, w, 3], if it has one."""
-    import open3d as o3d
-
+    o3d = import_open3d()
     materials: list[Any] = []
     complaints = _Complaints()
     try:
         if path.suffix.lower() == ".ply":  # the reader of models knows no PLY, the other one few textures
             meshes = [(o3d.io.read_triangle_mesh(path), -1, "the mesh")]
         else:
-            model = o3d.io.read_triangle_model(path)  # type: ignore[arg-type]
+            model = o3d.io.read_triangle_model(path)
             meshes = [(part.mesh, part.material_idx, f"part {part.mesh_name!r}") for part in model.meshes]
             materials = model.materials
     except RuntimeError as error:

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.open3d_import import import_open3d
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.base.workers import peak_memory_bytes, worker_pool
 from duagc.pipeline.bench.stopwatch import Calls, Stopwatch, counted, replaced, shares, summary
@@ -91,9 +92,13 @@ def run(plan: Plan) -> dict[str, Any]:
     """Measure; the result as {"machine", "recording", "rows", "reasons"}, ready for JSON.
 
     Raises:
-        DuagError: the recording is broken, or has no such robot.
+        DuagError: the recording is broken, or has no such robot; Open3D cannot be imported.
     """
     from duagc.pipeline.bench.raster import cpu_name
+
+    if plan.open3d:
+        with worker_pool(1) as pool:  # not in this process, whose memory would grow
+            pool.submit(_check_open3d).result()
 
     source = Recording(plan.recording)
     robots = list(plan.robots) or source.robots
@@ -253,6 +258,11 @@ def _within(watch: Stopwatch, function: Callable[..., Any]) -> Callable[..., Any
     return call
 
 
+def _check_open3d() -> None:
+    """Raise what keeps Open3D from running, before minutes are spent."""
+    import_open3d()
+
+
 def measure_open3d(log: Path, method: str) -> dict[str, Any]:
     """Open3D's RGB-D odometry (tensors, CPU, its defaults) from each frame to the next, in a fresh process.
 
@@ -263,8 +273,7 @@ def measure_open3d(log: Path, method: str) -> dict[str, Any]:
     Returns:
         Times, peak memory, stamps_ns and poses T_first_camera [n, 4, 4]; `failed` frames keep the pose before.
     """
-    import open3d as o3d
-
+    o3d = import_open3d()
     odometry = o3d.t.pipelines.odometry
     how, tensor = getattr(odometry.Method, method), o3d.core.Tensor.from_numpy
     calls = Calls()

@@ -20,6 +20,7 @@ from duagc.converters.layouts import mesh_reader
 from duagc.converters.logs import describe
 from duagc.converters.simulate.render import mesh_process, meshes
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.open3d_import import import_open3d
 from duagc.pipeline.checks import check
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.geometry.trajectory import read_tum
@@ -150,8 +151,7 @@ def _open_numbers() -> list[int]:
 
 def read_scene(src: Path, out: Path) -> None:
     """A folder of meshes."""
-    import open3d  # noqa: F401  in this process: the one that reads is a copy of it
-
+    import_open3d()  # in this process: the one that reads is a copy of it
     mesh_process.subprocess.Popen, mesh_process.IDLE_S = Forked, 1
     files = meshes.mesh_files(src / "scene")
     (out / "cache").mkdir()

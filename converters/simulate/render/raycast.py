@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from duagc.converters.simulate.render.meshes import LEVELS, MeshScene
 from duagc.converters.simulate.render.renderer import RenderedView
+from duagc.pipeline.base.open3d_import import import_open3d
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 Array = NDArray[np.float64]
@@ -26,8 +27,7 @@ class Caster:
     """Rays through a scene and distances to it, on one thread: the same numbers whatever the machine does besides."""
 
     def __init__(self, scene: MeshScene) -> None:
-        import open3d as o3d
-
+        o3d = import_open3d()
         self.scene = scene
         self._tensor = o3d.core.Tensor.from_numpy
         self._embree = o3d.t.geometry.RaycastingScene(nthreads=1)
