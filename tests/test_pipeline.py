@@ -1,7 +1,14 @@
 """The whole job on a tiny team: determinism, firewall, replay, and the effect of what crosses the network."""
 
 import json
+import os
+import re
 import shutil
+import subprocess
+import sys
+import tomllib
+from functools import cache
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import pytest
@@ -28,6 +35,7 @@ SMALL = (
     "exchange.max_rounds=400",
     "fusion.refine.steps_per_view=2",
 )
+ROOT = Path(__file__).parents[1]
 
 
 def quiet(line: str) -> None:
@@ -51,9 +59,34 @@ def recording(folder: Path) -> Path:
     return out
 
 
+@cache
+def unimportable() -> set[str]:
+    """Open3D, and the modules of all optional packages that are installed."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    packages = {re.split(r"[\[<>=~]", line)[0] for lines in extras.values() for line in lines} - {"duagc"}
+    installed = packages_distributions().items()
+    modules = {module for module, names in installed if packages & {name.lower() for name in names}}
+    return {"open3d", *filter(str.isidentifier, modules)}
+
+
 @pytest.fixture(scope="module")
-def finished(folder: Path, recording: Path) -> Path:
-    return make_run(recording, folder / "run")
+def bare(folder: Path) -> dict[str, str]:
+    """An environment, for a process and all that it starts, with modules in front that cannot be imported."""
+    (folder / "unimportable").mkdir()
+    for module in unimportable():
+        code = f"raise ModuleNotFoundError('no module named {module}')\n"
+        (folder / "unimportable" / f"{module}.py").write_text(code)
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(folder / "unimportable"), str(ROOT)])}
+
+
+@pytest.fixture(scope="module")
+def finished(folder: Path, recording: Path, bare: dict[str, str]) -> Path:
+    out = folder / "run"
+    command = [sys.executable, "-c", "from duagc.pipeline.cli import main; main()", "run", str(recording)]
+    settings = [word for line in SMALL for word in ("--set", line)]
+    done = subprocess.run([*command, "--out", str(out), *settings], env=bare, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return out
 
 
 def robots_digests(run_folder: Path) -> dict[str, str]:
@@ -80,6 +113,16 @@ def test_the_team_meets_and_everything_is_written(finished: Path) -> None:
         "metrics.parquet",
     ):
         assert (finished / name).stat().st_size > 0
+
+
+def test_the_job_needs_no_open3d_and_no_optional_package(bare: dict[str, str], finished: Path) -> None:
+    """Nor did any process of the job that `finished` is, and that other tests repeat with everything installed."""
+    for module in unimportable():
+        done = subprocess.run(
+            [sys.executable, "-c", f"import {module}"], env=bare, capture_output=True, text=True
+        )
+        assert f"no module named {module}" in done.stderr
+    assert (finished / "manifest.json").exists()
 
 
 def test_neither_workers_nor_ground_truth_change_a_bit(folder: Path, recording: Path, finished: Path) -> None:
