@@ -2,6 +2,8 @@
 PYTHON ?= python3
 # Options for installing torch, for example an index that has the smaller CPU-only build; any build will do.
 TORCH_OPTIONS ?=
+# Options for pytest in `make test`, for example "--cpu 25": the 25 tests that take most processor time.
+TEST_OPTIONS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
@@ -10,12 +12,13 @@ SANITIZED := build/sanitize/.built
 DEMO := outputs/demo
 DOCS_VENV := build/docs-venv
 
-.PHONY: help setup demo test docs bench lint format sanitize check-full fuzz clean
+.PHONY: help setup demo test golden docs bench lint format sanitize check-full fuzz clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo        set up, then simulate two robots, fuse their maps, evaluate, report ($(DEMO))"
-	@echo "make test        set up, then run the tests"
+	@echo "make test        set up, then run the tests, and print their processor time by folder"
+	@echo "make golden      make the stored runs again and name every difference (minutes)"
 	@echo "make lint        ruff and mypy"
 	@echo "make docs        the site of the documentation, every link checked (build/site)"
 	@echo "make bench       speed of the kernels, side by side with plain torch"
@@ -39,7 +42,11 @@ demo: setup
 	$(BIN)/duagc demo --out $(DEMO) --force
 
 test: setup
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow" $(TEST_OPTIONS)
+
+# Four runs made again and compared, message by message, with what is stored under tests/golden.
+golden: setup
+	$(BIN)/python -m tests.golden.command check
 
 # Nothing is imported, so the tools of the site need neither .venv nor the kernels.
 docs: $(DOCS_VENV)/.set-up

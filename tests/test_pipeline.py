@@ -32,6 +32,8 @@ from duagc.pipeline.viewing.inspection import Inspector, format_facts, format_lo
 
 SMALL = (
     "frontend.mapping.max_gaussians=3000",
+    "frontend.mapping.iterations=8",
+    "frontend.mapping.final_iterations=8",
     "exchange.max_rounds=400",
     "fusion.refine.steps_per_view=2",
 )
@@ -55,7 +57,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def recording(folder: Path) -> Path:
     out = folder / "recording"
-    simulate(out, robots=2, frames=24, size=(240, 180), seed=1, overlap=0.9, workers=2)
+    simulate(out, robots=2, frames=20, size=(160, 120), seed=1, overlap=0.9, workers=1)
     return out
 
 

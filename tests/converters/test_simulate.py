@@ -25,6 +25,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import Recording, content_digest, open_rgbd, read_log
 from duagc.schemas import topics
+from tests.fixtures.sampling import sampled
 
 SIZE = (160, 120)
 
@@ -135,7 +136,7 @@ def test_paths_are_smooth_clear_and_long(room, ways):
         assert room.clearance(positions).min() > 0.5
 
 
-@pytest.mark.parametrize("overlap", [0.5, 0.7])
+@pytest.mark.parametrize("overlap", sampled([0.5, 0.7]))
 def test_neighbors_share_as_much_of_the_view_as_asked(room, camera, overlap):
     small = Renderer(room, None, camera.scaled(*loops.OVERLAP_IMAGE))
     one, other = loops.plan(room, 2, 150, overlap, camera=camera)

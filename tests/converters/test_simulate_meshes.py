@@ -138,7 +138,8 @@ def test_free_space_is_the_floor_without_the_table(stage):
     assert alongside.min() > 0.2
 
 
-@pytest.mark.parametrize("kind", sampled(["glb", "ply"]))
+@pytest.mark.slow  # in `make test` with all sensors together, of one kind of files: test_simulate_sensors.py
+@pytest.mark.parametrize("kind", ["glb", "ply"])
 def test_the_same_bytes_for_any_number_of_workers(tmp_path, kind):
     folder = folder_of(tmp_path / "flat", kind)
     settings = {"scene": str(folder), "frames": 3, "size": (64, 48), "noise": "kinect", "seed": 2}

@@ -47,7 +47,7 @@ ways_of = cache(planned)  # several tests look at the same ways
 @pytest.mark.parametrize(
     ("paradigm", "robots", "overlap"),
     [
-        ("concentric", 3, 0.6),
+        ("concentric", 2, 0.6),
         ("leader-follower", 4, 0.8),
         ("crossing", 2, 0.3),
         ("parallel", 3, 0.6),

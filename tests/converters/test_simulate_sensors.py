@@ -163,7 +163,12 @@ def test_all_together_do_not_depend_on_the_number_of_workers(folder, tmp_path):
         simulate(tmp_path / name / "rec", workers=workers, **kind)
     for path in sorted((tmp_path / "one" / "rec").iterdir()):
         assert path.read_bytes() == (tmp_path / "two" / "rec" / path.name).read_bytes(), path.name
-    description = json.loads((tmp_path / "one" / "rec" / "recording.json").read_text())
+    text = (tmp_path / "one" / "rec" / "recording.json").read_text()
+    description = json.loads(text)
+    assert str(tmp_path) not in text
+    assert description["parameters"]["scene"] == description["source"]["scene"] == "flat"
+    assert description["parameters"]["up"] == "y"
+    assert sorted(description["source"]["files_sha256"]) == ["table.obj", "walls.obj"]
     offsets = description["checks"]["clock_offset_ns"]
     assert len(set(offsets.values())) == 2
     for robot, offset in offsets.items():

@@ -9,6 +9,7 @@ import pytest
 
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import FisherSums, LossWeights, Rasterizer, available_isas
+from tests.fixtures.sampling import sampled
 from tests.kernels.scenes import make_scene, random_gaussians
 
 CAMERA = PinholeCamera(203, 117, 90.0, 92.0, 101.2, 57.1)
@@ -17,6 +18,7 @@ SURFACE = LossWeights(**{**vars(LOSS), "surface_weight": 0.3})
 CALLS = [(isa, threads) for isa in available_isas() for threads in (1, 2, 3, 5)]
 QUICK = [call for call in CALLS if call[0] != "portable" or call[1] in (1, 3)]  # it imitates fma, at length
 FAST = [call for call in QUICK if call[0] != "portable"] or QUICK[:1]
+PORTABLE = [call for call in QUICK if call not in FAST]
 
 
 def digest(rasterizer: Rasterizer) -> str:
@@ -58,7 +60,7 @@ def one_digest() -> str:
     return digest(Rasterizer(*CALLS[0]))
 
 
-@pytest.mark.parametrize(("isa", "threads"), QUICK)
+@pytest.mark.parametrize(("isa", "threads"), sampled(FAST + PORTABLE, quick=len(FAST) + 1))
 def test_one_digest_for_threads_and_instruction_sets(isa, threads):
     assert digest(Rasterizer(isa, threads)) == one_digest()
 
