@@ -1,4 +1,4 @@
-"""Processor time of every test, per folder, alongside the budget of the folder.
+"""Processor time of every test, per folder, with the budget of the folder.
 
 `make test` shall take at most eight minutes of processor time, so each folder has a share. A folder over its share is
 named in the summary; the session does not fail, because processor time depends on the machine and on its load.

@@ -33,7 +33,7 @@ def start(recording: Path, robot: str) -> int:
 
 
 def test_one_recorder_tells_how_headers_differ(tmp_path: Path) -> None:
-    """Stated always, applied only if asked."""
+    """Reported always, applied only if asked."""
     r = Ros(2)
     jackal, husky = both(r)
     bag = r.write(tmp_path / "bag", sorted(jackal + husky, key=lambda x: x[1]), "mcap")

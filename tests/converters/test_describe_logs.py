@@ -75,7 +75,7 @@ def test_the_toml_file_converts_as_the_log_itself(tmp_path: Path) -> None:
 
 
 def test_namespaces_that_decide_become_robots(tmp_path: Path) -> None:
-    """Two robots in one log: stated apart, their clocks compared, and both converted by the TOML file."""
+    """Two robots in one log: separated, their clocks compared, and both converted by the TOML file."""
     r = Ros(2)
     jackal, husky = both(r)
     log = r.write(tmp_path / "bag", sorted(jackal + husky, key=lambda x: x[1]), "mcap")

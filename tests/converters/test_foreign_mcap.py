@@ -356,7 +356,7 @@ def test_broken_json_of_ros_is_one_line(change: Callable[[dict[str, Any]], Any],
 
 
 def test_webp_comes_out_as_png(tmp_path: Path) -> None:
-    """Color as WebP without loss gives the pixels; one that is cut short is left out and stated."""
+    """Color as WebP without loss gives the pixels; one that is cut short is left out and reported."""
     r, rows, pixels = Ros(2), [], []
     for topic, ns, m in scene(r):
         if topic.endswith("color/image_raw"):

@@ -373,7 +373,7 @@ def test_a_real_bag_converts_when_told_that_times_differ(tmp_path: Path) -> None
 
 
 def test_frames_whose_color_is_cut_short_are_left_out(tmp_path: Path) -> None:
-    """Stated, not fatal: a camera that was unplugged for a moment must not cost the rest of the log."""
+    """Reported, not fatal: a camera that was unplugged for a moment must not cost the rest of the log."""
     r = Ros(1)
     rows = []
     for topic, log_ns, message in scene(r):
@@ -440,7 +440,7 @@ def test_chunks_that_unpack_into_too_much_are_refused(
 
 
 def test_true_poses_of_a_file(tmp_path: Path) -> None:
-    """In TUM's format and by a clock of their own; of a body whose place the log or an option shows."""
+    """In TUM's format and by a clock of their own; of a body whose place the log or an option states."""
     r = Ros(2)
     r.write(tmp_path / "bag", scene(r), "mcap")
     T_marker_color = se3.from_rotation_translation(so3.exp([0.1, -0.4, 0.3]), [0.02, -0.03, 0.1])
@@ -468,7 +468,7 @@ def test_true_poses_of_a_file(tmp_path: Path) -> None:
 
 
 def test_robots_whose_frames_have_the_same_names(tmp_path: Path) -> None:
-    """Two robots on one /tf_static tie the same frames differently: neither is trusted, their own topics are."""
+    """Two robots on one /tf_static tie the same frames differently: neither is used, their own topics are."""
     r = Ros(1)
     rows = scene(r)
     static = next(m for t, _, m in rows if t == "/tf_static")

@@ -117,8 +117,8 @@ def test_walks_are_smooth_clear_and_overlap(stage):
         position = way[:, :3, 3]
         assert (position > walks.MIN_CLEARANCE_M - 0.06).all()
         assert (position < ROOM - walks.MIN_CLEARANCE_M + 0.06).all()
-        alongside = np.maximum(TABLE[0] - position, position - TABLE[1])[:, :2].max(axis=1)
-        assert alongside.min() > walks.MIN_CLEARANCE_M - 0.06  # the body does not stand in the table
+        aside = np.maximum(TABLE[0] - position, position - TABLE[1])[:, :2].max(axis=1)
+        assert aside.min() > walks.MIN_CLEARANCE_M - 0.06  # the body does not stand in the table
         assert np.abs(way[:, 2, 0]).max() < 1e-9  # upright
     eye = MeshRenderer(stage.caster, camera.scaled(48, 36))
     assert abs(shared_view(eye, *ways) - 0.6) < 0.2
@@ -134,8 +134,8 @@ def test_free_space_is_the_floor_without_the_table(stage):
     low, high = space.cells.min(axis=0), space.cells.max(axis=0)
     assert np.abs(low - kept).max() < 0.1 + 1e-6
     assert np.abs(high - (ROOM[:2] - kept)).max() < 0.1 + 1e-6
-    alongside = np.maximum(TABLE[0, :2] - space.cells, space.cells - TABLE[1, :2]).max(axis=1)
-    assert alongside.min() > 0.2
+    aside = np.maximum(TABLE[0, :2] - space.cells, space.cells - TABLE[1, :2]).max(axis=1)
+    assert aside.min() > 0.2
 
 
 @pytest.mark.slow  # in `make test` with all sensors together, of one kind of files: test_simulate_sensors.py

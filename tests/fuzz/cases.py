@@ -185,7 +185,7 @@ def _batch(reader: Reader, root: Path, numbers: range) -> Iterator[Outcome]:
 
 
 def _lines(pipe: BinaryIO, child: int) -> Iterator[bytes]:
-    """What a child writes, until it ends, or waits for `IDLE_S` for something that does not come."""
+    """What a child states, until it ends, or waits for `IDLE_S` for something that does not come."""
     rest, idle_s, before = b"", 0, -1
     while idle_s < IDLE_S:
         if not select.select([pipe], [], [], 1.0)[0]:

@@ -33,7 +33,7 @@ def test_depth_of_another_camera_is_exact_on_a_wall() -> None:
     truth = plane_depth(WIDE, np.eye(4))
     inner = seen[6:-6, 6:-6]
     assert (inner > 0).all()  # no gaps
-    # a sample falls up to half a pixel from the center, where the wall is up to 0.2 / 56 / 2 of its depth away
+    # a sample falls up to half a pixel off the center, where the wall is up to 0.2 / 56 / 2 of its depth away
     np.testing.assert_allclose(inner, truth[6:-6, 6:-6], rtol=3e-3)
     assert abs(float(np.mean(inner - truth[6:-6, 6:-6]))) < 5e-4
 

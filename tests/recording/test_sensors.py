@@ -42,9 +42,7 @@ def test_pixels_that_are_hit_have_exactly_the_depth_of_the_point() -> None:
     at = pixels[inside][hit]
     assert (sigma[at[:, 1], at[:, 0]] == 0).all()
     close = np.isclose(depth[at[:, 1], at[:, 0]], truth[at[:, 1], at[:, 0]], rtol=0.02)
-    assert (
-        close.mean() > 0.98
-    )  # a point may lie half a pixel alongside the center, beyond the edge of the box
+    assert close.mean() > 0.98  # a point may lie half a pixel off the center, beyond the edge of the box
     filled = depth > 0
     assert filled.mean() > 0.55
     assert np.median(np.abs(depth - truth)[filled]) < 1e-4  # between the points walls are exact
