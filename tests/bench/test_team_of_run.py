@@ -7,7 +7,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.experiments.consensus_modes import Plan, run_on
 from duagc.pipeline.experiments.team_of_run import team_of_run
 from duagc.pipeline.runs.folder import RunFolder
-from tests.evaluation.fake_run import make
+from tests.fixtures.fake_run import make
 
 
 def test_the_matches_of_a_run_are_agreed_on_in_every_mode(tmp_path) -> None:

@@ -9,8 +9,8 @@ import pytest
 
 from duagc.converters import registry
 from duagc.pipeline.checks import check
-from tests.converters.test_ros import Ros, scene
 from tests.fixtures.image_folders import CASES
+from tests.fixtures.ros_bags import Ros, scene
 from tests.fixtures.seven_scenes import make_sequence
 from tests.fuzz.seeds import kimera, s3e
 

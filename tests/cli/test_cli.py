@@ -14,24 +14,9 @@ from duagc.pipeline import cli
 from duagc.pipeline.base.atomic_folder import new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
-from tests.evaluation import fake_run
+from tests.fixtures import fake_run
+from tests.fixtures.commands import ROOT, assert_one_line, duagc
 from tests.fixtures.recording_logs import write_camera
-
-ROOT = Path(__file__).parents[2]
-
-
-def duagc(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", "from duagc.pipeline.cli import main; main()", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120, check=False)
-
-
-def assert_one_line(result: subprocess.CompletedProcess[str], *words: str) -> None:
-    assert result.returncode == 1, result.stderr
-    lines = [line for line in result.stderr.splitlines() if line.strip()]
-    assert len(lines) == 1, result.stderr
-    assert lines[0].startswith("duagc: ")
-    for word in words:
-        assert word in lines[0]
 
 
 def test_help_is_there_for_every_command() -> None:

@@ -6,7 +6,7 @@ import pytest
 from duagc.pipeline.consensus.elimination import Front, damped, shared_variables
 from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
-from tests.posegraph.worlds import random_information, random_poses
+from tests.fixtures.pose_worlds import random_information, random_poses
 
 
 def scattered(seed, n=12, m=30):

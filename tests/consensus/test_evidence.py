@@ -1,10 +1,7 @@
 """Evidence: packing, turning with keyframes, zero where nothing was said."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from duagc.pipeline.consensus.evidence import SHAPE_FLOOR, Evidence
 from duagc.pipeline.geometry import se3, so3, spd
@@ -18,38 +15,8 @@ from duagc.pipeline.splat.information import (
     pack_symmetric,
     unpack_symmetric,
 )
-from tests.posegraph.worlds import random_poses
-
-
-@dataclass
-class Sums:
-    """The fields of the Fisher sums that evidence reads."""
-
-    ids: NDArray
-    geometry: NDArray
-    color: NDArray
-    opacity: NDArray
-    deviation_m: NDArray
-    overlap: float = 12.0
-
-
-def random_map(seed, n=20, keyframes=4):
-    rng = np.random.default_rng(seed)
-    gaussians = Gaussians(
-        rng.permutation(1000)[:n],
-        rng.integers(keyframes, size=n),
-        rng.normal(size=(n, 3)),
-        rng.normal(size=(n, 4)),
-        rng.uniform(-5, -3, size=(n, 3)),
-        rng.uniform(size=(n, 3)),
-        rng.normal(size=n),
-    )
-    A = rng.normal(size=(n, 9, 9))
-    geometry = pack_symmetric(A @ A.swapaxes(-1, -2))
-    sums = Sums(
-        gaussians.ids, geometry, rng.uniform(1, 2, (n, 3)), rng.uniform(1, 2, n), rng.uniform(0.001, 0.1, n)
-    )
-    return gaussians, sums, random_poses(rng, keyframes)
+from tests.fixtures.gaussian_maps import Sums, random_map
+from tests.fixtures.pose_worlds import random_poses
 
 
 def test_packing_is_undone():

@@ -10,7 +10,7 @@ from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import MatchingConfig, gaussian_distance, match, threshold, tracks
 from duagc.pipeline.geometry import so3, spd
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN
-from tests.posegraph.worlds import random_poses
+from tests.fixtures.pose_worlds import random_poses
 
 CONFIG = MatchingConfig()
 

@@ -9,7 +9,7 @@ from duagc.pipeline.consensus.pose_admm import PoseAgent, PoseConsensusConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.gnc import graduated_weights
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses
-from tests.posegraph.worlds import (
+from tests.fixtures.pose_worlds import (
     EXACT,
     TeamWorld,
     benchmark,

@@ -16,8 +16,8 @@ from duagc.pipeline.consensus.weighting import (
     self_information,
     shared_evidence,
 )
-from tests.consensus.test_evidence import Sums, random_map
-from tests.posegraph.worlds import random_poses
+from tests.fixtures.gaussian_maps import Sums, random_map
+from tests.fixtures.pose_worlds import random_poses
 
 
 @dataclass

@@ -11,12 +11,9 @@ from duagc.converters import registry
 from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cli import app
-from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import open_rgbd, read_log
 from tests.fixtures.box_room import path, render, save
-
-DOC = Path(__file__).parents[2] / "docs" / "howto" / "dataset.md"
-CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 79.5, 59.5)
+from tests.fixtures.dataset_example import CAMERA, DOC
 
 
 @pytest.fixture

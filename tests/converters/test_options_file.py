@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 from duagc.converters import registry
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cli import app
-from tests.converters.test_adding_a_dataset import CAMERA, DOC
 from tests.fixtures.box_room import path, render, save
+from tests.fixtures.dataset_example import CAMERA, DOC
 from tests.fixtures.seven_scenes import make_sequence
 
 

@@ -6,7 +6,7 @@ import pytest
 from duagc.pipeline.evaluation.depth_agreement import MIN_PAIRS, depth_agreement
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
-from tests.registration.room import CAMERA, pose, render
+from tests.fixtures.room import CAMERA, pose, render
 
 TRUTH = np.array([pose(x=-0.4 + 0.1 * k, z=-0.9, yaw=0.3 - 0.05 * k) for k in range(7)])
 

@@ -7,7 +7,7 @@ from duagc.pipeline.evaluation.feature_agreement import MIN_PAIRS, feature_agree
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from tests.registration.room import pose, render, texture
+from tests.fixtures.room import pose, render, texture
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 159.5, 119.5)
 TRUTH = np.array([pose(x=-0.4 + 0.1 * k, z=-0.9, yaw=0.3 - 0.05 * k) for k in range(6)])

@@ -10,8 +10,8 @@ from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, RelativePoses
 from duagc.pipeline.runs.folder import RunFolder
-from tests.evaluation.fake_run import make
-from tests.posegraph.worlds import make_team, talk
+from tests.fixtures.fake_run import make
+from tests.fixtures.pose_worlds import make_team, talk
 
 CONFIG = PoseConsensusConfig(wire="float64", tolerance=1e-9)
 

@@ -20,7 +20,7 @@ from duagc.pipeline.recording import LogWriter
 from duagc.pipeline.runs.digest import digest_file
 from duagc.pipeline.runs.folder import RunFolder, position_information
 from duagc.schemas import topics
-from tests.evaluation.fake_run import make
+from tests.fixtures.fake_run import make
 
 
 def a_render(value: float = 0.5, depth_m: float = 2.0, alpha: float = 1.0) -> Render:

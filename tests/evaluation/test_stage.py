@@ -15,7 +15,7 @@ from duagc.pipeline.experiments.own_longer import own_longer
 from duagc.pipeline.recording import LogWriter, Recording, read_log
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.schemas import topics
-from tests.evaluation.fake_run import DRIFT_M, FRAMES, KEYFRAMES, FakeRun, make
+from tests.fixtures.fake_run import DRIFT_M, FRAMES, KEYFRAMES, FakeRun, make
 
 NUMBER = (int, float)
 ROBOT = {

@@ -27,7 +27,7 @@ from duagc.pipeline.network.packets import (
 )
 from duagc.pipeline.network.signatures import SIGNATURE_BYTES, Identity
 from duagc.pipeline.runs.robot_data import RobotData, SessionResult
-from tests.exchange.test_session import same
+from tests.fixtures.results import same
 
 NAMES = ("alpha", "bravo")
 SIGNED = ExchangeConfig(transport=TransportConfig(signatures="ed25519"))

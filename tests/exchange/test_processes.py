@@ -17,7 +17,7 @@ from duagc.pipeline.exchange.session_result import result_of
 from duagc.pipeline.network import link_model
 from duagc.pipeline.network.link_model import LinkModel
 from tests.exchange.conftest import robot
-from tests.exchange.test_session import same
+from tests.fixtures.results import same
 
 NAMES = ("alpha", "bravo", "charlie")
 CONFIG = ExchangeConfig(link=LinkConfig(topology="chain", loss_probability=0.3))

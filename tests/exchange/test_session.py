@@ -26,6 +26,7 @@ from duagc.pipeline.network.packets import Kind, Packet, chunk_bytes, parse, ser
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import content_digest, read_log
 from duagc.pipeline.runs.robot_data import RobotData, SessionResult
+from tests.fixtures.results import same
 from tests.fixtures.sampling import sampled
 
 NAMES = ("alpha", "bravo", "charlie")
@@ -76,25 +77,6 @@ def error_m(result: SessionResult, team: dict[str, tuple[RobotData, np.ndarray]]
     """Largest distance of an own keyframe from the truth, in the map frame of the lowest-named robot."""
     T_true = se3.inverse(team[result.component[0]][1][0]) @ team[result.robot][1]
     return float(se3.distance(T_true, result.T_world_keyframe)[0].max())
-
-
-def same(a: SessionResult, b: SessionResult) -> bool:
-    """Whether two results are equal bit for bit."""
-
-    def equal(x: Any, y: Any) -> bool:
-        if isinstance(x, np.ndarray):
-            return x.dtype == y.dtype and np.array_equal(x, y)
-        if dataclasses.is_dataclass(x):
-            return type(x) is type(y) and all(
-                equal(getattr(x, f.name), getattr(y, f.name)) for f in dataclasses.fields(x)
-            )
-        if isinstance(x, dict):
-            return list(x) == list(y) and all(equal(x[k], y[k]) for k in x)
-        if isinstance(x, list | tuple):
-            return len(x) == len(y) and all(equal(p, q) for p, q in zip(x, y, strict=True))
-        return x == y
-
-    return equal(a, b)
 
 
 def test_a_chain_agrees_though_packets_are_lost(lossy_chain: Any, team: Any) -> None:

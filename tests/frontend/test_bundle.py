@@ -18,7 +18,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration import Level, Reference, RegistrationConfig, RgbdPyramid, register
 from duagc.pipeline.registration.features import Features, matches
-from tests.registration.room import pose, render
+from tests.fixtures.room import pose, render
 
 CAMERA = PinholeCamera(320, 240, 220.0, 220.0, 159.5, 119.5)
 CONFIG, REGISTRATION = KeyframeConfig(), RegistrationConfig()

@@ -13,7 +13,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import RgbdFrame
 from duagc.pipeline.registration import RegistrationConfig
 from duagc.pipeline.splat.gaussians import Gaussians
-from tests.registration.room import CAMERA, pose, render
+from tests.fixtures.room import CAMERA, pose, render
 
 KEYFRAME = pose(z=-0.9)
 FRAME = pose(x=0.06, z=-0.88, yaw=0.04)

@@ -21,8 +21,8 @@ from duagc.pipeline.geometry.trajectory import ate_rmse_m
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import content_digest, log_metadata, read_log
 from duagc.schemas import topics
-from tests.registration.room import CAMERA, pose, render
-from tests.registration.test_moving import RADIUS_M, with_ball
+from tests.fixtures.moving_ball import RADIUS_M, with_ball
+from tests.fixtures.room import CAMERA, pose, render
 
 FRAMES = 13
 FRAME_NS = 33_333_333

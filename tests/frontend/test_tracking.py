@@ -13,7 +13,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import ate_rmse_m
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import Motion
-from tests.registration.room import CAMERA, pose, render
+from tests.fixtures.room import CAMERA, pose, render
 
 CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)))
 STEPS = 36

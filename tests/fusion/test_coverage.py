@@ -8,7 +8,7 @@ from duagc.pipeline.fusion.coverage import explained
 from duagc.pipeline.fusion.fuse import OwnMap
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import LOG_COVARIANCE, MEAN
-from tests.fusion.worlds import (
+from tests.fixtures.gaussian_worlds import (
     CAMERA,
     CONFIG,
     N,

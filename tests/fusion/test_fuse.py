@@ -12,7 +12,7 @@ from duagc.pipeline.fusion.fuse import OwnMap
 from duagc.pipeline.geometry import se3, so3, spd
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import COLOR, COLOR_INFORMATION, LOG_COVARIANCE, MEAN, pack_information
-from tests.fusion.worlds import (
+from tests.fixtures.gaussian_worlds import (
     ALIKE,
     CONFIG,
     MATCHING,

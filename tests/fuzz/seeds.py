@@ -20,9 +20,9 @@ from rosbags.typesys import store
 from duagc.converters.datasets import bonn, icl_nuim, seven_scenes, tum
 from duagc.converters.layouts.ros_images import rows_of
 from duagc.pipeline.geometry.camera import PinholeCamera
-from tests.evaluation import fake_run
 from tests.fixtures import (
     box_room,
+    fake_run,
     foreign_mcap,
     image_folders,
     kimera_multi,
@@ -228,7 +228,7 @@ CSV_COLUMNS = "robot_src,pose_src,robot_dst,pose_dst,qx,qy,qz,qw,tx,ty,tz,kappa,
 
 
 def make_g2o(seed: Path) -> None:
-    from tests.posegraph.graphs import helix_edges, write_g2o
+    from tests.fixtures.pose_graphs import helix_edges, write_g2o
 
     write_g2o(seed / "graph.g2o", helix_edges(24))
 

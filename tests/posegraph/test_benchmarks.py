@@ -9,7 +9,7 @@ import pytest
 
 from duagc.pipeline.config.posegraph import settings
 from duagc.pipeline.team_posegraph import solve
-from tests.posegraph.worlds import POSE_GRAPHS
+from tests.fixtures.pose_worlds import POSE_GRAPHS
 
 pytestmark = pytest.mark.slow
 TEAMS = "multi_robot/"

@@ -7,7 +7,7 @@ import pytest
 
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.cycle_consistency import Proposal, place
-from tests.posegraph.worlds import random_poses
+from tests.fixtures.pose_worlds import random_poses
 
 NAMES = ["alpha", "bravo", "charlie", "delta"]
 VARIANCE = (0.02**2, 0.01**2)

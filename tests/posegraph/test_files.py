@@ -9,7 +9,7 @@ from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.files import read_team_graph
 from duagc.pipeline.posegraph.pose_graph import PoseGraph
 from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, RelativePoses
-from tests.posegraph.graphs import KAPPA, TAU, g2o_line, helix, helix_edges, symbol, write_g2o, write_team
+from tests.fixtures.pose_graphs import KAPPA, TAU, g2o_line, helix, helix_edges, symbol, write_g2o, write_team
 
 EXACT = LoopClosureConfig(sigma_floor_m=0, sigma_floor_rad=0)
 

@@ -9,7 +9,7 @@ from duagc.pipeline.config.posegraph import settings
 from duagc.pipeline.network.packets import parse, serialize
 from duagc.pipeline.posegraph.files import read_team_graph
 from duagc.pipeline.team_posegraph.agent import PoseGraphAgent
-from tests.posegraph.graphs import helix_edges, write_g2o
+from tests.fixtures.pose_graphs import helix_edges, write_g2o
 
 
 @pytest.mark.parametrize("solver", ["admm", "elimination", "paper"])

@@ -15,7 +15,7 @@ from duagc.pipeline.posegraph.loop_closures import (
 )
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, closures_as_relative_poses
 from duagc.pipeline.posegraph.spanning_tree import chain_frames
-from tests.posegraph.worlds import random_information, random_poses
+from tests.fixtures.pose_worlds import random_information, random_poses
 
 CONFIG = LoopClosureConfig()
 

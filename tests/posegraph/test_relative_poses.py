@@ -10,7 +10,7 @@ from duagc.pipeline.posegraph.initialization import chordal
 from duagc.pipeline.posegraph.least_squares import difference, retract
 from duagc.pipeline.posegraph.pose_graph import solve_pose_graph
 from duagc.pipeline.posegraph.relative_poses import RelativePoses, isotropic_information
-from tests.posegraph.worlds import benchmark, random_information, random_poses
+from tests.fixtures.pose_worlds import benchmark, random_information, random_poses
 
 
 def scattered(seed, n=6, m=9):

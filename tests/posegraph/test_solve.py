@@ -13,8 +13,8 @@ from duagc.pipeline.team_posegraph import solve
 from duagc.pipeline.team_posegraph import team as team_rounds
 from duagc.pipeline.team_posegraph.agent import PoseGraphAgent
 from duagc.pipeline.team_posegraph.team import Traffic, meet
-from tests.cli.test_cli import assert_one_line, duagc
-from tests.posegraph.graphs import helix_edges, wild_edges, write_g2o, write_team
+from tests.fixtures.commands import assert_one_line, duagc
+from tests.fixtures.pose_graphs import helix_edges, wild_edges, write_g2o, write_team
 
 N = 48
 

@@ -12,7 +12,7 @@ import pytest
 from rosbags.rosbag1 import Writer
 
 from duagc.pipeline.geometry.camera import PinholeCamera
-from tests.converters.test_ros import START_NS, STEP_NS, Ros
+from tests.fixtures.ros_bags import START_NS, STEP_NS, Ros
 
 CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 319.5, 239.5)
 SHORT, LONG = 15, 150

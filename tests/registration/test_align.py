@@ -13,7 +13,7 @@ from duagc.pipeline.registration import (
     RgbdPyramid,
     register,
 )
-from tests.registration.room import CAMERA, pose, render
+from tests.fixtures.room import CAMERA, pose, render
 
 START, END = pose(yaw=0.3), pose(x=0.06, y=-0.03, z=-0.75, yaw=0.34, pitch=-0.02)
 T_START_END = se3.inverse(START) @ END

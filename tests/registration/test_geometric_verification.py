@@ -18,7 +18,7 @@ from duagc.pipeline.registration.geometric_verification import (
     motion_from_features,
     verify,
 )
-from tests.registration.room import CAMERA, pose, render
+from tests.fixtures.room import CAMERA, pose, render
 
 CONFIG, REGISTRATION = GeometricVerificationConfig(), RegistrationConfig()
 FIRST, SECOND = pose(), pose(x=0.08, y=-0.03, yaw=0.06)

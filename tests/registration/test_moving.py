@@ -6,24 +6,11 @@ import pytest
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration.moving import FreeSpace
-from tests.registration.room import CAMERA, pose, render
+from tests.fixtures.moving_ball import with_ball
+from tests.fixtures.room import CAMERA, pose, render
 
 CONFIG = MovingConfig(halvings=1, grow_px=2)
 POSES = [pose(x=-0.2 + 0.1 * k, z=-1.4, yaw=0.1 - 0.05 * k) for k in range(5)]
-RADIUS_M = 0.2
-
-
-def with_ball(
-    depth: np.ndarray, T_world_camera: np.ndarray, center_world: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The depth image with a ball in the room, and the pixels that show it."""
-    center = se3.transform(se3.inverse(T_world_camera), center_world[None])[0]
-    rays = CAMERA.rays()
-    b, a = rays @ center, (rays**2).sum(axis=-1)
-    inside = b * b - a * (center @ center - RADIUS_M**2)
-    z = np.where(inside > 0, (b - np.sqrt(np.maximum(inside, 0))) / a, np.inf)
-    shows = (z > 0) & (z < depth)
-    return np.where(shows, z, depth).astype(np.float32), shows
 
 
 def ball_at(k: int) -> np.ndarray:

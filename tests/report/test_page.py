@@ -9,7 +9,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation import evaluate
 from duagc.pipeline.report import figures, labels, pictures, write_report
 from duagc.pipeline.report.renders import sigma_colors
-from tests.evaluation.fake_run import make
+from tests.fixtures.fake_run import make
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from duagc.pipeline.evaluation import evaluate
 from duagc.pipeline.replay import replay
 from duagc.pipeline.report import write_report
 from duagc.pipeline.runs.folder import RunFolder
-from tests.evaluation import fake_run
+from tests.fixtures import fake_run
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from duagc.pipeline.recording import LogWriter, open_rgbd, read_log
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.stages import Stage
 from duagc.schemas import topics
-from tests.evaluation import fake_run
+from tests.fixtures import fake_run
 
 ESTIMATOR = (stages.FRONTEND, stages.INFORMATION, stages.EXCHANGE, stages.FUSION)
 

@@ -8,7 +8,7 @@ import pytest
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation import evaluate
 from duagc.pipeline.viewing import rerun_view, run_rrd
-from tests.evaluation.fake_run import FRAMES, KEYFRAMES, FakeRun, make, wall
+from tests.fixtures.fake_run import FRAMES, KEYFRAMES, FakeRun, make, wall
 
 
 @pytest.fixture(scope="module")
