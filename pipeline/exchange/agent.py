@@ -338,7 +338,7 @@ class Agent:
     def _repeats(self, neighbor: Neighbor, state: bytes) -> bool:
         """Whether a neighbor was sent this very state lately; with evidence to share, states go out in every round."""
         known, sent_round = neighbor.sent_state
-        due = self.round - sent_round >= self.config.transport.retransmit_after_rounds
+        due = self.round - sent_round >= neighbor.transport.repeat_after_rounds
         met = neighbor.transport.last_heard is not None
         if not self.sharing.enabled and met and state == known and not due:
             return True

@@ -24,6 +24,9 @@ from duagc.pipeline.posegraph.relative_poses import LoopClosure, closures_as_rel
 Array = NDArray[np.float64]
 
 
+ROUNDING_STEPS = 4.0
+
+
 @dataclass(frozen=True)
 class LinkStart:
     """A joined neighbor as the solver gets it.
@@ -121,17 +124,15 @@ class PoseSolver(Protocol):
 class AdmmSolver:
     """`PoseAgent` with its packets in the states of the rounds."""
 
-    def __init__(self, start: SolverStart, config: PoseConsensusConfig, *, release: float = 1.0) -> None:
+    def __init__(self, start: SolverStart, config: PoseConsensusConfig) -> None:
         """Lay out the graph.
 
         Args:
             start: what the robot knows.
             config: the same at all robots.
-            release: a robot that has converged stays so until it changes by this multiple of the tolerance.
         """
-        self.own, self.config, self.release = start.index, config, release
+        self.own, self.config = start.index, config
         self.refused: list[str] = []
-        self._stays = False  # it had converged, and changed little since
         own = start.own
         self.agent = PoseAgent(
             own.robot,
@@ -151,11 +152,6 @@ class AdmmSolver:
 
     def advance(self) -> None:
         self.agent.step()
-        recent = max(
-            [self.agent.step_change, *(k.largest_recent_change() for k in self.agent.links.values())]
-        )
-        little = recent < self.release * self.config.tolerance
-        self._stays = little and (self._stays or self.agent.settled) and self.release > 1.0
 
     def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
         packet = self.agent.outgoing(neighbor.name)
@@ -173,7 +169,19 @@ class AdmmSolver:
 
     @property
     def converged(self) -> bool:
-        return self.agent.settled or self._stays
+        return self.agent.settled or (self.agent.robust_done and self._recent_change() < self._rounding_m())
+
+    def _recent_change(self) -> float:
+        """Largest change of a pose or an edge variable, by the last arrivals too (m, rad)."""
+        links = (link.largest_recent_change() for link in self.agent.links.values())
+        return max([self.agent.step_change, *links])
+
+    def _rounding_m(self) -> float:
+        """By what poses in float32 keep changing, however well robots agree: some steps of the largest coordinate."""
+        if self.config.wire != "float32":
+            return 0.0
+        largest = np.float32(np.abs(self.agent.T_world_keyframe[:, :3, 3]).max())
+        return ROUNDING_STEPS * float(np.spacing(largest))
 
     @property
     def largest_change(self) -> float:

@@ -215,6 +215,11 @@ class Transport:
                 out.append(self._packet(entry.message, chunk, round_index))
         return out
 
+    @property
+    def repeat_after_rounds(self) -> int:
+        """Rounds after which a state that did not change should go out again: the sooner the more is lost."""
+        return self._retransmit_after(Kind.TREE)
+
     def _retransmit_after(self, kind: Kind) -> int:
         """Rounds until a packet counts as lost: never less than there and back take.
 

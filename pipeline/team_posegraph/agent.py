@@ -15,7 +15,7 @@ from duagc.pipeline.exchange.agent import Agent
 from duagc.pipeline.exchange.known_loop_closures import KnownLoopClosures
 from duagc.pipeline.exchange.own_graph import OwnGraph
 from duagc.pipeline.exchange.sharing import NoSharing
-from duagc.pipeline.exchange.solvers import AdmmSolver, EliminationSolver, PoseSolver, SolverStart
+from duagc.pipeline.exchange.solvers import EliminationSolver, PoseSolver, SolverStart
 from duagc.pipeline.posegraph.files import RobotGraph
 from duagc.pipeline.posegraph.initialization import own_start
 from duagc.pipeline.posegraph.loop_closures import drift
@@ -23,7 +23,6 @@ from duagc.pipeline.team_posegraph.printed_admm import PrintedAdmmSolver
 
 Array = NDArray[np.float64]
 _NEVER = 1 << 30
-_RELEASE = 10.0  # tolerances; float32 rounds coordinates of 300 m by as much as the tolerance
 _UNLIMITED_BYTES = 1 << 40  # what a solver sends is counted, not held back
 
 
@@ -70,8 +69,8 @@ class PoseGraphAgent(Agent):
             held_by_both=printed,
         )
 
-        def solver(start: SolverStart) -> PoseSolver:
-            return PrintedAdmmSolver(start, config) if printed else _admm(start, config.consensus)
+        def print_solver(start: SolverStart) -> PoseSolver:
+            return PrintedAdmmSolver(start, config)
 
         super().__init__(
             own,
@@ -81,7 +80,7 @@ class PoseGraphAgent(Agent):
             seed=config.seed,
             loop_closing=source,
             sharing=NoSharing(sorted(team).index(part.name), len(team)),
-            solver=None if exact else solver,
+            solver=print_solver if printed else None,
         )
 
     @property
@@ -101,11 +100,6 @@ class PoseGraphAgent(Agent):
         }
         revoked = {n.name: np.zeros(len(n.link.weights)) for n in self.neighbors.values() if n.link.weights}
         return self.poses.loop_weights, held | revoked
-
-
-def _admm(start: SolverStart, config: PoseConsensusConfig) -> PoseSolver:
-    """Edge-ADMM that stays converged while float32 on the wire moves coordinates of hundreds of meters."""
-    return AdmmSolver(start, config, release=_RELEASE)
 
 
 def _own_graph(part: RobotGraph, config: PoseConsensusConfig) -> OwnGraph:
