@@ -114,7 +114,7 @@ class Agent:
         self.neighbors = {self.team.index(name): self._neighbor(name) for name in sorted(neighbors)}
         self.round = -1
         self.refused: Counter[str] = Counter()
-        margin = np.inf if loop_closing.trusted else config.consensus.closures.margin
+        margin = config.consensus.closures.margin if loop_closing.revokes else np.inf
         self.alignment = MapAlignment(self.own, self.team, margin, short=not sharing.enabled)
         self.alignment_hops = self.converged_hops = 0
         self.poses: PoseSolver | None = None

@@ -128,4 +128,4 @@ class KnownPair(LoopClosureProtocol):
             return [Group(np.ones(len(self.closures), dtype=bool), robust_frame(frames, config))]
         found = consistent(self.closures, own.from_first, peer, config)
         assert found.T_ownmap_peermap is not None, "one loop closure joins two robots here"
-        return [Group(found.keep, found.T_ownmap_peermap), *found.others]
+        return [Group(found.keep, found.T_ownmap_peermap)]  # no cycle of robots chooses another one

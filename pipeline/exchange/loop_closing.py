@@ -125,11 +125,11 @@ class LoopClosing(Protocol):
 
     @property
     def trusted(self) -> bool:
-        """Whether all loop closures are true: then none is left out, and no relative frame contradicts another."""
+        """Whether all loop closures are true: then none is left out."""
 
     @property
     def revokes(self) -> bool:
-        """Whether a link without enough inliers, or that contradicts others, is revoked; else it has no weight."""
+        """Whether links that contradict others, or have too few inliers, are revoked; if not, weights alone decide."""
 
     @property
     def greeting(self) -> bytes | None:

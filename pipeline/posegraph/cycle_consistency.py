@@ -82,7 +82,7 @@ def place(pairs: Mapping[Pair, Sequence[Proposal]], robots: Sequence[str], margi
     Args:
         pairs: proposals by (earlier, later) name.
         robots: all names.
-        margin: factor on variances; infinite if all proposals are true.
+        margin: factor on variances; infinite if cycles decide nothing.
     """
     scores = {pair: [_score(pair, k, pairs, margin) for k in range(len(pairs[pair]))] for pair in pairs}
     best = {pair: int(np.argmax(score)) for pair, score in scores.items()}  # the first of equals
@@ -114,7 +114,7 @@ def _score(pair: Pair, k: int, pairs: Mapping[Pair, Sequence[Proposal]], margin:
     a, b = pair
     proposal = pairs[pair][k]
     score = proposal.weight
-    if math.isinf(margin):  # all of them are true: that cycles close is no evidence
+    if math.isinf(margin):  # every cycle closes, which is no evidence
         return score
     thirds = sorted({name for other in pairs for name in other} - {a, b})
     for c in thirds:
