@@ -102,8 +102,9 @@ class Surface:
 
         tree = cKDTree(self.points)
         radius_m = float(np.quantile(tree.query(self.points, k=2)[0][:, 1], 0.95))
-        _, index = tree.query(queries, k=min(NEIGHBORS, len(self.points)))
-        index = index.reshape(len(queries), -1)
+        neighbors = min(NEIGHBORS, len(self.points))
+        _, index = tree.query(queries, k=neighbors)
+        index = index.reshape(len(queries), neighbors)
         offset = queries[:, None, :] - self.points[index]
         across = np.sum(offset * self.normals[index], axis=2)
         along = np.sqrt(np.maximum(np.sum(offset**2, axis=2) - across**2, 0.0))

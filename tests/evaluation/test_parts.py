@@ -103,6 +103,8 @@ def test_distance_from_a_sampled_corner_does_not_feel_the_sampling():
     assert np.array_equal(np.argmax(np.abs(direction), axis=1) == 2, points[:, 2] <= points[:, 0])
     beyond = np.array([[1.5, 0.5, 0.0]])
     assert cloud.closest(beyond)[0] == pytest.approx(1.5 - 1.18, abs=0.021)
+    distance, direction = cloud.closest(np.zeros((0, 3)))  # of a map without Gaussians
+    assert (distance.shape, direction.shape) == ((0,), (0, 3))
 
 
 @pytest.mark.parametrize("damage", ["cut", "ascii", "not finite", "no normals", "empty"])
