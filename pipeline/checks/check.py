@@ -25,6 +25,12 @@ LOOKED_AT = 16  # frames of a robot whose pixels are counted
 def check(path: Path) -> Report:
     """Check a recording, or the log of one robot.
 
+    Args:
+        path: folder of the recording, or the log.
+
+    Returns:
+        All findings; `Report.sound` is whether there is no error among them.
+
     Raises:
         DuagError: it is neither. Everything else that is wrong is a finding.
     """

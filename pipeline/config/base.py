@@ -70,7 +70,11 @@ def _apply(values: dict[str, Any], override: str) -> None:
 
 
 def dump_config(config: Config) -> str:
-    """TOML text of a configuration, every setting with its documentation as a comment."""
+    """TOML text of a configuration, every setting with its documentation as a comment.
+
+    Args:
+        config: the settings.
+    """
     import tomlkit
 
     document = tomlkit.document()

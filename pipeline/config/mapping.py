@@ -100,7 +100,11 @@ class MappingConfig(Config):
     """Learning rate of the gains and offsets."""
 
     def depth_kind(self, depth_noise_m: float | None) -> DepthKind:
-        """How the Gaussians' depth is drawn; depth_noise_m: of the depth images, None: unknown."""
+        """How the depth of the Gaussians is drawn.
+
+        Args:
+            depth_noise_m: standard deviation of the depth images in meters; None: unknown.
+        """
         if self.depth != "auto":
             return self.depth
         return "ray_plane" if depth_noise_m is not None and depth_noise_m < self.exact_depth_m else "blended"

@@ -160,13 +160,21 @@ class Evidence:
         return len(self.ids)
 
     def select(self, index: NDArray[np.bool_] | NDArray[np.int64] | slice) -> Evidence:
-        """The Gaussians of a mask, a slice or an index array, in that order."""
+        """Pick Gaussians.
+
+        Args:
+            index: mask [n], slice or indices; the order of the result is that of the index.
+        """
         return Evidence(
             self.owner, self.ids[index], self.anchors[index], self.theta[index], self.information[index]
         )
 
     def in_world(self, T_world_keyframe: ArrayLike) -> Evidence:
-        """The same in the world frame, by the owner's keyframe poses [k, 4, 4] (by anchor)."""
+        """Move the evidence from the frames of its anchors into the world frame.
+
+        Args:
+            T_world_keyframe: poses of the owner's keyframes, by anchor, [k, 4, 4].
+        """
         return self._moved(np.asarray(T_world_keyframe, dtype=np.float64))
 
     def _moved(self, T_new_anchor: Array) -> Evidence:

@@ -114,7 +114,15 @@ class LinkModel:
         }
 
     def fate(self, sender: str, receiver: str, sequence: int, send_ns: int, size: int) -> Fate:
-        """Fate of one packet of `size` bytes, handed to the radio at `send_ns` since the beginning of the session."""
+        """Decide what becomes of one packet.
+
+        Args:
+            sender: robot that sends it.
+            receiver: robot that it is for.
+            sequence: number of the packet on this directed link.
+            send_ns: when it is handed to the radio, since the beginning of the session.
+            size: bytes, header included.
+        """
         config = self.config
         radio = self._radios.setdefault((sender, receiver), _Radio())
         start_ns = max(send_ns, radio.free_ns)

@@ -70,7 +70,11 @@ class RelativePoses:
 
     @staticmethod
     def of(poses: Sequence[RelativePose]) -> RelativePoses:
-        """Single relative poses as arrays, in the same order."""
+        """Collect single relative poses into arrays.
+
+        Args:
+            poses: the relative poses; their order is kept.
+        """
         return RelativePoses(
             np.array([p.i for p in poses], dtype=np.int64),
             np.array([p.j for p in poses], dtype=np.int64),
@@ -87,17 +91,29 @@ class RelativePoses:
         return len(self.i)
 
     def select(self, index: NDArray[np.bool_] | Index | slice) -> RelativePoses:
-        """Those of a mask, a slice or an index array."""
+        """Pick relative poses.
+
+        Args:
+            index: mask [n], slice or indices; the order of the result is that of the index.
+        """
         return RelativePoses(self.i[index], self.j[index], self.T_i_j[index], self.information[index])
 
     def renamed(self, new_index: ArrayLike) -> RelativePoses:
-        """The same with variable k called new_index[k]."""
+        """Rename the variables.
+
+        Args:
+            new_index: new index of every variable, int [variables].
+        """
         names = np.asarray(new_index, dtype=np.int64)
         return RelativePoses(names[self.i], names[self.j], self.T_i_j, self.information)
 
     @staticmethod
     def concatenate(parts: Sequence[RelativePoses]) -> RelativePoses:
-        """All relative poses of all parts, in order."""
+        """Put sets of relative poses together.
+
+        Args:
+            parts: the sets; their order is kept.
+        """
         if not parts:
             return RelativePoses.empty()
         return RelativePoses(

@@ -28,14 +28,25 @@ class Recording:
         return sorted(self._robots)
 
     def log(self, robot: str) -> Path:
-        """The log of a robot's sensors."""
+        """The log of a robot's sensors.
+
+        Args:
+            robot: name of the robot.
+
+        Raises:
+            DuagError: the recording has no such robot, or its log is missing.
+        """
         path = self.path / self._robot(robot)["log"]
         if not path.is_file():
             raise DuagError(f"{path}: no such file, expected the log of {robot} that {RECORDING_FILE} names")
         return path
 
     def digest(self, name: str) -> str:
-        """Content digest of a log as it was written, by the log's file name; "nothing" if recording.json has none."""
+        """Content digest of a log as it was written; "nothing" if recording.json has none.
+
+        Args:
+            name: file name of the log.
+        """
         rows = self._robots.values()
         digest = next(
             (d[name] for r in rows if isinstance(d := r.get("digests"), dict) and name in d), "nothing"
@@ -43,7 +54,14 @@ class Recording:
         return str(digest)
 
     def groundtruth(self, robot: str) -> Path | None:
-        """The log of a robot's ground truth, for evaluation only; None where there is none, listed or not."""
+        """The log of a robot's ground truth, for evaluation only; None where there is none, listed or not.
+
+        Args:
+            robot: name of the robot.
+
+        Raises:
+            DuagError: the recording has no such robot.
+        """
         name = self._robot(robot).get("groundtruth")
         return self.path / name if name and (self.path / name).is_file() else None
 

@@ -136,7 +136,15 @@ class RgbdLog:
             yield self.frame(index)
 
     def frame(self, index: int) -> RgbdFrame:
-        """Frame `index`, 0 <= index < len(self)."""
+        """Read one frame.
+
+        Args:
+            index: position in the log, 0 <= index < len(self).
+
+        Raises:
+            DuagError: an image is damaged; the line names file, topic and time.
+            IndexError: there are fewer frames.
+        """
         if not 0 <= index < len(self):
             raise IndexError(f"frame {index} of {len(self)}")
         stamp, depth_stamp = self.pairing.pairs[index]
@@ -168,5 +176,15 @@ class RgbdLog:
 
 
 def open_rgbd(path: Path) -> RgbdLog:
-    """Open the log of one robot's camera; see `RgbdLog`."""
+    """Open the log of one robot's camera.
+
+    Args:
+        path: the log, an .mcap of a recording.
+
+    Returns:
+        The log; close it, or use it in a `with` block.
+
+    Raises:
+        DuagError: the log is damaged, or has no color, depth or calibration; the line names file and topic.
+    """
     return RgbdLog(path)

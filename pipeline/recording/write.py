@@ -69,7 +69,16 @@ class LogWriter:
         return self
 
     def channel(self, topic: str, schema: str, metadata: Mapping[str, str] | None = None) -> None:
-        """Open a topic with channel metadata, before its first message; without metadata this is not needed."""
+        """Open a topic before its first message; without metadata this is not needed.
+
+        Args:
+            topic: a topic of schemas/topics.py.
+            schema: full name of its schema.
+            metadata: text about the channel, for example depth_scale.
+
+        Raises:
+            ValueError: the topic is open already, is not in the table, or carries another schema.
+        """
         if topic in self._channels:
             raise ValueError(f"{topic} is open already")
         row = topic_table.find(topic)

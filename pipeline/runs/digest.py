@@ -39,6 +39,9 @@ def digest_file(path: Path) -> str:
 def digest(path: Path) -> str:
     """64 hex characters of a log, a recording, a run, or one of its files.
 
+    Args:
+        path: folder of the recording or run, or the file.
+
     Raises:
         DuagError: the path is absent, or is neither a file, a recording nor a whole run.
     """

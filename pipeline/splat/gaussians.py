@@ -64,28 +64,49 @@ class Gaussians:
         return len(self.ids)
 
     def select(self, index: ArrayLike | slice) -> Gaussians:
-        """The Gaussians of a mask, a slice or an index array, in that order."""
+        """Pick Gaussians.
+
+        Args:
+            index: mask [n], slice or indices; the order of the result is that of the index.
+        """
         return Gaussians(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     def replace(self, **arrays: Any) -> Gaussians:
-        """The same Gaussians with some arrays exchanged."""
+        """Exchange some arrays.
+
+        Args:
+            arrays: new arrays by the name of their attribute, shapes as before.
+        """
         return replace(self, **arrays)
 
     @staticmethod
     def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
-        """All Gaussians of all parts, in order."""
+        """Put sets of Gaussians of one frame together.
+
+        Args:
+            parts: the sets; their order is kept.
+        """
         if not parts:
             return Gaussians.empty()
         return Gaussians(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in _SHAPES})
 
     def transformed(self, T_b_a: ArrayLike) -> Gaussians:
-        """The Gaussians of frame a in frame b; T_b_a is [4, 4] for all or [n, 4, 4], one each."""
+        """Express the Gaussians of frame a in frame b.
+
+        Args:
+            T_b_a: pose of frame a in frame b, [4, 4] for all Gaussians or [n, 4, 4], one for each.
+        """
         T = np.asarray(T_b_a, dtype=np.float64)
         means = (T[..., :3, :3] @ self.means.astype(np.float64)[..., None])[..., 0] + T[..., :3, 3]
         quats = so3.multiply_quat_wxyz(so3.to_quat_wxyz(T[..., :3, :3]), self.quats_wxyz)
         return self.replace(means=means.astype(np.float32), quats_wxyz=quats.astype(np.float32))
 
     def moved(self, T_old_keyframe: ArrayLike, T_new_keyframe: ArrayLike) -> Gaussians:
-        """Every Gaussian moved with its anchor: keyframe poses [k, 4, 4] before and after, by anchor index."""
+        """Move every Gaussian with its anchor.
+
+        Args:
+            T_old_keyframe: poses of the keyframes before, by anchor, [k, 4, 4].
+            T_new_keyframe: the same after.
+        """
         change = np.asarray(T_new_keyframe) @ se3.inverse(T_old_keyframe)
         return self.transformed(change[self.anchors]) if len(self) else self

@@ -48,7 +48,9 @@ def cli_page() -> str:
     """Every command, its arguments and its options."""
     root = typer.main.get_command(app)
     parts = [HEAD + "# Command line\n", NOTE, (root.help or "") + "\n"]
-    parts.append("Exit codes: 0 success; 1 failure, with one line; 2 wrong usage; 3 a difference, or data lost.\n")
+    parts.append(
+        "Exit codes: 0 success; 1 failure, with one line; 2 wrong usage; 3 a difference, or data lost.\n"
+    )
     for path, command in _commands(root, ("duagc",)):
         parts.append(f"## {' '.join(path)}\n")
         parts += [f"    {' '.join([*path, *_usage(command)])}\n", _help_text(command.help or "")]

@@ -1,0 +1,44 @@
+"""Every public name of `duagc` is documented in the form that the site reads: one line under `Args:` per parameter."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+import duagc
+
+
+def functions() -> Iterator[tuple[str, Callable[..., Any]]]:
+    """Public functions, methods of public classes, and functions of public modules, by their names."""
+    for name in sorted(duagc.__all__):
+        value = getattr(duagc, name)
+        if inspect.isfunction(value):
+            yield name, value
+        elif inspect.isclass(value) or inspect.ismodule(value):
+            module = value.__name__ if inspect.ismodule(value) else value.__module__
+            for inner, found in vars(value).items():
+                function = getattr(found, "__func__", found)
+                if inspect.isfunction(function) and function.__module__ == module and inner[0] != "_":
+                    yield f"{name}.{inner}", function
+
+
+FUNCTIONS = dict(functions())
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_parameter_has_a_line(name: str) -> None:
+    function = FUNCTIONS[name]
+    expected = [p for p in inspect.signature(function).parameters if p not in ("self", "cls")]
+    text = inspect.cleandoc(function.__doc__ or "")
+    assert text
+    section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", text, re.DOTALL | re.MULTILINE)
+    assert (re.findall(r"^    (\w+):", section[1], re.MULTILINE) if section else []) == expected
+
+
+def test_there_are_about_forty_public_names_each_with_a_docstring() -> None:
+    assert 30 <= len(duagc.__all__) <= 80
+    assert [name for name in duagc.__all__ if not inspect.getdoc(getattr(duagc, name))] == []
