@@ -25,11 +25,21 @@ def run(
     figures: Iterable[str],
     robots: Iterable[int],
     overlaps: Iterable[float],
+    *,
     frames: int,
     seed: int,
     up: str,
 ) -> list[Row]:
     """Plan every combination, and measure it as `simulate` does.
+
+    Args:
+        scenes: names, or folders of meshes.
+        figures: paradigms of the paths.
+        robots: numbers of robots.
+        overlaps: shares of the view that neighbors are asked to see, 0..1.
+        frames: per robot.
+        seed: of scenes and paths.
+        up: axis of meshes that is up: y, z or auto.
 
     Returns:
         Rows with scene, paradigm, robots, asked; then `refused` (why), or shared (mean of all neighbors),

@@ -232,12 +232,12 @@ def bench_frontend(
         plan = frontend.Plan(
             recording,
             settings.frontend,
-            chosen,
-            ablation,
-            open3d,
-            threads,
-            settings.seed,
-            (robot,) if robot else (),
+            caps=chosen,
+            ablation=ablation,
+            open3d=open3d,
+            threads=threads,
+            seed=settings.seed,
+            robots=(robot,) if robot else (),
         )
         result = frontend.run(plan)
     if plot is not None:
@@ -284,7 +284,7 @@ def bench_paths(
     if max(counts) > MAX_ROBOTS:
         raise typer.BadParameter(f"{max(counts)} is more than {MAX_ROBOTS}", param_hint="--robots")
     asked = _numbers("--overlap", overlap, 0, 1)
-    rows = paths.run(scenes.split(","), paradigms.split(","), counts, asked, frames, seed, up)
+    rows = paths.run(scenes.split(","), paradigms.split(","), counts, asked, frames=frames, seed=seed, up=up)
     print(json.dumps(rows, indent=2) if as_json else paths.format_table(rows))
 
 

@@ -135,13 +135,13 @@ class Session:
             rows.append((p.round, p.robot, p.receiver, PURPOSE[kind], _size(p), p.delivered))
         columns = list(zip(*rows, strict=True)) or [()] * 6
         return Packets(
-            np.array(columns[0], dtype=np.int64),
-            np.array(columns[1], dtype=np.str_),
-            np.array(columns[2], dtype=np.str_),
-            np.array(columns[3], dtype=np.str_),
-            np.array(columns[4], dtype=np.int64),
-            np.array(columns[5], dtype=np.bool_),
-            len(kinds),
+            round=np.array(columns[0], dtype=np.int64),
+            sender=np.array(columns[1], dtype=np.str_),
+            receiver=np.array(columns[2], dtype=np.str_),
+            purpose=np.array(columns[3], dtype=np.str_),
+            size_bytes=np.array(columns[4], dtype=np.int64),
+            delivered=np.array(columns[5], dtype=np.bool_),
+            messages=len(kinds),
         )
 
     @cached_property

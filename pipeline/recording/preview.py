@@ -87,6 +87,13 @@ def _line(words: str, width: int) -> Picture:
 
     line = np.zeros((LINE_PX, width, 3), dtype=np.uint8)
     cv2.putText(
-        line, words, (4, LINE_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA
+        line,
+        words,
+        (4, LINE_PX - 7),
+        fontFace=cv2.FONT_HERSHEY_SIMPLEX,
+        fontScale=0.45,
+        color=(255, 255, 255),
+        thickness=1,
+        lineType=cv2.LINE_AA,
     )
     return line

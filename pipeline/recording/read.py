@@ -215,7 +215,15 @@ class LogFile:
             for schema, channel, m in self._reader.iter_messages(topics=topics, log_time_order=True):
                 name, data = (schema.name, schema.data) if schema else ("", b"")
                 times = self._sound_time(m.log_time), self._sound_time(m.publish_time)
-                yield Record(self.path, channel.topic, name, *times, m.sequence, m.data, data)
+                yield Record(
+                    self.path,
+                    channel.topic,
+                    name,
+                    *times,
+                    sequence=m.sequence,
+                    data=m.data,
+                    schema_data=data,
+                )
 
     def metadata(self) -> list[tuple[str, dict[str, str]]]:
         """Metadata records: name and text."""
@@ -295,7 +303,9 @@ class LogFile:
             body = data[offset + _MESSAGE.size : offset + 9 + length]
             name, schema_data = self.schema_of(channel)
             times = self._sound_time(log_time), self._sound_time(publish_time)
-            return Record(self.path, topic, name, *times, sequence, body, schema_data)
+            return Record(
+                self.path, topic, name, *times, sequence=sequence, data=body, schema_data=schema_data
+            )
 
     def _chunk(self, start: int) -> bytes:
         if start not in self._chunks:

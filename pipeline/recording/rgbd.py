@@ -152,7 +152,15 @@ class RgbdLog:
         depth = self._log.record_at(self._source.topic, self._depth_at[depth_stamp])
         image = self._decode_color(color)
         offset, found = depth_stamp - stamp, self._source.read(depth)
-        return RgbdFrame(index, stamp, image, found.depth_m, self._mask_of(stamp), offset, found.sigma_m)
+        return RgbdFrame(
+            index,
+            stamp,
+            image,
+            found.depth_m,
+            mask=self._mask_of(stamp),
+            depth_offset_ns=offset,
+            depth_sigma=found.sigma_m,
+        )
 
     def _decode_color(self, record: Record) -> NDArray[np.uint8]:
         import cv2

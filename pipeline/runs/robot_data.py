@@ -101,7 +101,7 @@ class SessionResult:
     """One robot after a session, by its own estimate.
 
     Attributes:
-        component: names of the robots that share its world frame, sorted; only itself if it met nobody.
+        component: names of the robots that share its world frame, sorted; only itself if it met no other robot.
         T_world_keyframe: [n, 4, 4], own keyframes in the map frame of component[0]; exactly those of its own
             map if it is alone.
         T_world_keyframe_of: the same of every member, itself included, as far as their agreed poses arrived.
@@ -215,10 +215,10 @@ def load(source: AgentInput) -> RobotData:
         robot,
         camera,
         poses,
-        odometry_of(keyframes),
-        registrations,
-        images,
-        gaussian_map.gaussians,
-        information,
-        gaussian_map.depth,
+        odometry=odometry_of(keyframes),
+        registrations=registrations,
+        images=images,
+        gaussians=gaussian_map.gaussians,
+        information=information,
+        depth=gaussian_map.depth,
     )

@@ -104,7 +104,7 @@ def test_an_overlap_that_cannot_be_is_the_nearest_one_and_said(tmp_path):
 
 def test_a_survey_says_what_was_reached(room, monkeypatch):
     monkeypatch.setattr(paths, "set_up", lambda *_, **__: room)
-    rows = paths.run(["room"], ["crossing"], [2], [0.3], FRAMES, 0, "auto")
+    rows = paths.run(["room"], ["crossing"], [2], [0.3], frames=FRAMES, seed=0, up="auto")
     ways = ways_of(room, "crossing", 0.3, 2)
     assert rows[0]["robots_apart_m"] == paradigms.least_apart(ways)
     eye = room.renderer(camera_of((480, 360)).scaled(*OVERLAP_IMAGE))
