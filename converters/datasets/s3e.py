@@ -24,7 +24,7 @@ from duagc.converters.layouts.derived_depth import (
     ROW_PAIRS,
     STEREO_SCALE_M,
     ImuFeed,
-    Lidar,
+    LidarSource,
     ScaleCheck,
     StereoFrames,
     decoded,
@@ -93,7 +93,7 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
         if robots and robots != len(vehicles):
             raise DuagError(f"{bag}: found {len(vehicles)} robots, expected --robots {robots}")
         folder = Path(settings.calibration) if settings.calibration else src.resolve().parent / "Calibration"
-        calibrations = {v: Calibration.read(folder / f"{v.lower()}.yaml") for v in vehicles}
+        calibrations = {v: S3eCalibration.read(folder / f"{v.lower()}.yaml") for v in vehicles}
         fixes = {v: read_fixes(src / f"{v.lower()}_gt.txt") for v in vehicles}
         known = [f.positions[0] for f in fixes.values() if f is not None]
         origin = np.floor(known[0]) if known else np.zeros(3)
@@ -146,7 +146,7 @@ def _count(log: Log, topic: str) -> int:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class S3eCalibration:
     """The cameras of one vehicle, T_right_left, and where LiDAR and IMU are in the left camera, [4, 4] each."""
 
     left: RawCamera
@@ -157,7 +157,7 @@ class Calibration:
     where: str
 
     @staticmethod
-    def read(path: Path) -> Calibration:
+    def read(path: Path) -> S3eCalibration:
         """From the file of a vehicle, in the notation of OpenCV.
 
         Raises:
@@ -206,7 +206,7 @@ class Calibration:
                 "camera in millimeters"
             )
         T_right_left = se3.from_rotation_translation(so3.project(matrix("RIGHT.R", 3, 3)), baseline_mm / 1000)
-        return Calibration(
+        return S3eCalibration(
             camera("LEFT"),
             camera("RIGHT"),
             T_right_left,
@@ -271,7 +271,7 @@ class _Vehicle:
         self,
         log: Log,
         vehicle: str,
-        calibration: Calibration,
+        calibration: S3eCalibration,
         fixes: Fixes | None,
         *,
         origin: Array,
@@ -287,7 +287,7 @@ class _Vehicle:
         self.T_camera_imu = T_camera_left @ c.T_left_imu
         self.readings = imu_readings((entry.header_ns(), entry) for entry in log.entries(self.imu))
         motion = gyro(self.readings, self.T_camera_imu)
-        self.lidar = Lidar(T_camera_left @ c.T_left_lidar, settings.range_sigma_m, motion)
+        self.lidar = LidarSource(T_camera_left @ c.T_left_lidar, settings.range_sigma_m, motion)
         self.groups = self._groups()
         self.truth = self._truth(fixes, origin)
 

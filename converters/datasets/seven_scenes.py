@@ -119,7 +119,7 @@ class Options(Config):
 
 
 @dataclass(frozen=True)
-class FrameFiles:
+class SevenScenesFrame:
     """The files of one frame; `pose` is None in a sequence without poses."""
 
     number: int
@@ -180,7 +180,9 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
 # --- which frames make which robot ----------------------------------------------------------------------------------
 
 
-def _parts(src: Path, robots: int, options: Options) -> tuple[list[tuple[str, list[FrameFiles]]], list[str]]:
+def _parts(
+    src: Path, robots: int, options: Options
+) -> tuple[list[tuple[str, list[SevenScenesFrame]]], list[str]]:
     """(name of the sequence, its frames) per robot, and warnings about frames that are missing."""
     folders = _sequence_folders(src, options)
     warnings: list[str] = []
@@ -222,7 +224,7 @@ def _sequence_folders(src: Path, options: Options) -> list[Path]:
     return [found[n] for n in sorted({int(text) for text in wanted})]
 
 
-def list_frames(folder: Path) -> tuple[list[FrameFiles], list[int]]:
+def list_frames(folder: Path) -> tuple[list[SevenScenesFrame], list[int]]:
     """Frames of a sequence in order of their number, and the numbers that are missing in between.
 
     Raises:
@@ -248,11 +250,13 @@ def list_frames(folder: Path) -> tuple[list[FrameFiles], list[int]]:
                 )
     missing = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers))
     return [
-        FrameFiles(n, files["color"][n], files["depth"][n], files["pose"].get(n)) for n in numbers
+        SevenScenesFrame(n, files["color"][n], files["depth"][n], files["pose"].get(n)) for n in numbers
     ], missing
 
 
-def _reference(src: Path, sequence: str, frames: list[FrameFiles], options: Options) -> Reference | None:
+def _reference(
+    src: Path, sequence: str, frames: list[SevenScenesFrame], options: Options
+) -> Reference | None:
     """T_world_color by frame number where other poses than the dataset's are asked for."""
     if not options.reference_poses:
         if options.reference_sequence:
@@ -271,10 +275,15 @@ def _reference(src: Path, sequence: str, frames: list[FrameFiles], options: Opti
 
 
 def _write_robot(
-    robot: RobotWriter, frames: list[FrameFiles], reference: Reference | None, options: Options, *, label: str
+    robot: RobotWriter,
+    frames: list[SevenScenesFrame],
+    reference: Reference | None,
+    options: Options,
+    *,
+    label: str,
 ) -> dict[str, Any]:
     """Write all frames of a robot; returns what the self-check measured."""
-    register = Registration(options.depth_camera(), options.color_camera(), options.baseline_m)
+    register = DepthRegistration(options.depth_camera(), options.color_camera(), options.baseline_m)
     check = ReprojectionCheck(options.color_camera(), len(frames))
     lens, correction = options.lens(), options.depth_correction()
     maps = None if lens.is_pinhole else lens.maps()
@@ -296,7 +305,7 @@ def _write_robot(
     return {**rates, **check.result(label)}
 
 
-def _true_pose(files: FrameFiles, reference: Reference | None, options: Options) -> Array | None:
+def _true_pose(files: SevenScenesFrame, reference: Reference | None, options: Options) -> Array | None:
     """T_world_camera [4, 4] of the recording's camera, None where it is not known."""
     if reference is not None:
         T_world_color = reference.get(files.number)
@@ -334,7 +343,7 @@ def _read_pose(path: Path) -> Array:
 # --- depth into the color camera -----------------------------------------------------------------------------------
 
 
-class Registration:
+class DepthRegistration:
     """Resamples depth for a camera displaced along x, with another focal length and principal point.
 
     With w = 1 / z a point of depth pixel (u, v) falls on color column A u + B - f b w and row A v + C: rows map to

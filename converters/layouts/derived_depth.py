@@ -29,7 +29,7 @@ MAX_RATIO_ERROR = 0.02
 
 
 @dataclass(frozen=True)
-class Lidar:
+class LidarSource:
     """A LiDAR next to a camera.
 
     Attributes:
@@ -113,7 +113,7 @@ def gray(image: Image) -> Image:
 class ScaleCheck:
     """Compares the depth of a stereo pair with that of a LiDAR: they need not know of each other's mistakes."""
 
-    def __init__(self, lidar: Lidar, rig: StereoRig) -> None:
+    def __init__(self, lidar: LidarSource, rig: StereoRig) -> None:
         self._lidar, self._rig = lidar, rig
         self._ratios: list[Array] = [np.zeros(0)]
 

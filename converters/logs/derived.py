@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from duagc.converters.layouts.derived_depth import (
     ROW_PAIRS,
     STEREO_SCALE_M,
-    Lidar,
+    LidarSource,
     StereoFrames,
     decoded,
     png,
@@ -93,7 +93,9 @@ class Sweeps:
     words = "lidar, drawn on reading"
     T_color_camera = np.eye(4)
 
-    def __init__(self, lidar: Lidar, camera: RosCamera, undistort: bool, where: tuple[str, str]) -> None:
+    def __init__(
+        self, lidar: LidarSource, camera: RosCamera, undistort: bool, where: tuple[str, str]
+    ) -> None:
         """where: of color and points, for the line of an error."""
         self.lidar, self.camera, self._where = lidar, camera.camera, where
         self._maps = camera.maps() if undistort else None
@@ -199,7 +201,7 @@ def sweeps_of(
             f"{log.name}: {topic} is of {frame!r}, and /tf_static does not tie it to {color[1].frame_id!r}; "
             "expected --set T_color_depth='x y z qw qx qy qz' of the LiDAR"
         )
-    lidar = Lidar(T, settings.range_sigma_m, motion)
+    lidar = LidarSource(T, settings.range_sigma_m, motion)
     where = f"{log.name}: {color[0]}", f"{log.name}: {topic}"
     return Sweeps(lidar, color[1], settings.undistort, where)
 

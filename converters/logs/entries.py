@@ -13,7 +13,7 @@ LAST_NS = 1 << 62
 
 
 @dataclass(frozen=True)
-class Topic:
+class LogTopic:
     """A topic of a log.
 
     Attributes:

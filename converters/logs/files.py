@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from duagc.converters.logs.entries import Entry, Topic
+from duagc.converters.logs.entries import Entry, LogTopic
 from duagc.pipeline.base.errors import DuagError
 
 SUFFIXES = (".bag", ".db3", ".mcap")
@@ -28,7 +28,7 @@ class LogPart(Protocol):
     """One container file, or a folder of `ros2 bag`."""
 
     path: Path
-    topics: dict[str, Topic]
+    topics: dict[str, LogTopic]
 
     def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:
         """Messages of these topics in order of recording.
@@ -46,7 +46,7 @@ class Log:
     def __init__(self, parts: Sequence[LogPart], name: str) -> None:
         """name: how messages for people call it."""
         self.parts, self.name = list(parts), name
-        self.topics: dict[str, Topic] = {}
+        self.topics: dict[str, LogTopic] = {}
         for part in self.parts:
             for topic in part.topics.values():
                 known = self.topics.get(topic.name)

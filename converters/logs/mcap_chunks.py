@@ -24,7 +24,7 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 Enough = Callable[[bytes], bool] | None
 
 
-class Message(NamedTuple):
+class LogMessage(NamedTuple):
     """A message, in the order of a log: by time, then by its place in the file."""
 
     log_ns: int
@@ -43,9 +43,9 @@ class Chunks:
         self._indexes = sorted(indexes, key=lambda i: (i.message_start_time, i.chunk_start_offset))
         self._compared: set[int] = set()
 
-    def messages(self, wanted: Mapping[int, Enough]) -> Iterator[Message]:
+    def messages(self, wanted: Mapping[int, Enough]) -> Iterator[LogMessage]:
         """The messages of some channels."""
-        waiting: list[Message] = []
+        waiting: list[LogMessage] = []
         for index in self._indexes:
             if wanted.keys().isdisjoint(index.message_index_offsets):
                 continue
@@ -57,7 +57,7 @@ class Chunks:
         while waiting:
             yield heapq.heappop(waiting)
 
-    def _of_chunk(self, start: int, index: ChunkIndex, wanted: Mapping[int, Enough]) -> Iterator[Message]:
+    def _of_chunk(self, start: int, index: ChunkIndex, wanted: Mapping[int, Enough]) -> Iterator[LogMessage]:
         self._stream.seek(start + _RECORD.size)
         chunk = Chunk.read(ReadDataStream(self._stream))
         here = [wanted[number] for number in index.message_index_offsets if number in wanted]
@@ -80,7 +80,7 @@ class Chunks:
                 if number in wanted:
                     data = _body(source, length - read, wanted[number])
                     read += len(data)
-                    yield Message(log_ns, start, at, number, publish_ns, data)
+                    yield LogMessage(log_ns, start, at, number, publish_ns, data)
             if end < size:
                 source.seek(length - read, io.SEEK_CUR)
             at = end

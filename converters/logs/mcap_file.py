@@ -15,7 +15,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from duagc import schemas
 from duagc.converters.logs import foxglove, ros_json
-from duagc.converters.logs.entries import Entry, Topic, ros_type, sound_time, stamp_ns
+from duagc.converters.logs.entries import Entry, LogTopic, ros_type, sound_time, stamp_ns
 from duagc.converters.logs.mcap_chunks import Chunks
 from duagc.converters.logs.rosbag_file import (
     LARGEST_CHUNK,
@@ -37,7 +37,7 @@ class McapFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.topics: dict[str, Topic] = {}
+        self.topics: dict[str, LogTopic] = {}
         self._decoders: dict[int, _Decoder] = {}
         check_file(path, WANTED)
         with reading(path, WANTED):
@@ -106,7 +106,7 @@ class McapFile:
             )
         if count or not known:
             total = count + (known.count if known else 0)
-            self.topics[channel.topic] = Topic(channel.topic, kind, name, encoding, total)
+            self.topics[channel.topic] = LogTopic(channel.topic, kind, name, encoding, total)
 
     def _records(self) -> Iterator[Any]:
         """Schemas, channels and messages in the order of the file."""

@@ -11,7 +11,7 @@ from typing import Any
 
 from duagc.converters.logs import foxglove
 from duagc.converters.logs.bag_messages import messages
-from duagc.converters.logs.entries import NANOSECONDS, Entry, Topic, sound_time, stamp_ns
+from duagc.converters.logs.entries import NANOSECONDS, Entry, LogTopic, sound_time, stamp_ns
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file
 
@@ -55,8 +55,8 @@ class RosBag:
             self.close()
             raise
 
-    def _topics(self) -> dict[str, Topic]:
-        topics: dict[str, Topic] = {}
+    def _topics(self) -> dict[str, LogTopic]:
+        topics: dict[str, LogTopic] = {}
         for c in self._reader.connections:
             connection = c.topic, c.msgtype, c.msgcount  # of a bag of ROS 2 they stand in its metadata
             if not all(map(isinstance, connection, (str, str, int))):
@@ -70,7 +70,7 @@ class RosBag:
                 )
             count = c.msgcount + (before.count if before is not None else 0)
             kind = foxglove.ROS_TYPES.get(foxglove.plain_name(c.msgtype), c.msgtype)
-            topics[c.topic] = Topic(c.topic, kind, c.msgtype, self._encoding, count)
+            topics[c.topic] = LogTopic(c.topic, kind, c.msgtype, self._encoding, count)
         return topics
 
     def entries(self, topics: Sequence[str], heads: Sequence[str] = ()) -> Iterator[Entry]:

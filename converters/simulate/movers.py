@@ -12,7 +12,7 @@ from duagc.converters.simulate.render import meshes, triangles
 from duagc.converters.simulate.render.raycast import Caster, MeshRenderer
 from duagc.converters.simulate.scenes import textures as tex
 from duagc.converters.simulate.scenes.scene import Scene
-from duagc.converters.simulate.trajectories.walks import FreeSpace, route
+from duagc.converters.simulate.trajectories.walks import WalkableSpace, route
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.geometry.camera import PinholeCamera
 
@@ -51,7 +51,7 @@ class Mover:
 
 
 def walk(
-    count: int, space: FreeSpace, caster: Caster, trajectories: list[Array], *, seed: int, cache: Path
+    count: int, space: WalkableSpace, caster: Caster, trajectories: list[Array], *, seed: int, cache: Path
 ) -> list[Mover]:
     """Figures that walk through the free space, clear of the robots and in their view as long as can be found.
 

@@ -104,7 +104,7 @@ class SimulatedRoom:
     def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
         return loops.plan(self.scene, robots, frames, overlap, camera=camera)
 
-    def free_space(self) -> walks.FreeSpace:
+    def free_space(self) -> walks.WalkableSpace:
         def closed(places: Array) -> NDArray[np.bool_]:
             return np.ones(len(places), dtype=np.bool_)
 
@@ -145,7 +145,7 @@ class SimulatedMeshes:
         self.step_m, self.depth_scale_m, self.sky = settings.step_m, settings.depth_scale_m, settings.sky
         self.scene = meshes.load(folder)
         self.caster = Caster(self.scene)
-        self._space: walks.FreeSpace | None = None
+        self._space: walks.WalkableSpace | None = None
 
     def store(self, folder: Path) -> MeshesOnDisk:
         """Everything is on disk already."""
@@ -160,7 +160,7 @@ class SimulatedMeshes:
     def wander(self, robots: int, frames: int, overlap: float, camera: PinholeCamera) -> list[Array]:
         return walks.plan(self, robots, frames, overlap, camera=camera, seed=self.seed)
 
-    def free_space(self) -> walks.FreeSpace:
+    def free_space(self) -> walks.WalkableSpace:
         if self._space is None:
             self._space = walks.free_space(self.caster, self.sky)
         return self._space

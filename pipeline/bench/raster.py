@@ -84,7 +84,7 @@ TITLES = {
 
 
 @dataclass(frozen=True)
-class Plan:
+class RasterPlan:
     """What to measure: every scene with every instruction set on every number of threads.
 
     portable_everywhere: else the portable build, slow on x86 where it must imitate fused multiply-add, runs one round
@@ -122,10 +122,10 @@ class Plan:
         return min(TORCH_ROUNDS, self.rounds) if self.torch_too and width * height * n <= TORCH_LARGEST else 0
 
 
-def run(plan: Plan) -> dict[str, Any]:
+def run(plan: RasterPlan) -> dict[str, Any]:
     """Times, work and peaks as {"machine": {...}, "rows": [...]}, ready for JSON; a row per scene and candidate."""
     peaks = Peaks(plan.isas, plan.threads)
-    measured: list[Scene] = []
+    measured: list[RasterScene] = []
     rounds = _rounds(plan, peaks, measured)
     total = sum(_ticks(plan, scene) * (plan.rounds + 1) for scene in plan.scenes())
     for _ in track(rounds, "timing the rasterizer", total=total):
@@ -134,7 +134,7 @@ def run(plan: Plan) -> dict[str, Any]:
     return {"machine": peaks.as_dict(), "rows": rows}
 
 
-def _ticks(plan: Plan, scene: tuple[Size, int]) -> int:
+def _ticks(plan: RasterPlan, scene: tuple[Size, int]) -> int:
     """Roughly how long a round of a scene takes, in steps of the progress bar."""
     (width, height), n = scene
     pixels = width * height
@@ -142,10 +142,10 @@ def _ticks(plan: Plan, scene: tuple[Size, int]) -> int:
     return round(1 + pixels / 25_000 + n / 10_000 + torch_share * (30 + pixels / 1000))
 
 
-def _rounds(plan: Plan, peaks: Peaks, measured: list[Scene]) -> Iterator[None]:
+def _rounds(plan: RasterPlan, peaks: Peaks, measured: list[RasterScene]) -> Iterator[None]:
     """Measure scene by scene, round by round; yields as often as a round's share of the whole."""
     for scene in plan.scenes():
-        measured.append(Scene(plan, *scene))
+        measured.append(RasterScene(plan, *scene))
         for _ in measured[-1].rounds(peaks):
             yield from repeat(None, _ticks(plan, scene))
 
@@ -192,10 +192,10 @@ def draws(name: str) -> bool:
     return name in ("forward", "view_gradients")
 
 
-class Scene:
+class RasterScene:
     """One image size and number of Gaussians, its candidates and their times."""
 
-    def __init__(self, plan: Plan, size: Size, gaussians: int) -> None:
+    def __init__(self, plan: RasterPlan, size: Size, gaussians: int) -> None:
         self.plan, self.size, self.gaussians = plan, size, gaussians
         candidates = plan.candidates((size, gaussians))
         self.times_ms: dict[tuple[str, int], dict[str, list[float]]] = {c: {} for c in candidates}
@@ -204,8 +204,8 @@ class Scene:
 
     def rounds(self, peaks: Peaks) -> Iterator[None]:
         """Time everything once per round, after one that only warms up; yields after each."""
-        view = View(self.size, self.gaussians)
-        self.work = Work(self.plan.isas[0], view)
+        view = RasterView(self.size, self.gaussians)
+        self.work = RasterWork(self.plan.isas[0], view)
         rasterizers = {candidate: Rasterizer(*candidate) for candidate in self.times_ms}
         peaks.measure()
         for k in range(self.plan.rounds + 1):
@@ -258,7 +258,7 @@ class Scene:
         return row
 
 
-class View:
+class RasterView:
     """The room in one camera, with what the passes over it take."""
 
     def __init__(self, size: Size, gaussians: int) -> None:
@@ -310,10 +310,10 @@ class View:
         }[name]
 
 
-class Work:
+class RasterWork:
     """What the passes over one view have to do, counted; the same on every instruction set and number of threads."""
 
-    def __init__(self, isa: str, view: View) -> None:
+    def __init__(self, isa: str, view: RasterView) -> None:
         self.moved_bytes: dict[str, float] = {}
         for name in FLOPS:
             rasterizer = Rasterizer(isa)  # a new one, whose memory shows what the pass needs
@@ -348,7 +348,7 @@ def _typical(milliseconds: list[float], threads: int) -> float:
     return float(np.percentile(milliseconds, 25)) if threads > 1 else statistics.median(milliseconds)
 
 
-def _time_torch(view: View, threads: int) -> dict[str, float]:
+def _time_torch(view: RasterView, threads: int) -> dict[str, float]:
     """Milliseconds of one forward and one backward."""
     import torch
 

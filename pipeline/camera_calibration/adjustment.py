@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.camera_calibration.rig import NAMES, Rig
+from duagc.pipeline.camera_calibration.rig import NAMES, CameraRig
 from duagc.pipeline.camera_calibration.views import Views, look_up, normals_at
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3, so3
@@ -62,12 +62,12 @@ class Adjusted:
         quality: agreement of every part.
     """
 
-    rig: Rig
+    rig: CameraRig
     covariance: Array | None
     quality: list[Quality]
 
 
-def adjust(parts: Sequence[Views], rig: Rig, calibrate: bool) -> Adjusted:
+def adjust(parts: Sequence[Views], rig: CameraRig, calibrate: bool) -> Adjusted:
     """Adjust poses and landmarks (in place), and the cameras too if asked, until it has converged.
 
     Args:
@@ -75,7 +75,7 @@ def adjust(parts: Sequence[Views], rig: Rig, calibrate: bool) -> Adjusted:
         rig: cameras to begin with.
         calibrate: whether they are adjusted.
     """
-    start, pairs = Rig.of(rig.camera), [overlapping(part) for part in parts]
+    start, pairs = CameraRig.of(rig.camera), [overlapping(part) for part in parts]
     ends = np.cumsum([0] + [6 * len(part.T_map_camera) for part in parts])
     size = len(NAMES) if calibrate else 0
     scale = rig.camera.width / 640
@@ -120,7 +120,7 @@ def overlapping(views: Views) -> NDArray[np.int64]:
     Args:
         views: of one part.
     """
-    n, rig = len(views.T_map_camera), Rig.of(views.camera)
+    n, rig = len(views.T_map_camera), CameraRig.of(views.camera)
     share = np.zeros((n, n))
     for a in range(n):
         others = np.stack([np.full(n - 1, a), np.delete(np.arange(n), a)], axis=-1)
@@ -138,7 +138,7 @@ def overlapping(views: Views) -> NDArray[np.int64]:
     return np.concatenate([pairs, pairs[:, ::-1]])
 
 
-def quality(views: Views, pairs: NDArray[np.int64], rig: Rig) -> Quality:
+def quality(views: Views, pairs: NDArray[np.int64], rig: CameraRig) -> Quality:
     """How well the views agree as they are.
 
     Args:
@@ -168,7 +168,7 @@ class _Planes:
     by_depth: Array  # [p, s, 6]
 
 
-def _planes(views: Views, pairs: NDArray[np.int64], rig: Rig) -> _Planes:
+def _planes(views: Views, pairs: NDArray[np.int64], rig: CameraRig) -> _Planes:
     c = views.camera
     first, second = pairs.T
     column, row = np.moveaxis(views.samples[first], -1, 0)
@@ -213,7 +213,7 @@ class _Features:
     by_rig: Array  # [k, 3, 17]
 
 
-def _features(views: Views, rig: Rig) -> _Features:
+def _features(views: Views, rig: CameraRig) -> _Features:
     c, view = views.camera, views.view
     T = se3.inverse(views.T_map_camera[view])
     q = se3.transform(T, views.points_map[views.landmark][:, None])[:, 0]
@@ -273,7 +273,7 @@ class _Step:
         return np.clip(-(self._V_inverse @ right[..., None])[..., 0], -0.1, 0.1)
 
 
-def _linearized(views: Views, pairs: NDArray[np.int64], rig: Rig, calibrate: bool) -> _Step:
+def _linearized(views: Views, pairs: NDArray[np.int64], rig: CameraRig, calibrate: bool) -> _Step:
     from scipy import sparse
 
     count, cameras = 6 * len(views.T_map_camera), len(NAMES) if calibrate else 0
@@ -312,7 +312,7 @@ def _linearized(views: Views, pairs: NDArray[np.int64], rig: Rig, calibrate: boo
     return _Step(H + H_planes, g + g_planes, V_inverse, force.reshape(-1, 3), W.T.tocsr())
 
 
-def _of_planes(views: Views, pairs: NDArray[np.int64], rig: Rig, cameras: int) -> tuple[Array, Array]:
+def _of_planes(views: Views, pairs: NDArray[np.int64], rig: CameraRig, cameras: int) -> tuple[Array, Array]:
     """Normal equations of the depth images over poses and the last `cameras` numbers: H [n, n] and g [n]."""
     count = 6 * len(views.T_map_camera)
     H, g = np.zeros((count + cameras, count + cameras)), np.zeros(count + cameras)

@@ -18,7 +18,7 @@ import numpy as np
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.camera_calibration.adjustment import PRIOR, Adjusted, Quality, adjust
-from duagc.pipeline.camera_calibration.rig import NAMES, Rig
+from duagc.pipeline.camera_calibration.rig import NAMES, CameraRig
 from duagc.pipeline.camera_calibration.views import Views, load_views, track_log
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.recording import Recording
@@ -43,9 +43,9 @@ class Calibration:
         recording: description of the recording.
     """
 
-    rig: Rig
+    rig: CameraRig
     sigma: dict[str, float]
-    halves: list[Rig]
+    halves: list[CameraRig]
     before: list[Quality]
     after: list[Quality]
     names: list[str]
@@ -85,11 +85,11 @@ def calibrate(folder: Path, config: FrontendConfig, robots: Sequence[str], views
         if found < MIN_LANDMARKS:
             names = " and ".join(part.name for part in half)
             raise DuagError(f"{folder}: {found} features were followed in {names}, expected {MIN_LANDMARKS}")
-    return _calibrate(folder, halves, Rig.of(cameras.pop()), source.description)
+    return _calibrate(folder, halves, CameraRig.of(cameras.pop()), source.description)
 
 
 def _calibrate(
-    folder: Path, halves: list[list[Views]], start: Rig, description: dict[str, Any]
+    folder: Path, halves: list[list[Views]], start: CameraRig, description: dict[str, Any]
 ) -> Calibration:
     done = list(track(_adjustments(halves, start), "adjust", total=7))
     recorded, alone, by_other, both = done[:2], done[2:4], done[4:6], done[6]
@@ -124,10 +124,10 @@ def _calibrate(
     return found
 
 
-def _adjustments(halves: list[list[Views]], start: Rig) -> Iterator[Adjusted]:
+def _adjustments(halves: list[list[Views]], start: CameraRig) -> Iterator[Adjusted]:
     """Each half as recorded, each calibrated by itself, each as the other calibrates it, and all of it calibrated."""
 
-    def adjusted(parts: Sequence[Views], rig: Rig, calibrate: bool) -> Adjusted:
+    def adjusted(parts: Sequence[Views], rig: CameraRig, calibrate: bool) -> Adjusted:
         return adjust([copy(part) for part in parts], rig, calibrate)
 
     for half in halves:

@@ -23,7 +23,7 @@ NAMES = (*LENS, *ROTATION, "delay_s", *DEPTH)
 
 
 @dataclass(frozen=True)
-class Rig:
+class CameraRig:
     """Both cameras.
 
     Attributes:
@@ -41,20 +41,20 @@ class Rig:
     depth_error: Array
 
     @staticmethod
-    def of(camera: PinholeCamera) -> Rig:
+    def of(camera: PinholeCamera) -> CameraRig:
         """As in the recording: a pinhole, not turned, at the same time, exact depth.
 
         Args:
             camera: of the recording.
         """
         lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, 0, 0, 0])
-        return Rig(camera, lens, np.eye(3), 0.0, np.zeros(6))
+        return CameraRig(camera, lens, np.eye(3), 0.0, np.zeros(6))
 
     def values(self) -> Array:
         """The numbers of `NAMES`; the rotation as a rotation vector."""
         return np.concatenate([self.lens, so3.log(self.R_color_depth), [self.delay_s], self.depth_error])
 
-    def moved(self, step: Array) -> Rig:
+    def moved(self, step: Array) -> CameraRig:
         """With a step of all numbers added; that of the rotation from the left.
 
         Args:

@@ -224,7 +224,7 @@ def check_range(
 
 
 @dataclass(frozen=True)
-class Edges:
+class DepthEdges:
     """Mean gray gradient under the edges of depth, relative to that of the images.
 
     by_frames: [2 * SHIFTS + 1] with the depth of -SHIFTS ... SHIFTS frames later. by_pixels: [2 * SHIFT_PX + 1] with
@@ -236,7 +236,7 @@ class Edges:
     windows: int
 
 
-def edges_of(log: RgbdLog) -> Edges | None:
+def edges_of(log: RgbdLog) -> DepthEdges | None:
     """How well edges of depth fall on edges of gray; None if the log is short or has no edges."""
     frames = len(log)
     if frames < 2 * SHIFTS + 2:
@@ -257,7 +257,7 @@ def edges_of(log: RgbdLog) -> Edges | None:
         by_pixels.append(moved)
     if not by_frames or not by_pixels:
         return None
-    return Edges(np.mean(by_frames, axis=0), np.mean(by_pixels, axis=0), len(by_frames))
+    return DepthEdges(np.mean(by_frames, axis=0), np.mean(by_pixels, axis=0), len(by_frames))
 
 
 def _gradient(color: NDArray[np.uint8]) -> Image:
@@ -282,7 +282,7 @@ def _depth_edges(depth_m: Image) -> NDArray[np.bool_]:
     return out
 
 
-def check_edges(robot: str, edges: Edges | None) -> Iterator[Finding]:
+def check_edges(robot: str, edges: DepthEdges | None) -> Iterator[Finding]:
     """Findings about depth that is not of the time, or not of the place, of its color."""
     if edges is None or edges.windows < WINDOWS // 2:
         return

@@ -42,7 +42,7 @@ def bench_raster(
             raise typer.BadParameter(
                 f"{name!r} is not one of {', '.join(available_isas())}", param_hint="--isa"
             )
-    plan = raster.Plan(
+    plan = raster.RasterPlan(
         sizes=tuple(_sizes(sizes)),
         gaussians=tuple(_counts("--gaussians", "60k,300k,1M" if full else gaussians)),
         threads=tuple(_counts("--threads", threads)),
@@ -93,7 +93,7 @@ def bench_consensus(
         for word in words:
             if word not in known:
                 raise typer.BadParameter(f"{word!r} is not one of {', '.join(known)}", param_hint=option)
-    plan = consensus_modes.Plan(
+    plan = consensus_modes.ConsensusPlan(
         robots=tuple(_counts("--robots", robots)),
         topologies=tuple(topology.split(",")),
         losses=tuple(_numbers("--loss", loss, 0.0, 0.99)),

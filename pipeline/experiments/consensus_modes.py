@@ -52,7 +52,7 @@ _NEAR_SIGMA, _AT_SIGMA = 0.05, 1e-6
 
 
 @dataclass(frozen=True)
-class Plan:
+class ConsensusPlan:
     """What to measure; every combination."""
 
     robots: tuple[int, ...] = (2, 4, 8)
@@ -93,7 +93,7 @@ class Team:
         self.roots = np.sqrt(total_weights(weights, rows, tracks).diagonal())
 
     @staticmethod
-    def made(case: dict[str, Any], plan: Plan) -> Team:
+    def made(case: dict[str, Any], plan: ConsensusPlan) -> Team:
         names = [f"robot_{k}" for k in range(case["robots"])]
         link = LinkConfig(topology=case["topology"])
         theta, weights = {}, {}
@@ -145,12 +145,12 @@ class _Cost:
             self.rounds_at = self.rounds
 
 
-def run(plan: Plan) -> dict[str, Any]:
-    """Measure made teams; see `Plan`. One row per case: times are CPU time of all robots together."""
+def run(plan: ConsensusPlan) -> dict[str, Any]:
+    """Measure made teams; see `ConsensusPlan`. One row per case: times are CPU time of all robots together."""
     return _measured(plan, ((case, Team.made(case, plan)) for case in plan.cases()), len(plan.cases()))
 
 
-def run_on(team: Team, topology: str, plan: Plan) -> dict[str, Any]:
+def run_on(team: Team, topology: str, plan: ConsensusPlan) -> dict[str, Any]:
     """The same on evidence that is there, over links of a topology, for every loss and mode of the plan."""
     weights = np.stack([w.diagonal() for w in team.weights.values()])
     known = weights[weights > 0]
@@ -166,7 +166,9 @@ def run_on(team: Team, topology: str, plan: Plan) -> dict[str, Any]:
     return _measured(replace(plan, tracks=len(team.best)), teams, len(cases))
 
 
-def _measured(plan: Plan, cases: Iterator[tuple[dict[str, Any], Team]], count: int) -> dict[str, Any]:
+def _measured(
+    plan: ConsensusPlan, cases: Iterator[tuple[dict[str, Any], Team]], count: int
+) -> dict[str, Any]:
     rows = []
     for case, team in progress.track(cases, "consensus of Gaussians", count):
         model = LinkModel(LinkConfig(topology=case["topology"], loss_probability=case["loss"]), plan.seed)
@@ -191,7 +193,7 @@ def _measured(plan: Plan, cases: Iterator[tuple[dict[str, Any], Team]], count: i
     return {"plan": {k: list(v) if isinstance(v, tuple) else v for k, v in vars(plan).items()}, "rows": rows}
 
 
-def _rounds(team: Team, model: LinkModel, case: dict[str, Any], plan: Plan) -> _Cost:
+def _rounds(team: Team, model: LinkModel, case: dict[str, Any], plan: ConsensusPlan) -> _Cost:
     """Rounds of `admm` or `paper` until the optimum, or until nothing moves any more."""
     config = GaussianConsensusConfig(mode=case["mode"], wire="float64")
     shares = Shares.of({n: np.arange(plan.tracks) for n in team.names}, team.linked)
@@ -231,7 +233,7 @@ def _rounds(team: Team, model: LinkModel, case: dict[str, Any], plan: Plan) -> _
     return cost
 
 
-def _evidence(team: Team, model: LinkModel, case: dict[str, Any], plan: Plan) -> _Cost:
+def _evidence(team: Team, model: LinkModel, case: dict[str, Any], plan: ConsensusPlan) -> _Cost:
     """Every robot's evidence goes once along the shortest paths to all robots; each sums up what it has."""
     kind = EVIDENCE_MODES[case["mode"]]
     index = {name: k for k, name in enumerate(team.names)}

@@ -271,7 +271,7 @@ def resized(shots: Sequence[Shot], camera: PinholeCamera) -> list[Shot]:
 
 
 @dataclass(frozen=True)
-class Row:
+class DisturbanceRow:
     """A tracked frame of a disturbed run.
 
     Attributes:
@@ -351,7 +351,7 @@ class Undisturbed:
         disturbance: Disturbance,
         frames: int = 45,
         config: FrontendConfig | None = None,
-    ) -> list[Row]:
+    ) -> list[DisturbanceRow]:
         """Track on from a frame with a disturbance that begins there.
 
         Args:
@@ -365,5 +365,5 @@ class Undisturbed:
         for shot in disturbance(self.shots[start : start + frames], np.random.default_rng(start)):
             frame, pose = track(tracker, shot)
             moved_m, turned_rad = se3.distance(self.poses[shot.index], pose)
-            rows.append(Row(shot, frame, pose, float(moved_m), float(turned_rad)))
+            rows.append(DisturbanceRow(shot, frame, pose, float(moved_m), float(turned_rad)))
         return rows

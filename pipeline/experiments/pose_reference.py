@@ -39,7 +39,7 @@ NOTHING = Features(np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32))
 
 
 @dataclass(frozen=True)
-class View:
+class ReferenceView:
     """A keyframe as `bundle.optimize` wants it; no features, because it looks for no loops."""
 
     reference: Reference
@@ -143,7 +143,7 @@ class _Team:
         for k in range(len(self.where)):
             pyramid = self.images(k, len(config.tracking.strides))
             reference = Reference.from_pyramid(pyramid, config.tracking.strides)
-            self.views.append(View(reference, pyramid.levels[-1]))
+            self.views.append(ReferenceView(reference, pyramid.levels[-1]))
         first, count = {}, 0
         for robot in robots:
             first[robot.run.robot] = count

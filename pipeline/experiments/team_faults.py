@@ -39,7 +39,7 @@ MAP_OFFSET_M = 10.0
 
 
 @dataclass(frozen=True)
-class Session:
+class FaultySession:
     """One exchange: what it is called, with which data, settings and seed; names by the run's own names."""
 
     name: str
@@ -65,7 +65,7 @@ class TeamBench:
                 )
             self.truth[robot] = true
 
-    def measure(self, session: Session) -> dict[str, Any]:
+    def measure(self, session: FaultySession) -> dict[str, Any]:
         """Let the team meet and measure the result."""
         with tempfile.TemporaryDirectory(prefix="duagc-bench-") as folder:
             exchange = Path(folder) / "exchange.mcap"
@@ -115,19 +115,19 @@ class TeamBench:
 
     # --- what is tried
 
-    def session(self, name: str, seed: int | None = None, **changes: Any) -> Session:
+    def session(self, name: str, seed: int | None = None, **changes: Any) -> FaultySession:
         """The run's own exchange with some settings changed."""
         config = self.config.model_copy(update=changes)
         same = {d.robot: d.robot for d in self.data}
-        return Session(name, self.data, config, self.seed if seed is None else seed, same)
+        return FaultySession(name, self.data, config, self.seed if seed is None else seed, same)
 
-    def frames(self, seeds: int) -> Iterator[Session]:
+    def frames(self, seeds: int) -> Iterator[FaultySession]:
         """Every map in a frame of its own, drawn anew."""
         for seed in range(seeds):
             base = self.session("frames")
             yield replace(base, data=[moved(d, seed) for d in self.data])
 
-    def names(self, seeds: int) -> Iterator[Session]:
+    def names(self, seeds: int) -> Iterator[FaultySession]:
         """The robots under each other's names."""
         names = [d.robot for d in self.data]
         for order in itertools.islice(itertools.permutations(names), 1, MOST_ORDERS):
@@ -135,24 +135,24 @@ class TeamBench:
             base = self.session("names")
             yield replace(base, data=[renamed(d, new[d.robot]) for d in self.data], names=new)
 
-    def closures(self, seeds: int) -> Iterator[Session]:
+    def closures(self, seeds: int) -> Iterator[FaultySession]:
         """False closures among the true ones."""
         faults = self.config.injection.model_copy(update={"false_closures": FALSE_CLOSURES})
         for seed in range(seeds):
             yield self.session("closures", seed, injection=faults)
 
-    def loss(self, seeds: int) -> Iterator[Session]:
+    def loss(self, seeds: int) -> Iterator[FaultySession]:
         """Packets lost independently; as many rounds as it takes."""
         for loss in LOSSES:
             for seed in range(seeds):
                 link = self.config.link.model_copy(update={"loss_probability": loss})
                 yield self.session(f"loss {loss:g}", seed, link=link, max_rounds=20_000)
 
-    def silence(self, seeds: int) -> Iterator[Session]:
+    def silence(self, seeds: int) -> Iterator[FaultySession]:
         """Everything is lost."""
         yield self.session("silence", link=self.config.link.model_copy(update={"loss_probability": 1.0}))
 
-    def solver(self, seeds: int) -> Iterator[Session]:
+    def solver(self, seeds: int) -> Iterator[FaultySession]:
         """The other solver of the poses."""
         other = "elimination" if self.config.solver == "admm" else "admm"
         yield self.session(other, solver=other)
@@ -175,7 +175,9 @@ def run(
     """
     bench = TeamBench(run_folder, recording, config, seed)
     base = bench.measure(bench.session("base"))
-    makers: dict[str, Callable[[int], Iterator[Session]]] = {name: getattr(bench, name) for name in CHECKS}
+    makers: dict[str, Callable[[int], Iterator[FaultySession]]] = {
+        name: getattr(bench, name) for name in CHECKS
+    }
     sessions = [session for check in checks for session in makers[check](seeds)]
     rows = [bench.measure(session) for session in track(iter(sessions), "bench team", total=len(sessions))]
     worst: dict[str, Any] = {}

@@ -14,7 +14,7 @@ from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.evaluation import groundtruth
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.experiments import disturbances as d
-from duagc.pipeline.experiments.disturbances import Row, Shot, Undisturbed
+from duagc.pipeline.experiments.disturbances import DisturbanceRow, Shot, Undisturbed
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
@@ -51,7 +51,7 @@ def main() -> None:
         )
 
 
-def _summary(trials: Sequence[Sequence[Row]]) -> str:
+def _summary(trials: Sequence[Sequence[DisturbanceRow]]) -> str:
     rows = [row for trial in trials for row in trial]
     disturbed = [row for row in rows if row.shot.disturbed]
     worst_m = max((row.moved_m for row in rows if row.good and not row.shot.foreign), default=0.0)
@@ -73,7 +73,10 @@ def _true_poses(log: Path, shots: Sequence[Shot]) -> dict[int, np.ndarray]:
 
 
 def _errors_to_truth(
-    run: Undisturbed, truth: dict[int, np.ndarray], starts: Sequence[int], trials: Sequence[Sequence[Row]]
+    run: Undisturbed,
+    truth: dict[int, np.ndarray],
+    starts: Sequence[int],
+    trials: Sequence[Sequence[DisturbanceRow]],
 ) -> str:
     """Largest error of good poses, mm, and that of the undisturbed run in the same frames.
 

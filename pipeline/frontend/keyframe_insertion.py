@@ -6,7 +6,7 @@ import numpy as np
 
 from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
-from duagc.pipeline.frontend.tracking_state import Candidate, CurrentFrame, TrackingState
+from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration import Reference, register
@@ -34,7 +34,7 @@ def insert_first_keyframe(state: TrackingState, frame: CurrentFrame, reference: 
     )
 
 
-def insert_keyframe(state: TrackingState, frame: CurrentFrame, tracked: Candidate) -> int:
+def insert_keyframe(state: TrackingState, frame: CurrentFrame, tracked: PoseCandidate) -> int:
     """Make a tracked frame the next keyframe, and register it to earlier ones.
 
     Args:

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from duagc.pipeline.frontend.failure import Reason, free_space_violations
-from duagc.pipeline.frontend.tracking_state import Candidate, CurrentFrame, TrackingState
+from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration.geometric_verification import features_agree
 
@@ -21,7 +21,9 @@ from duagc.pipeline.registration.geometric_verification import features_agree
 class PoseCheck(Protocol):
     """One test of a candidate pose."""
 
-    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
         """The candidate, maybe corrected, or why it is rejected.
 
         Args:
@@ -33,8 +35,8 @@ class PoseCheck(Protocol):
 
 
 def verify(
-    checks: Sequence[PoseCheck], state: TrackingState, frame: CurrentFrame, candidate: Candidate
-) -> Candidate | Reason:
+    checks: Sequence[PoseCheck], state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+) -> PoseCandidate | Reason:
     """The candidate after all checks, or the first reason against it.
 
     Args:
@@ -56,7 +58,9 @@ def verify(
 class WellConstrained:
     """What an object in front of the camera leaves visible must still determine where the camera is."""
 
-    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
         # along weak directions a prior knows the pose, or the outcome would not be OK
         covariance = np.linalg.pinv(candidate.result.information, rcond=1e-12, hermitian=True)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
@@ -74,7 +78,9 @@ class MatchesPrediction:
     which half a keyframe is seen, are 11 cm off there.
     """
 
-    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
         tracking, result = state.config.tracking, candidate.result
         predicted = state.predict(frame.stamp_ns).T_keyframe_camera
         moved_m, turned_rad = se3.distance(predicted, result.T_reference_target)
@@ -94,7 +100,9 @@ class DepthColorConsistency:
     used, unless by it the camera moved less, or something is in front of the camera.
     """
 
-    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
         limits = state.config.tracking.failure
         largest = limits.color_check_gray_of_usual * state.usual_gray_rms
         if state.last_good is None or not state.gray_rms or candidate.result.rms_gray <= largest:
@@ -111,13 +119,15 @@ class DepthColorConsistency:
         held_back = state.last_good.translation_m(T) < state.last_good.translation_m(T_color_only)
         if state.lost or occluded or not held_back or not state.looks_as_usual(color_only):
             return Reason.CONTRADICTION
-        return Candidate(state.keyframe_index, color_only, Reason.CONTRADICTION)
+        return PoseCandidate(state.keyframe_index, color_only, Reason.CONTRADICTION)
 
 
 class SharesEnough:
     """The frame and its keyframe must show enough of the same surfaces and little that contradicts them."""
 
-    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
         limits, result = state.config.tracking.relocalization, candidate.result
         shares = result.overlap >= limits.min_overlap and result.conflict <= limits.max_conflict
         return candidate if shares else Reason.OBSTRUCTED
@@ -126,14 +136,18 @@ class SharesEnough:
 class LooksAlike:
     """Gray values must fit the keyframe: rooms built alike agree in shape, not in their pictures."""
 
-    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
         return candidate if candidate.result.rms_gray <= state.largest_gray_rms else Reason.OBSTRUCTED
 
 
 class RespectsFreeSpace:
     """Little of the frame may be in space that the keyframe saw to be free."""
 
-    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
         limits, keyframe = state.config.tracking.failure, state.keyframes[candidate.keyframe_index]
         T = candidate.result.T_reference_target
         violations, visible = free_space_violations(frame.pyramid.levels[-1], keyframe.coarsest, T, limits)
@@ -143,7 +157,9 @@ class RespectsFreeSpace:
 class WithinReach:
     """A camera of finite speed can have come no farther since it was last tracked."""
 
-    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
         limits = state.config.tracking.failure
         elapsed_s = max(state.elapsed_s(frame.stamp_ns), 0.0)
         moved_m, _ = _from_prediction(state, frame, candidate)
@@ -157,7 +173,9 @@ class FeaturesConfirm:
     predicted passes.
     """
 
-    def judge(self, state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> Candidate | Reason:
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
         limits, relocalization = state.config.tracking.failure, state.config.tracking.relocalization
         features = state.keyframes[candidate.keyframe_index].features
         if len(features) >= limits.min_features_of_inliers * relocalization.min_inliers:
@@ -172,7 +190,9 @@ class FeaturesConfirm:
         return candidate if expected and not state.is_long_lost(frame.stamp_ns) else Reason.OBSTRUCTED
 
 
-def _from_prediction(state: TrackingState, frame: CurrentFrame, candidate: Candidate) -> tuple[float, float]:
+def _from_prediction(
+    state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+) -> tuple[float, float]:
     """Distance in the map, meters, and angle, radians, of a candidate from the prediction."""
     keyframe, T = state.keyframes[candidate.keyframe_index], candidate.result.T_reference_target
     T_map_expected = state.keyframe.T_map_keyframe @ state.predict(frame.stamp_ns).T_keyframe_camera

@@ -17,7 +17,7 @@ from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
 from duagc.pipeline.frontend.pose_checks import PLAUSIBLE, verify
 from duagc.pipeline.frontend.stable_registration import register_until_stable
-from duagc.pipeline.frontend.tracking_state import Candidate, CurrentFrame, TrackingState
+from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration.features import Features, matches
 from duagc.pipeline.registration.geometric_verification import motion_from_features
@@ -59,7 +59,7 @@ def place_candidates(
 class _Unconfirmed:
     """A place where a lost camera may be, as of a time, and how many later frames agreed."""
 
-    candidate: Candidate
+    candidate: PoseCandidate
     stamp_ns: int
     agreed: int
 
@@ -75,8 +75,8 @@ class Relocalizer:
         self._unconfirmed = None
 
     def locate(
-        self, state: TrackingState, frame: CurrentFrame, register_nearby: Callable[[], Candidate | Reason]
-    ) -> Candidate | Reason:
+        self, state: TrackingState, frame: CurrentFrame, register_nearby: Callable[[], PoseCandidate | Reason]
+    ) -> PoseCandidate | Reason:
         """Where a frame is, or why that is not known.
 
         Args:
@@ -89,7 +89,7 @@ class Relocalizer:
             if confirmed is not None:
                 return confirmed
         nearby = register_nearby()
-        place = nearby if isinstance(nearby, Candidate) else find_place(state, frame)
+        place = nearby if isinstance(nearby, PoseCandidate) else find_place(state, frame)
         if place is None:
             return nearby if isinstance(nearby, Reason) else Reason.UNCONFIRMED
         if state.config.tracking.relocalization.confirmations == 0:
@@ -97,7 +97,7 @@ class Relocalizer:
         self._unconfirmed = _Unconfirmed(place, frame.stamp_ns, 0)
         return Reason.UNCONFIRMED
 
-    def _confirm(self, state: TrackingState, frame: CurrentFrame) -> Candidate | Reason | None:
+    def _confirm(self, state: TrackingState, frame: CurrentFrame) -> PoseCandidate | Reason | None:
         """Track on from a place that was found; None if the frame does not agree with it."""
         assert self._unconfirmed is not None
         before, self._unconfirmed = self._unconfirmed, None
@@ -106,7 +106,7 @@ class Relocalizer:
         result = register_until_stable(
             state.keyframes[index], frame.pyramid, last, tracking, first=tracking.registration
         )
-        candidate = Candidate(index, result)
+        candidate = PoseCandidate(index, result)
         moved_m, _ = se3.distance(last, result.T_reference_target)
         reach_m = tracking.failure.max_speed_m_s * (frame.stamp_ns - before.stamp_ns) * 1e-9
         if moved_m > reach_m or isinstance(verify(PLAUSIBLE, state, frame, candidate), Reason):
@@ -117,7 +117,7 @@ class Relocalizer:
         return Reason.UNCONFIRMED
 
 
-def find_place(state: TrackingState, frame: CurrentFrame) -> Candidate | None:
+def find_place(state: TrackingState, frame: CurrentFrame) -> PoseCandidate | None:
     """The first keyframe, in the order of matching features, that a frame can be registered to; None if there is none.
 
     Args:
@@ -132,13 +132,15 @@ def find_place(state: TrackingState, frame: CurrentFrame) -> Candidate | None:
         result = register_until_stable(
             state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
         )
-        found = verify(PLAUSIBLE, state, frame, Candidate(index, result))
-        if isinstance(found, Candidate):
+        found = verify(PLAUSIBLE, state, frame, PoseCandidate(index, result))
+        if isinstance(found, PoseCandidate):
             return by_latest_keyframe(state, frame, found)
     return None
 
 
-def by_latest_keyframe(state: TrackingState, frame: CurrentFrame, found: Candidate) -> Candidate | None:
+def by_latest_keyframe(
+    state: TrackingState, frame: CurrentFrame, found: PoseCandidate
+) -> PoseCandidate | None:
     """A place that was found, by the latest keyframe that shows enough of it; None if one contradicts.
 
     Between keyframes far apart in time lies the drift of tracking. The path goes on from its end: by an early keyframe
@@ -158,8 +160,8 @@ def by_latest_keyframe(state: TrackingState, frame: CurrentFrame, found: Candida
         if predicted_overlap(keyframe.reference, frame.pyramid, guess) < limits.min_overlap:
             continue
         result = register_until_stable(keyframe, frame.pyramid, guess, tracking, first=tracking.registration)
-        later = verify(PLAUSIBLE, state, frame, Candidate(keyframe.keyframe_index, result))
-        if isinstance(later, Candidate):
+        later = verify(PLAUSIBLE, state, frame, PoseCandidate(keyframe.keyframe_index, result))
+        if isinstance(later, PoseCandidate):
             return later
         if (
             result.ok

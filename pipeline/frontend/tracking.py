@@ -24,7 +24,7 @@ from duagc.pipeline.frontend.pose_checks import FOLLOWED, PLAUSIBLE, DepthColorC
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.stable_registration import register_until_stable
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
-from duagc.pipeline.frontend.tracking_state import Candidate, CurrentFrame, TrackingState
+from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.posegraph.relative_poses import RelativePose
@@ -109,7 +109,7 @@ class Tracker:
         found = self._locate(frame, missing)
         return self._mark_lost(frame, found) if isinstance(found, Reason) else self._accept(frame, found)
 
-    def _locate(self, frame: CurrentFrame, missing: Reason) -> Candidate | Reason:
+    def _locate(self, frame: CurrentFrame, missing: Reason) -> PoseCandidate | Reason:
         """Where a frame is, or why that is not known.
 
         Args:
@@ -139,7 +139,7 @@ class Tracker:
         state.frames_without_depth = 0 if missing is Reason.NONE else state.frames_without_depth + 1
         return missing
 
-    def _follow_by_color(self, frame: CurrentFrame, missing: Reason) -> Candidate | Reason:
+    def _follow_by_color(self, frame: CurrentFrame, missing: Reason) -> PoseCandidate | Reason:
         """Follow a frame without depth by its color alone, for a while, if it looks as frames did before."""
         state, failure = self.state, self.state.config.tracking.failure
         too_many = state.frames_without_depth > failure.max_frames_without_depth
@@ -147,9 +147,9 @@ class Tracker:
             return missing
         result = state.register_color(frame)
         followed = result.ok and state.looks_as_usual(result)
-        return Candidate(state.keyframe_index, result, missing) if followed else missing
+        return PoseCandidate(state.keyframe_index, result, missing) if followed else missing
 
-    def _follow_by_depth(self, frame: CurrentFrame) -> Candidate | Reason:
+    def _follow_by_depth(self, frame: CurrentFrame) -> PoseCandidate | Reason:
         """Follow a frame with frozen color by its depth alone, for a few frames: on walls it drifts soon."""
         state, tracking = self.state, self.state.config.tracking
         too_many = state.frames_without_color > tracking.failure.max_frames_without_color
@@ -165,22 +165,24 @@ class Tracker:
             prior_information=predicted.information,
         )
         return (
-            Candidate(state.keyframe_index, result, Reason.FROZEN_COLOR) if result.ok else Reason.FROZEN_COLOR
+            PoseCandidate(state.keyframe_index, result, Reason.FROZEN_COLOR)
+            if result.ok
+            else Reason.FROZEN_COLOR
         )
 
     # --- predict, register, verify --------------------------------------------------------------------------------
 
-    def _register_nearby(self, frame: CurrentFrame) -> Candidate | Reason:
+    def _register_nearby(self, frame: CurrentFrame) -> PoseCandidate | Reason:
         """The first registration near the last pose that passes its checks, or why the first one failed."""
         reason = Reason.NONE
         for candidate, checks in self._attempts(frame):
             found = verify(checks, self.state, frame, candidate)
-            if isinstance(found, Candidate):
+            if isinstance(found, PoseCandidate):
                 return found
             reason = reason if reason is not Reason.NONE else found
         return reason
 
-    def _attempts(self, frame: CurrentFrame) -> Iterator[tuple[Candidate, Sequence[PoseCheck]]]:
+    def _attempts(self, frame: CurrentFrame) -> Iterator[tuple[PoseCandidate, Sequence[PoseCheck]]]:
         """Registrations to the latest keyframe, each with its checks: from the prediction, then with wider gates."""
         state, tracking, index = self.state, self.state.config.tracking, self.state.keyframe_index
         last, predicted = state.T_keyframe_camera, state.predict(frame.stamp_ns)
@@ -197,12 +199,12 @@ class Tracker:
                     tracking.registration,
                     prior_information=information,
                 )
-                yield Candidate(index, result), FOLLOWED
+                yield PoseCandidate(index, result), FOLLOWED
         for start in starts:
             result = register_until_stable(
                 state.keyframe, frame.pyramid, start, tracking, first=tracking.recovery
             )
-            yield Candidate(index, result), _FOUND_NEARBY
+            yield PoseCandidate(index, result), _FOUND_NEARBY
 
     # --- update ---------------------------------------------------------------------------------------------------
 
@@ -245,7 +247,7 @@ class Tracker:
             reason=reason,
         )
 
-    def _accept(self, frame: CurrentFrame, found: Candidate) -> TrackedFrame:
+    def _accept(self, frame: CurrentFrame, found: PoseCandidate) -> TrackedFrame:
         """Update the state by the pose of a frame; it becomes a keyframe if it sees much that is new."""
         status = Status.RELOCALIZED if self.state.lost else Status.OK
         self._update_motion(frame, found)
@@ -262,7 +264,7 @@ class Tracker:
             reason=found.without,
         )
 
-    def _update_motion(self, frame: CurrentFrame, found: Candidate) -> None:
+    def _update_motion(self, frame: CurrentFrame, found: PoseCandidate) -> None:
         """Pose and velocity, and the usual gray residual."""
         state, result = self.state, found.result
         same_keyframe = found.keyframe_index == state.keyframe_index
@@ -280,7 +282,7 @@ class Tracker:
             frames = state.config.tracking.failure.usual_frames
             state.gray_rms = [*state.gray_rms[1 - frames :], result.rms_gray]
 
-    def _update_view(self, frame: CurrentFrame, found: Candidate) -> None:
+    def _update_view(self, frame: CurrentFrame, found: PoseCandidate) -> None:
         """What is in front of the camera, by a frame with depth and color; and the last good frame."""
         state = self.state
         state.depth_color_inconsistent = False
@@ -293,7 +295,7 @@ class Tracker:
                 found.result.information,
             )
 
-    def _becomes_keyframe(self, frame: CurrentFrame, found: Candidate) -> bool:
+    def _becomes_keyframe(self, frame: CurrentFrame, found: PoseCandidate) -> bool:
         return (
             not is_held_out(frame.frame_index)
             and found.without is Reason.NONE
@@ -313,7 +315,7 @@ class Tracker:
         leaving = min(result.overlap, result.view) < tracking.relocalization.min_overlap
         return leaving and saturated_share(pyramid.levels[0]) <= tracking.max_saturated
 
-    def _promote(self, frame: CurrentFrame, found: Candidate, status: Status) -> TrackedFrame:
+    def _promote(self, frame: CurrentFrame, found: PoseCandidate, status: Status) -> TrackedFrame:
         """Make a tracked frame the next keyframe; then anchored to itself, with the information of its tracking."""
         state = self.state
         new = insert_keyframe(state, frame, found)

@@ -61,7 +61,7 @@ def features_of(pyramid: RgbdPyramid, config: RelocalizationConfig) -> Features:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class PoseCandidate:
     """A registration of the current frame to a keyframe that is not accepted yet.
 
     Attributes:
@@ -256,7 +256,7 @@ class TrackingState:
             prior_information=predicted.information,
         )
 
-    def viewpoint(self, candidate: Candidate) -> Viewpoint:
+    def viewpoint(self, candidate: PoseCandidate) -> Viewpoint:
         """The keyframe of a candidate, as occlusion is judged by it.
 
         Args:

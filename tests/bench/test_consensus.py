@@ -6,12 +6,12 @@ import sys
 
 import pytest
 
-from duagc.pipeline.experiments.consensus_modes import MODES, Plan, format_table, run
+from duagc.pipeline.experiments.consensus_modes import MODES, ConsensusPlan, format_table, run
 
 
 @pytest.fixture(scope="module")
 def rows() -> dict[tuple[str, float], dict]:
-    plan = Plan((3,), ("chain",), (0.0, 0.5), (47.0,), (0.1,), MODES, tracks=20, max_rounds=1500)
+    plan = ConsensusPlan((3,), ("chain",), (0.0, 0.5), (47.0,), (0.1,), MODES, tracks=20, max_rounds=1500)
     result = run(plan)
     lines = [line for line in format_table(result).splitlines() if line.startswith("|")]
     assert len(lines) == 2 + len(result["rows"])

@@ -12,7 +12,7 @@ from duagc.pipeline.bench import raster, raster_tables, torch_tiles
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import Rasterizer, _raster, available_isas
 
-TINY = raster.Plan(sizes=((40, 30), (20, 16)), gaussians=(500,), threads=(1, 2), rounds=1)
+TINY = raster.RasterPlan(sizes=((40, 30), (20, 16)), gaussians=(500,), threads=(1, 2), rounds=1)
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +53,10 @@ def test_work_is_the_same_for_every_candidate(result):
 
 
 def test_drawn_pairs_are_the_pixels_that_gaussians_count():
-    view = raster.View((40, 30), 500)
+    view = raster.RasterView((40, 30), 500)
     rasterizer = Rasterizer()
     rasterizer.forward(view.room, view.camera, view.T_camera_map)
-    assert raster.Work("auto", view).seen.blended_pairs == rasterizer.contributions()[1].sum()
+    assert raster.RasterWork("auto", view).seen.blended_pairs == rasterizer.contributions()[1].sum()
 
 
 def test_fraction_of_peak_is_work_over_time_over_rate(result):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.experiments.consensus_modes import Plan, run_on
+from duagc.pipeline.experiments.consensus_modes import ConsensusPlan, run_on
 from duagc.pipeline.experiments.team_of_run import team_of_run
 from duagc.pipeline.runs.folder import RunFolder
 from tests.fixtures.fake_run import make
@@ -23,7 +23,7 @@ def test_the_matches_of_a_run_are_agreed_on_in_every_mode(tmp_path) -> None:
     np.testing.assert_allclose(
         team.theta["alpha"][:, :3], moved.means[np.searchsorted(ids, [1, 3, 5])], atol=1e-6
     )
-    plan = Plan(losses=(0.0,), modes=("evidence_float64", "paper"), max_rounds=100)
+    plan = ConsensusPlan(losses=(0.0,), modes=("evidence_float64", "paper"), max_rounds=100)
     rows = {row["mode"]: row for row in run_on(team, "full", plan)["rows"]}
     assert rows["evidence_float64"]["gap_sigma"] < 1e-9
     assert rows["paper"]["gap_sigma"] < 1e-4  # float32 weights

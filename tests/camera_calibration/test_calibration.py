@@ -23,7 +23,7 @@ from duagc.pipeline.camera_calibration.adjustment import (
     overlapping,
 )
 from duagc.pipeline.camera_calibration.calibrate import Calibration, calibrate
-from duagc.pipeline.camera_calibration.rig import NAMES, Rig
+from duagc.pipeline.camera_calibration.rig import NAMES, CameraRig
 from duagc.pipeline.camera_calibration.views import (
     NORMALS_LEVEL,
     Tracked,
@@ -40,7 +40,7 @@ from duagc.pipeline.recording import Recording, RgbdFrame, RgbdLog
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 
 CAMERA = PinholeCamera(320, 240, 262.0, 262.0, 160.0, 118.0)
-TRUE = Rig(
+TRUE = CameraRig(
     CAMERA,
     np.array([266.0, 265.0, 163.0, 121.0, 0.08, -0.30, 0.25]),
     so3.exp(np.array([0.006, -0.008, 0.01])),
@@ -169,7 +169,7 @@ def test_noise_of_depth_pushes_no_coefficient() -> None:
 
 def test_known_cameras_are_found(views: Views) -> None:
     """From one walk through the room within their standard deviations; and they hold on another walk."""
-    found = adjust([make_views(1)], Rig.of(CAMERA), True)
+    found = adjust([make_views(1)], CameraRig.of(CAMERA), True)
     assert found.covariance is not None
     sigma = np.sqrt(np.diag(found.covariance))
     off = np.abs(found.rig.values() - TRUE.values())
@@ -179,9 +179,9 @@ def test_known_cameras_are_found(views: Views) -> None:
     p = np.column_stack([np.random.default_rng(0).uniform(-0.45, 0.45, (200, 2)), np.ones(200)])
     true = TRUE.project(p @ TRUE.R_color_depth.T)[0]
     moved = found.rig.project(p @ found.rig.R_color_depth.T)[0] - true
-    before = Rig.of(CAMERA).project(p)[0] - true
+    before = CameraRig.of(CAMERA).project(p)[0] - true
     assert np.median(np.linalg.norm(moved, axis=-1)) < 0.15 * np.median(np.linalg.norm(before, axis=-1))
-    as_recorded = adjust([copy(views)], Rig.of(CAMERA), False).quality[0]
+    as_recorded = adjust([copy(views)], CameraRig.of(CAMERA), False).quality[0]
     held_out = adjust([copy(views)], found.rig, False).quality[0]
     assert held_out.features_px < 0.5 * as_recorded.features_px
     assert held_out.depth < as_recorded.depth

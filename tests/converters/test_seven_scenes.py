@@ -12,7 +12,7 @@ import pytest
 
 from duagc.converters import registry
 from duagc.converters.datasets import seven_scenes
-from duagc.converters.datasets.seven_scenes import Options, Registration, convert, list_frames
+from duagc.converters.datasets.seven_scenes import DepthRegistration, Options, convert, list_frames
 from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
@@ -266,7 +266,7 @@ def test_planes_stay_planes(slope: float) -> None:
     options = Options()
     depth = slanted(options.depth_camera(), slope)
     depth[(depth < 0.3) | (depth > 4)] = 0
-    out = Registration(options.depth_camera(), options.color_camera(), options.baseline_m)(depth)
+    out = DepthRegistration(options.depth_camera(), options.color_camera(), options.baseline_m)(depth)
     # the plane in the color camera, which sits baseline_m further along x
     rays = options.color_camera().rays()[:, :, 0]
     exact = (1.2 + slope * options.baseline_m) / (1 - slope * rays)
@@ -284,7 +284,7 @@ def test_the_nearest_surface_wins_and_edges_stay_sharp() -> None:
     options = Options()
     depth = np.full((480, 640), 2.0)
     depth[:, 300:340] = 0.8
-    out = Registration(options.depth_camera(), options.color_camera(), options.baseline_m)(depth)
+    out = DepthRegistration(options.depth_camera(), options.color_camera(), options.baseline_m)(depth)
     values = np.unique(np.round(out, 9))
     assert values.tolist() == [0.0, 0.8, 2.0], "nothing is interpolated across the edge"
     columns = np.nonzero(out[240] == np.min(out[240][out[240] > 0]))[0]
@@ -298,9 +298,9 @@ def test_the_nearest_surface_wins_and_edges_stay_sharp() -> None:
 
 def test_no_depth_stays_none() -> None:
     options = Options()
-    register = Registration(options.depth_camera(), options.color_camera(), options.baseline_m)
+    register = DepthRegistration(options.depth_camera(), options.color_camera(), options.baseline_m)
     assert not register(np.zeros((480, 640))).any()
-    same = Registration(options.depth_camera(), options.depth_camera(), 0.0)
+    same = DepthRegistration(options.depth_camera(), options.depth_camera(), 0.0)
     depth = slanted(options.depth_camera(), 0.5)
     depth[100:110, 50:300] = 0
     np.testing.assert_allclose(same(depth), depth, rtol=1e-12)  # the identity keeps every hole

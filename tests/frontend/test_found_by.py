@@ -12,7 +12,7 @@ from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.relocalization import by_latest_keyframe
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
-from duagc.pipeline.frontend.tracking_state import Candidate, CurrentFrame
+from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import RgbdPyramid, register
 from tests.fixtures.films import CAMERA, filmed
@@ -115,13 +115,13 @@ def _drifted(run: Undisturbed) -> Tracker:
     return tracker
 
 
-def _found_by_the_first(run: Undisturbed, tracker: Tracker) -> tuple[Candidate, Candidate | None]:
+def _found_by_the_first(run: Undisturbed, tracker: Tracker) -> tuple[PoseCandidate, PoseCandidate | None]:
     """A place that the first keyframe shows, and what is made of it."""
     shot = run.shots[START]
     pyramid = pyramid_of(shot)
     result = register(tracker.keyframes[0].reference, pyramid, run.poses[START])
     assert result.ok
-    place = Candidate(0, result)
+    place = PoseCandidate(0, result)
     frame = CurrentFrame(shot.index, shot.stamp_ns, pyramid, CONFIG.tracking.relocalization)
     return place, by_latest_keyframe(tracker.state, frame, place)
 

@@ -13,7 +13,7 @@ import pytest
 
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.experiments import disturbances as d
-from duagc.pipeline.experiments.disturbances import Row, Shot, Undisturbed
+from duagc.pipeline.experiments.disturbances import DisturbanceRow, Shot, Undisturbed
 from duagc.pipeline.frontend.failure import FrozenImageDetector, Reason, free_space_violations
 from duagc.pipeline.frontend.tracked import Status
 from duagc.pipeline.frontend.tracking import Tracker
@@ -32,15 +32,15 @@ def other_room() -> list[Shot]:
     return filmed(5, 30)
 
 
-def during(rows: Sequence[Row]) -> list[Row]:
+def during(rows: Sequence[DisturbanceRow]) -> list[DisturbanceRow]:
     return [row for row in rows if row.shot.disturbed]
 
 
-def after(rows: Sequence[Row]) -> list[Row]:
+def after(rows: Sequence[DisturbanceRow]) -> list[DisturbanceRow]:
     return [row for row in rows if not row.shot.disturbed]
 
 
-def assert_found_again(rows: Sequence[Row], within: int) -> None:
+def assert_found_again(rows: Sequence[DisturbanceRow], within: int) -> None:
     """Some frame soon after the disturbance has a pose, and from then on all have."""
     good = [row.good for row in after(rows)]
     assert any(good[:within])

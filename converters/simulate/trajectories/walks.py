@@ -56,7 +56,7 @@ EDGE_GRAY = 6.0  # of 255, between neighboring pixels of VIEW_IMAGE
 
 
 @dataclass(frozen=True)
-class FreeSpace:
+class WalkableSpace:
     """Where a robot can stand.
 
     Attributes:
@@ -93,7 +93,7 @@ class Terrain(Protocol):
     def clearance(self, points: Array) -> Array:
         """Distance (m) of world points [..., 3] to the nearest surface."""
 
-    def free_space(self) -> FreeSpace:
+    def free_space(self) -> WalkableSpace:
         """Where a robot can stand."""
 
 
@@ -143,7 +143,7 @@ def floor_height(caster: Caster) -> float:
     return float(np.average(heights[around], weights=areas[around]))
 
 
-def free_space(caster: Caster, sky: bool = False) -> FreeSpace:
+def free_space(caster: Caster, sky: bool = False) -> WalkableSpace:
     """The largest connected free space of a scene; under a sky only the floor below matters.
 
     Raises:
@@ -165,7 +165,7 @@ def space_between(
     distance: Callable[[Array], Array],
     *,
     closed: Callable[[Array], NDArray[np.bool_]],
-) -> FreeSpace:
+) -> WalkableSpace:
     """The largest connected free space on a grid from `low` to `high` (x, y).
 
     Args:
@@ -192,7 +192,7 @@ def space_between(
         )
     inside = parts == 1 + int(np.argmax(sizes))
     graph = _graph(inside, clearance, cell_m)
-    return FreeSpace(
+    return WalkableSpace(
         floor, places[inside], clearance[inside], graph, inside=inside, low=places[0, 0], cell_m=cell_m
     )
 
@@ -238,7 +238,7 @@ def _graph(inside: NDArray[np.bool_], clearance: Array, cell_m: float) -> coo_ar
 
 
 def _candidates(
-    terrain: Terrain, space: FreeSpace, robot: int, frames: int, *, camera: PinholeCamera, seed: int
+    terrain: Terrain, space: WalkableSpace, robot: int, frames: int, *, camera: PinholeCamera, seed: int
 ) -> list[tuple[float, Array]]:
     """Walks of a robot that keep clear and see something, each with how much its dullest view shows."""
     graph = space.graph.tocsr()
@@ -273,7 +273,7 @@ def _candidates(
     return found
 
 
-def route(space: FreeSpace, graph: coo_array, length_m: float, rng: np.random.Generator) -> Array:
+def route(space: WalkableSpace, graph: coo_array, length_m: float, rng: np.random.Generator) -> Array:
     """A path over the floor [n, 2] of at least a length, through places drawn at random, smoothed, 25 mm apart."""
     here = int(rng.integers(len(space.cells)))
     cells, total = [here], 0.0
