@@ -207,19 +207,26 @@ def test_points_of_the_geometry_lie_on_surfaces(room, atlas, tmp_path):
     np.testing.assert_array_equal(np.frombuffer(body[:12], "<f4"), points[0].astype("<f4"))
 
 
+NOISY = {"robots": 2, "frames": 5, "size": SIZE, "noise": "kinect", "seed": 7}
+
+
+def test_a_noisy_recording_has_the_truth_apart(tmp_path):
+    simulate(tmp_path / "rec", workers=1, **NOISY)
+    check_noisy_recording(tmp_path / "rec")
+    with pytest.raises(DuagError, match="exists"):
+        simulate(tmp_path / "rec", workers=1, **NOISY)
+
+
+@pytest.mark.slow  # in `make test` among meshes: test_simulate_sensors.py
 def test_recordings_do_not_depend_on_the_number_of_workers(tmp_path):
-    kind = {"robots": 2, "frames": 5, "size": SIZE, "noise": "kinect", "seed": 7}
-    simulate(tmp_path / "one" / "rec", workers=1, **kind)
-    simulate(tmp_path / "two" / "rec", workers=2, **kind)
+    simulate(tmp_path / "one" / "rec", workers=1, **NOISY)
+    simulate(tmp_path / "two" / "rec", workers=2, **NOISY)
     names = sorted(path.name for path in (tmp_path / "one" / "rec").iterdir())
     assert len(names) == 6
     for name in names:
         assert (tmp_path / "one" / "rec" / name).read_bytes() == (
             tmp_path / "two" / "rec" / name
         ).read_bytes(), name
-    check_noisy_recording(tmp_path / "one" / "rec")
-    with pytest.raises(DuagError, match="exists"):
-        simulate(tmp_path / "one" / "rec", workers=1, **kind)
 
 
 def check_noisy_recording(folder: Path) -> None:
