@@ -9,6 +9,7 @@ from duagc.pipeline.geometry import se3, spd
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import FisherSums, Rasterizer
 from duagc.pipeline.kernels.reference import ReferenceRasterizer
+from duagc.pipeline.splat.information import unpack_geometry
 from tests.kernels.scenes import BACKGROUND, make_scene, random_gaussians
 
 
@@ -99,9 +100,9 @@ def test_information_adds_over_views_and_scales_with_precision(plain):
 
 def test_information_is_positive_semidefinite(scene):
     sums = sums_of(scene, (scene.image(1, low=1.0), scene.image(2, low=1.0)))
-    values = np.linalg.eigvalsh(sums.geometry_matrices())
+    values = np.linalg.eigvalsh(unpack_geometry(sums.geometry))
     assert (values[:, 0] >= -3e-6 * values[:, -1]).all()  # float32 sums of a view
-    assert (sums.geometry_matrices()[sums.observations == 0] == 0).all()
+    assert (unpack_geometry(sums.geometry)[sums.observations == 0] == 0).all()
 
 
 def test_pixels_without_precision_say_nothing(plain):
@@ -116,7 +117,7 @@ def test_information_turns_with_the_map(kind):
     T_other_map = se3.exp([0.3, -0.2, 0.5, 0.4, -0.7, 0.9])
     R = T_other_map[:3, :3]
     views = scene.image(1, low=1.0), scene.image(2, low=1.0)
-    before = sums_of(scene, views).geometry_matrices()
+    before = unpack_geometry(sums_of(scene, views).geometry)
     sums, rasterizer = FisherSums(len(scene.gaussians)), Rasterizer()
     rasterizer.forward(
         scene.gaussians.transformed(T_other_map),
@@ -128,5 +129,5 @@ def test_information_turns_with_the_map(kind):
     turn = np.zeros((9, 9))
     turn[:3, :3], turn[3:, 3:] = R, spd.sym_rotation(R)
     wanted = turn @ before @ turn.T
-    error = np.linalg.norm(sums.geometry_matrices() - wanted) / np.linalg.norm(wanted)
+    error = np.linalg.norm(unpack_geometry(sums.geometry) - wanted) / np.linalg.norm(wanted)
     assert error < 1e-4  # the parameters themselves are rounded to float32 in the other frame
