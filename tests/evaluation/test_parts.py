@@ -9,6 +9,7 @@ import pytest
 from duagc import schemas
 from duagc.converters.simulate.ply import write_points
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.evaluation import map_errors, views
 from duagc.pipeline.evaluation.groundtruth import Surface, surface
 from duagc.pipeline.evaluation.network import Session
@@ -134,7 +135,7 @@ def test_a_changed_configuration_is_noticed(tmp_path):
         _ = RunFolder(tmp_path).config
     path.write_text("seed = 3\n")
     (tmp_path / "manifest.json").write_text(json.dumps({"config": digest_file(path)}))
-    assert RunFolder(tmp_path).config == {"seed": 3}
+    assert RunFolder(tmp_path).config == RunConfig(seed=3)
     path.write_text("seed = 4\n")
     with pytest.raises(DuagError, match="as in manifest"):
         _ = RunFolder(tmp_path).config
