@@ -17,6 +17,13 @@ class Recording:
     """A folder with one log per robot and a `recording.json` that says what they are."""
 
     def __init__(self, path: Path) -> None:
+        """Read the description of a recording; its logs are opened when they are asked for.
+
+        Args:
+            path: folder of the recording.
+        Raises:
+            DuagError: the folder has no sound `recording.json`.
+        """
         self.path = Path(path)
         self.description = _read_description(self.path / RECORDING_FILE)
         self.name: str = self.description["name"]

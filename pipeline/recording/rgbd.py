@@ -54,6 +54,13 @@ class RgbdLog:
     """
 
     def __init__(self, path: Path) -> None:
+        """Open a log; `open_rgbd` does the same.
+
+        Args:
+            path: MCAP log of one robot.
+        Raises:
+            DuagError: the log is damaged, or lacks color, depth or calibration.
+        """
         self.path = Path(path)
         self._log = LogFile(self.path)
         try:
