@@ -65,6 +65,13 @@ MASK = Topic(
     Scope.SENSOR,
     "8UC1, pixels of the color image that may be used: 255 = yes, 0 = no, for example a moving object",
 )
+VALID = Topic(
+    "/<robot>/camera/valid",
+    "foxglove.CompressedImage",
+    "converters",
+    Scope.SENSOR,
+    "PNG of 8 bits, of all color images of the log: pixels that show the scene: 255 = yes, 0 = no (rim, the robot)",
+)
 CALIBRATION = Topic(
     "/<robot>/camera/calibration",
     "foxglove.CameraCalibration",
@@ -144,6 +151,20 @@ KEYFRAME_FACTOR = Topic(
     "frontend",
     Scope.ROBOT,
     "every registration between keyframes",
+)
+SUBMAP = Topic(
+    "/<robot>/submap",
+    "duagc.v1.Submap",
+    "frontend",
+    Scope.ROBOT,
+    "a submap of a robot that was lost and began anew; none if it has a single one",
+)
+EXPOSURE = Topic(
+    "/<robot>/exposure",
+    "duagc.v1.FrameExposure",
+    "frontend",
+    Scope.ROBOT,
+    "exposure of a frame, where exposures differ",
 )
 MAP_UPDATE = Topic(
     "/<robot>/map_update", "duagc.v1.MapUpdate", "frontend", Scope.ROBOT, "what one keyframe did to the map"
@@ -236,6 +257,7 @@ TOPICS: tuple[Topic, ...] = (
     DEPTH,
     DEPTH_SIGMA,
     MASK,
+    VALID,
     CALIBRATION,
     RAW_DEPTH,
     RAW_DEPTH_CALIBRATION,
@@ -250,6 +272,8 @@ TOPICS: tuple[Topic, ...] = (
     ODOMETRY,
     KEYFRAME,
     KEYFRAME_FACTOR,
+    SUBMAP,
+    EXPOSURE,
     MAP_UPDATE,
     MAP,
     UNREFINED_MAP,
@@ -268,7 +292,11 @@ TOPICS: tuple[Topic, ...] = (
 )
 
 ROBOT_NAME = r"[a-z][a-z0-9_]*"
-_MATCHERS = tuple((re.compile(t.pattern.replace("<robot>", f"(?P<robot>{ROBOT_NAME})")), t) for t in TOPICS)
+COMPONENT_NAME = ROBOT_NAME + r"(?:-[1-9][0-9]*)?"
+"""A robot, or a component of it that did not join the largest one: "alpha-2". No robot of a recording is named so."""
+_MATCHERS = tuple(
+    (re.compile(t.pattern.replace("<robot>", f"(?P<robot>{COMPONENT_NAME})")), t) for t in TOPICS
+)
 
 
 def find(topic: str) -> tuple[Topic, str] | None:

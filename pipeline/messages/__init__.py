@@ -6,12 +6,14 @@ at the fields; their place in the log in `schemas/*.proto`, their topics in `sch
 
 from duagc.pipeline.messages.estimates import (
     CorrectedKeyframes,
+    FrameExposure,
     GaussianInformation,
     GaussianMap,
     Keyframe,
     KeyframeFactor,
     MapUpdate,
     Odometry,
+    Submap,
     unpack,
 )
 from duagc.pipeline.messages.parts import (
@@ -33,17 +35,20 @@ from duagc.pipeline.messages.sensors import (
     pack_points,
     pack_pose_in_frame,
     pack_transform,
+    pack_valid,
     unpack_calibration,
     unpack_depth,
     unpack_mask,
     unpack_points,
     unpack_pose_in_frame,
     unpack_transform,
+    unpack_valid,
 )
 
 __all__ = [
     "WORLD_FRAME",
     "CorrectedKeyframes",
+    "FrameExposure",
     "GaussianInformation",
     "GaussianMap",
     "Keyframe",
@@ -52,6 +57,7 @@ __all__ = [
     "Odometry",
     "PeerColors",
     "PeerMapReport",
+    "Submap",
     "camera_frame",
     "map_frame",
     "pack_calibration",
@@ -64,6 +70,7 @@ __all__ = [
     "pack_pose_in_frame",
     "pack_stamp",
     "pack_transform",
+    "pack_valid",
     "unpack",
     "unpack_calibration",
     "unpack_depth",
@@ -73,4 +80,5 @@ __all__ = [
     "unpack_pose_in_frame",
     "unpack_stamp",
     "unpack_transform",
+    "unpack_valid",
 ]

@@ -161,6 +161,49 @@ class Keyframe:
 
 
 @dataclass(frozen=True, eq=False)
+class Submap:
+    """A submap of a robot that was lost and began anew.
+
+    stamp_ns: time of its first keyframe. robot: the component that it belongs to. submap: number from 1, in the order
+    in which the robot's submaps began. first_frame, last_frame: with a pose in it. frames: how many have one.
+    keyframes: how many. loop_closures: that tie it to other submaps of its component.
+    """
+
+    schema: ClassVar[str] = "duagc.v1.Submap"
+
+    stamp_ns: int
+    robot: str
+    submap: int
+    first_frame: int
+    last_frame: int
+    frames: int
+    keyframes: int
+    loop_closures: int
+
+    def pack(self) -> Any:
+        """duagc.v1.Submap."""
+        message = schemas.new(
+            "Submap",
+            frame_id=map_frame(self.robot),
+            robot=self.robot,
+            submap=int(self.submap),
+            first_frame=int(self.first_frame),
+            last_frame=int(self.last_frame),
+            frames=int(self.frames),
+            keyframes=int(self.keyframes),
+            loop_closures=int(self.loop_closures),
+        )
+        pack_stamp(message, self.stamp_ns)
+        return message
+
+    @staticmethod
+    def unpack(m: Any) -> Submap:
+        """From duagc.v1.Submap."""
+        counts = (m.submap, m.first_frame, m.last_frame, m.frames, m.keyframes, m.loop_closures)
+        return Submap(unpack_stamp(m), m.robot, *counts)
+
+
+@dataclass(frozen=True, eq=False)
 class KeyframeFactor:
     """A registration between two keyframes, with the weight that the refinement of their poses gave it.
 
@@ -205,6 +248,53 @@ class KeyframeFactor:
             T_first_second=unpack_pose(m.pose_first_second, "KeyframeFactor.pose_first_second"),
             information=numbers(m.information, (6, 6), "KeyframeFactor.information"),
             weight=m.weight,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FrameExposure:
+    """The exposure of a frame: what the map shows in color c is gain * c + offset in the image.
+
+    Attributes:
+        stamp_ns: time of the frame.
+        robot: whose frame.
+        frame_index: position in the log.
+        gain: [3], by channel.
+        offset: [3], colors 0..1.
+    """
+
+    schema: ClassVar[str] = "duagc.v1.FrameExposure"
+
+    stamp_ns: int
+    robot: str
+    frame_index: int
+    gain: Array
+    offset: Array
+
+    def pack(self) -> Any:
+        """duagc.v1.FrameExposure."""
+        message = schemas.new(
+            "FrameExposure",
+            robot=self.robot,
+            frame_index=int(self.frame_index),
+            gain=self.gain,
+            offset=self.offset,
+        )
+        pack_stamp(message, self.stamp_ns)
+        return message
+
+    @staticmethod
+    def unpack(m: Any) -> FrameExposure:
+        """From duagc.v1.FrameExposure.
+
+        Raises:
+            DuagError: a gain that is not positive.
+        """
+        gain = numbers(m.gain, (3,), "FrameExposure.gain")
+        if not np.all(gain > 0):
+            raise DuagError(f"FrameExposure.gain is {gain.tolist()}, expected positive numbers")
+        return FrameExposure(
+            unpack_stamp(m), m.robot, m.frame_index, gain, numbers(m.offset, (3,), "FrameExposure.offset")
         )
 
 
@@ -262,6 +352,8 @@ _UNPACK: dict[str, Callable[[Any], Any]] = {
         Odometry,
         Keyframe,
         KeyframeFactor,
+        Submap,
+        FrameExposure,
         MapUpdate,
         GaussianMap,
         GaussianInformation,

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from duagc import schemas
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 
-Array = NDArray[np.float64]
 NANOSECONDS = 1_000_000_000
 WORLD_FRAME = "world"
 

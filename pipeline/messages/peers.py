@@ -6,7 +6,8 @@ from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 from duagc import schemas
-from duagc.pipeline.messages.parts import Array, numbers, pack_stamp, unpack_stamp
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.messages.parts import numbers, pack_stamp, unpack_stamp
 
 
 @dataclass(frozen=True)

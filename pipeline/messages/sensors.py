@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from duagc import schemas
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import decode_image
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.messages.parts import Array, camera_frame, numbers, pack_array, pack_stamp, unpack_array
+from duagc.pipeline.messages.parts import camera_frame, numbers, pack_array, pack_stamp, unpack_array
 
 
 def _foxglove(name: str, stamp_ns: int, frame_id: str, **fields: Any) -> Any:
@@ -69,6 +71,29 @@ def unpack_mask(m: Any, where: str) -> NDArray[np.bool_]:
     if len(odd):
         raise DuagError(f"{where} has the value {odd[0]}, expected 0 (ignore) and 255 (usable) only")
     return values == 255
+
+
+def pack_valid(stamp_ns: int, robot: str, valid: NDArray[np.bool_]) -> Any:
+    """foxglove.CompressedImage, PNG of 8 bits, of the pixels that show the scene, bool [H, W]: 255 = yes, 0 = no."""
+    import cv2
+
+    if valid.dtype != np.bool_ or valid.ndim != 2:
+        raise ValueError(f"mask is {valid.dtype} {valid.shape}, expected bool [H, W]")
+    data = cv2.imencode(".png", np.where(valid, np.uint8(255), np.uint8(0)))[1].tobytes()
+    return pack_color(stamp_ns, robot, data, "png")
+
+
+def unpack_valid(m: Any, where: str) -> NDArray[np.bool_]:
+    """bool [H, W], True = shows the scene, of a foxglove.CompressedImage; `where` begins the line of an error."""
+    import cv2
+
+    image = decode_image(m.data, cv2.IMREAD_UNCHANGED)
+    if image is None or image.dtype != np.uint8 or image.ndim != 2:
+        raise DuagError(f"{where} has {len(m.data)} bytes, expected a PNG of 8 bits and one channel")
+    odd = image[(image != 0) & (image != 255)]
+    if len(odd):
+        raise DuagError(f"{where} has the value {odd[0]}, expected 0 (no scene) and 255 (scene) only")
+    return np.asarray(image == 255)
 
 
 def pack_calibration(stamp_ns: int, robot: str, camera: PinholeCamera) -> Any:
