@@ -7,7 +7,11 @@ is not installed comes a stand-in, a library of the same name whose functions st
 import ctypes
 import importlib
 import re
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from duagc.pipeline.base.errors import DuagError
@@ -23,6 +27,8 @@ PACKAGES = {
     "libudev.so.1": "libudev1",
     "libusb-1.0.so.0": "libusb-1.0-0",
 }
+_WEB_VIEWER = "open3d.visualization.draw_plotly"
+_WEB_VIEWER_FUNCTIONS = ("draw_plotly", "draw_plotly_server", "get_plotly_fig")
 _NOT_FOUND = re.compile(r"(\S+): cannot open shared object file")
 
 _kept: dict[str, ctypes.CDLL] = {}  # the linker takes a library of that name that is loaded already
@@ -38,11 +44,41 @@ def import_open3d() -> Any:
     """
     while True:  # each time, the linker names one library that it lacks
         try:
-            return importlib.import_module("open3d")
+            with _web_viewer_by_need():
+                return importlib.import_module("open3d")
         except ImportError as error:
             missing = _NOT_FOUND.match(str(error))
             if missing is None or not _load_stand_in(missing[1]):
                 raise DuagError(_advice(str(error))) from error
+
+
+@contextmanager
+def _web_viewer_by_need() -> Iterator[None]:
+    """Let Open3D import its viewer in a browser when that is called first.
+
+    Dash and plotly, which only that viewer needs, take longer to import than all the rest, in every process.
+    """
+    if "open3d" in sys.modules:
+        yield
+        return
+    viewer = ModuleType(_WEB_VIEWER)
+
+    def imported_by_need(name: str) -> Callable[..., Any]:
+        def call(*arguments: Any, **named: Any) -> Any:
+            if sys.modules.get(_WEB_VIEWER) is viewer:
+                del sys.modules[_WEB_VIEWER]
+            return getattr(importlib.import_module(_WEB_VIEWER), name)(*arguments, **named)
+
+        return call
+
+    for name in _WEB_VIEWER_FUNCTIONS:
+        setattr(viewer, name, imported_by_need(name))
+    sys.modules[_WEB_VIEWER] = viewer
+    try:
+        yield
+    except BaseException:
+        sys.modules.pop(_WEB_VIEWER, None)
+        raise
 
 
 def _load_stand_in(library: str) -> bool:
