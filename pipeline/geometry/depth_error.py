@@ -10,9 +10,8 @@ is the true 1/z. c0 changes nothing at 2 m: no image shows a common factor of al
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from duagc.pipeline.base.arrays import Array
 
 COEFFICIENTS = 6
 NO_ERROR_M = 2.0

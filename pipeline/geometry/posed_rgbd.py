@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.geometry.exposure import Exposure, unit_color
+
 
 @dataclass(frozen=True)
 class PosedRgbd:
@@ -18,6 +20,7 @@ class PosedRgbd:
         T_world_camera: [4, 4], pose of the camera in the frame of the map at hand, a robot's own or the team's.
         mask: bool [H, W], pixels that may be used; None: all.
         depth_sigma_m: float32 [H, W], standard deviation of the depth; None: not known pixel by pixel.
+        exposure: of the image; None: as the map.
     """
 
     color: NDArray[np.uint8]
@@ -25,8 +28,9 @@ class PosedRgbd:
     T_world_camera: NDArray[np.float64]
     mask: NDArray[np.bool_] | None = None
     depth_sigma_m: NDArray[np.float32] | None = None
+    exposure: Exposure | None = None
 
     @property
     def unit_color(self) -> NDArray[np.float32]:
-        """float32 [H, W, 3], RGB in 0..1."""
-        return self.color * np.float32(1 / 255)
+        """float32 [H, W, 3], RGB in the colors of the map, 0..1 and above."""
+        return unit_color(self.color, self.exposure)

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry.camera import PinholeCamera
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Image = NDArray[np.floating]
 

@@ -1,11 +1,10 @@
 """Rigid motions T_a_b as float64 matrices [..., 4, 4]; tangents (translation m, rotation rad), on the right."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import so3
-
-Array = NDArray[np.float64]
 
 
 def from_rotation_translation(R: ArrayLike, t: ArrayLike) -> Array:

@@ -1,9 +1,10 @@
 """Rotations: exponential, logarithm, quaternions (wxyz). Batched over leading axes, float64."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from duagc.pipeline.base.arrays import Array
+
 SMALL_ANGLE_RAD = 1e-4
 
 

@@ -5,11 +5,11 @@ Euclidean norm of the vector the Frobenius norm of the matrix.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import so3
 
-Array = NDArray[np.float64]
 SQRT2 = float(np.sqrt(2.0))
 _ROW = np.array([0, 1, 2, 0, 0, 1])
 _COLUMN = np.array([0, 1, 2, 1, 2, 2])

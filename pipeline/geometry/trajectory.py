@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file, read_text
 from duagc.pipeline.geometry import se3, so3
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,89 @@
+"""Masks of pixels that may be used: bool [H, W], True = usable."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Mask = NDArray[np.bool_]
+CHECKER = (170, 210)  # grays of the squares that stand for no pixel
+
+
+def halved(mask: Mask) -> Mask:
+    """Blocks of 2x2 pixels that may all be used, [H // 2, W // 2]; a last odd row or column is cut.
+
+    Args:
+        mask: bool [H, W].
+    """
+    h, w = mask.shape[0] // 2 * 2, mask.shape[1] // 2 * 2
+    return mask[0:h:2, :w:2] & mask[0:h:2, 1:w:2] & mask[1:h:2, :w:2] & mask[1:h:2, 1:w:2]
+
+
+def whole_windows(mask: Mask, reach_px: int) -> Mask:
+    """Pixels around which a square window holds usable pixels only, [H, W]; beyond the image all count as usable.
+
+    Args:
+        mask: bool [H, W].
+        reach_px: of the window to either side; its side is 2 reach_px + 1.
+    """
+    import cv2
+
+    window = np.ones((2 * reach_px + 1, 2 * reach_px + 1), dtype=np.uint8)
+    eroded = cv2.erode(mask.view(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=(1,))
+    return np.asarray(eroded, dtype=np.uint8).astype(bool)
+
+
+def distance_px(mask: Mask) -> NDArray[np.float32]:
+    """Distance of every pixel to the nearest one that may not be used, px, [H, W]; 0 there.
+
+    Args:
+        mask: bool [H, W].
+    """
+    import cv2
+
+    if mask.all():
+        return np.full(mask.shape, np.inf, dtype=np.float32)
+    distance = cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(distance, dtype=np.float32)
+
+
+def checkered(image: NDArray[np.uint8], mask: Mask | None, side_px: int = 8) -> NDArray[np.uint8]:
+    """An image to be looked at: a checkerboard of grays where a pixel may not be used.
+
+    Args:
+        image: uint8 [H, W, 3].
+        mask: bool [H, W]; None: all may be used.
+        side_px: of the squares.
+    """
+    if mask is None:
+        return image
+    row, column = (np.arange(size) // side_px for size in mask.shape)
+    board = np.where((row[:, None] + column) % 2 == 0, np.uint8(CHECKER[0]), np.uint8(CHECKER[1]))
+    return np.where(mask[..., None], image, board[..., None])
+
+
+def filled(color: NDArray[np.uint8], mask: Mask) -> NDArray[np.uint8]:
+    """An image in which every pixel that may not be used has the color of a usable one next to it.
+
+    So nothing of what was there is left, and no edge is made that a filter or a feature detector would find.
+
+    Args:
+        color: uint8 [H, W, 3].
+        mask: bool [H, W]; without a usable pixel the image becomes black.
+    """
+    import cv2
+
+    if mask.all():
+        return color
+    if not mask.any():
+        return np.zeros_like(color)
+    # a usable pixel is a zero of the distance transform, and has a label of its own
+    _, labels = cv2.distanceTransformWithLabels(
+        (~mask).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    usable = np.flatnonzero(mask)
+    pixel_of_label = np.zeros(int(labels.max()) + 1, dtype=np.int64)
+    pixel_of_label[labels.ravel()[usable]] = usable
+    out = color.copy()
+    out[~mask] = color.reshape(-1, color.shape[-1])[pixel_of_label[labels[~mask]]]
+    return out

@@ -1,0 +1,80 @@
+"""Masks: what is left of them in smaller images and windows, and that filled images hold nothing of what is masked."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from duagc.pipeline.geometry import masks
+
+
+def mask_of(seed: int, shape: tuple[int, int] = (9, 14), share: float = 0.3) -> masks.Mask:
+    return np.random.default_rng(seed).random(shape) > share
+
+
+@given(st.integers(0, 1000))
+@settings(deadline=None, max_examples=30)
+def test_a_coarse_pixel_may_be_used_if_all_its_parts_may(seed: int) -> None:
+    mask = mask_of(seed)
+    half = masks.halved(mask)
+    assert half.shape == (4, 7)
+    for v in range(4):
+        for u in range(7):
+            assert half[v, u] == mask[2 * v : 2 * v + 2, 2 * u : 2 * u + 2].all()
+
+
+@given(st.integers(0, 1000), st.integers(0, 3))
+@settings(deadline=None, max_examples=30)
+def test_a_whole_window_holds_usable_pixels_only(seed: int, reach: int) -> None:
+    mask = mask_of(seed, share=0.1)
+    whole = masks.whole_windows(mask, reach)
+    for v in range(mask.shape[0]):
+        for u in range(mask.shape[1]):
+            window = mask[max(v - reach, 0) : v + reach + 1, max(u - reach, 0) : u + reach + 1]
+            assert whole[v, u] == window.all()
+
+
+@given(st.integers(0, 1000), st.floats(0.05, 0.95))
+@settings(deadline=None, max_examples=50)
+def test_a_filled_image_depends_on_usable_pixels_alone(seed: int, share: float) -> None:
+    mask = mask_of(seed, share=share)
+    rng = np.random.default_rng(seed + 1)
+    color = rng.integers(0, 256, (*mask.shape, 3), dtype=np.uint8)
+    other = np.where(mask[..., None], color, rng.integers(0, 256, color.shape, dtype=np.uint8))
+    filled = masks.filled(color, mask)
+    assert np.array_equal(filled, masks.filled(other, mask))
+    assert np.array_equal(filled[mask], color[mask])
+    if mask.any():
+        present = {tuple(c) for c in color[mask].tolist()}
+        assert all(tuple(c) in present for c in filled.reshape(-1, 3).tolist())
+    else:
+        assert not filled.any()
+
+
+def test_the_color_is_that_of_a_pixel_next_to_it() -> None:
+    color = np.zeros((4, 6, 3), np.uint8)
+    color[:, :3], color[:, 3:] = 10, 200
+    mask = np.ones((4, 6), bool)
+    mask[:, :2] = mask[:, 4:] = False
+    filled = masks.filled(color, mask)
+    assert (filled[:, :3] == 10).all()
+    assert (filled[:, 3:] == 200).all()
+
+
+def test_distances_are_to_masked_pixels() -> None:
+    mask = np.ones((5, 8), bool)
+    assert np.isinf(masks.distance_px(mask)).all()
+    mask[2, 0] = False
+    distance = masks.distance_px(mask)
+    assert distance[2, 0] == 0
+    np.testing.assert_allclose(distance[2, 1:], np.arange(1, 8))
+    np.testing.assert_allclose(distance[0, 2], np.hypot(2, 2), rtol=1e-6)
+
+
+def test_a_picture_shows_squares_of_gray_where_it_is_masked() -> None:
+    image = np.full((32, 32, 3), 50, np.uint8)
+    mask = np.ones((32, 32), bool)
+    mask[:, 16:] = False
+    shown = masks.checkered(image, mask)
+    assert (shown[:, :16] == 50).all()
+    assert set(np.unique(shown[:, 16:])) == set(masks.CHECKER)
+    assert masks.checkered(image, None) is image
