@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.geometry.depth_noise import NEAREST_M, DepthNoise
+from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.geometry.statistics import mad_sigma
 from duagc.pipeline.information.views import MapViews
 
@@ -80,7 +81,7 @@ def estimate_noise(views: MapViews, config: InformationConfig, *, every: int = 4
         render = views.draw(rasterizer, image, usable)
         alpha, z = render.alpha[sample].astype(np.float64), image.depth_m[sample].astype(np.float64)
         covered = alpha > 0.9
-        difference = render.color[sample].astype(np.float64) - image.color[sample] / 255.0
+        difference = render.color[sample].astype(np.float64) - _colors(image)[sample]
         colors.append(np.abs(difference[covered]).ravel())
         both = covered & (z > 0)
         residual = render.depth[sample][both] / alpha[both] - z[both]
@@ -131,7 +132,7 @@ def with_correlation(
         drawn += rasterizer.statistics().blended_pairs
         pixels += camera.height * camera.width if image.mask is None else int(np.count_nonzero(image.mask))
         covered = render.alpha > 0.9
-        color = (render.color.astype(np.float64) - image.color / 255.0).mean(axis=2)
+        color = (render.color.astype(np.float64) - _colors(image)).mean(axis=2)
         both = covered & (image.depth_m > 0)
         z = np.where(both, image.depth_m, 1.0).astype(np.float64)
         off = (render.depth / np.maximum(render.alpha, 0.9) - z) / noise.depth_sigma_m(z, image.depth_sigma_m)
@@ -140,6 +141,11 @@ def with_correlation(
     found = {name: autocorrelation.pixels_per_sample() for name, autocorrelation in sums.items()}
     changed = replace(noise, color_pixels=found["color"], depth_pixels=found["depth"])
     return changed, max(1.0, drawn / max(pixels, 1))
+
+
+def _colors(image: PosedRgbd) -> NDArray[np.float64]:
+    """RGB [H, W, 3] in the colors of the map."""
+    return image.color / 255.0 if image.exposure is None else image.unit_color.astype(np.float64)
 
 
 class _Autocorrelation:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.information import InformationConfig
 from duagc.pipeline.config.registration import MovingConfig
@@ -19,7 +20,7 @@ from duagc.pipeline.information.noise import estimate_noise, with_correlation
 from duagc.pipeline.information.sums import sum_information, without_thickness
 from duagc.pipeline.information.views import MapViews, without_moving
 from duagc.pipeline.messages import GaussianInformation, GaussianMap, Keyframe, Odometry
-from duagc.pipeline.recording import LogWriter, open_rgbd, read_log
+from duagc.pipeline.recording import LogWriter, open_rgbd, read_exposures, read_log
 from duagc.schemas import topics
 
 
@@ -30,6 +31,7 @@ def run_information(
     *,
     config: InformationConfig,
     moving: MovingConfig,
+    thickness_floor_m: float,
     threads: int = 1,
 ) -> GaussianInformation:
     """Write the Fisher information of a robot's final map, from its own keyframes.
@@ -40,6 +42,7 @@ def run_information(
         out_path: information.mcap, written.
         config: which keyframes are summed, and the noise of their images.
         moving: as the front end looked for what moves.
+        thickness_floor_m: that the map was made with: log-scales there carry no information.
         threads: of the rasterizer; changes no bit of the result.
     Returns:
         What was written, in the order of the map's Gaussians.
@@ -48,27 +51,29 @@ def run_information(
     """
     final, keyframes, log_time_ns = read_frontend(frontend_path)
     with open_rgbd(log_path) as log:
-        if log.robot != final.robot:
+        if log.robot != robot_of(final.robot):
             raise DuagError(f"{frontend_path}: has the map of {final.robot}, expected that of {log.robot}")
+        log.move_depth_by(frontend_path)
         beyond = [k.frame_index for k in keyframes if k.frame_index >= len(log)]
         if beyond:
             raise DuagError(
-                f"{frontend_path}: {topics.KEYFRAME.of(log.robot)} names frame {beyond[0]}, "
+                f"{frontend_path}: {topics.KEYFRAME.of(final.robot)} names frame {beyond[0]}, "
                 f"expected less than the {len(log)} frames of {log_path.name}"
             )
+        exposures = read_exposures(frontend_path, final.robot)
         images = []
         for keyframe in keyframes:
             frame = log.frame(keyframe.frame_index)
-            images.append(
-                PosedRgbd(frame.color, frame.depth, keyframe.T_map_camera, frame.mask, frame.depth_sigma)
-            )
+            exposure = exposures.at(frame.index)
+            T = keyframe.T_map_camera
+            images.append(PosedRgbd(frame.color, frame.depth, T, frame.mask, frame.depth_sigma, exposure))
         camera = log.camera
     images = without_moving(images, camera, moving)
     views = MapViews(final.gaussians, camera, images, final.depth, threads)
     noise, overlap = with_correlation(estimate_noise(views, config), views, config)
     sums = sum_information(views, noise, config)
     deviation_m = surface_deviation(views, config.deviation_gate_m)
-    informed = without_thickness(sums.geometry, final.gaussians, config.thickness_floor_m)
+    informed = without_thickness(sums.geometry, final.gaussians, thickness_floor_m)
     result = GaussianInformation(
         stamp_ns=final.stamp_ns,
         robot=final.robot,

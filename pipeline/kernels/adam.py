@@ -6,7 +6,7 @@ import numpy as np
 
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.kernels import _raster
-from duagc.pipeline.kernels.rasterizer import empty
+from duagc.pipeline.kernels.outputs import empty
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.optimizer import BETA_1, BETA_2, EPSILON, Adam, GaussianGradients
 

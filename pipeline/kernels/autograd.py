@@ -23,12 +23,12 @@ _of_thread = threading.local()  # a Rasterizer serves one thread at a time
 
 
 def rasterize(
+    *,
     means: torch.Tensor,
     quats_wxyz: torch.Tensor,
     log_scales: torch.Tensor,
     colors: torch.Tensor,
     opacity_logits: torch.Tensor,
-    *,
     camera: PinholeCamera,
     T_camera_map: ArrayLike,
     background: ArrayLike = (0.0, 0.0, 0.0),

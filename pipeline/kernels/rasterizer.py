@@ -30,6 +30,7 @@ from duagc.pipeline.kernels.arguments import (
     complaint_about,
     refuse_bad_image,
 )
+from duagc.pipeline.kernels.outputs import NOTHING, empty, gradients_of, outputs_for, zeros
 from duagc.pipeline.kernels.types import (
     FISHER_DIAGONAL_COLUMNS,
     FisherSums,
@@ -46,7 +47,6 @@ MAX_THREADS = 1024
 MAX_GAUSSIANS = 2**30
 SAME_LAYER = 0.05  # relative difference of depth
 
-_NOTHING = np.zeros(0, dtype=np.float32)  # an optional array that is not given
 _NO_DOUBLES = np.zeros(0)
 _NO_MASK = np.zeros(0, dtype=np.uint8)
 
@@ -113,7 +113,9 @@ class Rasterizer:
         Raises:
             ValueError: an argument that no camera or Gaussian can have; the message names it.
         """
-        height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth_kind)
+        height, width, view = self._view(
+            gaussians, camera, T_camera_map, background=background, mask=mask, depth_kind=depth_kind
+        )
         color, depths, alpha = empty(height, width, 3), empty(height, width), empty(height, width)
         self._finish(
             gaussians,
@@ -127,10 +129,10 @@ class Rasterizer:
         gaussians: Gaussians,
         camera: PinholeCamera,
         T_camera_map: ArrayLike,
+        *,
         color: Image,
         depth_m: Image,
         loss: LossWeights,
-        *,
         exposure: tuple[float, float] = (0.0, 0.0),
         background: ArrayLike = (0.0, 0.0, 0.0),
         mask: NDArray[np.bool_] | None = None,
@@ -166,7 +168,9 @@ class Rasterizer:
         Raises:
             ValueError: an argument of a wrong type, shape or value; the message names it.
         """
-        height, width, view = self._view(gaussians, camera, T_camera_map, background, mask, depth_kind)
+        height, width, view = self._view(
+            gaussians, camera, T_camera_map, background=background, mask=mask, depth_kind=depth_kind
+        )
         measured = (
             checked_image("color", color, (height, width, 3), "the camera"),
             checked_image("depth_m", depth_m, (height, width), "the camera"),
@@ -176,7 +180,7 @@ class Rasterizer:
         *of_images, surface_weight = astuple(loss)
         weights = np.array([*of_images, *gain_and_offset, surface_weight], np.float32)
         check_wanted(pose, parameters, fisher=False)
-        out = _outputs(gaussians, parameters)
+        out = outputs_for(gaussians, parameters)
         by_pose, values = np.zeros(6 if pose else 0), np.zeros(6)
         arguments = [*arrays_of(gaussians), *view, *measured, weights, values, *out, by_pose]
         if depth_certainty is not None:
@@ -194,7 +198,7 @@ class Rasterizer:
         )
         return (
             ViewLoss(value, of_color, of_depth, (by_gain, by_offset), surface),
-            _gradients(out if parameters else None, by_pose if pose else None),
+            gradients_of(out if parameters else None, by_pose if pose else None),
         )
 
     def _view(
@@ -202,6 +206,7 @@ class Rasterizer:
         gaussians: Gaussians,
         camera: PinholeCamera,
         T_camera_map: ArrayLike,
+        *,
         background: ArrayLike,
         mask: NDArray[np.bool_] | None,
         depth_kind: DepthKind,
@@ -261,15 +266,15 @@ class Rasterizer:
         n = len(gaussians)
         images = (
             checked_image("d_color", d_color, (height, width, 3)),
-            _NOTHING if d_depth is None else checked_image("d_depth", d_depth, (height, width)),
-            _NOTHING if d_alpha is None else checked_image("d_alpha", d_alpha, (height, width)),
+            NOTHING if d_depth is None else checked_image("d_depth", d_depth, (height, width)),
+            NOTHING if d_alpha is None else checked_image("d_alpha", d_alpha, (height, width)),
         )
-        out = _outputs(gaussians, parameters)
+        out = outputs_for(gaussians, parameters)
         by_pose = np.zeros(6 if pose else 0)
-        diagonal = _zeros(n, FISHER_DIAGONAL_COLUMNS) if fisher else _NOTHING
+        diagonal = zeros(n, FISHER_DIAGONAL_COLUMNS) if fisher else NOTHING
         status = self._raster.backward(*arrays_of(gaussians), *images, *out, diagonal, by_pose)
         refuse_bad_image(status, dict.fromkeys(("d_color", "d_depth", "d_alpha"), NOT_FINITE))
-        return _gradients(
+        return gradients_of(
             out if parameters else None, by_pose if pose else None, diagonal if fisher else None
         )
 
@@ -291,7 +296,7 @@ class Rasterizer:
         images = (
             checked_image("inv_var_color", inv_var_color, size),
             checked_image("inv_var_depth", inv_var_depth, size),
-            _NOTHING if residual is None else checked_image("residual", residual, size),
+            NOTHING if residual is None else checked_image("residual", residual, size),
         )
         check_type("sums", sums, FisherSums)
         expected = {
@@ -380,29 +385,3 @@ class Rasterizer:
         if self._gaussians is None:
             raise RuntimeError("forward has not drawn anything yet")
         return self._gaussians, self._size
-
-
-def empty(*shape: int) -> NDArray[np.float32]:
-    """An array in memory that earlier outputs gave back, holding anything."""
-    return _raster.empty(int(np.prod(shape))).reshape(shape)
-
-
-def _zeros(*shape: int) -> NDArray[np.float32]:
-    array = empty(*shape)
-    array.fill(0.0)
-    return array
-
-
-def _outputs(gaussians: Gaussians, parameters: bool) -> list[NDArray[np.float32]]:
-    return [_zeros(*array.shape) if parameters else _NOTHING for array in arrays_of(gaussians)]
-
-
-def _gradients(
-    of_parameters: list[NDArray[np.float32]] | None,
-    pose: NDArray[np.float64] | None,
-    fisher_diagonal: NDArray[np.float32] | None = None,
-) -> Gradients:
-    nothing: list[None] = [None] * 5
-    names = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
-    arrays: dict[str, Any] = dict(zip(names, of_parameters or nothing, strict=True))
-    return Gradients(**arrays, pose=pose, fisher_diagonal=fisher_diagonal)

@@ -25,12 +25,11 @@ class TrainingView:
     """An RGB-D image as the loss takes it.
 
     Attributes:
-        color: float32 [H, W, 3], RGB in 0..1.
+        color: float32 [H, W, 3], RGB in 0..1, or above where an exposure was taken back.
         depth_m: float32 [H, W], meters, 0 where nothing was measured.
         T_map_camera: [4, 4], pose of the camera in the frame of the Gaussians.
         mask: bool [H, W], pixels that count; None: all.
         depth_certainty: float32 [H, W], factor of the depth residuals (`splat.losses.depth_certainty`); None: 1.
-        exposure: (a, b), log gain and offset of the image.
     """
 
     color: Image
@@ -38,7 +37,6 @@ class TrainingView:
     T_map_camera: NDArray[np.float64]
     mask: NDArray[np.bool_] | None = None
     depth_certainty: Image | None = None
-    exposure: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -63,10 +61,9 @@ class TrainingStep:
             gaussians,
             camera,
             se3.inverse(view.T_map_camera),
-            view.color,
-            view.depth_m,
-            self.loss,
-            exposure=view.exposure,
+            color=view.color,
+            depth_m=view.depth_m,
+            loss=self.loss,
             mask=view.mask,
             depth_kind=self.depth_kind,
             depth_certainty=view.depth_certainty,

@@ -13,10 +13,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import spd
 from duagc.pipeline.splat.gaussians import Gaussians
-
-Array = NDArray[np.float64]
 
 THETA_SIZE = 13
 MEAN, LOG_COVARIANCE, COLOR, OPACITY = slice(0, 3), slice(3, 9), slice(9, 12), 12

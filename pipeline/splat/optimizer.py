@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.splat.gaussians import Gaussians
 
-Array = NDArray[np.float32]
+Floats = NDArray[np.float32]
 _SHAPES: dict[str, tuple[int, ...]] = {
     "means": (3,),
     "quats_wxyz": (4,),
@@ -26,15 +26,15 @@ class GaussianGradients(Protocol):
     """Derivatives of a loss by every parameter of n Gaussians, shapes as in `Gaussians`."""
 
     @property
-    def means(self) -> Array: ...
+    def means(self) -> Floats: ...
     @property
-    def quats_wxyz(self) -> Array: ...
+    def quats_wxyz(self) -> Floats: ...
     @property
-    def log_scales(self) -> Array: ...
+    def log_scales(self) -> Floats: ...
     @property
-    def colors(self) -> Array: ...
+    def colors(self) -> Floats: ...
     @property
-    def opacity_logits(self) -> Array: ...
+    def opacity_logits(self) -> Floats: ...
 
 
 def smoothstep_decay(step: int, steps: int, last: float) -> float:
@@ -117,5 +117,5 @@ class Adam:
         return gaussians.replace(**values)
 
 
-def _zeros(n: int) -> dict[str, Array]:
+def _zeros(n: int) -> dict[str, Floats]:
     return {name: np.zeros((n, *tail), np.float32) for name, tail in _SHAPES.items()}

@@ -326,7 +326,9 @@ def write_logs(
 def test_the_stage_writes_what_it_returns_and_the_threads_do_not_show(tmp_path: Path) -> None:
     gaussians = write_logs(tmp_path)
     paths = [tmp_path / name for name in ("alpha.mcap", "frontend.mcap", "information.mcap")]
-    result = run_information(*paths, config=InformationConfig(), moving=MovingConfig())
+    result = run_information(
+        *paths, config=InformationConfig(), moving=MovingConfig(), thickness_floor_m=THICKNESS_FLOOR_M
+    )
     (record,) = read_log(paths[2])
     assert record.topic == "/alpha/information"
     back = record.message()
@@ -337,6 +339,7 @@ def test_the_stage_writes_what_it_returns_and_the_threads_do_not_show(tmp_path: 
     assert back.observations.max() == 3
     assert back.color_sigma == pytest.approx(0.05, rel=0.15)
     settings = {"config": InformationConfig(), "moving": MovingConfig()}
+    settings["thickness_floor_m"] = THICKNESS_FLOOR_M
     run_information(*paths[:2], tmp_path / "again.mcap", **settings, threads=3)
     (again,) = read_log(tmp_path / "again.mcap")
     assert again.data == record.data
@@ -351,6 +354,7 @@ def test_held_out_frames_never_enter(tmp_path: Path) -> None:
             tmp_path / "out.mcap",
             config=InformationConfig(),
             moving=MovingConfig(),
+            thickness_floor_m=THICKNESS_FLOOR_M,
         )
     assert not (tmp_path / "out.mcap").exists()
 
@@ -366,6 +370,7 @@ def test_a_front_end_without_a_map_is_one_line(tmp_path: Path) -> None:
             tmp_path / "out.mcap",
             config=InformationConfig(),
             moving=MovingConfig(),
+            thickness_floor_m=THICKNESS_FLOOR_M,
         )
 
 

@@ -158,7 +158,14 @@ def loss_outputs(
     depth_m = rng.uniform(0.5, 4.0, shape).astype(np.float32)
     depth_m[rng.random(shape) < 0.2] = 0.0
     loss, gradients = rasterizer.view_gradients(
-        *view, color, depth_m, LOSS, exposure=EXPOSURE, background=scene.background, pose=True, **options
+        *view,
+        color=color,
+        depth_m=depth_m,
+        loss=LOSS,
+        exposure=EXPOSURE,
+        background=scene.background,
+        pose=True,
+        **options,
     )
     cotangents: tuple[Any, ...] = ()
     if floors:

@@ -199,7 +199,9 @@ def test_cameras_that_cannot_be(name, value):
 def test_a_refused_view_leaves_nothing_to_differentiate():
     rasterizer = drawn()
     with pytest.raises(REFUSED, match="depth_m"):
-        rasterizer.view_gradients(random_gaussians(5, 0), CAMERA, np.eye(4), ones(3), -ones(), LOSS)
+        rasterizer.view_gradients(
+            random_gaussians(5, 0), CAMERA, np.eye(4), color=ones(3), depth_m=-ones(), loss=LOSS
+        )
     with pytest.raises(RuntimeError, match="forward"):
         rasterizer.contributions()
 
@@ -265,7 +267,7 @@ def test_arrays_in_any_layout(isa):
         )
         rasterizer, sums = Rasterizer(isa), FisherSums(20, diagonal=True)
         loss, gradients = rasterizer.view_gradients(
-            gaussians, CAMERA, np.eye(4), of_color, of_depth, LOSS, mask=of_mask, pose=True
+            gaussians, CAMERA, np.eye(4), color=of_color, depth_m=of_depth, loss=LOSS, mask=of_mask, pose=True
         )
         rasterizer.fisher(of_residual, of_depth, sums, residual=of_residual)
         results.append(
@@ -290,9 +292,9 @@ def test_any_size_of_anything(isa, size, n, depth):
         gaussians,
         camera,
         np.eye(4),
-        np.ones((height, width, 3), np.float32),
-        image,
-        LOSS,
+        color=np.ones((height, width, 3), np.float32),
+        depth_m=image,
+        loss=LOSS,
         mask=mask,
         depth_kind=depth,
         pose=True,
@@ -321,7 +323,7 @@ def test_extremes_stay_finite(isa, depth):
     )
     rasterizer, sums = Rasterizer(isa), FisherSums(n, diagonal=True)
     loss, gradients = rasterizer.view_gradients(
-        gaussians, CAMERA, np.eye(4), ones(3), ones(), LOSS, depth_kind=depth, pose=True
+        gaussians, CAMERA, np.eye(4), color=ones(3), depth_m=ones(), loss=LOSS, depth_kind=depth, pose=True
     )
     rasterizer.fisher(ones(), ones(), sums, residual=ones())
     assert np.isfinite([loss.value, loss.color, loss.depth, *loss.d_exposure]).all()

@@ -432,9 +432,9 @@ def test_view_gradients_are_forward_loss_and_backward(rasterizer, scene, exposur
         scene.gaussians,
         scene.camera,
         scene.T_camera_map,
-        color,
-        depth_m,
-        LOSS,
+        color=color,
+        depth_m=depth_m,
+        loss=LOSS,
         exposure=exposure,
         background=scene.background,
         mask=mask,
@@ -468,17 +468,18 @@ def test_view_gradients_are_forward_loss_and_backward(rasterizer, scene, exposur
 
 def test_view_gradients_with_certain_depth_are_those_without(plain):
     color, depth_m = measured_images(plain)
-    arguments = plain.gaussians, plain.camera, plain.T_camera_map, color, depth_m, LOSS
+    view = plain.gaussians, plain.camera, plain.T_camera_map
+    measured = {"color": color, "depth_m": depth_m, "loss": LOSS}
     rasterizer, sure = Rasterizer(), np.ones_like(depth_m)
-    loss, gradients = rasterizer.view_gradients(*arguments, exposure=(0.1, 0.02))
-    same, of_same = rasterizer.view_gradients(*arguments, exposure=(0.1, 0.02), depth_certainty=sure)
+    loss, gradients = rasterizer.view_gradients(*view, **measured, exposure=(0.1, 0.02))
+    same, of_same = rasterizer.view_gradients(*view, **measured, exposure=(0.1, 0.02), depth_certainty=sure)
     np.testing.assert_allclose([same.value, same.depth], [loss.value, loss.depth], rtol=1e-5)
     np.testing.assert_allclose(same.d_exposure, loss.d_exposure, rtol=1e-4)
     np.testing.assert_allclose(of_same.means, gradients.means, atol=1e-4 * np.abs(gradients.means).max())
-    less, of_less = rasterizer.view_gradients(*arguments, depth_certainty=0.0 * sure)
+    less, of_less = rasterizer.view_gradients(*view, **measured, depth_certainty=0.0 * sure)
     assert less.depth == 0
     without, of_color = rasterizer.view_gradients(
-        *arguments[:-1], dataclasses.replace(LOSS, depth_weight=0.0)
+        *view, **measured | {"loss": dataclasses.replace(LOSS, depth_weight=0.0)}
     )
     assert less.value == pytest.approx(without.value, rel=1e-5)
     np.testing.assert_allclose(of_less.means, of_color.means, atol=1e-4 * np.abs(of_color.means).max())
@@ -489,12 +490,12 @@ def test_view_gradients_with_certain_depth_are_those_without(plain):
 def test_view_gradients_of_the_depth_of_single_gaussians_are_those_of_the_reference(plain, depth, pose_only):
     color, depth_m = measured_images(plain)
     certainty = np.random.default_rng(5).uniform(0, 1, depth_m.shape).astype(np.float32)
-    arguments = plain.gaussians, plain.camera, plain.T_camera_map, color, depth_m
+    view = plain.gaussians, plain.camera, plain.T_camera_map
     options = {"depth_kind": depth, "pose": True, "depth_certainty": certainty, "mask": checkerboard(plain)}
-    options |= {"parameters": not pose_only}
+    options |= {"parameters": not pose_only, "color": color, "depth_m": depth_m}
     both = dataclasses.replace(LOSS, surface_weight=0.8)
-    loss, gradients = Rasterizer().view_gradients(*arguments, both, **options)
-    wanted, of_reference = ReferenceRasterizer().view_gradients(*arguments, both, **options)
+    loss, gradients = Rasterizer().view_gradients(*view, loss=both, **options)
+    wanted, of_reference = ReferenceRasterizer().view_gradients(*view, loss=both, **options)
     assert loss.surface == pytest.approx(wanted.surface, rel=1e-5)
     assert loss.value == pytest.approx(wanted.value, rel=1e-5)
     if pose_only:
@@ -502,7 +503,7 @@ def test_view_gradients_of_the_depth_of_single_gaussians_are_those_of_the_refere
         np.testing.assert_allclose(gradients.pose, of_reference.pose, rtol=1e-4, atol=1e-6)
     else:
         assert_same_gradients(gradients, of_reference, 1e-4)
-    without, of_less = Rasterizer().view_gradients(*arguments, LOSS, **options)
+    without, of_less = Rasterizer().view_gradients(*view, loss=LOSS, **options)
     assert without.surface == 0
     assert loss.value == pytest.approx(without.value + 0.8 * loss.surface, rel=1e-5)
     assert np.abs(gradients.pose - of_less.pose).max() > 0.01 * np.abs(of_less.pose).max()
@@ -510,13 +511,14 @@ def test_view_gradients_of_the_depth_of_single_gaussians_are_those_of_the_refere
 
 def test_view_gradients_draw_a_view_that_can_be_asked_further(rasterizer, plain):
     color, depth_m = measured_images(plain)
-    arguments = (plain.gaussians, plain.camera, plain.T_camera_map)
-    _, pose_only = rasterizer.view_gradients(*arguments, color, depth_m, LOSS, pose=True, parameters=False)
+    view = (plain.gaussians, plain.camera, plain.T_camera_map)
+    measured = {"color": color, "depth_m": depth_m, "loss": LOSS}
+    _, pose_only = rasterizer.view_gradients(*view, **measured, pose=True, parameters=False)
     assert pose_only.means is None
     weights, _ = rasterizer.contributions()
-    _, both = rasterizer.view_gradients(*arguments, color, depth_m, LOSS, pose=True)
+    _, both = rasterizer.view_gradients(*view, **measured, pose=True)
     np.testing.assert_array_equal(pose_only.pose, both.pose)
-    rasterizer.forward(*arguments)
+    rasterizer.forward(*view)
     np.testing.assert_array_equal(weights, rasterizer.contributions()[0])
 
 
@@ -526,7 +528,13 @@ def test_derivatives_by_exposure_are_differences(rasterizer, plain):
 
     def at(a, b):
         return rasterizer.view_gradients(
-            plain.gaussians, plain.camera, plain.T_camera_map, color, depth_m, LOSS, exposure=(a, b)
+            plain.gaussians,
+            plain.camera,
+            plain.T_camera_map,
+            color=color,
+            depth_m=depth_m,
+            loss=LOSS,
+            exposure=(a, b),
         )[0]
 
     by_a = (at(0.1 + step, 0.02).value - at(0.1 - step, 0.02).value) / (2 * step)
@@ -537,11 +545,11 @@ def test_derivatives_by_exposure_are_differences(rasterizer, plain):
 def test_views_without_measurements_have_no_loss(rasterizer, plain):
     nothing = np.zeros((plain.camera.height, plain.camera.width), dtype=bool)
     color, depth_m = measured_images(plain)
-    arguments = (plain.gaussians, plain.camera, plain.T_camera_map, color)
-    loss, gradients = rasterizer.view_gradients(*arguments, depth_m, LOSS, mask=nothing)
+    view = (plain.gaussians, plain.camera, plain.T_camera_map)
+    loss, gradients = rasterizer.view_gradients(*view, color=color, depth_m=depth_m, loss=LOSS, mask=nothing)
     assert loss.value == loss.color == loss.depth == 0.0
     assert loss.d_exposure == (0.0, 0.0)
     assert not flat(gradients).any()
-    loss, _ = rasterizer.view_gradients(*arguments, np.zeros_like(depth_m), LOSS)
+    loss, _ = rasterizer.view_gradients(*view, color=color, depth_m=np.zeros_like(depth_m), loss=LOSS)
     assert loss.depth == 0.0
     assert loss.value == loss.color > 0

@@ -9,26 +9,28 @@ import pytest
 
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.kernels import FisherSums, LossWeights, Rasterizer, available_isas
-from tests.fixtures.sampling import sampled
 from tests.kernels.scenes import make_scene, random_gaussians
 
 CAMERA = PinholeCamera(203, 117, 90.0, 92.0, 101.2, 57.1)
+SMALL_CAMERA = PinholeCamera(107, 61, 47.4, 48.0, 53.2, 29.6)
 LOSS = LossWeights(color_huber=0.1, depth_weight=0.5, depth_huber_m=0.02, alpha_weight=0.02)
 SURFACE = LossWeights(**{**vars(LOSS), "surface_weight": 0.3})
 CALLS = [(isa, threads) for isa in available_isas() for threads in (1, 2, 3, 5)]
 QUICK = [call for call in CALLS if call[0] != "portable" or call[1] in (1, 3)]  # it imitates fma, at length
 FAST = [call for call in QUICK if call[0] != "portable"] or QUICK[:1]
 PORTABLE = [call for call in QUICK if call not in FAST]
+MANY, FEW = 3000, 1000  # Gaussians: in the slow tests, and in `make test`
 
 
-def digest(rasterizer: Rasterizer) -> str:
-    """SHA-256 over every output of views of 3000 Gaussians."""
-    gaussians = random_gaussians(3000, seed=1)
-    rng, shape = np.random.default_rng(2), (CAMERA.height, CAMERA.width)
+def digest(rasterizer: Rasterizer, count: int = FEW) -> str:
+    """SHA-256 over every output of views of so many Gaussians."""
+    camera = CAMERA if count == MANY else SMALL_CAMERA
+    gaussians = random_gaussians(count, seed=1)
+    rng, shape = np.random.default_rng(2), (camera.height, camera.width)
     d_color, d_depth, d_alpha = (rng.normal(size=s).astype(np.float32) for s in ((*shape, 3), shape, shape))
     of_color, of_depth = (rng.uniform(0, 1e3, shape).astype(np.float32) for _ in range(2))
     color, depth_m = rng.random((*shape, 3)).astype(np.float32), rng.uniform(0, 4, shape).astype(np.float32)
-    view = gaussians, CAMERA, np.eye(4)
+    view = gaussians, camera, np.eye(4)
     arrays: list[np.ndarray] = []
     for depth, mask in (("blended", None), ("ray_plane", rng.random(shape) < 0.8)):
         sums = FisherSums(len(gaussians), diagonal=True)
@@ -40,10 +42,23 @@ def digest(rasterizer: Rasterizer) -> str:
         arrays += [rasterizer.full_fisher(of_color, of_depth), *rasterizer.contributions()]
         arrays += [rasterizer.layer_depth()]
         loss, gradients = rasterizer.view_gradients(
-            *view, color, depth_m, LOSS, exposure=(0.1, -0.05), mask=mask, depth_kind=depth, pose=True
+            *view,
+            color=color,
+            depth_m=depth_m,
+            loss=LOSS,
+            exposure=(0.1, -0.05),
+            mask=mask,
+            depth_kind=depth,
+            pose=True,
         )
         _, of_surface = rasterizer.view_gradients(
-            *view, color, depth_m, SURFACE, mask=mask, depth_kind=depth, depth_certainty=color[..., 0].copy()
+            *view,
+            color=color,
+            depth_m=depth_m,
+            loss=SURFACE,
+            mask=mask,
+            depth_kind=depth,
+            depth_certainty=color[..., 0].copy(),
         )
         arrays += [a for a in vars(of_surface).values() if a is not None]
         statistics = rasterizer.statistics()
@@ -56,24 +71,33 @@ def digest(rasterizer: Rasterizer) -> str:
 
 
 @cache
-def one_digest() -> str:
-    return digest(Rasterizer(*CALLS[0]))
+def one_digest(count: int = FEW) -> str:
+    return digest(Rasterizer(*CALLS[0]), count)
 
 
-@pytest.mark.parametrize(("isa", "threads"), sampled(FAST + PORTABLE, quick=len(FAST) + 1))
+@pytest.mark.parametrize(("isa", "threads"), FAST + PORTABLE[:1])
 def test_one_digest_for_threads_and_instruction_sets(isa, threads):
     assert digest(Rasterizer(isa, threads)) == one_digest()
 
 
-def digest_of(call: tuple[str, int]) -> str:
-    return digest(Rasterizer(*call))
+@pytest.mark.slow
+@pytest.mark.parametrize(("isa", "threads"), CALLS)
+def test_one_digest_of_many_gaussians(isa, threads):
+    assert digest(Rasterizer(isa, threads), MANY) == one_digest(MANY)
 
 
-@pytest.mark.parametrize("calls", [FAST, pytest.param(QUICK, marks=pytest.mark.slow)], ids=["fast", "all"])
-def test_one_digest_for_processes(calls):
+def digest_of(call: tuple[str, int], count: int) -> str:
+    return digest(Rasterizer(*call), count)
+
+
+@pytest.mark.parametrize(
+    ("calls", "count"), [(FAST, FEW), pytest.param(QUICK, MANY, marks=pytest.mark.slow)], ids=["fast", "all"]
+)
+def test_one_digest_for_processes(calls, count):
     """Fresh processes, each with addresses and hash seeds of its own."""
     with multiprocessing.get_context("spawn").Pool(2) as pool:
-        assert set(pool.map(digest_of, calls * 2, chunksize=len(calls))) == {one_digest()}
+        tasks = [(call, count) for call in calls * 2]
+        assert set(pool.starmap(digest_of, tasks, chunksize=len(calls))) == {one_digest(count)}
 
 
 def be_busy() -> None:
@@ -90,13 +114,13 @@ def test_one_digest_under_load():
     for process in busy:
         process.start()
     try:
-        digests = {digest_of(call) for _ in range(12) for call in CALLS}
+        digests = {digest_of(call, MANY) for _ in range(12) for call in CALLS}
         assert all(process.is_alive() for process in busy)
     finally:
         for process in busy:
             process.terminate()
             process.join()
-    assert digests == {one_digest()}
+    assert digests == {one_digest(MANY)}
 
 
 def test_scratch_of_other_views_leaves_no_trace():

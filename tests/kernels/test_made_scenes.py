@@ -48,7 +48,7 @@ def assert_agreement(scene: Scene, depth: DepthKind = "blended") -> None:
 depths = st.sampled_from(DEPTH_KINDS)
 
 
-@examples(40)
+@examples(25)
 @given(scene=mixed_scenes(), depth=depths)
 def test_mixed_scenes(scene, depth):
     assert_agreement(scene, depth)
@@ -75,24 +75,39 @@ def test_many_thousands_on_one_pixel(scene, depth):
 
 
 def kinds() -> list:
-    """All shapes, places and opacities; `make test` takes so many that every two of them meet."""
-    every = itertools.product(enumerate(SHAPES), enumerate(PLACES), enumerate(OPACITIES))
+    """All shapes, places, opacities and depths; `make test` takes so many that every two of them meet."""
+    every = itertools.product(*map(enumerate, (SHAPES, PLACES, OPACITIES, DEPTH_KINDS)))
     return [
         pytest.param(
-            shape, place, opacity, marks=() if (i + j + k) % len(OPACITIES) == 0 else pytest.mark.slow
+            shape,
+            place,
+            opacity,
+            depth,
+            marks=()
+            if (i + j + k) % len(OPACITIES) == 0 and (i + j + m) % len(DEPTH_KINDS) == 0
+            else pytest.mark.slow,
         )
-        for (i, shape), (j, place), (k, opacity) in every
+        for (i, shape), (j, place), (k, opacity), (m, depth) in every
     ]
 
 
-@pytest.mark.parametrize(("shape", "place", "opacity"), kinds())
-def test_every_kind_alone(shape, place, opacity):
+def test_every_two_kinds_meet():
+    quick = [param.values for param in kinds() if not param.marks]
+    for pair in itertools.combinations(range(4), 2):
+        of_all, of_quick = (
+            {tuple(values[c] for c in pair) for values in each}
+            for each in ([param.values for param in kinds()], quick)
+        )
+        assert of_quick == of_all
+
+
+@pytest.mark.parametrize(("shape", "place", "opacity", "depth"), kinds())
+def test_every_kind_alone(shape, place, opacity, depth):
     """One Gaussian: nothing else can hide what is wrong with it."""
-    rng = np.random.default_rng(5)
-    for seed, depth in enumerate(DEPTH_KINDS):
-        fx, fy, cx, cy = rng.uniform([20, 20, 0, 0], [60, 60, 30, 22]).astype(np.float32).tolist()
-        scene = made_scene(seed, [(shape, place, opacity)], PinholeCamera(30, 22, fx, fy, cx, cy))
-        assert_agreement(scene, depth)
+    seed = DEPTH_KINDS.index(depth)
+    intrinsics = np.random.default_rng(5).uniform([20, 20, 0, 0], [60, 60, 30, 22], (len(DEPTH_KINDS), 4))
+    camera = PinholeCamera(30, 22, *intrinsics[seed].astype(np.float32).tolist())
+    assert_agreement(made_scene(seed, [(shape, place, opacity)], camera), depth)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -113,7 +128,7 @@ def test_every_build_gives_the_same_bits(scene, depth):
     assert len({digest(isa, scene, depth) for isa in available_isas()}) == 1
 
 
-@examples(20)
+@examples(12)
 @given(camera=cameras(), n=st.integers(0, 2))
 def test_scenes_of_next_to_nothing(camera, n):
     assert_agreement(made_scene(n, [("plain", "plain", "plain")] * n, camera))
