@@ -5,6 +5,7 @@ when it was produced, `sequence` counts per topic from 0; all in the time of the
 The identity of a log is its content digest: the bytes of the file depend on the version of the compressor.
 """
 
+from duagc.pipeline.recording.exposures import read_exposures
 from duagc.pipeline.recording.folder import Recording
 from duagc.pipeline.recording.motion import Motion, MotionPrior
 from duagc.pipeline.recording.names import (
@@ -38,6 +39,7 @@ __all__ = [
     "log_metadata",
     "merge",
     "open_rgbd",
+    "read_exposures",
     "read_log",
     "verify",
     "write_preview_of",

@@ -115,7 +115,7 @@ def _is_record(stream: IO[bytes], at: int, size: int) -> bool:
     return Opcode.HEADER <= opcode <= Opcode.DATA_END and at + _RECORD.size + length <= size
 
 
-def _after_damage(stream: IO[bytes], at: int, size: int, salvage: Salvage, known: bool = False) -> int:
+def _after_damage(stream: IO[bytes], at: int, size: int, salvage: Salvage, *, known: bool = False) -> int:
     """Where the next sound chunk begins after a place that is no record; the end of the file if there is none."""
     start = at
     while True:

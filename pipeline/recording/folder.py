@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_bytes
 from duagc.pipeline.recording.names import RECORDING_FILE, RECORDING_FORMAT, RECORDING_SCHEMA
@@ -48,6 +49,15 @@ class Recording:
             raise DuagError(f"{path}: no such file, expected the log of {robot} that {RECORDING_FILE} names")
         return path
 
+    @property
+    def calibration(self) -> list[str]:
+        """What a calibration changed in this recording, in sentences; empty: nothing did."""
+        try:
+            said = [str(line) for c in self.description["calibration"]["cameras"] for line in c["summary"]]
+        except (KeyError, TypeError):  # there is none, or recording.json says nonsense
+            return []
+        return said
+
     def digest(self, name: str) -> str:
         """Content digest of a log as it was written; "nothing" if recording.json has none.
 
@@ -77,7 +87,8 @@ class Recording:
         name = self.description.get("geometry")
         return self.path / name if name and (self.path / name).is_file() else None
 
-    def _robot(self, robot: str) -> dict[str, Any]:
+    def _robot(self, name: str) -> dict[str, Any]:
+        robot = robot_of(name)
         if robot not in self._robots:
             raise DuagError(
                 f"{self.path}: found robots {', '.join(self.robots)}, expected {robot!r} among them"

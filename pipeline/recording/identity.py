@@ -23,7 +23,7 @@ class ContentDigest:
         self._hash = hashlib.sha256()
 
     def add(
-        self, identity: bytes, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes
+        self, identity: bytes, log_time_ns: int, publish_time_ns: int, *, sequence: int, data: bytes
     ) -> None:
         self._hash.update(identity + struct.pack("<QQIQ", log_time_ns, publish_time_ns, sequence, len(data)))
         self._hash.update(data)

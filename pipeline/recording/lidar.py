@@ -11,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import inside
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Image = NDArray[np.float32]
 NEAREST_M = 0.05

@@ -7,16 +7,15 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.pipeline import messages
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.recording.depth_sources import constant, transform_rows
 from duagc.pipeline.recording.read import LogFile
 from duagc.schemas import topics as topic_table
 
-Array = NDArray[np.float64]
 LONGEST_POSE_GAP_NS = 250_000_000
 LONGEST_RATE_GAP_NS = 50_000_000
 

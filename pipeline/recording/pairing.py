@@ -6,40 +6,57 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-TOLERANCE_NS = 20_000_000
-"""Color and depth farther apart are not of one frame: a robot moves by some centimeters in this time."""
+TOLERANCE_NS = 100_000_000
+"""Depth farther from a color image is not moved there: the camera may have turned back meanwhile."""
 
 
 @dataclass(frozen=True)
 class Pairing:
-    """pairs: (time of color, time of depth) of every frame in order, ns. color_alone, depth_alone: times without."""
+    """The depth of every color image.
 
-    pairs: tuple[tuple[int, int], ...]
+    Attributes:
+        pairs: time of color and time of its depth, ns, of every color image in order; None: it has no depth.
+        color_alone: times of color images without depth.
+        depth_alone: times of depth images that belong to no color image.
+    """
+
+    pairs: tuple[tuple[int, int | None], ...]
     color_alone: tuple[int, ...]
     depth_alone: tuple[int, ...]
 
     @property
+    def offsets_ns(self) -> NDArray[np.int64]:
+        """How much later the depth was taken, of every color image that has one."""
+        return np.array([depth - color for color, depth in self.pairs if depth is not None], dtype=np.int64)
+
+    @property
     def largest_offset_ns(self) -> int:
         """Largest time between the color and the depth of a frame."""
-        return max((abs(color - depth) for color, depth in self.pairs), default=0)
+        return int(np.abs(self.offsets_ns).max(initial=0))
 
 
 def pair(color_ns: Iterable[int], depth_ns: Iterable[int], tolerance_ns: int = TOLERANCE_NS) -> Pairing:
-    """Pair two sequences of times: each is the other's nearest (the earlier of two), within the tolerance."""
+    """The depth nearest to each color image, of two the earlier, within the tolerance; several may have the same.
+
+    Args:
+        color_ns: times of the color images.
+        depth_ns: times of the depth images.
+        tolerance_ns: largest time between them.
+    """
     color, depth = (np.unique(np.fromiter(times, np.int64)) for times in (color_ns, depth_ns))
     if len(color) == 0 or len(depth) == 0:
-        return Pairing((), tuple(color.tolist()), tuple(depth.tolist()))
-    to_depth, to_color = _nearest(color, depth), _nearest(depth, color)
-    mutual = to_color[to_depth] == np.arange(len(color))
-    near = np.abs(depth[to_depth] - color) <= tolerance_ns
-    rows = np.flatnonzero(mutual & near)
-    columns = to_depth[rows]
-    return Pairing(
-        tuple(zip(color[rows].tolist(), depth[columns].tolist(), strict=True)),
-        tuple(np.delete(color, rows).tolist()),
-        tuple(np.delete(depth, columns).tolist()),
+        alone = tuple(color.tolist())
+        return Pairing(tuple((stamp, None) for stamp in alone), alone, tuple(depth.tolist()))
+    nearest = _nearest(color, depth)
+    near = np.abs(depth[nearest] - color) <= tolerance_ns
+    pairs = tuple(
+        (stamp, partner if has else None)
+        for stamp, partner, has in zip(color.tolist(), depth[nearest].tolist(), near.tolist(), strict=True)
     )
+    unused = np.delete(depth, np.unique(nearest[near]))
+    return Pairing(pairs, tuple(color[~near].tolist()), tuple(unused.tolist()))
 
 
 def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
+from duagc.pipeline.geometry.masks import checkered
 from duagc.pipeline.recording.rgbd import RgbdFrame, RgbdLog, open_rgbd
 
 SHOWN = 6  # frames of a robot
 TILE_PX = 240  # width of a picture
+CHECKER_PX = 16  # side of the squares where a pixel is masked, before it is shrunk
 LINE_PX = 22  # height of a line of text
 Picture = NDArray[np.uint8]
 
@@ -59,7 +61,9 @@ def _rows_of(log: RgbdLog) -> list[Picture]:
     frames = some_frames(log)
     depth_m = reach(frames)["depth_m"]
     near, far = (depth_m[0], max(depth_m[2], depth_m[0] + 1e-3)) if depth_m else (0.0, 1.0)
-    colors = np.concatenate([_tile(frame.color) for frame in frames], axis=1)
+    colors = np.concatenate(
+        [_tile(checkered(frame.color, frame.mask, CHECKER_PX)) for frame in frames], axis=1
+    )
     depths = np.concatenate([_tile(_painted(frame.depth, near, far)) for frame in frames], axis=1)
     times = ", ".join(f"{frame.stamp_ns * 1e-9:.1f}" for frame in frames)
     words = f"{log.robot}: {len(log)} frames, at {times} s; depth {near:.2f} m (blue) to {far:.2f} m (red)"

@@ -367,7 +367,13 @@ def content_digest(path: Path) -> str:
         content = ContentDigest()
         for record in log.records(None):
             identity = log.identities[record.topic]
-            content.add(identity, record.log_time_ns, record.publish_time_ns, record.sequence, record.data)
+            content.add(
+                identity,
+                record.log_time_ns,
+                record.publish_time_ns,
+                sequence=record.sequence,
+                data=record.data,
+            )
         channels = [(log.identities[topic], channel.metadata) for topic, channel in log.channels.items()]
         metadata = [(name, text) for name, text in log.metadata() if name != DIGEST_RECORD]
         return content.finish(channels, metadata, log.attachments())

@@ -144,7 +144,7 @@ class _Copy:
             self._salvage.lost += m.sequence - expected
         self._sequences[m.channel_id] = m.sequence + 1
         self._writer.add_message(number, m.log_time, m.data, m.publish_time, m.sequence)
-        self._content.add(identity, m.log_time, m.publish_time, m.sequence, m.data)
+        self._content.add(identity, m.log_time, m.publish_time, sequence=m.sequence, data=m.data)
         self._in_order &= m.log_time >= self._last_ns
         self._last_ns = m.log_time
         self._salvage.messages += 1

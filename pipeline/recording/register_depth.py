@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import back_project, visible
 
-Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 SAME_SURFACE = 0.03  # relative step of depth up to which neighbors are one surface
 ONE_LAYER = 0.01  # relative depth behind the nearest sample of a pixel up to which samples are averaged

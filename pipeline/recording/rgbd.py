@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image
+from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.recording.depth_sources import check_size, constant, depth_source
+from duagc.pipeline.geometry.trajectory import Trajectory
+from duagc.pipeline.recording.depth_sources import DepthImage, check_size, constant, depth_source
 from duagc.pipeline.recording.motion import MotionPrior, motion_prior
+from duagc.pipeline.recording.moved_depth import DepthMotion, move_depth, tracked_frames
 from duagc.pipeline.recording.pairing import TOLERANCE_NS, pair
 from duagc.pipeline.recording.read import LogFile, Record
 from duagc.schemas import topics as topic_table
@@ -24,10 +27,13 @@ from duagc.schemas import topics as topic_table
 class RgbdFrame:
     """One color image with its depth.
 
-    index: position in the log. stamp_ns: when the color was taken. color: uint8 [H, W, 3], RGB.
-    depth: float32 [H, W], meters along z, 0 where nothing was measured. mask: bool [H, W], True = usable, False = a
-    moving object or otherwise to be ignored; None = all usable. depth_offset_ns: how much later the depth was taken.
-    depth_sigma: float32 [H, W], standard deviation of the depth in meters, 0 where there is no depth; None = unknown.
+    index: position in the log. stamp_ns: when the color was taken. color: uint8 [H, W, 3], RGB; where the mask forbids
+    a pixel that of a usable one next to it. depth: float32 [H, W], meters along z, 0 where nothing was measured and
+    where the camera never shows the scene. mask: bool [H, W], True = usable, False = not of the scene (the rim of an
+    undistorted image, the robot itself), a moving object or otherwise to be ignored; None = all usable.
+    depth_offset_ns: how much later the depth was taken. depth_moved: whether it was moved from there into the time of
+    the color. depth_sigma: float32 [H, W], standard deviation of the depth in meters, 0 where there is no depth; None =
+    unknown.
     """
 
     index: int
@@ -37,6 +43,7 @@ class RgbdFrame:
     mask: NDArray[np.bool_] | None = None
     depth_offset_ns: int = 0
     depth_sigma: NDArray[np.float32] | None = None
+    depth_moved: bool = False
 
     @property
     def usable_depth(self) -> NDArray[np.float32]:
@@ -45,12 +52,15 @@ class RgbdFrame:
 
 
 class RgbdLog:
-    """Color and depth of one robot: a frame is a color image and the depth nearest to it, if that is near enough.
+    """Color and depth of one robot: a frame is a color image and the depth nearest to it in time.
 
-    Images without a partner are no frames; `pairing` has their times. Depth may be registered already, or of another
-    camera, or a LiDAR's (`depth_sources`). Masks belong to the color image of the same publish time.
+    Where no depth is near enough a frame has none; `pairing` has all times. Depth of another time is as it was taken
+    until `move_depth` says how the camera moved. Depth may be registered already, or of another
+    camera, or a LiDAR's (`depth_sources`). Masks belong to the color image of the same publish time; `valid` belongs
+    to all of them.
 
-    `robot`, `camera`, `depth_scale` (meters per unit). Reads what is asked for and keeps no more than a few frames.
+    `robot`, `camera`, `depth_scale` (meters per unit), `valid` (bool [H, W], pixels that show the scene; None = all).
+    Reads what is asked for and keeps no more than a few frames.
     """
 
     def __init__(self, path: Path) -> None:
@@ -80,6 +90,7 @@ class RgbdLog:
         if not self._log.entries(self._color_topic):
             raise DuagError(f"{self.path}: {self._color_topic} has no message, expected images")
         self.camera = self._read_camera()
+        self.valid = self._read_valid()
         self._source = depth_source(self._log, self.robot, self.camera)
         self.depth_scale = self._source.scale
         self._mask_topic = topic_table.MASK.of(self.robot)
@@ -87,7 +98,8 @@ class RgbdLog:
         self._color_at = self._log.entries_by_time(*topics)
         self._depth_at = self._log.entries_by_time(self._source.topic)
         self.pairing = pair(self._color_at, self._depth_at)
-        if not self.pairing.pairs:
+        self._depth_motion: DepthMotion | None = None
+        if not len(self.pairing.offsets_ns):
             raise DuagError(
                 f"{self.path}: {self._color_topic} has {len(self._color_at)} images and {self._source.topic} "
                 f"{len(self._depth_at)}, none of them within {TOLERANCE_NS / 1e6:g} ms of each other, expected pairs"
@@ -103,6 +115,24 @@ class RgbdLog:
                 f"{self.path}: {topic} begins at {first} ns, expected no later than the images ({image} ns)"
             )
         return camera
+
+    def _read_valid(self) -> NDArray[np.bool_] | None:
+        """Pixels that show the scene in all images, by all messages about it; None: all pixels.
+
+        Raises:
+            DuagError: a mask has another size than the images, or no pixel is left.
+        """
+        topic = topic_table.VALID.of(self.robot)
+        found = np.ones((self.camera.height, self.camera.width), dtype=bool)
+        for entry in self._log.entries(topic):
+            record = self._log.record_at(topic, entry)
+            where = f"{self.path}: {topic} at {record.publish_time_ns} ns"
+            valid = messages.unpack_valid(record.proto(), where)
+            check_size(record, valid.shape[1], valid.shape[0], self.camera)
+            found &= valid
+            if not found.any():
+                raise DuagError(f"{where} leaves no pixel that shows the scene, expected some")
+        return None if found.all() else found
 
     def _read_mask_times(self) -> dict[int, tuple[int, int, int]]:
         """The entry of every mask by its publish time.
@@ -133,6 +163,24 @@ class RgbdLog:
         """Close the file."""
         self._log.close()
 
+    def move_depth(self, *parts: Trajectory) -> None:
+        """Move depth of another time than its color into the time of the color, in all frames read from now on.
+
+        Args:
+            parts: T_map_camera of the frames that were tracked; of every part that has a frame of its own.
+        """
+        if self.pairing.largest_offset_ns:
+            self._depth_motion = DepthMotion(*parts)
+
+    def move_depth_by(self, frontend: Path) -> None:
+        """`move_depth` by the poses that the front end found.
+
+        Args:
+            frontend: frontend.mcap of the robot; read only if some depth is of another time.
+        """
+        if self.pairing.largest_offset_ns:
+            self.move_depth(tracked_frames(frontend))
+
     def motion_prior(self) -> MotionPrior | None:
         """How the camera moved by other sensors of the log; None if it has none."""
         return motion_prior(self._log, self.robot)
@@ -156,18 +204,35 @@ class RgbdLog:
             raise IndexError(f"frame {index} of {len(self)}")
         stamp, depth_stamp = self.pairing.pairs[index]
         color = self._log.record_at(self._color_topic, self._color_at[stamp])
-        depth = self._log.record_at(self._source.topic, self._depth_at[depth_stamp])
-        image = self._decode_color(color)
-        offset, found = depth_stamp - stamp, self._source.read(depth)
+        image, mask = self._decode_color(color), self._mask_of(stamp)
+        found, moved = self._depth_of(stamp, depth_stamp)
         return RgbdFrame(
             index,
             stamp,
-            image,
-            found.depth_m,
-            mask=self._mask_of(stamp),
-            depth_offset_ns=offset,
-            depth_sigma=found.sigma_m,
+            image if mask is None else masks.filled(image, mask),
+            self._of_scene(found.depth_m),
+            mask=mask,
+            depth_offset_ns=0 if depth_stamp is None else depth_stamp - stamp,
+            depth_sigma=None if found.sigma_m is None else self._of_scene(found.sigma_m),
+            depth_moved=moved,
         )
+
+    def _depth_of(self, color_ns: int, depth_ns: int | None) -> tuple[DepthImage, bool]:
+        """The depth of a frame, and whether it was moved into the time of the color."""
+        if depth_ns is None:
+            return DepthImage(np.zeros((self.camera.height, self.camera.width), dtype=np.float32)), False
+        found = self._source.read(self._log.record_at(self._source.topic, self._depth_at[depth_ns]))
+        if depth_ns == color_ns or self._depth_motion is None:
+            return found, False
+        T_color_depth = self._depth_motion.between(color_ns, depth_ns)
+        if T_color_depth is None:
+            return found, False
+        seen = DepthImage(self._of_scene(found.depth_m), found.sigma_m)
+        return move_depth(seen, self.camera, T_color_depth), True
+
+    def _of_scene(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """An image [H, W] with 0 where the camera never shows the scene."""
+        return values if self.valid is None else np.where(self.valid, values, np.float32(0))
 
     def _decode_color(self, record: Record) -> NDArray[np.uint8]:
         import cv2
@@ -183,11 +248,11 @@ class RgbdLog:
     def _mask_of(self, stamp_ns: int) -> NDArray[np.bool_] | None:
         entry = self._mask_at.get(stamp_ns)
         if entry is None:
-            return None
+            return self.valid
         record = self._log.record_at(self._mask_topic, entry)
         mask = messages.unpack_mask(record.proto(), f"{self.path}: {record.topic} at {stamp_ns} ns")
         check_size(record, mask.shape[1], mask.shape[0], self.camera)
-        return mask
+        return mask if self.valid is None else mask & self.valid
 
 
 def open_rgbd(path: Path) -> RgbdLog:

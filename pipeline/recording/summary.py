@@ -59,7 +59,7 @@ def _log_info(path: Path) -> dict[str, Any]:
 
 
 def _pairing_warnings(log: LogFile) -> list[str]:
-    """Images of a camera without a partner: they are no frames."""
+    """Images of a camera without a partner, and depth of another time."""
     out = []
     for topic in sorted(log.channels):
         row = topic_table.find(topic)
@@ -70,10 +70,11 @@ def _pairing_warnings(log: LogFile) -> list[str]:
         if depth is None:
             continue
         found = pair(log.entries_by_time(topic), log.entries_by_time(depth))
-        for name, other, alone in ((topic, depth, found.color_alone), (depth, topic, found.depth_alone)):
-            if alone:
-                near = f"within {TOLERANCE_NS / 1e6:g} ms"
-                out.append(f"{name}: {len(alone)} images have none of {other} {near} and are no frames")
+        if found.color_alone:
+            near = f"within {TOLERANCE_NS / 1e6:g} ms"
+            out.append(f"{topic}: {len(found.color_alone)} images have none of {depth} {near}: no depth")
+        if found.depth_alone:
+            out.append(f"{depth}: {len(found.depth_alone)} images are nearest to none of {topic}: not used")
         if found.largest_offset_ns:
             out.append(f"{depth}: up to {found.largest_offset_ns / 1e6:.1f} ms from {topic}")
     return out
@@ -112,6 +113,7 @@ def _topic_info(log: LogFile, topic: str) -> dict[str, Any]:
 def _recording_info(path: Path) -> dict[str, Any]:
     recording = Recording(path)
     out: dict[str, Any] = {"kind": "recording", **recording.description, "robots": {}}
+    out["calibrated"] = recording.calibration
     out["warnings"] = warnings = list(recording.description.get("warnings", []))
     for robot in recording.robots:
         row = dict(recording.description["robots"][robot])
@@ -142,6 +144,7 @@ def _frames_info(path: Path) -> dict[str, Any]:
             "end_ns": stamps[-1],
             "camera": asdict(log.camera),
             "depth_scale_m": log.depth_scale,
+            "masked_share": 0.0 if log.valid is None else float(np.mean(~log.valid)),
             **reach(some_frames(log)),
         }
 
@@ -169,6 +172,7 @@ def format_info(content: Mapping[str, Any]) -> str:
         source = " ".join(str(v) for v in content["source"].values() if isinstance(v, str) and v)
         lines = [f"recording {content['name']}: {source}, {len(content['robots'])} robots"]
         lines += _robot_table(content["robots"])
+        lines += [f"  calibration: {line}" for line in content["calibrated"]]
         for robot, row in content["robots"].items():
             lines += _robot_lines(robot, row)
             lines += _clock_lines(content.get("clocks", {}).get(robot))
@@ -201,6 +205,8 @@ def _robot_lines(robot: str, row: Mapping[str, Any]) -> list[str]:
         f"center {c['cx']:g} {c['cy']:g} px, depth in {row['depth_scale_m']:g} m",
         f"    ground truth: {row['groundtruth'] or 'none'}",
     ]
+    if row["masked_share"]:
+        lines.append(f"    {row['masked_share']:.1%} of the pixels never show the scene and are masked")
     try:
         path = row["path"]
         spans = zip(path["low_m"], path["high_m"], strict=True)

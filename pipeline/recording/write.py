@@ -16,6 +16,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording.access import check_write
 from duagc.pipeline.recording.identity import ContentDigest, channel_identity
 from duagc.pipeline.recording.names import DIGEST_RECORD, LIBRARY, LOG_RECORD, ROBOT_KEY
+from duagc.pipeline.recording.read import LogFile, Record
 from duagc.schemas import topics as topic_table
 
 CHUNK_BYTES = 1 << 20
@@ -54,7 +55,7 @@ class LogWriter:
         self._part = self.path.with_name(self.path.name + ".part")
         self._stream: IO[bytes] | None = None
         self._channels: dict[str, _OpenChannel] = {}
-        self._schema_ids: dict[str, int] = {}
+        self._schema_ids: dict[tuple[str, bytes], int] = {}
         self._content = ContentDigest()
         self._last_log_time_ns = 0
 
@@ -87,12 +88,20 @@ class LogWriter:
             raise ValueError(f"{topic} carries {schema}, expected {expected}")
         check_write(self.path, topic)
         descriptors = schemas.descriptor_set(schema)
-        if schema not in self._schema_ids:
-            self._schema_ids[schema] = self._writer.register_schema(schema, "protobuf", descriptors)
-        text = dict(sorted((metadata or {}).items()))
-        number = self._writer.register_channel(topic, "protobuf", self._schema_ids[schema], text)
-        identity = channel_identity(topic, schema, descriptors)
-        self._channels[topic] = _OpenChannel(number, schema, identity, text)
+        self._open(topic, (schema, "protobuf", descriptors), "protobuf", metadata or {})
+
+    def _open(
+        self, topic: str, schema: tuple[str, str, bytes], encoding: str, metadata: Mapping[str, str]
+    ) -> None:
+        name, schema_encoding, data = schema
+        number = 0  # without a schema
+        if name:
+            if (name, data) not in self._schema_ids:
+                self._schema_ids[name, data] = self._writer.register_schema(name, schema_encoding, data)
+            number = self._schema_ids[name, data]
+        text = dict(sorted(metadata.items()))
+        channel = self._writer.register_channel(topic, encoding, number, text)
+        self._channels[topic] = _OpenChannel(channel, name, channel_identity(topic, name, data), text)
 
     def write(self, topic: str, message: Any, log_time_ns: int, publish_time_ns: int | None = None) -> None:
         """Append one message.
@@ -107,19 +116,38 @@ class LogWriter:
         schema = proto.DESCRIPTOR.full_name
         if topic not in self._channels:
             self.channel(topic, schema)
-        channel = self._channels[topic]
-        if schema != channel.schema:
-            raise ValueError(f"{topic} carries {schema}, expected {channel.schema}")
+        if schema != self._channels[topic].schema:
+            raise ValueError(f"{topic} carries {schema}, expected {self._channels[topic].schema}")
         log_time_ns = int(log_time_ns)
         publish_time_ns = log_time_ns if publish_time_ns is None else int(publish_time_ns)
+        self._append(topic, proto.SerializeToString(deterministic=True), log_time_ns, publish_time_ns)
+
+    def copy(self, log: LogFile, record: Record) -> None:
+        """Append a message of another log as it stands there, also of a topic that is not in the table.
+
+        Args:
+            log: that it is of.
+            record: the message.
+        """
+        if record.topic not in self._channels:
+            check_write(self.path, record.topic)
+            channel = log.channels[record.topic]
+            schema = log.summary.schemas.get(channel.schema_id)
+            described = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
+            self._open(record.topic, described, channel.message_encoding, channel.metadata)
+        self._append(record.topic, record.data, record.log_time_ns, record.publish_time_ns)
+
+    def _append(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> None:
+        channel = self._channels[topic]
         if log_time_ns < self._last_log_time_ns or publish_time_ns < 0:
             raise ValueError(
                 f"{topic} at {log_time_ns} ns comes after {self._last_log_time_ns} ns in {self.path.name}"
             )
         self._last_log_time_ns = log_time_ns
-        data = proto.SerializeToString(deterministic=True)
         self._writer.add_message(channel.number, log_time_ns, data, publish_time_ns, channel.sequence)
-        self._content.add(channel.identity, log_time_ns, publish_time_ns, channel.sequence, data)
+        self._content.add(
+            channel.identity, log_time_ns, publish_time_ns, sequence=channel.sequence, data=data
+        )
         channel.sequence += 1
 
     def __exit__(

@@ -121,7 +121,10 @@ def test_frames_stream(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"skip_color": (0, 2), "skip_depth": (1, 3)}, "none of them within 20 ms of each other"),
+        (
+            {"frames": 9, "skip_color": (0, 1, 2, 3, 4), "skip_depth": tuple(range(2, 9))},
+            "none of them within 100 ms",
+        ),
         ({"skip_depth": (0, 1, 2, 3)}, "has a message, expected depth from one of them"),
         ({"frames": 0}, "expected exactly one robot"),
         ({"cameras": {}}, f"{CALIBRATION} has no message"),
@@ -145,22 +148,27 @@ def test_unsound_cameras_are_one_line(tmp_path: Path, change: dict[str, Any], wo
     assert words in str(caught.value)
 
 
-def test_images_without_a_partner_are_no_frames(tmp_path: Path) -> None:
-    path = write_camera(tmp_path / "alpha.mcap", 8, skip_color=(1,), skip_depth=(4, 5))
+def test_images_without_a_partner(tmp_path: Path) -> None:
+    """Without depth of its own a color image has that of the next one, and none where no depth is near."""
+    path = write_camera(tmp_path / "alpha.mcap", 12, skip_color=(1,), skip_depth=(2, *range(4, 12)))
     with open_rgbd(path) as log:
-        assert [f.stamp_ns // FRAME_NS for f in log.frames()] == [0, 2, 3, 6, 7]
-        assert [f.index for f in log.frames()] == [0, 1, 2, 3, 4]
-        for frame in log.frames():
-            assert np.array_equal(frame.depth, depth(frame.stamp_ns // FRAME_NS) * np.float32(0.001))
-        assert log.pairing.color_alone == (4 * FRAME_NS, 5 * FRAME_NS)
-        assert log.pairing.depth_alone == (FRAME_NS,)
+        frames = list(log.frames())
+        assert [f.stamp_ns // FRAME_NS for f in frames] == [0, *range(2, 12)]
+        assert [f.index for f in frames] == list(range(11))
+        of = {0: 0, 2: 1, 3: 3, 4: 3, 5: 3, 6: 3}
+        for frame in frames:
+            k = frame.stamp_ns // FRAME_NS
+            expected = depth(of[k]) * np.float32(0.001) if k in of else np.zeros_like(depth(0), np.float32)
+            assert np.array_equal(frame.depth, expected)
+            assert frame.depth_offset_ns == ((of[k] - k) * FRAME_NS if k in of else 0)
+        assert log.pairing.color_alone == tuple(k * FRAME_NS for k in range(7, 12))
+        assert log.pairing.depth_alone == ()
     warnings = info(path)["warnings"]
-    assert f"{COLOR}: 2 images have none of {DEPTH} within 20 ms and are no frames" in warnings
-    assert f"{DEPTH}: 1 images have none of {COLOR} within 20 ms and are no frames" in warnings
+    assert f"{COLOR}: 5 images have none of {DEPTH} within 100 ms: no depth" in warnings
 
 
 def test_color_and_depth_may_come_at_their_own_rates(tmp_path: Path) -> None:
-    """Color at 30 Hz, depth at 10 Hz and 7 ms late: every third color image has its nearest depth."""
+    """Color at 30 Hz, depth at 10 Hz and 7 ms late: every color image has its nearest depth."""
     path = tmp_path / "alpha.mcap"
     events = [(k * FRAME_NS, topics.COLOR, k) for k in range(9)]
     events += [(3 * k * FRAME_NS + 7_000_000, topics.DEPTH, k) for k in range(3)]
@@ -177,12 +185,13 @@ def test_color_and_depth_may_come_at_their_own_rates(tmp_path: Path) -> None:
             log.write(topic.of("alpha"), message, stamp)
     with open_rgbd(path) as log:
         frames = list(log.frames())
-    assert [f.stamp_ns // FRAME_NS for f in frames] == [0, 3, 6]
-    assert [f.depth_offset_ns for f in frames] == [7_000_000] * 3
+    assert [f.stamp_ns // FRAME_NS for f in frames] == list(range(9))
+    nearest = [0, 0, 1, 1, 1, 2, 2, 2, 2]
     for k, frame in enumerate(frames):
-        assert np.array_equal(frame.color, image(3 * k)[:, :, ::-1])
-        assert np.array_equal(frame.depth, depth(k) * np.float32(0.001))
-    assert f"{DEPTH}: up to 7.0 ms from {COLOR}" in info(path)["warnings"]
+        assert frame.depth_offset_ns == (3 * nearest[k] - k) * FRAME_NS + 7_000_000
+        assert np.array_equal(frame.color, image(k)[:, :, ::-1])
+        assert np.array_equal(frame.depth, depth(nearest[k]) * np.float32(0.001))
+    assert f"{DEPTH}: up to 59.7 ms from {COLOR}" in info(path)["warnings"]
 
 
 @settings(max_examples=50, deadline=None)
@@ -190,12 +199,61 @@ def test_color_and_depth_may_come_at_their_own_rates(tmp_path: Path) -> None:
     color=st.lists(st.integers(0, 10**9), unique=True, min_size=1, max_size=20),
     depth_times=st.lists(st.integers(0, 10**9), unique=True, min_size=1, max_size=20),
 )
-def test_pairs_are_each_others_nearest(color: list[int], depth_times: list[int]) -> None:
+def test_every_color_image_has_the_nearest_depth(color: list[int], depth_times: list[int]) -> None:
     found = pair(color, depth_times)
+    assert [c for c, _ in found.pairs] == sorted(color)
     for c, d in found.pairs:
-        assert abs(c - d) <= TOLERANCE_NS
-        assert abs(c - d) == min(abs(c - other) for other in depth_times)
-        assert abs(c - d) == min(abs(other - d) for other in color)
-    assert sorted([c for c, _ in found.pairs] + list(found.color_alone)) == sorted(color)
-    assert sorted([d for _, d in found.pairs] + list(found.depth_alone)) == sorted(depth_times)
-    assert len({d for _, d in found.pairs}) == len(found.pairs)
+        least = min(abs(c - other) for other in depth_times)
+        if d is None:
+            assert least > TOLERANCE_NS
+        else:
+            assert abs(c - d) == least <= TOLERANCE_NS
+    assert found.color_alone == tuple(c for c, d in found.pairs if d is None)
+    used = {d for _, d in found.pairs if d is not None}
+    assert sorted([*used, *found.depth_alone]) == sorted(depth_times)
+    assert found.largest_offset_ns == max((abs(d - c) for c, d in found.pairs if d is not None), default=0)
+
+
+def test_a_mask_of_all_images_holds_with_those_of_single_ones(tmp_path: Path) -> None:
+    """What is under either mask is gone from the color; where no image shows the scene there is no depth either."""
+    valid = np.ones((12, 16), bool)
+    valid[:, :3] = False
+    with RecordingWriter(tmp_path / "rec") as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
+        robot.set_valid(valid)
+        for k in range(2):
+            robot.add_frame(k * FRAME_NS, png(image(k)), "png", depth(k), mask=usable(k) if k else None)
+    with open_rgbd(tmp_path / "rec" / "alpha.mcap") as log:
+        assert np.array_equal(log.valid, valid)
+        first, second = log.frame(0), log.frame(1)
+    assert np.array_equal(first.mask, valid)
+    assert np.array_equal(second.mask, valid & usable(1))
+    for k, frame in enumerate((first, second)):
+        assert frame.mask is not None
+        assert np.array_equal(frame.color[frame.mask], image(k)[:, :, ::-1][frame.mask])
+        assert not frame.depth[~valid].any()
+        assert np.array_equal(frame.depth[valid] > 0, depth(k)[valid] > 0)
+
+
+@pytest.mark.parametrize(
+    ("valid", "words"),
+    [
+        (np.ones((4, 5), bool), "is 5x4, expected 16x12"),
+        (np.zeros((12, 16), bool), "leaves no pixel that shows the scene"),
+    ],
+)
+def test_a_mask_of_all_images_that_cannot_be_used(tmp_path: Path, valid: np.ndarray, words: str) -> None:
+    log = write_camera(tmp_path / "alpha.mcap", frames=2, valid=m.pack_valid(0, "alpha", valid))
+    with pytest.raises(DuagError, match=words), open_rgbd(log):
+        pass
+
+
+def test_the_bytes_of_a_mask_of_all_images_are_a_png(tmp_path: Path) -> None:
+    message = m.pack_valid(0, "alpha", np.ones((12, 16), bool))
+    message.data = message.data[:20]
+    log = write_camera(tmp_path / "alpha.mcap", frames=2, valid=message)
+    with pytest.raises(DuagError, match="expected a PNG of 8 bits and one channel"), open_rgbd(log):
+        pass
+    message = m.pack_color(0, "alpha", png(np.full((12, 16), 7, np.uint8)), "png")
+    log = write_camera(tmp_path / "alpha.mcap", frames=2, valid=message)
+    with pytest.raises(DuagError, match="has the value 7, expected 0"), open_rgbd(log):
+        pass
