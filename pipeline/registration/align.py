@@ -15,15 +15,13 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 from duagc.pipeline.registration.reference import Reference
 from duagc.pipeline.registration.residuals import Linearization, linearize_at
-
-Array = NDArray[np.float64]
 
 STEP_TOLERANCE = (
     4e-6  # m, rad: steps shrink by a third or more each, so less than half of the last one is left

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.geometry import masks, se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import back_project
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 
-Array = NDArray[np.float64]
 Descriptors = NDArray[np.uint8]
 DIMENSIONS = 128
 REFINEMENT_ROUNDS = 3  # of fitting to the inliers and finding them again
@@ -41,24 +41,37 @@ class Features:
 
 
 def extract(
-    color: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera, most: int
+    color: NDArray[np.uint8],
+    depth_m: NDArray[np.float32],
+    camera: PinholeCamera,
+    most: int,
+    *,
+    mask: masks.Mask | None = None,
 ) -> Features:
     """The strongest SIFT features of a frame that have a depth.
+
+    A feature that is nearer to a pixel that may not be used than its size, the diameter of its blob, is left out.
 
     Args:
         color: uint8 RGB [h, w, 3].
         depth_m: float32 [h, w], meters, 0 = unknown.
         camera: of both.
         most: number of features kept.
+        mask: bool [h, w], pixels that may be used; None: all.
     """
     import cv2
 
     gray = np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-    return extract_from_gray(gray, depth_m, camera, most)
+    return extract_from_gray(gray, depth_m, camera, most, mask=mask)
 
 
 def extract_from_gray(
-    gray: NDArray[np.uint8], depth_m: NDArray[np.float32], camera: PinholeCamera, most: int
+    gray: NDArray[np.uint8],
+    depth_m: NDArray[np.float32],
+    camera: PinholeCamera,
+    most: int,
+    *,
+    mask: masks.Mask | None = None,
 ) -> Features:
     """`extract` from a gray image.
 
@@ -67,6 +80,7 @@ def extract_from_gray(
         depth_m: float32 [h, w], meters, 0 = unknown.
         camera: of both.
         most: number of features kept.
+        mask: bool [h, w], pixels that may be used; None: all.
     """
     import cv2
 
@@ -78,6 +92,8 @@ def extract_from_gray(
     column = np.clip(np.rint(u).astype(np.int64), 0, camera.width - 1)
     row = np.clip(np.rint(v).astype(np.int64), 0, camera.height - 1)
     z = depth_m[row, column].astype(np.float64)
+    if mask is not None:
+        z = np.where(masks.distance_px(mask)[row, column] > [k.size for k in keypoints], z, 0)
     angle = np.array([k.angle for k in keypoints])
     order = np.lexsort((angle, u, v, -response))
     order = order[z[order] > 0][:most]
@@ -99,7 +115,7 @@ def extract_from_pyramid(pyramid: RgbdPyramid, max_width_px: int, most: int) -> 
     gray = np.rint(np.clip(level.gray, 0, 1) * 255).astype(np.uint8)
     known = level.inverse_depth > 0
     depth_m = np.where(known, 1 / np.where(known, level.inverse_depth, 1), 0).astype(np.float32)
-    return extract_from_gray(gray, depth_m, level.camera, most)
+    return extract_from_gray(gray, depth_m, level.camera, most, mask=level.mask)
 
 
 def root_sift(sift: NDArray[np.float32]) -> Descriptors:

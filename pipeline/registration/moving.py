@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import FREE, ON_SURFACE, back_project, free_space, largest_of_3x3
 from duagc.pipeline.registration.pyramid import Level
 
-Array = NDArray[np.float64]
 Image = NDArray[np.floating]
 Mask = NDArray[np.bool_]
 

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 Image = NDArray[np.floating]
@@ -32,6 +33,7 @@ class Level:
         inverse_depth: float32 [h, w], 1/m, 0 where the depth is unknown.
         has_depth: False if there is no depth image, which is not the same as one that is empty.
         depth_sigma_m: float32 [h, w], standard deviation of the depth; None: not known pixel by pixel.
+        mask: bool [h, w], pixels all parts of which may be used; None: all. Elsewhere the depth is unknown.
     """
 
     camera: PinholeCamera
@@ -39,6 +41,7 @@ class Level:
     inverse_depth: Image
     has_depth: bool = True
     depth_sigma_m: Image | None = None
+    mask: masks.Mask | None = None
 
     @cached_property
     def gradients(self) -> tuple[Image, Image]:
@@ -52,10 +55,15 @@ class Level:
     def channels(self) -> Image:
         """(gray, d/du, d/dv, inverse depth or NaN, and sigma where known) for interpolation, [h * w, 4 or 5].
 
-        NaN makes every value that touches an unknown depth unknown, and fails every gate.
+        NaN makes every value that touches an unknown depth unknown, and fails every gate. So does a pixel whose
+        gradient touches one that may not be used. Without a depth image the inverse depth is 1 at all others.
         """
         gu, gv = self.gradients
-        inverse_depth = np.where(self.inverse_depth > 0, self.inverse_depth, np.float32(np.nan))
+        known = self.inverse_depth > 0 if self.has_depth else np.ones(self.gray.shape, dtype=bool)
+        if self.mask is not None:
+            known &= masks.whole_windows(self.mask, 1)
+        depths = self.inverse_depth if self.has_depth else np.ones_like(self.inverse_depth)
+        inverse_depth = np.where(known, depths, np.float32(np.nan))
         sigma = [] if self.depth_sigma_m is None else [self.depth_sigma_m]
         return np.stack([self.gray, gu, gv, inverse_depth, *sigma], axis=-1).reshape(-1, 4 + len(sigma))
 
@@ -85,21 +93,24 @@ class Level:
 
         The gray value is the mean. The inverse depth is the mean over the nearest surface in the block (members
         within 5 % of the nearest pixel), unknown if fewer than two pixels show it; sigma is their mean too, as errors
-        of neighbors are much the same.
+        of neighbors are much the same. A block may be used if all its pixels may.
         """
         camera = self.camera.halved()
+        mask = None if self.mask is None else masks.halved(self.mask)
         blocks = _blocks(self.inverse_depth, camera)
         members = blocks > blocks.max(axis=0) * (1 - SAME_SURFACE)
         count = members.sum(axis=0, dtype=np.float32)
         total = np.where(members, blocks, np.float32(0)).sum(axis=0)
         known = (total > 0) & (count >= 2)
+        if mask is not None:
+            known &= mask
         inverse_depth = np.where(known, total / np.maximum(count, 1), np.float32(0))
         sigma = None
         if self.depth_sigma_m is not None:
             of_members = np.where(members, _blocks(self.depth_sigma_m, camera), np.float32(0)).sum(axis=0)
             sigma = np.where(known, of_members / np.maximum(count, 1), np.float32(0))
         gray = _blocks(self.gray, camera).sum(axis=0) * np.float32(0.25)
-        return Level(camera, gray, inverse_depth, depth_sigma_m=sigma)
+        return Level(camera, gray, inverse_depth, depth_sigma_m=sigma, mask=mask)
 
 
 @dataclass(frozen=True)
@@ -115,7 +126,13 @@ class RgbdPyramid:
     def without_depth(self) -> RgbdPyramid:
         """The gray values alone, of a frame without a depth image."""
         return self._changed(
-            lambda level: Level(level.camera, level.gray, np.zeros_like(level.inverse_depth), has_depth=False)
+            lambda level: Level(
+                level.camera,
+                level.gray,
+                np.zeros_like(level.inverse_depth),
+                has_depth=False,
+                mask=level.mask,
+            )
         )
 
     def with_exposure(self, gain: float, offset: float) -> RgbdPyramid:
@@ -139,6 +156,7 @@ class RgbdPyramid:
         levels: int = 3,
         *,
         depth_sigma_m: Image | None = None,
+        mask: masks.Mask | None = None,
     ) -> RgbdPyramid:
         """Build the pyramid of a frame.
 
@@ -148,16 +166,21 @@ class RgbdPyramid:
             camera: intrinsics of both images.
             levels: number of resolutions.
             depth_sigma_m: [h, w], meters; None: not known pixel by pixel.
+            mask: bool [h, w], pixels that may be used; None: all.
         """
         gray = image @ GRAY_OF_RGB if image.ndim == 3 else np.asarray(image, dtype=np.float32)
         shape = (camera.height, camera.width)
         if gray.shape != shape or depth_m.shape != shape:
             raise ValueError(f"images of {gray.shape} and {depth_m.shape}, camera of {shape}")
         known = np.isfinite(depth_m) & (depth_m > 0)
+        if mask is not None:
+            known &= mask
         inverse_depth = np.where(known, 1 / np.where(known, depth_m, 1), 0).astype(np.float32)
         if depth_sigma_m is not None:
             depth_sigma_m = np.where(known, depth_sigma_m, 0).astype(np.float32)
-        built = [Level(camera, np.ascontiguousarray(gray), inverse_depth, depth_sigma_m=depth_sigma_m)]
+        built = [
+            Level(camera, np.ascontiguousarray(gray), inverse_depth, depth_sigma_m=depth_sigma_m, mask=mask)
+        ]
         while len(built) < levels:
             built.append(built[-1].halved())
         return RgbdPyramid(tuple(built))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.projection import back_project
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
 
@@ -77,7 +78,7 @@ class Reference:
         """
         finest = pyramid.levels[0]
         gu, gv = finest.gradients
-        known = _has_normal(finest)
+        known = _has_normal(finest) & _usable_at_all_levels(pyramid)
         strength = np.where(known, np.sqrt(gu * gu + gv * gv), np.float32(-1))
         textured = round(count * GRADIENT_SHARE)
         chosen = np.union1d(
@@ -99,6 +100,18 @@ def _has_normal(level: Level) -> NDArray[np.bool_]:
     known[:MARGIN] = known[-MARGIN:] = False
     known[:, :MARGIN] = known[:, -MARGIN:] = False
     return known
+
+
+def _usable_at_all_levels(pyramid: RgbdPyramid) -> NDArray[np.bool_]:
+    """Pixels [h, w] of the finest level around which the pixels of every coarser one may be used."""
+    finest, coarsest = pyramid.levels[0], pyramid.levels[-1]
+    usable = np.ones(finest.gray.shape, dtype=bool)
+    if coarsest.mask is not None:
+        scale = 2 ** (len(pyramid.levels) - 1)
+        whole = masks.whole_windows(coarsest.mask, 1).repeat(scale, axis=0).repeat(scale, axis=1)
+        # a last odd row or column is in no coarse pixel
+        usable[: whole.shape[0], : whole.shape[1]] = whole
+    return usable
 
 
 def _samples(level: Level, v: NDArray[np.int64], u: NDArray[np.int64]) -> ReferenceLevel:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -23,7 +24,6 @@ from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
 from duagc.pipeline.registration.reference import Reference
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 
 MAD_STRIDE = 4  # residuals between those that estimate a scale, where there are thousands
@@ -130,8 +130,8 @@ def linearize_at(
 
     gray, gu, gv, inverse_depth, *measured_sigma = _interpolate(level, u, v)
     with np.errstate(invalid="ignore"):
-        # without a depth image every sample may be what is seen there
-        z = 1 / inverse_depth if level.has_depth else q[2]
+        # without a depth image every sample may be what is seen there, where the pixels may be used
+        z = 1 / inverse_depth if level.has_depth else np.where(np.isnan(inverse_depth), inverse_depth, q[2])
         gate = np.maximum(np.float32(config.depth_gate_m), np.float32(config.depth_gate_relative) * q[2])
         if measured_sigma:
             gate = np.maximum(gate, np.float32(GATE_SIGMAS) * measured_sigma[0])
