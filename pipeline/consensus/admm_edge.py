@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.geometry import so3
 from duagc.pipeline.posegraph.gnc import RobustWeights
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, closures_as_relative_poses
 
-Array = NDArray[np.float64]
 STEP_M = 2.0**-27
 """Steps of translations on the wire `fixed`: 7.5 nm."""
 BLOCK = [0, 0, 0, 1, 1, 1]
@@ -165,3 +165,32 @@ def link_metric(
     if not np.all(total > 0):
         raise ValueError("a closure without information about translation or rotation cannot join two robots")
     return total[:, BLOCK].astype(np.float32)
+
+
+def start_of_copies(
+    closures: Sequence[LoopClosure],
+    kept: NDArray[np.bool_],
+    keyframes: NDArray[np.int64],
+    T_map_keyframe: Array,
+    *,
+    known: Mapping[int, Array],
+) -> Array:
+    """Where the copies of a neighbor's keyframes start, [s, 4, 4] in the own map frame.
+
+    Args:
+        closures: that this end holds.
+        kept: which of them count.
+        keyframes: [s], of the neighbor.
+        T_map_keyframe: [n, 4, 4], own keyframes.
+        known: poses [4, 4] in the own map frame by keyframe of the neighbor; the others start where the first kept
+            loop closure that names them puts them.
+    """
+    out = np.zeros((len(keyframes), 4, 4))
+    for s, keyframe in enumerate(keyframes.tolist()):
+        if keyframe in known:
+            out[s] = known[keyframe]
+        else:
+            named = [k for k, c in enumerate(closures) if c.peer_keyframe == keyframe]
+            best = closures[max(named, key=lambda k: bool(kept[k]))]
+            out[s] = T_map_keyframe[best.own_keyframe] @ best.T_own_peer
+    return out

@@ -6,10 +6,7 @@ give the ratio of the gains and the colors that correspond; over the team these 
 the same evidence and pair lists solve the same problem, so nothing more is sent, and a robot converts what it received
 from a peer to its own colors (`ColorMap`).
 
-Two robots' splats of one place differ in color by noise in both, so a regression of one on the other would find a gain
-below one between equal cameras. The gain here is the ratio of the spreads (reduced major axis), which is the same
-for both robots; exact if noise grows with the gain. It lies between the two regressions, ratio * r and ratio / r with
-r the correlation, and counts as spread evenly between them (Frisch 1934): that is most of its standard deviation.
+Two robots' splats of one place differ in color by noise in both; `geometry.color_comparison` compares them.
 """
 
 from __future__ import annotations
@@ -20,17 +17,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import ColorConfig
 from duagc.pipeline.consensus.evidence import Evidence, rows_by_id
-from duagc.pipeline.geometry.statistics import mad_sigmas
+from duagc.pipeline.geometry.color_comparison import ComparedColors, compare_colors
 from duagc.pipeline.splat.information import COLOR, COLOR_INFORMATION
 
-Array = NDArray[np.float64]
 Pairs = Mapping[tuple[str, str], NDArray[np.int64]]
-_ROUNDS = 20  # of reweighting
-_TUNING = 3.0  # standard deviations at which a pair counts a quarter
-_LEAST_SPREAD = 1e-3  # of colors; below it there is no contrast to compare
-_LEAST_CORRELATION = 0.05
 
 
 @dataclass(frozen=True)
@@ -121,18 +114,6 @@ class TeamColors:
         )
 
 
-@dataclass(frozen=True)
-class _Compared:
-    """Two robots' colors of the same places, by channel [3]: log of the ratio of spreads, other over own, and its
-    variance; the middle of either's colors, and the variance of their difference in units of the geometric mean."""
-
-    log_ratio: Array
-    variance: Array
-    middle_own: Array
-    middle_other: Array
-    variance_middle: Array
-
-
 def team_colors(evidence: Mapping[str, Evidence], pairs: Pairs, config: ColorConfig) -> TeamColors:
     """How the cameras of a team differ.
 
@@ -144,12 +125,19 @@ def team_colors(evidence: Mapping[str, Evidence], pairs: Pairs, config: ColorCon
     """
     robots = tuple(sorted(evidence))
     matches: dict[tuple[str, str], int] = {}
-    found: list[tuple[int, int, _Compared]] = []
+    found: list[tuple[int, int, ComparedColors]] = []
     for a, b in sorted(p for p in pairs if p[0] in evidence and p[1] in evidence):
         own, other = _colors_of(evidence[a], evidence[b], pairs[a, b])
         if config.enabled and len(own) >= config.min_matches:
             matches[a, b] = len(own)
-            found.append((robots.index(a), robots.index(b), _compare(own, other, config)))
+            compared = compare_colors(
+                own,
+                other,
+                per_sample=config.splats_per_sample,
+                sigma_floor=config.sigma_floor,
+                sigma_floor_middle=config.sigma_floor,
+            )
+            found.append((robots.index(a), robots.index(b), compared))
     scale, shift = np.ones((len(robots), 3)), np.zeros((len(robots), 3))
     of_scale, of_shift = (
         np.zeros((len(robots), len(robots), 3)) + s**2 * np.eye(len(robots))[..., None]
@@ -181,33 +169,6 @@ def _colors_of(own: Evidence, other: Evidence, ids: NDArray[np.int64]) -> tuple[
     i, j = i[here], j[here]
     known = np.all(own.color_information()[i] > 0, axis=1) & np.all(other.color_information()[j] > 0, axis=1)
     return own.theta[i[known], COLOR], other.theta[j[known], COLOR]
-
-
-def _compare(own: Array, other: Array, config: ColorConfig) -> _Compared:
-    """Compare matched colors [m, 3]; continuous in them, and the same with the two exchanged."""
-    middle = [np.median(x, axis=0) for x in (own, other)]
-    spread = [mad_sigmas(x - m) for x, m in zip((own, other), middle, strict=True)]
-    squares = [s**2 + _LEAST_SPREAD**2 for s in spread]
-    for _ in range(_ROUNDS):
-        ratio = np.sqrt(squares[1] / squares[0])
-        x, y = own - middle[0], other - middle[1]
-        apart = (y - ratio * x) / np.sqrt(ratio)
-        sigma = mad_sigmas(apart) + _LEAST_SPREAD
-        weight = 1 / (1 + (apart / (_TUNING * sigma)) ** 2) ** 2
-        total = weight.sum(axis=0)
-        middle = [(weight * c).sum(axis=0) / total for c in (own, other)]
-        x, y = own - middle[0], other - middle[1]
-        squares = [(weight * d**2).sum(axis=0) / total + _LEAST_SPREAD**2 for d in (x, y)]
-    correlation = (weight * x * y).sum(axis=0) / total / np.sqrt(squares[0] * squares[1])
-    correlation = np.clip(correlation, _LEAST_CORRELATION, 1.0)
-    samples = total / config.splats_per_sample
-    return _Compared(
-        0.5 * np.log(squares[1] / squares[0]),
-        (1 - correlation**2) / samples + np.log(correlation) ** 2 / 3 + config.sigma_floor**2,
-        middle[0],
-        middle[1],
-        sigma**2 / samples + config.sigma_floor**2,
-    )
 
 
 def _differences(robots: int, rows: list[tuple[int, int, float, float]], prior: float) -> tuple[Array, Array]:

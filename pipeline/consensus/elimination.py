@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
 
-Array = NDArray[np.float64]
 Variable = tuple[int, int]  # index of the owner in the team, its keyframe
 _FLOOR = 1e-12  # of the largest diagonal entry: keeps a matrix definite where a variable has no factor
 _ANCHOR = 1e6  # of the largest diagonal entry, on the root's first keyframe; only fixes the gauge

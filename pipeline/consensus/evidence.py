@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3, so3, spd
 from duagc.pipeline.geometry.spd import add_covariance
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -31,7 +32,6 @@ from duagc.pipeline.splat.information import (
     theta_of,
 )
 
-Array = NDArray[np.float64]
 SHAPE_FLOOR = 0.1
 """Least standard deviation of a coordinate of vec log Sigma: 5 % of a scale."""
 LEAST_DEVIATION_M = 1e-4

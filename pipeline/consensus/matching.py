@@ -25,13 +25,13 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import cKDTree
 
-from duagc.pipeline.config.consensus import MatchingConfig
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.config.consensus import MapMatching
 from duagc.pipeline.consensus.colors import team_colors
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.geometry import spd
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Pairs = Mapping[tuple[str, str], Index]
 SH_C0 = 0.28209479177387814  # color = 0.5 + SH_C0 * coefficient
@@ -61,7 +61,7 @@ class _Chart:
     held: Array
 
     @staticmethod
-    def of(theta: Array, config: MatchingConfig) -> _Chart:
+    def of(theta: Array, config: MapMatching) -> _Chart:
         values, vectors = np.linalg.eigh(spd.vec_to_sym(theta[:, LOG_COVARIANCE]))
         values = np.maximum(values, 2 * np.log(config.thickness_floor_m))
         clamped = theta.copy()
@@ -69,7 +69,7 @@ class _Chart:
         return _Chart(clamped, held_thickness(theta[:, LOG_COVARIANCE], config.thickness_floor_m))
 
 
-def _distances(charts: tuple[_Chart, _Chart], i: Index, j: Index, config: MatchingConfig) -> Array:
+def _distances(charts: tuple[_Chart, _Chart], i: Index, j: Index, config: MapMatching) -> Array:
     """d_G [m] of Gaussians i of the first chart and j of the second."""
     a, b = charts
     out = np.empty(len(i))
@@ -88,7 +88,7 @@ def _distances(charts: tuple[_Chart, _Chart], i: Index, j: Index, config: Matchi
     return out
 
 
-def gaussian_distance(a: Evidence, i: Index, b: Evidence, j: Index, *, config: MatchingConfig) -> Array:
+def gaussian_distance(a: Evidence, i: Index, b: Evidence, j: Index, *, config: MapMatching) -> Array:
     """d_G [m] of pairs of Gaussians.
 
     Args:
@@ -104,7 +104,7 @@ def gaussian_distance(a: Evidence, i: Index, b: Evidence, j: Index, *, config: M
     return _distances(charts, i, j, config)
 
 
-def threshold(own: Evidence, config: MatchingConfig) -> float:
+def threshold(own: Evidence, config: MapMatching) -> float:
     """tau_G of a map: how much its own neighboring Gaussians differ; 0 if no two are within the radius."""
     if len(own) < 2:
         return 0.0
@@ -119,7 +119,7 @@ def threshold(own: Evidence, config: MatchingConfig) -> float:
     return float(np.percentile(_distances((chart, chart), near, other, config), config.percentile))
 
 
-def match(own: Evidence, peer: Evidence, config: MatchingConfig) -> Index:
+def match(own: Evidence, peer: Evidence, config: MapMatching) -> Index:
     """Matched Gaussians of two robots: within the radius, d_G below tau_G, and each the other's best.
 
     Args:
@@ -138,7 +138,7 @@ def match(own: Evidence, peer: Evidence, config: MatchingConfig) -> Index:
     return _match(own, peer, config)
 
 
-def _match(own: Evidence, peer: Evidence, config: MatchingConfig) -> Index:
+def _match(own: Evidence, peer: Evidence, config: MapMatching) -> Index:
     """`match` of evidence in the same colors, not empty."""
     i, j = _candidates(own.theta[:, MEAN], peer.theta[:, MEAN], config)
     d = _distances((_Chart.of(own.theta, config), _Chart.of(peer.theta, config)), i, j, config)
@@ -151,7 +151,7 @@ def _match(own: Evidence, peer: Evidence, config: MatchingConfig) -> Index:
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
 
-def _candidates(means_own: Array, means_peer: Array, config: MatchingConfig) -> tuple[Index, Index]:
+def _candidates(means_own: Array, means_peer: Array, config: MapMatching) -> tuple[Index, Index]:
     """Rows (own, peer) within the radius: the nearest few of either side, each pair once."""
     found = []
     for a, b, turned in ((means_own, means_peer, False), (means_peer, means_own, True)):
@@ -197,7 +197,7 @@ class Tracks:
     row: Index
 
 
-def tracks(evidence: Mapping[str, Evidence], pairs: Pairs, config: MatchingConfig) -> Tracks:
+def tracks(evidence: Mapping[str, Evidence], pairs: Pairs, config: MapMatching) -> Tracks:
     """Connected components of the pairs over all robots.
 
     A component that holds two Gaussians of one robot loses its pair of largest d_G (ties by ids) until none does.

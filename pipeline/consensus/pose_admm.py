@@ -16,19 +16,7 @@ On the product group the edge variable is kept as its *offset* d = x - y, a vect
 adds delta to d, m is x (+) d, y is x (+) (-d), and an arrival subtracts relaxation (m (-) y) from d. Unlike the
 logarithm of a pose y, an offset does not wrap at pi, and offsets are large where forces are (d = force / W).
 
-Penalty handshake. The end with the lower name decides. Versions count up from 0, and a packet is used only by a
-receiver of the same version.
-
-    * Every packet carries the sender's version; the decider's also its penalties; the follower's also its curvature
-      once it has received enough in this version.
-    * The decider, having received enough itself and holding a curvature of this version, takes new penalties, moves
-      its y so that its force W d stays, and counts the version up.
-    * The follower adopts penalties and version from the first newer packet that reaches it, keeping its force
-      likewise, and then uses that packet.
-
-So the ends differ by at most one version (the decider cannot decide again before it has heard the follower in the new
-version), a lost packet only delays the follower's change, and what the follower sent before it is dropped by the
-decider, as if lost. Keeping the force keeps every fixed point: there m = y before and after.
+Penalties are agreed between the two ends of a link: `admm_penalties`.
 """
 
 from __future__ import annotations
@@ -37,16 +25,18 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
+from duagc.pipeline.consensus import admm_penalties
 from duagc.pipeline.consensus.admm_edge import (
-    BLOCK,
     AdmmEdge,
     PosePacket,
     SharedKeyframes,
     link_metric,
     rounded,
+    start_of_copies,
 )
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.spd import add_covariance
@@ -55,7 +45,6 @@ from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT, RobustWeights
 from duagc.pipeline.posegraph.least_squares import difference, retract
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, closures_as_relative_poses
 
-Array = NDArray[np.float64]
 _STEADY = 1e-3  # m, rad: a link that moves less is past its initial transient
 
 
@@ -149,7 +138,10 @@ class PoseAgent:
             shared = SharedKeyframes(
                 keyframes.astype(np.int32), link_metric(closures, keyframes, self.config.closures)
             )
-            self._copies_start[peer] = self._copies(closures, kept, keyframes, T_world_keyframe_peer or {})
+            known = self._in_map(T_world_keyframe_peer or {})
+            self._copies_start[peer] = start_of_copies(
+                closures, kept, keyframes, self.T_map_keyframe, known=known
+            )
         self.links[peer] = AdmmEdge(
             peer=peer,
             decides=self.robot < peer,
@@ -164,24 +156,9 @@ class PoseAgent:
         self.links = {name: self.links[name] for name in sorted(self.links)}
         return shared
 
-    def _copies(
-        self,
-        closures: Sequence[LoopClosure],
-        kept: NDArray[np.bool_],
-        keyframes: NDArray[np.int64],
-        known: Mapping[int, ArrayLike],
-    ) -> Array:
-        """Start of the peer's keyframes [s, 4, 4] in the own map frame."""
-        out = np.zeros((len(keyframes), 4, 4))
-        from_world = se3.inverse(self.T_world_map)
-        for s, keyframe in enumerate(keyframes.tolist()):
-            if keyframe in known:
-                out[s] = from_world @ np.asarray(known[keyframe], dtype=np.float64)
-            else:
-                named = [k for k, c in enumerate(closures) if c.peer_keyframe == keyframe]
-                best = closures[max(named, key=lambda k: bool(kept[k]))]
-                out[s] = self.T_map_keyframe[best.own_keyframe] @ best.T_own_peer
-        return out
+    def _in_map(self, T_world: Mapping[int, ArrayLike]) -> dict[int, Array]:
+        T_map_world = se3.inverse(self.T_world_map)
+        return {k: T_map_world @ np.asarray(T, dtype=np.float64) for k, T in T_world.items()}
 
     def _start(self) -> None:
         """Lay out the variables: own keyframes, then copies by neighbor; factors over all of them."""
@@ -263,7 +240,7 @@ class PoseAgent:
             translations=translations,
             penalties=link.penalties.astype(np.float32),
             curvature=None if curvature is None else curvature.astype(np.float32),
-            converged=self.settled,
+            converged=self.converged,
         )
 
     def receive(self, peer: str, packet: PosePacket) -> bool:
@@ -302,55 +279,21 @@ class PoseAgent:
     # ---- penalties ----
 
     def _curvature(self, link: AdmmEdge) -> Array | None:
-        """Curvature [2] measured since the last change of penalties: |change of force| / |change of pose|.
-
-        In the metric, for translation and rotation apart; None before enough was received or if nothing moved.
-        """
-        if not (self.config.adaptive and self.robust_done) or link.received < self.config.penalty_period:
+        """Curvature [2] since the last change of penalties; None before enough was received or if nothing moved."""
+        if not (self.config.adaptive and self.robust_done):
             return None
-        if link.reference is None:
-            self._mark(link)
-            return None
-        force, poses = link.reference
-        root = np.sqrt(link.metric)
-        d_force = (link.force() - force) / root
-        d_pose = difference(self._x[link.slots], poses) * root
-        stiffness = []
-        for block in (slice(0, 3), slice(3, 6)):
-            moved = float(np.linalg.norm(d_pose[:, block]))
-            changed = float(np.linalg.norm(d_force[:, block]))
-            if moved == 0.0 or changed == 0.0:
-                return None
-            stiffness.append(changed / moved)
-        return np.array(stiffness)
-
-    def _mark(self, link: AdmmEdge) -> None:
-        """Begin a new window of the curvature."""
-        link.reference = (link.force(), self._x[link.slots].copy())
-        link.received = 0.0
-        link.peer_curvature = None
+        return admm_penalties.curvature(link, self._x[link.slots], self.config)
 
     def _decide(self, link: AdmmEdge) -> None:
         """At the end of the lower name: new penalties once both ends have measured a curvature in this version."""
-        if not link.decides:
-            return
-        own = self._curvature(link)
-        if own is None or link.peer_curvature is None:
-            return
-        c = self.config
-        received = link.received_total - link.adapting_from
-        limit = 1.0 + 2.0 / max(1.0, received / c.penalty_decay)
-        penalties = np.sqrt(own * link.peer_curvature)
-        penalties = np.clip(penalties, link.penalties / limit, link.penalties * limit)
-        penalties = np.clip(penalties, c.penalty_min, c.penalty_max).astype(np.float32).astype(np.float64)
-        self._change_penalties(link, penalties, link.version + 1)
+        own = self._curvature(link) if link.decides else None
+        if own is not None and link.peer_curvature is not None:
+            penalties = admm_penalties.next_penalties(link, own, link.peer_curvature, self.config)
+            self._change_penalties(link, penalties, link.version + 1)
 
     def _change_penalties(self, link: AdmmEdge, penalties: Array, version: int) -> None:
-        """Change W and move y so that the force W (x - y) stays."""
-        link.offset = link.offset * (link.penalties / penalties)[BLOCK]
-        link.penalties, link.version = penalties, version
+        admm_penalties.change(link, penalties, version, self._x[link.slots])
         self._solve = None
-        self._mark(link)
 
     # ---- robust weights of held loop closures ----
 
@@ -401,7 +344,7 @@ class PoseAgent:
         return max([self.step_change, *(link.largest_change() for link in self.links.values())])
 
     @property
-    def settled(self) -> bool:
+    def converged(self) -> bool:
         """Whether this end changes less than the tolerance, by the last arrivals too, and its weights are final."""
         recent = [link.largest_recent_change() for link in self.links.values()]
         return self.robust_done and max([self.step_change, *recent]) < self.config.tolerance
@@ -409,7 +352,7 @@ class PoseAgent:
     @property
     def agreed(self) -> bool:
         """Whether this end and, by their last packets, all neighbors have converged."""
-        return self.settled and all(link.peer_converged for link in self.links.values())
+        return self.converged and all(link.peer_converged for link in self.links.values())
 
     @property
     def T_world_keyframe(self) -> Array:  # noqa: N802

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.elimination import (
     BackSubstitution,
@@ -28,7 +28,6 @@ from duagc.pipeline.posegraph.gnc import RobustWeights
 from duagc.pipeline.posegraph.least_squares import retract
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
 
-Array = NDArray[np.float64]
 Message = dict[Variable, int] | tuple[int, Block] | BackSubstitution
 """Up: which robots have which variables, or a block and its exchange. Down: a step."""
 _SLOW = 0.5  # share of the step before from which the matrices are too old

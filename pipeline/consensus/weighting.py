@@ -14,14 +14,14 @@ information, they are in units of what two robots' splats usually differ by.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import WeightKind
 from duagc.pipeline.consensus.evidence import Evidence, MapInformation, rows_by_id
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import pack_information
 
-Array = NDArray[np.float64]
 UNIT_SIGMA_M, UNIT_SIGMA_SHAPE, UNIT_SIGMA_COLOR, UNIT_SIGMA_OPACITY = 0.01, 1.0, 0.07, 0.5
 """Standard deviations of a weight of one: mean, coordinates of vec log Sigma, colors, opacity logits."""
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 

@@ -14,13 +14,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.loop_closures import CHI2_3_999
 from duagc.pipeline.posegraph.spanning_tree import chain_frames, spanning_tree
 
-Array = NDArray[np.float64]
 Pair = tuple[str, str]
 Cycle = tuple[Pair, Pair, Pair]
 CLEAR = 0.5

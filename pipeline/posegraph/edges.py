@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.geometry import se3
 
-Array = NDArray[np.float64]
 SYMBOL_BITS = 56  # a gtsam symbol is a character in the highest byte and an index below it
 _IGNORED_TAGS = {
     "VERTEX_SE3:QUAT",

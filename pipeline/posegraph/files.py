@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.posegraph.edges import Edges, Key, read_g2o, read_kimera
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, isotropic_information
 
-Array = NDArray[np.float64]
 _REFERENCES = ("reference_inliers.csv", "gt_info.xml")
 
 

@@ -10,11 +10,10 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 
-Array = NDArray[np.float64]
 INLIER_WEIGHT = 0.5
 """Robust weight from which a relative pose counts as an inlier."""
 _LEAST_PACKETS = 2  # per step: the other end has answered to the last weights

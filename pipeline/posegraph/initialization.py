@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.posegraph import least_squares
@@ -14,7 +15,6 @@ from duagc.pipeline.posegraph.gnc import controls, graduated_weights
 from duagc.pipeline.posegraph.pose_graph import solve_pose_graph
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
 
-Array = NDArray[np.float64]
 _STEPS = 3  # Gauss-Newton steps per step of the graduated weights
 
 

@@ -25,14 +25,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
-
-Array = NDArray[np.float64]
 
 
 def retract(T: Array, delta: Array) -> Array:

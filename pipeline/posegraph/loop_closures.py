@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, closures_as_relative_poses
 
-Array = NDArray[np.float64]
 CHI2_3_999 = 16.27  # 99.9 % quantile of chi^2 with 3 degrees of freedom
 _OTHER_GROUPS = 2  # further than the largest, that a cycle of three robots may find to be the right ones
 _CANDIDATES = 150  # relative frames tried as the start of the mean

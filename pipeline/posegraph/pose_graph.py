@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.relative_poses import (
@@ -15,8 +16,6 @@ from duagc.pipeline.posegraph.relative_poses import (
     RelativePoses,
     closures_as_relative_poses,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

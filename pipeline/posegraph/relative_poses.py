@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.spd import add_covariance
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 

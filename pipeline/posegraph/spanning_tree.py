@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3
-
-Array = NDArray[np.float64]
 
 
 def chain_frames(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.network import LinkConfig, TransportConfig
@@ -21,7 +21,6 @@ from duagc.pipeline.posegraph.initialization import own_start
 from duagc.pipeline.posegraph.loop_closures import drift
 from duagc.pipeline.team_posegraph.printed_admm import PrintedAdmmSolver
 
-Array = NDArray[np.float64]
 _NEVER = 1 << 30
 _UNLIMITED_BYTES = 1 << 40  # what a solver sends is counted, not held back
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.posegraph import PoseGraphConfig
 from duagc.pipeline.consensus.admm_edge import PosePacket
 from duagc.pipeline.exchange.solvers import LinkStart, SolverStart
@@ -23,7 +24,6 @@ from duagc.pipeline.posegraph import least_squares
 from duagc.pipeline.posegraph.least_squares import retract
 from duagc.pipeline.posegraph.relative_poses import RelativePoses, closures_as_relative_poses
 
-Array = NDArray[np.float64]
 _ARMIJO = 1e-4
 _RESIDUAL = 1e-4  # m, rad: the paper's stopping test
 _HALVINGS = 40

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.posegraph import PoseGraphConfig
 from duagc.pipeline.network.packets import HEADER_BYTES, MAX_PAYLOAD_BYTES
 from duagc.pipeline.posegraph import least_squares
@@ -24,7 +25,6 @@ from duagc.pipeline.posegraph.relative_poses import HeldLoopClosures, RelativePo
 from duagc.pipeline.team_posegraph.agent import PoseGraphAgent
 from duagc.pipeline.team_posegraph.team import Traffic, meet
 
-Array = NDArray[np.float64]
 GAPS = {"1e-2": 1e-2, "1e-4": 1e-4, "1e-6": 1e-6}
 RAW_FACTOR_BYTES = 40  # two keys, rotation vector, translation, kappa, tau
 _TRUNCATIONS = 30

@@ -7,12 +7,12 @@ import pytest
 
 from duagc.pipeline.config.consensus import ColorConfig
 from duagc.pipeline.consensus.evidence import Evidence
-from duagc.pipeline.consensus.matching import MatchingConfig, gaussian_distance, match, threshold, tracks
+from duagc.pipeline.consensus.matching import MapMatching, gaussian_distance, match, threshold, tracks
 from duagc.pipeline.geometry import so3, spd
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN
 from tests.fixtures.pose_worlds import random_poses
 
-CONFIG = MatchingConfig()
+CONFIG = MapMatching()
 
 
 def surface(owner, seed, n=400, jitter_m=0.004, first_id=0):

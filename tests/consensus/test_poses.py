@@ -70,16 +70,16 @@ def test_a_neighbor_that_hears_nothing_does_not_make_an_end_hold_still():
     agents = make_team(1, robots=2).agents(PLAIN)
     deaf, other = agents["alpha"], agents["bravo"]
     deaf.step()
-    quiet, settled = [], []
+    quiet, converged = [], []
     for _ in range(20):
         other.receive("alpha", deaf.outgoing("bravo"))
         other.step()
         quiet.append(other.largest_change < other.config.tolerance)
-        settled.append(other.settled)
+        converged.append(other.converged)
     first = quiet.index(True)
     assert first < 10
     assert all(quiet[first:])
-    assert not any(settled[: first + REMEMBERED - 2])
+    assert not any(converged[: first + REMEMBERED - 2])
 
 
 def test_duplicates_reordering_and_halves_change_nothing_in_the_end():
@@ -147,7 +147,7 @@ def test_a_cut_link_leaves_both_ends_near_their_odometry():
     agents = world.agents(PLAIN)
     start = {r: agents[r].T_world_keyframe for r in agents}
     assert talk(agents, 30, loss=1.0) == 30
-    assert not any(agent.agreed or agent.settled for agent in agents.values())
+    assert not any(agent.agreed or agent.converged for agent in agents.values())
     for r, agent in agents.items():
         meters, _ = se3.distance(agent.T_world_keyframe, start[r])
         assert meters.max() < 0.5
@@ -179,7 +179,7 @@ def test_a_change_of_penalties_keeps_forces_and_the_fixed_point():
     assert other.receive("alpha", agent.outgoing("bravo"))  # brings the new one
     agent.step(), other.step()
     assert agent.receive("bravo", other.outgoing("alpha"))
-    assert agent.settled
+    assert agent.converged
     np.testing.assert_allclose(agent.T_world_keyframe, poses, atol=1e-8)
 
 

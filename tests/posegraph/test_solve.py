@@ -13,7 +13,7 @@ from duagc.pipeline.team_posegraph import solve
 from duagc.pipeline.team_posegraph import team as team_rounds
 from duagc.pipeline.team_posegraph.agent import PoseGraphAgent
 from duagc.pipeline.team_posegraph.team import Traffic, meet
-from tests.fixtures.commands import assert_one_line, duagc
+from tests.fixtures.commands import assert_one_line, duagc, duagc_here
 from tests.fixtures.pose_graphs import helix_edges, wild_edges, write_g2o, write_team
 
 N = 48
@@ -82,9 +82,9 @@ def record(team, config, packets):
     """`meet`, keeping every packet that was sent."""
     carried = session_rounds.LinkModel.fate
 
-    def fate(self, sender, receiver, sequence, send_ns, size):
+    def fate(self, sender, receiver, *, sequence, send_ns, size):
         packets.append((sender, receiver, sequence, size))
-        return carried(self, sender, receiver, sequence, send_ns, size)
+        return carried(self, sender, receiver, sequence=sequence, send_ns=send_ns, size=size)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(session_rounds.LinkModel, "fate", fate)
@@ -195,16 +195,16 @@ def test_the_command_on_a_teams_files(tmp_path):
     assert {"bytes_raw_alternative", "converged"} <= set(result)
     assert set(result["rounds_to"]) >= {"1e-4", "1e-6"}
     assert abs(result["cost"] / result["optimum"] - 1) < 1e-6
-    text = duagc("posegraph", folder, "--solver", "elimination").stdout
+    text = duagc_here("posegraph", folder, "--solver", "elimination").stdout
     assert "centralized optimum" in text
     assert "all agents have converged" in text
-    assert "Examples" in duagc("posegraph", "--help").stdout
+    assert "Examples" in duagc_here("posegraph", "--help").stdout
 
 
 def test_the_command_refuses_in_one_line(tmp_path):
     flat = tmp_path / "flat.g2o"
     flat.write_text("VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
     assert_one_line(duagc("posegraph", flat), "flat.g2o", "2-D", "expected 3-D")
-    assert_one_line(duagc("posegraph", tmp_path / "absent.g2o"), "absent.g2o", "not found")
+    assert_one_line(duagc_here("posegraph", tmp_path / "absent.g2o"), "absent.g2o", "not found")
     path = write_g2o(tmp_path / "helix.g2o", helix_edges(N))
-    assert_one_line(duagc("posegraph", path, "--robots", "40"), "48 poses", "40 robots")
+    assert_one_line(duagc_here("posegraph", path, "--robots", "40"), "48 poses", "40 robots")
