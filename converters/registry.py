@@ -64,6 +64,7 @@ def convert(
     force: bool = False,
     options: Sequence[str] = (),
     options_file: Path | None = None,
+    masks: Sequence[str] = (),
 ) -> None:
     """Convert a dataset into a recording.
 
@@ -74,20 +75,28 @@ def convert(
         robots: how many robots to make of it; None: one, or as many as the dataset has.
         force: replace a recording that is there.
         options: `name=value` of the converter, values in TOML notation.
-        options_file: TOML file of options; those of `options` win. `recording.json` keeps its text.
+        options_file: TOML file of options; those of `options` win. `recording.json` keeps its text. Its tables
+            [[masks]] hold masks of pixels: `file` or `polygon`, and `robot` unless for all.
+        masks: PNG of the pixels that show the scene (0 = none), FILE of every robot or ROBOT=FILE.
     Raises:
         DuagError: names the file, what was found and what was expected.
     """
     module = _module(dataset)
     count = {} if robots is None else {"robots": robots}
     said = parse_options(options)
+    from duagc.converters.layouts.validity import USER_MASKS, user_masks
+
     with _options_of_file(options_file, module, dataset) as filed:
         for name in ("src", "out", "robots", "force"):
             if name in filed or name in said:
                 raise DuagError(
                     f"{dataset}: {name} is no option of a converter, expected it among the arguments"
                 )
-        module.convert(Path(src), Path(out), force=force, **count, **{**filed, **said})
+        token = USER_MASKS.set(user_masks(masks, filed.pop("masks", ()), options_file))
+        try:
+            module.convert(Path(src), Path(out), force=force, **count, **{**filed, **said})
+        finally:
+            USER_MASKS.reset(token)
 
 
 @contextmanager
@@ -106,7 +115,8 @@ def _options_of_file(path: Path | None, module: ModuleType, dataset: str) -> Ite
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise DuagError(f"{path}: {error}, expected options of a converter in TOML") from error
     if hasattr(module, "Options"):
-        options_of(module.Options, values, f"{path}, for {dataset}")
+        of_converter = {name: value for name, value in values.items() if name != "masks"}
+        options_of(module.Options, of_converter, f"{path}, for {dataset}")
     token = OPTIONS_FILE.set({"name": path.name, "text": text})
     try:
         yield values

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.converters.layouts.validity import EVERY, BlackBorder, mask_of_user
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -57,6 +59,7 @@ class RobotWriter:
         depth_scale: float,
         *,
         sensors: Mapping[str, str] | None = None,
+        find_black: bool = True,
     ) -> None:
         """Initialize.
 
@@ -67,6 +70,7 @@ class RobotWriter:
             depth_scale: meters per unit of the depth images.
             sensors: what is known about the sensors, for example {"depth_noise": "none"}; kept in the log's
                 metadata.
+            find_black: leave out large regions at the border that are black in all images, as a vignette is.
         """
         if not re.fullmatch(topics.ROBOT_NAME, name):
             raise DuagError(f"robot {name!r}: expected lower-case letters, digits and underscores")
@@ -80,6 +84,9 @@ class RobotWriter:
         self._log = LogWriter(self.folder / f"{name}.mcap", name, self.sensors)
         self._truth: LogWriter | None = None
         self._has_depth = self._has_exact_depth = self._has_sigma = False
+        self._valid = mask_of_user(name, camera.width, camera.height)
+        self._black = BlackBorder() if find_black else None
+        self._black_share = 0.0
         # topic of a sensor's pose in the camera that is still to be written
         self._sensors: dict[str, NDArray[np.float64]] = {}
         self._stamps: list[int] = []
@@ -88,6 +95,37 @@ class RobotWriter:
     def __enter__(self) -> RobotWriter:
         self._files.enter_context(self._log)
         return self
+
+    def set_valid(self, valid: NDArray[np.bool_] | None) -> None:
+        """Say which pixels of all images show the scene, before the first frame; what is said before holds too.
+
+        Args:
+            valid: bool [H, W]; None: all do.
+        """
+        if valid is None:
+            return
+        if self._stamps:
+            raise ValueError(f"robot {self.name}: the mask comes after the first frame")
+        self._check_size(valid)
+        self._valid = valid if self._valid is None else self._valid & valid
+
+    def _leave_out_black(self) -> None:
+        """Write another mask of all images, at the end, where a region at the border was black in all of them."""
+        shown = None if self._black is None or not self._stamps else self._black.result(self._valid)
+        if shown is not None:
+            self._black_share = float(np.mean(~shown))
+            self._valid = shown if self._valid is None else self._valid & shown
+            self._write_valid(self._stamps[-1])
+
+    def _write_valid(self, stamp_ns: int) -> None:
+        """Write the mask of all images where it leaves pixels out."""
+        if self._valid is None or self._valid.all():
+            self._valid = None
+            return
+        if not self._valid.any():
+            raise DuagError(f"robot {self.name}: the masks leave no pixel, expected some that show the scene")
+        message = messages.pack_valid(stamp_ns, self.name, self._valid)
+        self._log.write(topics.VALID.of(self.name), message, stamp_ns)
 
     def add_frame(
         self,
@@ -100,6 +138,7 @@ class RobotWriter:
         exact_depth: NDArray[np.uint16] | None = None,
         mask: NDArray[np.bool_] | None = None,
         depth_sigma_m: NDArray[np.floating] | None = None,
+        depth_stamp_ns: int | None = None,
     ) -> None:
         """Append one frame.
 
@@ -115,6 +154,7 @@ class RobotWriter:
             mask: bool [H, W], False where a pixel must not be used (a moving object); None = all may.
             depth_sigma_m: [H, W], standard deviation of the depth in meters, where it is known pixel by
                 pixel: then with every frame. It is kept to 3 %, and from 0.1 mm to 6.5 m.
+            depth_stamp_ns: time of the depth, one that no other depth has; None: that of the color.
         Raises:
             ValueError: an image has another size than the camera, or the time does not increase.
             DuagError: the true pose is beyond FAR_M.
@@ -124,12 +164,16 @@ class RobotWriter:
         if not self._stamps:
             calibration = messages.pack_calibration(stamp_ns, name, self.camera)
             self._log.write(topics.CALIBRATION.of(name), calibration, stamp_ns)
+            self._write_valid(stamp_ns)
+        if self._black is not None and len(self._stamps) % EVERY == 0:
+            self._black.add(color)
         self._stamps.append(int(stamp_ns))
         self._log.write(
             topics.COLOR.of(name), messages.pack_color(stamp_ns, name, color, color_format), stamp_ns
         )
         if depth is not None:
-            self._add_registered_depth(stamp_ns, depth, depth_sigma_m)
+            taken_ns = stamp_ns if depth_stamp_ns is None else max(int(depth_stamp_ns), 0)
+            self._add_registered_depth(stamp_ns, taken_ns, depth, depth_sigma_m)
         if mask is not None:
             self._log.write(topics.MASK.of(name), messages.pack_mask(stamp_ns, name, mask), stamp_ns)
         if T_world_camera is not None:
@@ -147,15 +191,20 @@ class RobotWriter:
             raise ValueError(f"frame at {stamp_ns} ns comes after one at {self._stamps[-1]} ns")
 
     def _add_registered_depth(
-        self, stamp_ns: int, depth: NDArray[np.uint16], sigma_m: NDArray[np.floating] | None
+        self,
+        stamp_ns: int,
+        taken_ns: int,
+        depth: NDArray[np.uint16],
+        sigma_m: NDArray[np.floating] | None,
     ) -> None:
+        """Write depth that was taken at a time and is logged with the color of another."""
         topic = topics.DEPTH.of(self.name)
         if not self._has_depth:
             self._log.channel(topic, topics.DEPTH.schema, {DEPTH_SCALE_KEY: repr(self.depth_scale)})
             self._has_depth = True
-        self._log.write(topic, messages.pack_depth(stamp_ns, self.name, depth), stamp_ns)
+        self._log.write(topic, messages.pack_depth(taken_ns, self.name, depth), stamp_ns, taken_ns)
         if sigma_m is not None:
-            self._add_sigma(stamp_ns, depth, sigma_m)
+            self._add_sigma(stamp_ns, taken_ns, depth, sigma_m)
 
     def _add_true_pose(self, stamp_ns: int, T_world_camera: NDArray[np.float64]) -> None:
         far_m = float(np.abs(T_world_camera[:3, 3]).max())
@@ -176,7 +225,9 @@ class RobotWriter:
             self._has_exact_depth = True
         truth.write(topic, messages.pack_depth(stamp_ns, self.name, exact_depth), stamp_ns)
 
-    def _add_sigma(self, stamp_ns: int, depth: NDArray[np.uint16], sigma_m: NDArray[np.floating]) -> None:
+    def _add_sigma(
+        self, stamp_ns: int, taken_ns: int, depth: NDArray[np.uint16], sigma_m: NDArray[np.floating]
+    ) -> None:
         topic = topics.DEPTH_SIGMA.of(self.name)
         if not self._has_sigma:
             self._log.channel(topic, topics.DEPTH_SIGMA.schema, {DEPTH_SCALE_KEY: repr(SIGMA_SCALE_M)})
@@ -187,7 +238,7 @@ class RobotWriter:
         # five binary digits say all that a sigma can, and take a third of the space
         step = 2.0 ** np.maximum(np.frexp(units)[1] - 5, 0)
         raw = np.where(is_known, np.minimum(np.rint(units / step) * step, most), 0).astype(np.uint16)
-        self._log.write(topic, messages.pack_depth(stamp_ns, self.name, raw), stamp_ns)
+        self._log.write(topic, messages.pack_depth(taken_ns, self.name, raw), stamp_ns, taken_ns)
 
     def set_depth_camera(
         self, camera: PinholeCamera, T_camera_depth: NDArray[np.float64], depth_scale: float
@@ -298,6 +349,12 @@ class RobotWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        try:
+            if kind is None:
+                self._leave_out_black()
+        except BaseException:
+            self._files.__exit__(*sys.exc_info())
+            raise
         self._files.__exit__(kind, error, trace)
         if kind is None:
             self.summary = self._summarize()
@@ -320,6 +377,10 @@ class RobotWriter:
             "digests": {self._log.path.name: self._log.digest},
             "path": None,
         }
+        if self._valid is not None:
+            summary["masked_share"] = float(np.mean(~self._valid))
+        if self._black_share:
+            summary["black_share"] = self._black_share
         if self._truth:
             summary["digests"][self._truth.path.name] = self._truth.digest
         if self._positions:

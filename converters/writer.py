@@ -27,6 +27,7 @@ from types import TracebackType
 from typing import Any
 
 from duagc import __version__
+from duagc.converters.layouts.validity import ALL_ROBOTS, USER_MASKS
 from duagc.converters.robot_writer import RobotWriter
 from duagc.pipeline.base.atomic_folder import RECORDING, new_folder
 from duagc.pipeline.base.errors import DuagError
@@ -96,7 +97,13 @@ class RecordingWriter:
         return self
 
     def robot(
-        self, name: str, camera: PinholeCamera, depth_scale: float, sensors: Mapping[str, str] | None = None
+        self,
+        name: str,
+        camera: PinholeCamera,
+        depth_scale: float,
+        sensors: Mapping[str, str] | None = None,
+        *,
+        find_black: bool = True,
     ) -> RobotWriter:
         """The writer of one robot's logs, to be used as a context manager within this one.
 
@@ -105,8 +112,9 @@ class RecordingWriter:
             camera: of color and depth alike.
             depth_scale: meters per unit of the depth images.
             sensors: as of `RobotWriter`.
+            find_black: as of `RobotWriter`.
         """
-        writer = RobotWriter(self.folder, name, camera, depth_scale, sensors=sensors)
+        writer = RobotWriter(self.folder, name, camera, depth_scale, sensors=sensors, find_black=find_black)
         self._open.append(writer)
         return writer
 
@@ -120,6 +128,10 @@ class RecordingWriter:
         robot = row.pop("robot")
         if robot in self._robots:
             raise ValueError(f"robot {robot} is in the recording already")
+        if row.get("black_share"):
+            self.warnings.append(
+                f"{robot}: {row['black_share']:.1%} of the pixels, at the border, are black in all images; left out"
+            )
         self._robots[robot] = row
 
     def add_geometry(self, write: Callable[[Path], None]) -> None:
@@ -145,6 +157,10 @@ class RecordingWriter:
     def _finish(self) -> None:
         if not self._robots:
             raise DuagError(f"{self.out}: found no robot, expected at least one")
+        unknown = sorted(set(USER_MASKS.get() or {}) - {ALL_ROBOTS} - set(self._robots))
+        if unknown:
+            names = ", ".join(sorted(self._robots))
+            raise DuagError(f"{self.out}: a mask is of robot {unknown[0]!r}, expected one of {names}")
         description = {
             "format": RECORDING_FORMAT,
             "schema": RECORDING_SCHEMA,

@@ -51,7 +51,7 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     settings = options_of(Options, options, "bonn")
     frames, _, warnings = tum_layout.frames_of(src, settings)
     frames = [
-        f if f.T_world_camera is None else replace(f, T_world_camera=camera_pose(f.T_world_camera))
+        replace(f, T_world_camera=camera_pose(f.T_world_camera), T_world_depth=camera_pose(f.T_world_depth))
         for f in frames
     ]
     clip = Clip(
@@ -62,12 +62,13 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         distortion=DISTORTION if settings.undistort else (),
         sensors={"moving_objects": "in color and depth; no masks"},
     )
-    parameters = {"robots": robots, **settings.model_dump()}
-    image_folder.write(
-        out, "bonn", src, clip.cut(robots, src), parameters=parameters, warnings=warnings, force=force
+    image_folder.write_parts(
+        out, "bonn", src, clip, robots=robots, options=settings, warnings=warnings, force=force
     )
 
 
-def camera_pose(T_marker: np.ndarray) -> np.ndarray:
-    """T_world_camera [4, 4] of a line of groundtruth.txt."""
+def camera_pose(T_marker: np.ndarray | None) -> np.ndarray | None:
+    """T_world_camera [4, 4] of a line of groundtruth.txt; None of none."""
+    if T_marker is None:
+        return None
     return se3.inverse(T_ROS) @ T_marker @ T_ROS @ T_MARKER_CAMERA

@@ -59,9 +59,8 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     if shift:
         warnings.append("poses count from 1, images from 0")
     clip = Clip("", frames, CAMERA, DEPTH_SCALE, sensors={"depth": "rendered"})
-    parameters = {"robots": robots, **settings.model_dump()}
-    image_folder.write(
-        out, "icl-nuim", src, clip.cut(robots, src), parameters=parameters, warnings=warnings, force=force
+    image_folder.write_parts(
+        out, "icl-nuim", src, clip, robots=robots, options=settings, warnings=warnings, force=force
     )
 
 

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from duagc.converters.datasets.ros import settle_clocks, write_robot
@@ -31,11 +30,11 @@ from duagc.converters.logs.robot_log import RobotLog
 from duagc.converters.logs.sources import logs_in
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base import determinism
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.geometry import se3, so3
 
-Array = NDArray[np.float64]
 COLOR, DEPTH = "forward/color/image_raw/compressed", "forward/depth/image_rect_raw"
 COLOR_INFO, DEPTH_INFO = "forward/color/camera_info", "forward/depth/camera_info"
 IMU = "forward/imu"

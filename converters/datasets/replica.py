@@ -30,9 +30,8 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     settings = options_of(Options, options, "replica")
     camera, depth_scale = _read_camera(src)
     clip, warnings = replica_layout.read_part(src, "", camera, depth_scale, options=settings)
-    parameters = {"robots": robots, **settings.model_dump()}
-    image_folder.write(
-        out, "replica", src, clip.cut(robots, src), parameters=parameters, warnings=warnings, force=force
+    image_folder.write_parts(
+        out, "replica", src, clip, robots=robots, options=settings, warnings=warnings, force=force
     )
 
 

@@ -122,6 +122,7 @@ def write_robot(
     """
     sensors = {"part": label, **source.sensors()}
     with recording.robot(name, source.camera, source.depth_scale, sensors) as robot:
+        robot.set_valid(source.valid)
         recording.checks[name] = _write_frames(robot, source, max_ratio, gap)
     recording.warnings += [f"{name}: {text}" for text in source.warnings]
 
@@ -133,6 +134,7 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
         robot.set_lidar(derived.lidar.T_camera_lidar, derived.lidar.range_sigma_m)
     check = ReprojectionCheck(source.camera, len(pairs), gap)
     without = empty = far = cut = 0
+    written: set[int] = set()
     progress = track(source.frames(), f"convert {robot.name}", len(pairs))
     for index, (stamp_ns, color, depth) in enumerate(progress):
         if is_cut_short(color) or is_cut_short(depth):
@@ -150,7 +152,17 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
         at_ns, encoded = source.written_ns(stamp_ns), (picture.color, picture.color_format)
         if picture.points_lidar is not None:
             robot.add_points(at_ns, picture.points_lidar)
-        robot.add_frame(at_ns, *encoded, picture.depth, T_world_camera=T, depth_sigma_m=picture.depth_sigma_m)
+        depth_ns = source.depth_stamp_ns(stamp_ns)
+        robot.add_frame(
+            at_ns,
+            *encoded,
+            None if depth_ns in written else picture.depth,
+            T_world_camera=T,
+            depth_sigma_m=picture.depth_sigma_m,
+            depth_stamp_ns=depth_ns,
+        )
+        if depth_ns is not None:
+            written.add(depth_ns)
         if check.needs(index, T):
             check.add(index, source.depth_m(picture), T)
         empty += 0 if picture.depth is None else picture.depth.size - int(np.count_nonzero(picture.depth))

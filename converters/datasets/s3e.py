@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from duagc.converters.layouts.derived_depth import (
@@ -43,12 +42,12 @@ from duagc.converters.logs.gather import gathered, nearest
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3, so3
 
-Array = NDArray[np.float64]
 LEFT, RIGHT = "left_camera/compressed", "right_camera/compressed"
 POINTS, IMU = "velodyne_points", "imu/data"
 EYES_NS = 10_000_000  # left and right farther apart in time are no pair; they differ by 2 ms
@@ -105,6 +104,7 @@ def convert(src: Path, out: Path, robots: int = 0, force: bool = False, **option
                     log, vehicle, calibrations[vehicle], fixes[vehicle], origin=origin, settings=settings
                 )
                 with recording.robot(name, one.rig.camera, STEREO_SCALE_M, one.sensors()) as robot:
+                    robot.set_valid(one.rig.valid)
                     recording.checks[name] = one.write(robot)
                 recording.warnings += [f"{name} ({vehicle}): {text}" for text in one.warnings]
 

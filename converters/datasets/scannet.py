@@ -54,9 +54,8 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         for n, stamp in zip(numbers, stamps_of(numbers, settings.rate_hz), strict=True)
     ]
     clip = Clip("", frames, camera, DEPTH_SCALE, color_camera=color_camera)
-    parameters = {"robots": robots, **settings.model_dump()}
-    image_folder.write(
-        out, "scannet", src, clip.cut(robots, src), parameters=parameters, warnings=warnings, force=force
+    image_folder.write_parts(
+        out, "scannet", src, clip, robots=robots, options=settings, warnings=warnings, force=force
     )
 
 

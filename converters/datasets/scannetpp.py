@@ -85,9 +85,8 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
     if len(taken) < len(entries):
         warnings.append(f"{len(entries) - len(taken)} images are marked as bad and were left out")
     clip = Clip("", frames, camera, DEPTH_SCALE, sensors={"depth": "rendered from a laser scan"})
-    parameters = {"robots": robots, **settings.model_dump()}
-    image_folder.write(
-        out, "scannetpp", src, clip.cut(robots, src), parameters=parameters, warnings=warnings, force=force
+    image_folder.write_parts(
+        out, "scannetpp", src, clip, robots=robots, options=settings, warnings=warnings, force=force
     )
 
 

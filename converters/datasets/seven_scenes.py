@@ -20,11 +20,14 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from duagc.converters.layouts import reference_poses
 from duagc.converters.layouts.calibrated import ColorLens, correct, numbers, resampled
+from duagc.converters.layouts.displaced_depth import DepthRegistration
 from duagc.converters.layouts.image_files import options_of, read_color, read_depth, rigid
 from duagc.converters.layouts.self_check import ReprojectionCheck
+from duagc.converters.layouts.validity import of_maps
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.base.progress import track
@@ -32,8 +35,7 @@ from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry import depth_error, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 
-Array = NDArray[np.float64]
-Depth = NDArray[np.float64]
+Depth = Array
 Reference = dict[int, Array]  # T_world_color [4, 4] by frame number
 
 WIDTH, HEIGHT = 640, 480
@@ -42,8 +44,6 @@ NO_DEPTH = (0, 65535)
 FRAME_FILE = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(png|jpg|jpeg|txt)")
 SEQUENCE_FOLDER = re.compile(r"seq-(\d+)")
 KINDS = ("color", "depth", "pose")
-
-CONNECTED_RATIO = 0.03  # neighboring depths that differ by less than this share of the nearer are one surface
 
 LENGTHS = {
     "color_distortion": (4, 5),
@@ -287,6 +287,7 @@ def _write_robot(
     check = ReprojectionCheck(options.color_camera(), len(frames))
     lens, correction = options.lens(), options.depth_correction()
     maps = None if lens.is_pinhole else lens.maps()
+    robot.set_valid(None if maps is None else of_maps(maps, WIDTH, HEIGHT))
     holes = invalid = 0
     for index, files in enumerate(track(frames, f"convert {robot.name}")):
         depth = register(correct(_depth_m(files.depth), options.depth_camera(), correction))
@@ -338,72 +339,3 @@ def _read_pose(path: Path) -> Array:
     except ValueError as error:
         raise DuagError(f"{path}: {error}, expected 4x4 numbers") from error
     return rigid(T, str(path))
-
-
-# --- depth into the color camera -----------------------------------------------------------------------------------
-
-
-class DepthRegistration:
-    """Resamples depth for a camera displaced along x, with another focal length and principal point.
-
-    With w = 1 / z a point of depth pixel (u, v) falls on color column A u + B - f b w and row A v + C: rows map to
-    rows. First the rows are resampled, then each row is redrawn as a chain of segments between neighbors. Inverse
-    depth is interpolated, in which planes are linear, and only within a surface (CONNECTED_RATIO); where surfaces
-    overlap the nearest wins; at the border of a surface a pixel covers half its width.
-    """
-
-    def __init__(self, depth_camera: PinholeCamera, color_camera: PinholeCamera, baseline_m: float) -> None:
-        d, c = depth_camera, color_camera
-        self._zoom = c.fx / d.fx
-        self._offset = c.cx - self._zoom * d.cx
-        self._shift_px_m = c.fx * baseline_m
-        self._shape = (c.height, c.width)
-        row = (np.arange(c.height) - c.cy) * (d.fy / c.fy) + d.cy
-        self._row_near = np.clip(np.floor(row).astype(int), 0, d.height - 2)
-        self._row_part = (row - self._row_near)[:, None]
-        self._row_inside = ((row >= -0.5) & (row <= d.height - 0.5))[:, None]
-        self._columns = np.arange(d.width)
-
-    def __call__(self, depth: Depth) -> Depth:
-        """Depth [h, w] in meters of the depth camera, 0 where none -> depth [H, W] in meters of the color camera."""
-        with np.errstate(divide="ignore"):
-            w = np.where(depth > 0, 1.0 / depth, 0.0)
-        w = self._resample_rows(w)
-        out = np.zeros(self._shape)
-        self._draw_segments(w, out)
-        with np.errstate(divide="ignore"):
-            return np.where(out > 0, 1.0 / out, 0.0)
-
-    def _resample_rows(self, w: Depth) -> Depth:
-        upper, lower, part = w[self._row_near], w[self._row_near + 1], self._row_part
-        nearest = np.where(part < 0.5, upper, lower)
-        between = _connected(upper, lower) & (part >= 0) & (part <= 1)
-        return np.where(self._row_inside, np.where(between, upper + part * (lower - upper), nearest), 0.0)
-
-    def _draw_segments(self, w: Depth, out: Depth) -> None:
-        x = self._zoom * self._columns + self._offset - self._shift_px_m * w
-        left, right, w_left, w_right = x[:, :-1], x[:, 1:], w[:, :-1], w[:, 1:]
-        joined = _connected(w_left, w_right)
-        first = np.ceil(left)
-        for column in (first, first + 1):  # connected neighbors are less than two columns apart
-            inside = joined & (column <= right)
-            part = (column - left) / np.where(right > left, right - left, 1.0)
-            self._keep_nearest(out, inside, column, w_left + part * (w_right - w_left))
-        half = 0.5 * self._zoom
-        nearest = np.rint(x)
-        border_left = np.ones(w.shape, bool)
-        border_left[:, 1:] = ~joined
-        border_right = np.ones(w.shape, bool)
-        border_right[:, :-1] = ~joined
-        covered = np.where(nearest < x, border_left, border_right) & (np.abs(nearest - x) <= half)
-        self._keep_nearest(out, covered & (w > 0), nearest, w)
-
-    def _keep_nearest(self, out: Depth, mask: NDArray[np.bool_], column: Depth, w: Depth) -> None:
-        mask = mask & (column >= 0) & (column < self._shape[1])
-        rows = np.nonzero(mask)[0]
-        np.maximum.at(out, (rows, column[mask].astype(int)), w[mask])
-
-
-def _connected(w_a: Depth, w_b: Depth) -> NDArray[np.bool_]:
-    """Whether two inverse depths belong to one surface; no measurement belongs to none."""
-    return (w_a > 0) & (w_b > 0) & (np.abs(w_a - w_b) <= CONNECTED_RATIO * np.minimum(w_a, w_b))

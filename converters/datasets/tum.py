@@ -57,9 +57,8 @@ def convert(src: Path, out: Path, robots: int = 1, force: bool = False, **option
         distortion=distortion if settings.undistort else (),
         sensors={"depth": "Kinect v1, registered to color by the dataset"},
     )
-    parameters = {"robots": robots, **settings.model_dump()}
-    image_folder.write(
-        out, "tum", src, clip.cut(robots, src), parameters=parameters, warnings=warnings, force=force
+    image_folder.write_parts(
+        out, "tum", src, clip, robots=robots, options=settings, warnings=warnings, force=force
     )
 
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.files import decode_image
 from duagc.pipeline.geometry import depth_error, se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 
-Array = NDArray[np.float64]
 Numbers = tuple[float, ...]
 
 
@@ -70,15 +70,20 @@ class ColorLens:
         R = so3.exp(np.array(self.rotation_rad or (0.0, 0.0, 0.0)))
         return se3.from_rotation_translation(R, np.zeros(3))
 
-    def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Where in the camera's images every pixel of `camera` lies, columns and rows [h, w]."""
+    def maps(self, camera: PinholeCamera | None = None) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Where in the camera's images every pixel of resampled ones lies, columns and rows [h, w].
+
+        Args:
+            camera: of the resampled images, turned as the depth camera is; None: `camera` of this lens.
+        """
         import cv2
 
-        rays, s = self.camera.rays().reshape(-1, 3), self.source
+        s, seen_by = self.source, camera or self.camera
+        rays = seen_by.rays().reshape(-1, 3)
         turned = np.array(self.rotation_rad or (0.0, 0.0, 0.0))
         lens = np.array(self.distortion or (0.0, 0.0, 0.0, 0.0))
         pixels, _ = cv2.projectPoints(rays, turned, np.zeros(3), s.matrix(), lens)
-        u, v = pixels.reshape(s.height, s.width, 2).astype(np.float32).transpose(2, 0, 1)
+        u, v = pixels.reshape(seen_by.height, seen_by.width, 2).astype(np.float32).transpose(2, 0, 1)
         return np.ascontiguousarray(u), np.ascontiguousarray(v)
 
 
@@ -86,7 +91,7 @@ def resampled(data: bytes, maps: tuple[NDArray[np.float32], NDArray[np.float32]]
     """An encoded color image at the pixels of `ColorLens.maps`, as PNG; beyond its border the border is repeated."""
     import cv2
 
-    image = decode_image(data, cv2.IMREAD_COLOR)
+    image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     assert image is not None  # whoever read it has decoded it
     moved = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return cv2.imencode(".png", moved)[1].tobytes()

@@ -14,12 +14,12 @@ from duagc.converters.layouts.ros_points import as_of, points_of
 from duagc.converters.layouts.stereo import RowCheck, StereoRig
 from duagc.converters.logs.entries import Entry
 from duagc.converters.robot_writer import RobotWriter
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image
 from duagc.pipeline.recording.lidar import lidar_depth
 from duagc.pipeline.recording.motion import GyroPrior, MotionPrior
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 STEREO_SCALE_M = 0.002  # per unit of the depth images
 ROW_PAIRS = 6  # image pairs whose rows are tested

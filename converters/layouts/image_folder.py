@@ -17,25 +17,38 @@ from numpy.typing import NDArray
 
 from duagc.converters.layouts.image_files import read_color, read_depth
 from duagc.converters.layouts.self_check import ReprojectionCheck
+from duagc.converters.layouts.validity import of_maps
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
+from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry.camera import PinholeCamera
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """One frame: its number in the dataset, time, files, and T_world_camera [4, 4] where known."""
+    """One frame of a dataset.
+
+    Attributes:
+        number: in the dataset.
+        stamp_ns: time of the color.
+        color: file.
+        depth: file; None where no depth was taken near in time. Several frames may have the same.
+        T_world_camera: [4, 4] where known.
+        depth_stamp_ns: time of the depth; None: that of the color.
+        T_world_depth: [4, 4], of the camera at that time; None: unknown, or the same as T_world_camera.
+    """
 
     number: int
     stamp_ns: int
     color: Path
-    depth: Path
+    depth: Path | None
     T_world_camera: Array | None = None
+    depth_stamp_ns: int | None = None
+    T_world_depth: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -75,6 +88,35 @@ def stamps_of(numbers: Sequence[int], rate_hz: int) -> list[int]:
     return [number * NANOSECONDS // rate_hz for number in numbers]
 
 
+def write_parts(
+    out: Path,
+    dataset: str,
+    src: Path,
+    clip: Clip,
+    *,
+    robots: int,
+    options: Config,
+    warnings: Sequence[str],
+    force: bool,
+) -> None:
+    """Write a recording of one sequence, cut into contiguous parts of one robot each.
+
+    Args:
+        out: folder of the recording.
+        dataset: its name.
+        src: where its files are.
+        clip: the whole sequence.
+        robots: number of parts.
+        options: the settings it was made with.
+        warnings: what users should know about the recording.
+        force: replace a recording that is there.
+    Raises:
+        DuagError: a file is not what it should be, or depth and poses do not belong together.
+    """
+    parameters = {"robots": robots, **options.model_dump()}
+    write(out, dataset, src, clip.cut(robots, src), parameters=parameters, warnings=warnings, force=force)
+
+
 def write(
     out: Path,
     dataset: str,
@@ -107,7 +149,9 @@ def write(
         for name, clip in zip(names or robot_names(len(clips)), clips, strict=True):
             sensors = {"part": clip.label, **clip.sensors}
             with recording.robot(name, clip.camera, clip.depth_scale, sensors) as robot:
-                check = _write_clip(robot, clip, f"{src}: {clip.label}" if clip.label else str(src))
+                lens = _Lens(clip)
+                robot.set_valid(lens.valid)
+                check = _write_clip(robot, clip, lens, f"{src}: {clip.label}" if clip.label else str(src))
             numbers = {"first_frame": clip.frames[0].number, "last_frame": clip.frames[-1].number}
             recording.checks[name] = {**numbers, **check}
             without = sum(frame.T_world_camera is None for frame in clip.frames)
@@ -115,28 +159,54 @@ def write(
                 recording.warnings.append(f"{name}: {without} of {len(clip.frames)} frames have no true pose")
 
 
-def _write_clip(robot: RobotWriter, clip: Clip, label: str) -> dict[str, Any]:
+def _write_clip(robot: RobotWriter, clip: Clip, lens: _Lens, label: str) -> dict[str, Any]:
     """Write all frames of a robot; returns what the self-check measured."""
-    lens = _Lens(clip)
     check = ReprojectionCheck(clip.camera, len(clip.frames))
-    empty = 0
+    empty = count = 0
     size = clip.camera.width, clip.camera.height
-    start_ns = clip.frames[0].stamp_ns
+    start_ns = _start_ns(clip)
+    written: set[Path] = set()
+    seen: NDArray[np.uint16] | None = None
     for index, files in enumerate(track(clip.frames, f"convert {robot.name}")):
-        raw = read_depth(files.depth, size)
-        raw = lens.depth(np.where(np.isin(raw, clip.no_depth), 0, raw).astype(np.uint16))
         color, color_format = lens.color(files.color)
+        raw = None
+        if files.depth is not None:
+            # depth with a time of its own is written once; frames that share it come one after the other
+            if files.depth not in written or files.depth_stamp_ns is None:
+                raw = read_depth(files.depth, size)
+                raw = lens.depth(np.where(np.isin(raw, clip.no_depth), 0, raw).astype(np.uint16))
+                empty, count, seen = empty + int((raw == 0).sum()), count + 1, raw
+            written.add(files.depth)
+            assert seen is not None
+            at_color = files.depth_stamp_ns is None
+            T_world_depth = files.T_world_camera if at_color else files.T_world_depth
+            check.add(index, seen.astype(np.float64) * clip.depth_scale, T_world_depth)
         robot.add_frame(
-            files.stamp_ns - start_ns, color, color_format, raw, T_world_camera=files.T_world_camera
+            files.stamp_ns - start_ns,
+            color,
+            color_format,
+            raw,
+            T_world_camera=files.T_world_camera,
+            depth_stamp_ns=None if files.depth_stamp_ns is None else files.depth_stamp_ns - start_ns,
         )
-        check.add(index, raw.astype(np.float64) * clip.depth_scale, files.T_world_camera)
-        empty += int((raw == 0).sum())
-    pixels = len(clip.frames) * size[0] * size[1]
+    if not written:
+        raise DuagError(f"{label}: none of {len(clip.frames)} images has depth near in time, expected some")
+    pixels = count * size[0] * size[1]
     return {"without_depth": empty / pixels, **check.result(label)}
 
 
+def _start_ns(clip: Clip) -> int:
+    """The time of the dataset that becomes 0: of the first image of color or depth."""
+    stamps = [files.stamp_ns for files in clip.frames[:1]]
+    stamps += [files.depth_stamp_ns for files in clip.frames if files.depth_stamp_ns is not None]
+    return min(stamps)
+
+
 class _Lens:
-    """Takes distortion out of color and depth, and color into the camera of the depth, where there is need."""
+    """Takes distortion out of color and depth, and color into the camera of the depth, where there is need.
+
+    valid: bool [H, W], pixels that are made of pixels of the source; None: all.
+    """
 
     def __init__(self, clip: Clip) -> None:
         self._source = clip.color_camera or clip.camera
@@ -145,6 +215,7 @@ class _Lens:
         self._depth_too = bool(clip.distortion)
         if clip.distortion or clip.color_camera is not None:
             self._maps = _maps(clip.camera, self._source, clip.distortion)
+        self.valid = None if self._maps is None else of_maps(self._maps, *self._size)
 
     def depth(self, raw: NDArray[np.uint16]) -> NDArray[np.uint16]:
         """Depth [H, W]; never interpolated."""

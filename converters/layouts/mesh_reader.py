@@ -25,10 +25,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.open3d_import import import_open3d
-
-Array = NDArray[np.float64]
 
 LEVELS = 6
 NO_TEXTURE = -1

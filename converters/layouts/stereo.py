@@ -21,11 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from duagc.converters.layouts.validity import of_maps, shrunk
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.masks import Mask
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Depth = NDArray[np.float32]
 BLOCK_PX = 5
@@ -123,9 +125,9 @@ class StereoRig:
             )
         D = [np.array(c.distortion or (0.0,) * 4) for c in (left, right)]
         model: Any = cv2.fisheye if left.fisheye else cv2
-        more = {"balance": 0.0} if left.fisheye else {"alpha": 0}
+        more = {"balance": 0.0, "tvec": t[:, None]} if left.fisheye else {"alpha": 0, "T": t[:, None]}
         found = model.stereoRectify(
-            left.K, D[0], right.K, D[1], size, R, t.reshape(3, 1), flags=cv2.CALIB_ZERO_DISPARITY, **more
+            left.K, D[0], right.K, D[1], size, R, flags=cv2.CALIB_ZERO_DISPARITY, **more
         )
         R_left, R_right, P_left, P_right = (np.asarray(a, dtype=np.float64) for a in found[:4])
         if not (np.isfinite(P_left).all() and 0.2 < P_left[0, 0] / left.K[0, 0] < 5):
@@ -192,6 +194,15 @@ class StereoRig:
             for c, turn, p in zip((left, right), turns, P, strict=True)
         ]
         return StereoRig(a, rig.baseline_m, options, (maps[0], maps[1]), R_rectified_left=turns[0])
+
+    @cached_property
+    def valid(self) -> Mask | None:
+        """Pixels [h, w] of the rectified left images that are made of pixels of the camera's; None: all."""
+        if self._maps is None:
+            return None
+        height, width = self._maps[0][0].shape  # of the source too
+        mask = of_maps(self._maps[0], width, height)[: self._whole.height, : self._whole.width]
+        return shrunk(mask, self.options.shrink)
 
     def rectify_left(self, image: Image) -> Image:
         """A left image, gray or color, as the rectified camera sees it."""
@@ -279,7 +290,7 @@ class StereoRig:
 
 def disparity_sigma_m(
     depth_m: NDArray[np.floating], sigma_px: NDArray[np.floating] | float, focal_baseline: float
-) -> NDArray[np.float64]:
+) -> Array:
     """Standard deviation of a depth by that of its disparity: sigma_z = z^2 sigma_d / (f b), meters.
 
     Args:

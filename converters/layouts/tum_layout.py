@@ -15,30 +15,33 @@ from pydantic import Field
 
 from duagc.converters.layouts.image_folder import FrameFiles
 from duagc.converters.robot_writer import NANOSECONDS
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.recording.pairing import TOLERANCE_NS
 
-Array = NDArray[np.float64]
 LAST_NS = 1 << 62  # about the year 2116
 
 
 class AssociationOptions(Config):
     """Which depth image belongs to which color image, and where the camera was."""
 
-    association: Literal["official", "nearest"] = "official"
-    """`official`: closest pairs first, each image once, as the dataset's associate.py. `nearest`: for each color image
-    the nearest depth image, which may be used twice, as most published loaders do."""
+    association: Literal["all", "official", "nearest"] = "all"
+    """`all`: every color image, with the nearest depth image as of its own time, which may be used twice; a run moves
+    it by the motion of the camera. `official`: closest pairs first, each image once, as the dataset's associate.py.
+    `nearest`: for each color image the nearest depth image, which may be used twice, as most published loaders do. Both
+    take depth as of the time of color."""
     max_difference_s: float = Field(0.0, ge=0.0)
-    """Largest difference of their times; 0: 0.02 for `official`, 0.08 for `nearest`."""
+    """Largest difference of their times; 0: 0.1 for `all`, 0.02 for `official`, 0.08 for `nearest`."""
     max_pose_gap_s: float = Field(0.1, gt=0.0)
     """Poses are interpolated between two measured ones that are no further apart; never beyond the ends."""
 
     @property
     def limit_ns(self) -> int:
         """Largest difference of times of color and depth."""
-        default = 0.02 if self.association == "official" else 0.08
+        default = {"all": TOLERANCE_NS / NANOSECONDS, "official": 0.02, "nearest": 0.08}[self.association]
         return round((self.max_difference_s or default) * NANOSECONDS)
 
 
@@ -107,6 +110,11 @@ def associate(
     return [(color[i], depth[j]) for i, j in sorted(pairs)]
 
 
+def _is_near(color: Listed, depth: Listed) -> bool:
+    """Whether depth can be moved to the time of color; what is farther away the options take as of that time."""
+    return abs(depth.stamp_ns - color.stamp_ns) <= TOLERANCE_NS
+
+
 @dataclass(frozen=True)
 class Poses:
     """Measured poses: stamps_ns int64 [n], increasing, T_world_body [n, 4, 4]; how many lines were no pose."""
@@ -163,7 +171,7 @@ def frames_of(src: Path, options: AssociationOptions) -> tuple[list[FrameFiles],
     if not src.is_dir():
         raise DuagError(f"{src}: no such folder, expected rgb.txt, depth.txt and groundtruth.txt in it")
     color, depth = read_list(src / "rgb.txt"), read_list(src / "depth.txt")
-    pairs = associate(color, depth, options)
+    pairs: list[tuple[Listed, Listed | None]] = list(associate(color, depth, options))
     if not pairs:
         raise DuagError(
             f"{src / 'depth.txt'}: no image within {options.limit_ns / NANOSECONDS:g} s of one in rgb.txt, "
@@ -172,6 +180,10 @@ def frames_of(src: Path, options: AssociationOptions) -> tuple[list[FrameFiles],
     warnings = []
     if len(pairs) < len(color):
         warnings.append(f"{len(color) - len(pairs)} of {len(color)} color images have no depth near in time")
+    keeps_times = options.association == "all"
+    if keeps_times:
+        partner = {c.stamp_ns: d for c, d in pairs}
+        pairs = [(c, partner.get(c.stamp_ns)) for c in color]
     truth = src / "groundtruth.txt"
     poses = Poses.read(truth) if truth.is_file() else None
     if poses is None:
@@ -183,8 +195,12 @@ def frames_of(src: Path, options: AssociationOptions) -> tuple[list[FrameFiles],
             number,
             c.stamp_ns,
             c.path,
-            d.path,
-            None if poses is None else poses.at(c.stamp_ns, options.max_pose_gap_s),
+            None if d is None else d.path,
+            T_world_camera=None if poses is None else poses.at(c.stamp_ns, options.max_pose_gap_s),
+            depth_stamp_ns=d.stamp_ns if keeps_times and d is not None and _is_near(c, d) else None,
+            T_world_depth=None
+            if poses is None or d is None
+            else poses.at(d.stamp_ns, options.max_pose_gap_s),
         )
         for number, (c, d) in enumerate(pairs)
     ]

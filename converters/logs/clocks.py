@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from duagc.converters.logs.entries import NANOSECONDS
 from duagc.converters.logs.files import Log
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import so3
 
-Array = NDArray[np.float64]
 MOST_SHARED = 5000  # messages of a log that are compared
 LEAST_SHARED = 5
 LEAST_OFFSET_S = 0.02  # what pairing of images bears, and what transport takes

@@ -20,17 +20,18 @@ from duagc.converters.layouts.derived_depth import (
 )
 from duagc.converters.layouts.ros_images import RosCamera, color_bytes
 from duagc.converters.layouts.stereo import RawCamera, StereoRig
+from duagc.converters.layouts.validity import of_maps
 from duagc.converters.logs.files import Log
 from duagc.converters.logs.frames import Transforms
 from duagc.converters.logs.motion import extrinsics_of
 from duagc.converters.logs.options import LogOptions
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.masks import Mask
 from duagc.pipeline.recording.lidar import lidar_depth
 from duagc.pipeline.recording.motion import MotionPrior
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -45,12 +46,17 @@ class Picture:
 
 
 class Derived(Protocol):
-    """A source of depth. camera: of the recording; T_color_camera [4, 4]: where it is in the log's color camera."""
+    """A source of depth.
+
+    camera: of the recording. T_color_camera [4, 4]: where it is in the log's color camera. valid: bool [h, w], pixels
+    of the recording's images that show the scene; None: all.
+    """
 
     camera: PinholeCamera
     T_color_camera: Array
     scale: float
     words: str
+    valid: Mask | None
 
     def picture(self, color: Any, partner: Any, color_ns: int, partner_ns: int) -> Picture:
         """Of a color message and that which goes with it."""
@@ -70,7 +76,7 @@ class Stereo:
     def __init__(self, rig: StereoRig, size: tuple[int, int], where: str) -> None:
         """size: of the images as they come. where: begins the line of an error."""
         self._frames, self._where = StereoFrames(rig, size), where
-        self.camera = rig.camera
+        self.camera, self.valid = rig.camera, rig.valid
         self.T_color_camera = se3.from_rotation_translation(rig.R_rectified_left.T, np.zeros(3))
 
     def check(self, pairs: Sequence[tuple[Any, Any]]) -> dict[str, Any]:
@@ -99,6 +105,9 @@ class Sweeps:
         """where: of color and points, for the line of an error."""
         self.lidar, self.camera, self._where = lidar, camera.camera, where
         self._maps = camera.maps() if undistort else None
+        self.valid = (
+            None if self._maps is None else of_maps(self._maps, self.camera.width, self.camera.height)
+        )
 
     def picture(self, color: Any, partner: Any, color_ns: int, partner_ns: int) -> Picture:
         import cv2

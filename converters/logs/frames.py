@@ -6,14 +6,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.converters.logs.entries import Entry, stamp_ns
 from duagc.converters.logs.files import Log
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 
-Array = NDArray[np.float64]
 TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 FARTHEST_M = 1e8  # also from the origin of a map of the earth
 SAME = 1e-6  # meters and radians up to which a transform has not changed

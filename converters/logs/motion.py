@@ -15,11 +15,11 @@ from duagc.converters.logs.entries import NANOSECONDS, Entry, sound_time
 from duagc.converters.logs.files import Log
 from duagc.converters.logs.frames import TF_TYPES, Transforms, frame_name, pose_matrix, transforms_in
 from duagc.converters.logs.options import LogOptions
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording.motion import GyroPrior, MotionPrior, OdometryPrior
 
-Array = NDArray[np.float64]
 POSE_TYPES = (
     "nav_msgs/msg/Odometry",
     "geometry_msgs/msg/PoseStamped",

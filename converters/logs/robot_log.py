@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from duagc.converters.layouts.ros_images import RosCamera, is_integer_depth, size_of
 from duagc.converters.layouts.tum_layout import Listed, associate
+from duagc.converters.layouts.validity import of_maps
 from duagc.converters.logs.choice import REGISTERED, Chooser, video_words
 from duagc.converters.logs.clocks import Drift, RobotClock, drift
 from duagc.converters.logs.derived import Derived, Picture, Stereo, some_pairs, stereo_of, sweeps_of
@@ -23,12 +24,14 @@ from duagc.converters.logs.frames import Transforms, pose_matrix
 from duagc.converters.logs.gather import gathered
 from duagc.converters.logs.motion import CameraPoses, Imu, MotionReader, extrinsics_of
 from duagc.converters.logs.options import LogOptions
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.masks import Mask
+from duagc.pipeline.recording.pairing import TOLERANCE_NS
 from duagc.pipeline.recording.register_depth import MOST_SAMPLES, sample_steps
 
-Array = NDArray[np.float64]
 HALF_TURN_S = 0.055  # of a LiDAR with 10 turns a second
 RECTIFIED = ("image_rect", "image_rect_color", "rect")
 SAME_CAMERA_PX = 1.0  # up to which a camera has not changed
@@ -174,6 +177,14 @@ class RobotLog:
         return self.color_camera.maps() if self.settings.undistort else None
 
     @cached_property
+    def valid(self) -> Mask | None:
+        """Pixels of the recording's images that show the scene; None: all."""
+        if self.derived is not None:
+            return self.derived.valid
+        maps, camera = self.color_maps, self.color_camera.camera
+        return None if maps is None else of_maps(maps, camera.width, camera.height)
+
+    @cached_property
     def depth_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Where in the depth images every pixel of their pinhole lies; None if they need not be undistorted.
 
@@ -317,23 +328,36 @@ class RobotLog:
                     f"{self.name}: {topic}: all times are zero, expected times, or --set time_source=log"
                 )
         listed = {topic: [Listed(t, Path()) for t in sorted(set(times))] for topic, times in stamps.items()}
-        found = associate(listed[self.color], listed[self.depth], self.settings)
+        settings = self.settings
+        if self.derived is not None and settings.association == "all":
+            # eyes and sweeps are of one time with the color; none of them can be moved or used twice
+            settings = settings.model_copy(update={"association": "official"})
+        found = associate(listed[self.color], listed[self.depth], settings)
         if not found:
             away = nearest_s(
                 [d.stamp_ns for d in listed[self.depth]], [c.stamp_ns for c in listed[self.color]]
             )
             raise DuagError(
-                f"{self.name}: no image on {self.depth} within {self.settings.limit_ns / NANOSECONDS:g} s of one on "
+                f"{self.name}: no image on {self.depth} within {settings.limit_ns / NANOSECONDS:g} s of one on "
                 f"{self.color} (the nearest is {away:.3f} s away), expected pairs, or --set max_difference_s=SECONDS"
             )
         alone = len(listed[self.color]) - len(found)
         if alone:
             self.warnings.append(
-                f"{alone} of {len(listed[self.color])} color images have no depth near in time"
+                f"{alone} of {len(listed[self.color])} color images have no depth near in time; left out"
             )
         if min(c.stamp_ns for c, _ in found) + self.shift_ns < 0:
             raise DuagError(f"{self.name}: clock_offset_s = {self.settings.clock_offset_s} leads before 1970")
         return {c.stamp_ns: d.stamp_ns for c, d in found}
+
+    def depth_stamp_ns(self, stamp_ns: int) -> int | None:
+        """The time of the recording for the depth of a color image; None: it counts as that of the color."""
+        depth_ns = self.pairs[stamp_ns]
+        moves = self.derived is None and self.settings.association == "all"
+        # what is farther away was allowed by max_difference_s, because the times are wrong
+        if not moves or abs(depth_ns - stamp_ns) > TOLERANCE_NS:
+            return None
+        return self.written_ns(depth_ns)
 
     def clock(self, robot: str) -> RobotClock:
         """What the times of the images say about the robot's clock."""

@@ -17,13 +17,17 @@ from numpy.typing import NDArray
 from duagc.converters.layouts.stereo import StereoRig
 from duagc.converters.simulate.movers import Mover
 from duagc.converters.simulate.render.raycast import MeshRenderer
-from duagc.converters.simulate.render.renderer import RenderedView
+from duagc.converters.simulate.render.renderer import CameraRenderer, RenderedView
 from duagc.converters.simulate.sensors import noise
+from duagc.converters.simulate.sensors.degradations import FRAME_RATE_HZ, Degradations
+from duagc.converters.simulate.sensors.lens import Lens
+from duagc.converters.simulate.sensors.light import vignette, with_light
 from duagc.converters.simulate.sensors.rig import BASELINE_M, MovingCamera, Rig, with_gain
-from duagc.converters.simulate.settings import FRAME_RATE_HZ, SimulationSettings
+from duagc.converters.simulate.settings import Cover, SimulationSettings
 from duagc.converters.simulate.simulated_scenes import SceneOnDisk, SimulatedScene
 from duagc.pipeline.base import determinism, random_streams
 from duagc.pipeline.base.workers import worker_pool
+from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 
 PNG_LEVEL = 1
@@ -38,12 +42,14 @@ class FrameJob:
         index: of the frame.
         T_world_camera: [4, 4].
         twist: [6], its motion per second, a right tangent (m, rad).
+        gains: of red, green and blue, factors of the light.
     """
 
     robot: str
     index: int
     T_world_camera: NDArray[np.float64]
     twist: NDArray[np.float64]
+    gains: tuple[float, ...] = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,7 @@ class FrameImages:
         png: the color image, encoded.
         depth: uint16 [h, w] in units of the scene's depth_scale_m, 0 = none; None: the depth is that of a LiDAR.
         exact_depth: likewise, without noise, where that differs.
-        mask: [h, w], False where something moves; None where nothing can.
+        mask: [h, w], False where something moves or the lens saw nothing; None where neither can be.
         sigma_m: [h, w], standard deviation of the depth, where it is known pixel by pixel.
         points: [n, 3], m, LiDAR frame, if there is a LiDAR.
     """
@@ -77,6 +83,8 @@ class FrameSettings:
         seed: of the noise.
         rig: the sensors.
         movers: figures that walk through the scene.
+        covers: when a lens is covered.
+        degradations: what makes the camera worse than an ideal one.
     """
 
     camera: PinholeCamera
@@ -84,17 +92,29 @@ class FrameSettings:
     seed: int
     rig: Rig
     movers: list[Mover]
+    covers: tuple[Cover, ...]
+    degradations: Degradations
+
+    @property
+    def lens(self) -> Lens | None:
+        """The lens of the camera; None: a pinhole."""
+        k1 = self.degradations.lens_k1
+        return Lens(self.camera, k1) if k1 != 0 else None
 
     @classmethod
-    def of(cls, settings: SimulationSettings, camera: PinholeCamera, movers: list[Mover]) -> "FrameSettings":
+    def of(
+        cls, settings: SimulationSettings, camera: PinholeCamera, movers: list[Mover], rig: Rig
+    ) -> "FrameSettings":
         """Those of a simulation.
 
         Args:
             settings: of the simulation.
             camera: of all robots.
             movers: figures that walk through the scene.
+            rig: the sensors, with the exposure that the motion blur takes.
         """
-        return cls(camera, settings.noise, settings.seed, settings.rig, movers)
+        s = settings
+        return cls(camera, s.noise, s.seed, rig, movers, covers=s.covers, degradations=s.degradations)
 
 
 class FrameRenderer:
@@ -110,10 +130,15 @@ class FrameRenderer:
         self.settings, self.depth_scale_m = settings, scene.depth_scale_m
         self.renderer = scene.renderer(settings.camera)
         self.moving: MovingCamera | None = None
-        if not settings.rig.plain or settings.movers:
+        lens, d = settings.lens, settings.degradations
+        if not settings.rig.plain or settings.movers or lens is not None:
             assert isinstance(self.renderer, MeshRenderer)
-            self.moving = MovingCamera(self.renderer, settings.rig, settings.movers)
+            self.moving = MovingCamera(
+                self.renderer, settings.rig, settings.movers, lens=lens, blur_px=d.blur_px
+            )
         self.stereo = StereoRig.rectified(settings.camera, settings.camera, BASELINE_M, "simulate")
+        self.vignette = vignette(settings.camera, d.vignette) if d.vignette > 0 else None
+        self.straight = None if lens is None else _Undistortion(lens, scene.renderer(lens.pinhole))
 
     def render(self, job: FrameJob) -> FrameImages:
         """The images of one frame.
@@ -122,30 +147,66 @@ class FrameRenderer:
             job: which frame.
         """
         settings, rig = self.settings, self.settings.rig
+        if any(cover.hides(job.robot, job.index) for cover in settings.covers):
+            return self._covered()
         view, mask = self._view(job, job.T_world_camera)
-        color, exact = view.color, _units(view.depth, self.depth_scale_m)
-        depth: NDArray[np.uint16] | None = exact
+        color, exact_m = self._lit(view.color, job), view.depth
+        depth_m = self._depth_before(job) if settings.degradations.depth_delay_s > 0 else exact_m
         sigma_m, points = None, None
         if settings.noise == "kinect":
             rng = random_streams.generator(settings.seed, "simulate.noise", robot=job.robot, frame=job.index)
-            depth = _units(noise.kinect_depth(view.depth, settings.camera, rng), self.depth_scale_m)
+            depth_m = noise.kinect_depth(depth_m, settings.camera, rng)
             color = noise.gray_noise(color, rng)
-        elif rig.sensor == "stereo":
-            depth, sigma_m = self._stereo_depth(job, color)
+        depth_m = noise.quantized(depth_m, settings.degradations.depth_step_m)
+        if rig.gain_stops > 0 or rig.camera_stops > 0:
+            gain = rig.gain(settings.seed, job.robot, job.index / FRAME_RATE_HZ)
+            color = with_gain(color, gain, rig.tint(settings.seed, job.robot))
+        mask = mask if settings.movers else None
+        if self.straight is not None:
+            color, depth_m, mask = (
+                self.straight.color(color),
+                self.straight.depth(depth_m),
+                self.straight.mask,
+            )
+            exact_m = self.straight.exact_depth(job.T_world_camera)
+        depth: NDArray[np.uint16] | None = _units(depth_m, self.depth_scale_m)
+        exact = None if depth_m is exact_m else _units(exact_m, self.depth_scale_m)
+        if rig.sensor == "stereo":
+            depth, sigma_m = self._stereo_depth(job, view.color)
+            exact = _units(exact_m, self.depth_scale_m)
         elif rig.sensor == "lidar":
             assert self.moving is not None
             rng = random_streams.generator(settings.seed, "simulate.lidar", robot=job.robot, frame=job.index)
             depth, points = None, self.moving.sweep(job.T_world_camera, job.index, rng)
-        if rig.gain_stops > 0 or rig.camera_stops > 0:
-            gain = rig.gain(settings.seed, job.robot, job.index / FRAME_RATE_HZ)
-            color = with_gain(color, gain, rig.tint(settings.seed, job.robot))
+            exact = _units(exact_m, self.depth_scale_m)
+        return FrameImages(_png(color), depth, exact, mask=mask, sigma_m=sigma_m, points=points)
+
+    def _lit(self, color: NDArray[np.uint8], job: FrameJob) -> NDArray[np.uint8]:
+        """The image as the camera's exposure, white balance and vignette have it."""
+        if job.gains == (1.0, 1.0, 1.0) and self.vignette is None:
+            return color
+        return with_light(color, np.array(job.gains), self.vignette)
+
+    def _depth_before(self, job: FrameJob) -> NDArray[np.float64]:
+        """Exact depth as it was a delay before the frame."""
+        T = job.T_world_camera @ se3.exp(-self.settings.degradations.depth_delay_s * job.twist)
+        if self.moving is None:
+            return self.renderer.depth(T)[0]
+        return self.moving.depth(T, job.index)[0]
+
+    def _covered(self) -> FrameImages:
+        """What a covered camera sees: nothing; the mask, where there are any, is that of the lens."""
+        settings, camera = self.settings, self.settings.camera
+        depth = np.zeros((camera.height, camera.width), dtype=np.uint16)
+        of_images = settings.rig.sensor != "lidar"
+        exact_apart = settings.noise == "kinect" or settings.degradations.of_depth_or_lens
+        mask = np.ones(depth.shape, dtype=np.bool_) if settings.movers else None
         return FrameImages(
-            _png(color),
-            depth,
-            None if depth is exact else exact,
-            mask=mask if settings.movers else None,
-            sigma_m=sigma_m,
-            points=points,
+            _png(np.zeros((*depth.shape, 3), dtype=np.uint8)),
+            depth if of_images else None,
+            depth if exact_apart else None,
+            mask=mask if self.straight is None else self.straight.mask,
+            sigma_m=np.zeros(depth.shape, dtype=np.float32) if settings.rig.sensor == "stereo" else None,
         )
 
     def _view(
@@ -165,6 +226,28 @@ class FrameRenderer:
         gray = [np.asarray(cv2.cvtColor(each, cv2.COLOR_RGB2GRAY), np.uint8) for each in (left, right.color)]
         depth_m, sigma_m = self.stereo.depth(gray[0], gray[1])
         return _units(depth_m.astype(np.float64), self.depth_scale_m), sigma_m
+
+
+class _Undistortion:
+    """Images of a lens as a converter would write them: of a pinhole camera, with a rim that the lens did not see."""
+
+    def __init__(self, lens: Lens, renderer: CameraRenderer) -> None:
+        self._u, self._v, self.mask = lens.maps()
+        self._renderer = renderer
+
+    def color(self, color: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Color [h, w, 3], black in the rim."""
+        straight = cv2.remap(color, self._u, self._v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.where(self.mask[..., None], np.asarray(straight, dtype=np.uint8), np.uint8(0))
+
+    def depth(self, depth_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Depth [h, w], never interpolated, 0 in the rim."""
+        straight = cv2.remap(depth_m, self._u, self._v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        return np.where(self.mask, np.asarray(straight, dtype=np.float64), 0.0)
+
+    def exact_depth(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """True depth [h, w] at the pixel centers, 0 in the rim."""
+        return np.where(self.mask, self._renderer.depth(T_world_camera)[0], 0.0)
 
 
 def _png(color: NDArray[np.uint8]) -> bytes:

@@ -14,9 +14,8 @@ from duagc.converters.simulate.scenes import textures as tex
 from duagc.converters.simulate.scenes.scene import Scene
 from duagc.converters.simulate.trajectories.walks import WalkableSpace, route
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry.camera import PinholeCamera
-
-Array = NDArray[np.float64]
 
 STEP_M = 0.025  # per frame
 TALL_M, REACH_M = 1.75, 1.0  # a ball of that radius about its middle holds a figure
@@ -113,8 +112,10 @@ def _figure(k: int, seed: int) -> Scene:
     rng = random_streams.generator(seed, "simulate.figure-colors", mover=k)
     coat = tex.fabric(tex.vivid(rng, 0.8), tex.vivid(rng, 0.5))
     for side, y in (("left", 0.1), ("right", -0.1)):
-        scene.cylinder(f"leg {side}", (0.0, y, 0.02), 0.085, 0.8, tex.fabric((62, 70, 92), (90, 86, 80)))
-        scene.cylinder(f"arm {side}", (0.0, 2.7 * y, 0.8), 0.06, 0.58, coat)
-    scene.cylinder("coat", (0.0, 0.0, 0.78), 0.2, 0.66, coat)
+        scene.cylinder(
+            f"leg {side}", (0.0, y, 0.02), tex.fabric((62, 70, 92), (90, 86, 80)), radius=0.085, height=0.8
+        )
+        scene.cylinder(f"arm {side}", (0.0, 2.7 * y, 0.8), coat, radius=0.06, height=0.58)
+    scene.cylinder("coat", (0.0, 0.0, 0.78), coat, radius=0.2, height=0.66)
     scene.sphere("head", (0.0, 0.0, 1.58), 0.14, tex.marbled((206, 164, 136), (96, 64, 44), 0.2))
     return scene

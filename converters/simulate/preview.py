@@ -1,14 +1,15 @@
 """A contact sheet of a simulated recording: the paths from above, and what every robot saw over time."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.files import new_file
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 COLORS = (
@@ -25,7 +26,15 @@ MARGIN, PAPER, INK = 12, (250, 250, 248), (40, 40, 44)
 class Preview:
     """Collects what the sheet shows."""
 
-    def __init__(self, title: str, names: list[str], trajectories: list[Array], walks: list[Array]) -> None:
+    def __init__(
+        self,
+        title: str,
+        names: list[str],
+        trajectories: list[Array],
+        walks: list[Array],
+        *,
+        kept: list[list[int]],
+    ) -> None:
         """Initialize.
 
         Args:
@@ -33,15 +42,16 @@ class Preview:
             names: of the robots.
             trajectories: T_world_camera [frames, 4, 4] of each.
             walks: poses [frames, 4, 4] of what moves besides.
+            kept: indices of the frames of each that are recorded.
         """
         self.title, self.names, self.trajectories, self.walks = title, names, trajectories, walks
-        frames = len(trajectories[0])
-        self.shown = np.unique(np.linspace(0, frames - 1, THUMBS).round().astype(np.int64)).tolist()
+        spread = [np.unique(np.linspace(0, len(k) - 1, THUMBS).round().astype(np.int64)) for k in kept]
+        self.shown = {name: np.array(k)[s].tolist() for name, k, s in zip(names, kept, spread, strict=True)}
         self._thumbs: dict[tuple[str, int], Image] = {}
 
     def add(self, robot: str, index: int, png: bytes) -> None:
         """Keep a frame, if it is one of those that are shown."""
-        if index in self.shown:
+        if index in self.shown[robot]:
             image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
             assert image is not None
             height = round(THUMB_WIDTH * image.shape[0] / image.shape[1])
@@ -62,11 +72,11 @@ class Preview:
         """The frames of one robot."""
         name, color = self.names[k], COLORS[k % len(COLORS)]
         pieces = []
-        for index in self.shown:
+        for index in self.shown[name]:
             thumb = self._thumbs[name, index].copy()
             cv2.rectangle(thumb, (0, 0), (thumb.shape[1] - 1, thumb.shape[0] - 1), color, 3)
-            cv2.putText(thumb, f"{name} {index}", (8, 18), 0, 0.5, (0, 0, 0), 3, cv2.LINE_AA)
-            cv2.putText(thumb, f"{name} {index}", (8, 18), 0, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+            _write(thumb, f"{name} {index}", (8, 18), (0, 0, 0), thickness=3)
+            _write(thumb, f"{name} {index}", (8, 18), (255, 255, 255))
             pieces.append(thumb)
         return np.concatenate(pieces, axis=1)
 
@@ -95,20 +105,19 @@ class Preview:
             )  # no path hides another
             cv2.polylines(image, [line], False, (255, 255, 255), wide + 2, cv2.LINE_AA)
             cv2.polylines(image, [line], False, color, wide, cv2.LINE_AA)
-            for index in self.shown:
+            for index in self.shown[self.names[k]]:
                 at = path[index, :2, 3]
                 for side in (-0.5, 0.5):  # half the opening angle of a camera, about
                     c, s = np.cos(side), np.sin(side)
                     end = at + 28 / scale * (np.array([[c, -s], [s, c]]) @ path[index, :2, 2])
                     cv2.line(image, pixel(at), pixel(end), color, 1, cv2.LINE_AA)
             cv2.circle(image, pixel(path[0, :2, 3]), 7, color, -1, cv2.LINE_AA)
-            cv2.putText(
-                image, self.names[k][0], pixel(path[0, :2, 3] + 10 / scale), 0, 0.6, color, 2, cv2.LINE_AA
-            )
+            initial_px = pixel(path[0, :2, 3] + 10 / scale)
+            _write(image, self.names[k][0], initial_px, color, scale=0.6, thickness=2)
         meters = 10.0 ** np.floor(np.log10(200 / scale))
         bottom = image.shape[0] - 14
         cv2.line(image, (14, bottom), (14 + round(meters * scale), bottom), INK, 3)
-        cv2.putText(image, f"{meters:g} m", (14, bottom - 8), 0, 0.5, INK, 1, cv2.LINE_AA)
+        _write(image, f"{meters:g} m", (14, bottom - 8), INK)
         return image
 
 
@@ -134,9 +143,22 @@ def _from_above(points: Array, colors: NDArray[np.uint8], low: Array, high: Arra
     return np.asarray(cv2.resize(image, whole, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
 
 
+def _write(
+    image: Image,
+    text: str,
+    at_px: Sequence[int],
+    color: Sequence[int],
+    *,
+    scale: float = 0.5,
+    thickness: int = 1,
+) -> None:
+    font, smooth = cv2.FONT_HERSHEY_SIMPLEX, cv2.LINE_AA
+    cv2.putText(image, text, at_px, font, scale, color, thickness=thickness, lineType=smooth)
+
+
 def _line(text: str, width: int) -> Image:
     strip = np.full((36, width, 3), PAPER, dtype=np.uint8)
-    cv2.putText(strip, text, (MARGIN, 24), 0, 0.6, INK, 1, cv2.LINE_AA)
+    _write(strip, text, (MARGIN, 24), INK, scale=0.6)
     return strip
 
 

@@ -1,19 +1,60 @@
 """What to simulate, checked before anything is computed."""
 
+from __future__ import annotations
+
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from duagc.converters.simulate.scenes.catalog import SCENES
+from duagc.converters.simulate.sensors.degradations import FRAME_RATE_HZ, Degradations
 from duagc.converters.simulate.sensors.rig import SENSORS, Rig
 from duagc.converters.simulate.trajectories.paradigms import PARADIGMS
+from duagc.converters.writer import robot_names
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
 
-FRAME_RATE_HZ = 30
 FOCAL_OF_WIDTH = 0.82  # focal length as a share of the image width: 63 degrees across
 NOISES = ("none", "kinect")
 MAX_ROBOTS = 8
+
+
+@dataclass(frozen=True)
+class Cover:
+    """The lens of one robot is covered for a while: its images are black, without depth; it moves on.
+
+    Attributes:
+        robot: its name.
+        first: the first frame.
+        frames: how many.
+    """
+
+    robot: str
+    first: int
+    frames: int
+
+    @staticmethod
+    def parse(text: str) -> Cover:
+        """From "alpha:80:90".
+
+        Args:
+            text: name, first frame and number of frames.
+        Raises:
+            DuagError: it is not that.
+        """
+        robot, *numbers = text.split(":")
+        if len(numbers) != 2 or not all(number.isdecimal() for number in numbers):
+            raise DuagError(f"simulate: cover is {text!r}, expected ROBOT:FIRST:FRAMES, such as alpha:80:90")
+        return Cover(robot, int(numbers[0]), int(numbers[1]))
+
+    def hides(self, robot: str, frame: int) -> bool:
+        """Whether a frame shows nothing.
+
+        Args:
+            robot: whose frame.
+            frame: its index.
+        """
+        return robot == self.robot and 0 <= frame - self.first < self.frames
 
 
 @dataclass(frozen=True)
@@ -32,6 +73,9 @@ class SimulationSettings:
         paradigm: the figure that the paths draw together, one of `PARADIGMS`; "wander" is none.
         rig: the sensors.
         movers: figures that walk through the scene; a mask says where they are.
+        covers: when a lens is covered.
+        degradations: what makes the camera worse than an ideal one.
+        triangles: make triangles of the room even if nothing needs them.
     """
 
     robots: int = 2
@@ -45,11 +89,15 @@ class SimulationSettings:
     paradigm: str = "wander"
     rig: Rig = field(default_factory=Rig)
     movers: int = 0
+    covers: tuple[Cover, ...] = ()
+    degradations: Degradations = field(default_factory=Degradations)
+    triangles: bool = False
 
     @property
     def needs_triangles(self) -> bool:
         """Whether the room's own renderer, which knows rays from one point only, does not do."""
-        return not self.rig.plain or self.movers > 0
+        d = self.degradations
+        return self.triangles or not self.rig.plain or self.movers > 0 or d.needs_triangles
 
     def check(self) -> None:
         """Refuse settings out of range.
@@ -59,6 +107,14 @@ class SimulationSettings:
         """
         self._check_team()
         self._check_sensors()
+        names = robot_names(self.robots)
+        for cover in self.covers:
+            if cover.robot not in names or cover.first + cover.frames > self.frames:
+                raise DuagError(
+                    f"simulate: cover names {cover.robot}, frames {cover.first} to {cover.first + cover.frames - 1}, "
+                    f"expected one of {', '.join(names)}, frames 0 to {self.frames - 1}"
+                )
+        self._check_degradations()
 
     def _check_team(self) -> None:
         for name, value, low, high in (
@@ -98,6 +154,21 @@ class SimulationSettings:
             if not 0 <= value <= high:
                 raise DuagError(f"simulate: {name} is {value:g}, expected 0 to {high:g}")
 
+    def _check_degradations(self) -> None:
+        d = self.degradations
+        d.check()
+        if self.rig.sensor != "rgbd" and d.of_depth_or_lens:
+            raise DuagError(
+                f"simulate: a lens, a depth step or a depth delay with {self.rig.sensor}, expected it with rgbd"
+            )
+        if d.blur_px > 0 and self.rig.exposure_s > 0:
+            raise DuagError(
+                f"simulate: motion blur is given as {d.blur_px:g} px and as {self.rig.exposure_s:g} s of exposure, "
+                "expected one of them"
+            )
+        if d.lens_k1 != 0 and self.movers:
+            raise DuagError("simulate: movers are seen through a lens, expected a camera without one")
+
     def parameters(self) -> dict[str, Any]:
         """What `recording.json` keeps of them, besides the scene; defaults of sensors and paths are left out."""
         kept = {"robots": self.robots, "frames": self.frames, "size": list(self.size)}
@@ -106,6 +177,12 @@ class SimulationSettings:
             kept["paradigm"] = self.paradigm
         if self.rig != Rig() or self.movers:
             kept |= asdict(self.rig) | {"movers": self.movers}
+        if self.covers:
+            kept["covers"] = [asdict(cover) for cover in self.covers]
+        if self.degradations != Degradations():
+            kept["degradations"] = asdict(self.degradations)
+        if self.triangles:
+            kept["triangles"] = True
         return kept
 
 

@@ -13,9 +13,9 @@ from duagc.converters.simulate.render.renderer import CameraRenderer, Renderer
 from duagc.converters.simulate.scenes.catalog import MESHES, SCENES, SceneSettings, build
 from duagc.converters.simulate.trajectories import loops, walks
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry.camera import PinholeCamera
 
-Array = NDArray[np.float64]
 Points = tuple[Array, Array, NDArray[np.uint8]]
 
 ROOM = SCENES["room"][1]

@@ -1,33 +1,36 @@
 """Simulated recordings: a team of robots with cameras in a procedural scene or among textured meshes."""
 
+import dataclasses
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.converters.simulate.frames import FrameImages, FrameJob, FrameSettings, RenderPool
 from duagc.converters.simulate.movers import Mover, walk
 from duagc.converters.simulate.ply import write_points
 from duagc.converters.simulate.preview import Preview
+from duagc.converters.simulate.sensors import light, shutter
+from duagc.converters.simulate.sensors.degradations import FRAME_RATE_HZ, Degradations
+from duagc.converters.simulate.sensors.lens import Lens
 from duagc.converters.simulate.sensors.rig import RANGE_SIGMA_M, T_CAMERA_LIDAR, Rig
-from duagc.converters.simulate.settings import FRAME_RATE_HZ, SimulationSettings, camera_of, scene_of
+from duagc.converters.simulate.settings import Cover, SimulationSettings, camera_of, scene_of
 from duagc.converters.simulate.simulated_scenes import SimulatedMeshes, SimulatedScene, set_up
 from duagc.converters.simulate.trajectories import loops, paradigms
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 
-Array = NDArray[np.float64]
-
 START_NS = 1_000_000_000
 OVERLAP_TOLERANCE = 0.05  # beyond it, the recording says so
 SLOW_SHARE = 0.6  # of the scene's usual speed; likewise if no robot of a figure is as fast
 MAX_WORKERS = 1024
+METER_IMAGE = (40, 30)  # of the exposure meter
 
 
 def simulate(
@@ -47,6 +50,9 @@ def simulate(
     preview: Path | None = None,
     rig: Rig | None = None,
     movers: int = 0,
+    covers: Sequence[Cover] = (),
+    degradations: Degradations | None = None,
+    triangles: bool = False,
 ) -> None:
     """Render a recording of a robot team, with exact depth, poses and geometry as ground truth.
 
@@ -69,6 +75,10 @@ def simulate(
         preview: a PNG file to write, with what the robots saw and their paths from above.
         rig: the sensors, if other than an RGB-D camera that does not move during a frame.
         movers: figures that walk through the scene; a mask says where they are.
+        covers: when a lens is covered: the robot moves on and sees nothing.
+        degradations: what makes the camera worse than an ideal one; None: nothing.
+        triangles: make triangles of the room even if nothing needs them: its paths are then those of recordings
+            that do.
     Raises:
         DuagError: an argument is out of range, `out` exists, or a mesh cannot be used.
     """
@@ -84,6 +94,9 @@ def simulate(
         paradigm=paradigm,
         rig=rig or Rig(),
         movers=movers,
+        covers=tuple(covers),
+        degradations=degradations or Degradations(),
+        triangles=triangles,
     )
     settings.check()
     _check_output(workers, preview)
@@ -109,9 +122,12 @@ def simulate(
         recording.add_geometry(lambda path: write_points(path, *points))
         figures = _movers(settings, simulated, team.trajectories, Path(cache))
         title = f"{parameters['scene']}, {paradigm}, seed {seed}: neighbors share {shared:.2f} of the view"
-        sheet = Preview(title, team.names, team.trajectories, [mover.poses for mover in figures])
+        sheet = Preview(
+            title, team.names, team.trajectories, [mover.poses for mover in figures], kept=team.kept_frames
+        )
         team.report_sensors(recording)
-        with RenderPool(simulated, FrameSettings.of(settings, team.camera, figures), workers) as pool:
+        frame_settings = FrameSettings.of(settings, team.camera, figures, team.rig)
+        with RenderPool(simulated, frame_settings, workers) as pool:
             jobs = team.jobs()
             team.write(recording, track(pool.images(jobs), "simulate", len(jobs)), sheet)
         if preview is not None:
@@ -127,6 +143,13 @@ class _Team:
         self.trajectories = self._plan()
         """T_world_camera [frames, 4, 4] of every robot."""
         self._clocks_ns = {name: settings.rig.clock_offset_ns(settings.seed, name) for name in self.names}
+        self._twists = [twists_of(path) for path in self.trajectories]
+        self.rig = self._rig()
+        """The sensors, with the exposure that the motion blur takes."""
+        d, seed = settings.degradations, settings.seed
+        self._kept = {name: d.kept_frames(settings.frames, seed, name).tolist() for name in self.names}
+        self._exposures = self._exposure_gains()
+        self._balances = [light.white_balance_gains(settings.frames, d, seed, name) for name in self.names]
 
     def _plan(self) -> list[Array]:
         s = self.settings
@@ -141,6 +164,30 @@ class _Team:
             camera=self.camera,
             seed=s.seed,
         )
+
+    def _rig(self) -> Rig:
+        rig, blur_px = self.settings.rig, self.settings.degradations.blur_px
+        if blur_px == 0:
+            return rig
+        small = self.scene.renderer(self.camera.scaled(*loops.OVERLAP_IMAGE))
+        exposure_s = shutter.exposure_for(blur_px, small, self.trajectories, self._twists, camera=self.camera)
+        return dataclasses.replace(rig, exposure_s=exposure_s)
+
+    def _exposure_gains(self) -> list[Array]:
+        """Gains [frames] of every robot's automatic exposure."""
+        d = self.settings.degradations
+        if d.auto_exposure == 0:
+            return [np.ones(self.settings.frames) for _ in self.names]
+        small = self.scene.renderer(self.camera.scaled(*METER_IMAGE))
+        return [
+            light.exposure_gains(np.array([light.metered(small.render(T).color) for T in path]), d)
+            for path in self.trajectories
+        ]
+
+    @property
+    def kept_frames(self) -> list[list[int]]:
+        """Indices on its path of the recorded frames of every robot."""
+        return [self._kept[name] for name in self.names]
 
     def report_paths(self, recording: RecordingWriter) -> float:
         """Write clearance, shared views and distances to the checks, and warn where settings were not met.
@@ -184,7 +231,7 @@ class _Team:
             )
 
     def report_sensors(self, recording: RecordingWriter) -> None:
-        """Write clock offsets, exposures and color responses to the checks.
+        """Write clock offsets, exposures, color responses and missing frames to the checks.
 
         Args:
             recording: gets the checks.
@@ -201,14 +248,29 @@ class _Team:
             tints = {name: rig.tint(seed, name) for name in self.names}
             recording.checks["camera_gain"] = {name: gain.tolist() for name, (gain, _) in tints.items()}
             recording.checks["camera_black"] = {name: black.tolist() for name, (_, black) in tints.items()}
+        d = self.settings.degradations
+        if d.auto_exposure > 0:
+            recording.checks["auto_exposure_gain"] = {
+                name: gains[self._kept[name]].tolist()
+                for name, gains in zip(self.names, self._exposures, strict=True)
+            }
+        if d.white_balance > 0:
+            recording.checks["white_balance_gain"] = {
+                name: gains[self._kept[name]].tolist()
+                for name, gains in zip(self.names, self._balances, strict=True)
+            }
+        if d.missing > 0 or d.rate_hz < FRAME_RATE_HZ:
+            recording.checks["frames_of_path"] = self._kept
 
     def jobs(self) -> list[FrameJob]:
         """All frames to render, robot after robot."""
+        robots = zip(
+            self.names, self.trajectories, self._twists, self._exposures, self._balances, strict=True
+        )
         return [
-            FrameJob(name, i, path[i], twists[i])
-            for name, path in zip(self.names, self.trajectories, strict=True)
-            for twists in [twists_of(path)]
-            for i in range(self.settings.frames)
+            FrameJob(name, i, path[i], twists[i], tuple((exposures[i] * balances[i]).tolist()))
+            for name, path, twists, exposures, balances in robots
+            for i in self._kept[name]
         ]
 
     def write(self, recording: RecordingWriter, images: Iterator[FrameImages], sheet: Preview) -> None:
@@ -219,13 +281,17 @@ class _Team:
             images: of all frames, in the order of `jobs`.
             sheet: gets the frames that it shows.
         """
-        rig = self.settings.rig
-        sensors = _log_metadata(rig, self.settings.noise)
+        rig = self.rig
+        sensors = _log_metadata(rig, self.settings)
+        k1 = self.settings.degradations.lens_k1
+        camera = Lens(self.camera, k1).pinhole if k1 != 0 else self.camera
         for name, path in zip(self.names, self.trajectories, strict=True):
-            with recording.robot(name, self.camera, self.scene.depth_scale_m, sensors) as robot:
+            scale_m = self.scene.depth_scale_m
+            # black that was rendered is part of the scene
+            with recording.robot(name, camera, scale_m, sensors, find_black=False) as robot:
                 if rig.sensor == "lidar":
                     robot.set_lidar(T_CAMERA_LIDAR, RANGE_SIGMA_M)
-                for i in range(self.settings.frames):
+                for i in self._kept[name]:
                     image = next(images)
                     sheet.add(name, i, image.png)
                     stamp_ns = START_NS + self._clocks_ns[name] + round(i * 1e9 / FRAME_RATE_HZ)
@@ -275,11 +341,13 @@ def twists_of(T_world_camera: Array) -> Array:
     return np.concatenate([twist, twist[-1:]])
 
 
-def _log_metadata(rig: Rig, noise: str) -> dict[str, str]:
-    """What a log says about its sensors."""
-    metadata = {"depth_noise": noise} if rig.sensor == "rgbd" else {"depth": rig.sensor}
+def _log_metadata(rig: Rig, settings: SimulationSettings) -> dict[str, str]:
+    """What a log says about its sensors, as far as a camera's maker states it."""
+    metadata = {"depth_noise": settings.noise} if rig.sensor == "rgbd" else {"depth": rig.sensor}
     if rig.readout_s > 0:
         metadata["rolling_shutter_s"] = repr(rig.readout_s)
     if rig.exposure_s > 0:
         metadata["exposure_s"] = repr(rig.exposure_s)
+    if settings.degradations.lens_k1 != 0:
+        metadata["lens_k1"] = repr(settings.degradations.lens_k1)
     return metadata

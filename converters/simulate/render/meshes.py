@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from duagc.converters.layouts.mesh_reader import LEVELS, NO_TEXTURE, texture_file
 from duagc.converters.simulate.render import mesh_process
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file
-
-Array = NDArray[np.float64]
 
 UP_OF_SUFFIX = {".glb": "y", ".gltf": "y", ".obj": "y", ".ply": "z"}  # glTF says so, the others by custom
 UPS = ("auto", "y", "z")

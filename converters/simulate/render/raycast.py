@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from duagc.converters.simulate.render.meshes import LEVELS, MeshScene
 from duagc.converters.simulate.render.renderer import RenderedView
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.open3d_import import import_open3d
 from duagc.pipeline.geometry.camera import PinholeCamera
-
-Array = NDArray[np.float64]
 
 OFFSETS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 UNEVEN_GRAY = 4.0  # of 255: where the first and the last of these differ less, the two others are left out

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from duagc.converters.simulate.render.bake import Atlas
-from duagc.converters.simulate.scenes.scene import Ball, Flat, Scene, Side
+from duagc.converters.simulate.scenes.scene import Ball, Flat, Scene, Side, Surface
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry.camera import PinholeCamera
-
-Array = NDArray[np.float64]
 
 NEAR_M = 0.05
 EDGE_TOLERANCE_M = 1e-9  # rays that pass exactly between two faces of a box hit one of them
@@ -69,6 +68,7 @@ class Renderer:
         self.is_curved[self.curved] = True
         self.period = np.zeros(len(self.surfaces))
         self.period[self.curved] = [self.surfaces[k].size[0] for k in self.curved]
+        self.curved_faces = np.array([_faces_around(self.surfaces[k]) for k in self.curved])
         self.u = np.arange(camera.width, dtype=np.float64)
         self.v = np.arange(camera.height, dtype=np.float64)
 
@@ -109,14 +109,12 @@ class Renderer:
             hit &= self._covers(k, inverse, s, t)
             np.copyto(nearest[win], inverse, where=hit)
             surface[win][hit] = k
-        for k in self.curved:
-            u0, v0, u1, v1 = pose.curved_window(k)
-            if u0 < u1 and v0 < v1:
-                win = (slice(v0, v1), slice(u0, u1))
-                inverse, _, _ = pose.curved(k, *np.broadcast_arrays(u[u0:u1], v[v0:v1]))
-                hit = inverse > nearest[win]
-                np.copyto(nearest[win], inverse, where=hit)
-                surface[win][hit] = k
+        for k, (u0, v0, u1, v1) in pose.curved_windows():
+            win = (slice(v0, v1), slice(u0, u1))
+            inverse, _, _ = pose.curved(k, *np.broadcast_arrays(u[u0:u1], v[v0:v1]))
+            hit = inverse > nearest[win]
+            np.copyto(nearest[win], inverse, where=hit)
+            surface[win][hit] = k
         return nearest, surface
 
     def _covers(self, k: int, inverse: Array, s_inverse: Array, t_inverse: Array) -> NDArray[np.bool_]:
@@ -305,23 +303,19 @@ class _Pose:
         last = np.clip(np.floor(np.clip(high, -1, size) + 1e-6) + 1, 0, size)
         return np.concatenate([first, last], axis=1).astype(np.int64)
 
-    def curved_window(self, k: int) -> tuple[int, int, int, int]:
-        """Pixels (u0, v0, u1, v1) that bound a curved surface."""
-        surface = self.renderer.surfaces[k]
-        if isinstance(surface, Side):
-            half = np.array([surface.radius, surface.radius, surface.height / 2])
-            center = surface.base + np.array([0, 0, surface.height / 2])
-        else:
-            assert isinstance(surface, Ball)
-            half, center = np.full(3, surface.radius), surface.center
-        # the six faces as polygons, so that the near plane cuts them correctly
-        signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-        faces = [np.insert(signs, axis, side, axis=1) for axis in range(3) for side in (-1, 1)]
-        low, high, _ = self._bounds(center + half * np.stack(faces))
-        u0, v0, u1, v1 = self._window(low.min(axis=0, keepdims=True), high.max(axis=0, keepdims=True))[
-            0
-        ].tolist()
-        return u0, v0, u1, v1
+    def curved_windows(self) -> list[tuple[int, tuple[int, int, int, int]]]:
+        """Curved surfaces that may be seen, with the pixels (u0, v0, u1, v1) that bound them."""
+        r = self.renderer
+        if not r.curved:
+            return []
+        # the six faces of a box around each as polygons, so that the near plane cuts them correctly
+        low, high, _ = self._bounds(r.curved_faces.reshape(-1, 4, 3))
+        window = self._window(low.reshape(-1, 6, 2).min(axis=1), high.reshape(-1, 6, 2).max(axis=1)).tolist()
+        return [
+            (k, (u0, v0, u1, v1))
+            for k, (u0, v0, u1, v1) in zip(r.curved, window, strict=True)
+            if u0 < u1 and v0 < v1
+        ]
 
     def curved(self, k: int, u: ArrayLike, v: ArrayLike) -> tuple[Array, Array, Array]:
         """Inverse depth (0 where missed) and surface coordinates of curved surface k at pixels of any shape."""
@@ -348,6 +342,19 @@ class _Pose:
             t = np.arccos(np.clip(q[..., 2] / surface.radius, -1, 1)) * surface.radius
             hit = (root > 0) & (z > NEAR_M)
         return np.where(hit, 1 / np.where(hit, z, 1.0), 0.0), s, t
+
+
+def _faces_around(surface: Surface) -> Array:
+    """Corners [6, 4, 3] of the faces of a box around a curved surface."""
+    if isinstance(surface, Side):
+        half = np.array([surface.radius, surface.radius, surface.height / 2])
+        center = surface.base + np.array([0, 0, surface.height / 2])
+    else:
+        assert isinstance(surface, Ball)
+        half, center = np.full(3, surface.radius), surface.center
+    signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    faces = [np.insert(signs, axis, side, axis=1) for axis in range(3) for side in (-1, 1)]
+    return np.asarray(center + half * np.stack(faces))
 
 
 def _wrapped(difference: Array, period: float) -> Array:

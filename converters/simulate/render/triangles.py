@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from duagc.converters.simulate.render import bake, meshes
 from duagc.converters.simulate.render.raycast import Caster
 from duagc.converters.simulate.scenes.scene import Ball, Flat, Scene, Side, Surface
-
-Array = NDArray[np.float64]
+from duagc.pipeline.base.arrays import Array
 
 SIDES = 48  # of a cylinder, a disc and the equator of a sphere; no coarser than 3 mm at 0.7 m radius
 

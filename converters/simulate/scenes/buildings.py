@@ -88,7 +88,7 @@ def corridor(seed: int) -> Scene:
     for k, (x, y) in enumerate(((9.95, 0.45), (16.1, 6.5), (9.95, 6.5))):
         fur.plant(Place(scene, f"hall/plant{k}", x, y), rng, 1.1)
     column = tex.marbled((176, 168, 150), (140, 128, 112), 0.2)
-    scene.cylinder("column", (13.0, 3.5, 0.0), 0.28, h - 0.001, column)
+    scene.cylinder("column", (13.0, 3.5, 0.0), column, radius=0.28, height=h - 0.001)
     return scene
 
 
@@ -221,7 +221,7 @@ def _lounge(scene: Scene, rng: np.random.Generator, room: Rect) -> None:
     fur.sofa(Place(scene, "lounge/sofa", (x0 + x1) / 2 + 0.4, y1, NORTH), rng)
     table = Place(scene, "lounge/table", (x0 + x1) / 2 + 0.3, y1 - 1.6, 0.15)
     table.box("top", (-0.5, -0.3, 0.38), (1.0, 0.6, 0.05), tex.wood((136, 90, 56)))
-    table.legs("leg", (-0.47, -0.27, 0), (0.94, 0.54, 0.38), 0.06, tex.wood((100, 66, 44)))
+    table.legs("leg", (-0.47, -0.27, 0), (0.94, 0.54, 0.38), tex.wood((100, 66, 44)), thick=0.06)
     table.box("paper", (-0.2, -0.1, 0.43), (0.3, 0.22, 0.02), drawn.picture("landscape"), yaw_rad=0.4)
     rug_at = Place(scene, "lounge/rug", (x0 + x1) / 2 + 0.3, y1 - 1.6)
     rug_at.box("rug", (-1.1, -0.75, 0.0), (2.2, 1.5, 0.012), tex.plaster((120, 90, 70)), top=tex.rug)

@@ -4,13 +4,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from duagc.converters.simulate.scenes import drawn
 from duagc.converters.simulate.scenes import textures as tex
 from duagc.converters.simulate.scenes.scene import Scene
-
-Array = NDArray[np.float64]
+from duagc.pipeline.base.arrays import Array
 
 OAK, DARK, PINE = (168, 124, 80), (92, 68, 50), (190, 152, 106)
 STEEL = tex.plaster((150, 154, 158), 0.08)
@@ -47,6 +46,7 @@ class Place:
         low: ArrayLike,
         size: ArrayLike,
         material: tex.Material,
+        *,
         yaw_rad: float = 0.0,
         **faces: Any,
     ) -> None:
@@ -57,7 +57,9 @@ class Place:
             f"{self.name}/{name}", low_world, 2 * half, material, yaw_rad=self.yaw_rad + yaw_rad, **faces
         )
 
-    def legs(self, name: str, low: ArrayLike, size: ArrayLike, thick: float, material: tex.Material) -> None:
+    def legs(
+        self, name: str, low: ArrayLike, size: ArrayLike, material: tex.Material, *, thick: float
+    ) -> None:
         """Four legs under the box [low, low + size]."""
         low, size = np.asarray(low, dtype=np.float64), np.asarray(size, dtype=np.float64)
         for i, (dx, dy) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1))):
@@ -65,10 +67,10 @@ class Place:
             self.box(f"{name}{i}", corner, (thick, thick, size[2]), material)
 
     def cylinder(
-        self, name: str, base: ArrayLike, radius: float, height: float, material: tex.Material
+        self, name: str, base: ArrayLike, material: tex.Material, *, radius: float, height: float
     ) -> None:
         """An upright cylinder."""
-        self.scene.cylinder(f"{self.name}/{name}", self.world(base), radius, height, material)
+        self.scene.cylinder(f"{self.name}/{name}", self.world(base), material, radius=radius, height=height)
 
     def sphere(self, name: str, center: ArrayLike, radius: float, material: tex.Material) -> None:
         """A sphere."""
@@ -79,7 +81,7 @@ def desk(at: Place, rng: np.random.Generator) -> None:
     """A desk at the wall with a display, drawers, books, paper and a mug, and a chair before it."""
     dark = tex.wood(DARK)
     at.box("top", (-0.75, -0.75, 0.71), (1.5, 0.75, 0.04), tex.wood(PINE))
-    at.legs("leg", (-0.72, -0.72, 0), (1.44, 0.68, 0.71), 0.06, dark)
+    at.legs("leg", (-0.72, -0.72, 0), (1.44, 0.68, 0.71), dark, thick=0.06)
     at.box(
         "drawers",
         (0.22, -0.68, 0.18),
@@ -97,7 +99,7 @@ def desk(at: Place, rng: np.random.Generator) -> None:
         "paper", (0.05, -0.6, 0.75), (0.3, 0.22, 0.012), drawn.picture("page"), yaw_rad=rng.uniform(-0.4, 0.4)
     )
     mug = tex.marbled((176, 66, 48), (226, 212, 186), 0.05)
-    at.cylinder("mug", (-0.6, -0.5, 0.75), 0.045, 0.1, mug)
+    at.cylinder("mug", (-0.6, -0.5, 0.75), mug, radius=0.045, height=0.1)
     x, y, _ = at.world((0.0, -0.95, 0))
     turned = Place(at.scene, f"{at.name}/chair", x, y, at.yaw_rad)
     chair(turned, rng, float(rng.uniform(-0.5, 0.5)))
@@ -108,7 +110,7 @@ def chair(at: Place, rng: np.random.Generator, yaw_rad: float = 0.0) -> None:
     cloth = tex.fabric(*CLOTHS[int(rng.integers(0, len(CLOTHS)))])
     own = Place(at.scene, at.name, at.x, at.y, at.yaw_rad + yaw_rad)
     own.box("seat", (-0.22, -0.22, 0.42), (0.44, 0.44, 0.06), cloth)
-    own.legs("leg", (-0.21, -0.21, 0), (0.42, 0.42, 0.42), 0.045, tex.wood(DARK))
+    own.legs("leg", (-0.21, -0.21, 0), (0.42, 0.42, 0.42), tex.wood(DARK), thick=0.045)
     own.box("back", (-0.22, -0.22, 0.54), (0.44, 0.05, 0.4), cloth)
 
 
@@ -150,7 +152,7 @@ def cabinet(at: Place, rng: np.random.Generator, width: float = 1.2, height: flo
     cover = tex.marbled((92, 70, 60), (124, 92, 74))
     at.box("books", (-width / 2 + 0.08, -0.3, height), (0.36, 0.18, 0.25), cover, front=drawn.spines)
     glaze = tex.marbled(tex.vivid(rng), (226, 206, 176), 0.08)
-    at.cylinder("jar", (0.1 * width, -0.22, height), 0.09, float(rng.uniform(0.16, 0.3)), glaze)
+    at.cylinder("jar", (0.1 * width, -0.22, height), glaze, radius=0.09, height=float(rng.uniform(0.16, 0.3)))
     at.sphere(
         "ball", (0.36 * width, -0.22, height + 0.11), 0.11, tex.marbled(tex.vivid(rng), (70, 96, 130), 0.1)
     )
@@ -159,9 +161,13 @@ def cabinet(at: Place, rng: np.random.Generator, width: float = 1.2, height: flo
 def plant(at: Place, rng: np.random.Generator, high: float = 1.0) -> None:
     """A plant in a pot, its middle at the place."""
     at.cylinder(
-        "pot", (0, 0, 0), 0.2, 0.4, tex.marbled(tex.shaded(rng, (168, 96, 66), 0.15), (120, 70, 52), 0.1)
+        "pot",
+        (0, 0, 0),
+        tex.marbled(tex.shaded(rng, (168, 96, 66), 0.15), (120, 70, 52), 0.1),
+        radius=0.2,
+        height=0.4,
     )
-    at.cylinder("stem", (0, 0, 0.4), 0.03, high - 0.6, tex.wood((96, 74, 50)))
+    at.cylinder("stem", (0, 0, 0.4), tex.wood((96, 74, 50)), radius=0.03, height=high - 0.6)
     at.sphere("leaves", (0, 0, high), float(rng.uniform(0.26, 0.34)), tex.foliage)
 
 
@@ -187,7 +193,7 @@ def sofa(at: Place, rng: np.random.Generator, width: float = 1.7) -> None:
 def meeting_table(at: Place, rng: np.random.Generator, length: float = 2.4) -> None:
     """A long table along x with chairs on both sides and paper on it, its middle at the place."""
     at.box("top", (-length / 2, -0.5, 0.7), (length, 1.0, 0.05), tex.wood((136, 90, 56)))
-    at.legs("leg", (-length / 2 + 0.05, -0.45, 0), (length - 0.1, 0.9, 0.7), 0.08, tex.wood(DARK))
+    at.legs("leg", (-length / 2 + 0.05, -0.45, 0), (length - 0.1, 0.9, 0.7), tex.wood(DARK), thick=0.08)
     for k in range(4):
         low = (-length / 2 + 0.2 + k * (length - 0.4) / 4, float(rng.uniform(-0.35, 0.1)), 0.75)
         kind = PICTURES[int(rng.integers(0, 4))]
@@ -232,7 +238,7 @@ def bench(at: Place, rng: np.random.Generator, length: float = 1.6) -> None:
     wood = tex.wood(tex.shaded(rng, OAK, 0.1))
     for k in range(3):
         at.box(f"board{k}", (-length / 2, -0.5 + 0.15 * k, 0.42), (length, 0.12, 0.04), wood)
-    at.legs("leg", (-length / 2 + 0.1, -0.48, 0), (length - 0.2, 0.4, 0.42), 0.06, STEEL)
+    at.legs("leg", (-length / 2 + 0.1, -0.48, 0), (length - 0.2, 0.4, 0.42), STEEL, thick=0.06)
     bag = tex.fabric(tex.vivid(rng, 0.7), (60, 54, 50))
     at.box("bag", (0.2, -0.42, 0.46), (0.4, 0.2, 0.3), bag, yaw_rad=float(rng.uniform(-0.3, 0.3)))
 
@@ -240,7 +246,9 @@ def bench(at: Place, rng: np.random.Generator, length: float = 1.6) -> None:
 def cooler(at: Place, rng: np.random.Generator) -> None:
     """A water cooler at the wall."""
     at.box("body", (-0.17, -0.36, 0), (0.34, 0.34, 1.0), tex.plaster((216, 216, 210), 0.05))
-    at.cylinder("water", (0, -0.19, 1.0), 0.14, 0.38, tex.marbled((96, 150, 190), (150, 196, 220), 0.15))
+    at.cylinder(
+        "water", (0, -0.19, 1.0), tex.marbled((96, 150, 190), (150, 196, 220), 0.15), radius=0.14, height=0.38
+    )
     at.box("tap", (-0.12, -0.39, 0.62), (0.24, 0.03, 0.16), drawn.screen)
 
 

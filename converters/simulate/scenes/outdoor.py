@@ -96,8 +96,8 @@ def _house(scene: Scene, rng: np.random.Generator) -> None:
 def _square(scene: Scene, rng: np.random.Generator) -> None:
     """The fountain, trees, benches, flower boxes and a column with posters."""
     stone = tex.marbled((168, 162, 150), (132, 124, 112), 0.25)
-    scene.cylinder("fountain", (10.5, 17.0, 0), 1.6, 0.55, stone)
-    scene.cylinder("fountain/pillar", (10.5, 17.0, 0.55), 0.3, 1.1, stone)
+    scene.cylinder("fountain", (10.5, 17.0, 0), stone, radius=1.6, height=0.55)
+    scene.cylinder("fountain/pillar", (10.5, 17.0, 0.55), stone, radius=0.3, height=1.1)
     scene.sphere("fountain/ball", (10.5, 17.0, 2.0), 0.45, tex.marbled((92, 130, 140), (180, 190, 180), 0.2))
     for k, (x, y) in enumerate(
         ((5.2, 22.0), (7.8, 28.5), (14.5, 8.0), (6.0, 7.5), (16.4, 13.2), (16.2, 21.5))
@@ -111,7 +111,7 @@ def _square(scene: Scene, rng: np.random.Generator) -> None:
         tex.plaster((196, 186, 160), 0.08),
         [(drawn.picture(kind), 0.15 + 0.85 * k, 0.4, 0.7, 1.1) for k, kind in enumerate(fur.PICTURES)],
     )
-    scene.cylinder("posters", (4.4, 12.6, 0), 0.6, 2.6, posters)
+    scene.cylinder("posters", (4.4, 12.6, 0), posters, radius=0.6, height=2.6)
     for k, (x, y) in enumerate(((18.6, 10.0), (18.6, 16.0), (18.6, 22.0))):
         box = Place(scene, f"flowers{k}", x, y, float(rng.uniform(-0.1, 0.1)))
         box.box("trough", (-0.3, -1.1, 0), (0.6, 2.2, 0.5), tex.wood((150, 112, 76)), top=tex.foliage)
@@ -135,18 +135,22 @@ def _street(scene: Scene, rng: np.random.Generator) -> None:
         _car(Place(scene, f"car{k}", x, y, yaw + float(rng.uniform(-0.05, 0.05))), rng)
     for k, (x, y) in enumerate(((20.8, 5.5), (20.8, 28.5), (36.0, 5.5), (36.0, 28.8), (21.0, 17.0))):
         iron = tex.plaster((62, 70, 68), 0.15)
-        scene.cylinder(f"post{k}", (x, y, 0), 0.09, 4.2, iron)
+        scene.cylinder(f"post{k}", (x, y, 0), iron, radius=0.09, height=4.2)
         scene.sphere(f"post{k}/light", (x, y, 4.4), 0.28, tex.marbled((236, 230, 210), (206, 196, 170), 0.15))
     for k, (x, y) in enumerate(((22.2, 24.6), (35.2, 24.2), (35.0, 9.6), (40.5, 27.0))):
         _tree(Place(scene, f"street tree{k}", x, y), rng)
     for k, (x, y) in enumerate(((22.3, 9.8), (40.6, 15.0), (28.6, 30.6))):
-        scene.cylinder(f"bin{k}", (x, y, 0), 0.3, 0.95, tex.marbled((70, 90, 76), (150, 150, 140), 0.15))
+        scene.cylinder(
+            f"bin{k}", (x, y, 0), tex.marbled((70, 90, 76), (150, 150, 140), 0.15), radius=0.3, height=0.95
+        )
 
 
 def _tree(at: Place, rng: np.random.Generator) -> None:
     """A trunk and a crown of three balls of leaves."""
     high = float(rng.uniform(2.2, 3.0))
-    at.cylinder("trunk", (0, 0, 0), float(rng.uniform(0.14, 0.22)), high, tex.wood((104, 82, 60)))
+    at.cylinder(
+        "trunk", (0, 0, 0), tex.wood((104, 82, 60)), radius=float(rng.uniform(0.14, 0.22)), height=high
+    )
     for k in range(3):
         out = rng.uniform(-0.6, 0.6, 2)
         radius = float(rng.uniform(0.9, 1.3))

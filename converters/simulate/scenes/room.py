@@ -159,7 +159,7 @@ def _sideboard(scene: Scene, rng: np.random.Generator) -> None:
         tex.wood((176, 132, 86)),
         front=tex.front((170, 126, 82), 4, 1),
     )
-    scene.legs("sideboard", (3.1, 5.2, 0.0), (2.0, 0.35, 0.08), 0.06, tex.wood((80, 58, 42)))
+    scene.legs("sideboard", (3.1, 5.2, 0.0), (2.0, 0.35, 0.08), tex.wood((80, 58, 42)), thick=0.06)
     scene.box(
         "display", (3.5, 5.3, 0.68), (1.1, 0.06, 0.64), tex.plaster((38, 38, 42), 0.1), front=drawn.screen
     )
@@ -173,7 +173,9 @@ def _sideboard(scene: Scene, rng: np.random.Generator) -> None:
         tex.marbled((92, 70, 60), (124, 92, 74)),
         front=drawn.spines,
     )
-    scene.cylinder("vase", (4.88, 5.38, 0.6), 0.085, 0.3, tex.marbled((60, 92, 120), (210, 204, 190), 0.1))
+    scene.cylinder(
+        "vase", (4.88, 5.38, 0.6), tex.marbled((60, 92, 120), (210, 204, 190), 0.1), radius=0.085, height=0.3
+    )
     scene.sphere("vase/leaves", (4.88, 5.38, 1.04), 0.17, tex.foliage)
 
 
@@ -182,7 +184,7 @@ def _desk(scene: Scene) -> None:
     top = tex.wood((190, 152, 106))
     dark = tex.wood((92, 68, 50))
     scene.box("desk", (5.65, 1.2, 0.71), (0.75, 1.7, 0.04), top)
-    scene.legs("desk", (5.67, 1.24, 0.0), (0.70, 1.62, 0.71), 0.06, dark)
+    scene.legs("desk", (5.67, 1.24, 0.0), (0.70, 1.62, 0.71), dark, thick=0.06)
     scene.box(
         "desk/drawers",
         (5.75, 1.35, 0.2),
@@ -205,18 +207,24 @@ def _desk(scene: Scene) -> None:
     )
     scene.box("desk/paper", (5.76, 2.25, 0.75), (0.3, 0.22, 0.012), drawn.picture("page"), shades=False)
     scene.cylinder(
-        "desk/mug", (5.85, 1.75, 0.75), 0.045, 0.1, tex.marbled((176, 66, 48), (226, 212, 186), 0.05)
+        "desk/mug",
+        (5.85, 1.75, 0.75),
+        tex.marbled((176, 66, 48), (226, 212, 186), 0.05),
+        radius=0.045,
+        height=0.1,
     )
     turn: dict[str, Any] = {"yaw_rad": 0.45, "about": (5.35, 2.15)}
     scene.box(
         "chair", (5.13, 1.93, 0.42), (0.44, 0.44, 0.06), tex.fabric((150, 84, 62), (196, 160, 110)), **turn
     )
-    scene.legs("chair", (5.14, 1.94, 0.0), (0.42, 0.42, 0.42), 0.045, dark, **turn)
+    scene.legs("chair", (5.14, 1.94, 0.0), (0.42, 0.42, 0.42), dark, thick=0.045, **turn)
     back = tex.fabric((150, 84, 62), (196, 160, 110))
     scene.box("chair/back", (5.13, 1.93, 0.56), (0.05, 0.44, 0.4), back, **turn)
     for k, y in enumerate((1.95, 2.31)):
         scene.box(f"chair/post{k}", (5.135, y, 0.48), (0.04, 0.04, 0.08), dark, shades=False, **turn)
-    scene.cylinder("bin", (6.1, 3.25, 0.0), 0.16, 0.36, tex.marbled((66, 84, 92), (140, 150, 150), 0.1))
+    scene.cylinder(
+        "bin", (6.1, 3.25, 0.0), tex.marbled((66, 84, 92), (140, 150, 150), 0.1), radius=0.16, height=0.36
+    )
     scene.box("cartons/low", (5.7, 4.55, 0.0), (0.55, 0.6, 0.42), drawn.carton)
     scene.box("cartons/high", (5.82, 4.65, 0.42), (0.38, 0.42, 0.3), drawn.carton, yaw_rad=-0.3)
 
@@ -242,17 +250,21 @@ def _sofa(scene: Scene) -> None:
             yaw_rad=yaw,
             shades=False,
         )
-    scene.cylinder("side table", (4.55, 0.5, 0.0), 0.26, 0.5, tex.wood((132, 92, 60)))
+    scene.cylinder("side table", (4.55, 0.5, 0.0), tex.wood((132, 92, 60)), radius=0.26, height=0.5)
     scene.sphere("globe", (4.55, 0.5, 0.66), 0.16, tex.marbled((52, 96, 142), (176, 164, 96), 0.16))
-    scene.cylinder("lamp/pole", (1.35, 0.4, 0.0), 0.03, 1.3, tex.plaster((70, 66, 62), 0.1))
-    scene.cylinder("lamp/shade", (1.35, 0.4, 1.3), 0.2, 0.3, tex.fabric((226, 204, 160), (196, 160, 110)))
+    scene.cylinder("lamp/pole", (1.35, 0.4, 0.0), tex.plaster((70, 66, 62), 0.1), radius=0.03, height=1.3)
+    scene.cylinder(
+        "lamp/shade", (1.35, 0.4, 1.3), tex.fabric((226, 204, 160), (196, 160, 110)), radius=0.2, height=0.3
+    )
 
 
 def _low_table(scene: Scene) -> None:
     """A low table on the rug, slightly turned, with books and a bowl."""
     turn: dict[str, Any] = {"yaw_rad": 0.12, "about": (3.15, 2.8)}
     scene.box("low table", (2.6, 2.5, 0.38), (1.1, 0.6, 0.045), tex.wood((136, 90, 56)), **turn)
-    scene.legs("low table", (2.63, 2.53, 0.0), (1.04, 0.54, 0.38), 0.06, tex.wood((100, 66, 44)), **turn)
+    scene.legs(
+        "low table", (2.63, 2.53, 0.0), (1.04, 0.54, 0.38), tex.wood((100, 66, 44)), thick=0.06, **turn
+    )
     pages = tex.plaster((206, 198, 178), 0.1)
     scene.box(
         "low table/book",
@@ -273,7 +285,11 @@ def _low_table(scene: Scene) -> None:
         shades=False,
     )
     scene.cylinder(
-        "low table/bowl", (3.2, 2.68, 0.425), 0.11, 0.09, tex.marbled((190, 120, 70), (236, 214, 178), 0.06)
+        "low table/bowl",
+        (3.2, 2.68, 0.425),
+        tex.marbled((190, 120, 70), (236, 214, 178), 0.06),
+        radius=0.11,
+        height=0.09,
     )
 
 
@@ -294,11 +310,17 @@ def _west_side(scene: Scene) -> None:
         right=drawn.spines,
     )
     scene.cylinder(
-        "dresser/jar", (0.24, 3.85, 0.88), 0.09, 0.24, tex.marbled((150, 60, 56), (226, 206, 176), 0.08)
+        "dresser/jar",
+        (0.24, 3.85, 0.88),
+        tex.marbled((150, 60, 56), (226, 206, 176), 0.08),
+        radius=0.09,
+        height=0.24,
     )
     scene.sphere("dresser/ball", (0.24, 4.17, 1.0), 0.12, tex.marbled((220, 180, 70), (70, 96, 130), 0.1))
-    scene.cylinder("plant/pot", (0.45, 2.4, 0.0), 0.2, 0.4, tex.marbled((168, 96, 66), (120, 70, 52), 0.1))
-    scene.cylinder("plant/stem", (0.45, 2.4, 0.4), 0.03, 0.3, tex.wood((96, 74, 50)))
+    scene.cylinder(
+        "plant/pot", (0.45, 2.4, 0.0), tex.marbled((168, 96, 66), (120, 70, 52), 0.1), radius=0.2, height=0.4
+    )
+    scene.cylinder("plant/stem", (0.45, 2.4, 0.4), tex.wood((96, 74, 50)), radius=0.03, height=0.3)
     scene.sphere("plant/leaves", (0.45, 2.4, 0.98), 0.32, tex.foliage)
     scene.box(
         "crate",

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from duagc.converters.simulate.scenes import textures as tex
+from duagc.pipeline.base.arrays import Array
 
-Array = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -191,6 +191,7 @@ class Scene:
         low: ArrayLike,
         size: ArrayLike,
         material: tex.Material,
+        *,
         yaw_rad: float = 0.0,
         about: ArrayLike | None = None,
         shades: bool = True,
@@ -226,7 +227,7 @@ class Scene:
                 self.surfaces.append(flat)
 
     def cylinder(
-        self, name: str, base: ArrayLike, radius: float, height: float, material: tex.Material
+        self, name: str, base: ArrayLike, material: tex.Material, *, radius: float, height: float
     ) -> None:
         """Put an upright cylinder with its lid on `base`."""
         base = np.asarray(base, dtype=np.float64)
@@ -243,7 +244,7 @@ class Scene:
         self.surfaces.append(Ball(name, material, center, radius))
 
     def legs(
-        self, name: str, low: ArrayLike, size: ArrayLike, thick: float, material: tex.Material, **turn: Any
+        self, name: str, low: ArrayLike, size: ArrayLike, material: tex.Material, *, thick: float, **turn: Any
     ) -> None:
         """Put four legs under the box [low, low + size]."""
         low, size = np.asarray(low, dtype=np.float64), np.asarray(size, dtype=np.float64)

@@ -70,6 +70,13 @@ def vivid(rng: np.random.Generator, saturation: float = 0.8) -> tuple[float, flo
     return float(r), float(g), float(b)
 
 
+def _ellipse(
+    image: Image, center: tuple[int, int], axes: tuple[int, int], color: Color, *, turn_deg: float
+) -> None:
+    """Fill an ellipse; center and half axes in pixels."""
+    cv2.ellipse(image, center, axes, turn_deg, 0, 360, color=color, thickness=-1, lineType=cv2.LINE_AA)
+
+
 def _grain(rng: np.random.Generator, shape: tuple[int, int], texel_m: float) -> Image:
     """Streaks of wood along the columns' direction (x), [h, w]."""
     broad = cloud(rng, shape, 0.045 / texel_m, 3, gain=0.7, stretch=9.0)
@@ -88,7 +95,7 @@ def _knots(rng: np.random.Generator, image: Image, texel_m: float, per_m2: float
             max(2, int(rng.uniform(0.010, 0.028) / texel_m)),
             max(2, int(rng.uniform(0.006, 0.014) / texel_m)),
         )
-        cv2.ellipse(image, (x, y), size, float(rng.uniform(-20, 20)), 0, 360, (62, 40, 24), -1, cv2.LINE_AA)
+        _ellipse(image, (x, y), size, (62, 40, 24), turn_deg=float(rng.uniform(-20, 20)))
 
 
 def wood(color: Color = (168, 120, 78), knots_per_m2: float = 9.0) -> Material:
@@ -189,7 +196,7 @@ def wallpaper(color: Color = (150, 172, 166), motif: Color = (104, 132, 126)) ->
                 a = np.deg2rad(turn + spread)
                 center = (round(x + 0.8 * length * np.cos(a)), round(y + 0.8 * length * np.sin(a)))
                 axes = (max(1, round(0.62 * length)), max(1, round(0.2 * length)))
-                cv2.ellipse(image, center, axes, turn + spread, 0, 360, tint, -1, cv2.LINE_AA)
+                _ellipse(image, center, axes, tint, turn_deg=turn + spread)
         return image
 
     return paint
@@ -312,7 +319,7 @@ def foliage(rng: np.random.Generator, width_m: float, height_m: float, texel_m: 
             max(1, round(rng.uniform(0.008, 0.016) / texel_m)),
         )
         tint = shaded(rng, (72, 118, 58), 0.28)
-        cv2.ellipse(image, center, axes, float(rng.uniform(0, 180)), 0, 360, tint, -1, cv2.LINE_AA)
+        _ellipse(image, center, axes, tint, turn_deg=float(rng.uniform(0, 180)))
     return image
 
 

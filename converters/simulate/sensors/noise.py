@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry.camera import PinholeCamera
-
-Array = NDArray[np.float64]
 
 SENSOR_FOCAL_PX = 580.0
 BASELINE_M = 0.075
@@ -60,6 +59,23 @@ def kinect_depth(depth: Array, camera: PinholeCamera, rng: np.random.Generator) 
     valid &= _incidence_cosine(depth, camera) > low + (high - low) * np.clip(0.5 + 0.5 * spots, 0, 1)
     valid &= (measured > NEAREST_M) & (measured < FARTHEST_M)
     return np.where(valid, measured, 0.0)
+
+
+def quantized(depth: Array, step_m: float) -> Array:
+    """Depth (m, 0 = none), of any shape, in the steps of a sensor that measures disparity.
+
+    Disparity is rounded to whole quanta, so neighboring depths around z are step_m z^2 apart; beyond half a quantum
+    nothing is measured.
+
+    Args:
+        depth: before.
+        step_m: distance between neighboring depths at 1 m; 0: none.
+    """
+    if step_m == 0:
+        return depth
+    inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1.0), 0.0)
+    quanta = np.rint(inverse / step_m)
+    return np.where(quanta > 0, 1 / (step_m * np.maximum(quanta, 1.0)), 0.0)
 
 
 def gray_noise(color: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:

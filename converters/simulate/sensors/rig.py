@@ -1,10 +1,11 @@
 """What sensors other than a perfect RGB-D camera make of a scene, all from its triangles and the exact poses.
 
-A camera that moves while it looks: every row has a time of its own (rolling shutter), and a color is the mean over the
-time that the shutter is open (motion blur). The recorded pose is that of the middle row in the middle of that time;
-depth is that of this one moment. Velocities are those between the frame and the next one.
+A camera that moves while it looks: every row has a time of its own (rolling shutter), and the light of a pixel is the
+mean over the time that the shutter is open (motion blur). The recorded pose is that of the middle row in the middle of
+that time; depth is that of this one moment. Velocities are those between the frame and the next one.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,15 +14,14 @@ from numpy.typing import NDArray
 from duagc.converters.simulate.movers import Mover
 from duagc.converters.simulate.render.raycast import OFFSETS, MeshRenderer
 from duagc.converters.simulate.render.renderer import RenderedView
+from duagc.converters.simulate.sensors.lens import Lens
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.camera import PinholeCamera
-
-Array = NDArray[np.float64]
 
 SENSORS = ("rgbd", "stereo", "lidar")
 BASELINE_M = 0.12
-BLUR_ROUNDS = 2  # times four moments within an exposure
+LEAST_MOMENTS = 8  # within an exposure, a multiple of the rays per pixel
 RINGS_DEG, AZIMUTHS = np.linspace(-24.0, 14.0, 32), 900
 FARTHEST_M, RANGE_SIGMA_M = 60.0, 0.02
 T_CAMERA_LIDAR = np.array(
@@ -88,11 +88,40 @@ def with_gain(
 
 
 class MovingCamera:
-    """Renders meshes and movers with a camera that has a rolling shutter and an exposure."""
+    """Renders meshes and movers with a camera that has a rolling shutter, an exposure and a lens."""
 
-    def __init__(self, renderer: MeshRenderer, rig: Rig, movers: list[Mover]) -> None:
-        self.renderer, self.rig, self.camera = renderer, rig, renderer.camera
+    def __init__(
+        self,
+        renderer: MeshRenderer,
+        rig: Rig,
+        movers: list[Mover],
+        *,
+        lens: Lens | None = None,
+        blur_px: float = 0.0,
+    ) -> None:
+        """Initialize.
+
+        Args:
+            renderer: of the scene, with the camera whose images are rendered.
+            rig: readout and exposure.
+            movers: figures that walk through the scene.
+            lens: of that camera; None: a pinhole camera.
+            blur_px: about how far pixels move within an exposure: there are as many moments.
+        """
+        self.renderer, self.rig, self.camera, self.lens = renderer, rig, renderer.camera, lens
         self.movers = [(mover, mover.renderer(renderer.camera)) for mover in movers]
+        moments = 0 if rig.exposure_s == 0 else max(LEAST_MOMENTS, math.ceil(blur_px))
+        self._rounds = max(1, -(-moments // len(OFFSETS)))
+        self._directions = {offset: self._rays_of(*offset) for offset in ((0.0, 0.0), *OFFSETS)}
+
+    def _rays_of(self, du: float, dv: float) -> tuple[Array, Array]:
+        """Rays (x, y, 1) next to the pixel centers, x and y [h, w] or of shapes that broadcast to it."""
+        if self.lens is not None:
+            return self.lens.rays(du, dv)
+        c = self.camera
+        x = (np.arange(c.width) + du - c.cx) / c.fx
+        y = (np.arange(c.height) + dv - c.cy) / c.fy
+        return np.asarray(x[None, :], dtype=np.float64), np.asarray(y[:, None], dtype=np.float64)
 
     def render(
         self, T_world_camera: Array, twist: Array, frame: int
@@ -105,21 +134,33 @@ class MovingCamera:
             frame: index, for the movers.
         """
         shape = (self.camera.height, self.camera.width)
-        rounds = BLUR_ROUNDS if self.rig.exposure_s > 0 else 1
-        shares = (np.arange(rounds * len(OFFSETS)) + 0.5) / (rounds * len(OFFSETS)) - 0.5
+        offsets, blurs = OFFSETS * self._rounds, self.rig.exposure_s > 0
+        shares = (np.arange(len(offsets)) + 0.5) / len(offsets) - 0.5
         rows = (np.arange(shape[0]) - (shape[0] - 1) / 2) / max(shape[0] - 1, 1) * self.rig.readout_s
         total, moving = np.zeros((*shape, 3), dtype=np.float32), np.zeros(shape, dtype=np.bool_)
-        for share, offset in zip(shares, OFFSETS * rounds, strict=True):
+        for share, offset in zip(shares, offsets, strict=True):
             times = rows + share * self.rig.exposure_s
             poses = T_world_camera @ se3.exp(times[:, None] * twist)
-            _, colors, moved = self._trace(*_rays(self.camera, poses, *offset), frame)
-            total += colors.reshape(total.shape)
+            _, colors, moved = self._trace(*_rays(poses, *self._directions[offset]), frame)
+            total += (_light(colors) if blurs else colors).reshape(total.shape)
             moving |= moved.reshape(shape)
+        depth, moved = self.depth(T_world_camera, frame)
+        mean = total / np.float32(len(shares))
+        color = np.clip(np.rint(_value(mean) if blurs else mean), 0, 255).astype(np.uint8)
+        return RenderedView(color, depth, np.zeros(shape, dtype=np.int64)), ~(moving | moved)
+
+    def depth(self, T_world_camera: Array, frame: int) -> tuple[Array, NDArray[np.bool_]]:
+        """Depth (z, m, 0 = nothing) at one moment, and where something moves, [h, w].
+
+        Args:
+            T_world_camera: [4, 4].
+            frame: index, for the movers.
+        """
+        shape = (self.camera.height, self.camera.width)
         still = np.broadcast_to(T_world_camera, (shape[0], 4, 4))
-        t, _, moved = self._trace(*_rays(self.camera, still, 0.0, 0.0), frame)
+        t, _, moved = self._trace(*_rays(still, *self._directions[0.0, 0.0]), frame)
         depth = np.where(np.isfinite(t), t, 0.0).astype(np.float64).reshape(shape)
-        color = np.clip(np.rint(total / len(shares)), 0, 255).astype(np.uint8)
-        return RenderedView(color, depth, np.zeros(shape, dtype=np.int64)), ~(moving | moved.reshape(shape))
+        return depth, moved.reshape(shape)
 
     def _trace(
         self, origins: Array, directions: NDArray[np.float32], frame: int
@@ -155,10 +196,20 @@ class MovingCamera:
         return np.asarray(measured[seen, None] * beams[seen])
 
 
-def _rays(camera: PinholeCamera, poses: Array, du: float, dv: float) -> tuple[Array, NDArray[np.float32]]:
-    """Origins and directions [h * w, 3] of rays next to the pixel centers; poses [h, 4, 4], one for every row."""
-    x = (np.arange(camera.width) + du - camera.cx) / camera.fx
-    y = (np.arange(camera.height) + dv - camera.cy) / camera.fy
-    ahead = poses[:, None, :3, 0] * x[:, None] + (poses[:, :3, 1] * y[:, None] + poses[:, :3, 2])[:, None]
-    origins = np.repeat(poses[:, :3, 3], camera.width, axis=0)
+def _light(colors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Light, 0 to 1, of image values, 0 to 255."""
+    return np.asarray((colors * np.float32(1 / 255)) ** np.float32(GAMMA), dtype=np.float32)
+
+
+def _value(light: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Image values, 0 to 255, of light, 0 to 1."""
+    return np.asarray(255 * light ** np.float32(1 / GAMMA), dtype=np.float32)
+
+
+def _rays(poses: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.float32]]:
+    """Origins and directions [h * w, 3] of rays (x, y, 1) of an image whose rows have poses [h, 4, 4] of their own."""
+    ahead = poses[:, None, :3, 0] * x[..., None] + (
+        poses[:, None, :3, 1] * y[..., None] + poses[:, None, :3, 2]
+    )
+    origins = np.repeat(poses[:, :3, 3], ahead.shape[1], axis=0)
     return origins, ahead.reshape(-1, 3).astype(np.float32)

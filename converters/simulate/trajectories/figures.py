@@ -8,16 +8,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 
 from duagc.converters.simulate.trajectories.loops import HEIGHTS_M, look_at
 from duagc.converters.simulate.trajectories.walks import MAX_TURN_RAD, MIN_CLEARANCE_M, Terrain, route
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3
-
-Array = NDArray[np.float64]
 
 GIVE_WAY_M, GIVE_WAY_SMOOTH = 0.4, 3.0  # what a curve may be moved by what stands there; smooth over points
 KEPT_SHARE = 0.7  # of its length, at least, when a curve bends around something

@@ -14,12 +14,11 @@ from scipy.interpolate import CubicSpline
 from duagc.converters.simulate.render.renderer import CameraRenderer, Renderer
 from duagc.converters.simulate.scenes.scene import UP, Scene
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import visible
-
-Array = NDArray[np.float64]
 
 STEP_M = 0.022
 MIN_CLEARANCE_M = 0.5
@@ -110,9 +109,11 @@ def plan(scene: Scene, robots: int, frames: int, overlap: float, *, camera: Pinh
     angle = start
     for loop in loops[1:]:
         low, high = 0.0, np.pi
+        before = look(small, paths[-1])
         for _ in range(8):
             shift = (low + high) / 2
-            if shared_view(small, paths[-1], loop.poses(frames, angle + shift)) > overlap:
+            after = look(small, loop.poses(frames, angle + shift))
+            if shared(small.camera, before, after) > overlap:
                 low = shift
             else:
                 high = shift

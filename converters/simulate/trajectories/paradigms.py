@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.converters.simulate.render.renderer import CameraRenderer
 from duagc.converters.simulate.trajectories.figures import APART_M, SHAPES, Figure, Ground, GroundPath, apart
@@ -26,10 +25,9 @@ from duagc.converters.simulate.trajectories.walks import (
     Terrain,
     least_shown,
 )
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
-
-Array = NDArray[np.float64]
 
 PARADIGMS = ("wander", *SHAPES)
 SIZES = (1.0, 0.8, 0.64, 0.5, 0.4, 0.3, 0.2, 0.14, 0.1)  # of the length that frames and step would make

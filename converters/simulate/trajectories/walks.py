@@ -22,14 +22,13 @@ from scipy.sparse.csgraph import dijkstra
 
 from duagc.converters.simulate.render.raycast import Caster
 from duagc.converters.simulate.render.renderer import CameraRenderer
-from duagc.converters.simulate.trajectories.loops import HEIGHTS_M, OVERLAP_IMAGE, look_at, shared_view
+from duagc.converters.simulate.trajectories.loops import HEIGHTS_M, OVERLAP_IMAGE, look, look_at, shared
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-
-Array = NDArray[np.float64]
 
 STEP_M = 0.028
 MAX_TURN_RAD = np.deg2rad(1.5)
@@ -121,8 +120,9 @@ def plan(
         if robot == 0:
             walks.append(max(found, key=lambda each: each[0])[1])
         else:
-            before = walks[-1]
-            walks.append(min(found, key=lambda each: abs(shared_view(small, before, each[1]) - overlap))[1])
+            before = look(small, walks[-1])
+            shares = [shared(small.camera, before, look(small, walk)) for _, walk in found]
+            walks.append(found[int(np.argmin(np.abs(np.array(shares) - overlap)))][1])
     return walks
 
 

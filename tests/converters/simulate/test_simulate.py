@@ -15,7 +15,7 @@ from duagc.converters.simulate.render.renderer import Renderer
 from duagc.converters.simulate.scenes.catalog import build
 from duagc.converters.simulate.scenes.scene import Scene
 from duagc.converters.simulate.sensors import noise
-from duagc.converters.simulate.settings import camera_of
+from duagc.converters.simulate.settings import Cover, camera_of
 from duagc.converters.simulate.team import simulate
 from duagc.converters.simulate.trajectories import loops
 from duagc.pipeline import messages
@@ -25,6 +25,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import Recording, content_digest, open_rgbd, read_log
 from duagc.schemas import topics
+from tests.fixtures.recordings import true_poses
 from tests.fixtures.sampling import sampled
 
 SIZE = (160, 120)
@@ -265,3 +266,28 @@ def test_arguments_out_of_range_are_refused(tmp_path, argument, value):
     with pytest.raises(DuagError, match="expected"):
         simulate(tmp_path / "rec", **{argument: value})
     assert not (tmp_path / "rec").exists()
+
+
+def test_a_covered_lens_is_black_while_the_robot_moves_on(tmp_path: Path) -> None:
+    kind = {"robots": 1, "frames": 5, "size": (64, 48), "noise": "kinect"}
+    simulate(tmp_path / "open", **kind)
+    simulate(tmp_path / "covered", covers=[Cover.parse("alpha:1:3")], **kind)
+    logs = [Recording(tmp_path / name).log("alpha") for name in ("open", "covered")]
+    with open_rgbd(logs[0]) as seen, open_rgbd(logs[1]) as covered:
+        for k in range(5):
+            one, other = seen.frame(k), covered.frame(k)
+            assert one.stamp_ns == other.stamp_ns
+            hidden = 1 <= k < 4
+            assert other.color.any() == (not hidden)
+            assert other.depth.any() == (not hidden)
+            assert hidden or (
+                np.array_equal(one.color, other.color) and np.array_equal(one.depth, other.depth)
+            )
+    poses = [true_poses(Recording(tmp_path / name), "alpha") for name in ("open", "covered")]
+    assert np.array_equal(*poses)
+
+
+@pytest.mark.parametrize("text", ["alpha", "alpha:1", "alpha:1:x", "alpha:-1:2", "bravo:0:1", "alpha:3:3"])
+def test_a_cover_that_cannot_be_is_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(DuagError, match="cover"):
+        simulate(tmp_path / "out", robots=1, frames=5, covers=[Cover.parse(text)])

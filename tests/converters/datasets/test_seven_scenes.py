@@ -12,7 +12,8 @@ import pytest
 
 from duagc.converters import registry
 from duagc.converters.datasets import seven_scenes
-from duagc.converters.datasets.seven_scenes import DepthRegistration, Options, convert, list_frames
+from duagc.converters.datasets.seven_scenes import Options, convert, list_frames
+from duagc.converters.layouts.displaced_depth import DepthRegistration
 from duagc.pipeline import messages as m
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3, so3
@@ -20,7 +21,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import Recording, content_digest, open_rgbd, read_log
 from tests.fixtures.seven_scenes import FRAMES, T_DEPTH_COLOR, depth_pose, make_sequence, render, render_rays
 
-REAL = Path(__file__).parents[3] / "shared" / "data" / "redkitchen"
+REAL = Path(__file__).parents[4] / "shared" / "data" / "redkitchen"
 
 
 @pytest.fixture(scope="module")

@@ -122,8 +122,8 @@ def test_walks_are_smooth_clear_and_overlap(stage):
         assert np.abs(way[:, 2, 0]).max() < 1e-9  # upright
     eye = MeshRenderer(stage.caster, camera.scaled(48, 36))
     assert abs(shared_view(eye, *ways) - 0.6) < 0.2
-    again = stage.wander(2, 40, 0.6, camera)
-    assert all(np.array_equal(a, b) for a, b in zip(ways, again, strict=True))
+    (again,) = stage.wander(1, 40, 0.6, camera)  # of two, bytes are compared in test_simulate_sensors.py
+    assert np.array_equal(ways[0], again)
 
 
 @pytest.mark.parametrize("stage", ["obj"], indirect=True)
@@ -294,7 +294,7 @@ def test_the_command_takes_a_folder_and_an_axis(tmp_path):
         "rec",
     ]
     command += ["--scene", str(folder), "--up", "x", "--workers", "1"]
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     done = subprocess.run(command, capture_output=True, text=True, cwd=root)
     assert done.returncode == 1
     assert done.stderr == "duagc: simulate: up is 'x', expected one of auto, y, z\n"

@@ -23,7 +23,7 @@ from duagc.schemas import topics
 from tests.fixtures.box_room import path, render, save
 from tests.fixtures.image_folders import CASES, FRAMES, smooth, traj_line, tum_line
 
-REAL = Path(__file__).parents[3] / "shared" / "data" / "replica_office0" / "office0"
+REAL = Path(__file__).parents[4] / "shared" / "data" / "replica_office0" / "office0"
 
 
 @pytest.fixture(scope="module")
@@ -87,9 +87,12 @@ def test_times_and_warnings(made: dict[str, tuple[Path, Path]]) -> None:
         return " ".join(json.loads((made[name][1] / "recording.json").read_text())["warnings"])
 
     with open_rgbd(made["tum"][1] / "alpha.mcap") as log:
-        assert len(log) == 5
+        assert len(log) == 6
         assert log.frame(1).stamp_ns == 33_333_000
-    assert "1 of 6 color images have no depth" in stated("tum")
+        offsets_ms = [frame.depth_offset_ns / 1e6 for frame in log.frames()]
+        assert offsets_ms == pytest.approx([15, 15, 15, 15, 15, -18.333], abs=0.01)
+        assert np.array_equal(log.frame(5).depth, log.frame(4).depth), "the last depth is 50 ms late"
+    assert "have no depth" not in stated("tum")
     assert "1 lines of groundtruth.txt hold no pose" in stated("tum")
     with open_rgbd(made["scannet"][1] / "alpha.mcap") as log:
         assert log.frame(3).stamp_ns == 10 * 10**9 // 30
@@ -105,9 +108,16 @@ def test_association_policies(made: dict[str, tuple[Path, Path]], tmp_path: Path
     registry.convert("tum", src, tmp_path / "near", options=["association=nearest"])
     with open_rgbd(tmp_path / "near" / "alpha.mcap") as log:
         assert len(log) == 6
+        assert log.pairing.largest_offset_ns == 0, "as of the time of color"
+    registry.convert("tum", src, tmp_path / "official", options=["association=official"])
+    with open_rgbd(tmp_path / "official" / "alpha.mcap") as log:
+        assert len(log) == 5
+    stated = json.loads((tmp_path / "official" / "recording.json").read_text())["warnings"]
+    assert any("1 of 6 color images have no depth" in text for text in stated)
     listed = [tum_layout.Listed(t * 10**6, Path(str(t))) for t in (0, 10, 30)]
     other = [tum_layout.Listed(t * 10**6, Path(str(t))) for t in (8, 12, 100)]
-    official = tum_layout.associate(listed, other, tum_layout.AssociationOptions())
+    options = tum_layout.AssociationOptions(association="official")
+    official = tum_layout.associate(listed, other, options)
     pairs = [(int(a.path.name), int(b.path.name)) for a, b in official]
     assert pairs == [(0, 12), (10, 8)]  # each image once: what is taken is taken
     nearest = tum_layout.AssociationOptions(association="nearest")

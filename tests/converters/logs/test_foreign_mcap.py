@@ -289,7 +289,7 @@ def test_definitions_that_are_not_those_of_ros_are_refused(tmp_path: Path) -> No
             log.first("/i")
 
 
-KITCHEN = Path(__file__).parents[3] / "shared" / "data" / "redkitchen"
+KITCHEN = Path(__file__).parents[4] / "shared" / "data" / "redkitchen"
 
 
 @pytest.mark.skipif(not KITCHEN.is_dir(), reason="the real images are not there")

@@ -17,7 +17,7 @@ from duagc.pipeline.base.errors import DuagError
 from tests.fixtures.mesh_scenes import QUADS, folder_of, write_glb, write_ply
 from tests.fuzz.images import png_bomb
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def missing(folder: Path) -> None:
