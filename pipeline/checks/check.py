@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.checks import estimate, geometry, images, stamps
-from duagc.pipeline.checks.findings import Finding, Report, Severity, lines
+from duagc.pipeline.checks import estimate, geometry, images, scale, stamps
+from duagc.pipeline.checks.findings import Finding, Report, Severity, judged, lines
+from duagc.pipeline.config.checks import ChecksConfig, MotionChecks
 from duagc.pipeline.evaluation import groundtruth
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.recording import Recording, RgbdLog, log_metadata, open_rgbd
@@ -19,14 +20,15 @@ from duagc.pipeline.recording.read import LogFile
 
 __all__ = ["Finding", "Report", "Severity", "check", "format_report"]
 
-LOOKED_AT = 16  # frames of a robot whose pixels are counted
+_DEFAULT = ChecksConfig()
 
 
-def check(path: Path) -> Report:
+def check(path: Path, config: ChecksConfig = _DEFAULT) -> Report:
     """Check a recording, or the log of one robot.
 
     Args:
         path: folder of the recording, or the log.
+        config: from which value on something is reported.
 
     Returns:
         All findings; `Report.sound` is whether there is no error among them.
@@ -43,13 +45,14 @@ def check(path: Path) -> Report:
         try:
             log = recording.log(robot) if recording else path
             with open_rgbd(log) as rgbd:
-                _check_robot(report, recording, rgbd, sights)
+                _check_robot(report, recording, rgbd, sights, config=config)
         except DuagError as error:
             advice = "duagc recover may save it" if log else ""
             report.findings.append(_unreadable(robot, error, advice))
-    report.findings += images.check_colors(sights)
+    report.findings += images.check_colors(sights, config.images)
     report.estimate = estimate.estimate(report.robots)
     report.findings += estimate.check_disk(path.parent, report.estimate["bytes"])
+    report.findings = list(judged(report.findings, config.sure, config.likely))
     return report
 
 
@@ -59,7 +62,12 @@ def _unreadable(robot: str, error: DuagError, advice: str) -> Finding:
 
 
 def _check_robot(
-    report: Report, recording: Recording | None, log: RgbdLog, sights: dict[str, images.Sight]
+    report: Report,
+    recording: Recording | None,
+    log: RgbdLog,
+    sights: dict[str, images.Sight],
+    *,
+    config: ChecksConfig,
 ) -> None:
     robot, add = log.robot, report.findings.extend
     with LogFile(log.path) as file:
@@ -68,21 +76,21 @@ def _check_robot(
             add(_check_clock(recording, robot))
         topics = images.read_repeats(file, robot)
     for topic, repeats in topics.items():
-        add(stamps.check_stamps(robot, topic, repeats.stamps_ns))
-        add(images.check_repeats(robot, topic, repeats))
-    add(stamps.check_pairs(robot, log.pairing))
-    add(geometry.check_camera(robot, log.camera))
-    shown = np.unique(np.linspace(0, len(log) - 1, LOOKED_AT).astype(int)).tolist()
+        add(stamps.check_stamps(robot, topic, repeats.stamps_ns, config.times))
+        add(images.check_repeats(robot, topic, repeats, config.images))
+    add(stamps.check_pairs(robot, log.pairing, config.times))
+    add(geometry.check_camera(robot, log.camera, config.camera))
+    shown = np.unique(np.linspace(0, len(log) - 1, config.images.frames).astype(int)).tolist()
     sight = sights[robot] = images.Sight.of((log.frame(i) for i in shown), log.depth_scale)
-    add(images.check_sight(robot, sight))
+    add(images.check_sight(robot, sight, config.images))
     moved: list[geometry.Move] = []
     if sight.known:
-        moved = geometry.moves(log)
-        add(geometry.check_moves(robot, moved))
+        moved = geometry.moves(log, config.motion)
+        add(geometry.check_moves(robot, moved, config.motion))
         sensors = " ".join(f"{key} {value}" for key, value in log_metadata(log.path).items())
-        add(geometry.check_range(robot, sight.depth_m, moved, sensors))
-        add(_check_scales(recording, log, moved))
-        add(geometry.check_edges(robot, geometry.edges_of(log)))
+        add(geometry.check_range(robot, sight, moved, sensors, config=config.motion))
+        add(_check_scales(recording, log, moved, config.motion))
+        add(geometry.check_edges(robot, geometry.edges_of(log, config.edges), config.edges))
     residuals = [move.residual for move in moved if np.isfinite(move.residual)]
     report.robots[robot] = {
         "frames": len(log),
@@ -91,6 +99,7 @@ def _check_robot(
         "with_depth": round(sight.known, 4),
         "registered_pairs": f"{sum(move.T_first_second is not None for move in moved)} of {len(moved)}",
         "reprojection": round(float(np.median(residuals)), 5) if residuals else None,
+        "keyframes": estimate.keyframes(moved, len(log), log.pairing.pairs[-1][0] - log.pairing.pairs[0][0]),
     }
 
 
@@ -121,7 +130,9 @@ def _check_clock(recording: Recording, robot: str) -> Iterator[Finding]:
                 )
 
 
-def _check_scales(recording: Recording | None, log: RgbdLog, moved: list[geometry.Move]) -> Iterator[Finding]:
+def _check_scales(
+    recording: Recording | None, log: RgbdLog, moved: list[geometry.Move], config: MotionChecks
+) -> Iterator[Finding]:
     prior = log.motion_prior()
 
     def by_odometry(start_ns: int, stop_ns: int) -> float | None:
@@ -130,7 +141,7 @@ def _check_scales(recording: Recording | None, log: RgbdLog, moved: list[geometr
             float(np.linalg.norm(motion.T_start_stop[:3, 3])) if motion and motion.knows_translation else None
         )
 
-    yield from geometry.check_scale(log.robot, moved, "its odometry", by_odometry)
+    yield from scale.check_scale(log.robot, moved, "its odometry", by_odometry, config=config)
     truth = groundtruth.trajectory(recording, log.robot) if recording else Absent("a log alone")
     if isinstance(truth, Absent):
         return
@@ -141,7 +152,7 @@ def _check_scales(recording: Recording | None, log: RgbdLog, moved: list[geometr
             return None
         return float(np.linalg.norm(poses[start_ns][:3, 3] - poses[stop_ns][:3, 3]))
 
-    yield from geometry.check_scale(log.robot, moved, "its true poses", by_truth)
+    yield from scale.check_scale(log.robot, moved, "its true poses", by_truth, config=config)
 
 
 def format_report(report: Report) -> str:
@@ -158,7 +169,7 @@ def format_report(report: Report) -> str:
     unit, name = (60, "minutes") if e["seconds_to"] > 120 else (1, "seconds")
     span = f"{e['seconds_from'] / unit:.0f} to {e['seconds_to'] / unit:.0f} {name}"
     if report.robots:
-        out.append(f"a run takes about {span} on two cores, and {e['bytes'] / 1e6:.0f} MB of disk")
+        out.append(f"a run takes {span} on two idle cores, and about {e['bytes'] / 1e6:.0f} MB of disk")
     out += lines(report.findings)
     counts = [f"{len(found)} {s.value}{'s' * (len(found) != 1)}" for s in Severity if (found := report.of(s))]
     return "\n".join([*out, ", ".join(counts) or "nothing found"])

@@ -3,25 +3,65 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from duagc.pipeline.checks.findings import Finding, Severity
+import numpy as np
 
-# seconds per million pixels of a frame, whole runs on two idle cores: RedKitchen takes 118 s for 205 of them
-# (docs/results/runs.md) and the demo about 60 s for 55; textures and speed decide how many keyframes there are
-SECONDS_PER_MEGAPIXEL = (0.5, 1.2)
+from duagc.pipeline.checks.findings import Finding, Severity
+from duagc.pipeline.checks.geometry import Move
+from duagc.pipeline.config.frontend import KeyframeConfig
+
+# Seconds on two idle cores of 2.6 GHz, fitted to the parts of whole runs (docs/reference/checks.md).
+RUN_S = 6.0  # start, report, view
+ROBOT_S, FRAME_S, KEYFRAME_S = (
+    3.0,
+    0.14,
+    14.5,
+)  # front end on one core; frame and keyframe for every million pixels
+FUSION_S = (6.0, 60.0)  # of a robot that has peers: in any case, and for every million pixels of an image
+EVALUATION_S = 0.35  # for every million pixels of all frames
+EXCHANGE_S = 4.0  # of a pair of robots, and of the team
+RANGE = (0.6, 1.7)  # of the sum: textures decide how long a map is trained, and robots may not meet
 BYTES_PER_ROBOT = 50_000_000  # maps at their cap of Gaussians with information; report and Rerun file
 BYTES_PER_FRAME = 25_000
 
 
+def keyframes(moved: Sequence[Move], frames: int, duration_ns: int) -> int:
+    """About how many keyframes the front end makes: one whenever it has lost the share of a view that asks for one.
+
+    Args:
+        moved: registered pairs.
+        frames: of the log.
+        duration_ns: from the first frame to the last.
+    """
+    rates = [m.lost / (m.second_ns - m.first_ns) for m in moved if np.isfinite(m.lost)]
+    if not rates:
+        return frames  # nothing registers: it may try with every frame
+    lost = float(np.mean(rates)) * duration_ns
+    return min(frames, 1 + round(lost / (1 - KeyframeConfig().min_overlap)))
+
+
 def estimate(robots: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
-    """Seconds (from, to) on two cores and bytes on disk of a run, from `frames` and `pixels` of every robot."""
-    megapixels = sum(row["frames"] * row["pixels"] for row in robots.values()) * 1e-6
-    low, high = (megapixels * seconds for seconds in SECONDS_PER_MEGAPIXEL)
-    size = sum(BYTES_PER_ROBOT + BYTES_PER_FRAME * row["frames"] for row in robots.values())
-    return {"seconds_from": low, "seconds_to": high, "bytes": float(size)}
+    """Seconds (from, to) of a run on two idle cores and bytes on disk.
+
+    Args:
+        robots: `frames`, `pixels` of an image and `keyframes` of every robot.
+    """
+    rows, count = list(robots.values()), len(robots)
+    megapixels = [row["pixels"] * 1e-6 for row in rows]
+    front_ends = [
+        ROBOT_S + m * (FRAME_S * row["frames"] + KEYFRAME_S * row["keyframes"])
+        for row, m in zip(rows, megapixels, strict=True)
+    ]
+    seconds = RUN_S + max([*front_ends, sum(front_ends) / 2], default=0.0)
+    seconds += EVALUATION_S * sum(m * row["frames"] for row, m in zip(rows, megapixels, strict=True))
+    if count > 1:
+        seconds += EXCHANGE_S * (1 + count * (count - 1) / 2)
+        seconds += sum(FUSION_S[0] + FUSION_S[1] * m for m in megapixels)
+    size = sum(BYTES_PER_ROBOT + BYTES_PER_FRAME * row["frames"] for row in rows)
+    return {"seconds_from": RANGE[0] * seconds, "seconds_to": RANGE[1] * seconds, "bytes": float(size)}
 
 
 def check_disk(folder: Path, needed: float) -> Iterator[Finding]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
@@ -18,7 +18,17 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that somebody should know. robot: "" if it concerns the whole recording."""
+    """One thing that somebody should know.
+
+    Attributes:
+        severity: how bad.
+        check: its name.
+        robot: "" if it concerns the whole recording.
+        found: what is so.
+        expected: instead of it.
+        advice: what to do.
+        confidence: probability that what was found holds for the recording; 1 if all of it was looked at.
+    """
 
     severity: Severity
     check: str
@@ -26,12 +36,14 @@ class Finding:
     found: str
     expected: str
     advice: str = ""
+    confidence: float = 1.0
 
     def line(self) -> str:
         """One line for people."""
         where = f"{self.robot}: " if self.robot else ""
         advice = f"; {self.advice}" if self.advice else ""
-        return f"{self.severity.value}: {where}{self.check}: {self.found}, expected {self.expected}{advice}"
+        sure = f"{self.severity.value} ({_percent(self.confidence)})"
+        return f"{sure}: {where}{self.check}: {self.found}, expected {self.expected}{advice}"
 
 
 @dataclass
@@ -66,3 +78,25 @@ def lines(findings: Iterable[Finding]) -> list[str]:
     """The findings as text, the most severe first."""
     order = list(Severity)
     return [f.line() for f in sorted(findings, key=lambda f: order.index(f.severity))]
+
+
+def judged(findings: Iterable[Finding], sure: float, likely: float) -> Iterator[Finding]:
+    """Findings with no more severity than their confidence allows: one level less if only likely, none if not.
+
+    Args:
+        findings: with the severity that they have where they are sure.
+        sure: confidence from which on they have it.
+        likely: confidence below which they are left out.
+    """
+    order = list(Severity)
+    for finding in findings:
+        if finding.confidence >= sure:
+            yield finding
+        elif finding.confidence >= likely:
+            lower = order[min(order.index(finding.severity) + 1, len(order) - 1)]
+            yield replace(finding, severity=lower)
+
+
+def _percent(share: float) -> str:
+    """Never rounded up to certainty."""
+    return "100 %" if share == 1 else f"{min(100 * share, 99.9):.3g} %"

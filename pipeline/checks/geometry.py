@@ -2,105 +2,103 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.checks.confidence import share_above
 from duagc.pipeline.checks.findings import Finding, Severity
+from duagc.pipeline.checks.images import FEW_FRAMES, Sight
+from duagc.pipeline.config.checks import CameraChecks, EdgeChecks, MotionChecks
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import visible
 from duagc.pipeline.recording import RgbdFrame, RgbdLog
-from duagc.pipeline.registration import Reference, RgbdPyramid, register
+from duagc.pipeline.registration import Reference, Registration, RgbdPyramid, register
 
-Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 
-# --- intrinsics
-
-OFF_CENTER = 0.1  # of the image's width or height
-SQUARE = 0.05
-VIEWS_DEG = (15.0, 150.0)
-
-# --- depth moved into a later frame
-
-MOVES = 8  # pairs of frames
-MOVE_NS = 150_000_000  # between the frames of a pair
-RESIDUAL = 0.03  # of the depth
-FEW_REGISTERED = 0.5
-
-# --- scale
-
-SCALES = (0.6, 1.6)  # of lengths by registration relative to those by another sensor
-FAR_ENOUGH_M = 0.004  # a pair that moved less determines no scale
-NEAR_M, FAR_M = 0.1, 100.0
-SENSOR_M = 14.0  # no camera with its own light sees farther
-FAST_M_PER_S = 4.0
 MEASURED_AFAR = ("stereo", "lidar", "render", "simulat")  # words about a sensor that may see farther
-
-# --- color edges
-
-STEP = 0.06  # relative step of depth that is an edge
-EDGE_PIXELS = 200
-SHIFTS = 4  # frames
-WINDOWS = 8
-SHIFT_PX = 24
-CLEARLY = 1.15  # ratio of two mean gradients
+WEAK_SHARE = 0.1  # of a direction of motion that the images do not determine
 
 
-def check_camera(robot: str, camera: PinholeCamera) -> Iterator[Finding]:
+def check_camera(robot: str, camera: PinholeCamera, config: CameraChecks) -> Iterator[Finding]:
     """Findings about the intrinsics alone."""
     for axis, center, size in (("cx", camera.cx, camera.width), ("cy", camera.cy, camera.height)):
-        if abs(center - (size - 1) / 2) > OFF_CENTER * size:
+        if abs(center - (size - 1) / 2) > config.max_off_center * size:
             yield Finding(
                 Severity.WARNING,
                 "intrinsics",
                 robot,
                 f"{axis} = {center:.1f} px in an image of {camera.width}x{camera.height}",
-                f"within {OFF_CENTER:.0%} of its middle, {(size - 1) / 2:.1f}",
+                f"within {config.max_off_center:.0%} of its middle, {(size - 1) / 2:.1f}",
                 "see whether cx and cy are exchanged, or the calibration is of another resolution",
             )
-    if abs(camera.fx / camera.fy - 1) > SQUARE:
+    if abs(camera.fx / camera.fy - 1) > config.max_focal_difference:
         yield Finding(
             Severity.WARNING,
             "intrinsics",
             robot,
             f"focal lengths {camera.fx:.1f} and {camera.fy:.1f} px",
-            f"equal to {SQUARE:.0%}",
+            f"equal to {config.max_focal_difference:.0%}",
             "pixels are square in almost all cameras",
         )
     view = float(np.degrees(2 * np.arctan2(camera.width / 2, camera.fx)))
-    if not VIEWS_DEG[0] <= view <= VIEWS_DEG[1]:
+    if not config.views_deg[0] <= view <= config.views_deg[1]:
         yield Finding(
             Severity.WARNING,
             "intrinsics",
             robot,
             f"a focal length of {camera.fx:.1f} px sees {view:.0f} degrees of {camera.width} px",
-            f"{VIEWS_DEG[0]:g} to {VIEWS_DEG[1]:g} degrees",
+            f"{config.views_deg[0]:g} to {config.views_deg[1]:g} degrees",
             "see whether the calibration is of another resolution",
         )
 
 
 @dataclass(frozen=True)
 class Move:
-    """A pair of frames. T_first_second [4, 4], by registration; None if that failed. residual: median difference of
-    depth moved into the other frame, relative."""
+    """A pair of frames.
+
+    Attributes:
+        first_ns: time of the first frame.
+        second_ns: time of the second frame.
+        T_first_second: [4, 4], by registration; None if that failed.
+        residual: median difference of depth moved into the other frame, relative.
+        sigma_m: standard deviation of the length of the translation, by the covariance of the registration.
+        turned_rad: angle of the rotation.
+        depth_m: median depth of the first frame.
+        depth_offset_ns: the larger of the two times between color and depth.
+        lost: share of the view of the first frame that the second one has not.
+    """
 
     first_ns: int
     second_ns: int
     T_first_second: Array | None
-    residual: float
+    residual: float = np.nan
+    sigma_m: float = 0.0
+    turned_rad: float = 0.0
+    depth_m: float = 0.0
+    depth_offset_ns: int = 0
+    lost: float = np.nan
+
+    @property
+    def speed_m_s(self) -> float:
+        """Of the translation; NaN if the registration failed."""
+        if self.T_first_second is None:
+            return np.nan
+        return float(np.linalg.norm(self.T_first_second[:3, 3]) / ((self.second_ns - self.first_ns) * 1e-9))
 
 
-def moves(log: RgbdLog) -> list[Move]:
+def moves(log: RgbdLog, config: MotionChecks) -> list[Move]:
     """Pairs of frames spread over the log, each registered and the depth of one moved into the other."""
     stamps = np.array([color for color, _ in log.pairing.pairs], dtype=np.int64)
     found = []
     last = len(stamps) - 1
-    for first in np.unique(np.linspace(0, last - 1, min(MOVES, last)).astype(int)).tolist():
-        near = int(np.searchsorted(stamps, stamps[first] + MOVE_NS, side="right")) - 1
+    for first in np.unique(np.linspace(0, last - 1, min(config.pairs, last)).astype(int)).tolist():
+        near = int(np.searchsorted(stamps, stamps[first] + round(1e9 * config.pair_s), side="right")) - 1
         frame = log.frame(first)
         for second in sorted({max(near, first + 1), first + 1}, reverse=True):
             move = _move(frame, log.frame(second), log.camera)
@@ -117,147 +115,180 @@ def _move(first: RgbdFrame, second: RgbdFrame, camera: PinholeCamera) -> Move:
             frame.usable_depth,
             camera,
             depth_sigma_m=frame.depth_sigma,
+            mask=frame.mask,
         )
         for frame in (first, second)
     )
     result = register(Reference.from_pyramid(a), b, np.eye(4))
-    T = result.T_reference_target if result.ok else None
-    residual = np.nan if T is None else _residual(first.usable_depth, second.usable_depth, T, camera)
-    return Move(first.stamp_ns, second.stamp_ns, T, residual)
+    if not result.ok:
+        return Move(first.stamp_ns, second.stamp_ns, None)
+    T, depth_m = result.T_reference_target, first.usable_depth
+    residual, lost = _moved(depth_m, second.usable_depth, T, camera)
+    return Move(
+        first.stamp_ns,
+        second.stamp_ns,
+        T,
+        residual=residual,
+        lost=lost,
+        sigma_m=_length_sigma_m(result),
+        turned_rad=float(se3.distance(np.eye(4), T)[1]),
+        depth_m=float(np.median(depth_m[depth_m > 0])) if (depth_m > 0).any() else 0.0,
+        depth_offset_ns=max(abs(first.depth_offset_ns), abs(second.depth_offset_ns)),
+    )
 
 
-def _residual(first_m: Image, second_m: Image, T_first_second: Array, camera: PinholeCamera) -> float:
+def _length_sigma_m(result: Registration) -> float:
+    """Standard deviation of the length of a translation; infinite where a direction of it was not measured."""
+    along = np.zeros(6)
+    along[:3] = result.T_reference_target[:3, :3].T @ result.T_reference_target[:3, 3]
+    along /= max(float(np.linalg.norm(along)), 1e-12)
+    if len(result.weak) and np.abs(result.weak @ along).max() > WEAK_SHARE:
+        return float("inf")
+    variance = float(along @ np.linalg.pinv(result.information) @ along)
+    return float(np.sqrt(max(variance, 0.0)))
+
+
+def _moved(
+    first_m: Image, second_m: Image, T_first_second: Array, camera: PinholeCamera
+) -> tuple[float, float]:
+    """Median relative difference of depth moved into the second frame, and share of the view that is lost there.
+
+    That share is by how far the middle of the image moves, because depth often ends before the border does.
+    """
     points = camera.back_project(first_m)[::4, ::4].reshape(-1, 3)
-    points = se3.transform(se3.inverse(T_first_second), points[points[:, 2] > 0])
-    index, u, v = visible(camera, points, near_m=0.0)
-    expected, found = points[index, 2], second_m[v, u]
+    points = points[points[:, 2] > 0]
+    moved = se3.transform(se3.inverse(T_first_second), points)
+    index, u, v = visible(camera, moved, near_m=0.0)
+    if not len(index):
+        return np.nan, 1.0
+    before = points[index, :2] / points[index, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    shift = np.abs(np.median(np.stack([u, v], axis=1) - before, axis=0)) / [camera.width, camera.height]
+    expected, found = moved[index, 2], second_m[v, u]
     both = found > 0
-    return float(np.median(np.abs(found - expected)[both] / expected[both])) if both.any() else np.nan
+    residual = float(np.median(np.abs(found - expected)[both] / expected[both])) if both.any() else np.nan
+    return residual, float(min(max(shift.sum(), 1 - len(index) / len(points)), 1.0))
 
 
-def check_moves(robot: str, found: list[Move]) -> Iterator[Finding]:
+def check_moves(robot: str, found: list[Move], config: MotionChecks) -> Iterator[Finding]:
     """Findings about depth moved into later frames."""
     registered = [move for move in found if move.T_first_second is not None]
-    if found and len(registered) < FEW_REGISTERED * len(found):
+    if found and len(registered) < config.min_registered * len(found):
         yield Finding(
             Severity.WARNING,
             "reprojection",
             robot,
             f"{len(registered)} of {len(found)} pairs of near frames could be registered",
-            f"{FEW_REGISTERED:.0%} or more",
+            f"{config.min_registered:.0%} or more",
             "tracking will be lost; see whether color and depth are of one time and place, and the rate is enough",
+            confidence=share_above(len(found) - len(registered), len(found), 1 - config.min_registered),
         )
-    residuals = [move.residual for move in registered if np.isfinite(move.residual)]
-    if residuals and np.median(residuals) > RESIDUAL:
+    residuals = np.array([move.residual for move in registered if np.isfinite(move.residual)])
+    if len(residuals) and np.median(residuals) > config.max_residual:
         yield Finding(
             Severity.WARNING,
             "reprojection",
             robot,
             f"depth moved into a later frame differs by {np.median(residuals):.1%} (median)",
-            f"less than {RESIDUAL:.0%}",
+            f"less than {config.max_residual:.0%}",
             "see whether depth is along z and not along the ray, and the intrinsics are those of these images",
-        )
-
-
-def check_scale(
-    robot: str, found: list[Move], sensor: str, lengths: Callable[[int, int], float | None]
-) -> Iterator[Finding]:
-    """Compare lengths by registration with those of another sensor.
-
-    Args:
-        sensor: its name in words. lengths: meters moved between two times (ns), None where it does not know.
-    """
-    ratios = []
-    for move in found:
-        other = lengths(move.first_ns, move.second_ns)
-        if move.T_first_second is None or other is None or other < FAR_ENOUGH_M:
-            continue
-        ratios.append(float(np.linalg.norm(move.T_first_second[:3, 3])) / other)
-    if len(ratios) >= 2 and not SCALES[0] <= np.median(ratios) <= SCALES[1]:
-        yield Finding(
-            Severity.ERROR,
-            "depth scale",
-            robot,
-            f"the camera moves {np.median(ratios):.3g} times as far by its depth as by {sensor}",
-            "1",
-            "depth_scale, or the unit of the poses, is wrong by this factor",
+            confidence=share_above(int((residuals > config.max_residual).sum()), len(residuals)),
         )
 
 
 def check_range(
-    robot: str, depth_m: tuple[float, float, float], found: list[Move], sensors: str
+    robot: str, sight: Sight, found: list[Move], sensors: str, *, config: MotionChecks
 ) -> Iterator[Finding]:
     """Findings about distances and speeds that nothing else contradicts. sensors: what the log says about them."""
-    _, middle, high = depth_m
-    if not NEAR_M <= middle <= FAR_M:
+    _, middle, high = sight.depth_m
+    low_m, high_m = config.median_depth_m
+    middles, highs = sight.depth_of_frames[:, 1], sight.depth_of_frames[:, 2]
+    if not low_m <= middle <= high_m:
         yield Finding(
             Severity.ERROR,
             "depth scale",
             robot,
             f"half of the depth is beyond {middle:.3g} m",
-            f"{NEAR_M:g} to {FAR_M:g} m",
+            f"{low_m:g} to {high_m:g} m",
             "depth_scale must be meters per unit: 0.001 for millimeters",
+            confidence=share_above(int(((middles < low_m) | (middles > high_m)).sum()), len(middles)),
         )
-    elif high > SENSOR_M and not any(word in sensors.lower() for word in MEASURED_AFAR):
+    elif high > config.max_depth_m and not any(word in sensors.lower() for word in MEASURED_AFAR):
+        far = int((highs > config.max_depth_m).sum())
         yield Finding(
             Severity.WARNING,
             "depth scale",
             robot,
             f"depth reaches {high:.1f} m (99 %)",
-            f"at most {SENSOR_M:g} m, unless from stereo, a LiDAR or a simulator",
+            f"at most {config.max_depth_m:g} m, unless from stereo, a LiDAR or a simulator",
             "see whether depth_scale is meters per unit",
+            confidence=share_above(far, len(highs), FEW_FRAMES),
         )
-    speeds = [
-        np.linalg.norm(move.T_first_second[:3, 3]) / ((move.second_ns - move.first_ns) * 1e-9)
-        for move in found
-        if move.T_first_second is not None
-    ]
-    if speeds and np.median(speeds) > FAST_M_PER_S:
+    speeds = np.array([move.speed_m_s for move in found if move.T_first_second is not None])
+    if len(speeds) and np.median(speeds) > config.max_speed_m_per_s:
         yield Finding(
             Severity.WARNING,
             "depth scale",
             robot,
             f"the camera moves at {np.median(speeds):.1f} m/s (median)",
-            f"at most {FAST_M_PER_S:g} m/s",
+            f"at most {config.max_speed_m_per_s:g} m/s",
             "see whether depth_scale is meters per unit, and the times are right",
+            confidence=share_above(int((speeds > config.max_speed_m_per_s).sum()), len(speeds)),
         )
 
 
 @dataclass(frozen=True)
 class DepthEdges:
-    """Mean gray gradient under the edges of depth, relative to that of the images.
+    """Mean gray gradient under the edges of depth of some frames, relative to that of the images.
 
-    by_frames: [2 * SHIFTS + 1] with the depth of -SHIFTS ... SHIFTS frames later. by_pixels: [2 * SHIFT_PX + 1] with
-    the depth moved by -SHIFT_PX ... SHIFT_PX px to the right. windows: how many frames it is the mean of.
+    Attributes:
+        frames_of: [windows, 2 n + 1] with the depth of -n ... n frames later, n being `shift_frames`.
+        pixels_of: [k, 2 m + 1] with the depth moved by -m ... m px to the right, m being `shift_px`.
     """
 
-    by_frames: Array
-    by_pixels: Array
-    windows: int
+    frames_of: Array
+    pixels_of: Array
+
+    @property
+    def by_frames(self) -> Array:
+        """Mean of `frames_of`."""
+        return np.asarray(self.frames_of.mean(axis=0))
+
+    @property
+    def by_pixels(self) -> Array:
+        """Mean of `pixels_of`."""
+        return np.asarray(self.pixels_of.mean(axis=0))
+
+    @property
+    def windows(self) -> int:
+        """How many frames it is the mean of."""
+        return len(self.frames_of)
 
 
-def edges_of(log: RgbdLog) -> DepthEdges | None:
+def edges_of(log: RgbdLog, config: EdgeChecks) -> DepthEdges | None:
     """How well edges of depth fall on edges of gray; None if the log is short or has no edges."""
-    frames = len(log)
-    if frames < 2 * SHIFTS + 2:
+    frames, shifts, reach = len(log), config.shift_frames, config.shift_px
+    if frames < 2 * shifts + 2:
         return None
     by_frames, by_pixels = [], []
-    for middle in np.unique(np.linspace(SHIFTS, frames - 1 - SHIFTS, WINDOWS).astype(int)).tolist():
+    spread = np.linspace(shifts, frames - 1 - shifts, config.frames)
+    for middle in np.unique(spread.astype(int)).tolist():
         frame = log.frame(middle)
         gradient = _gradient(frame.color)
-        near = [_depth_edges(log.frame(middle + k).depth) for k in range(-SHIFTS, SHIFTS + 1)]
-        if min(int(edges.sum()) for edges in near) < EDGE_PIXELS:
+        near = [
+            _depth_edges(log.frame(middle + k).usable_depth, config.step) for k in range(-shifts, shifts + 1)
+        ]
+        if min(int(edges.sum()) for edges in near) < config.min_pixels:
             continue
         by_frames.append([gradient[edges].mean() for edges in near])
-        v, u = np.nonzero(near[SHIFTS])
-        inner = (u >= SHIFT_PX) & (u < gradient.shape[1] - SHIFT_PX)
-        if inner.sum() < EDGE_PIXELS:
+        v, u = np.nonzero(near[shifts])
+        inner = (u >= reach) & (u < gradient.shape[1] - reach)
+        if inner.sum() < config.min_pixels:
             continue
-        moved = [gradient[v[inner], u[inner] + d].mean() for d in range(-SHIFT_PX, SHIFT_PX + 1)]
+        moved = [gradient[v[inner], u[inner] + d].mean() for d in range(-reach, reach + 1)]
         by_pixels.append(moved)
     if not by_frames or not by_pixels:
         return None
-    return DepthEdges(np.mean(by_frames, axis=0), np.mean(by_pixels, axis=0), len(by_frames))
+    return DepthEdges(np.array(by_frames), np.array(by_pixels))
 
 
 def _gradient(color: NDArray[np.uint8]) -> Image:
@@ -269,42 +300,50 @@ def _gradient(color: NDArray[np.uint8]) -> Image:
     return np.asarray(size / max(float(size.mean()), 1e-6), dtype=np.float32)
 
 
-def _depth_edges(depth_m: Image) -> NDArray[np.bool_]:
-    """Pixels of the nearer surface at a step of depth."""
+def _depth_edges(depth_m: Image, step: float) -> NDArray[np.bool_]:
+    """Pixels of the nearer surface at a relative step of depth."""
     out = np.zeros(depth_m.shape, dtype=bool)
     for a, b, at_a, at_b in (
         (depth_m[:-1], depth_m[1:], out[:-1], out[1:]),
         (depth_m[:, :-1], depth_m[:, 1:], out[:, :-1], out[:, 1:]),
     ):
-        step = (a > 0) & (b > 0) & (np.abs(a - b) > STEP * np.minimum(a, b))
-        at_a |= step & (a < b)
-        at_b |= step & (b < a)
+        edge = (a > 0) & (b > 0) & (np.abs(a - b) > step * np.minimum(a, b))
+        at_a |= edge & (a < b)
+        at_b |= edge & (b < a)
     return out
 
 
-def check_edges(robot: str, edges: DepthEdges | None) -> Iterator[Finding]:
+def check_edges(robot: str, edges: DepthEdges | None, config: EdgeChecks) -> Iterator[Finding]:
     """Findings about depth that is not of the time, or not of the place, of its color."""
-    if edges is None or edges.windows < WINDOWS // 2:
+    if edges is None or edges.windows < config.frames // 2:
         return
+    shifts, reach = config.shift_frames, config.shift_px
     frames, pixels = (int(np.argmax(a)) for a in (edges.by_frames, edges.by_pixels))
-    if edges.by_frames[frames] > CLEARLY * edges.by_frames[SHIFTS]:
-        shift = frames - SHIFTS
+    if edges.by_frames[frames] > config.clear_ratio * edges.by_frames[shifts]:
+        shift = frames - shifts
         yield Finding(
             Severity.WARNING,
             "depth in time",
             robot,
             f"edges of color fit the depth {abs(shift)} frames {'later' if shift > 0 else 'earlier'} better by "
-            f"{edges.by_frames[frames] / edges.by_frames[SHIFTS] - 1:.0%}",
+            f"{edges.by_frames[frames] / edges.by_frames[shifts] - 1:.0%}",
             "best fit at its own time",
             "color and depth are of different times; correct the times of one of them",
+            confidence=_agreeing(edges.frames_of, frames, shifts),
         )
-    elif edges.by_pixels[pixels] > CLEARLY * edges.by_pixels[SHIFT_PX] and abs(pixels - SHIFT_PX) > 2:
+    elif edges.by_pixels[pixels] > config.clear_ratio * edges.by_pixels[reach] and abs(pixels - reach) > 2:
         yield Finding(
             Severity.WARNING,
             "depth in place",
             robot,
-            f"edges of color fit the depth {pixels - SHIFT_PX:+d} px to the right better by "
-            f"{edges.by_pixels[pixels] / edges.by_pixels[SHIFT_PX] - 1:.0%}",
+            f"edges of color fit the depth {pixels - reach:+d} px to the right better by "
+            f"{edges.by_pixels[pixels] / edges.by_pixels[reach] - 1:.0%}",
             "best fit where it is",
             "register the depth to the color camera",
+            confidence=_agreeing(edges.pixels_of, pixels, reach),
         )
+
+
+def _agreeing(fits: Array, shifted: int, unshifted: int) -> float:
+    """Confidence that a shift fits better, by how many frames [n, shifts] fit better with it."""
+    return share_above(int((fits[:, shifted] > fits[:, unshifted]).sum()), len(fits))

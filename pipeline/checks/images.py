@@ -11,20 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.progress import track
+from duagc.pipeline.checks.confidence import share_above
 from duagc.pipeline.checks.findings import Finding, Severity
+from duagc.pipeline.config.checks import ImageChecks
 from duagc.pipeline.messages import unpack_stamp
 from duagc.pipeline.recording import Record, RgbdFrame
 from duagc.pipeline.recording.read import LogFile
 from duagc.schemas import topics as topic_table
 
-STUCK = 5  # equal images in a row
-MANY_REPEATED = 0.4  # of all images
-LITTLE_DEPTH = 0.2  # of the pixels
-SATURATED = 65535
-MUCH_SATURATED = 0.005
+FEW_FRAMES = 0.1  # of a recording: so many with saturated or far depth are enough to be reported
+SATURATED = 65535  # the largest number of a 16-bit depth image
 BINS = 8  # of a color histogram, per channel
-SWAPPED_RATIO = 0.5  # distance of colors after exchanging red and blue, relative to before
-DIFFERENT_COLORS = 0.15  # squared Hellinger distance
 
 
 @dataclass
@@ -60,7 +57,7 @@ def read_repeats(log: LogFile, robot: str) -> dict[str, Repeats]:
     return found
 
 
-def check_repeats(robot: str, topic: str, repeats: Repeats) -> Iterator[Finding]:
+def check_repeats(robot: str, topic: str, repeats: Repeats, config: ImageChecks) -> Iterator[Finding]:
     """Findings about images that come again."""
     count = len(repeats.stamps_ns)
     if repeats.other_stamps:
@@ -73,7 +70,7 @@ def check_repeats(robot: str, topic: str, repeats: Repeats) -> Iterator[Finding]
             "the time of the message is used",
         )
     if repeats.repeated:
-        stuck = repeats.longest >= STUCK or repeats.repeated > MANY_REPEATED * count
+        stuck = repeats.longest >= config.repeats_in_a_row or repeats.repeated > config.max_repeated * count
         yield Finding(
             Severity.WARNING if stuck else Severity.NOTE,
             "repeats",
@@ -90,46 +87,82 @@ class Sight:
 
     Attributes:
         depth_m: percentiles 1, 50, 99 of the known depth, NaN if there is none.
-        known: shares of the pixels.
-        saturated: shares of the pixels.
-        colors: histogram of RGB [BINS, BINS, BINS], sums to 1.
+        known: share of the pixels.
+        saturated: share of the known depth.
+        depth_of_frames: [frames, 3], those percentiles of every frame that has depth.
+        known_of_frames: [frames], share of the pixels of every frame.
+        saturated_of_frames: [frames], share of the known depth of every frame.
+        colors_of_frames: [frames, BINS, BINS, BINS], histogram of RGB of every frame, sums to 1.
     """
 
     depth_m: tuple[float, float, float]
     known: float
     saturated: float
-    colors: NDArray[np.float64]
+    depth_of_frames: NDArray[np.float64]
+    known_of_frames: NDArray[np.float64]
+    saturated_of_frames: NDArray[np.float64]
+    colors_of_frames: NDArray[np.float64]
+
+    @property
+    def colors(self) -> NDArray[np.float64]:
+        """Histogram of RGB of all frames together, [BINS, BINS, BINS], sums to 1."""
+        return np.asarray(self.colors_of_frames.mean(axis=0))
 
     @staticmethod
     def of(frames: Iterator[RgbdFrame], scale: float) -> Sight:
-        """From frames, of which every 4th row and column counts. scale: meters per unit."""
-        depths, counts = [], np.zeros(BINS**3)
+        """From the usable pixels of frames, of which every 4th row and column counts. scale: meters per unit."""
+        depths, colors = [], []
         for frame in frames:
-            depths.append(frame.depth[::4, ::4].ravel())
-            codes = (frame.color[::4, ::4].reshape(-1, 3) // (256 // BINS)).astype(np.int64)
-            counts += np.bincount(codes @ [BINS * BINS, BINS, 1], minlength=BINS**3)
-        depth = np.concatenate(depths)
-        known = depth[depth > 0]
-        low, middle, high = np.percentile(known, (1, 50, 99)) if len(known) else (np.nan,) * 3
-        saturated = float((known >= (SATURATED - 0.5) * scale).mean()) if len(known) else 0.0
-        colors = (counts / counts.sum()).reshape(BINS, BINS, BINS)
-        return Sight((float(low), float(middle), float(high)), len(known) / len(depth), saturated, colors)
+            usable = np.s_[:, :] if frame.mask is None else frame.mask[::4, ::4]
+            depths.append(frame.depth[::4, ::4][usable].ravel())
+            codes = (frame.color[::4, ::4][usable].reshape(-1, 3) // (256 // BINS)).astype(np.int64)
+            counts = np.bincount(codes @ [BINS * BINS, BINS, 1], minlength=BINS**3)
+            colors.append(counts / max(len(codes), 1))
+        known = [depth[depth > 0] for depth in depths]
+        together = np.concatenate(known)
+        low, middle, high = _percentiles(together) if len(together) else (np.nan,) * 3
+        largest_m = (SATURATED - 0.5) * scale
+        saturated = [float((k >= largest_m).sum() / max(len(k), 1)) for k in (together, *known)]
+        return Sight(
+            depth_m=(float(low), float(middle), float(high)),
+            known=len(together) / max(sum(len(depth) for depth in depths), 1),
+            saturated=saturated[0],
+            depth_of_frames=np.array([_percentiles(depth) for depth in known if len(depth)]).reshape(-1, 3),
+            known_of_frames=np.array(
+                [len(k) / max(len(depth), 1) for k, depth in zip(known, depths, strict=True)]
+            ),
+            saturated_of_frames=np.array(saturated[1:]),
+            colors_of_frames=np.array(colors).reshape(-1, BINS, BINS, BINS),
+        )
 
 
-def check_sight(robot: str, sight: Sight) -> Iterator[Finding]:
+def _percentiles(depth: NDArray[np.float32]) -> NDArray[np.float64]:
+    return np.asarray(np.percentile(depth, (1, 50, 99)), dtype=np.float64)
+
+
+def check_sight(robot: str, sight: Sight, config: ImageChecks) -> Iterator[Finding]:
     """Findings about missing and saturated depth."""
+    frames = len(sight.known_of_frames)
     if sight.known == 0:
-        yield Finding(Severity.ERROR, "depth", robot, "no pixel has depth", "some depth in every image")
-    elif sight.known < LITTLE_DEPTH:
+        yield Finding(
+            Severity.ERROR,
+            "depth",
+            robot,
+            "no pixel has depth",
+            "some depth in every image",
+            confidence=share_above(frames, frames),
+        )
+    elif sight.known < config.min_depth:
         yield Finding(
             Severity.WARNING,
             "depth",
             robot,
             f"{sight.known:.0%} of the pixels have depth",
-            f"more than {LITTLE_DEPTH:.0%}",
+            f"more than {config.min_depth:.0%}",
             "tracking and mapping use these alone",
+            confidence=share_above(int((sight.known_of_frames < config.min_depth).sum()), frames),
         )
-    if sight.saturated > MUCH_SATURATED:
+    if sight.saturated > config.max_saturated:
         yield Finding(
             Severity.WARNING,
             "depth",
@@ -137,15 +170,18 @@ def check_sight(robot: str, sight: Sight) -> Iterator[Finding]:
             f"{sight.saturated:.1%} of the known depth is the largest number, {SATURATED}",
             "0 where nothing was measured",
             "let the converter take this number for none",
+            confidence=share_above(
+                int((sight.saturated_of_frames > config.max_saturated).sum()), frames, FEW_FRAMES
+            ),
         )
 
 
-def check_colors(sights: Mapping[str, Sight]) -> Iterator[Finding]:
+def check_colors(sights: Mapping[str, Sight], config: ImageChecks) -> Iterator[Finding]:
     """Robots whose colors agree far better with red and blue exchanged: one of them has them in the wrong order."""
     for a, b in combinations(sorted(sights), 2):
-        as_is = _distance(sights[a].colors, sights[b].colors)
-        swapped = _distance(sights[a].colors, sights[b].colors.transpose(2, 1, 0))
-        if as_is > DIFFERENT_COLORS and swapped < SWAPPED_RATIO * as_is:
+        one, other = sights[a].colors, sights[b].colors
+        as_is, swapped = _distance(one, other), _distance(one, other.transpose(2, 1, 0))
+        if as_is > config.other_colors and swapped < config.swapped_ratio * as_is:
             yield Finding(
                 Severity.WARNING,
                 "color order",
@@ -153,7 +189,14 @@ def check_colors(sights: Mapping[str, Sight]) -> Iterator[Finding]:
                 f"its colors are those of {a} with red and blue exchanged",
                 "the same order in all logs",
                 "see whether the source is RGB or BGR",
+                confidence=_exchanged(one, sights[b].colors_of_frames),
             )
+
+
+def _exchanged(colors: NDArray[np.float64], of_frames: NDArray[np.float64]) -> float:
+    """Confidence that red and blue are exchanged, by how many frames agree better if they are."""
+    votes = sum(_distance(colors, f.transpose(2, 1, 0)) < _distance(colors, f) for f in of_frames)
+    return share_above(votes, len(of_frames))
 
 
 def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:

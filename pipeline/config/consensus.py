@@ -1,10 +1,13 @@
 """Settings of loop closures, pose consensus and matching."""
 
+from __future__ import annotations
+
 from typing import Literal
 
 from pydantic import Field
 
 from duagc.pipeline.config.base import Config
+from duagc.pipeline.config.mapping import THICKNESS_FLOOR_M
 
 WeightKind = Literal["uniform", "observation_count", "residual_magnitude", "scalar", "diagonal", "block"]
 
@@ -120,5 +123,18 @@ class MatchingConfig(Config):
     """tau_G is this percentile, over the own map, of d_G to the nearest neighbor within the radius."""
     candidates: int = Field(default=16, ge=1)
     """Nearest Gaussians within the radius that are compared, from either side."""
-    thickness_floor_m: float = Field(default=1e-3, gt=0.0)
+
+    def of_maps(self, thickness_floor_m: float) -> MapMatching:
+        """The same, of maps that were made with this floor.
+
+        Args:
+            thickness_floor_m: least standard deviation that the mapper lets a Gaussian have.
+        """
+        return MapMatching(**dict(self), thickness_floor_m=thickness_floor_m)
+
+
+class MapMatching(MatchingConfig):
+    """Matching of maps with what they were made with. No section of a run: `RunConfig.matching` puts it together."""
+
+    thickness_floor_m: float = Field(default=THICKNESS_FLOOR_M, gt=0.0)
     """Standard deviation below which the mapper lets no Gaussian go."""

@@ -1,8 +1,12 @@
 """Configuration of the front end: tracking, keyframes, mapping."""
 
+from __future__ import annotations
+
 from pydantic import Field
 
 from duagc.pipeline.config.base import Config
+from duagc.pipeline.config.consensus import LoopClosureConfig
+from duagc.pipeline.config.exposure import ExposureConfig
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.registration import GeometricVerificationConfig, MovingConfig, RegistrationConfig
 
@@ -39,6 +43,38 @@ class LoopConfig(GeometricVerificationConfig):
     """The same as a share of the matches; the larger number holds."""
     min_overlap: float = Field(default=0.4, ge=0.0, le=1.0)
     """Overlap that the registrations in both directions must find."""
+    robust: bool = True
+    """Leave out loop closures that contradict the path and the other ones, by graduated truncated least squares."""
+    odometry_floor_m: float = 0.005
+    """Standard deviation of the drift between two keyframes that were registered to each other, added to what their
+    information says: errors that the frames share are not in it."""
+    odometry_floor_rad: float = 0.005
+    """The same for the rotation."""
+    closure_floor_m: float = 0.02
+    """The same of a loop closure."""
+    closure_floor_rad: float = 0.02
+    """The same for its rotation."""
+
+
+class JudgmentConfig(GeometricVerificationConfig):
+    """Whether optimized keyframe poses can be true."""
+
+    enabled: bool = True
+    """Judge them, and call lost what was tracked from keyframes that features or depth contradict."""
+    neighbors: int = 2
+    """Earlier keyframes that each is judged with, besides the two before it."""
+    min_inliers: int = Field(default=15, ge=4)
+    """Matches that must agree on one motion; fewer say nothing."""
+    min_inlier_share: float = Field(default=0.5, ge=0.0, le=1.0)
+    """The same as a share of the matches; the larger number holds."""
+    max_angle_rad: float = 0.02
+    """Median angle between a feature and its partner from which features contradict the poses of two keyframes."""
+    max_angle_of_own: float = 2.0
+    """The same as a multiple of that by the motion that the features agree on; the larger limit holds."""
+    min_visible: float = 0.2
+    """Share of a view that the other must be able to judge; less says nothing."""
+    max_free_space_violations: float = 0.25
+    """Share of that in space which the other saw to be free, from which depth contradicts the poses."""
 
 
 class KeyframeConfig(Config):
@@ -50,6 +86,9 @@ class KeyframeConfig(Config):
     """A frame that moved by more than this fraction of the median depth becomes a keyframe."""
     max_rotation_rad: float = 0.5
     """A frame that turned by more than this becomes a keyframe."""
+    max_depth_offset_s: float = 0.03
+    """A frame whose depth was taken earlier or later by more than this becomes none: depth that is moved to the time of
+    its image is as good as the motion that is known."""
     neighbors: int = 4
     """Earlier keyframes that a new one is registered to, besides the one it was tracked against."""
     neighbor_overlap: float = 0.5
@@ -73,11 +112,17 @@ class KeyframeConfig(Config):
     optimization_neighbors: int = 8
     """Earlier keyframes that a keyframe is compared with at most, those with most overlap."""
     loops: LoopConfig = LoopConfig()
+    judgment: JudgmentConfig = JudgmentConfig()
 
 
 class FailureConfig(Config):
     """Tests of whether the images of a camera can be used and a pose can be true."""
 
+    min_contrast: float = 0.02
+    """Difference between the brightest and the darkest gray value (0..1) of the coarsest image below which a frame
+    without depth shows nothing, as with a covered lens: it is left out."""
+    max_saturated: float = 0.95
+    """Share of black and white pixels above which a frame shows nothing."""
     max_frames_without_depth: int = 15
     """Frames in a row that are tracked by color alone, because their depth is missing or frozen."""
     min_view_without_depth: float = 0.6
@@ -139,7 +184,8 @@ class FailureConfig(Config):
 
 
 class MotionPriorConfig(Config):
-    """Uncertainty of the motion prior of the log: standard deviations of a motion between two frames."""
+    """Uncertainty of a prediction: by the motion prior of the log, standard deviations of a motion between two frames;
+    by the last velocity, the accelerations of a camera that is carried."""
 
     odometry_sigma_m: float = 0.005
     """Translation by another odometry."""
@@ -153,6 +199,13 @@ class MotionPriorConfig(Config):
     """Rotation by the integrated rates of a gyroscope."""
     gyro_sigma_rad_per_s: float = 0.01
     """Plus this for every second: the bias."""
+    acceleration_m_s2: float = 1.5
+    """Acceleration that the last velocity does not know of."""
+    angular_acceleration_rad_s2: float = 4.0
+    """The same of the rotation."""
+    max_deviation_px: float = 4.0
+    """Distance of a view from its prediction by these accelerations, pixels of the coarsest image of the registration,
+    from which matched features give the start: dense registration converges from a few pixels off."""
 
 
 class RelocalizationConfig(GeometricVerificationConfig):
@@ -170,6 +223,8 @@ class RelocalizationConfig(GeometricVerificationConfig):
     """Matches among the strongest features from which a keyframe is tried."""
     min_inliers: int = Field(default=10, ge=4)
     """Matches that must agree on one motion."""
+    max_angle_rad: float = 0.02
+    """Angle between a feature and its partner up to which they can be the same, where two poses are compared."""
     min_overlap: float = Field(default=0.5, ge=0.0, le=1.0)
     """Overlap with its keyframe that a plausible pose must have."""
     max_keyframe_disagreement_m: float = 0.03
@@ -184,6 +239,10 @@ class RelocalizationConfig(GeometricVerificationConfig):
     """Factor on the usual gray residual that is added to `max_gray_rms`."""
     confirmations: int = 1
     """Later frames that must be tracked from there before the camera counts as found."""
+    look_again: bool = True
+    """Look for lost frames again after the optimization of the poses, among the keyframes around them in time."""
+    look_again_keyframes: int = Field(default=2, ge=1)
+    """Keyframes before and after a lost frame, each, that it is then registered to."""
 
 
 class TrackingConfig(Config):
@@ -199,6 +258,11 @@ class TrackingConfig(Config):
         max_rotation_rad=0.6,
     )
     """The second attempt: one more pyramid level, wider gates; its result is checked by the usual registration."""
+    max_gray_rms_with_features: float = 0.25
+    """Largest gray residual of a registration that matched features confirm, in place of `registration.max_gray_rms`:
+    blur and another point of view make a frame look unlike its keyframe."""
+    min_overlap_with_features: float = 0.15
+    """Least overlap of such a registration, in place of `registration.min_overlap`."""
     stable_rounds: int = 3
     """Usual registrations at most, after one with wide gates or from a far guess, until one stays where it began."""
     stable_m: float = 0.01
@@ -222,6 +286,15 @@ class TrackingConfig(Config):
     relocalization: RelocalizationConfig = RelocalizationConfig()
     prior: MotionPriorConfig = MotionPriorConfig()
 
+    def verified_by_features(self) -> TrackingConfig:
+        """The same for registrations that features verify besides."""
+        limits = {
+            "max_gray_rms": self.max_gray_rms_with_features,
+            "min_overlap": self.min_overlap_with_features,
+        }
+        changed = self.registration.model_copy(update=limits)
+        return self.model_copy(update={"registration": changed})
+
 
 class ModelConfig(Config):
     """Registering frames between keyframes to the map, once it is grown."""
@@ -241,6 +314,38 @@ class ModelConfig(Config):
     """Pixels between samples of the drawn map, finest level first."""
 
 
+class SubmapConfig(GeometricVerificationConfig):
+    """New submaps where the camera is lost, and the loop closures that join them, found as those between robots."""
+
+    enabled: bool = True
+    """Begin a new submap where the camera is lost and relocalization fails; if not, such frames have no pose."""
+    min_frames: int = Field(default=10, ge=1)
+    """Frames in a row that must be tracked from a first one before they are a submap; until then only the submaps that
+    are there are searched."""
+    min_keyframes: int = Field(default=2, ge=1)
+    """Keyframes that a submap must have by then: what moves with the camera gives one."""
+    compared: int = Field(default=32, ge=1)
+    """Keyframes of another submap, those that share most visual words, whose features are compared with one."""
+    features_compared: int = Field(default=120, ge=4)
+    """The strongest features, by which they are ranked."""
+    min_matches: int = Field(default=8, ge=1)
+    """Matches among them from which a pair of keyframes is a candidate."""
+    candidates: int = Field(default=3, ge=1)
+    """Keyframes of another submap tried per keyframe, those with most matches."""
+    max_verified: int = Field(default=64, ge=1)
+    """Candidates of a pair of submaps that are verified, the best of every keyframe first."""
+    hypotheses: int = Field(default=500, ge=1)
+    """Three-point samples of RANSAC."""
+    max_refinement_m: float = Field(default=0.15, gt=0.0)
+    """Largest translation by which the registration may change what RANSAC found."""
+    max_refinement_rad: float = Field(default=0.10, gt=0.0)
+    """The same for the rotation."""
+    min_surface_agreement: float = Field(default=0.5, ge=0.0, le=1.0)
+    """Share of the surfaces seen from both submaps that must lie at the same place when one is laid into the other."""
+    closures: LoopClosureConfig = LoopClosureConfig()
+    """Noise and consistency of these loop closures."""
+
+
 class FrontendConfig(Config):
     """Front end of one robot."""
 
@@ -248,7 +353,10 @@ class FrontendConfig(Config):
     keyframes: KeyframeConfig = KeyframeConfig()
     mapping_enabled: bool = True
     """Grow a map; without, the log holds odometry and keyframes and an empty map."""
+    exposure: ExposureConfig = ExposureConfig()
+    """Exposures of single frames."""
     mapping: MappingConfig = MappingConfig()
     model: ModelConfig = ModelConfig()
+    submaps: SubmapConfig = SubmapConfig()
     moving: MovingConfig = MovingConfig()
     """Moving objects, by depth: not mapped, in no Fisher sum, not in the fine-tuning after fusion."""

@@ -8,7 +8,7 @@ from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.training import LearningRates, MapLossConfig
 
 
-class RefineConfig(Config):
+class FinetuneConfig(Config):
     """Finetuning of the fused map on the robot's own images and on renders of its peers' maps."""
 
     steps_per_view: int = Field(default=9, ge=0)
@@ -91,6 +91,6 @@ class FusionConfig(Config):
     added_need_information: bool = True
     """Import only Gaussians with information on their position."""
     peer_validation: PeerValidationConfig = PeerValidationConfig()
-    refine: RefineConfig = RefineConfig()
+    finetune: FinetuneConfig = FinetuneConfig()
     max_added: int | None = Field(default=None, ge=0)
     """Most Gaussians of peers that are imported, those of most position information first."""

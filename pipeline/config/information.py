@@ -5,7 +5,6 @@ from typing import Literal
 from pydantic import Field
 
 from duagc.pipeline.config.base import Config
-from duagc.pipeline.config.mapping import THICKNESS_FLOOR_M
 
 
 class InformationConfig(Config):
@@ -32,5 +31,3 @@ class InformationConfig(Config):
     they share counts once; 0 takes every pixel for independent."""
     deviation_gate_m: float = Field(default=0.1, gt=0.0)
     """A surface measured farther than this from a Gaussian is another one's."""
-    thickness_floor_m: float = THICKNESS_FLOOR_M
-    """Log-scales at this floor carry no information; must be the floor that the map was made with."""

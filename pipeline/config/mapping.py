@@ -32,8 +32,9 @@ class SeedingConfig(Config):
     """Initial opacity."""
     spread: float = 0.55
     """Standard deviation of a disc in units of its cell's side on the surface."""
-    thickness_m: float = THICKNESS_FLOOR_M
-    """Standard deviation across the surface at first; also the floor of every log-scale while mapping."""
+    thickness_m: float = Field(default=THICKNESS_FLOOR_M, gt=0.0)
+    """Standard deviation across the surface at first; also the floor of every log-scale while mapping. A log-scale at
+    the floor carries no information, and counts for nothing where maps are matched."""
     min_depth_m: float = 0.2
     """Nearer depth gets no Gaussian."""
     max_depth_m: float = 10.0
@@ -94,10 +95,6 @@ class MappingConfig(Config):
     """Noise of colors (0..1) by which a change of an image is measured."""
     contribution_depth_sigma_m: float = 0.02
     """Noise of depth by which a change of an image is measured."""
-    exposure: bool = False
-    """Fit a gain and an offset per view; the map ends in the mean exposure of its keyframes."""
-    exposure_rate: float = 2e-3
-    """Learning rate of the gains and offsets."""
 
     def depth_kind(self, depth_noise_m: float | None) -> DepthKind:
         """How the depth of the Gaussians is drawn.

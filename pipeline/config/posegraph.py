@@ -48,7 +48,12 @@ class PoseGraphConfig(Config):
 
 
 def settings(
-    solver: Solver = "admm", robust: Robust = "none", loss: float = 0.0, seed: int = 0, max_rounds: int = 5000
+    solver: Solver = "admm",
+    robust: Robust = "none",
+    *,
+    loss: float = 0.0,
+    seed: int = 0,
+    max_rounds: int = 5000,
 ) -> PoseGraphConfig:
     """Settings of the command line."""
     default = PoseGraphConfig()

@@ -46,6 +46,7 @@ def test_fixtures_pass(tmp_path: Path, name: str) -> None:
     registry.convert(dataset, make(tmp_path / "data"), tmp_path / "recording", options=options)
     report = check.check(tmp_path / "recording")
     alarms = report.of(check.Severity.ERROR) + report.of(check.Severity.WARNING)
-    known = ("m/s", "could be registered")  # some fixtures fly round their room, in few large steps
+    # some fixtures fly round their room, in few large steps; of some the last depth image is late
+    known = ("m/s", "could be registered", "6 color images have 5 depth images")
     assert all(any(words in f.found for words in known) for f in alarms), check.format_report(report)
     assert report.sound

@@ -6,6 +6,7 @@ import pytest
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.base import Config, dump_config, load_config
+from duagc.pipeline.config.run import RunConfig
 
 
 class Link(Config):
@@ -64,3 +65,14 @@ def test_broken_file_is_named(tmp_path: Path) -> None:
         load_config(Whole, path)
     with pytest.raises(DuagError, match=r"absent\.toml"):
         load_config(Whole, tmp_path / "absent.toml")
+
+
+def test_a_run_has_one_thickness_floor() -> None:
+    config = load_config(
+        RunConfig, overrides=["frontend.mapping.seeding.thickness_m=0.002", "exchange.matching.radius_m=0.03"]
+    )
+    assert config.thickness_floor_m == config.matching.thickness_floor_m == 0.002
+    assert config.matching.model_dump(exclude={"thickness_floor_m"}) == config.exchange.matching.model_dump()
+    for other in ("information.thickness_floor_m", "exchange.matching.thickness_floor_m"):
+        with pytest.raises(DuagError, match=f"{other} is not a known setting"):
+            load_config(RunConfig, overrides=[f"{other}=0.002"])
