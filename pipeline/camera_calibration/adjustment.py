@@ -13,14 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.camera_calibration.rig import NAMES, CameraRig
 from duagc.pipeline.camera_calibration.views import Views, look_up, normals_at
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma
 from duagc.pipeline.registration.residuals import depth_noise
-
-Array = NDArray[np.float64]
 
 ROUNDS = 30
 CONVERGED, CONVERGED_OF_PRIOR = (
@@ -219,8 +218,9 @@ def _features(views: Views, rig: CameraRig) -> _Features:
     q = se3.transform(T, views.points_map[views.landmark][:, None])[:, 0]
     q[:, 2] = np.maximum(q[:, 2], 0.05)
     velocity = views.velocity[view]
-    R = rig.R_color_depth @ se3.exp(-rig.delay_s * velocity)[:, :3, :3]
-    p = se3.transform(se3.exp(-rig.delay_s * velocity), q[:, None])[:, 0] @ rig.R_color_depth.T
+    T_color_time = se3.exp(-(rig.delay_s + views.late_s[view])[:, None] * velocity)
+    R = rig.R_color_depth @ T_color_time[:, :3, :3]
+    p = se3.transform(T_color_time, q[:, None])[:, 0] @ rig.R_color_depth.T
     p[:, 2] = np.maximum(p[:, 2], 0.05)
     pixel, by_p, by_lens = rig.project(p)
     uv = c.project(q)

@@ -1,8 +1,8 @@
 """Both cameras of an RGB-D recording, calibrated from its own images; no target, no ground truth.
 
 The front end tracks the recording; then poses, landmarks and cameras are adjusted together, once to all views and once
-to each half. The calibration by one half is tested on the other: it is reported only if it holds there. Frames that are
-held out for the evaluation of maps take no part.
+to each half. Views that a calibration did not use judge it: each half the calibration of the other, and frames between
+the views that of both. Frames that are held out for the evaluation of maps take no part at all.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,40 @@ import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
+from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.camera_calibration.adjustment import PRIOR, Adjusted, Quality, adjust
 from duagc.pipeline.camera_calibration.rig import NAMES, CameraRig
-from duagc.pipeline.camera_calibration.views import Views, load_views, track_log
+from duagc.pipeline.camera_calibration.undetermined import UndeterminedError
+from duagc.pipeline.camera_calibration.views import Tracked, Views, load_views, track_log
+from duagc.pipeline.config.calibration import CalibrationConfig
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.recording import Recording
 
 MIN_LANDMARKS = 200  # of a half
 UNKNOWN = 0.7  # share of its prior standard deviation from which a number counts as undetermined
+QUALITIES = ("features_px", "depth_of_features", "depth")
+BY_OTHER, BY_BOTH = "the other half", "both halves"
+
+
+@dataclass(frozen=True)
+class Judged:
+    """How well views agree under a calibration that did not use them.
+
+    Attributes:
+        views: what they are.
+        calibrated_by: which views the calibration is from.
+        before: agreement as recorded.
+        after: agreement as calibrated.
+    """
+
+    views: str
+    calibrated_by: str
+    before: Quality
+    after: Quality
+
+    def ratios(self) -> list[float]:
+        """After over before, of each of `QUALITIES`."""
+        return [getattr(self.after, name) / max(getattr(self.before, name), 1e-12) for name in QUALITIES]
 
 
 @dataclass(frozen=True)
@@ -35,8 +62,7 @@ class Calibration:
         rig: the cameras, from all views.
         sigma: standard deviation of every number of `NAMES`.
         halves: the cameras from each half alone.
-        before: agreement of each half as recorded.
-        after: agreement of each half calibrated by the *other* half.
+        judged: agreement of views that the calibration did not use.
         names: of the halves.
         views: number of views.
         landmarks: number of landmarks.
@@ -46,15 +72,52 @@ class Calibration:
     rig: CameraRig
     sigma: dict[str, float]
     halves: list[CameraRig]
-    before: list[Quality]
-    after: list[Quality]
+    judged: list[Judged]
     names: list[str]
     views: int
     landmarks: int
     recording: dict[str, Any]
 
+    def refusal(self, config: CalibrationConfig) -> str:
+        """Why the recording is no better with this calibration, by views that it did not use; "" if it is.
 
-def calibrate(folder: Path, config: FrontendConfig, robots: Sequence[str], views: int = 56) -> Calibration:
+        Args:
+            config: how much better it must be.
+        """
+        for judged in self.judged:
+            ratios = judged.ratios()
+            gain, loss = 1 - float(np.exp(np.mean(np.log(ratios)))), max(ratios) - 1
+            if gain < config.min_gain or loss > config.max_loss:
+                return (
+                    f"{judged.views}, calibrated by {judged.calibrated_by}: {100 * abs(gain):.1f} % "
+                    f"{'better' if gain >= 0 else 'worse'} in the mean, "
+                    f"up to {100 * max(loss, 0):.1f} % worse, expected at least {100 * config.min_gain:g} % and "
+                    f"at most {100 * config.max_loss:g} %"
+                )
+        return ""
+
+    def delay_ns(self, config: CalibrationConfig) -> int:
+        """How much later color was taken than its stamps say, where that is certain enough; else 0.
+
+        A delay that differs from half to half is less certain than its standard deviation says: stamps wander.
+
+        Args:
+            config: what is certain enough.
+        """
+        first, second = (half.delay_s for half in self.halves)
+        uncertain_s = max(self.sigma["delay_s"], abs(first - second) / 2)
+        certain = abs(self.rig.delay_s) > config.delay_sigmas * uncertain_s
+        return round(1e9 * self.rig.delay_s) if certain else 0
+
+
+def calibrate(
+    folder: Path,
+    config: FrontendConfig,
+    robots: Sequence[str],
+    views: int = CalibrationConfig().views,
+    *,
+    workers: int = 1,
+) -> Calibration:
     """Calibrate the cameras of a recording; all chosen robots have the same.
 
     Args:
@@ -62,21 +125,25 @@ def calibrate(folder: Path, config: FrontendConfig, robots: Sequence[str], views
         config: of the front end that tracks it.
         robots: names; empty = all.
         views: largest number of each half.
+        workers: robots that are tracked at the same time; changes no bit of the result.
 
     Raises:
-        DuagError: the recording is broken, or its images do not determine the cameras, or a half contradicts the other.
+        UndeterminedError: its images do not determine the cameras.
+        DuagError: the recording is broken, or the robots have different cameras.
     """
     source = Recording(folder)
     for robot in robots:
         if robot not in source.robots:
             raise DuagError(f"{folder}: has no robot {robot}, expected one of {', '.join(source.robots)}")
-    tracked = [track_log(source.log(robot), robot, config) for robot in robots or source.robots]
+    tracked = _track({robot: source.log(robot) for robot in robots or source.robots}, config, workers)
     if len(tracked) == 1:
         n = len(tracked[0].ok)
-        halves = [[load_views(tracked[0], a, b, views)] for a, b in ((0, n // 2), (n // 2, n))]
+        ranges = [[(tracked[0], a, b)] for a, b in pairwise((0, n // 2, n))]
+        most = views
     else:
+        ranges = [[(t, 0, len(t.ok)) for t in tracked[k::2]] for k in (0, 1)]
         most = max(12, 2 * views // len(tracked))
-        halves = [[load_views(t, 0, len(t.ok), most) for t in tracked[k::2]] for k in (0, 1)]
+    halves = [[load_views(*part, most) for part in half] for half in ranges]
     cameras = {part.camera for half in halves for part in half}
     if len(cameras) > 1:
         raise DuagError(f"{folder}: its robots have {len(cameras)} different cameras, expected --robot NAME")
@@ -84,14 +151,40 @@ def calibrate(folder: Path, config: FrontendConfig, robots: Sequence[str], views
         found = sum(len(part.points_map) for part in half)
         if found < MIN_LANDMARKS:
             names = " and ".join(part.name for part in half)
-            raise DuagError(f"{folder}: {found} features were followed in {names}, expected {MIN_LANDMARKS}")
-    return _calibrate(folder, halves, CameraRig.of(cameras.pop()), source.description)
+            raise UndeterminedError(
+                f"{folder}: {found} features were followed in {names}, expected {MIN_LANDMARKS}"
+            )
+    between = [
+        views_between
+        for half, parts in zip(halves, ranges, strict=True)
+        for part, of in zip(half, parts, strict=True)
+        if (views_between := _between(of, part, most)) is not None
+    ]
+    return _calibrate(folder, halves, between, source.description)
+
+
+def _track(logs: dict[str, Path], config: FrontendConfig, workers: int) -> list[Tracked]:
+    if min(workers, len(logs)) < 2:
+        return [track_log(log, robot, config) for robot, log in logs.items()]
+    with worker_pool(min(workers, len(logs))) as pool:
+        jobs = [pool.submit(track_log, log, robot, config) for robot, log in logs.items()]
+        return [job.result() for job in jobs]
+
+
+def _between(of: tuple[Tracked, int, int], used: Views, most: int) -> Views | None:
+    """Views of frames between those of a part; None if there are too few."""
+    try:
+        found = load_views(*of, most // 2, without=used.frames.tolist())
+    except UndeterminedError:
+        return None
+    return found if len(found.points_map) >= MIN_LANDMARKS // 2 else None
 
 
 def _calibrate(
-    folder: Path, halves: list[list[Views]], start: CameraRig, description: dict[str, Any]
+    folder: Path, halves: list[list[Views]], between: list[Views], description: dict[str, Any]
 ) -> Calibration:
-    done = list(track(_adjustments(halves, start), "adjust", total=7))
+    start = CameraRig.of(halves[0][0].camera)
+    done = list(track(_adjustments(halves, between, start), "adjust", total=9 if between else 7))
     recorded, alone, by_other, both = done[:2], done[2:4], done[4:6], done[6]
     assert both.covariance is not None
     sigma = dict(zip(NAMES, np.sqrt(np.diag(both.covariance)).tolist(), strict=True))
@@ -100,32 +193,37 @@ def _calibrate(
         n for n in NAMES if sigma[n] > UNKNOWN * PRIOR[n] * (scale if n in ("fx", "fy", "cx", "cy") else 1)
     ]
     if unknown:
-        raise DuagError(
+        raise UndeterminedError(
             f"{folder}: its images do not determine {', '.join(unknown)}, expected more motion (turns about all axes, "
             "near and far) and texture up to the corners"
         )
-    found = Calibration(
+    names = [" and ".join(part.name for part in half) for half in halves]
+    judged = [
+        Judged(name, BY_OTHER, _mean(before.quality), _mean(after.quality))
+        for name, before, after in zip(names, recorded, by_other, strict=True)
+    ]
+    if between:
+        count = sum(len(part.frames) for part in between)
+        judged.append(
+            Judged(f"{count} frames between", BY_BOTH, *(_mean(adjusted.quality) for adjusted in done[7:]))
+        )
+    return Calibration(
         rig=both.rig,
         sigma=sigma,
         halves=[half.rig for half in alone],
-        before=[_mean(half.quality) for half in recorded],
-        after=[_mean(half.quality) for half in by_other],
-        names=[" and ".join(part.name for part in half) for half in halves],
+        judged=judged,
+        names=names,
         views=sum(len(part.T_map_camera) for half in halves for part in half),
         landmarks=sum(len(part.points_map) for half in halves for part in half),
         recording=description,
     )
-    for name, before, after in zip(found.names, found.before, found.after, strict=True):
-        if after.features_px > before.features_px:
-            raise DuagError(
-                f"{folder}: found no better calibration than its own: by that of the other half, features of {name} "
-                f"meet within {after.features_px:.3f} px, expected less than {before.features_px:.3f} px as recorded"
-            )
-    return found
 
 
-def _adjustments(halves: list[list[Views]], start: CameraRig) -> Iterator[Adjusted]:
-    """Each half as recorded, each calibrated by itself, each as the other calibrates it, and all of it calibrated."""
+def _adjustments(halves: list[list[Views]], between: list[Views], start: CameraRig) -> Iterator[Adjusted]:
+    """Each half as recorded, each calibrated by itself, each as the other calibrates it, and all of it calibrated.
+
+    Then the views between, as recorded and as all of it is calibrated.
+    """
 
     def adjusted(parts: Sequence[Views], rig: CameraRig, calibrate: bool) -> Adjusted:
         return adjust([copy(part) for part in parts], rig, calibrate)
@@ -138,13 +236,12 @@ def _adjustments(halves: list[list[Views]], start: CameraRig) -> Iterator[Adjust
         yield alone[-1]
     for half, other in zip(halves, reversed(alone), strict=True):
         yield adjusted(half, other.rig, False)
-    yield adjusted([part for half in halves for part in half], start, True)
+    both = adjusted([part for half in halves for part in half], start, True)
+    yield both
+    if between:
+        yield adjusted(between, start, False)
+        yield adjusted(between, both.rig, False)
 
 
 def _mean(quality: Sequence[Quality]) -> Quality:
-    return Quality(
-        *(
-            float(np.mean([getattr(q, name) for q in quality]))
-            for name in ("features_px", "depth_of_features", "depth")
-        )
-    )
+    return Quality(*(float(np.mean([getattr(q, name) for q in quality])) for name in QUALITIES))

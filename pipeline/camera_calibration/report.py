@@ -1,4 +1,4 @@
-"""A calibration as text, and as options of a converter."""
+"""A calibration as text, as plain values, and as options of a converter."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from duagc import __version__
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.camera_calibration.adjustment import Quality
-from duagc.pipeline.camera_calibration.calibrate import Calibration
+from duagc.pipeline.camera_calibration.calibrate import Calibration, Judged
 from duagc.pipeline.camera_calibration.rig import DEPTH, LENS, NAMES, ROTATION
+from duagc.pipeline.geometry import so3
 
 CONVERTER = "7scenes"
 AS_RECORDED = ("depth_focal_px", "depth_cx_px", "depth_cy_px", "baseline_m")
@@ -24,6 +26,7 @@ OPTIONS = {
     "depth_correction_per_m": DEPTH,
 }
 """Options of the converter that take a calibration, and the numbers that each takes."""
+DEPTHS_M = (1.0, 3.0)  # at which a correction of depth is reported
 BEFORE = ("color_focal_px", "color_cx_px", "color_cy_px")  # a recording may have other values of these
 
 UNITS = dict.fromkeys(NAMES, "1/m") | dict.fromkeys(LENS, "px") | dict.fromkeys(("k1", "k2", "k3"), "")
@@ -50,9 +53,14 @@ def plain(found: Calibration) -> dict[str, Any]:
             }
             for k, name in enumerate(NAMES)
         },
-        "held_out": [
-            {"half": name, "as_recorded": vars(before), "calibrated_by_the_other": vars(after)}
-            for name, before, after in _held_out(found)
+        "judged": [
+            {
+                "views": judged.views,
+                "calibrated_by": judged.calibrated_by,
+                "as_recorded": vars(judged.before),
+                "calibrated": vars(judged.after),
+            }
+            for judged in found.judged
         ],
         "options": options(found),
     }
@@ -67,6 +75,8 @@ def not_taken(recording: dict[str, Any]) -> str:
     converter, used = recording.get("converter", {}).get("name"), recording.get("parameters", {})
     if converter != CONVERTER:
         return f"was made by {converter}, which takes no calibration, expected one by {CONVERTER}"
+    if recording.get("calibration"):
+        return "is calibrated already, expected one as its converter makes it"
     resampled = [name for name in OPTIONS if name not in BEFORE and used.get(name)]
     return f"was converted with {', '.join(resampled)}, expected one without" if resampled else ""
 
@@ -112,8 +122,9 @@ def toml(found: Calibration) -> str:
     name, version = json.dumps(found.recording["name"]), __version__
     lines = [
         f"Cameras of the recording {name} from its own images, by duagc {version}:",
-        f"{found.views} views, {found.landmarks} features followed. As recorded -> calibrated by the other half:",
-        *(f"{name}: {_change(before, after)}" for name, before, after in _held_out(found)),
+        f"{found.views} views, {found.landmarks} features followed. As recorded -> as views that were not used "
+        "calibrate it:",
+        *(change(judged) for judged in found.judged),
         f"To use them: duagc convert {CONVERTER} SRC --options THIS_FILE --out REC",
         "",
         "cameras that the recording was made with; the rest is relative to them",
@@ -184,20 +195,45 @@ def format_calibration(found: Calibration) -> str:
         lines.append(
             f"{name:8} {entry['value']:11.5f} {entry['sigma']:10.5f} {first:11.5f} {second:11.5f} {entry['unit']}"
         )
-    lines += ["", "agreement of a half: as recorded -> calibrated by the other half"]
-    for name, before, after in _held_out(found):
-        lines.append(f"{name}: {_change(before, after)}")
+    lines += ["", "agreement of views that a calibration did not use: as recorded -> calibrated"]
+    lines += [change(judged) for judged in found.judged]
     why = not_taken(found.recording)
     lines += [
         "",
+        "--apply REC writes the recording with these cameras",
         f"the recording {why}" if why else "--out FILE.toml writes this as options for duagc convert",
     ]
     return "\n".join(lines)
 
 
-def _held_out(found: Calibration) -> list[tuple[str, Quality, Quality]]:
-    """Name of every half, its agreement as recorded and as the other half calibrates it."""
-    return list(zip(found.names, found.before, found.after, strict=True))
+def changes(found: Calibration, delay_ns: int) -> list[str]:
+    """What a recording with this calibration has that the recorded one has not, in sentences.
+
+    Args:
+        found: the calibration.
+        delay_ns: how much earlier the stamps of depth become.
+    """
+    rig, c = found.rig, found.rig.camera
+    rays = c.rays()[:: max(1, c.height // 24), :: max(1, c.width // 32)].reshape(-1, 3)
+    moved = rig.project(rays @ rig.R_color_depth.T)[0] - c.project(rays)
+    px = np.linalg.norm(moved, axis=-1)
+    mm = [1e3 * np.abs(rig.depth(np.full(len(rays), 1 / z), rays) - z) for z in DEPTHS_M]
+    turn = " ".join(f"{1e3 * angle:.1f}" for angle in so3.log(rig.R_color_depth))
+    delay, sigma = 1e3 * rig.delay_s, 1e3 * found.sigma["delay_s"]
+    stamps = f"stamps of depth moved by {-1e-6 * delay_ns:+.1f} ms" if delay_ns else "stamps as recorded"
+    fx, fy, cx, cy, *lens = rig.lens.tolist()
+    return [
+        f"color resampled: pixels moved by {np.median(px):.1f} px (median), {px.max():.1f} px at most; "
+        f"lens {fx:.1f} {fy:.1f} px, center {cx:.1f} {cy:.1f} px, distortion {_text(lens)}, "
+        f"turned against depth by {turn} mrad",
+        "depth corrected: "
+        + ", ".join(
+            f"at {z:g} m by {np.median(d):.1f} mm (median), {d.max():.1f} mm at most"
+            for z, d in zip(DEPTHS_M, mm, strict=True)
+        ),
+        f"color {delay:.1f} +- {sigma:.1f} ms later than its stamps say: {stamps}",
+        *(f"agreement, as recorded -> calibrated: {change(judged)}" for judged in found.judged),
+    ]
 
 
 def _known(name: str, entry: dict[str, Any]) -> str:
@@ -207,9 +243,15 @@ def _known(name: str, entry: dict[str, Any]) -> str:
     return f"{text} (halves {first:.5f}, {second:.5f})"
 
 
-def _change(before: Quality, after: Quality) -> str:
+def change(judged: Judged) -> str:
+    """How the agreement of views that a calibration did not use changes.
+
+    Args:
+        judged: the views.
+    """
+    before, after = judged.before, judged.after
     return (
-        f"features {before.features_px:.2f} -> {after.features_px:.2f} px, "
+        f"{judged.views}, by {judged.calibrated_by}: features {before.features_px:.2f} -> {after.features_px:.2f} px, "
         f"their depth {before.depth_of_features:.2f} -> {after.depth_of_features:.2f} sigma(z), "
         f"depth images {before.depth:.2f} -> {after.depth:.2f} sigma(z)"
     )

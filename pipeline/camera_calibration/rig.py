@@ -9,12 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import depth_error, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
-
-Array = NDArray[np.float64]
 
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "k3")
 ROTATION = ("rx", "ry", "rz")
@@ -30,7 +28,7 @@ class CameraRig:
         camera: of the recording, to which depth is registered.
         lens: [7], focal lengths and principal point in pixels, radial distortion k1 k2 k3 as OpenCV defines it.
         R_color_depth: [3, 3].
-        delay_s: how much later color was taken.
+        delay_s: how much later color was taken than the time stamps say.
         depth_error: [6], 1/m, see `geometry.depth_error`.
     """
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,24 +12,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
-from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.progress import track
+from duagc.pipeline.camera_calibration.undetermined import UndeterminedError
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.stage import run_frontend
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.recording import open_rgbd
+from duagc.pipeline.geometry.masks import distance_px
+from duagc.pipeline.recording import RgbdLog, open_rgbd
 from duagc.pipeline.registration.features import DIMENSIONS, matches, root_sift
 from duagc.pipeline.registration.pyramid import SAME_SURFACE, RgbdPyramid
 from duagc.pipeline.runs.folder import RobotRun
-
-Array = NDArray[np.float64]
 
 FEATURES = 1200
 RATIO = 0.75
 LINE_PX, POINT_PX = 8.0, 25.0  # of 640 px: how far a match may be from where the tracked poses put it
 MIN_MATCHES = 10
 MIN_TRACK = 3  # views
+MIN_VIEWS = 8
+MAX_OFFSET_NS = 20_000_000  # between color and depth: in this time a camera moves evenly
 NORMALS_LEVEL = (
     2  # quarter size: noisy normals add false information along a surface, and steps get too short
 )
@@ -54,6 +56,8 @@ class Views:
         landmark: [k], of every observation.
         pixel: [k, 2], of every observation.
         points_map: [m, 3] of the landmarks.
+        frames: [n], index of each in its log.
+        late_s: [n], how much later than depth the log says that color was taken.
     """
 
     name: str
@@ -67,6 +71,8 @@ class Views:
     landmark: NDArray[np.int64]
     pixel: Array
     points_map: Array
+    frames: NDArray[np.int64]
+    late_s: Array
 
 
 @dataclass(frozen=True)
@@ -116,68 +122,110 @@ def track_log(path: Path, robot: str, config: FrontendConfig) -> Tracked:
     )
 
 
-def load_views(tracked: Tracked, first: int, last: int, most: int) -> Views:
+def load_views(tracked: Tracked, first: int, last: int, most: int, *, without: Collection[int] = ()) -> Views:
     """Views of a range of frames, evenly spread, and the features followed through them.
 
     Held-out frames are never read: a calibration must not be fitted to the images that maps are evaluated by.
+    Depth is as it was taken: where that was at another time, `late_s` says so. Frames whose depth shows too little, or
+    was taken long before or after color, are passed over.
 
     Args:
         tracked: the log.
         first: of the frames.
         last: of the frames, less one.
         most: largest number of views.
+        without: frames that are not to be taken.
 
     Raises:
-        DuagError: too few frames were tracked.
+        UndeterminedError: too few frames are left.
     """
-    import cv2
-
     name = f"{tracked.robot}, frames {first} to {last - 1}"
     good = first + np.flatnonzero((tracked.ok & ~tracked.held_out)[first:last])
-    if len(good) < 8:
-        raise DuagError(
-            f"{tracked.path}: {len(good)} tracked frames in {name} that are not held out, expected at least 8"
-        )
-    chosen = good[np.unique(np.linspace(0, len(good) - 1, most).round().astype(int))]
-    sift = cv2.SIFT.create(nfeatures=FEATURES)
-    pixels, descriptors, depths, inverse, normals, samples = [], [], [], [], [], []
+    good = good[~np.isin(good, list(without))]
+    chosen = good[np.unique(np.linspace(0, len(good) - 1, min(most, len(good))).round().astype(int))]
+    images = []
     with open_rgbd(tracked.path) as log:
         camera = log.camera
         for index in track(chosen, f"features of {name}"):
-            frame = log.frame(int(index))
-            depth = np.asarray(frame.usable_depth, dtype=np.float32)
-            gray = np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-            keypoints, found = sift.detectAndCompute(gray, None)
-            pixel = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
-            row, column = np.rint(pixel[:, 1]).astype(int), np.rint(pixel[:, 0]).astype(int)
-            pyramid = RgbdPyramid.build(np.zeros(depth.shape, np.float32), depth, camera, NORMALS_LEVEL + 1)
-            pixels.append(pixel)
-            descriptors.append(
-                root_sift(np.asarray(found, dtype=np.float32))
-                if len(pixel)
-                else np.zeros((0, DIMENSIONS), np.uint8)
-            )
-            depths.append(depth[row, column].astype(np.float64))
-            w = pyramid.levels[0].inverse_depth
-            inverse.append(np.where(w > 0, w, np.float32(np.nan)))
-            normals.append(pyramid.levels[NORMALS_LEVEL].normals)
-            samples.append(
-                _samples(normals[-1], depth, robot=tracked.robot, index=int(index), path=tracked.path)
-            )
-    T = tracked.T_map_camera[chosen]
-    view, landmark, pixel, points = _landmarks(pixels, descriptors, depths, camera=camera, T=T)
+            if (image := _image(log, int(index))) is not None:
+                images.append(image)
+    if len(images) < MIN_VIEWS:
+        raise UndeterminedError(
+            f"{tracked.path}: {len(images)} tracked frames in {name} that are not held out and have depth, "
+            f"expected at least {MIN_VIEWS}"
+        )
+    frames = np.array([image.frame for image in images])
+    T = tracked.T_map_camera[frames]
+    view, landmark, pixel, points = _landmarks(
+        [image.pixel for image in images],
+        [image.descriptors for image in images],
+        [image.depth for image in images],
+        camera=camera,
+        T=T,
+    )
     return Views(
         name=name,
         camera=camera,
         T_map_camera=T,
-        velocity=_velocities(tracked, chosen),
-        inverse_depth=np.array(inverse),
-        normals=np.array(normals),
-        samples=np.array(samples),
+        velocity=_velocities(tracked, frames),
+        inverse_depth=np.array([image.inverse_depth for image in images]),
+        normals=np.array([image.normals for image in images]),
+        samples=np.array([image.samples for image in images]),
         view=view,
         landmark=landmark,
         pixel=pixel,
         points_map=points,
+        frames=frames,
+        late_s=np.array([image.late_s for image in images]),
+    )
+
+
+@dataclass(frozen=True)
+class _Image:
+    """What a frame gives to its view."""
+
+    frame: int
+    late_s: float
+    pixel: Array  # [k, 2] of its features
+    descriptors: NDArray[np.uint8]  # [k, 128]
+    depth: Array  # [k], m, 0 = unknown
+    inverse_depth: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    samples: NDArray[np.int64]
+
+
+def _image(log: RgbdLog, index: int) -> _Image | None:
+    """Features and surfaces of a frame; None if its depth shows too little of a surface, or another time."""
+    import cv2
+
+    frame = log.frame(index)
+    if abs(frame.depth_offset_ns) > MAX_OFFSET_NS:
+        return None
+    depth = np.asarray(frame.usable_depth, dtype=np.float32)
+    pyramid = RgbdPyramid.build(np.zeros(depth.shape, np.float32), depth, log.camera, NORMALS_LEVEL + 1)
+    normals = pyramid.levels[NORMALS_LEVEL].normals
+    samples = _samples(normals, depth, robot=log.robot, index=index)
+    if samples is None:
+        return None
+    gray = np.asarray(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    keypoints, found = cv2.SIFT.create(nfeatures=FEATURES).detectAndCompute(gray, None)
+    pixel = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
+    if frame.mask is not None and len(pixel):
+        sizes = [k.size for k in keypoints]
+        seen = distance_px(frame.mask)[tuple(np.rint(pixel).astype(int).T[::-1])] > sizes
+        pixel, found = pixel[seen], np.asarray(found)[seen]
+    row, column = np.rint(pixel[:, 1]).astype(int), np.rint(pixel[:, 0]).astype(int)
+    none = np.zeros((0, DIMENSIONS), np.uint8)
+    w = pyramid.levels[0].inverse_depth
+    return _Image(
+        frame=index,
+        late_s=-1e-9 * frame.depth_offset_ns,
+        pixel=pixel,
+        descriptors=root_sift(np.asarray(found, dtype=np.float32)) if len(pixel) else none,
+        depth=depth[row, column].astype(np.float64),
+        inverse_depth=np.where(w > 0, w, np.float32(np.nan)),
+        normals=normals,
+        samples=samples,
     )
 
 
@@ -215,15 +263,14 @@ def _velocities(tracked: Tracked, chosen: NDArray[np.int64]) -> Array:
 
 
 def _samples(
-    normals: NDArray[np.float32], depth: NDArray[np.float32], *, robot: str, index: int, path: Path
-) -> NDArray[np.int64]:
+    normals: NDArray[np.float32], depth: NDArray[np.float32], *, robot: str, index: int
+) -> NDArray[np.int64] | None:
+    """Columns and rows [SAMPLES, 2] of pixels with a normal; None if there are too few."""
     row, column = np.nonzero((depth > 0) & (depth < FARTHEST_SAMPLE_M))
     known = np.abs(normals[coarse(row, normals.shape[0]), coarse(column, normals.shape[1])]).sum(axis=-1) > 0
     row, column = row[known], column[known]
     if len(row) < SAMPLES:
-        raise DuagError(
-            f"{path}: depth of frame {index} shows a surface at {len(row)} pixels, expected {SAMPLES}"
-        )
+        return None
     rng = random_streams.generator(0, "calibration.samples", robot=robot, frame=index)
     picked = np.sort(rng.choice(len(row), SAMPLES, replace=False))
     return np.stack([column[picked], row[picked]], axis=-1)

@@ -3,6 +3,7 @@
 import json
 import tomllib
 from copy import copy
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -22,8 +23,9 @@ from duagc.pipeline.camera_calibration.adjustment import (
     adjust,
     overlapping,
 )
-from duagc.pipeline.camera_calibration.calibrate import Calibration, calibrate
+from duagc.pipeline.camera_calibration.calibrate import Calibration, Judged, calibrate
 from duagc.pipeline.camera_calibration.rig import NAMES, CameraRig
+from duagc.pipeline.camera_calibration.undetermined import UndeterminedError
 from duagc.pipeline.camera_calibration.views import (
     NORMALS_LEVEL,
     Tracked,
@@ -33,6 +35,7 @@ from duagc.pipeline.camera_calibration.views import (
     track_log,
 )
 from duagc.pipeline.cli import app
+from duagc.pipeline.config.calibration import CalibrationConfig
 from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -86,6 +89,7 @@ def make_views(seed: int, noise_per_m: float = 0.001, count: int = 150) -> Views
         v, u = np.nonzero(np.abs(normals[-1]).sum(axis=-1) > 0)
         picked = rng.choice(len(v), count, replace=False)
         samples.append(np.stack([u[picked], v[picked]], axis=-1) << NORMALS_LEVEL)
+    late_s = np.random.default_rng(100 + seed).uniform(-0.01, 0.01, VIEWS)
     points, seen_by, landmarks, pixels = [], [], [], []
     for m in range(LANDMARKS):
         k, u, v = rng.integers(VIEWS), rng.integers(5, 315), rng.integers(5, 235)
@@ -94,7 +98,8 @@ def make_views(seed: int, noise_per_m: float = 0.001, count: int = 150) -> Views
             q = se3.transform(se3.inverse(T[i]), points[m][None])
             if q[0, 2] < 0.1:
                 continue
-            p = se3.transform(se3.exp(-TRUE.delay_s * velocity[i]), q) @ TRUE.R_color_depth.T
+            later = TRUE.delay_s + late_s[i]
+            p = se3.transform(se3.exp(-later * velocity[i]), q) @ TRUE.R_color_depth.T
             pixel = TRUE.project(p)[0][0]
             if not (0 <= pixel[0] < 320 and 0 <= pixel[1] < 240 and np.hypot(*(p[0, :2] / p[0, 2])) < 0.75):
                 continue
@@ -116,6 +121,8 @@ def make_views(seed: int, noise_per_m: float = 0.001, count: int = 150) -> Views
         np.array(landmarks),
         np.array(pixels),
         np.array(points) + rng.normal(size=(LANDMARKS, 3)) * 0.01,
+        np.arange(VIEWS),
+        late_s,
     )
 
 
@@ -191,7 +198,9 @@ def still_recording(folder: Path, contrast: int = 255) -> Path:
     """A camera that does not move, before a wall with a pattern."""
     rng = np.random.default_rng(0)
     pattern = cv2.GaussianBlur(rng.uniform(0, 255, (240, 320)), (0, 0), 2)
-    pattern = cv2.normalize(pattern, None, 0, contrast, cv2.NORM_MINMAX).astype(np.uint8)
+    pattern = cv2.normalize(
+        pattern, None, (255 - contrast) // 2, (255 + contrast) // 2, cv2.NORM_MINMAX
+    ).astype(np.uint8)
     png = cv2.imencode(".png", np.repeat(pattern[..., None], 3, axis=2))[1].tobytes()
     depth = np.full((240, 320), 1500, np.uint16) + (np.arange(320) // 4).astype(np.uint16)
     with RecordingWriter(folder) as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
@@ -202,7 +211,9 @@ def still_recording(folder: Path, contrast: int = 255) -> Path:
 
 def test_a_camera_that_does_not_move_is_refused(tmp_path: Path) -> None:
     folder = still_recording(tmp_path / "still")
-    with pytest.raises(DuagError, match=r"still: its images do not determine .*rx, ry.*expected more motion"):
+    with pytest.raises(
+        UndeterminedError, match=r"still: its images do not determine .*rx, ry.*expected more motion"
+    ):
         calibrate(folder, FrontendConfig(), [])
     with pytest.raises(DuagError, match="has no robot bravo, expected one of alpha"):
         calibrate(folder, FrontendConfig(), ["bravo"])
@@ -230,6 +241,10 @@ def test_held_out_frames_take_no_part(tmp_path: Path, monkeypatch: pytest.Monkey
     views = load_views(tracked, 0, 20, 56)
     assert read == [k for k in range(20) if not is_held_out(k)]
     assert len(views.T_map_camera) == len(read) == 18
+    assert views.frames.tolist() == read
+    read.clear()
+    between = load_views(tracked, 0, 20, 56, without=range(0, 20, 2))
+    assert between.frames.tolist() == read == list(range(1, 20, 2))  # held-out ones are even
     monkeypatch.undo()
     held_out = track_log(tracked.path, "alpha", FrontendConfig()).held_out
     np.testing.assert_array_equal(held_out, tracked.held_out)
@@ -239,7 +254,7 @@ def test_a_wall_without_texture_is_refused(tmp_path: Path) -> None:
     folder = still_recording(tmp_path / "bare", contrast=0)
     with pytest.raises(
         DuagError,
-        match=r"bare.* tracked frames in alpha, frames 0 to 9 that are not held out, expected at least 8",
+        match=r"bare.* tracked frames in alpha, frames 0 to 9 that are not held out .*, expected at least 8",
     ):
         calibrate(folder, FrontendConfig(), [])
     pixels, descriptors = [np.zeros((0, 2))] * 2, [np.zeros((0, 128), np.uint8)] * 2
@@ -248,7 +263,7 @@ def test_a_wall_without_texture_is_refused(tmp_path: Path) -> None:
 
 
 def found_by(converter: str, **parameters: object) -> Calibration:
-    quality = [Quality(0.8, 0.9, 1.2), Quality(0.6, 0.7, 1.1)]
+    before, after = Quality(0.8, 0.9, 1.2), Quality(0.6, 0.7, 1.1)
     description = {"name": "kitchen", "converter": {"name": converter}, "parameters": parameters}
     sigma = dict.fromkeys(NAMES, 0.001)
     halves = ["alpha, frames 0 to 9", "bravo, frames 0 to 9"]
@@ -256,13 +271,48 @@ def found_by(converter: str, **parameters: object) -> Calibration:
         rig=TRUE,
         sigma=sigma,
         halves=[TRUE, TRUE],
-        before=quality,
-        after=quality,
+        judged=[Judged(half, "the other half", before, after) for half in halves],
         names=halves,
         views=20,
         landmarks=900,
         recording=description,
     )
+
+
+@pytest.mark.parametrize(
+    ("after", "why"),
+    [
+        (Quality(0.7, 0.9, 1.2), ""),
+        (
+            Quality(0.79, 0.9, 1.2),
+            "between, calibrated by both halves: 0.4 % better in the mean, up to 0.0 % worse",
+        ),
+        (
+            Quality(0.6, 0.93, 1.2),
+            "8.1 % better in the mean, up to 3.3 % worse, expected at least 2 % and at most 1 %",
+        ),
+        (Quality(0.9, 0.9, 1.2), "4.0 % worse in the mean, up to 12.5 % worse"),
+    ],
+)
+def test_a_calibration_is_refused_unless_views_that_it_did_not_use_agree_better(
+    after: Quality, why: str
+) -> None:
+    """Each set of views by itself; here the halves agree better in every case."""
+    found = found_by("tum")
+    between = Judged("9 frames between", "both halves", Quality(0.8, 0.9, 1.2), after)
+    refusal = replace(found, judged=[*found.judged, between]).refusal(CalibrationConfig())
+    assert (why in refusal) if why else refusal == ""
+
+
+def test_a_delay_changes_stamps_only_if_it_is_certain() -> None:
+    found, config = found_by("tum"), CalibrationConfig()  # 4 ms
+    assert replace(found, sigma=found.sigma | {"delay_s": 0.0019}).delay_ns(config) == 4_000_000
+    assert replace(found, sigma=found.sigma | {"delay_s": 0.0021}).delay_ns(config) == 0
+    halves = [replace(TRUE, delay_s=delay_s) for delay_s in (0.001, 0.007)]
+    assert replace(found, halves=halves).delay_ns(config) == 0  # they differ too much
+    said = report.changes(found, 4_000_000)
+    assert "color 4.0 +- 1.0 ms later than its stamps say: stamps of depth moved by -4.0 ms" in said
+    assert "stamps as recorded" in report.changes(found, 0)[2]
 
 
 def test_the_file_of_options_is_one_of_the_converter(tmp_path: Path) -> None:
@@ -281,9 +331,12 @@ def test_the_file_of_options_is_one_of_the_converter(tmp_path: Path) -> None:
     for name in NAMES:
         assert f"# {name} = " in text
     assert "# k1 = 0.08000 +- 0.00100 (halves 0.08000, 0.08000)" in text
-    assert "features 0.80 -> 0.80 px" in text
+    line = (
+        "bravo, frames 0 to 9, by the other half: features 0.80 -> 0.60 px, their depth 0.90 -> 0.70 sigma(z)"
+    )
+    assert line in text
     text = report.format_calibration(found)
-    assert "features 0.80 -> 0.80 px" in text
+    assert line in text
     assert "--out FILE.toml" in text
     (tmp_path / "other.toml.part").mkdir()
     with pytest.raises(DuagError, match=r"other.toml: Is a directory, expected to write options"):
@@ -291,10 +344,12 @@ def test_the_file_of_options_is_one_of_the_converter(tmp_path: Path) -> None:
 
 
 def test_recordings_that_take_no_calibration() -> None:
+    calibrated = found_by("7scenes").recording | {"calibration": {"recording": "kitchen"}}
     for other, why in (
         (found_by("tum"), "was made by tum, which takes no calibration"),
         (found_by("7scenes", color_distortion="0.1 0 0 0"), "was converted with color_distortion, expected"),
         (found_by("7scenes", depth_correction_per_m="0.1"), "was converted with depth_correction_per_m"),
+        (replace(found_by("7scenes"), recording=calibrated), "is calibrated already, expected one as its"),
     ):
         assert report.options(other) is None
         assert why in report.format_calibration(other)

@@ -103,13 +103,21 @@ def test_cameras_that_were_put_wrong_are_found_and_put_right(tmp_path: Path) -> 
         way = write_sequence(tmp_path / "walk", stage)
         command("convert", "7scenes", tmp_path / "walk", "--out", tmp_path / "raw")
         file = tmp_path / "cameras.toml"
-        found = json.loads(command("calibrate", tmp_path / "raw", "--views", 36, "--out", file, "--json"))
+        applied = tmp_path / "applied"
+        said = command(
+            "calibrate", tmp_path / "raw", "--views", 36, "--out", file, "--apply", applied, "--json"
+        )
+        found = json.loads(said)
         for name in NAMES:
             value, sigma = (found["values"][name][key] for key in ("value", "sigma"))
             assert abs(value - TRUE[name]) < 4 * sigma, (name, value, sigma)
         command("convert", "7scenes", tmp_path / "walk", "--options", file, "--out", tmp_path / "right")
-        depth, gray = errors(tmp_path / "right", stage, way)
         depth_before, gray_before = errors(tmp_path / "raw", stage, way)
-        print(f"depth {1e3 * depth_before:.1f} -> {1e3 * depth:.1f} mm, gray {gray_before:.2f} -> {gray:.2f}")
-        assert depth < 0.4 * depth_before
-        assert gray < 0.4 * gray_before
+        for folder in (tmp_path / "right", applied):
+            depth, gray = errors(folder, stage, way)
+            print(
+                f"{folder.name}: depth {1e3 * depth_before:.1f} -> {1e3 * depth:.1f} mm, "
+                f"gray {gray_before:.2f} -> {gray:.2f}"
+            )
+            assert depth < 0.4 * depth_before
+            assert gray < 0.4 * gray_before
