@@ -16,8 +16,8 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import KeyframeConfig
 from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes, overlap, solve_pose_graph
 from duagc.pipeline.geometry import se3
@@ -34,7 +34,6 @@ from duagc.pipeline.registration import (
 )
 from duagc.pipeline.registration.features import Features
 
-Array = NDArray[np.float64]
 Ends = tuple[int, int]  # of a pair: the earlier keyframe, the later one
 CONVERGED = 1e-4  # m, rad: Gauss-Newton steps shrink fast, what is left after such a one is far smaller
 UNUSABLE = (Outcome.LOW_OVERLAP, Outcome.RESIDUAL)  # weak directions carry no information and do no harm

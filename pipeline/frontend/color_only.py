@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import FailureConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import (
@@ -24,7 +24,6 @@ from duagc.pipeline.registration import (
     register,
 )
 
-Array = NDArray[np.float64]
 OPEN_DIRECTION = 1e-4  # 1/m^2, 1/rad^2: a standard deviation of 100 m is no knowledge
 
 

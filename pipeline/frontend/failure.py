@@ -13,12 +13,12 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import FailureConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.projection import FREE, back_project, free_space, largest_of_3x3
 from duagc.pipeline.registration import Level, RegistrationConfig, RgbdPyramid
 
-Array = NDArray[np.float64]
 Image = NDArray[np.floating]
 
 
@@ -34,11 +34,16 @@ class Reason(Enum):
     RESIDUAL = "residual"
     JUMP = "jump"
     NO_DEPTH = "no_depth"
+    NO_PIXEL = "no_pixel"
     FROZEN_DEPTH = "frozen_depth"
     FROZEN_COLOR = "frozen_color"
     OBSTRUCTED = "obstructed"
     CONTRADICTION = "contradiction"
     UNCONFIRMED = "unconfirmed"
+    SMALL_SUBMAP = "small_submap"
+    OTHER_COMPONENT = "other_component"
+    CONTRADICTED_BY_FEATURES = "contradicted_by_features"
+    CONTRADICTED_BY_DEPTH = "contradicted_by_depth"
 
 
 class FrozenImageDetector:
@@ -133,12 +138,30 @@ def _depth_changed(now: Image, then: Image, config: FailureConfig) -> bool:
 
 
 def saturated_share(level: Level) -> float:
-    """Share of pixels that are as dark or as bright as an image can be.
+    """Share of usable pixels that are as dark or as bright as an image can be; 1 if there is none.
 
     Args:
         level: of a frame.
     """
-    return float(np.mean((level.gray <= 0.01) | (level.gray >= 0.99)))
+    gray = level.gray if level.mask is None else level.gray[level.mask]
+    return float(np.mean((gray <= 0.01) | (gray >= 0.99))) if gray.size else 1.0
+
+
+def shows_anything(pyramid: RgbdPyramid, config: FailureConfig) -> bool:
+    """Whether the masks leave a pixel, not nearly all are saturated, and some show a depth, or gray values that differ.
+
+    A covered lens shows neither. The coarsest gray image decides: there the noise of a dark image is averaged out.
+
+    Args:
+        pyramid: of the frame.
+        config: limits of saturation and contrast.
+    """
+    finest, coarsest = pyramid.levels[0], pyramid.levels[-1]
+    if saturated_share(finest) > config.max_saturated:
+        return False
+    gray = coarsest.gray if coarsest.mask is None else coarsest.gray[coarsest.mask]
+    contrast = float(np.ptp(gray)) if gray.size else 0.0
+    return bool(finest.inverse_depth.any()) or contrast >= config.min_contrast
 
 
 def has_enough_depth(pyramid: RgbdPyramid, config: RegistrationConfig) -> bool:

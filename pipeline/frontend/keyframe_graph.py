@@ -8,14 +8,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import KeyframeConfig
 from duagc.pipeline.geometry import projection, se3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.registration import Level, Reference, ReferenceLevel, Registration, RgbdPyramid
 
-Array = NDArray[np.float64]
 MAX_STEPS = 20
 STEP_TOLERANCE = 1e-9
 OPEN_DIRECTION = 1e-4  # 1/m^2, 1/rad^2: a standard deviation of 100 m is no knowledge

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import LoopConfig
 from duagc.pipeline.frontend.bundle import Images, KeyframeView
 from duagc.pipeline.frontend.keyframe_graph import overlap
@@ -17,8 +15,6 @@ from duagc.pipeline.registration import RegistrationConfig
 from duagc.pipeline.registration.features import matches
 from duagc.pipeline.registration.geometric_verification import VerificationView, verify
 from duagc.pipeline.registration.place_recognition import Places
-
-Array = NDArray[np.float64]
 
 
 def find_loops(

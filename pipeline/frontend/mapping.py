@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import LearningRates
-from duagc.pipeline.frontend.mapping_views import Bytes, Image, View, first_exposure
+from duagc.pipeline.frontend.mapping_views import Bytes, Image, View
 from duagc.pipeline.frontend.view_selection import covisible, optimization_window
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.exposure import Exposure
 from duagc.pipeline.kernels import (
     CompiledAdam,
     FisherSums,
@@ -105,6 +106,7 @@ class Mapper:
         *,
         mask: NDArray[np.bool_] | None = None,
         depth_sigma_m: Image | None = None,
+        exposure: Exposure | None = None,
     ) -> MappingStats:
         """Seed what the map does not explain of a new keyframe and optimize the window around it.
 
@@ -115,6 +117,7 @@ class Mapper:
             T_map_camera: [4, 4], pose of the camera in the map frame.
             mask: bool [H, W], False where a pixel neither seeds nor counts in a loss; None = all count.
             depth_sigma_m: [H, W], standard deviation of the depth, meters; None: not known pixel by pixel.
+            exposure: of the image; None: as the map.
         """
         if keyframe_index != len(self._views):
             raise ValueError(f"keyframe {keyframe_index} added after {len(self._views)} keyframes")
@@ -126,6 +129,7 @@ class Mapper:
             mask=mask,
             depth_sigma_m=depth_sigma_m,
             huber_m=self._loss_weights.depth_huber_m,
+            exposure=exposure,
         )
         self._views.append(view)
         self._adam.freeze_after(self.config.stable_steps or None)
@@ -150,6 +154,7 @@ class Mapper:
         *,
         mask: NDArray[np.bool_] | None = None,
         depth_sigma_m: Image | None = None,
+        exposure: Exposure | None = None,
     ) -> None:
         """Let a tracked frame that is no keyframe take part in `finalize`.
 
@@ -162,6 +167,7 @@ class Mapper:
             T_keyframe_camera: [4, 4], pose of the camera in the keyframe.
             mask: bool [H, W], False where a pixel does not count; None = all count.
             depth_sigma_m: [H, W], standard deviation of the depth, meters; None: not known pixel by pixel.
+            exposure: of the image; None: as the map.
         """
         T_map_camera = self._views[keyframe_index].T_map_camera @ T_keyframe_camera
         view = View.of(
@@ -172,6 +178,7 @@ class Mapper:
             mask=mask,
             depth_sigma_m=depth_sigma_m,
             huber_m=self._loss_weights.depth_huber_m,
+            exposure=exposure,
         )
         self._support.append(view)
 
@@ -206,8 +213,6 @@ class Mapper:
             rates = config.rates.times(smoothstep_decay(step, steps, config.final_rate_decay))
             self._optimize(views[order[position]], 0, rates)
         pruned += self._prune_degenerate()
-        if config.exposure and self._views:
-            self._center_exposures(views)
         return MappingStats(inserted, pruned, len(self._gaussians), before, self._mean_loss())
 
     # --- one view -----------------------------------------------------------------------------------------------
@@ -232,7 +237,7 @@ class Mapper:
 
     def _optimize(self, view: View, level: int, rates: LearningRates) -> None:
         """One Adam step of all Gaussians in one view."""
-        self._gaussians, loss = self._step(
+        self._gaussians, _ = self._step(
             self._gaussians,
             self.cameras[level],
             view.training(level),
@@ -240,22 +245,6 @@ class Mapper:
             rates=rates,
             least_log_scales=np.float32(np.log(self.config.seeding.thickness_m)),
         )
-        if self.config.exposure and view is not self._views[0]:
-            decay = rates.colors / self.config.rates.colors
-            view.step_exposure(loss.d_exposure, self.config.exposure_rate * decay)
-
-    def _center_exposures(self, views: Sequence[View]) -> None:
-        """Give the map the keyframes' mean exposure, so that (0, 0) is the best guess for an image that has none.
-
-        Nothing that is drawn in an exposure changes, but for what shines through from the background.
-        """
-        gain, offset = np.array([view.exposure for view in self._views]).mean(axis=0)
-        shift = offset / np.mean([np.exp(view.exposure[0] - gain) for view in self._views])
-        for view in views:
-            a, b = view.exposure
-            view.exposure = (float(a - gain), float(b - np.exp(a - gain) * shift))
-        colors = np.float32(np.exp(gain)) * self._gaussians.colors + np.float32(shift)
-        self._gaussians = self._gaussians.replace(colors=colors)
 
     # --- what is in the map -------------------------------------------------------------------------------------
 
@@ -267,8 +256,6 @@ class Mapper:
         wanted = depth_m > 0  # zero where the mask forbids a pixel
         if len(self._gaussians):
             render = self._draw(view, 0)
-            if config.exposure:
-                view.exposure = first_exposure(render, color, view.mask)
             color = self._as_drawn(view, color, render)
             wanted = unexplained(render, color, depth_m, config.seeding, depth_sigma_m=view.depth_sigma_m)
         new = self._discs(view, color, depth_m, wanted, budget=budget)
@@ -287,8 +274,7 @@ class Mapper:
         return len(new), pruned
 
     def _as_drawn(self, view: View, color: Image, render: Render) -> Image:
-        """The view's colors in the map's exposure; where the mask forbids a pixel, those of the render."""
-        color = (color - np.float32(view.exposure[1])) * np.float32(np.exp(-view.exposure[0]))
+        """The view's colors; where the mask forbids a pixel, those of the render."""
         # errors are smoothed: a masked pixel must not count through its neighbors
         return color if view.mask is None else np.where(view.mask[..., None], color, render.color)
 

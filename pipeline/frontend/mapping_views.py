@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.geometry import projection, se3
+from duagc.pipeline.geometry import masks, projection, se3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.kernels import Render
+from duagc.pipeline.geometry.exposure import Exposure, unit_color
 from duagc.pipeline.kernels.training import TrainingView
 from duagc.pipeline.splat.losses import depth_certainty, halve
-from duagc.pipeline.splat.optimizer import BETA_1, BETA_2
 
 Image = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
@@ -35,9 +34,7 @@ class View:
         depth_sigma_m: [H, W], standard deviation of the depth, meters; None = not known pixel by pixel.
         certainty: [H, W], factors of the depth residuals (`splat.losses.depth_certainty`); None = all 1.
         half_certainty: at half size.
-        exposure: (a, b): the image is about exp(a) * rendered + b.
-        exposure_moments: of Adam, [2, 2].
-        exposure_steps: number of Adam steps.
+        exposure: of the image; None = as the map.
     """
 
     index: int
@@ -52,9 +49,7 @@ class View:
     depth_sigma_m: Image | None = None
     certainty: Image | None = None
     half_certainty: Image | None = None
-    exposure: tuple[float, float] = (0.0, 0.0)
-    exposure_moments: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 2)))
-    exposure_steps: int = 0
+    exposure: Exposure | None = None
 
     @classmethod
     def of(
@@ -67,6 +62,7 @@ class View:
         mask: NDArray[np.bool_] | None,
         depth_sigma_m: Image | None,
         huber_m: float,
+        exposure: Exposure | None = None,
     ) -> View:
         """A view of images that are kept, not copied, but for depth where a mask forbids pixels.
 
@@ -78,6 +74,7 @@ class View:
             mask: bool [H, W], pixels that may be used; None = all.
             depth_sigma_m: [H, W], standard deviation of the depth, meters; None = not known pixel by pixel.
             huber_m: depth sigmas up to it change nothing.
+            exposure: of the image; None = as the map.
         """
         if color.dtype != np.uint8:
             raise ValueError(f"color is an array of {color.dtype}, expected uint8")
@@ -90,15 +87,16 @@ class View:
             index=index,
             color=color,
             depth_m=depth_m,
-            half_color=halve(_from_bytes(color)),
+            half_color=halve(unit_color(color, exposure)),
             half_depth_m=_halve_depth(depth_m),
             T_map_camera=np.array(T_map_camera, dtype=np.float64),
             median_depth_m=float(np.median(near[near > 0])) if near.any() else 0.0,
             mask=mask,
-            half_mask=None if mask is None else _halve_mask(mask),
+            half_mask=None if mask is None else masks.halved(mask),
             depth_sigma_m=depth_sigma_m,
             certainty=certainty,
             half_certainty=None if certainty is None else halve(certainty),
+            exposure=exposure,
         )
 
     @property
@@ -107,20 +105,20 @@ class View:
         return self.T_map_camera[:3, 3] + self.median_depth_m * self.T_map_camera[:3, 2]
 
     def images(self, level: int) -> tuple[Image, Image]:
-        """Color 0..1 and depth of a level.
+        """Color in that of the map, 0..1 and above, and depth of a level.
 
         Args:
             level: 0 = full size, 1 = half.
         """
         if level == 0:
-            return _from_bytes(self.color), self.depth_m
+            return unit_color(self.color, self.exposure), self.depth_m
         return self.half_color, self.half_depth_m
 
     def training(self, level: int) -> TrainingView:
         """The images of a level as a training step takes them."""
         color, depth_m = self.images(level)
         certainty = self.certainty if level == 0 else self.half_certainty
-        return TrainingView(color, depth_m, self.T_map_camera, self.usable(level), certainty, self.exposure)
+        return TrainingView(color, depth_m, self.T_map_camera, self.usable(level), certainty)
 
     def usable(self, level: int) -> NDArray[np.bool_] | None:
         """The mask of a level; None = all pixels.
@@ -129,22 +127,6 @@ class View:
             level: 0 = full size, 1 = half.
         """
         return self.mask if level == 0 else self.half_mask
-
-    def step_exposure(self, gradient: tuple[float, float], rate: float) -> None:
-        """One Adam step of the exposure.
-
-        Args:
-            gradient: of the loss by (a, b).
-            rate: learning rate.
-        """
-        self.exposure_steps += 1
-        g = np.array(gradient)
-        first, second = self.exposure_moments
-        first, second = BETA_1 * first + (1 - BETA_1) * g, BETA_2 * second + (1 - BETA_2) * g * g
-        self.exposure_moments = np.stack([first, second])
-        unbiased = np.sqrt(second / (1 - BETA_2**self.exposure_steps)) + 1e-12
-        a, b = np.array(self.exposure) - rate * first / (1 - BETA_1**self.exposure_steps) / unbiased
-        self.exposure = (float(a), float(b))
 
 
 def view_overlap(view: View, other: View, camera: PinholeCamera, stride_px: int = 16) -> float:
@@ -167,39 +149,9 @@ def view_overlap(view: View, other: View, camera: PinholeCamera, stride_px: int 
     return projection.overlap(seen, camera, depth_m=other.depth_m)
 
 
-def first_exposure(
-    render: Render, color: Image, mask: NDArray[np.bool_] | None = None
-) -> tuple[float, float]:
-    """Log gain from the medians over the pixels that the map covers; the offset starts at zero.
-
-    Args:
-        render: of the map.
-        color: 0..1 [H, W, 3], of the view.
-        mask: bool [H, W], pixels that may be used; None = all.
-    """
-    covered = render.alpha > 0.9
-    if mask is not None:
-        covered &= mask
-    if np.count_nonzero(covered) < 1000:
-        return 0.0, 0.0
-    ratio = np.median(color[covered]) / max(float(np.median(render.color[covered])), 0.02)
-    return float(np.log(np.clip(ratio, 0.25, 4.0))), 0.0
-
-
-def _from_bytes(color: Bytes) -> Image:
-    """Colors 0..1."""
-    return color * np.float32(1 / 255)
-
-
 def _halve_depth(depth_m: Image) -> Image:
     """Means of 2x2 blocks of measured depths on one surface (within 2 %); 0 where a pixel is missing or differs."""
     h, w = depth_m.shape[0] // 2 * 2, depth_m.shape[1] // 2 * 2
     quarters = np.stack([depth_m[i:h:2, j:w:2] for i in (0, 1) for j in (0, 1)])
     nearest, farthest = quarters.min(axis=0), quarters.max(axis=0)
     return np.where((nearest > 0) & (farthest <= 1.02 * nearest), halve(depth_m), np.float32(0))
-
-
-def _halve_mask(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Blocks of 2x2 pixels that may all be used; a last odd row or column is cut."""
-    h, w = mask.shape[0] // 2 * 2, mask.shape[1] // 2 * 2
-    return mask[0:h:2, :w:2] & mask[0:h:2, 1:w:2] & mask[1:h:2, :w:2] & mask[1:h:2, 1:w:2]

@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import ModelConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.frontend.tracked import TrackedFrame
@@ -22,8 +22,6 @@ from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.recording import RgbdFrame
 from duagc.pipeline.registration import Reference, Registration, RegistrationConfig, RgbdPyramid, register
 from duagc.pipeline.splat.gaussians import Gaussians
-
-Array = NDArray[np.float64]
 
 
 class ModelTracker:
@@ -97,7 +95,12 @@ class ModelTracker:
         image = frame.color * np.float32(1 / 255)
         levels = self._levels + self.config.level
         seen = RgbdPyramid.build(
-            image, frame.usable_depth, self._full, levels, depth_sigma_m=frame.depth_sigma
+            image,
+            frame.usable_depth,
+            self._full,
+            levels,
+            depth_sigma_m=frame.depth_sigma,
+            mask=frame.mask,
         )
         target = RgbdPyramid(seen.levels[self.config.level :])
         return register(reference, target, np.eye(4), self._registration, prior_information=information)

@@ -7,13 +7,25 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import is_held_out
 from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.frontend.components import Component
 from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes
+from duagc.pipeline.frontend.submaps import TrackedLog
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
-from duagc.pipeline.messages import GaussianMap, Keyframe, KeyframeFactor, MapUpdate, Odometry, map_frame
+from duagc.pipeline.geometry.exposure import ExposureTrack
+from duagc.pipeline.messages import (
+    FrameExposure,
+    GaussianMap,
+    Keyframe,
+    KeyframeFactor,
+    MapUpdate,
+    Odometry,
+    Submap,
+    map_frame,
+)
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import LogWriter
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -21,8 +33,6 @@ from duagc.schemas import topics
 
 LATENCY_NS = 30_000_000
 """Outputs are received this long after the frame that they are about: a constant, never the wall clock."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -103,6 +113,24 @@ def factor_messages(
     ]
 
 
+def exposure_messages(
+    name: str, exposures: ExposureTrack, odometry: Sequence[Odometry]
+) -> list[FrameExposure]:
+    """The exposures of all frames that have one, in the order of time.
+
+    Args:
+        name: of the component.
+        exposures: of the log.
+        odometry: of every frame.
+    """
+    stamps_ns = {message.frame_index: message.stamp_ns for message in odometry}
+    indices = exposures.frame_index.tolist()
+    return [
+        FrameExposure(stamps_ns[index], name, index, gain, offset)
+        for index, gain, offset in zip(indices, exposures.gain, exposures.offset, strict=True)
+    ]
+
+
 def odometry_message(robot: str, frame: TrackedFrame, T_map_keyframes: Array) -> Odometry:
     """The pose of a frame.
 
@@ -128,6 +156,38 @@ def odometry_message(robot: str, frame: TrackedFrame, T_map_keyframes: Array) ->
     )
 
 
+def submap_messages(robot: str, component: Component, log: TrackedLog) -> list[Submap]:
+    """The submaps of a component; none if the robot has a single one.
+
+    Args:
+        robot: name of the component.
+        component: of the robot.
+        log: as it was tracked.
+    """
+    if len(log.submaps) < 2:
+        return []
+    messages = []
+    for submap in (s for s in log.submaps if s.number in component.numbers):
+        frames = [
+            frame.frame_index
+            for frame, number in zip(log.frames, log.submap_of, strict=True)
+            if number == submap.number and frame.status is not Status.LOST
+        ]
+        messages.append(
+            Submap(
+                stamp_ns=submap.keyframes[0].stamp_ns,
+                robot=robot,
+                submap=submap.number,
+                first_frame=frames[0],
+                last_frame=frames[-1],
+                frames=len(frames),
+                keyframes=len(submap.keyframes),
+                loop_closures=component.closures[submap.number],
+            )
+        )
+    return messages
+
+
 def write_log(
     out_path: Path,
     robot: str,
@@ -135,7 +195,9 @@ def write_log(
     *,
     keyframes: Sequence[Keyframe],
     factors: Sequence[KeyframeFactor],
+    exposures: Sequence[FrameExposure],
     updates: Sequence[MapUpdate],
+    submaps: Sequence[Submap],
     maps: Maps,
     notes: Mapping[str, str],
 ) -> None:
@@ -147,10 +209,13 @@ def write_log(
         odometry: of every frame.
         keyframes: messages of the keyframes.
         factors: of the pose graph.
+        exposures: of the frames that have one.
         updates: of the map.
+        submaps: of the component.
         maps: the robot's maps.
         notes: metadata of the log.
     """
+    exposure_of = {exposure.frame_index: exposure for exposure in exposures}
     keyframe_of = {keyframe.frame_index: keyframe for keyframe in keyframes}
     factors_of: dict[int, list[KeyframeFactor]] = {}
     for factor in factors:
@@ -165,6 +230,9 @@ def write_log(
         for message in odometry:
             time_ns = message.stamp_ns + LATENCY_NS
             log.write(topics.ODOMETRY.of(robot), message, time_ns, message.stamp_ns)
+            if message.frame_index in exposure_of:
+                exposure = exposure_of[message.frame_index]
+                log.write(topics.EXPOSURE.of(robot), exposure, time_ns, message.stamp_ns)
             keyframe = keyframe_of.get(message.frame_index)
             if keyframe is not None:
                 log.write(topics.KEYFRAME.of(robot), keyframe, time_ns, message.stamp_ns)
@@ -173,6 +241,8 @@ def write_log(
                 for update in updates_of.get(keyframe.keyframe_index, []):
                     log.write(topics.MAP_UPDATE.of(robot), update, time_ns, message.stamp_ns)
         last = odometry[-1].stamp_ns
+        for submap in submaps:
+            log.write(topics.SUBMAP.of(robot), submap, last + LATENCY_NS, submap.stamp_ns)
         for topic, gaussians in ((topics.UNREFINED_MAP, maps.unrefined), (topics.MAP, maps.final)):
             if gaussians is not None:
                 whole = GaussianMap(last, robot, map_frame(robot), gaussians, depth=maps.depth)

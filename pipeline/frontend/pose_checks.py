@@ -12,10 +12,15 @@ from typing import Protocol
 
 import numpy as np
 
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.frontend.failure import Reason, free_space_violations
+from duagc.pipeline.frontend.judgment import contradicts
+from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, TrackingState
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.registration.geometric_verification import features_agree
+from duagc.pipeline.registration.features import matches
+from duagc.pipeline.registration.geometric_verification import angles_between, features_agree, judge_motion
 
 
 class PoseCheck(Protocol):
@@ -111,7 +116,11 @@ class DepthColorConsistency:
         if not color_only.ok or color_only.rms_gray > largest:
             return Reason.CONTRADICTION if state.depth_color_inconsistent else candidate
         T, T_color_only = candidate.result.T_reference_target, color_only.T_reference_target
-        if state.last_good.agrees(T, T_color_only, limits, state.depth_color_inconsistent):
+        agree = state.last_good.agrees(T, T_color_only, limits, state.depth_color_inconsistent)
+        predicted = state.predict(frame.stamp_ns)
+        weak = predicted.sigma_px > state.config.tracking.prior.max_deviation_px and not state.lost
+        keyframe = state.keyframes[candidate.keyframe_index]
+        if agree or (weak and _features_prefer(T, T_color_only, keyframe, frame)):
             return replace(candidate, unlike=True)
         state.depth_color_inconsistent = True
         view, viewpoint = frame.pyramid.levels[-1], state.viewpoint(candidate)
@@ -190,6 +199,40 @@ class FeaturesConfirm:
         return candidate if expected and not state.is_long_lost(frame.stamp_ns) else Reason.OBSTRUCTED
 
 
+class FeaturesDoNotContradict:
+    """The features of the frame must not say, by the motion that they agree on, that the camera is elsewhere.
+
+    `FeaturesConfirm` lets pass what is off by as much as depth can be: a decimeter at two meters.
+    """
+
+    def judge(
+        self, state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
+    ) -> PoseCandidate | Reason:
+        k, limits = candidate.keyframe_index, state.config.keyframes.judgment
+        # the draws only choose which samples are tried: the same in every run
+        rng = random_streams.generator(0, "frame_judgment", frame=frame.frame_index, keyframe=k)
+        features, T = state.keyframes[k].features, candidate.result.T_reference_target
+        found = judge_motion(features, frame.features, T, config=limits, rng=rng)
+        return Reason.OBSTRUCTED if found is not None and contradicts(found, limits) else candidate
+
+
+def _features_prefer(T: Array, T_other: Array, keyframe: TrackedKeyframe, frame: CurrentFrame) -> bool:
+    """Whether features say that the camera is at T rather than at T_other.
+
+    The keyframe's features, with their depth, are compared with where the frame's color shows them: its depth, which
+    may be of another time, takes no part.
+    """
+    limits = frame.relocalization
+    pairs = matches(keyframe.features.descriptors, frame.features.descriptors, limits.ratio)
+    seen = frame.features.points[pairs[:, 1]].astype(np.float64)
+    points = keyframe.features.points[pairs[:, 0]].astype(np.float64)
+    angles, other = (angles_between(se3.transform(se3.inverse(X), points), seen) for X in (T, T_other))
+    agree = np.minimum(angles, other) < limits.max_angle_rad
+    if agree.sum() < limits.min_inliers:
+        return False
+    return bool(np.median(angles[agree]) <= np.median(other[agree]))
+
+
 def _from_prediction(
     state: TrackingState, frame: CurrentFrame, candidate: PoseCandidate
 ) -> tuple[float, float]:
@@ -211,3 +254,15 @@ PLAUSIBLE: tuple[PoseCheck, ...] = (
     FeaturesConfirm(),
 )
 """Checks of a pose that was not simply followed."""
+
+FOUND_NEARBY: tuple[PoseCheck, ...] = (*PLAUSIBLE, DepthColorConsistency())
+"""Checks of a pose that was found near the last one."""
+
+FOUND_BY_FEATURES: tuple[PoseCheck, ...] = (
+    RespectsFreeSpace(),
+    WithinReach(),
+    FeaturesConfirm(),
+    FeaturesDoNotContradict(),
+)
+"""Checks of a pose that was found from matched features, whose descriptors say that it looks alike: far from its
+keyframe a frame overlaps little, and its gray values fit less well than from near."""

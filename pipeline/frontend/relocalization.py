@@ -8,10 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import RelocalizationConfig
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.keyframe_graph import predicted_overlap
@@ -21,8 +19,6 @@ from duagc.pipeline.frontend.tracking_state import CurrentFrame, PoseCandidate, 
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration.features import Features, matches
 from duagc.pipeline.registration.geometric_verification import motion_from_features
-
-Array = NDArray[np.float64]
 
 
 def place_candidates(
@@ -103,18 +99,34 @@ class Relocalizer:
         before, self._unconfirmed = self._unconfirmed, None
         index, last = before.candidate.keyframe_index, before.candidate.result.T_reference_target
         tracking = state.config.tracking
-        result = register_until_stable(
-            state.keyframes[index], frame.pyramid, last, tracking, first=tracking.registration
-        )
-        candidate = PoseCandidate(index, result)
-        moved_m, _ = se3.distance(last, result.T_reference_target)
         reach_m = tracking.failure.max_speed_m_s * (frame.stamp_ns - before.stamp_ns) * 1e-9
-        if moved_m > reach_m or isinstance(verify(PLAUSIBLE, state, frame, candidate), Reason):
+        candidate = None
+        for start in _starts(state, frame, index, last):
+            result = register_until_stable(
+                state.keyframes[index], frame.pyramid, start, tracking, first=tracking.registration
+            )
+            found = verify(PLAUSIBLE, state, frame, PoseCandidate(index, result))
+            moved_m, _ = se3.distance(last, result.T_reference_target)
+            if isinstance(found, PoseCandidate) and moved_m <= reach_m:
+                candidate = found
+                break
+        if candidate is None:
             return None
         if before.agreed + 1 >= tracking.relocalization.confirmations:
             return candidate
         self._unconfirmed = _Unconfirmed(candidate, frame.stamp_ns, before.agreed + 1)
         return Reason.UNCONFIRMED
+
+
+def _starts(state: TrackingState, frame: CurrentFrame, keyframe_index: int, last: Array) -> Iterator[Array]:
+    """Where the registration to a keyframe may start: at the last pose, or by features if the camera has left it."""
+    yield last
+    # the draws only choose which samples are tried: the same in every run
+    rng = random_streams.generator(0, "confirmation", frame=frame.frame_index, keyframe=keyframe_index)
+    features, config = state.keyframes[keyframe_index].features, state.config.tracking.relocalization
+    moved = motion_from_features(features, frame.features, config, rng)
+    if moved.T_first_second is not None and moved.accepted:
+        yield moved.T_first_second
 
 
 def find_place(state: TrackingState, frame: CurrentFrame) -> PoseCandidate | None:

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import TrackingConfig
 from duagc.pipeline.frontend.tracked import TrackedKeyframe
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Outcome, Registration, RegistrationConfig, RgbdPyramid, register
-
-Array = NDArray[np.float64]
 
 
 def register_until_stable(

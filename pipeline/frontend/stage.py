@@ -9,31 +9,40 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base import progress as progress_bar
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.component_names import component_name, submap_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
-from duagc.pipeline.frontend import bundle, loops
+from duagc.pipeline.frontend.bundle import Images
+from duagc.pipeline.frontend.components import Component
+from duagc.pipeline.frontend.exposure import ExposureEstimation
 from duagc.pipeline.frontend.failure import Reason
-from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes, solve_pose_graph
+from duagc.pipeline.frontend.leading_frames import track_leading_frames
 from duagc.pipeline.frontend.output import (
     Maps,
+    exposure_messages,
     factor_messages,
     keyframe_messages,
     odometry_message,
+    submap_messages,
     write_log,
 )
+from duagc.pipeline.frontend.pose_optimization import PathOptimization
+from duagc.pipeline.frontend.submap_joining import join_submaps
+from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
-from duagc.pipeline.frontend.tracking import Tracker
+from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.geometry.statistics import evenly_spaced
+from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.messages import Keyframe, MapUpdate
-from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import RgbdLog, open_rgbd
 from duagc.pipeline.registration import RgbdPyramid
 from duagc.pipeline.registration.moving import FreeSpace
@@ -41,8 +50,6 @@ from duagc.pipeline.splat.gaussians import Gaussians
 
 if TYPE_CHECKING:
     from duagc.pipeline.frontend.model_registration import ModelTracker
-
-Array = NDArray[np.float64]
 
 
 def run_frontend(
@@ -75,105 +82,203 @@ def run_frontend(
     with open_rgbd(log_path) as log:
         if len(log) == 0:
             raise DuagError(f"{log_path}: has no image, expected at least one")
-        tracker, frames = _track(log, config, progress)
-        if not tracker.keyframes:
-            reasons = ", ".join(sorted({frame.reason.value for frame in frames}))
+        tracked = _track_moved(log, config, progress)
+        if not tracked.submaps[0].keyframes:
+            reasons = ", ".join(sorted({frame.reason.value for frame in tracked.frames}))
             size = f"{log.camera.width} x {log.camera.height}"
             raise DuagError(
                 f"{log_path}: found no frame of {size} pixels to begin a map with ({reasons}), "
                 "expected one with depth in enough of them"
             )
-        noise_m = depth_noise_m(frames)
+        noise_m = depth_noise_m(tracked.frames)
         clock.lap("tracking_s")
-        solution, pairs = _optimize_poses(log, tracker, config, seed)
-        keyframes = keyframe_messages(log.robot, tracker.keyframes, solution)
-        factors = factor_messages(log.robot, tracker.keyframes, pairs, solution)
+        components = join_submaps(tracked.submaps, _images(log), config, seed=seed, robot=log.robot)
+        frames = [component.frames(tracked) for component in components]
+        for name, at in _named(log.robot, components, frames):
+            stage = _ComponentStage(
+                log=log,
+                name=name,
+                config=config,
+                seed=seed,
+                threads=threads,
+                progress=progress,
+                noise_m=noise_m,
+                clock=clock,
+            )
+            path = out_path if name == log.robot else component_path(out_path, name)
+            stage.run(components[at], frames[at], tracked, path)
+    return clock.laps
+
+
+def component_path(frontend: Path, name: str) -> Path:
+    """The log of a component that did not join the others of its robot: next to that of the robot.
+
+    Args:
+        frontend: log of the robot.
+        name: of the component.
+    """
+    return frontend.with_name(f"{frontend.stem}.{submap_of(name)}{frontend.suffix}")
+
+
+def _named(
+    robot: str, components: Sequence[Component], frames: Sequence[Sequence[TrackedFrame]]
+) -> list[tuple[str, int]]:
+    """Names of components and their places: the one with most frames has the robot's name, others their number too."""
+    posed = [sum(frame.status is not Status.LOST for frame in of_component) for of_component in frames]
+    largest = int(np.argmax(posed))  # the first of equals
+    others = [(component_name(robot, c.numbers[0]), at) for at, c in enumerate(components) if at != largest]
+    return [(robot, largest), *others]
+
+
+def _track(log: RgbdLog, config: FrontendConfig, progress: bool) -> TrackedLog:
+    """Track all frames in order."""
+    tracker = SubmapTracker(log.camera, config, log.motion_prior())
+    source = log.frames()
+    if progress:
+        source = progress_bar.track(source, f"tracking {log.robot}", len(log))
+    for frame in source:
+        tracker.track(
+            frame.index,
+            frame.stamp_ns,
+            frame.color.astype(np.float32) * np.float32(1 / 255),
+            frame.depth,
+            mask=frame.mask,
+            depth_sigma_m=frame.depth_sigma,
+            depth_offset_ns=frame.depth_offset_ns,
+            depth_moved=frame.depth_moved,
+        )
+    return tracker.finish()
+
+
+def _track_moved(log: RgbdLog, config: FrontendConfig, progress: bool) -> TrackedLog:
+    """Track all frames; where color and depth are of different times, again with depth moved by the first result."""
+    tracked = _track(log, config, progress)
+    if log.pairing.largest_offset_ns and tracked.submaps[0].keyframes:
+        log.move_depth(*_trajectories(tracked))
+        tracked = _track(log, config, progress)
+    if not tracked.submaps[0].keyframes:
+        return tracked
+    tracked = track_leading_frames(log, tracked, config)
+    log.move_depth(*_trajectories(tracked))
+    return tracked
+
+
+def _trajectories(tracked: TrackedLog) -> list[Trajectory]:
+    """T_submap_camera of the frames that have a pose, by submap."""
+    out = []
+    for submap in tracked.submaps:
+        frames = [f for f, n in zip(tracked.frames, tracked.submap_of, strict=True) if n == submap.number]
+        out.append(_trajectory(frames, np.array([k.T_map_keyframe for k in submap.keyframes])))
+    return out
+
+
+def _trajectory(frames: Sequence[TrackedFrame], T_map_keyframe: Array) -> Trajectory:
+    """T_map_camera of the frames that have a pose."""
+    placed = [frame for frame in frames if frame.status is not Status.LOST]
+    poses = [T_map_keyframe[frame.keyframe_index] @ frame.T_keyframe_camera for frame in placed]
+    stamps = np.array([frame.stamp_ns for frame in placed], dtype=np.int64)
+    return Trajectory(stamps, np.array(poses).reshape(-1, 4, 4))
+
+
+def _images(log: RgbdLog) -> Images:
+    """Reads the images of a frame, by its index and the number of pyramid levels."""
+
+    def images(frame_index: int, levels: int) -> RgbdPyramid:
+        frame = log.frame(frame_index)
+        color = frame.color * np.float32(1 / 255)
+        return RgbdPyramid.build(
+            color,
+            frame.usable_depth,
+            log.camera,
+            levels,
+            depth_sigma_m=frame.depth_sigma,
+            mask=frame.mask,
+        )
+
+    return images
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ComponentStage:
+    """From the submaps of a component to its log.
+
+    Attributes:
+        log: of the robot.
+        name: of the component: that of the robot, or with a number.
+        config: of the stage.
+        seed: of the run.
+        threads: of the rasterizer.
+        progress: whether it is shown.
+        noise_m: noise of the depth images.
+        clock: of the stage.
+    """
+
+    log: RgbdLog
+    name: str
+    config: FrontendConfig
+    seed: int
+    threads: int
+    progress: bool
+    noise_m: float | None
+    clock: _Clock
+
+    def run(self, component: Component, frames: list[TrackedFrame], tracked: TrackedLog, path: Path) -> None:
+        """Optimize the poses, map, and write the log.
+
+        Args:
+            component: keyframes and pose graph.
+            frames: every frame of the log.
+            tracked: the log as it was tracked.
+            path: of the log.
+        """
+        log, clock = self.log, self.clock
+        optimization = PathOptimization(_images(log), self.config, self.seed, log.robot)
+        optimized = optimization.run(component.keyframes, frames, component.pairs)
+        solution, frames = optimized.solution, optimized.frames
+        log.move_depth(_trajectory(frames, solution.T_map_keyframe))
+        keyframes = keyframe_messages(self.name, optimized.keyframes, solution)
+        factors = factor_messages(self.name, optimized.keyframes, optimized.factors, solution)
+        estimation = ExposureEstimation(log.frame, log.camera, self.config.exposure)
+        exposures = estimation.run(
+            [keyframe.frame_index for keyframe in keyframes],
+            solution.T_map_keyframe,
+            [(factor.i, factor.j) for factor in optimized.factors],
+            frames,
+        )
         clock.lap("refinement_s")
         updates, maps, frames = _map(
             log,
             keyframes,
             frames,
-            config,
-            noise_m=noise_m,
-            seed=seed,
-            threads=threads,
-            progress=progress,
+            self.config,
+            name=self.name,
+            exposures=exposures,
+            noise_m=self.noise_m,
+            seed=self.seed,
+            threads=self.threads,
+            progress=self.progress,
             clock=clock,
         )
         clock.lap("final_refinement_s")
         notes = {
             "color_without_depth": str(len(log.pairing.color_alone)),
             "depth_without_color": str(len(log.pairing.depth_alone)),
-            "depth_noise_m": "unknown" if noise_m is None else f"{noise_m:.6f}",
+            "depth_noise_m": "unknown" if self.noise_m is None else f"{self.noise_m:.6f}",
         }
-    odometry = [odometry_message(log.robot, frame, solution.T_map_keyframe) for frame in frames]
-    write_log(
-        out_path,
-        log.robot,
-        odometry,
-        keyframes=keyframes,
-        factors=factors,
-        updates=updates,
-        maps=maps,
-        notes=notes,
-    )
-    clock.lap("writing_s")
-    return clock.laps
-
-
-def _track(log: RgbdLog, config: FrontendConfig, progress: bool) -> tuple[Tracker, list[TrackedFrame]]:
-    """Track all frames in order."""
-    tracker = Tracker(log.camera, config, log.motion_prior())
-    source = log.frames()
-    if progress:
-        source = progress_bar.track(source, f"tracking {log.robot}", len(log))
-    tracked = []
-    for frame in source:
-        image = frame.color.astype(np.float32) * np.float32(1 / 255)
-        found = tracker.track(
-            frame.index,
-            frame.stamp_ns,
-            image,
-            frame.depth,
-            mask=frame.mask,
-            depth_sigma_m=frame.depth_sigma,
+        odometry = [odometry_message(self.name, frame, solution.T_map_keyframe) for frame in frames]
+        write_log(
+            path,
+            self.name,
+            odometry,
+            keyframes=keyframes,
+            factors=factors,
+            exposures=exposure_messages(self.name, exposures, odometry),
+            updates=updates,
+            submaps=submap_messages(self.name, component, tracked),
+            maps=maps,
+            notes=notes,
         )
-        tracked.append(found)
-    return tracker, tracked
-
-
-def _optimize_poses(
-    log: RgbdLog, tracker: Tracker, config: FrontendConfig, seed: int
-) -> tuple[OptimizedKeyframes, Sequence[RelativePose]]:
-    """Keyframe poses by all their images together, and the factors of the pose graph."""
-    keyframes, settings = tracker.keyframes, config.keyframes
-    start = np.array([keyframe.T_map_keyframe for keyframe in keyframes])
-    if len(keyframes) < 2 or not (settings.local_optimization or settings.loops.enabled):
-        return solve_pose_graph(start, tracker.pairs, settings.huber_sigmas), tracker.pairs
-
-    def images(index: int, levels: int) -> RgbdPyramid:
-        frame = log.frame(keyframes[index].frame_index)
-        color = frame.color * np.float32(1 / 255)
-        return RgbdPyramid.build(
-            color, frame.usable_depth, log.camera, levels, depth_sigma_m=frame.depth_sigma
-        )
-
-    registration = config.tracking.registration
-    pairs = list(tracker.pairs)
-    if settings.loops.enabled:
-        tracked = solve_pose_graph(start, pairs, settings.huber_sigmas).T_map_keyframe
-        pairs += loops.find_loops(
-            tracked,
-            keyframes,
-            images,
-            config=settings.loops,
-            registration=registration,
-            seed=seed,
-            robot=log.robot,
-        )
-    if not settings.local_optimization:
-        return solve_pose_graph(start, pairs, settings.huber_sigmas), pairs
-    return bundle.optimize(start, keyframes, images, pairs, config=settings, registration=registration)
+        clock.lap("writing_s")
 
 
 def _map(
@@ -182,6 +287,8 @@ def _map(
     frames: list[TrackedFrame],
     config: FrontendConfig,
     *,
+    name: str,
+    exposures: ExposureTrack,
     noise_m: float | None,
     seed: int,
     threads: int,
@@ -190,6 +297,7 @@ def _map(
 ) -> tuple[list[MapUpdate], Maps, list[TrackedFrame]]:
     """Grow the map at the keyframes' poses; one update per keyframe, and one for the final optimization.
 
+    All images are brought to one exposure, that of the map.
     The other frames are registered to the grown map, and some of them, never held-out ones, support its optimization.
     """
     if not config.mapping_enabled:
@@ -201,7 +309,7 @@ def _map(
     def update(keyframe: Keyframe, stats: MappingStats) -> MapUpdate:
         return MapUpdate(
             stamp_ns=keyframe.stamp_ns,
-            robot=log.robot,
+            robot=name,
             keyframe_index=keyframe.keyframe_index,
             inserted=stats.inserted,
             pruned=stats.pruned,
@@ -214,7 +322,7 @@ def _map(
     free = FreeSpace(log.camera, config.moving)
     for keyframe in keyframes:
         free.add(log.frame(keyframe.frame_index).usable_depth, keyframe.T_map_camera)
-    steps = progress_bar.track(keyframes, f"mapping {log.robot}") if progress else keyframes
+    steps = progress_bar.track(keyframes, f"mapping {name}") if progress else keyframes
     updates = []
     for keyframe in steps:
         frame = log.frame(keyframe.frame_index)
@@ -225,6 +333,7 @@ def _map(
             keyframe.T_map_camera,
             mask=free.usable(frame.usable_depth, keyframe.T_map_camera, frame.mask),
             depth_sigma_m=frame.depth_sigma,
+            exposure=exposures.at(frame.index),
         )
         updates.append(update(keyframe, stats))
     unrefined = mapper.gaussians
@@ -249,6 +358,7 @@ def _map(
             supporting.T_keyframe_camera,
             mask=free.usable(frame.usable_depth, T_map_camera, frame.mask),
             depth_sigma_m=frame.depth_sigma,
+            exposure=exposures.at(frame.index),
         )
     updates.append(update(keyframes[-1], mapper.finalize()))
     return updates, Maps(mapper.gaussians, unrefined, mapper.depth), frames
@@ -316,7 +426,7 @@ class _Clock:
         self._last = time.perf_counter()
 
     def lap(self, name: str) -> None:
-        """End a part; `laps` holds its time under this name."""
+        """End a part; `laps` holds its time under this name, summed over components."""
         now = time.perf_counter()
-        self.laps[name] = round(now - self._last, 3)
+        self.laps[name] = round(self.laps.get(name, 0.0) + now - self._last, 3)
         self._last = now

@@ -7,14 +7,12 @@ from enum import Enum
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.registration import Level, Reference, Registration
 from duagc.pipeline.registration.features import Features
-
-Array = NDArray[np.float64]
 
 
 class Status(Enum):
@@ -119,3 +117,9 @@ class TrackedKeyframe:
         points = self.reference.levels[-1].points.astype(np.float64)
         middle = np.median(points, axis=0) if len(points) else np.zeros(3)
         return se3.transform(self.T_map_keyframe, middle[None])[0]
+
+    @cached_property
+    def median_depth_m(self) -> float:
+        """Median depth of what it sees, meters; infinite if it sees nothing."""
+        known = self.coarsest.inverse_depth[self.coarsest.inverse_depth > 0]
+        return 1 / float(np.median(known)) if len(known) else np.inf

@@ -17,10 +17,23 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
 from duagc.pipeline.frontend.color_only import LastGoodFrame
-from duagc.pipeline.frontend.failure import Reason, has_enough_depth, saturated_share
+from duagc.pipeline.frontend.failure import (
+    Reason,
+    has_enough_depth,
+    saturated_share,
+    shows_anything,
+)
+from duagc.pipeline.frontend.feature_initialization import initial_motions
 from duagc.pipeline.frontend.keyframe_graph import becomes_keyframe
 from duagc.pipeline.frontend.keyframe_insertion import insert_first_keyframe, insert_keyframe
-from duagc.pipeline.frontend.pose_checks import FOLLOWED, PLAUSIBLE, DepthColorConsistency, PoseCheck, verify
+from duagc.pipeline.frontend.pose_checks import (
+    FOLLOWED,
+    FOUND_BY_FEATURES,
+    FOUND_NEARBY,
+    PLAUSIBLE,
+    PoseCheck,
+    verify,
+)
 from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.stable_registration import register_until_stable
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
@@ -29,11 +42,11 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import MotionPrior
+from duagc.pipeline.recording.depth_sources import DepthImage
+from duagc.pipeline.recording.moved_depth import move_depth
 from duagc.pipeline.registration import Reference, Registration, RgbdPyramid, register
 
 Image = NDArray[np.floating]
-
-_FOUND_NEARBY: tuple[PoseCheck, ...] = (*PLAUSIBLE, DepthColorConsistency())
 
 
 class Tracker:
@@ -82,6 +95,8 @@ class Tracker:
         *,
         mask: NDArray[np.bool_] | None = None,
         depth_sigma_m: Image | None = None,
+        depth_offset_ns: int = 0,
+        depth_moved: bool = False,
     ) -> TrackedFrame:
         """Track one frame; the first that can be used becomes keyframe 0 and the origin of the map.
 
@@ -90,19 +105,72 @@ class Tracker:
             stamp_ns: time of the frame, increasing.
             image: color [h, w, 3] or gray [h, w], 0..1.
             depth_m: [h, w], meters, 0 = unknown.
-            mask: bool [h, w], False where a pixel must not be used; its depth counts as unknown. None = all
+            mask: bool [h, w], False where a pixel must not be used, neither its depth nor its color. None = all
                 may.
             depth_sigma_m: [h, w], standard deviation of the depth, meters; None: that of the sensor model.
+            depth_offset_ns: how much later the depth was taken.
+            depth_moved: whether it was moved from there; if not, depth of a time too far for a keyframe is moved by
+                the velocity of the camera, or left out where that is unknown. What is nearer stays: with most cameras
+                the depth of the keyframe is as late.
         """
-        state, tracking = self.state, self.state.config.tracking
-        if mask is not None:
-            depth_m = np.where(mask, depth_m, 0)
-        state.intervals.update(stamp_ns)
-        state.lost = state.lost or state.is_after_gap(stamp_ns)
-        pyramid = RgbdPyramid.build(
-            image, depth_m, self.camera, len(tracking.strides), depth_sigma_m=depth_sigma_m
+        return self.track_frame(
+            self.prepared(
+                frame_index,
+                stamp_ns,
+                image,
+                depth_m,
+                mask=mask,
+                depth_sigma_m=depth_sigma_m,
+                depth_offset_ns=depth_offset_ns,
+                depth_moved=depth_moved,
+            )
         )
-        frame = CurrentFrame(frame_index, stamp_ns, pyramid, tracking.relocalization)
+
+    def prepared(
+        self,
+        frame_index: int,
+        stamp_ns: int,
+        image: Image,
+        depth_m: Image,
+        *,
+        mask: NDArray[np.bool_] | None = None,
+        depth_sigma_m: Image | None = None,
+        depth_offset_ns: int = 0,
+        depth_moved: bool = False,
+    ) -> CurrentFrame:
+        """A frame with the images that tracking needs; the state does not change.
+
+        Args:
+            frame_index: in the log.
+            stamp_ns: time of the frame.
+            image: color [h, w, 3] or gray [h, w], 0..1.
+            depth_m: [h, w], meters, 0 = unknown.
+            mask: bool [h, w], False where a pixel must not be used; None = all may.
+            depth_sigma_m: [h, w], standard deviation of the depth, meters; None: that of the sensor model.
+            depth_offset_ns: as of `track`.
+            depth_moved: as of `track`.
+        """
+        tracking = self.state.config.tracking
+        if not depth_moved and not self._is_near(depth_offset_ns):
+            T_color_depth = self.state.depth_motion(stamp_ns, depth_offset_ns)
+            moved = DepthImage(np.zeros_like(depth_m), depth_sigma_m)
+            if T_color_depth is not None:
+                moved = move_depth(DepthImage(depth_m, depth_sigma_m), self.camera, T_color_depth)
+            depth_m, depth_sigma_m = moved.depth_m, moved.sigma_m
+        pyramid = RgbdPyramid.build(
+            image, depth_m, self.camera, len(tracking.strides), depth_sigma_m=depth_sigma_m, mask=mask
+        )
+        return CurrentFrame(frame_index, stamp_ns, pyramid, tracking.relocalization, depth_offset_ns)
+
+    def track_frame(self, frame: CurrentFrame) -> TrackedFrame:
+        """Track one frame; several trackers of the same settings may take it.
+
+        Args:
+            frame: of `prepared`.
+        """
+        state = self.state
+        state.intervals.update(frame.stamp_ns)
+        state.lost = state.lost or state.is_after_gap(frame.stamp_ns)
         missing = self._missing_image(frame)
         if missing is Reason.NONE and not state.keyframes:
             return self._initialize(frame)
@@ -116,6 +184,8 @@ class Tracker:
             frame: the current frame.
             missing: which of its images cannot be used, if any.
         """
+        if missing is Reason.NO_PIXEL:
+            return missing
         if missing is Reason.FROZEN_COLOR:
             return self._follow_by_depth(frame)
         if missing is not Reason.NONE:
@@ -127,8 +197,10 @@ class Tracker:
     # --- which images can be used ---------------------------------------------------------------------------------
 
     def _missing_image(self, frame: CurrentFrame) -> Reason:
-        """FROZEN_COLOR, FROZEN_DEPTH, NO_DEPTH or NONE; counts the frames in a row."""
+        """NO_PIXEL, FROZEN_COLOR, FROZEN_DEPTH, NO_DEPTH or NONE; counts the frames in a row."""
         state = self.state
+        if not shows_anything(frame.pyramid, state.config.tracking.failure):
+            return Reason.NO_PIXEL
         frozen = state.frozen.update(frame.pyramid)
         if frozen is Reason.FROZEN_COLOR:
             state.frames_without_color += 1
@@ -183,12 +255,20 @@ class Tracker:
         return reason
 
     def _attempts(self, frame: CurrentFrame) -> Iterator[tuple[PoseCandidate, Sequence[PoseCheck]]]:
-        """Registrations to the latest keyframe, each with its checks: from the prediction, then with wider gates."""
+        """Registrations near the last pose, each with its checks.
+
+        From the prediction, from the motion that features agree on, then with wider gates. Where the prediction is
+        weak, features come first and may outweigh what looks unlike, and color alone, which starts from it, is no
+        check. Where it is not, what looks unlike is another place.
+        """
         state, tracking, index = self.state, self.state.config.tracking, self.state.keyframe_index
         last, predicted = state.T_keyframe_camera, state.predict(frame.stamp_ns)
+        weak = predicted.sigma_px > tracking.prior.max_deviation_px and not state.lost
         starts = [predicted.T_keyframe_camera]
         if predicted.T_keyframe_camera is not last:
             starts.append(last)
+        if weak:
+            yield from self._from_features(frame)
         if not state.lost:
             for start in starts:
                 information = predicted.information if start is predicted.T_keyframe_camera else None
@@ -199,12 +279,27 @@ class Tracker:
                     tracking.registration,
                     prior_information=information,
                 )
-                yield PoseCandidate(index, result), FOLLOWED
+                yield PoseCandidate(index, result), PLAUSIBLE if weak else FOLLOWED
+        if not weak:
+            for index, guess in initial_motions(state, frame):
+                result = register_until_stable(
+                    state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
+                )
+                yield PoseCandidate(index, result), FOUND_NEARBY
         for start in starts:
             result = register_until_stable(
                 state.keyframe, frame.pyramid, start, tracking, first=tracking.recovery
             )
-            yield PoseCandidate(index, result), _FOUND_NEARBY
+            yield PoseCandidate(index, result), PLAUSIBLE if weak else FOUND_NEARBY
+
+    def _from_features(self, frame: CurrentFrame) -> Iterator[tuple[PoseCandidate, Sequence[PoseCheck]]]:
+        """Registrations from the motion that features agree on, each with its checks."""
+        state, tracking = self.state, self.state.config.tracking.verified_by_features()
+        for index, guess in initial_motions(state, frame):
+            result = register_until_stable(
+                state.keyframes[index], frame.pyramid, guess, tracking, first=tracking.registration
+            )
+            yield PoseCandidate(index, result), FOUND_BY_FEATURES
 
     # --- update ---------------------------------------------------------------------------------------------------
 
@@ -214,10 +309,11 @@ class Tracker:
         reference = Reference.from_pyramid(frame.pyramid, tracking.strides)
         used = reference.levels[: len(tracking.registration.iterations)]
         too_little = any(len(level) < tracking.registration.min_samples for level in used)
-        if is_held_out(frame.frame_index) or too_little:
+        if is_held_out(frame.frame_index) or too_little or not self._is_near(frame.depth_offset_ns):
             return self._mark_lost(frame, Reason.NO_DEPTH)
         insert_first_keyframe(state, frame, reference)
         state.stamp_ns, state.lost = frame.stamp_ns, False
+        state.remember_pose()
         state.last_good = LastGoodFrame(frame.pyramid, tracking.strides, np.eye(4), None)
         return TrackedFrame(
             frame_index=frame.frame_index,
@@ -234,6 +330,7 @@ class Tracker:
     def _mark_lost(self, frame: CurrentFrame, reason: Reason) -> TrackedFrame:
         """A frame without a pose: it keeps the last known one, with zero information."""
         self.state.lost = True
+        self.state.recent = []
         return TrackedFrame(
             frame_index=frame.frame_index,
             stamp_ns=frame.stamp_ns,
@@ -277,6 +374,7 @@ class Tracker:
             state.last_good = None
         state.keyframe_index, state.T_keyframe_camera = found.keyframe_index, result.T_reference_target
         state.stamp_ns, state.lost = frame.stamp_ns, False
+        state.remember_pose()
         self._relocalizer.reset()
         if followed and found.without is Reason.NONE:
             frames = state.config.tracking.failure.usual_frames
@@ -299,10 +397,15 @@ class Tracker:
         return (
             not is_held_out(frame.frame_index)
             and found.without is Reason.NONE
+            and self._is_near(frame.depth_offset_ns)
             and becomes_keyframe(found.result, frame.pyramid, self.state.config.keyframes)
             and self._is_well_exposed(frame.pyramid, found.result)
             and not self.state.occlusion.active
         )
+
+    def _is_near(self, depth_offset_ns: int) -> bool:
+        """Whether depth was taken so near in time to its color that others may be registered to it."""
+        return abs(depth_offset_ns) * 1e-9 <= self.state.config.keyframes.max_depth_offset_s
 
     def _is_well_exposed(self, pyramid: RgbdPyramid, result: Registration) -> bool:
         """Whether a frame looks as its keyframe does, or that must be left and the frame is not burnt out.

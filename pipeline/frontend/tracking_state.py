@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import FrontendConfig, RelocalizationConfig
 from duagc.pipeline.frontend.color_only import LastGoodFrame
 from duagc.pipeline.frontend.failure import (
@@ -25,7 +25,7 @@ from duagc.pipeline.recording import MotionPrior
 from duagc.pipeline.registration import Registration, RgbdPyramid
 from duagc.pipeline.registration.features import Features, extract_from_pyramid
 
-Array = NDArray[np.float64]
+RECENT_FRAMES = 7  # whose mean velocity moves depth of another time
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,14 @@ class CurrentFrame:
         stamp_ns: its time.
         pyramid: its images.
         relocalization: how its features are extracted.
+        depth_offset_ns: how much later its depth was taken, wherever that was moved to.
     """
 
     frame_index: int
     stamp_ns: int
     pyramid: RgbdPyramid
     relocalization: RelocalizationConfig
+    depth_offset_ns: int = 0
 
     @cached_property
     def features(self) -> Features:
@@ -84,10 +86,12 @@ class Prediction:
     Attributes:
         T_keyframe_camera: [4, 4], in the keyframe that frames are tracked against.
         information: [6, 6] of its right tangent, from the motion prior of the log; None: it is no measurement.
+        sigma_px: how far the view may be from there, pixels of the coarsest image that a registration begins with.
     """
 
     T_keyframe_camera: Array
     information: Array | None
+    sigma_px: float = 0.0
 
 
 @dataclass
@@ -109,6 +113,7 @@ class TrackingState:
         frames_without_depth: in a row, up to the current one.
         frames_without_color: the same for color.
         last_good: the last frame with depth and color and nothing in front of it.
+        recent: time and T_map_camera of the last frames that were tracked without a loss between them.
         intervals: between frames.
         frozen: detects frozen images.
         occlusion: detects objects in front of the camera.
@@ -128,6 +133,7 @@ class TrackingState:
     frames_without_depth: int = 0
     frames_without_color: int = 0
     last_good: LastGoodFrame | None = None
+    recent: list[tuple[int, Array]] = field(default_factory=list)
     intervals: FrameIntervals = field(init=False)
     frozen: FrozenImageDetector = field(init=False)
     occlusion: OcclusionDetector = field(init=False)
@@ -150,6 +156,7 @@ class TrackingState:
             keyframes=list(self.keyframes),
             pairs=list(self.pairs),
             gray_rms=list(self.gray_rms),
+            recent=list(self.recent),
         )
         other.intervals = copy.copy(self.intervals)
         other.frozen, other.occlusion = copy.copy(self.frozen), copy.copy(self.occlusion)
@@ -183,7 +190,7 @@ class TrackingState:
         followed = last @ se3.exp(self.velocity * elapsed_s) if fresh else last
         motion = self.motion.between(self.stamp_ns, stamp_ns) if self.motion is not None else None
         if motion is None:
-            return Prediction(followed, None)
+            return Prediction(followed, None, self._deviation_px(elapsed_s, turns=True))
         config, T = self.config.tracking.prior, motion.T_start_stop
         path_m, angle_rad = se3.distance(np.eye(4), T)
         if motion.knows_translation:
@@ -193,7 +200,54 @@ class TrackingState:
         sigma_rad = config.gyro_sigma_rad + config.gyro_sigma_rad_per_s * elapsed_s
         predicted = last @ T
         predicted[:3, 3] = followed[:3, 3]
-        return Prediction(predicted, np.diag([0.0] * 3 + [sigma_rad**-2.0] * 3))
+        information = np.diag([0.0] * 3 + [sigma_rad**-2.0] * 3)
+        return Prediction(predicted, information, self._deviation_px(elapsed_s, turns=False))
+
+    def _deviation_px(self, elapsed_s: float, *, turns: bool) -> float:
+        """By how much acceleration moves a view off its prediction, pixels of the coarsest image of a registration."""
+        tracking, keyframe = self.config.tracking, self.keyframe
+        halvings = len(tracking.strides) - len(tracking.registration.iterations)
+        focal_px = keyframe.coarsest.camera.fx * 2.0**halvings
+        turned = tracking.prior.angular_acceleration_rad_s2 if turns else 0.0
+        moved = tracking.prior.acceleration_m_s2 / keyframe.median_depth_m
+        return focal_px * (turned + moved) * 0.5 * elapsed_s**2
+
+    def depth_motion(self, stamp_ns: int, depth_offset_ns: int) -> Array | None:
+        """T_color_depth [4, 4], how the camera moves from the time of color to that of depth; None if unknown.
+
+        By the motion prior of the log, else by the mean velocity of the last frames: their poses followed the depth
+        that was moved by it, and with the last velocity alone an error would grow from frame to frame.
+
+        Args:
+            stamp_ns: time of the color.
+            depth_offset_ns: how much later the depth was taken; negative: earlier.
+        """
+        moved = self._mean_motion(stamp_ns, depth_offset_ns)
+        if moved is None or self.motion is None:
+            return moved
+        first, last = sorted((stamp_ns, stamp_ns + depth_offset_ns))
+        motion = self.motion.between(first, last)
+        if motion is None:
+            return moved
+        T = motion.T_start_stop if depth_offset_ns > 0 else se3.inverse(motion.T_start_stop)
+        if not motion.knows_translation:
+            T = T.copy()
+            T[:3, 3] = moved[:3, 3]
+        return T
+
+    def remember_pose(self) -> None:
+        """Take the pose of the last frame that was tracked; none before a loss counts."""
+        T_map_camera = self.keyframe.T_map_keyframe @ self.T_keyframe_camera
+        self.recent = [*self.recent[1 - RECENT_FRAMES :], (self.stamp_ns, T_map_camera)]
+
+    def _mean_motion(self, stamp_ns: int, duration_ns: int) -> Array | None:
+        """Motion [4, 4] of the camera in some time at the mean velocity of the last frames; None if unknown."""
+        fresh = self.elapsed_s(stamp_ns) <= self.config.tracking.max_extrapolation_s
+        if self.lost or not fresh or len(self.recent) < 2:
+            return None
+        (first_ns, T_map_first), (last_ns, T_map_last) = self.recent[0], self.recent[-1]
+        share = duration_ns / max(last_ns - first_ns, 1)
+        return np.asarray(se3.exp(share * se3.log(se3.inverse(T_map_first) @ T_map_last)))
 
     def is_long_lost(self, stamp_ns: int) -> bool:
         """Whether the camera is lost for so long that its last velocity means nothing any more.
@@ -201,7 +255,7 @@ class TrackingState:
         Args:
             stamp_ns: now.
         """
-        return self.lost and self.elapsed_s(stamp_ns) > self.config.tracking.max_extrapolation_s
+        return self.lost and self.elapsed_s(stamp_ns) > self._longest_gap_s
 
     def is_after_gap(self, stamp_ns: int) -> bool:
         """Whether no frame came for so long that the camera can be anywhere near; odometry bridges a gap.
@@ -209,14 +263,16 @@ class TrackingState:
         Args:
             stamp_ns: now.
         """
-        failure = self.config.tracking.failure
-        longest_s = max(
-            self.config.tracking.max_extrapolation_s, failure.gap_intervals * self.intervals.median_s
-        )
-        if not self.keyframes or self.elapsed_s(stamp_ns) <= longest_s:
+        if not self.keyframes or self.elapsed_s(stamp_ns) <= self._longest_gap_s:
             return False
         motion = self.motion.between(self.stamp_ns, stamp_ns) if self.motion is not None else None
         return motion is None or not motion.knows_translation
+
+    @property
+    def _longest_gap_s(self) -> float:
+        """Time without a pose after which the camera can be anywhere near, by the usual interval between frames."""
+        usual_s = self.config.tracking.failure.gap_intervals * self.intervals.median_s
+        return max(self.config.tracking.max_extrapolation_s, usual_s)
 
     @property
     def usual_gray_rms(self) -> float:

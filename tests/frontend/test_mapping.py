@@ -249,21 +249,6 @@ def test_how_depth_is_drawn_follows_from_its_noise() -> None:
     assert mapper(0.0005, asked).depth == "blended"
 
 
-def test_exposure_is_found() -> None:
-    config = MappingConfig(max_gaussians=2500, iterations=40, exposure=True, final_iterations=10)
-    mapper = Mapper(CAMERA, config, seed=0)
-    for k in range(3):
-        color, depth = shot(POSES[k])
-        dimmed = np.rint(color * (0.8 if k == 1 else 1.0)).astype(np.uint8)
-        mapper.add_keyframe(k, dimmed, depth, POSES[k])
-    mapper.finalize()
-    exposures = [view.exposure for view in mapper._views]
-    assert np.allclose(np.mean(exposures, axis=0), 0.0, atol=1e-6)
-    gains = [np.exp(a) * 0.5 + b for a, b in exposures]  # at mid gray
-    assert gains[1] / gains[0] == pytest.approx(0.8, abs=0.02)
-    assert gains[2] / gains[0] == pytest.approx(1.0, abs=0.02)
-
-
 def test_overlap_is_a_share_of_the_first_view() -> None:
     def view(k: int, T: np.ndarray, known: bool = True) -> View:
         color, depth = shot(POSES[k])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.config.frontend import FrontendConfig, KeyframeConfig, TrackingConfig, is_held_out
+from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.keyframe_graph import solve_pose_graph
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.frontend.tracking import Tracker
@@ -13,6 +14,7 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import ate_rmse_m
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import Motion
+from duagc.pipeline.registration import Reference, RgbdPyramid, register
 from tests.fixtures.room import CAMERA, pose, render
 
 CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)))
@@ -124,6 +126,72 @@ def test_a_moving_object_behind_a_mask_leaves_the_poses_alone() -> None:
     assert errors[False] > 10 * errors[True]
 
 
+def test_a_frame_without_a_usable_pixel_is_lost_and_said() -> None:
+    tracker, none = Tracker(CAMERA, CONFIG), np.zeros((CAMERA.height, CAMERA.width), bool)
+    frames = []
+    for k in range(6):
+        frames.append(
+            tracker.track(k, 33_333_333 * k, *render(walk(0.5 * k)), mask=none if k in (0, 3) else None)
+        )
+    assert [(f.status, f.reason) for f in frames] == [
+        (Status.LOST, Reason.NO_PIXEL),
+        (Status.OK, Reason.NONE),
+        (Status.OK, Reason.NONE),
+        (Status.LOST, Reason.NO_PIXEL),
+        (Status.RELOCALIZED, Reason.NONE),
+        (Status.OK, Reason.NONE),
+    ]
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_a_saturated_frame_is_lost_and_said_and_never_the_first_keyframe(value: float) -> None:
+    tracker, frames = Tracker(CAMERA, CONFIG), []
+    for k in range(6):
+        gray, depth_m = render(walk(0.5 * k))
+        shown = np.full_like(gray, value) if k in (0, 3) else gray
+        frames.append(tracker.track(k, 33_333_333 * k, shown, depth_m))
+    assert [f.reason for f in frames] == [
+        Reason.NO_PIXEL, Reason.NONE, Reason.NONE, Reason.NO_PIXEL, Reason.NONE, Reason.NONE,
+    ]  # fmt: skip
+    assert [k.frame_index for k in tracker.keyframes] == [1]
+
+
+def test_color_alone_does_not_see_what_is_masked() -> None:
+    """Without a depth image the mask is all that keeps a sticker in front of the lens out of the registration."""
+    usable = np.ones((CAMERA.height, CAMERA.width), bool)
+    usable[:, 40:100] = False
+    pyramids = {}
+    for k in (0, 1):
+        image, depth_m = render(walk(k))
+        for sticker in (0.0, 1.0):
+            shown = np.where(usable, image, np.float32(sticker) * (1 + np.arange(CAMERA.width) % 2) / 2)
+            pyramids[k, sticker] = RgbdPyramid.build(shown, depth_m, CAMERA, 3, mask=usable)
+    found = [
+        register(Reference.from_pyramid(pyramids[0, s]), pyramids[1, s].without_depth(), np.eye(4))
+        for s in (0.0, 1.0)
+    ]
+    assert found[0].ok
+    np.testing.assert_array_equal(found[0].T_reference_target, found[1].T_reference_target)
+    np.testing.assert_array_equal(found[0].information, found[1].information)
+    truth = se3.inverse(walk(0)) @ walk(1)
+    assert se3.distance(found[0].T_reference_target, truth)[0] < 5e-3
+
+
+def test_depth_of_long_before_makes_no_keyframe() -> None:
+    tracker = Tracker(CAMERA, CONFIG)
+    far_ns = 50_000_000
+    first = tracker.track(0, 0, *render(walk(0)), depth_offset_ns=far_ns)
+    assert (first.status, first.reason) == (Status.LOST, Reason.NO_DEPTH)
+    frames = [tracker.track(k, 33_333_333 * k, *render(walk(k))) for k in (1, 2, 3)]
+    for k in range(4, 14):
+        late = render(walk(k + 1.5))[1]
+        frames.append(tracker.track(k, 33_333_333 * k, render(walk(k))[0], late, depth_offset_ns=far_ns))
+    assert all(f.status is Status.OK for f in frames)
+    assert len(tracker.keyframes) == 1
+    frames.append(tracker.track(14, 33_333_333 * 14, *render(walk(14))))
+    assert len(tracker.keyframes) == 2
+
+
 def test_too_large_a_motion_is_not_called_tracked() -> None:
     tracker = Tracker(CAMERA, CONFIG)
     tracker.track(0, 0, *render(walk(0)))
@@ -174,11 +242,14 @@ def test_a_prior_does_not_spoil_what_the_images_tell(walked, knows_translation: 
 
 
 def test_a_prior_follows_a_jerky_turn() -> None:
-    """23 degrees a frame, every frame to the other side: no velocity predicts that, and alone it is lost."""
+    """23 degrees a frame, every frame to the other side: no velocity predicts that; without features it is lost."""
     truth = [pose(x=-0.2, z=-0.9, yaw=0.4 * (k % 2)) for k in range(7)]
     prior = Walked(lambda ns: truth[round(ns / 33_333_333)], knows_translation=False)
+    without_features = FrontendConfig.model_validate(
+        {"tracking": {"strides": (2, 1, 1, 1), "relocalization": {"min_inliers": 1000}}}
+    )
     for motion, statuses in ((None, {Status.LOST}), (prior, {Status.OK})):
-        tracker = Tracker(CAMERA, CONFIG, motion)
+        tracker = Tracker(CAMERA, without_features, motion)
         frames = [tracker.track(k, 33_333_333 * k, *render(truth[k])) for k in range(len(truth))]
         assert {frame.status for frame in frames[1::2]} == statuses
     for frame, T in zip(frames, truth, strict=True):

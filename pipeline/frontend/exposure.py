@@ -1,0 +1,330 @@
+"""Exposures of a robot's frames: gain and offset of each channel, from what frames show of the same surfaces.
+
+A camera that sets its exposure and white balance itself shows a surface of color s as gain * s + offset in a frame.
+Tracked frames are compared with their keyframe, and keyframes with each other, at their optimized poses
+(`geometry.color_comparison`). Gains and offsets of all frames are the least-squares solution of all pairs, with a weak
+prior that every gain is one and every offset zero. The prior is the anchor too: pairs determine gains but for a common
+factor, and with it their geometric mean is one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.config.exposure import ExposureConfig
+from duagc.pipeline.config.frontend import is_held_out
+from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame
+from duagc.pipeline.geometry import projection, se3
+from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.color_comparison import ComparedColors, compare_colors
+from duagc.pipeline.geometry.exposure import ExposureTrack
+from duagc.pipeline.geometry.statistics import evenly_spaced, huber_divisor
+from duagc.pipeline.recording import RgbdFrame
+
+CLIPPED = (2, 253)
+"""Colors of 8 bits beyond are black or saturated: they tell nothing of the gain."""
+SAME_SURFACE = 0.03
+"""Relative difference of depth up to which two frames show the same surface."""
+Pair = tuple[int, int]
+FRAMES_TO_DECIDE = 40
+"""Frames between keyframes that are compared before the others, if those differ."""
+MIN_BLOCKS = 100
+"""Blocks that two frames must share to be compared."""
+BLOCKS_PER_SAMPLE = 30.0
+"""Blocks that say together what one would say alone: neighbors share their errors."""
+SMOOTH = 0.02
+"""Relative standard deviation of the inverse depth in a block up to which it shows one surface."""
+ROUNDS_OF_PAIR = 8
+"""Of reweighting, for the colors of a pair."""
+ROUNDS = 8
+"""Of linearization and reweighting, for all frames."""
+HUBER_SIGMAS = 2.0
+"""Residuals of pairs beyond count linearly."""
+
+
+@dataclass(frozen=True)
+class ColorBlocks:
+    """A frame as its colors are compared: means over square blocks.
+
+    Attributes:
+        camera: of the blocks.
+        color: float32 [h, w, 3], 0..1; NaN where a pixel of the block is clipped or masked.
+        inverse_depth: float32 [h, w], 1/m; NaN where the block does not show one surface.
+    """
+
+    camera: PinholeCamera
+    color: NDArray[np.float32]
+    inverse_depth: NDArray[np.float32]
+
+    @staticmethod
+    def of(frame: RgbdFrame, camera: PinholeCamera, width_px: int) -> ColorBlocks:
+        """Of a whole frame.
+
+        Args:
+            frame: color and depth.
+            camera: of the frame.
+            width_px: about so many columns are left.
+        """
+        import cv2
+
+        side = max(1, round(camera.width / width_px))
+        width, height = camera.width // side, camera.height // side
+        rows, columns = slice(height * side), slice(width * side)
+
+        def mean(image: NDArray[np.float32]) -> NDArray[np.float32]:
+            return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
+
+        taken = frame.color[rows, columns]
+        color = taken * np.float32(1 / 255)
+        color[(taken < CLIPPED[0]) | (taken > CLIPPED[1])] = np.nan
+        depth_m = frame.usable_depth[rows, columns]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = np.where(depth_m > 0, 1 / depth_m, np.float32(np.nan)).astype(np.float32)
+            middle = mean(inverse)
+            variance = mean(inverse * inverse) - middle * middle
+            middle = np.where(variance <= (SMOOTH * middle) ** 2, middle, np.float32(np.nan))
+        scaled = PinholeCamera(
+            width=width,
+            height=height,
+            fx=camera.fx / side,
+            fy=camera.fy / side,
+            cx=(camera.cx + 0.5) / side - 0.5,
+            cy=(camera.cy + 0.5) / side - 0.5,
+        )
+        if frame.mask is not None:
+            color[~frame.mask[rows, columns]] = np.nan
+        return ColorBlocks(scaled, mean(color), middle)
+
+    def shared_with(self, other: ColorBlocks, T_self_other: Array) -> tuple[Array, Array]:
+        """Colors [n, 3] of both frames where they show the same surface.
+
+        Args:
+            other: the other frame.
+            T_self_other: [4, 4].
+        """
+        import cv2
+
+        v, u = np.nonzero(np.isfinite(self.inverse_depth) & np.isfinite(self.color).all(axis=2))
+        z = 1 / self.inverse_depth[v, u].astype(np.float64)
+        there = se3.transform(se3.inverse(T_self_other), projection.back_project(self.camera, u, v, z))
+        front = there[:, 2] > projection.NEAR_M
+        u, v, there = u[front], v[front], there[front]
+        if not len(there):
+            return np.zeros((0, 3)), np.zeros((0, 3))
+        at = other.camera.project(there).astype(np.float32)
+        channels = np.concatenate([other.color, other.inverse_depth[..., None]], axis=2)
+        found = cv2.remap(
+            channels,
+            at[:, :1],
+            at[:, 1:],
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(np.nan,) * 4,
+        ).reshape(-1, 4)
+        with np.errstate(invalid="ignore"):
+            same = np.abs(found[:, 3] * there[:, 2] - 1) < SAME_SURFACE
+        same &= np.isfinite(found).all(axis=1)
+        return self.color[v[same], u[same]].astype(np.float64), found[same, :3].astype(np.float64)
+
+
+@dataclass(frozen=True)
+class ComparedPair:
+    """What two frames show of the same surfaces.
+
+    Attributes:
+        first: index of the frame in the log.
+        second: the same of the other.
+        colors: of both, the first's as `own`.
+    """
+
+    first: int
+    second: int
+    colors: ComparedColors
+
+
+@dataclass(frozen=True)
+class ExposureEstimation:
+    """Where frames are read and how they are compared.
+
+    Attributes:
+        read: a frame of the log, by its index.
+        camera: of all frames.
+        config: settings.
+    """
+
+    read: Callable[[int], RgbdFrame]
+    camera: PinholeCamera
+    config: ExposureConfig
+
+    def run(
+        self,
+        keyframes: Sequence[int],
+        T_map_keyframe: Array,
+        pairs: Iterable[Pair],
+        frames: Sequence[TrackedFrame],
+    ) -> ExposureTrack:
+        """Exposures of the keyframes and of the frames anchored to them; none if they do not differ.
+
+        Frames that are held out, lost or followed by one of their images alone are left out.
+
+        Args:
+            keyframes: index in the log of every keyframe.
+            T_map_keyframe: [k, 4, 4], optimized.
+            pairs: keyframes that see each other.
+            frames: of the log.
+        """
+        if self.config.mode == "off":
+            return ExposureTrack()
+        blocks = [self._blocks(index) for index in keyframes]
+        compared = []
+        for i, j in sorted(set(pairs)):
+            T_i_j = se3.inverse(T_map_keyframe[i]) @ T_map_keyframe[j]
+            compared += compare((keyframes[i], blocks[i]), (keyframes[j], blocks[j]), T_i_j, self.config)
+        usable = _usable(frames, keyframes)
+        first = set(evenly_spaced(len(usable), min(FRAMES_TO_DECIDE, len(usable))))
+        compared += self._compared([usable[k] for k in sorted(first)], keyframes, blocks)
+        if self.config.mode == "auto" and not differ(compared, self.config):
+            return ExposureTrack()
+        others = [frame for k, frame in enumerate(usable) if k not in first]
+        return solve_exposures([*compared, *self._compared(others, keyframes, blocks)], self.config)
+
+    def _blocks(self, frame_index: int) -> ColorBlocks:
+        return ColorBlocks.of(self.read(frame_index), self.camera, self.config.width_px)
+
+    def _compared(
+        self, frames: Iterable[TrackedFrame], keyframes: Sequence[int], blocks: Sequence[ColorBlocks]
+    ) -> list[ComparedPair]:
+        """Frames compared with their keyframes."""
+        compared = []
+        for frame in frames:
+            k, own = frame.keyframe_index, self._blocks(frame.frame_index)
+            ends = (keyframes[k], blocks[k]), (frame.frame_index, own)
+            compared += compare(*ends, frame.T_keyframe_camera, self.config)
+        return compared
+
+
+def _usable(frames: Sequence[TrackedFrame], keyframes: Sequence[int]) -> list[TrackedFrame]:
+    """Frames that the map may be made of, keyframes excepted."""
+    taken = set(keyframes)
+    return [
+        frame
+        for frame in frames
+        if frame.status is not Status.LOST
+        and frame.reason is Reason.NONE
+        and frame.frame_index not in taken
+        and not is_held_out(frame.frame_index)
+    ]
+
+
+def compare(
+    first: tuple[int, ColorBlocks],
+    second: tuple[int, ColorBlocks],
+    T_first_second: Array,
+    config: ExposureConfig,
+) -> list[ComparedPair]:
+    """Two frames compared; nothing if they share too little.
+
+    Args:
+        first: index in the log, and colors.
+        second: the same of the other.
+        T_first_second: [4, 4].
+        config: noise.
+    """
+    own, other = first[1].shared_with(second[1], T_first_second)
+    if len(own) < MIN_BLOCKS:
+        return []
+    colors = compare_colors(
+        own,
+        other,
+        per_sample=BLOCKS_PER_SAMPLE,
+        sigma_floor=config.sigma_gain,
+        sigma_floor_middle=config.sigma_color,
+        rounds=ROUNDS_OF_PAIR,
+    )
+    return [ComparedPair(first[0], second[0], colors)]
+
+
+def differ(pairs: Sequence[ComparedPair], config: ExposureConfig) -> bool:
+    """Whether enough pairs of frames show the same surfaces in different colors.
+
+    Args:
+        pairs: of frames.
+        config: how many, and how different.
+    """
+    if not pairs:
+        return False
+    different = [
+        bool(
+            np.any(
+                np.abs(p.colors.middle_other - p.colors.middle_own)
+                > config.min_sigmas * np.sqrt(p.colors.variance_middle)
+            )
+        )
+        for p in pairs
+    ]
+    return float(np.mean(different)) > config.min_share
+
+
+def solve_exposures(pairs: Sequence[ComparedPair], config: ExposureConfig) -> ExposureTrack:
+    """Gains and offsets of all frames by robust least squares of all pairs, each channel by itself.
+
+    With a the log gain and b the offset of a frame, a pair says by how much its log gains differ, and that the middles
+    c of its colors show one color s = (c - b) / exp(a).
+
+    Args:
+        pairs: of frames.
+        config: priors.
+    """
+    frames = sorted({index for pair in pairs for index in (pair.first, pair.second)})
+    if not frames:
+        return ExposureTrack()
+    i, j = np.searchsorted(frames, np.array([(pair.first, pair.second) for pair in pairs])).T
+    log_gain, offset = np.zeros((len(frames), 3)), np.zeros((len(frames), 3))
+    for channel in range(3):
+        of_pairs = np.array(
+            [
+                (
+                    c.log_ratio[channel],
+                    c.variance[channel],
+                    c.middle_own[channel],
+                    c.middle_other[channel],
+                    c.variance_middle[channel],
+                )
+                for c in (pair.colors for pair in pairs)
+            ]
+        )
+        log_gain[:, channel], offset[:, channel] = _solve_channel(len(frames), (i, j), of_pairs.T, config)
+    return ExposureTrack.of(frames, np.exp(log_gain), offset)
+
+
+def _solve_channel(
+    count: int, pairs: tuple[NDArray[np.int64], NDArray[np.int64]], of_pairs: Array, config: ExposureConfig
+) -> tuple[Array, Array]:
+    """Log gains [n] and offsets [n] of one channel; of_pairs [5, m] in the order of `ComparedColors`."""
+    from scipy.sparse import coo_array, diags_array
+    from scipy.sparse.linalg import spsolve
+
+    (i, j), (log_ratio, variance, own, other, variance_middle) = pairs, of_pairs
+    m, rows, one = len(i), np.arange(len(i)), np.ones(len(i))
+    row = np.concatenate([rows, rows, m + rows, m + rows, m + rows, m + rows])
+    column = np.concatenate([i, j, i, j, count + i, count + j])
+    prior = np.repeat([config.prior_gain**-2.0, config.prior_offset**-2.0], count)
+    weight = np.concatenate([1 / variance, 1 / variance_middle])
+    x = np.zeros(2 * count)
+    for _ in range(ROUNDS):
+        a, b = x[:count], x[count:]
+        shrink_i, shrink_j = np.exp(-a[i]), np.exp(-a[j])
+        s_i, s_j = (own - b[i]) * shrink_i, (other - b[j]) * shrink_j
+        residual = np.concatenate([a[j] - a[i] - log_ratio, s_j - s_i])
+        values = np.concatenate([-one, one, s_i, -s_j, shrink_i, -shrink_j])
+        J = coo_array((values, (row, column)), shape=(2 * m, 2 * count)).tocsr()
+        robust = weight / huber_divisor(residual * np.sqrt(weight), HUBER_SIGMAS)
+        H = (J.T @ diags_array(robust) @ J + diags_array(prior)).tocsc()
+        x = x - spsolve(H, J.T @ (robust * residual) + prior * x)
+    return x[:count], x[count:]

@@ -1,0 +1,57 @@
+"""Where a registration starts when the motion prior is weak: the motion that matched features with depth agree on.
+
+Dense registration converges from a few pixels off in its coarsest image. A camera that moves by hand leaves what its
+last velocity predicts by half its acceleration times the square of the time between frames: a pixel at 30 Hz, fifty at
+5 Hz. Matched features need no prediction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.frontend.tracking_state import CurrentFrame, TrackingState
+from duagc.pipeline.registration.features import matches
+from duagc.pipeline.registration.geometric_verification import motion_from_features
+
+
+def initial_motions(state: TrackingState, frame: CurrentFrame) -> Iterator[tuple[int, Array]]:
+    """Keyframes that a frame shows, each with the motion that its matched features agree on.
+
+    The keyframe that frames are tracked against comes first. Then come those of the keyframes that look at the nearest
+    places that share most matches with the frame: a path that turns back sees them from nearer than the latest one.
+
+    Args:
+        state: what the tracker knows.
+        frame: the current frame.
+
+    Yields:
+        Keyframe index and T_keyframe_camera [4, 4].
+    """
+    config = state.config.tracking.relocalization
+    for k in [state.keyframe_index, *_other_keyframes(state, frame)]:
+        # the draws only choose which samples are tried: the same in every run
+        rng = random_streams.generator(0, "initialization", frame=frame.frame_index, keyframe=k)
+        found = motion_from_features(state.keyframes[k].features, frame.features, config, rng)
+        if found.T_first_second is not None and found.accepted:
+            yield k, found.T_first_second
+
+
+def _other_keyframes(state: TrackingState, frame: CurrentFrame) -> Iterator[int]:
+    """Keyframes near the one that frames are tracked against, those with most matches first."""
+    config, latest = state.config.tracking.relocalization, state.keyframe_index
+    centers = np.array([keyframe.center_map for keyframe in state.keyframes])
+    distance = np.linalg.norm(centers - centers[latest], axis=1)
+    nearest = np.argsort(distance, kind="stable")[: state.config.keyframes.optimization_candidates].tolist()
+    most, theirs = config.features_compared, frame.features.descriptors[: config.features_compared]
+    scores = [
+        (-len(matches(state.keyframes[k].features.descriptors[:most], theirs, config.ratio)), -k)
+        for k in nearest
+        if k != latest
+    ]
+    for negative_score, negative_index in sorted(scores)[: config.candidates]:
+        if -negative_score >= config.min_matches:
+            yield -negative_index

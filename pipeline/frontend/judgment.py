@@ -1,0 +1,169 @@
+"""Whether optimized keyframe poses can be true: features and depth judge every pair of keyframes again.
+
+The joint optimization finds the poses that explain the images best, starting from tracking. Where tracking went wrong
+it ends in a wrong minimum, and its residuals look as usual. Matched features and free space are other evidence: they
+took no part in it. A pair is contradicted if features that agree on one motion are far from where the poses have them,
+or if one view stands in space that the other saw to be free. What contradicted pairs cut off from the largest part of
+the path is not where the poses have it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.config.frontend import FrontendConfig, JudgmentConfig
+from duagc.pipeline.frontend.bundle import KeyframeView
+from duagc.pipeline.frontend.failure import Reason, free_space_violations
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.posegraph.relative_poses import RelativePose
+from duagc.pipeline.registration import Level
+from duagc.pipeline.registration.geometric_verification import FeatureJudgment, judge_motion
+
+Ends = tuple[int, int]  # of a pair: the earlier keyframe, the later one
+
+
+class PairVerdict(Enum):
+    """What features and depth say of the motion between two keyframes."""
+
+    CONFIRMED = "confirmed"
+    OPEN = "open"
+    FEATURES = "features"
+    DEPTH = "depth"
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the motion cannot be true."""
+        return self in (PairVerdict.FEATURES, PairVerdict.DEPTH)
+
+
+@dataclass(frozen=True)
+class Judgment:
+    """Verdicts on pairs of keyframes, and what follows for each keyframe.
+
+    Attributes:
+        verdicts: of every pair that was judged.
+        by_features: the motions that features agree on, of the pairs that they contradict.
+        contradicted: the keyframes whose poses were rejected, each with the reason.
+    """
+
+    verdicts: Mapping[Ends, PairVerdict]
+    by_features: Sequence[RelativePose]
+    contradicted: Mapping[int, Reason]
+
+
+def judge(
+    T_map_keyframes: Array,
+    views: Sequence[KeyframeView],
+    factors: Sequence[RelativePose],
+    config: FrontendConfig,
+    *,
+    seed: int,
+    robot: str,
+) -> Judgment:
+    """Judge the poses of all keyframes.
+
+    Args:
+        T_map_keyframes: [k, 4, 4], optimized.
+        views: of the k keyframes.
+        factors: which keyframes see each other.
+        config: limits.
+        seed: of the random stream.
+        robot: of the random stream.
+    """
+    verdicts: dict[Ends, PairVerdict] = {}
+    by_features: list[RelativePose] = []
+    for ends in _judged(len(views), factors, config.keyframes.judgment):
+        first, second = ends
+        T_first_second = se3.inverse(T_map_keyframes[first]) @ T_map_keyframes[second]
+        rng = random_streams.generator(seed, "frontend.judgment", robot=robot, first=first, second=second)
+        limits = config.keyframes.judgment
+        found = judge_motion(
+            views[first].features, views[second].features, T_first_second, config=limits, rng=rng
+        )
+        if found is None:
+            verdicts[ends] = _by_depth(views[first].coarsest, views[second].coarsest, T_first_second, config)
+        elif not contradicts(found, limits):
+            verdicts[ends] = PairVerdict.CONFIRMED
+        else:
+            verdicts[ends] = PairVerdict.FEATURES
+            by_features.append(RelativePose(first, second, found.T_first_second, found.information))
+    parts = _parts(len(views), verdicts)
+    sizes = {part: parts.count(part) for part in set(parts)}
+    main = max(sizes, key=lambda part: (sizes[part], -part))
+    contradicted = {k: _reason(k, verdicts) for k, part in enumerate(parts) if part != main}
+    return Judgment(verdicts, by_features, contradicted)
+
+
+def _judged(count: int, factors: Sequence[RelativePose], config: JudgmentConfig) -> list[Ends]:
+    """Of every keyframe the pairs with the two before it, so that a wrong one is stepped over, and the earliest others.
+
+    Args:
+        count: number of keyframes.
+        factors: which of them see each other.
+        config: how many others.
+    """
+    earlier: list[set[int]] = [set() for _ in range(count)]
+    for factor in factors:
+        earlier[factor.j].add(factor.i)
+    chosen = []
+    for second, firsts in enumerate(earlier):
+        before = {first for first in (second - 2, second - 1) if first >= 0}
+        chosen += [(first, second) for first in sorted(before)]
+        chosen += [(first, second) for first in sorted(firsts - before)[: config.neighbors]]
+    return chosen
+
+
+def contradicts(found: FeatureJudgment, limits: JudgmentConfig) -> bool:
+    """Whether features are so far from where a motion has them that it cannot be true.
+
+    Args:
+        found: what they say.
+        limits: how far they may be.
+    """
+    return found.given_rad > max(limits.max_angle_rad, limits.max_angle_of_own * found.own_rad)
+
+
+def _by_depth(first: Level, second: Level, T_first_second: Array, config: FrontendConfig) -> PairVerdict:
+    """What depth says of a pair: whether one view stands in space that the other saw to be free."""
+    limits = config.keyframes.judgment
+    ways = ((second, first, T_first_second), (first, second, se3.inverse(T_first_second)))
+    for seen, other, T_other_seen in ways:
+        violations, visible = free_space_violations(seen, other, T_other_seen, config.tracking.failure)
+        enough = visible >= limits.min_visible * seen.inverse_depth.size
+        if enough and violations > limits.max_free_space_violations * visible:
+            return PairVerdict.DEPTH
+    return PairVerdict.OPEN
+
+
+def _parts(count: int, verdicts: Mapping[Ends, PairVerdict]) -> list[int]:
+    """The part of the path, by its lowest keyframe, that each keyframe is connected with.
+
+    Confirmed pairs connect. A pair that nothing can be said of connects two parts that no pair contradicts.
+    """
+    part = list(range(count))
+
+    def join(a: int, b: int) -> None:
+        low, high = sorted((part[a], part[b]))
+        part[:] = [low if p == high else p for p in part]
+
+    for (first, second), verdict in verdicts.items():
+        if verdict is PairVerdict.CONFIRMED:
+            join(first, second)
+    for (first, second), verdict in sorted(verdicts.items()):
+        if verdict is PairVerdict.OPEN and part[first] != part[second]:
+            between = {part[first], part[second]}
+            against = (v for (i, j), v in verdicts.items() if {part[i], part[j]} == between)
+            if not any(v.contradicts for v in against):
+                join(first, second)
+    return part
+
+
+def _reason(keyframe: int, verdicts: Mapping[Ends, PairVerdict]) -> Reason:
+    """Whether features or depth contradict a keyframe's pose, or that of the part that it belongs to."""
+    against = [verdict for ends, verdict in verdicts.items() if keyframe in ends and verdict.contradicts]
+    by_depth = against.count(PairVerdict.DEPTH) > against.count(PairVerdict.FEATURES)
+    return Reason.CONTRADICTED_BY_DEPTH if by_depth else Reason.CONTRADICTED_BY_FEATURES

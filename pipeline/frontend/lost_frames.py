@@ -1,0 +1,154 @@
+"""Lost frames are looked for again once all keyframes are known.
+
+Tracking knows only the keyframes before a frame, and accepts a place only when the next frame agrees. Afterwards a
+lost frame lies between two others whose poses are known, and the keyframes behind it may show it from nearer. Its pose
+changes no other: nothing was built on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import zip_longest
+
+import numpy as np
+
+from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.frontend.bundle import Images
+from duagc.pipeline.frontend.failure import Reason, free_space_violations
+from duagc.pipeline.frontend.judgment import contradicts
+from duagc.pipeline.frontend.stable_registration import register_until_stable
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
+from duagc.pipeline.frontend.tracking_state import features_of
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import Registration, RgbdPyramid
+from duagc.pipeline.registration.features import Features
+from duagc.pipeline.registration.geometric_verification import (
+    features_agree,
+    judge_motion,
+    motion_from_features,
+)
+
+LOOKED_FOR = frozenset(
+    {
+        Reason.LOW_OVERLAP,
+        Reason.ILL_CONDITIONED,
+        Reason.RESIDUAL,
+        Reason.JUMP,
+        Reason.OBSTRUCTED,
+        Reason.UNCONFIRMED,
+    }
+)
+"""Reasons of a loss that do not lie in the images: both can be used, and may show what a keyframe shows."""
+
+
+def found_afterwards(
+    frames: Sequence[TrackedFrame],
+    keyframes: Sequence[TrackedKeyframe],
+    T_map_keyframes: Array,
+    images: Images,
+    *,
+    config: FrontendConfig,
+) -> list[TrackedFrame]:
+    """The frames, with poses of those lost ones that are found between their neighbors.
+
+    Args:
+        frames: every frame of the log, anchored to keyframes.
+        keyframes: of the map.
+        T_map_keyframes: [k, 4, 4], optimized.
+        images: reads the images of a frame of the log, by its index.
+        config: of the front end.
+    """
+    if not config.tracking.relocalization.look_again:
+        return list(frames)
+    posed = [k for k, frame in enumerate(frames) if frame.status is not Status.LOST]
+    out = list(frames)
+    for k, frame in enumerate(frames):
+        after = int(np.searchsorted(posed, k))
+        if frame.status is not Status.LOST or frame.reason not in LOOKED_FOR or after in (0, len(posed)):
+            continue
+        around = frames[posed[after - 1]], frames[posed[after]]
+        near = _anchors(frames, posed, after, config.tracking.relocalization.look_again_keyframes)
+        pyramid = images(frame.frame_index, len(config.tracking.strides))
+        for keyframe, result in _registrations(frame, pyramid, [keyframes[n] for n in near], config):
+            T_map_camera = T_map_keyframes[keyframe.keyframe_index] @ result.T_reference_target
+            if all(
+                _within_reach(frame, T_map_camera, other, T_map_keyframes, config=config) for other in around
+            ):
+                out[k] = TrackedFrame.by(
+                    frame.frame_index,
+                    frame.stamp_ns,
+                    keyframe_index=keyframe.keyframe_index,
+                    result=result,
+                    status=Status.RELOCALIZED,
+                )
+                break
+    return out
+
+
+def _anchors(frames: Sequence[TrackedFrame], posed: Sequence[int], after: int, count: int) -> list[int]:
+    """The keyframes that the frames around a lost one are anchored to, the nearest in time first, sides in turn."""
+    before = list(dict.fromkeys(frames[k].keyframe_index for k in reversed(posed[:after])))[:count]
+    behind = list(dict.fromkeys(frames[k].keyframe_index for k in posed[after:]))[:count]
+    turns = [k for pair in zip_longest(before, behind) for k in pair if k is not None]
+    return list(dict.fromkeys(turns))
+
+
+def _registrations(
+    frame: TrackedFrame, pyramid: RgbdPyramid, keyframes: Sequence[TrackedKeyframe], config: FrontendConfig
+) -> Iterator[tuple[TrackedKeyframe, Registration]]:
+    """Registrations of a frame to keyframes, from matched features, that features and free space confirm."""
+    tracking = config.tracking.verified_by_features()
+    limits, failure = tracking.relocalization, tracking.failure
+    features = features_of(pyramid, limits)
+    for keyframe in keyframes:
+        # the draws only choose which samples are tried: the same in every run
+        rng = random_streams.generator(
+            0, "look_again", frame=frame.frame_index, keyframe=keyframe.keyframe_index
+        )
+        moved = motion_from_features(keyframe.features, features, limits, rng)
+        if moved.T_first_second is None or not moved.accepted:
+            continue
+        result = register_until_stable(
+            keyframe, pyramid, moved.T_first_second, tracking, first=tracking.registration
+        )
+        if not result.ok or not _confirmed(keyframe, features, result, config, rng=rng):
+            continue
+        violations, visible = free_space_violations(
+            pyramid.levels[-1], keyframe.coarsest, result.T_reference_target, failure
+        )
+        if violations <= failure.max_free_space_violations * visible:
+            yield keyframe, result
+
+
+def _confirmed(
+    keyframe: TrackedKeyframe,
+    features: Features,
+    result: Registration,
+    config: FrontendConfig,
+    *,
+    rng: np.random.Generator,
+) -> bool:
+    """Whether features confirm a registration, and do not agree on another motion."""
+    T, limits = result.T_reference_target, config.keyframes.judgment
+    if not features_agree(keyframe.features, features, T, config.tracking.relocalization):
+        return False
+    found = judge_motion(keyframe.features, features, T, config=limits, rng=rng)
+    return found is None or not contradicts(found, limits)
+
+
+def _within_reach(
+    frame: TrackedFrame,
+    T_map_camera: Array,
+    other: TrackedFrame,
+    T_map_keyframes: Array,
+    *,
+    config: FrontendConfig,
+) -> bool:
+    """Whether a camera of finite speed can have been at two places at the times of two frames."""
+    limits = config.tracking.failure
+    T_map_other = T_map_keyframes[other.keyframe_index] @ other.T_keyframe_camera
+    elapsed_s = abs(frame.stamp_ns - other.stamp_ns) * 1e-9
+    moved_m = float(se3.distance(T_map_camera, T_map_other)[0])
+    return moved_m <= limits.max_speed_m_s * elapsed_s + limits.slack_m

@@ -1,0 +1,173 @@
+"""Keyframe poses of a path: joint optimization with loop closures, then the judgment by features and depth.
+
+Where features contradict the poses of two keyframes, the motion that they agree on takes the place of what tracking
+found, and all is optimized again. What is contradicted even then is no keyframe, and the frames that are anchored to it
+are lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.frontend import bundle, loops
+from duagc.pipeline.frontend.bundle import Images
+from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.judgment import Judgment, judge
+from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes, solve_pose_graph
+from duagc.pipeline.frontend.loop_outliers import consistent_loops
+from duagc.pipeline.frontend.lost_frames import found_afterwards
+from duagc.pipeline.frontend.submaps import lost
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
+from duagc.pipeline.posegraph.relative_poses import RelativePose
+from duagc.pipeline.registration import RgbdPyramid
+
+
+@dataclass(frozen=True)
+class OptimizedPath:
+    """A path whose poses nothing contradicts.
+
+    Attributes:
+        keyframes: those that are not rejected, numbered from 0.
+        frames: every frame; lost if its keyframe was rejected.
+        solution: poses of the keyframes.
+        factors: of their pose graph.
+        places: index before of every keyframe.
+    """
+
+    keyframes: list[TrackedKeyframe]
+    frames: list[TrackedFrame]
+    solution: OptimizedKeyframes
+    factors: Sequence[RelativePose]
+    places: list[int]
+
+
+@dataclass(frozen=True)
+class PathOptimization:
+    """Settings of the optimization of one path, and what it reads.
+
+    Attributes:
+        images: reads the images of a frame of the log, by its index.
+        config: of the front end.
+        seed: of the random streams.
+        robot: of the random streams.
+    """
+
+    images: Images
+    config: FrontendConfig
+    seed: int
+    robot: str
+
+    def run(
+        self,
+        keyframes: Sequence[TrackedKeyframe],
+        frames: Sequence[TrackedFrame],
+        pairs: Sequence[RelativePose],
+    ) -> OptimizedPath:
+        """Optimize the poses of all keyframes, judge them, and look again for lost frames.
+
+        Args:
+            keyframes: as tracked.
+            frames: every frame, anchored to keyframes.
+            pairs: registrations that connect the keyframes.
+        """
+        path = self._consistent_path(keyframes, frames, pairs)
+        T_map_keyframes = path.solution.T_map_keyframe
+        found = found_afterwards(
+            path.frames, path.keyframes, T_map_keyframes, self.images, config=self.config
+        )
+        return replace(path, frames=found)
+
+    def _consistent_path(
+        self,
+        keyframes: Sequence[TrackedKeyframe],
+        frames: Sequence[TrackedFrame],
+        pairs: Sequence[RelativePose],
+    ) -> OptimizedPath:
+        """Optimized poses that nothing contradicts."""
+        solution, factors = self._optimized(keyframes, pairs)
+        path = OptimizedPath(list(keyframes), list(frames), solution, factors, list(range(len(keyframes))))
+        if not self.config.keyframes.judgment.enabled or len(keyframes) < 2:
+            return path
+        judgment = self._judged(path)
+        if not judgment.contradicted:
+            return path
+        pairs = _corrected(pairs, judgment)
+        solution, factors = self._optimized(keyframes, pairs)
+        path = replace(path, solution=solution, factors=factors)
+        judgment = self._judged(path)
+        if not judgment.contradicted:
+            return path
+        path, pairs = _without_rejected(path, _corrected(pairs, judgment), judgment.contradicted)
+        solution, factors = self._optimized(path.keyframes, pairs)
+        return replace(path, solution=solution, factors=factors)
+
+    def _judged(self, path: OptimizedPath) -> Judgment:
+        T = path.solution.T_map_keyframe
+        return judge(T, path.keyframes, path.factors, self.config, seed=self.seed, robot=self.robot)
+
+    def _optimized(
+        self, keyframes: Sequence[TrackedKeyframe], pairs: Sequence[RelativePose]
+    ) -> tuple[OptimizedKeyframes, Sequence[RelativePose]]:
+        """Keyframe poses by all their images together, and the factors of the pose graph."""
+        settings, registration = self.config.keyframes, self.config.tracking.registration
+        start = np.array([keyframe.T_map_keyframe for keyframe in keyframes])
+        if len(keyframes) < 2 or not (settings.local_optimization or settings.loops.enabled):
+            return solve_pose_graph(start, pairs, settings.huber_sigmas), pairs
+
+        def images(index: int, levels: int) -> RgbdPyramid:
+            return self.images(keyframes[index].frame_index, levels)
+
+        if settings.loops.enabled:
+            tracked = solve_pose_graph(start, pairs, settings.huber_sigmas).T_map_keyframe
+            found = loops.find_loops(
+                tracked,
+                keyframes,
+                images,
+                config=settings.loops,
+                registration=registration,
+                seed=self.seed,
+                robot=self.robot,
+            )
+            pairs = [*pairs, *consistent_loops(tracked, pairs, found, settings.loops)]
+        if not settings.local_optimization:
+            return solve_pose_graph(start, pairs, settings.huber_sigmas), pairs
+        return bundle.optimize(start, keyframes, images, pairs, config=settings, registration=registration)
+
+
+def _corrected(pairs: Sequence[RelativePose], judgment: Judgment) -> list[RelativePose]:
+    """Pairs that nothing contradicts, and what features say of the others."""
+    contradicted = {ends for ends, verdict in judgment.verdicts.items() if verdict.contradicts}
+    return [*(p for p in pairs if (p.i, p.j) not in contradicted), *judgment.by_features]
+
+
+def _without_rejected(
+    path: OptimizedPath, pairs: Sequence[RelativePose], contradicted: Mapping[int, Reason]
+) -> tuple[OptimizedPath, list[RelativePose]]:
+    """The path and its pairs without some keyframes; it starts from where it was optimized."""
+    places = [k for k in range(len(path.keyframes)) if k not in contradicted]
+    new = {before: k for k, before in enumerate(places)}
+    keyframes = []
+    for before, index in new.items():
+        previous = max((k for k in new if k <= path.keyframes[before].previous_index), default=-1)
+        keyframes.append(
+            replace(
+                path.keyframes[before],
+                keyframe_index=index,
+                previous_index=new.get(previous, index - 1),
+                T_map_keyframe=path.solution.T_map_keyframe[before],
+            )
+        )
+    kept = [replace(p, i=new[p.i], j=new[p.j]) for p in pairs if p.i in new and p.j in new]
+    frames: list[TrackedFrame] = []
+    anchor, T_anchor_camera = 0, np.eye(4)
+    for frame in path.frames:
+        if frame.keyframe_index in new:
+            anchor, T_anchor_camera = new[frame.keyframe_index], frame.T_keyframe_camera
+        elif frame.status is not Status.LOST:
+            frame = lost(frame, contradicted[frame.keyframe_index])
+        frames.append(replace(frame, keyframe_index=anchor, T_keyframe_camera=T_anchor_camera))
+    return OptimizedPath(keyframes, frames, path.solution, path.factors, places), kept

@@ -1,0 +1,79 @@
+"""Depth of other times than color: it is moved, and frames from before it started are followed backward."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from duagc.converters.writer import RecordingWriter
+from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
+from duagc.pipeline.frontend.stage import run_frontend
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.recording import read_log
+from duagc.schemas import topics
+from tests.fixtures.room import CAMERA, pose, render
+
+FRAMES, WITHOUT = 14, 7
+FRAME_NS = 33_333_333
+CONFIG = FrontendConfig(tracking=TrackingConfig(strides=(2, 1, 1, 1)), mapping_enabled=False)
+
+
+def walk(k: float) -> np.ndarray:
+    return pose(x=-0.2 + 0.01 * k, y=0.003 * k, z=-0.9, yaw=0.2 - 0.01 * k)
+
+
+def write(folder: Path, without: int, late_ns: int = 0, stated: bool = True, early: bool = False) -> Path:
+    """The walk, its first frames without depth; depth comes late by some time, of every other frame early by it."""
+    with RecordingWriter(folder) as recording, recording.robot("alpha", CAMERA, 0.0005) as robot:
+        for k in range(FRAMES):
+            gray = render(walk(k))[0]
+            offset_ns = -late_ns if early and k % 2 and k else late_ns
+            depth_m = render(walk(k + offset_ns / FRAME_NS))[1]
+            image = np.repeat(np.rint(np.clip(gray, 0, 1) * 255).astype(np.uint8)[..., None], 3, axis=2)
+            raw = np.rint(depth_m / 0.0005).astype(np.uint16) if k >= without else None
+            robot.add_frame(
+                k * FRAME_NS,
+                cv2.imencode(".png", image)[1].tobytes(),
+                "png",
+                raw,
+                depth_stamp_ns=k * FRAME_NS + offset_ns if raw is not None and stated else None,
+            )
+    return folder / "alpha.mcap"
+
+
+def errors_m(frames: list) -> np.ndarray:
+    """How far the frames are from the true walk, by that after the leading ones."""
+    T_first = se3.inverse(frames[WITHOUT].T_map_camera)
+    true = [se3.inverse(walk(WITHOUT)) @ walk(k) for k in range(FRAMES)]
+    return np.array([se3.distance(T_first @ f.T_map_camera, T)[0] for f, T in zip(frames, true, strict=True)])
+
+
+def tracked(log: Path) -> list:
+    run_frontend(log, log.with_name("frontend.mcap"), CONFIG)
+    topic = topics.ODOMETRY.of("alpha")
+    return [record.message() for record in read_log(log.with_name("frontend.mcap"), (topic,))]
+
+
+@pytest.mark.parametrize("late_ns", [0, 12_000_000])
+def test_they_have_poses_as_good_as_color_gives(tmp_path: Path, late_ns: int) -> None:
+    frames = tracked(write(tmp_path / "rec", WITHOUT, late_ns))
+    assert [f.status for f in frames] == ["ok"] * FRAMES
+    assert [f.stamp_ns for f in frames] == [k * FRAME_NS for k in range(FRAMES)]
+    # three frames before the first depth are near enough to it in time
+    assert [f.reason for f in frames] == ["no_depth"] * (WITHOUT - 3 + (late_ns > 0)) + [""] * (
+        FRAMES - WITHOUT + 3 - (late_ns > 0)
+    )
+    assert errors_m(frames).max() < 0.004
+
+
+def test_a_log_with_depth_from_the_start_has_none(tmp_path: Path) -> None:
+    frames = tracked(write(tmp_path / "rec", 0))
+    assert [f.reason for f in frames] == [""] * FRAMES
+
+
+def test_depth_that_is_late_and_early_in_turn_is_moved(tmp_path: Path) -> None:
+    """Taken as of the images it makes the camera stagger; moved by its own motion it does not."""
+    moved = errors_m(tracked(write(tmp_path / "moved", 0, 14_000_000, early=True)))
+    taken = errors_m(tracked(write(tmp_path / "taken", 0, 14_000_000, stated=False, early=True)))
+    assert np.sqrt(np.mean(moved**2)) < 0.5 * np.sqrt(np.mean(taken**2))

@@ -1,0 +1,62 @@
+"""Optimized keyframe poses are judged again by features and depth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from duagc.pipeline.experiments.disturbances import Undisturbed
+from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.judgment import Judgment, PairVerdict, judge
+from duagc.pipeline.frontend.tracking import Tracker
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration.features import Features
+from tests.frontend.conftest import CONFIG, STARTS
+
+OFF = se3.exp(np.array([0.12, 0.0, 0.05, 0.0, 0.03, 0.0]))
+
+
+@pytest.fixture(scope="module")
+def tracker(run: Undisturbed) -> Tracker:
+    return run.tracker(STARTS[-1])
+
+
+def judged(tracker: Tracker, T_map_keyframe: np.ndarray, *, features: bool = True) -> Judgment:
+    none = Features(np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32))
+    views = [k if features else replace(k, features=none) for k in tracker.keyframes]
+    return judge(T_map_keyframe, views, tracker.pairs, CONFIG, seed=0, robot="alpha")
+
+
+def poses(tracker: Tracker) -> np.ndarray:
+    return np.array([keyframe.T_map_keyframe for keyframe in tracker.keyframes])
+
+
+def test_true_poses_are_confirmed(tracker: Tracker) -> None:
+    found = judged(tracker, poses(tracker))
+    assert not found.contradicted
+    assert set(found.verdicts.values()) == {PairVerdict.CONFIRMED}
+
+
+def test_the_smaller_part_is_contradicted_where_the_path_breaks(tracker: Tracker) -> None:
+    T = poses(tracker)
+    last = len(T) - 2
+    T[last:] = T[last - 1] @ OFF @ se3.inverse(T[last - 1]) @ T[last:]
+    found = judged(tracker, T)
+    assert found.contradicted == dict.fromkeys(range(last, len(T)), Reason.CONTRADICTED_BY_FEATURES)
+    assert found.verdicts[last, last + 1] is PairVerdict.CONFIRMED
+
+
+def test_one_wrong_keyframe_is_contradicted_alone(tracker: Tracker) -> None:
+    T = poses(tracker)
+    T[2] = T[2] @ OFF
+    assert judged(tracker, T).contradicted == {2: Reason.CONTRADICTED_BY_FEATURES}
+
+
+def test_without_features_depth_contradicts(tracker: Tracker) -> None:
+    T = poses(tracker)
+    assert not judged(tracker, T, features=False).contradicted
+    T[-1] = T[-1] @ se3.exp(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+    found = judged(tracker, T, features=False)
+    assert found.contradicted == {len(T) - 1: Reason.CONTRADICTED_BY_DEPTH}

@@ -1,0 +1,70 @@
+"""Lost frames are looked for again between their neighbors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from duagc.pipeline.experiments.disturbances import Undisturbed
+from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.lost_frames import found_afterwards
+from duagc.pipeline.frontend.submaps import lost
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import RgbdPyramid
+from tests.fixtures.films import CAMERA
+from tests.frontend.conftest import CONFIG, STARTS
+
+END = STARTS[-1]
+LOST = 30
+
+
+def looked_for(run: Undisturbed, frames: list[TrackedFrame], shown: dict[int, int]) -> list[TrackedFrame]:
+    """The frames after another look; `shown` names frames that show what another one does."""
+
+    def images(frame_index: int, levels: int) -> RgbdPyramid:
+        shot = run.shots[shown.get(frame_index, frame_index)]
+        return RgbdPyramid.build(shot.color / np.float32(255), shot.depth, CAMERA, levels)
+
+    keyframes = run.tracker(END).keyframes
+    T = np.array([keyframe.T_map_keyframe for keyframe in keyframes])
+    return found_afterwards(frames, keyframes, T, images, config=CONFIG)
+
+
+def with_loss(run: Undisturbed, at: int, reason: Reason) -> list[TrackedFrame]:
+    frames = list(run.frames[:END])
+    before = frames[at - 1]
+    frames[at] = replace(
+        lost(frames[at], reason),
+        keyframe_index=before.keyframe_index,
+        T_keyframe_camera=before.T_keyframe_camera,
+    )
+    return frames
+
+
+def test_a_lost_frame_is_found_between_its_neighbors(run: Undisturbed) -> None:
+    frames = with_loss(run, LOST, Reason.UNCONFIRMED)
+    found = looked_for(run, frames, {})
+    assert [k for k, (a, b) in enumerate(zip(found, frames, strict=True)) if a is not b] == [LOST]
+    assert found[LOST].status is Status.RELOCALIZED
+    T_map_keyframe = run.tracker(END).keyframes[found[LOST].keyframe_index].T_map_keyframe
+    moved_m, turned_rad = se3.distance(T_map_keyframe @ found[LOST].T_keyframe_camera, run.poses[LOST])
+    assert moved_m < 0.003
+    assert turned_rad < 0.002
+
+
+def test_what_cannot_be_between_its_neighbors_stays_lost(run: Undisturbed) -> None:
+    frames = with_loss(run, LOST, Reason.UNCONFIRMED)
+    assert looked_for(run, frames, {LOST: LOST - 18}) == frames  # 40 cm away within 33 ms
+
+
+def test_frames_whose_images_cannot_be_used_stay_lost(run: Undisturbed) -> None:
+    for reason in (Reason.FROZEN_DEPTH, Reason.CONTRADICTION, Reason.OTHER_COMPONENT):
+        frames = with_loss(run, LOST, reason)
+        assert looked_for(run, frames, {}) == frames
+
+
+def test_a_loss_at_the_end_has_no_second_neighbor(run: Undisturbed) -> None:
+    frames = with_loss(run, END - 1, Reason.RESIDUAL)
+    assert looked_for(run, frames, {}) == frames

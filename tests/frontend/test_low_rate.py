@@ -1,0 +1,48 @@
+"""A camera whose frames are far apart: matched features give the start that no prediction gives."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from duagc.pipeline.experiments.disturbances import Shot, Undisturbed, track
+from duagc.pipeline.frontend.tracked import Status
+from duagc.pipeline.frontend.tracking import Tracker
+from duagc.pipeline.geometry import se3
+from tests.fixtures.films import CAMERA
+from tests.frontend.conftest import CONFIG
+
+TURNING_BACK = (
+    0,
+    30,
+    5,
+    40,
+    10,
+    50,
+    25,
+    70,
+    35,
+    80,
+    55,
+    94,
+)  # frames 22 mm apart: up to 1.2 m from one to the next
+
+
+def poses_of(shots: list[Shot]) -> dict[int, np.ndarray]:
+    """T_map_camera of the frames that were tracked, by their place in the film."""
+    tracker = Tracker(CAMERA, CONFIG)
+    found = {}
+    for k, shot in enumerate(shots):
+        frame, T_map_camera = track(tracker, replace(shot, index=k))
+        if frame.status is not Status.LOST:
+            found[shot.index] = T_map_camera
+    return found
+
+
+def test_a_camera_that_turns_back_at_a_low_rate_is_followed(run: Undisturbed) -> None:
+    shots = [replace(run.shots[k], stamp_ns=400_000_000 * place) for place, k in enumerate(TURNING_BACK)]
+    found = poses_of(shots)
+    assert sorted(found) == sorted(TURNING_BACK)
+    for k, T_map_camera in found.items():
+        moved_m, turned_rad = se3.distance(run.poses[k], T_map_camera)
+        assert moved_m < 0.005
+        assert turned_rad < 0.003
