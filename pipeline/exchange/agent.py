@@ -29,25 +29,24 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.exchange import injection
-from duagc.pipeline.exchange.loop_closing import LoopClosing, Send
+from duagc.pipeline.exchange.link_starts import LinkStarts
+from duagc.pipeline.exchange.loop_closing import LoopClosing
 from duagc.pipeline.exchange.map_alignment import MapAlignment
 from duagc.pipeline.exchange.neighbor import Neighbor
 from duagc.pipeline.exchange.own_graph import OwnGraph
+from duagc.pipeline.exchange.radio import Radio
 from duagc.pipeline.exchange.sharing import SharedData
 from duagc.pipeline.exchange.solvers import LinkStart, PoseSolver, SolverFactory, SolverStart, solver_of
 from duagc.pipeline.exchange.wire import state_wire
 from duagc.pipeline.exchange.wire.state_wire import RelativeFrames, State, pair_bit
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.network.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError, Packet, parse
-from duagc.pipeline.network.signatures import Identity
-from duagc.pipeline.network.transport import Arrival, Message, Outgoing, Transport
-from duagc.pipeline.posegraph.loop_closures import plausible
+from duagc.pipeline.network.packets import MAX_PAYLOAD_BYTES, Kind, MalformedError
+from duagc.pipeline.network.transport import Arrival, Message, Outgoing
 
-Array = NDArray[np.float64]
 WHOLE_COMPONENT = 255  # a hop count that has reached the whole component, for good
 MAX_EARLY_MESSAGES = 64
 LOOP_CLOSING_KINDS = frozenset(
@@ -63,6 +62,7 @@ class Agent:
         config: the same at all robots.
         team: names of all robots that may exist, sorted.
         own: index of this robot in the team.
+        radio: own end of all radio links.
         neighbors: robots that this one has a radio link to, by index.
         loop_closing: where loop closures come from.
         sharing: what is shared besides poses.
@@ -103,15 +103,12 @@ class Agent:
             solver: makes the solver of the poses; default by the settings.
         """
         self.graph, self.config, self.seed = graph, config, seed
-        self.team = sorted(team)
-        self.own = self.team.index(graph.robot)
-        self.identity = None
-        if config.transport.signatures == "ed25519":
-            self.identity = Identity.simulated(seed, self.team, graph.robot)
         self.loop_closing, self.sharing = loop_closing, sharing
+        self.radio = Radio(
+            graph.robot, team, neighbors, config.transport, seed=seed, loop_closing=loop_closing
+        )
+        self.team, self.own, self.neighbors = self.radio.team, self.radio.own, self.radio.neighbors
         self._make_solver = solver or solver_of(config, len(self.team))
-        self._messages = 0
-        self.neighbors = {self.team.index(name): self._neighbor(name) for name in sorted(neighbors)}
         self.round = -1
         self.refused: Counter[str] = Counter()
         margin = config.consensus.closures.margin if loop_closing.revokes else np.inf
@@ -122,16 +119,6 @@ class Agent:
         self.agreed = self.done = self.converged = False
         self.first_pose_round: int | None = None
         self.rounds_to_agreement: int | None = None
-
-    def _neighbor(self, name: str) -> Neighbor:
-        index = self.team.index(name)
-        transport = Transport(
-            self.own, index, name, self.config.transport, self._new_id, identity=self.identity
-        )
-        neighbor = Neighbor(index, name, transport, self.loop_closing.initial(name))
-        if neighbor.loop_closing is not None:
-            neighbor.loop_closing.begin(self._sender(neighbor))
-        return neighbor
 
     @property
     def T_world_keyframe(self) -> Array:  # noqa: N802 (a transform)
@@ -152,24 +139,21 @@ class Agent:
         for data in delivered:
             self._take(data)
         self._drop_silent_neighbors()
-        for neighbor in self._in_contact():
+        for neighbor in self.radio.in_contact:
             heard = neighbor.transport.last_heard is not None
             if heard and not neighbor.hello_sent:
                 neighbor.hello_sent = True
                 if self.loop_closing.greeting is not None:
-                    self._send(neighbor, Kind.HELLO, self.loop_closing.greeting)
+                    self.radio.send(neighbor, Kind.HELLO, self.loop_closing.greeting)
         self._merge_revocations()
         self._update_alignment()
         self._update_poses()
         T_world_map = self._T_world_map() if self.agreed else None
-        self.sharing.send_missing(self._send, self._joined(), self.alignment.members, T_world_map)
+        self.sharing.send_missing(self.radio.send, self.radio.joined, self.alignment.members, T_world_map)
         if self.agreed:
             self.sharing.match(self.others)
         self._finish()
-        return [packet for neighbor in self._in_contact() for packet in self._burst(neighbor)]
-
-    def _in_contact(self) -> list[Neighbor]:
-        return [n for n in self.neighbors.values() if not n.lost]
+        return [packet for neighbor in self.radio.in_contact for packet in self._burst(neighbor)]
 
     @property
     def others(self) -> list[int]:
@@ -180,9 +164,6 @@ class Agent:
         """Own map frame where it was placed before the pose rounds."""
         return self.alignment.T_world_first(self.own) @ se3.inverse(self.graph.T_map_keyframe[0])
 
-    def _joined(self) -> list[Neighbor]:
-        return [n for n in self.neighbors.values() if n.joined]
-
     def _drop_silent_neighbors(self) -> None:
         """Give up neighbors that were silent for too long; do not wait for them any more.
 
@@ -191,13 +172,13 @@ class Agent:
         stay as they are.
         """
         died = 0
-        for neighbor in self._in_contact():
+        for neighbor in self.radio.in_contact:
             heard = neighbor.transport.last_heard
             silent = self.round - (0 if heard is None else heard)
             if silent > self.config.transport.silent_after_rounds and not self.done:
                 died |= pair_bit(self.own, neighbor.index) if neighbor.joined else 0
                 neighbor.lost = True
-        others = self._joined()
+        others = self.radio.joined
         final = self.agreed or any(n.state is not None and n.state.agreed for n in others)
         if died and others and not final:
             self._revoke_links(self.alignment.revoked | died)
@@ -207,22 +188,11 @@ class Agent:
     def _take(self, data: bytes) -> None:
         """Parse and handle one packet; what cannot be used is counted with its reason and has no other effect."""
         try:
-            packet = parse(data) if self.identity is None else self.identity.open(data)
-            neighbor = self._addressed(packet)
-            arrival = neighbor.transport.receive(packet, self.round)
+            neighbor, arrival = self.radio.open(data, self.round)
             if arrival is not None:
                 self._handle(neighbor, arrival)
         except ValueError as error:
             self.refused[str(error)] += 1
-
-    def _addressed(self, packet: Packet) -> Neighbor:
-        if packet.receiver != self.own:
-            raise MalformedError("addressed to another robot")
-        if packet.sender not in self.neighbors:
-            raise MalformedError("from a robot that is no neighbor")
-        if self.neighbors[packet.sender].lost:
-            raise MalformedError("from a neighbor that was given up")
-        return self.neighbors[packet.sender]
 
     def _handle(self, n: Neighbor, arrival: Arrival) -> None:
         payload = arrival.payload
@@ -245,9 +215,9 @@ class Agent:
             protocol = self.loop_closing.protocol(n.name, kind, payload)
             if n.loop_closing is None:
                 n.loop_closing = protocol
-                protocol.begin(self._sender(n))
+                protocol.begin(self.radio.sender(n))
         if kind is not Kind.HELLO:
-            n.loop_closing.take(kind, payload, self._sender(n))
+            n.loop_closing.take(kind, payload, self.radio.sender(n))
 
     def _held_pairs(self) -> set[tuple[int, int]]:
         """Pairs of this robot whose relative frame no other robot decides."""
@@ -279,24 +249,6 @@ class Agent:
 
     # --- outgoing
 
-    def _new_id(self) -> int:
-        self._messages += 1
-        return self._messages
-
-    def _sender(self, neighbor: Neighbor) -> Send:
-        def send(kind: Kind, payload: bytes) -> None:
-            message = self._send(neighbor, kind, payload)
-            if kind is Kind.CLOSURES:
-                neighbor.verdict_message = message
-
-        return send
-
-    def _send(self, neighbor: Neighbor, kind: Kind, payload: bytes) -> int:
-        """Queue one reliable message; returns its id."""
-        message = Message(self._new_id(), kind, payload)
-        neighbor.transport.send(message)
-        return message.id
-
     def _burst(self, neighbor: Neighbor) -> list[Outgoing]:
         finished = self.done and neighbor.state is not None and neighbor.state.done
         states = [] if finished else self._states(neighbor)
@@ -304,8 +256,8 @@ class Agent:
 
     def _states(self, neighbor: Neighbor) -> list[Message]:
         """The state of this round, with the poses of this round if there are any."""
-        direct = {n.index for n in self._joined()}
-        alive = {n.index for n in self._in_contact() if not n.link.revoked}
+        direct = {n.index for n in self.radio.joined}
+        alive = {n.index for n in self.radio.in_contact if not n.link.revoked}
         state = state_wire.write_state(
             State(
                 links=self.alignment.links,
@@ -331,29 +283,20 @@ class Agent:
             room_bytes = MAX_PAYLOAD_BYTES - len(state)
             parts = self.poses.states(self.links[neighbor.index], room_bytes)
             payloads = [state + part for part in parts] or payloads
-        if payloads == [state] and self._repeats(neighbor, state):
+        # with evidence to share, states go out in every round
+        if payloads == [state] and not self.sharing.enabled and neighbor.was_sent(state, self.round):
             return []
-        return [Message(self._new_id(), Kind.STATE, payload) for payload in payloads]
-
-    def _repeats(self, neighbor: Neighbor, state: bytes) -> bool:
-        """Whether a neighbor was sent this very state lately; with evidence to share, states go out in every round."""
-        known, sent_round = neighbor.sent_state
-        due = self.round - sent_round >= neighbor.transport.repeat_after_rounds
-        met = neighbor.transport.last_heard is not None
-        if not self.sharing.enabled and met and state == known and not due:
-            return True
-        neighbor.sent_state = state, self.round
-        return False
+        return [Message(self.radio.new_id(), Kind.STATE, payload) for payload in payloads]
 
     def _all_agreed(self) -> bool:
-        return self.agreed and all(n.state is not None and n.state.agreed for n in self._joined())
+        return self.agreed and all(n.state is not None and n.state.agreed for n in self.radio.joined)
 
     # --- revoked links
 
     def _merge_revocations(self) -> None:
         """Add the revoked links that joined neighbors know. Once the poses are agreed there are no new ones."""
         known = self.alignment.revoked
-        for n in self._joined():
+        for n in self.radio.joined:
             if n.state is not None:
                 known |= n.state.revoked_links
         if known != self.alignment.revoked and not self.agreed:
@@ -393,7 +336,7 @@ class Agent:
 
         To have decided is also that the neighbors have what this robot knows: when all have, nothing new comes.
         """
-        joined = self._joined()
+        joined = self.radio.joined
         for n in joined:
             pair = _pair(self.own, n.index)
             assert n.loop_closing is not None
@@ -407,7 +350,7 @@ class Agent:
             for pair in sorted(self.alignment.payloads):
                 if pair not in n.passed.frames:
                     payload = self.alignment.payloads[pair]
-                    n.passed.frames[pair] = self._send(n, Kind.RELATIVE_FRAME, payload)
+                    n.passed.frames[pair] = self.radio.send(n, Kind.RELATIVE_FRAME, payload)
         if self.alignment_hops == WHOLE_COMPONENT:
             return
         self.alignment_hops = 0
@@ -422,7 +365,7 @@ class Agent:
 
     def _update_poses(self) -> None:
         """One round of the solver; the poses are final when all robots of the component have converged."""
-        joined = self._joined()
+        joined = self.radio.joined
         if self.alignment_hops < WHOLE_COMPONENT or not joined:
             return
         if self.poses is None:
@@ -439,7 +382,7 @@ class Agent:
             self.poses.refused.clear()
             for receiver, payload in self.poses.messages():
                 labeled = state_wire.write_labeled(self.alignment.revoked, len(self.team), payload)
-                self._send(self.neighbors[receiver], Kind.TREE, labeled)
+                self.radio.send(self.neighbors[receiver], Kind.TREE, labeled)
         if self.agreed:
             return
         refuted = sum(pair_bit(self.own, n.index) for n in joined if self.poses.refuted(n.name))
@@ -459,39 +402,18 @@ class Agent:
         """Give the solver the own graph where it was placed, and the joined neighbors."""
         if self.first_pose_round is None:
             self.first_pose_round = self.round
-        self.links = {n.index: self._link_start(n) for n in self._joined()}
+        starts = LinkStarts(
+            self.graph, self.alignment, self.config.consensus.closures, self.loop_closing.trusted
+        )
+        self.links = {n.index: starts.of(n) for n in self.radio.joined}
         T_world_map = self.alignment.T_world_first(self.own)
         tree, links = self.alignment.tree(), list(self.links.values())
         self.poses = self._make_solver(SolverStart(self.graph, self.own, T_world_map, tree, links))
-        for n in self._joined():
+        for n in self.radio.joined:
             for revoked, payload in n.early:
                 if revoked == self.alignment.revoked:
                     self.poses.take_message(n.index, payload)
             n.early.clear()
-
-    def _link_start(self, n: Neighbor) -> LinkStart:
-        """A joined neighbor; loop closures start with weight if they fit to where both robots were placed."""
-        protocol = n.loop_closing
-        assert protocol is not None
-        assert protocol.joined is not None
-        joined = protocol.joined
-        if not joined.closures:
-            return LinkStart(n.index, n.name, joined.shared, (), np.zeros(0, bool), np.zeros((0, 4, 4)))
-        assert protocol.peer_keyframes is not None
-        peer = protocol.peer_keyframes.moved(self.alignment.T_world_first(n.index))
-        keep = np.ones(len(joined.closures), bool)
-        if not self.loop_closing.trusted:
-            pair = (min(self.graph.robot, n.name), max(self.graph.robot, n.name))
-            chosen = self.alignment.placement.chosen[pair]
-            n.link.contradiction = self.alignment.placement.contradictions.get(pair, "")
-            keep = np.zeros(len(joined.closures), bool) if chosen is None else joined.groups[chosen]
-            keep = keep & plausible(
-                joined.closures,
-                self.graph.from_first.moved(self.alignment.T_world_first(self.own)),
-                peer,
-                self.config.consensus.closures,
-            )
-        return LinkStart(n.index, n.name, joined.shared, joined.closures, keep, peer.T_frame_keyframe)
 
     # --- end
 
@@ -499,7 +421,7 @@ class Agent:
         """Done when nothing is missing, nothing is unacknowledged and no neighbor lacks what only passes here."""
         if self.done:
             return
-        if self.alignment_hops == WHOLE_COMPONENT and not self._joined():
+        if self.alignment_hops == WHOLE_COMPONENT and not self.radio.joined:
             self.done = True  # alone from the start, or all neighbors were given up
             self.converged = self.poses is None
             return
@@ -507,7 +429,7 @@ class Agent:
         if self.agreed and self.sharing.complete(members):
             self.done = all(
                 n.transport.idle and n.state is not None and self.sharing.supplied(n.state, members)
-                for n in self._joined()
+                for n in self.radio.joined
             )
             self.converged = self.done
 

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes
 from duagc.pipeline.exchange import injection, place_recognition
@@ -35,18 +36,17 @@ from duagc.pipeline.exchange.loop_closing import (
 )
 from duagc.pipeline.exchange.own_graph import OwnGraph
 from duagc.pipeline.exchange.place_recognition import Candidate, Planner
-from duagc.pipeline.exchange.surface_agreement import coarse_depth, surface_agreement
 from duagc.pipeline.exchange.verification import Verdict, Verified, verify
 from duagc.pipeline.exchange.wire import loop_closing_wire
 from duagc.pipeline.exchange.wire.loop_closing_wire import DescriptorSet, KeyframeSample, Verdicts
 from duagc.pipeline.network.packets import Kind, MalformedError
 from duagc.pipeline.posegraph.loop_closures import Group, KeyframePoses, consistent, drift
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
+from duagc.pipeline.posegraph.surface_agreement import coarse_depth, surface_agreement
 from duagc.pipeline.registration import Reference, RgbdPyramid
 from duagc.pipeline.registration.features import Features, extract
 from duagc.pipeline.runs.robot_data import RobotData
 
-Array = NDArray[np.float64]
 VERIFIER_KINDS = frozenset({Kind.DESCRIPTORS, Kind.SAMPLE})
 """Messages that the verifier receives."""
 PYRAMIDS_KEPT = 12
@@ -75,9 +75,9 @@ class KeyframeDatabase:
         if self._features is None:
             self._features = []
             for k in range(self.data.keyframes):
-                color, depth_m, _ = self.data.images(k)
+                color, depth_m, _, mask = self.data.images(k)
                 most = self.config.places.features_per_keyframe
-                self._features.append(extract(color, depth_m, self.data.camera, most))
+                self._features.append(extract(color, depth_m, self.data.camera, most, mask=mask))
                 self._coarse_depths.append(coarse_depth(depth_m))
         return self._features
 
@@ -85,7 +85,11 @@ class KeyframeDatabase:
         """How well own depth images agree with a neighbor's samples [m, 3], keyframes at T_first_peer [k, 4, 4]."""
         assert len(self.features) == len(self._coarse_depths)  # which reads the images
         return surface_agreement(
-            self._coarse_depths, self.data.camera, self.graph.T_first_keyframe, samples, T_first_peer
+            self._coarse_depths,
+            self.data.camera,
+            samples,
+            T_ownmap_keyframe=self.graph.T_first_keyframe,
+            T_ownmap_peer=T_first_peer,
         )
 
     def pyramid(self, keyframe: int) -> RgbdPyramid:
@@ -96,7 +100,7 @@ class KeyframeDatabase:
         images = self.data.images(keyframe)
         color = images.color.astype(np.float32) / np.float32(255)
         camera, sigma_m = self.data.camera, images.depth_sigma_m
-        return RgbdPyramid.build(color, images.depth_m, camera, depth_sigma_m=sigma_m)
+        return RgbdPyramid.build(color, images.depth_m, camera, depth_sigma_m=sigma_m, mask=images.mask)
 
     @property
     def digest(self) -> bytes:
@@ -215,7 +219,11 @@ class Verifier(LoopClosureProtocol):
             detail = f"{candidate.score} descriptors match at best, {c.min_score} needed"
             self.tried.append(Tried(candidate, Verified(Verdict.UNLIKE, 0, 0, detail)))
         self.planner = Planner(
-            candidates, self.database.graph.drift, received.drift, c, self.config.consensus.closures
+            candidates,
+            c,
+            drift_own=self.database.graph.drift,
+            drift_peer=received.drift,
+            closures=self.config.consensus.closures,
         )
         self._request(send)
 

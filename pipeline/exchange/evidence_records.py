@@ -7,7 +7,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.config.consensus import MatchingConfig, WeightKind
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.config.consensus import MapMatching, WeightKind
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import match
 from duagc.pipeline.consensus.weighting import shared_evidence
@@ -18,7 +19,6 @@ from duagc.pipeline.runs.robot_data import RobotData
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import INFORMATION_DIAGONAL, MEAN
 
-Array = NDArray[np.float64]
 Records = NDArray[Any]
 
 # what a receiver expects before any evidence: standard deviations of position (m), log-covariance, color, opacity logit
@@ -100,7 +100,7 @@ def within(
 
 
 def match_pairs(
-    own: tuple[str, Records, Array], peer: tuple[str, Records, Array], config: MatchingConfig
+    own: tuple[str, Records, Array], peer: tuple[str, Records, Array], config: MapMatching
 ) -> NDArray[np.int64]:
     """Ids of matched Gaussians of two robots, int64 [n, 2].
 

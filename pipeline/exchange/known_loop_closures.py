@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes, link_metric
@@ -22,8 +21,6 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.packets import Kind, MalformedError
 from duagc.pipeline.posegraph.loop_closures import Group, KeyframePoses, consistent, holder, robust_frame
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
-
-Array = NDArray[np.float64]
 
 
 class KnownLoopClosures:

@@ -22,7 +22,6 @@ from duagc.pipeline.posegraph.cycle_consistency import Proposal
 from duagc.pipeline.posegraph.loop_closures import Group, KeyframePoses, frame_variance
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
 
-Array = NDArray[np.float64]
 Send = Callable[[Kind, bytes], None]
 """Queues a reliable message for the neighbor."""
 

@@ -9,16 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.consensus.tree import TreePlace
 from duagc.pipeline.exchange.wire import state_wire
 from duagc.pipeline.exchange.wire.state_wire import RelativeFrames, pair_bit
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph.cycle_consistency import Placement, place
 
-Array = NDArray[np.float64]
 Pair = tuple[int, int]
 
 

@@ -84,6 +84,20 @@ class Neighbor:
     early: list[tuple[int, bytes]] = field(default_factory=list)
     voxels: NDArray[np.int64] | None = None
 
+    def was_sent(self, state: bytes, round_index: int) -> bool:
+        """Whether it was sent this very state lately; if not, it is now.
+
+        Args:
+            state: the bytes of the own state.
+            round_index: the current round.
+        """
+        known, sent_round = self.sent_state
+        due = round_index - sent_round >= self.transport.repeat_after_rounds
+        if self.transport.last_heard is not None and state == known and not due:
+            return True
+        self.sent_state = state, round_index
+        return False
+
     @property
     def decided(self) -> bool:
         """Whether it is final if the two robots share a frame, and the neighbor knows it."""

@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.loop_closures import KeyframePoses
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.config.exchange import PlacesConfig
 from duagc.pipeline.registration.features import Descriptors, Features, matches
 
-Array = NDArray[np.float64]
 FIRST_SIGMA = np.array([10.0, 1.0])  # of the relative frame before anything is known (m, rad)
 MOST_LIKELY = 0.95
 """Probability of a loop closure for many matching descriptors; it falls as 1 - exp((4 - score) / 5). Counted on 413
@@ -78,18 +77,19 @@ class Planner:
     def __init__(
         self,
         candidates: Sequence[Candidate],
+        config: PlacesConfig,
+        *,
         drift_own: Array,
         drift_peer: Array,
-        config: PlacesConfig,
         closures: LoopClosureConfig,
     ) -> None:
         """Start with all candidates.
 
         Args:
             candidates: best first.
+            config: budget of requests.
             drift_own: [n, 2], variance along the own odometry (m^2, rad^2).
             drift_peer: [n, 2], the same of the neighbor.
-            config: budget of requests.
             closures: for their least variance.
         """
         self.config, self.min_support = config, closures.min_support

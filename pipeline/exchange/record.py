@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from duagc import schemas
+from duagc.pipeline.base.component_names import same_robot
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.messages import map_frame, pack_pose, pack_stamp
+from duagc.pipeline.messages.parts import pack_information
 from duagc.pipeline.network.link_model import Fate
 from duagc.pipeline.network.packets import (
     EVIDENCE_KINDS,
@@ -50,6 +52,12 @@ class RawAlternative:
         )
 
 
+def _write(writer: LogWriter, topic: str, message: Any, now_ns: int) -> None:
+    """Write a message with the time of the session."""
+    pack_stamp(message, now_ns)
+    writer.write(topic, message, now_ns)
+
+
 class ExchangeRecorder:
     """Writes exchange.mcap."""
 
@@ -81,8 +89,9 @@ class ExchangeRecorder:
             copies_deliver_ns=fate.deliver_ns[1:],
             dropped=fate.reason,
         )
-        pack_stamp(message, send_ns)
-        self.writer.write(topics.PEER_PACKET.of(sender), message, send_ns)
+        _write(self.writer, topics.PEER_PACKET.of(sender), message, send_ns)
+        if same_robot(sender, out.receiver):
+            return  # between components of one robot: no radio carries it
         totals = self._totals.setdefault((sender, out.receiver, out.message.kind.name), [0, 0, 0, 0])
         totals[0] += 1
         totals[1] += not fate.delivered
@@ -108,8 +117,7 @@ class ExchangeRecorder:
             message.payload = payload
         else:
             message.same_as_robot, message.same_as_message = earlier
-        pack_stamp(message, send_ns)
-        self.writer.write(topics.PEER_MESSAGE.of(sender), message, send_ns)
+        _write(self.writer, topics.PEER_MESSAGE.of(sender), message, send_ns)
 
     def summary(
         self, team: list[str], *, rounds: int, converged: bool, raw: RawAlternative, now_ns: int
@@ -139,8 +147,7 @@ class ExchangeRecorder:
             message.bytes_sent += size
             message.bytes_delivered += arrived
             message.bytes_setup += size * (kind not in RUNNING_KINDS)
-        pack_stamp(message, now_ns)
-        self.writer.write(topics.EXCHANGE_SUMMARY.pattern, message, now_ns)
+        _write(self.writer, topics.EXCHANGE_SUMMARY.pattern, message, now_ns)
 
 
 RUNNING_KINDS = frozenset(kind.name for kind in (Kind.ACK, Kind.STATE, *EVIDENCE_KINDS))
@@ -264,8 +271,7 @@ class ConsensusRecorder:
         if self._last.get(topic) != content:
             self._last[topic] = content
             message.round = round_index
-            pack_stamp(message, now_ns)
-            self.writer.write(topic, message, now_ns)
+            _write(self.writer, topic, message, now_ns)
 
     @staticmethod
     def _agent(agent: MapAgent) -> Any:
@@ -335,6 +341,5 @@ class ConsensusRecorder:
             if c.T_own_peer is not None:
                 message.pose_own_peer.CopyFrom(pack_pose(c.T_own_peer))
             if c.information is not None:
-                message.information.extend(c.information.ravel().tolist())
-            pack_stamp(message, now_ns)
-            self.writer.write(topics.LOOP_CLOSURE_DECISION.of(c.robot), message, now_ns)
+                message.information.extend(pack_information(c.information))
+            _write(self.writer, topics.LOOP_CLOSURE_DECISION.of(c.robot), message, now_ns)

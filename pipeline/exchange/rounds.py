@@ -61,7 +61,9 @@ def run_rounds(
             observer.ticked(agent, round_index, now_ns)
         for sender, burst in bursts:
             for out in burst:
-                fate = model.fate(sender, out.receiver, out.sequence, now_ns, len(out.packet))
+                fate = model.fate(
+                    sender, out.receiver, sequence=out.sequence, send_ns=now_ns, size=len(out.packet)
+                )
                 observer.sent(sender, out, fate, round_index=round_index, now_ns=now_ns)
                 waiting[out.receiver].extend(
                     (at_ns, sender, out.sequence, out.packet) for at_ns in fate.deliver_ns

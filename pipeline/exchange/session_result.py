@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.exchange.evidence_records import to_evidence
 from duagc.pipeline.exchange.map_agent import MapAgent
 from duagc.pipeline.exchange.neighbor import Neighbor
@@ -16,8 +16,6 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
 from duagc.pipeline.runs.robot_data import LoopClosureRecord, SessionResult
-
-Array = NDArray[np.float64]
 
 
 def result_of(agent: MapAgent) -> SessionResult:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
-import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.exchange import injection
 from duagc.pipeline.exchange.evidence_records import best_first, match_pairs, own_records, seen_voxels, within
@@ -19,7 +19,6 @@ from duagc.pipeline.network.packets import Kind, MalformedError
 from duagc.pipeline.network.transport import Arrival
 from duagc.pipeline.runs.robot_data import RobotData
 
-Array = NDArray[np.float64]
 EVIDENCE_WIRES = {
     "compact": Kind.EVIDENCE,
     "float32": Kind.EVIDENCE_EXACT,
@@ -287,7 +286,7 @@ class Sharing:
                 ids = match_pairs(
                     (self.data.robot, self.own_records(), k.anchors[self.own].T_common_keyframe),
                     (self.team[other], k.sound_records(other), k.anchors[other].T_common_keyframe),
-                    self.config.matching,
+                    self.config.matching.of_maps(self.data.thickness_floor_m),
                 )
                 ids = injection.false_matches(
                     ids, self.config.injection, seed=self.seed, robot=self.data.robot, peer=self.team[other]

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes
@@ -20,9 +21,6 @@ from duagc.pipeline.exchange.wire import elimination_wire
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses_in_parts
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT, RobustWeights
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, closures_as_relative_poses
-
-Array = NDArray[np.float64]
-
 
 ROUNDING_STEPS = 4.0
 
@@ -169,7 +167,7 @@ class AdmmSolver:
 
     @property
     def converged(self) -> bool:
-        return self.agent.settled or (self.agent.robust_done and self._recent_change() < self._rounding_m())
+        return self.agent.converged or (self.agent.robust_done and self._recent_change() < self._rounding_m())
 
     def _recent_change(self) -> float:
         """Largest change of a pose or an edge variable, by the last arrivals too (m, rad)."""

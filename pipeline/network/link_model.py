@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.component_names import robot_of, same_robot
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.network import LinkConfig, LinkWindow
 
@@ -46,18 +47,25 @@ class Fate:
 def neighbors(config: LinkConfig, robots: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """The robots that each robot has a radio link to at any time, in either direction, sorted.
 
+    Components of one robot always have a link, inside it, and those to others that the robot has.
+
     Args:
         config: topology and switch of the links.
-        robots: names of the team in any order; the topology is laid over them in alphabetical order.
+        robots: names of the team in any order, or of components; the topology is laid over the robots in
+            alphabetical order.
     Raises:
         DuagError: a window or waypoint names a robot that is not in the team, or a robot has no waypoint.
     """
-    names = sorted(robots)
-    linked: dict[str, set[str]] = {name: set() for name in names}
-    for one, other in _edges(config, names) if config.enabled else ():
-        linked[one].add(other)
-        linked[other].add(one)
-    return {name: tuple(sorted(linked[name])) for name in names}
+    components: dict[str, list[str]] = {}
+    for name in sorted(robots):
+        components.setdefault(robot_of(name), []).append(name)
+    linked: dict[str, set[str]] = {name: set(components[robot_of(name)]) - {name} for name in robots}
+    for one, other in _edges(config, sorted(components)) if config.enabled else ():
+        for a in components[one]:
+            linked[a] |= set(components[other])
+            for b in components[other]:
+                linked[b].add(a)
+    return {name: tuple(sorted(linked[name])) for name in sorted(robots)}
 
 
 def _edges(config: LinkConfig, names: list[str]) -> set[tuple[str, str]]:
@@ -113,7 +121,7 @@ class LinkModel:
             robot: _Track.of(config, robot) for robot in {waypoint.robot for waypoint in config.waypoints}
         }
 
-    def fate(self, sender: str, receiver: str, sequence: int, send_ns: int, size: int) -> Fate:
+    def fate(self, sender: str, receiver: str, *, sequence: int, send_ns: int, size: int) -> Fate:
         """Decide what becomes of one packet.
 
         Args:
@@ -124,7 +132,10 @@ class LinkModel:
             size: bytes, header included.
         """
         config = self.config
-        radio = self._radios.setdefault((sender, receiver), _Radio())
+        if same_robot(sender, receiver):
+            return Fate((send_ns + 1,))  # it never leaves the robot; it was sent before it is there
+        ends = robot_of(sender), robot_of(receiver)
+        radio = self._radios.setdefault(ends, _Radio())
         start_ns = max(send_ns, radio.free_ns)
         if start_ns - send_ns > config.queue_ns:
             return Fate((), QUEUE_FULL)
@@ -132,10 +143,10 @@ class LinkModel:
         if config.bandwidth_bytes_per_s:
             on_air_ns = size * 1_000_000_000 // config.bandwidth_bytes_per_s
             radio.free_ns = start_ns + on_air_ns
-        window = self._window(sender, receiver, start_ns)
+        window = self._window(*ends, start_ns)
         if config.topology == "listed" and window is None:
             return Fate((), DOWN)
-        if config.topology == "range" and self._distance_m(sender, receiver, start_ns) > config.range_m:
+        if config.topology == "range" and self._distance_m(*ends, start_ns) > config.range_m:
             return Fate((), FAR)
         draws = _Draws(self.seed, sender, receiver, sequence)
         loss = config.loss_probability
@@ -143,7 +154,7 @@ class LinkModel:
             loss = window.loss_probability
         if loss > 0.0 and draws.next() < loss:
             return Fate((), LOST)
-        if self._in_burst(radio, sender, receiver, start_ns) and draws.next() < config.burst_loss_probability:
+        if self._in_burst(radio, *ends, start_ns) and draws.next() < config.burst_loss_probability:
             return Fate((), BURST)
         arrival_ns = start_ns + on_air_ns + config.latency_ns
         copies = 1 + (config.duplicate_probability > 0.0 and draws.next() < config.duplicate_probability)

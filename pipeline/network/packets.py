@@ -129,7 +129,7 @@ def serialize(packet: Packet) -> bytes:
     """Bytes of a packet: header, with its CRC over all else, and payload."""
     if len(packet.payload) > MAX_PAYLOAD_BYTES:
         raise ValueError(f"payload of {len(packet.payload)} bytes, at most {MAX_PAYLOAD_BYTES} fit")
-    fields = _FIELDS.pack(
+    values = (
         MAGIC,
         VERSION,
         packet.kind,
@@ -142,6 +142,7 @@ def serialize(packet: Packet) -> bytes:
         packet.total,
         len(packet.payload),
     )
+    fields = _FIELDS.pack(*values)
     return fields + _CRC.pack(zlib.crc32(packet.payload, zlib.crc32(fields))) + packet.payload
 
 

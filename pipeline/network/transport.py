@@ -125,6 +125,7 @@ class Transport:
         peer: int,
         peer_name: str,
         config: TransportConfig,
+        *,
         new_id: Callable[[], int],
         identity: Identity | None = None,
     ) -> None:

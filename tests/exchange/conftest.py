@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.messages import GaussianInformation
@@ -17,7 +18,6 @@ from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.runs.robot_data import Images, RobotData
 from duagc.pipeline.splat.gaussians import Gaussians
 
-Array = NDArray[np.float64]
 MakeRobot = Callable[..., tuple[RobotData, Array]]
 CAMERA = PinholeCamera(240, 180, 200.0, 200.0, 119.5, 89.5)
 HALF_M = np.array([2.0, 1.3, 2.4])  # half the edges of the room

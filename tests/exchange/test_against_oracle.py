@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from duagc.pipeline.config.consensus import MatchingConfig, PoseConsensusConfig
+from duagc.pipeline.config.consensus import MapMatching, PoseConsensusConfig
 from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.network import LinkConfig
@@ -88,7 +88,7 @@ def fused_theta(
         OwnMap(name, own.gaussians, own.T_map_keyframe, poses[name]),
         {robot: e.in_world(poses[robot]) for robot, e in evidence.items()},
         pairs,
-        MapContext(own.camera, FusionConfig(coverage="overlap"), MatchingConfig()),
+        MapContext(own.camera, FusionConfig(coverage="overlap"), MapMatching()),
         self_information=splats.in_world(poses[name]),
     )
     n = len(own.gaussians)

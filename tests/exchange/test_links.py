@@ -23,7 +23,7 @@ def fates(
 ) -> list[Fate]:
     """Fates of so many packets of one link."""
     model = LinkModel(config, seed)
-    return [model.fate("alpha", "bravo", s, s * every_ns, size) for s in range(count)]
+    return [model.fate("alpha", "bravo", sequence=s, send_ns=s * every_ns, size=size) for s in range(count)]
 
 
 def test_topologies() -> None:
@@ -64,8 +64,8 @@ def test_a_fate_depends_on_no_other_packet(trouble: dict[str, Any]) -> None:
     model = LinkModel(config, seed=1)
     mixed = []
     for s in reversed(range(200)):
-        model.fate("bravo", "alpha", s, 0, 1000)
-        mixed.append(model.fate("alpha", "bravo", s, s * 0, 1000))
+        model.fate("bravo", "alpha", sequence=s, send_ns=0, size=1000)
+        mixed.append(model.fate("alpha", "bravo", sequence=s, send_ns=s * 0, size=1000))
     assert alone == mixed[::-1]
     assert alone != fates(config, 200, seed=2)
 
@@ -115,8 +115,8 @@ def test_a_bandwidth_holds() -> None:
     assert [f.deliver_ns for f in got[:10]] == [((k + 1) * 10 * MS,) for k in range(10)]
     assert {f.reason for f in got[10:]} == {link_model.QUEUE_FULL}
     model = LinkModel(config, 0)
-    assert model.fate("alpha", "bravo", 0, 0, 1000) == model.fate(
-        "bravo", "alpha", 0, 0, 1000
+    assert model.fate("alpha", "bravo", sequence=0, send_ns=0, size=1000) == model.fate(
+        "bravo", "alpha", sequence=0, send_ns=0, size=1000
     )  # a link each way
 
 
@@ -129,7 +129,7 @@ def test_windows_open_close_and_have_a_direction() -> None:
     model = LinkModel(LinkConfig(topology="listed", windows=windows), 0)  # type: ignore[arg-type]
 
     def reason(sender: str, receiver: str, now_ns: int) -> str:
-        return model.fate(sender, receiver, 0, now_ns, 100).reason
+        return model.fate(sender, receiver, sequence=0, send_ns=now_ns, size=100).reason
 
     assert reason("alpha", "bravo", 99) == reason("bravo", "alpha", 99) == ""
     assert reason("alpha", "bravo", 100) == reason("bravo", "alpha", 250) == link_model.DOWN
@@ -145,7 +145,10 @@ def test_range_follows_the_waypoints() -> None:
     )
     config = LinkConfig(topology="range", range_m=30.0, waypoints=waypoints)  # type: ignore[arg-type]
     assert neighbors(config, ["alpha", "bravo"]) == {"alpha": ("bravo",), "bravo": ("alpha",)}
-    got = {t: LinkModel(config, 0).fate("alpha", "bravo", 0, t, 100).reason for t in (0, 299, 301, 5000)}
+    got = {
+        t: LinkModel(config, 0).fate("alpha", "bravo", sequence=0, send_ns=t, size=100).reason
+        for t in (0, 299, 301, 5000)
+    }
     assert got == {0: "", 299: "", 301: link_model.FAR, 5000: link_model.FAR}
     with pytest.raises(DuagError, match="none of charlie, expected one for each robot"):
         neighbors(config, ["alpha", "bravo", "charlie"])

@@ -120,7 +120,9 @@ DRIFT = np.stack([np.arange(40) * 0.003**2, np.arange(40) * 0.001**2], axis=1)
 
 
 def planner(candidates: list[Candidate], **config: Any) -> Planner:
-    return Planner(candidates, DRIFT, DRIFT, PlacesConfig(**config), LoopClosureConfig())
+    return Planner(
+        candidates, PlacesConfig(**config), drift_own=DRIFT, drift_peer=DRIFT, closures=LoopClosureConfig()
+    )
 
 
 def test_every_pair_of_keyframes_is_scored_or_has_a_word_said_about_it(robots: dict) -> None:

@@ -48,7 +48,7 @@ def carry(pipes: dict[str, Connection]) -> None:
         for sender, (sent, _) in answers.items():
             for receiver, packet in sent:
                 sequence = int.from_bytes(packet[8:12], "little")
-                fate = model.fate(sender, receiver, sequence, now_ns, len(packet))
+                fate = model.fate(sender, receiver, sequence=sequence, send_ns=now_ns, size=len(packet))
                 waiting[receiver].extend((at_ns, sender, sequence, packet) for at_ns in fate.deliver_ns)
         if all(done for _, done in answers.values()):
             return

@@ -24,7 +24,8 @@ def write(
     ties: tuple[tuple[int, int], ...] = ((0, 1),),
 ) -> AgentInput:
     """A robot's frontend.mcap and information.mcap; its sensor log does not exist."""
-    source = AgentInput("alpha", folder / "alpha.mcap", folder / "frontend.mcap", folder / "information.mcap")
+    files = folder / "alpha.mcap", folder / "frontend.mcap", folder / "information.mcap"
+    source = AgentInput("alpha", *files, thickness_floor_m=1e-3)
     with LogWriter(source.frontend, robot="alpha") as log:
         for number in numbers:
             keyframe = Keyframe(
@@ -51,8 +52,12 @@ def write(
         ({"with_map": False}, r"frontend.mcap: /alpha/map not found"),
         ({"numbers": (0, 2)}, r"frontend.mcap: /alpha/keyframe is not numbered"),
         ({"first": 1}, r"information.mcap: is about other Gaussians"),
-        ({"ties": ()}, r"frontend.mcap: registrations tie keyframes \[\] to earlier ones, expected \[1\]"),
-        ({"ties": ((0, 1), (1, 2))}, r"frontend.mcap: registrations tie keyframes \[1, 2\]"),
+        ({"ties": ()}, r"frontend.mcap: registrations tie keyframe 1 to no other"),
+        (
+            {"ties": ((0, 1), (1, 2))},
+            r"frontend.mcap: a registration ties keyframes 1 and 2, expected two of 2",
+        ),
+        ({"ties": ((1, 0),)}, r"frontend.mcap: a registration ties keyframes 1 and 0"),
         ({}, r"alpha.mcap"),  # the sensor log itself
     ],
 )
@@ -62,6 +67,16 @@ def test_files_that_do_not_belong_together(
     data, _ = make_robot("alpha", 0.0, 1, 20)
     with pytest.raises(DuagError, match=complaint):
         load(write(tmp_path, data, **changes))
+
+
+def test_a_keyframe_may_be_tied_by_later_ones_only() -> None:
+    """The first keyframe of a joined submap: loop closures lead from later ones to the map before."""
+    T = np.eye(4)
+    keyframes = [Keyframe(k, "alpha", k, 8 * k, T, k - 1, T, np.eye(6), (0, 0)) for k in range(4)]
+    factors = [KeyframeFactor(j, "alpha", i, j, T, np.eye(6), 1.0) for i, j in ((0, 1), (2, 3), (1, 3))]
+    assert len(registrations_of(Path("frontend.mcap"), keyframes, factors)) == 3
+    with pytest.raises(DuagError, match="keyframe 2 to no other"):
+        registrations_of(Path("frontend.mcap"), keyframes, factors[:1] + factors[2:])
 
 
 def test_registrations_count_by_their_robust_weight() -> None:

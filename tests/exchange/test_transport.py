@@ -16,8 +16,8 @@ def two_ends(config: TransportConfig | None = None) -> tuple[Transport, Transpor
     config = config or TransportConfig()
     counters = (itertools.count(1), itertools.count(1))
     return (
-        Transport(0, 1, "bravo", config, counters[0].__next__),
-        Transport(1, 0, "alpha", config, counters[1].__next__),
+        Transport(0, 1, "bravo", config, new_id=counters[0].__next__),
+        Transport(1, 0, "alpha", config, new_id=counters[1].__next__),
     )
 
 
@@ -36,7 +36,7 @@ def run(
             sent_bytes += sum(len(o.packet) for o in burst) if sender is a else 0
             for out in burst:
                 packet = parse(out.packet)
-                if model.fate(*names, packet.sequence, 0, len(out.packet)).delivered:
+                if model.fate(*names, sequence=packet.sequence, send_ns=0, size=len(out.packet)).delivered:
                     arrival = receiver.receive(packet, round_index)
                     if arrival is not None and arrival.complete and arrival.kind is not Kind.STATE:
                         assert arrival.message not in got

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.splat.information import (
     COLOR,
     COLOR_INFORMATION,
@@ -30,7 +31,6 @@ from duagc.pipeline.splat.information import (
     pack_symmetric,
 )
 
-Array = NDArray[np.float64]
 COMPACT = np.dtype(
     [
         ("id", "<u4"),

@@ -7,14 +7,12 @@ from collections.abc import Mapping
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.consensus.elimination import BackSubstitution, Block, Variable
 from duagc.pipeline.consensus.tree import Message, TreeNode
 from duagc.pipeline.exchange.wire.state_wire import MAX_TEAM, Reader, array_bytes
 from duagc.pipeline.network.packets import MalformedError
-
-Array = NDArray[np.float64]
 
 
 class Code(IntEnum):

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.exchange.wire.compact_wire import COMPACT, decode, encode
 from duagc.pipeline.exchange.wire.state_wire import MAX_COORDINATE, Reader
@@ -31,8 +32,6 @@ from duagc.pipeline.splat.information import (
     log_covariance_block,
     mean_block,
 )
-
-Array = NDArray[np.float64]
 
 MAX_INFORMATION = 1e15  # of a coordinate, 1/m^2: 30 nm
 INDEFINITE_TOLERANCE = 1e-4  # of the largest eigenvalue: rounding of float32

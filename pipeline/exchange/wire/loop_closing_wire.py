@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes
 from duagc.pipeline.exchange.wire.state_wire import (
     MAX_KEYFRAMES,
@@ -19,8 +20,6 @@ from duagc.pipeline.exchange.wire.state_wire import (
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.registration import Reference, ReferenceLevel
 from duagc.pipeline.registration.features import DIMENSIONS, Descriptors, Features
-
-Array = NDArray[np.float64]
 
 DIGEST_BYTES = 8
 

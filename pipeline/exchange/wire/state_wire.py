@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import se3, so3
 from duagc.pipeline.network.packets import MalformedError
 from duagc.pipeline.posegraph.cycle_consistency import Proposal
-
-Array = NDArray[np.float64]
 
 MAX_KEYFRAMES = 100_000
 MAX_COORDINATE = 1e6  # m, or units of theta; beyond it positions lose their meaning
@@ -174,14 +173,20 @@ def read_state(data: bytes, team: int) -> tuple[State, bytes]:
     """A state and the bytes that follow it."""
     reader = Reader(data, "state")
     if len(data) > 2 and data[2] & _SHORT:
-        return _read_short_state(reader, team)
-    alignment_hops, converged_hops, flags, n = reader.fields(_STATE)
-    if n != team:
-        raise MalformedError(f"state: about a team of {n}, expected {team}")
-    if flags > 3:
-        raise MalformedError("state: unknown flags")
-    sources = reader.array("uint8", (n,))
-    links, revoked = _read_pairs(reader, team), _read_pairs(reader, team)
+        alignment_hops, converged_hops, flags = reader.fields(_SHORT_STATE)
+        if flags > _AGREED | _DONE | _SHORT | _REVOKED:
+            raise MalformedError("state: unknown flags")
+        links = _read_pairs(reader, team)
+        revoked = _read_pairs(reader, team) if flags & _REVOKED else 0
+        sources = np.full(team, NOBODY, np.uint8)
+    else:
+        alignment_hops, converged_hops, flags, n = reader.fields(_STATE)
+        if n != team:
+            raise MalformedError(f"state: about a team of {n}, expected {team}")
+        if flags > _AGREED | _DONE:
+            raise MalformedError("state: unknown flags")
+        sources = reader.array("uint8", (n,))
+        links, revoked = _read_pairs(reader, team), _read_pairs(reader, team)
     state = State(
         links=links,
         revoked_links=revoked,
@@ -192,26 +197,6 @@ def read_state(data: bytes, team: int) -> tuple[State, bytes]:
         sources=sources,
     )
     return state, data[reader.position :]
-
-
-def _read_short_state(reader: Reader, team: int) -> tuple[State, bytes]:
-    """A state without sources, and the bytes that follow it."""
-    alignment_hops, converged_hops, flags = reader.fields(_SHORT_STATE)
-    if flags > _AGREED | _DONE | _SHORT | _REVOKED:
-        raise MalformedError("state: unknown flags")
-    links = _read_pairs(reader, team)
-    revoked = _read_pairs(reader, team) if flags & _REVOKED else 0
-    sources = np.full(team, NOBODY, np.uint8)
-    state = State(
-        links=links,
-        revoked_links=revoked,
-        alignment_hops=alignment_hops,
-        converged_hops=converged_hops,
-        agreed=bool(flags & _AGREED),
-        done=bool(flags & _DONE),
-        sources=sources,
-    )
-    return state, reader.data[reader.position :]
 
 
 def write_labeled(revoked: int, team: int, payload: bytes) -> bytes:
