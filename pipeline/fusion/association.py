@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import held_thickness
@@ -21,7 +22,6 @@ from duagc.pipeline.geometry.spd import add_covariance
 from duagc.pipeline.geometry.statistics import MAD_TO_SIGMA
 from duagc.pipeline.splat.information import COLOR, LOG_COVARIANCE, MEAN, OPACITY, THETA_SIZE
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 # Information of the own mean (1/m^2) and shape, which decides where no robot has any. Matches are within centimeters,
 # so that of `neighbors` claims nothing; where all robots shall end with the same Gaussian it is next to nothing.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from duagc.pipeline.config.consensus import MatchingConfig, WeightKind
+from duagc.pipeline.config.consensus import MapMatching, WeightKind
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -26,7 +26,7 @@ class MapContext:
 
     camera: PinholeCamera
     config: FusionConfig
-    matching: MatchingConfig
+    matching: MapMatching
     depth_kind: DepthKind = "blended"
     weights: WeightKind = "block"
     threads: int = 1

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.geometry import se3
@@ -16,7 +17,6 @@ from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import MEAN, mean_block
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 DepthImages = Iterable[tuple[int, NDArray[np.float32]]]
 """(own keyframe index, depth [H, W] in meters, 0 invalid), read once."""

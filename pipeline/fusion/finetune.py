@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
-from duagc.pipeline.config.fusion import RefineConfig
+from duagc.pipeline.config.fusion import FinetuneConfig
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
 from duagc.pipeline.kernels import CompiledAdam, LossWeights, Rasterizer
@@ -32,7 +32,7 @@ PEERS_UNTIL = 0.6
 _TRAINED = ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits")
 
 
-def num_steps(config: RefineConfig, own_views: int, peer_views: int) -> tuple[int, int]:
+def num_steps(config: FinetuneConfig, own_views: int, peer_views: int) -> tuple[int, int]:
     """How many steps the training takes on own views and on views of peers' maps.
 
     Args:
@@ -60,13 +60,13 @@ def finetune_map(
     Args:
         gaussians: in the world frame of the views.
         views: own images.
-        context: camera and settings; `config.refine` is the schedule.
+        context: camera and settings; `config.finetune` is the schedule.
         trained: bool [n], which of the Gaussians may change; None: all.
         peer_views: as peers' maps show them.
     Returns:
         As many Gaussians, in the same order, with the same ids and anchors.
     """
-    config = context.config.refine
+    config = context.config.finetune
     own_steps, peer_steps = num_steps(config, len(views), len(peer_views))
     if not own_steps or not len(gaussians):
         return gaussians
@@ -77,6 +77,7 @@ def finetune_map(
     adam = CompiledAdam(len(gaussians), threads=context.threads)
     floor_m = context.matching.thickness_floor_m
     floor = np.minimum(gaussians.log_scales, np.float32(np.log(floor_m)))  # thinner ones stay as they are
+    # the streams keep the names that they had: under other names they would draw other views
     own = _in_turn(views, context.seed, "fusion.refine")
     peer = _in_turn(peer_views, context.seed, "fusion.refine.peers")
     for step in range(total):

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.consensus.colors import ColorMap, TeamColors, team_colors
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.matching import Pairs, tracks
@@ -40,7 +41,6 @@ from duagc.pipeline.splat.information import (
     pack_information,
 )
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 

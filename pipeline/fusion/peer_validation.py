@@ -23,7 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.config.consensus import MatchingConfig
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.config.consensus import MapMatching
 from duagc.pipeline.config.fusion import PeerValidationConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import team_colors
@@ -36,7 +37,6 @@ from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import LOG_COVARIANCE, MEAN, gaussians_of
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 NO_PAIRS: Index = np.zeros((0, 2), np.int64)
 
@@ -121,7 +121,7 @@ def validate_peer_maps(
     config, matching = context.config.peer_validation, context.matching
     own_colors = _ColorStatistics(config.min_color_variance)
     for view in views:
-        own_colors.add(view.color[... if view.mask is None else view.mask])
+        own_colors.add(view.unit_color[... if view.mask is None else view.mask])
     largest_m = config.max_size_ratio * _sizes_m(own).max(initial=0.0)
     radius_m = config.match_radius_factor * matching.radius_m
     world, contradicted, judged = {own.owner: own}, {}, {}
@@ -180,7 +180,7 @@ def _near(a: Evidence, b: Evidence, pairs: Index, radius_m: float) -> Index:
     return near
 
 
-def _in_colors_of(a: Evidence, b: Evidence, pairs: Index, matching: MatchingConfig) -> Evidence:
+def _in_colors_of(a: Evidence, b: Evidence, pairs: Index, matching: MapMatching) -> Evidence:
     """Evidence of b as the camera of a would show it, by their matches [m, 2] alone."""
     cameras = team_colors({a.owner: a, b.owner: b}, {(a.owner, b.owner): pairs}, matching.colors)
     return cameras.between(b.owner, a.owner).of(b)
@@ -189,7 +189,7 @@ def _in_colors_of(a: Evidence, b: Evidence, pairs: Index, matching: MatchingConf
 def _true_pairs(
     world: Mapping[str, Evidence],
     pairs: Pairs,
-    matching: MatchingConfig,
+    matching: MapMatching,
     *,
     radius_m: float,
     largest: float,
@@ -205,15 +205,15 @@ def _true_pairs(
 
 
 class _ColorStatistics:
-    """Variance of colors 0..255, summed as they come."""
+    """Variance of colors 0..1, summed as they come."""
 
     def __init__(self, least_variance: float) -> None:
         self.least_variance = least_variance
         self.pixels, self._sum, self._squares = 0, np.zeros(3), np.zeros(3)
 
-    def add(self, colors: NDArray[np.uint8]) -> None:
+    def add(self, colors: NDArray[np.float32]) -> None:
         """Colors [..., 3]."""
-        c = colors.reshape(-1, 3).astype(np.float32) * np.float32(1 / 255)
+        c = colors.reshape(-1, 3)
         self.pixels += len(c)
         self._sum += c.sum(axis=0, dtype=np.float64)
         self._squares += (c**2).sum(axis=0, dtype=np.float64)
@@ -284,7 +284,7 @@ class _PhotometricCheck:
             errors, weights = errors + sums[:, 0], weights + sums[:, 1]
             total += float(images[..., 0].sum(dtype=np.float64))
             if first:
-                self.own.add(view.color[judged])
+                self.own.add(view.unit_color[judged])
         if first:
             self.color_mse = total / max(self.own.pixels, 1)
         least_px = self.config.min_gaussian_px

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.consensus.evidence import Evidence
@@ -22,7 +22,6 @@ from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.kernels import Rasterizer
 from duagc.pipeline.splat.information import gaussians_of
 
-Array = NDArray[np.float64]
 COVERED = 0.9
 """Opacity from which on a pixel of a peer's map counts as seen by it."""
 
@@ -42,7 +41,7 @@ def peer_views(
     Args:
         evidence: of the peers, by name, in the world frame, each in its own colors.
         T_world_keyframe: by name, [k, 4, 4] by anchor.
-        context: the robot's own camera and settings; `config.refine.peer_views` of all views are taken,
+        context: the robot's own camera and settings; `config.finetune.peer_views` of all views are taken,
             evenly spread.
         depth_kinds: as the maps were made, by name.
         colors: from every peer's colors to the own.
@@ -50,7 +49,7 @@ def peer_views(
     rasterizer = Rasterizer(threads=context.threads)
     shown = [name for name in sorted(evidence) if len(evidence[name])]
     poses = [(name, T) for name in shown for T in _with_middles(T_world_keyframe[name])]
-    count = min(context.config.refine.peer_views, len(poses))
+    count = min(context.config.finetune.peer_views, len(poses))
     chosen = [poses[k] for k in evenly_spaced(len(poses), count)]
     views, drawn = [], ""
     for name, T_world_camera in chosen:

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.config.consensus import MatchingConfig, WeightKind
+from duagc.pipeline.config.consensus import MapMatching, WeightKind
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.consensus.weighting import in_world, self_information
@@ -32,7 +33,7 @@ from duagc.pipeline.messages import (
     PeerColors,
     PeerMapReport,
 )
-from duagc.pipeline.recording import LogWriter, open_rgbd, read_log
+from duagc.pipeline.recording import LogWriter, open_rgbd, read_exposures, read_log
 from duagc.pipeline.registration.moving import FreeSpace
 from duagc.pipeline.runs.robot_data import AgentInput, RobotData, SessionResult, load
 from duagc.pipeline.splat.gaussians import Gaussians
@@ -44,7 +45,6 @@ from duagc.pipeline.splat.information import (
 from duagc.pipeline.splat.ply import write_ply
 from duagc.schemas import topics
 
-Array = NDArray[np.float64]
 FUSED_KIND = "gauss_newton"
 
 
@@ -69,7 +69,7 @@ def run_fusion(
     folder: Path,
     *,
     config: FusionConfig,
-    matching: MatchingConfig,
+    matching: MapMatching,
     moving: MovingConfig,
     weights: WeightKind = "block",
     seed: int = 0,
@@ -100,7 +100,7 @@ def run_fusion(
     context = MapContext(own.camera, config, matching, own.depth, weights, threads, seed=seed)
     views: list[PosedRgbd] = []
     if len(result.component) > 1:
-        num_support = config.refine.support_views
+        num_support = config.finetune.support_views
         views = training_views(source, frames, T_world_camera, num_support=num_support, moving=moving)
     fusion = _fuse(own, result, views, context)
     refined = fusion.fused.gaussians if fusion.refined is None else fusion.refined
@@ -168,7 +168,7 @@ def _finetuned(
     context: MapContext,
 ) -> Gaussians | None:
     """The fused map trained on own images and on renders of peers' maps; None if the settings have no steps."""
-    config = context.config.refine
+    config = context.config.finetune
     if not config.steps_per_view:
         return None
     shown: list[PosedRgbd] = []
@@ -207,15 +207,19 @@ def training_views(
     others = [k for k, f in enumerate(frames) if f.frame_index not in keyframes and not f.held_out]
     count = min(num_support, len(others))
     middles = [others[k] for k in evenly_spaced(len(others), count)]
-    views = []
+    views, exposures = [], read_exposures(source.frontend, source.robot)
     with open_rgbd(source.log) as log:
+        stamps = np.array([frame.stamp_ns for frame in frames], dtype=np.int64)
+        log.move_depth(Trajectory(stamps, np.array([frame.T_map_camera for frame in frames])))
         free = FreeSpace(log.camera, moving)
         for k in (*first, *middles):
             frame = log.frame(frames[k].frame_index)
             usable = frame.usable_depth
             if frames[k].frame_index in keyframes:
                 free.add(usable, T_world_camera[k])
-            views.append(PosedRgbd(frame.color, usable, T_world_camera[k], frame.mask, frame.depth_sigma))
+            exposure = exposures.at(frame.index)
+            T = T_world_camera[k]
+            views.append(PosedRgbd(frame.color, usable, T, frame.mask, frame.depth_sigma, exposure))
     return [replace(v, mask=free.usable(v.depth_m, v.T_world_camera, v.mask)) for v in views]
 
 

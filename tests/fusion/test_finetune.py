@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from duagc.pipeline.config.consensus import MatchingConfig
-from duagc.pipeline.config.fusion import FusionConfig, RefineConfig
+from duagc.pipeline.config.consensus import MapMatching
+from duagc.pipeline.config.fusion import FinetuneConfig, FusionConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.consensus.evidence import Evidence
@@ -24,10 +24,10 @@ ALL = np.ones(400, bool)
 
 
 def context(
-    config: RefineConfig, depth_kind: DepthKind = "blended", seed: int = 0, threads: int = 1
+    config: FinetuneConfig, depth_kind: DepthKind = "blended", seed: int = 0, threads: int = 1
 ) -> MapContext:
-    fusion = FusionConfig(refine=config)
-    return MapContext(CAMERA, fusion, MatchingConfig(), depth_kind, threads=threads, seed=seed)
+    fusion = FusionConfig(finetune=config)
+    return MapContext(CAMERA, fusion, MapMatching(), depth_kind, threads=threads, seed=seed)
 
 
 ALIKE = {"zulu": ColorMap(np.ones(3), np.zeros(3), np.zeros(3), np.zeros(3), 0)}
@@ -56,7 +56,7 @@ def score(gaussians: Gaussians, views: list[PosedRgbd]) -> float:
 def test_it_draws_better_also_where_it_was_not_trained(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
     gaussians, views = spoiled
     train, held_out = views[::2], views[1::2]
-    better = finetune_map(gaussians, train, context(RefineConfig(steps_per_view=30, rate=0.3)))
+    better = finetune_map(gaussians, train, context(FinetuneConfig(steps_per_view=30, rate=0.3)))
     assert score(better, train) > score(gaussians, train) + 5
     assert score(better, held_out) > score(gaussians, held_out) + 3
     assert np.array_equal(better.ids, gaussians.ids)
@@ -64,7 +64,7 @@ def test_it_draws_better_also_where_it_was_not_trained(spoiled: tuple[Gaussians,
 
 def test_what_no_view_sees_stays(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
     gaussians, views = spoiled
-    better = finetune_map(gaussians, views, context(RefineConfig()))
+    better = finetune_map(gaussians, views, context(FinetuneConfig()))
     for name in ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits"):
         before, after = getattr(gaussians, name), getattr(better, name)
         assert np.array_equal(before[-10:], after[-10:])
@@ -74,7 +74,7 @@ def test_what_no_view_sees_stays(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> 
 def test_what_others_own_stays(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
     gaussians, views = spoiled
     own = np.arange(400) % 3 > 0
-    better = finetune_map(gaussians, views, context(RefineConfig()), trained=own)
+    better = finetune_map(gaussians, views, context(FinetuneConfig()), trained=own)
     for name in ("means", "quats_wxyz", "log_scales", "colors", "opacity_logits"):
         before, after = getattr(gaussians, name), getattr(better, name)
         assert np.array_equal(before[~own], after[~own])
@@ -85,7 +85,7 @@ def test_what_others_own_stays(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> No
 def test_masked_pixels_teach_nothing(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
     gaussians, views = spoiled
     nothing = [PosedRgbd(v.color, v.depth_m, v.T_world_camera, np.zeros((48, 64), bool)) for v in views]
-    same = finetune_map(gaussians, nothing, context(RefineConfig()))
+    same = finetune_map(gaussians, nothing, context(FinetuneConfig()))
     assert np.array_equal(same.means, gaussians.means)
     assert np.array_equal(same.colors, gaussians.colors)
 
@@ -93,7 +93,7 @@ def test_masked_pixels_teach_nothing(spoiled: tuple[Gaussians, list[PosedRgbd]])
 def test_the_same_bits_on_any_number_of_threads(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
     gaussians, views = spoiled
     one, three, other = (
-        finetune_map(gaussians, views, context(RefineConfig(), "ray_plane", seed=seed, threads=threads))
+        finetune_map(gaussians, views, context(FinetuneConfig(), "ray_plane", seed=seed, threads=threads))
         for seed, threads in ((0, 1), (0, 3), (1, 1))
     )
     assert np.array_equal(one.means, three.means)
@@ -103,8 +103,8 @@ def test_the_same_bits_on_any_number_of_threads(spoiled: tuple[Gaussians, list[P
 
 def test_no_steps_change_nothing(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
     gaussians, views = spoiled
-    assert finetune_map(gaussians, views, context(RefineConfig(steps_per_view=0))) is gaussians
-    assert finetune_map(gaussians, [], context(RefineConfig())) is gaussians
+    assert finetune_map(gaussians, views, context(FinetuneConfig(steps_per_view=0))) is gaussians
+    assert finetune_map(gaussians, [], context(FinetuneConfig())) is gaussians
 
 
 def seen_by_zulu(
@@ -117,7 +117,7 @@ def seen_by_zulu(
     return peer_views(
         {"zulu": evidence.in_world(T_world_keyframe)},
         {"zulu": T_world_keyframe},
-        context(RefineConfig(peer_views=most), threads=threads),
+        context(FinetuneConfig(peer_views=most), threads=threads),
         depth_kinds={"zulu": depth_kind},
         colors=ALIKE,
     )
@@ -167,7 +167,7 @@ def test_a_neighbors_map_shows_what_it_would_from_where_the_neighbor_stood() -> 
         all_of_them[k].T_world_camera.tolist() for k in (1, 3)
     ]
     assert np.array_equal(some[0].color, all_of_them[1].color)
-    assert peer_views({}, {}, context(RefineConfig()), depth_kinds={}, colors={}) == []
+    assert peer_views({}, {}, context(FinetuneConfig()), depth_kinds={}, colors={}) == []
 
 
 def test_neighbors_views_teach_what_own_ones_do_not_see(spoiled: tuple[Gaussians, list[PosedRgbd]]) -> None:
@@ -175,7 +175,7 @@ def test_neighbors_views_teach_what_own_ones_do_not_see(spoiled: tuple[Gaussians
     half = np.zeros((48, 64), bool)
     half[:, :20] = True
     own = [PosedRgbd(v.color, v.depth_m, v.T_world_camera, half) for v in views[::2]]
-    config = RefineConfig(steps_per_view=30, rate=0.3, peer_share=1.0)
+    config = FinetuneConfig(steps_per_view=30, rate=0.3, peer_share=1.0)
     alone = finetune_map(gaussians, own, context(config))
     together = finetune_map(gaussians, own, context(config), peer_views=views[1::2])
     assert score(together, views) > score(alone, views) + 3
@@ -184,7 +184,7 @@ def test_neighbors_views_teach_what_own_ones_do_not_see(spoiled: tuple[Gaussians
 
 
 def test_steps_are_shared_out() -> None:
-    config = RefineConfig(steps_per_view=5, steps_max=100, peer_share=0.25)
+    config = FinetuneConfig(steps_per_view=5, steps_max=100, peer_share=0.25)
     assert num_steps(config, 4, 7) == (20, 5)
     assert num_steps(config, 40, 7) == (100, 25)
     assert num_steps(config, 40, 0) == (100, 0)
@@ -196,5 +196,5 @@ def test_made_up_colors_of_a_neighbor_do_little_to_own_views(
     """Robust loss, a fifth of the steps, and own images last."""
     gaussians, views = spoiled
     own, hostile = views[::2], [replace(v, color=255 - v.color) for v in views[1::2]]
-    fooled = finetune_map(gaussians, own, context(RefineConfig()), peer_views=hostile)
+    fooled = finetune_map(gaussians, own, context(FinetuneConfig()), peer_views=hostile)
     assert score(fooled, own) > score(gaussians, own) + 1

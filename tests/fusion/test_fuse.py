@@ -5,7 +5,7 @@ import pytest
 
 from duagc.pipeline.config.consensus import ColorConfig
 from duagc.pipeline.consensus.evidence import Evidence
-from duagc.pipeline.consensus.matching import MatchingConfig
+from duagc.pipeline.consensus.matching import MapMatching
 from duagc.pipeline.consensus.weights import Weights
 from duagc.pipeline.fusion.association import association_covariance, weighted_move
 from duagc.pipeline.fusion.fuse import OwnMap
@@ -104,7 +104,7 @@ def test_every_robot_keeps_its_own_colors_and_the_maps_agree():
         colors = world.evidence[name].theta[:, COLOR].astype(np.float32)
         world.maps[name] = world.maps[name].replace(colors=colors)
     gain, offset = np.array([0.7, 0.8, 1.3]), np.array([0.02, -0.03, 0.01])
-    compared = MatchingConfig(colors=ColorConfig(min_matches=N, splats_per_sample=1))
+    compared = MapMatching(colors=ColorConfig(min_matches=N, splats_per_sample=1))
     alike = {name: world.fuse(name, ALIKE, matching=compared) for name in world.names}
     world.maps, evidence = tinted(world, bravo=(gain, offset))
     differ = {name: world.fuse(name, ALIKE, evidence=evidence, matching=compared) for name in world.names}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from duagc.pipeline.config.consensus import MatchingConfig
+from duagc.pipeline.config.consensus import MapMatching
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.fusion.fuse import FusedMap
@@ -60,7 +60,7 @@ def with_imported(information: float) -> FusedMap:
 
 def updated(information: float, config: FusionConfig = CONFIG, threads: int = 1, mask=None) -> FusedMap:
     fused = with_imported(information)
-    context = MapContext(CAMERA, config, MatchingConfig(), threads=threads)
+    context = MapContext(CAMERA, config, MapMatching(), threads=threads)
     return update_opacities(
         fused, views(mask), context, num_own=len(wall()), color_sigma=SIGMA, pixels_per_sample=9.0
     )

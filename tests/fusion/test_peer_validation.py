@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from duagc.pipeline.config.consensus import MatchingConfig
+from duagc.pipeline.config.consensus import MapMatching
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.fusion.context import MapContext
@@ -66,7 +66,7 @@ def validated_by_alpha(
         map_of("alpha").in_world(HERE),
         {"bravo": bravo.in_world(HERE)},
         pairs,
-        MapContext(CAMERA, FusionConfig(), MatchingConfig(), threads=threads),
+        MapContext(CAMERA, FusionConfig(), MapMatching(), threads=threads),
         views=views,
         depth_kinds={"bravo": "blended"},
     )

@@ -10,7 +10,7 @@ import pytest
 
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.config.consensus import ColorConfig, MatchingConfig
+from duagc.pipeline.config.consensus import ColorConfig, MapMatching
 from duagc.pipeline.config.fusion import FusionConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.consensus.evidence import Evidence
@@ -38,7 +38,7 @@ CAMERA = PinholeCamera(32, 24, 25.0, 25.0, 15.5, 11.5)
 FRAMES, KEYFRAMES, N = 6, (0, 3), 12
 SETTINGS: dict[str, Any] = {
     "config": FusionConfig(explained_opacity=0.0),
-    "matching": MatchingConfig(),
+    "matching": MapMatching(),
     "moving": MovingConfig(),
 }
 
@@ -145,7 +145,7 @@ def robot(tmp_path_factory):
 
 
 def fuse_files(robot, result, folder):
-    source = AgentInput("bravo", robot.log, robot.frontend, robot.information)
+    source = AgentInput("bravo", robot.log, robot.frontend, robot.information, 1e-3)
     run_fusion(source, result, folder, **SETTINGS)
     fused = [topics.FUSED_MAP.of("bravo"), topics.CORRECTED_KEYFRAMES.of("bravo")]
     return {type(r.message()): r.message() for r in read_log(folder / "fused.mcap", topics=fused)}
@@ -232,7 +232,7 @@ def test_information_of_another_map_is_refused(robot, tmp_path):
     other = robot.sums.ids + 1
     with LogWriter(tmp_path / "information.mcap", "bravo") as log:
         log.write(topics.INFORMATION.of("bravo"), replace(robot.sums, ids=other), 5 * 10**8)
-    source = AgentInput("bravo", robot.log, robot.frontend, tmp_path / "information.mcap")
+    source = AgentInput("bravo", robot.log, robot.frontend, tmp_path / "information.mcap", 1e-3)
     with pytest.raises(DuagError, match="other Gaussians"):
         run_fusion(
             source,
