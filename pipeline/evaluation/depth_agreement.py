@@ -14,12 +14,12 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.projection import inside
 
-Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 
 STRIDE_PX = 8
@@ -65,14 +65,12 @@ def pair_medians(
 ) -> PairMedians:
     """What `depth_agreement` takes the median of."""
     inverse = [np.where(d > 0, 1 / np.where(d > 0, d, 1), np.nan) for d in depths_m]
-    clouds = [_points(d, camera) for d in depths_m]
+    images = [(i, _points(d, camera)) for i, d in zip(inverse, depths_m, strict=True)]
     pairs: list[tuple[int, int]] = []
     medians: dict[str, list[float]] = {name: [] for name in trajectories}
     for a, b in combinations(range(len(depths_m)), 2):
         found = {
-            name: _difference_m(
-                inverse[a], inverse[b], clouds[a], clouds[b], se3.inverse(T[a]) @ T[b], camera
-            )
+            name: _difference_m(images[a], images[b], se3.inverse(T[a]) @ T[b], camera)
             for name, T in trajectories.items()
         }
         if all(value is not None for value in found.values()):
@@ -92,9 +90,18 @@ def _points(depth_m: Depth, camera: PinholeCamera) -> Array:
 
 
 def _difference_m(
-    inverse_a: Array, inverse_b: Array, points_a: Array, points_b: Array, T_a_b: Array, camera: PinholeCamera
+    a: tuple[Array, Array], b: tuple[Array, Array], T_a_b: Array, camera: PinholeCamera
 ) -> float | None:
-    """Median absolute difference of depth of a pair, both ways together; None if it shows too little in common."""
+    """Median absolute difference of depth of a pair, both ways together; None if it shows too little in common.
+
+    Args:
+        a: inverse depth [h, w] (1/m) and points [n, 3] (m, camera frame) of the first image.
+        b: the same of the second.
+        T_a_b: from the second camera to the first.
+        camera: of both.
+    """
+    inverse_a, points_a = a
+    inverse_b, points_b = b
     there = _compare(inverse_a, se3.transform(T_a_b, points_b), camera)
     back = _compare(inverse_b, se3.transform(se3.inverse(T_a_b), points_a), camera)
     if there is None or back is None:

@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.registration.features import Features, extract, matches, ransac
-
-Array = NDArray[np.float64]
 
 FEATURES = 600
 """The strongest of a view that have depth."""
@@ -39,6 +38,8 @@ def feature_agreement(
     depths_m: Sequence[NDArray[np.float32]],
     camera: PinholeCamera,
     trajectories: Mapping[str, Array],
+    *,
+    masks: Sequence[NDArray[np.bool_] | None] | None = None,
 ) -> tuple[int, dict[str, float | Absent]]:
     """Median over pairs of views of the median distance between a moved feature and its partner, pixels.
 
@@ -46,10 +47,15 @@ def feature_agreement(
         colors: uint8 RGB [h, w, 3] of every view.
         depths_m: [h, w], 0 = unknown.
         trajectories: T_frame_camera [n, 4, 4] of the same views, by name.
+        masks: bool [h, w] of every view, pixels that may be used; None: all.
     Returns:
         Number of pairs, and the value of every trajectory.
     """
-    features = [extract(c, d, camera, FEATURES) for c, d in zip(colors, depths_m, strict=True)]
+    masks = masks or [None] * len(colors)
+    features = [
+        extract(color, depth_m, camera, FEATURES, mask=mask)
+        for color, depth_m, mask in zip(colors, depths_m, masks, strict=True)
+    ]
     medians: dict[str, list[float]] = {name: [] for name in trajectories}
     pairs = 0
     for a, b in combinations(range(len(features)), 2):

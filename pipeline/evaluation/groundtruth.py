@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry.trajectory import Trajectory
@@ -25,7 +28,7 @@ def trajectory(recording: Recording, robot: str) -> Trajectory | Absent:
     path = recording.groundtruth(robot)
     if path is None:
         return Absent(f"the recording has no ground truth of {robot}")
-    records = list(read_log(path, topics=[topics.GROUNDTRUTH_POSE.of(robot)]))
+    records = list(read_log(path, topics=[topics.GROUNDTRUTH_POSE.of(robot_of(robot))]))
     if not records:
         return Absent(f"the ground truth of {robot} has no poses")
     stamps_ns = np.array([r.publish_time_ns for r in records], dtype=np.int64)
@@ -36,7 +39,7 @@ def exact_depths(
     recording: Recording, robot: str, stamps_ns: Collection[int]
 ) -> dict[int, NDArray[np.float32]] | Absent:
     """Exact depth images [h, w] in meters by time stamp, for those of the wanted stamps that have one."""
-    path, topic = recording.groundtruth(robot), topics.GROUNDTRUTH_DEPTH.of(robot)
+    path, topic = recording.groundtruth(robot), topics.GROUNDTRUTH_DEPTH.of(robot_of(robot))
     if path is None:
         return Absent(f"the recording has no ground truth of {robot}")
     scale, found = None, {}
@@ -51,13 +54,13 @@ def exact_depths(
 
 def recorded_depth_is_exact(recording: Recording, robot: str) -> bool:
     """Whether recording.json says that the depth in the robot's log has no noise: a simulated sensor."""
-    sensors = recording.description["robots"][robot].get("sensors") or {}
+    sensors = recording.description["robots"][robot_of(robot)].get("sensors") or {}
     return sensors.get("depth_noise") == "none"
 
 
 def knows_rotations(recording: Recording, robot: str) -> bool:
     """Whether the rotations of the true poses mean anything; satellite positions, for example, have none."""
-    sensors = recording.description["robots"][robot].get("sensors") or {}
+    sensors = recording.description["robots"][robot_of(robot)].get("sensors") or {}
     return sensors.get("truth") != "position"
 
 
@@ -98,10 +101,7 @@ class Surface:
         A disc is as wide as the points are apart, and the nearest disc counts, so that the distance is not blurred
         by the sampling.
         """
-        from scipy.spatial import cKDTree
-
-        tree = cKDTree(self.points)
-        radius_m = float(np.quantile(tree.query(self.points, k=2)[0][:, 1], 0.95))
+        tree, radius_m = self._discs
         neighbors = min(NEIGHBORS, len(self.points))
         _, index = tree.query(queries, k=neighbors)
         index = index.reshape(len(queries), neighbors)
@@ -112,6 +112,14 @@ class Surface:
         best = np.argmin(distance, axis=1)[:, None]
         nearest = np.take_along_axis(index, best, 1)[:, 0]
         return np.take_along_axis(distance, best, 1)[:, 0], self.normals[nearest]
+
+    @cached_property
+    def _discs(self) -> tuple[Any, float]:
+        """The points by place, and the radius of a disc; the same for every map that is compared."""
+        from scipy.spatial import cKDTree
+
+        tree = cKDTree(self.points)
+        return tree, float(np.quantile(tree.query(self.points, k=2)[0][:, 1], 0.95))
 
 
 def surface(recording: Recording) -> Surface | Absent:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.geometry import masks
 from duagc.pipeline.splat.losses import Rendered, halve
 
 Image = NDArray[np.float32]
@@ -43,7 +44,19 @@ def _window_mean(image: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(smooth[inside, inside])
 
 
-def _ssim_terms(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
+def counted_windows(mask: masks.Mask) -> masks.Mask:
+    """Positions of the 11x11 window of SSIM at which it lies inside the image and touches usable pixels only.
+
+    Args:
+        mask: bool [H, W], pixels that count.
+    """
+    inside = slice(_WINDOW_RADIUS, -_WINDOW_RADIUS)
+    return masks.whole_windows(mask, _WINDOW_RADIUS)[inside, inside]
+
+
+def _ssim_terms(
+    x: NDArray[np.float64], y: NDArray[np.float64], mask: masks.Mask | None
+) -> tuple[float, float]:
     """Mean SSIM and mean contrast-structure term of two images [H, W, C] in 0..1."""
     if min(x.shape[:2]) < 2 * _WINDOW_RADIUS + 1:
         raise ValueError(f"an image of {x.shape[1]}x{x.shape[0]} is smaller than the 11x11 window of SSIM")
@@ -52,6 +65,11 @@ def _ssim_terms(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, 
     cov = _window_mean(x * y) - mx * my
     structure = (2 * cov + _C2) / (vx + vy + _C2)
     luminance = (2 * mx * my + _C1) / (mx * mx + my * my + _C1)
+    if mask is not None:
+        counted = counted_windows(mask)
+        if not counted.any():
+            raise ValueError("no 11x11 window of SSIM has usable pixels only")
+        luminance, structure = luminance[counted], structure[counted]
     return float(np.mean(luminance * structure)), float(np.mean(structure))
 
 
@@ -62,7 +80,7 @@ def _clipped(rendered: NDArray, reference: NDArray) -> tuple[NDArray[np.float64]
     return x, y
 
 
-def ssim(rendered: NDArray, reference: NDArray) -> float:
+def ssim(rendered: NDArray, reference: NDArray, mask: masks.Mask | None = None) -> float:
     """Single-scale SSIM of colors [H, W, 3] in 0..1, the mean over channels and window positions.
 
     11x11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, no padding.
@@ -70,14 +88,20 @@ def ssim(rendered: NDArray, reference: NDArray) -> float:
     Args:
         rendered: colors [H, W, 3], clipped to 0..1 first.
         reference: colors [H, W, 3] in 0..1.
+        mask: bool [H, W], pixels that count: window positions that touch another one are left out; None: all.
     Raises:
-        ValueError: images of different shapes, or smaller than the window.
+        ValueError: images of different shapes, smaller than the window, or none of its positions counts.
     Source: Wang, Bovik, Sheikh, Simoncelli, IEEE TIP 2004.
     """
-    return _ssim_terms(*_clipped(rendered, reference))[0]
+    return _ssim_terms(*_clipped(rendered, reference), mask)[0]
 
 
-def ms_ssim(rendered: NDArray, reference: NDArray, weights: Sequence[float] = MS_SSIM_WEIGHTS) -> float:
+def ms_ssim(
+    rendered: NDArray,
+    reference: NDArray,
+    weights: Sequence[float] = MS_SSIM_WEIGHTS,
+    mask: masks.Mask | None = None,
+) -> float:
     """Multi-scale SSIM: a different number from `ssim`, and usually a higher one; never report it under that name.
 
     Five scales (2x2 means between them), so both sides of the image must be at least 176 pixels. Negative
@@ -87,8 +111,10 @@ def ms_ssim(rendered: NDArray, reference: NDArray, weights: Sequence[float] = MS
         rendered: colors [H, W, 3], clipped to 0..1 first.
         reference: colors [H, W, 3] in 0..1.
         weights: of the scales, fine to coarse.
+        mask: bool [H, W], pixels that count, as of `ssim`; a pixel of a coarser scale counts if all its parts
+            do. None: all.
     Raises:
-        ValueError: images of different shapes, or too small for the scales.
+        ValueError: images of different shapes, too small for the scales, or no window position counts at one.
     Source: Wang, Simoncelli, Bovik, Asilomar 2003.
     """
     x, y = _clipped(rendered, reference)
@@ -99,10 +125,11 @@ def ms_ssim(rendered: NDArray, reference: NDArray, weights: Sequence[float] = MS
         )
     product = 1.0
     for scale, weight in enumerate(weights):
-        whole, structure = _ssim_terms(x, y)
+        whole, structure = _ssim_terms(x, y, mask)
         last = scale == len(weights) - 1
         product *= max(whole if last else structure, 0.0) ** weight
         x, y = halve(x), halve(y)
+        mask = None if mask is None else masks.halved(mask)
     return product
 
 

@@ -25,7 +25,12 @@ OF_TRUTH = "_of_truth"
 
 
 def section(
-    log_path: Path, held_out: Mapping[int, int], paths: Mapping[str, Path3D], true: Paired | Absent
+    log_path: Path,
+    held_out: Mapping[int, int],
+    paths: Mapping[str, Path3D],
+    true: Paired | Absent,
+    *,
+    frontend: Path,
 ) -> dict[str, Any]:
     """How well held-out views agree under trajectories, and under the ground truth where there is one.
 
@@ -34,6 +39,7 @@ def section(
         held_out: stamp of every held-out frame that was tracked, by its index.
         paths: by the ending of their names in the result.
         true: estimate and ground truth, paired.
+        frontend: frontend.mcap of the robot, by which depth of another time is moved into that of its image.
     Returns:
         `depth_agreement_m` and `feature_agreement_px` of every path, and of how many pairs of views.
     """
@@ -47,14 +53,16 @@ def section(
     most = min(VIEWS, len(known))
     chosen = [known[k] for k in evenly_spaced(len(known), most)]
     with open_rgbd(log_path) as log:
+        log.move_depth_by(frontend)
         camera, frames = log.camera, [log.frame(index) for index in chosen]
-    depths = [f.depth if f.mask is None else np.where(f.mask, f.depth, np.float32(0)) for f in frames]
+    depths = [f.usable_depth for f in frames]
     poses = {
         name: np.array([path[held_out[index]] for index in chosen]).reshape(-1, 4, 4)
         for name, path in paths.items()
     }
     pairs, by_depth = depth_agreement(depths, camera, poses)
-    matched, by_features = feature_agreement([f.color for f in frames], depths, camera, poses)
+    colors, usable = [f.color for f in frames], [f.mask for f in frames]
+    matched, by_features = feature_agreement(colors, depths, camera, poses, masks=usable)
     found |= {"depth_agreement_pairs": pairs, "feature_agreement_pairs": matched}
     for name in paths:
         found[f"depth_agreement_m{name}"] = by_depth[name]

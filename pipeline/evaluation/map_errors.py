@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.evaluation import uncertainty_calibration
 from duagc.pipeline.evaluation.groundtruth import Surface
 from duagc.pipeline.evaluation.results import Absent
@@ -15,7 +16,6 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.messages import GaussianMap
 from duagc.pipeline.runs.folder import position_information
 
-Array = NDArray[np.float64]
 WORST_CONDITION = 1e12
 MIN_GAUSSIANS = 100
 NAMES = (

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.component_names import same_robot
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation.oracle import gap_to_oracle
 from duagc.pipeline.evaluation.results import Absent
@@ -125,6 +126,8 @@ class Session:
         kinds = {(m.robot, m.message): m.kind_name for m in self._log("exchange.mcap", topics.PEER_MESSAGE)}
         rows = []
         for p in self._log("exchange.mcap", topics.PEER_PACKET):
+            if same_robot(p.robot, p.receiver):
+                continue  # no radio carried it
             kind = kinds.get((p.robot, p.message))
             if kind not in PURPOSE:
                 found = "no message" if kind is None else f"a message of kind {kind}"

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.consensus.pose_admm import with_floor
@@ -35,7 +36,6 @@ from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.pipeline.splat.information import theta_of
 from duagc.schemas import topics
 
-Array = NDArray[np.float64]
 NO_TEAM = Absent("no two robots share a world")
 NO_MATCHES = Absent("no Gaussians were matched")
 NO_INFORMATION = Absent("consensus.mcap does not hold the information of the closures")
@@ -80,7 +80,9 @@ def gap_to_oracle(
             name: with_floor(RelativePoses.of(_registrations(run.robots[name])), config) for name in members
         }
         central = solve_component(poses, odometry, closures, config)
-        gaps.append(central if isinstance(central, Absent) else _gap(run, members, poses, central, pairs))
+        gaps.append(
+            central if isinstance(central, Absent) else _gap(run, members, poses, central, pairs=pairs)
+        )
     found = [gap for gap in gaps if isinstance(gap, Gap)]
     if len(found) < len(gaps):
         return next(gap for gap in gaps if isinstance(gap, Absent))
@@ -103,12 +105,13 @@ def _gap(
     members: Sequence[str],
     poses: Mapping[str, Array],
     central: Mapping[str, Array],
+    *,
     pairs: Mapping[tuple[str, str], NDArray[np.int64]],
 ) -> Gap:
     """The gap of one component whose centralized poses are known."""
     meters, radians = pose_gap(poses, central)
     among = {key: ids for key, ids in pairs.items() if key[0] in members and key[1] in members}
-    gaps = np.concatenate([_gaussian_gaps(run, name, members, central, among) for name in members])
+    gaps = np.concatenate([_gaussian_gaps(run, name, members, central, pairs=among) for name in members])
     if not len(gaps):
         return Gap(meters, radians, NO_MATCHES, NO_MATCHES)
     return Gap(meters, radians, float(gaps.max()), float(np.percentile(gaps, 99)))
@@ -125,6 +128,7 @@ def _gaussian_gaps(
     robot: str,
     members: Sequence[str],
     central: Mapping[str, Array],
+    *,
     pairs: Mapping[tuple[str, str], NDArray[np.int64]],
 ) -> Array:
     """Largest |x - x*| sqrt(diagonal of the information at x*) of each of a robot's matched Gaussians [m]."""
@@ -137,7 +141,7 @@ def _gaussian_gaps(
     context = MapContext(
         PinholeCamera(2, 2, 1.0, 1.0, 0.5, 0.5),  # looks at nothing: what is imported is not compared
         run.config.fusion.model_copy(update={"coverage": "overlap"}),
-        run.config.exchange.matching,
+        run.config.matching,
         weights=weights,
     )
     best = fuse(

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.evaluation import groundtruth, trajectory_errors
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs.folder import RunFolder
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

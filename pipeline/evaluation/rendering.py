@@ -19,6 +19,7 @@ from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import ColorMap
 from duagc.pipeline.evaluation import groundtruth, views
 from duagc.pipeline.evaluation.results import Absent, Row
+from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import Recording, RgbdLog, open_rgbd
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
@@ -55,7 +56,9 @@ class _Found:
     longer: bool
     scores: dict[tuple[str, str, str], Scores] = field(default_factory=dict)
 
-    def add(self, robot: str, kind: str, view_set: str, index: int, score: views.ViewScore | Absent) -> None:
+    def add(
+        self, robot: str, kind: str, view_set: str, *, index: int, score: views.ViewScore | Absent
+    ) -> None:
         self.scores.setdefault((robot, kind, view_set), []).append(score)
         self.rows += _view_rows(robot, f"{kind}/{view_set}", index, score)
 
@@ -118,13 +121,13 @@ def rendering_sections(
         task = RenderTask(own, robot, "held_out", robot.own_map.depth)
         for index, scores in task.scores(source, threads, f"render maps of {name}" if progress else None):
             for kind, score in scores.items():
-                found.add(name, kind, "held_out", index, score)
+                found.add(name, kind, "held_out", index=index, score=score)
         task = RenderTask({k: own[k] for k in ("own", "fused")}, robot, "keyframes", robot.own_map.depth)
         for index, scores in task.scores(
             source, threads, f"render keyframes of {name}" if progress else None
         ):
             for kind, score in scores.items():
-                found.add(name, kind, "training", index, score)
+                found.add(name, kind, "training", index=index, score=score)
         world = {kind: in_world(robot, kind, g) for kind, g in maps.items() if kind in COMPARED}
         colors = read_peer_colors(robot.folder / "fused.mcap", name)
         for peer in mates(run, robot):
@@ -134,7 +137,7 @@ def rendering_sections(
             title = f"render maps of {name} from {peer.robot}" if progress else None
             for index, scores in task.scores(source, threads, title):
                 for kind, score in scores.items():
-                    found.add(name, kind, "peers", index, score)
+                    found.add(name, kind, "peers", index=index, score=score)
     robots_of_run = list(run.robots)
     sets: dict[str, tuple[str, ...]] = dict.fromkeys(COMPARED, COMPARED_SETS)
     sets |= {"own_unrefined": ("held_out",)} | dict.fromkeys(("own", "fused"), (*COMPARED_SETS, "training"))
@@ -199,25 +202,39 @@ class RenderTask:
         keyframes = {k.frame_index for k in robot.keyframes}
         chosen = robot.held_out if self.view_set == "held_out" else keyframes
         with open_rgbd(source.log(name)) as log:
+            log.move_depth_by(robot.folder / "frontend.mcap")
             stamps = {f.stamp_ns for f in robot.frames if f.frame_index in chosen}
             exact = groundtruth.exact_depths(source, name, stamps)
-            frames = _views(log, sorted(chosen), exact, groundtruth.recorded_depth_is_exact(source, name))
+            frames = _views(
+                log,
+                sorted(chosen),
+                exact,
+                recorded_is_exact=groundtruth.recorded_depth_is_exact(source, name),
+                exposures=robot.exposures,
+            )
             maps = {kind: (m.gaussians, poses_by_stamp(m.trajectory)) for kind, m in self.maps.items()}
-            found = views.score_maps(maps, log.camera, frames, threads, self.depth, IN_EVERY_RUN)
+            found = views.score_maps(
+                maps, log.camera, frames, threads=threads, depth=self.depth, compared=IN_EVERY_RUN
+            )
             yield from track(found, title, total=len(chosen)) if title else found
 
 
 def _views(
-    log: RgbdLog, indices: list[int], exact: Mapping[int, Any] | Absent, recorded_is_exact: bool
+    log: RgbdLog,
+    indices: list[int],
+    exact: Mapping[int, Any] | Absent,
+    *,
+    recorded_is_exact: bool,
+    exposures: ExposureTrack,
 ) -> Iterator[views.ScoredFrame]:
     for index in indices:
         frame = log.frame(index)
+        depth_m: Any = exact
         if recorded_is_exact:
-            yield views.ScoredFrame(frame, frame.depth)
-        elif isinstance(exact, Absent):
-            yield views.ScoredFrame(frame, exact)
-        else:
-            yield views.ScoredFrame(frame, exact.get(frame.stamp_ns, Absent("the frame has no exact depth")))
+            depth_m = frame.depth
+        elif not isinstance(exact, Absent):
+            depth_m = exact.get(frame.stamp_ns, Absent("the frame has no exact depth"))
+        yield views.ScoredFrame(frame, depth_m, exposures.at(index))
 
 
 def poses_by_stamp(trajectory: Trajectory) -> dict[int, NDArray[np.float64]]:

@@ -97,7 +97,8 @@ def _patterns(
         _, _, value = name.removeprefix("robots.").partition(".")
         alike = [f"robots.{robot}.{value}" for robot in robots]
         if len(alike) > 1 and name in alike and all(rest.get(other) == reason for other in alike):
-            rest = {other: why for other, why in rest.items() if other not in alike}
+            for other in alike:
+                del rest[other]
             rest[f"robots.*.{value}"] = reason
     covered = {name: reason for name, reason in reasons.items() if name.rpartition(".")[2] not in anywhere}
     return patterns | _prefixes(rest, (), covered)
@@ -110,7 +111,9 @@ def _prefixes(
     if len(reasons) == 1:
         return dict(reasons)
     pattern = ".".join((*prefix, "*"))
-    if prefix and len({reason for name, reason in covered.items() if fnmatchcase(name, pattern)}) == 1:
+    if prefix:
+        covered = {name: reason for name, reason in covered.items() if fnmatchcase(name, pattern)}
+    if prefix and len(set(covered.values())) == 1:
         return {pattern: next(iter(reasons.values()))}
     children: dict[str, dict[str, str]] = {}
     for name, reason in reasons.items():

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation import (
     cameras,
+    coverage,
     groundtruth,
     map_agreement,
     map_errors,
@@ -53,9 +55,11 @@ PROTOCOL = {
     "its depth error and lowers its completeness",
     "peers": "held-out views of the other robots of the component, at their own poses; own map moved into the world",
     "poses": "own: odometry.tum in the robot's map frame; fused: trajectory.tum in the world frame",
-    "exposure": "none fitted",
+    "exposure": "none; psnr_interpolated: between those that the robot found of the mapped frames before and after the "
+    "view, the identity where it found none; psnr_exposure_*: gain and offset of each channel by robust least squares "
+    "between render and image on one half of the view, scored on the other half alone",
     "colors": "those of the camera that took the view; at peers' views the map's, which are its own camera's, are put "
-    "into them by the robot's own estimate from matched Gaussians (/<robot>/peer_colors); nothing is fitted to a view",
+    "into them by the robot's own estimate from matched Gaussians (/<robot>/peer_colors)",
     "background": "black",
     "psnr": "render clamped to 0..1, mean over views, at most 100 dB",
     "ssim": "one scale, 11x11 Gaussian window of sigma 1.5, windows inside the image",
@@ -95,7 +99,7 @@ def evaluate(
         DuagError: the run or the recording is incomplete or they do not fit together.
     """
     run, source = RunFolder(run_dir), Recording(recording)
-    unknown = sorted(set(run.robots) - set(source.robots))
+    unknown = sorted({robot_of(name) for name in run.robots} - set(source.robots))
     if unknown:
         raise DuagError(f"{recording}: has no robot {unknown[0]}, expected the robots of {run_dir}")
     truth, session = TruePaths.of(run, source), Session(run)
@@ -112,6 +116,8 @@ def evaluate(
             for name, robot in run.robots.items()
         },
         "team": _team_section(run, truth) | session.loop_closure_counts(),
+        "coverage": coverage.of_robots(run),
+        "components": coverage.of_components(run, truth.after),
         "rendering": rendering.team,
         "calibration": _calibration_section(run, source, truth, rows),
         "exchange": session.exchange_section(),
@@ -197,7 +203,8 @@ def _robot_section(robot: RobotRun, truth: TruePaths) -> dict[str, Any]:
 def _agreement_section(robot: RobotRun, source: Recording, truth: TruePaths) -> dict[str, Any]:
     held_out = {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
     paths = {"": poses_by_stamp(robot.trajectory), "_before_consensus": poses_by_stamp(robot.odometry)}
-    return map_agreement.section(source.log(robot.robot), held_out, paths, truth.after[robot.robot])
+    true, frontend = truth.after[robot.robot], robot.folder / "frontend.mcap"
+    return map_agreement.section(source.log(robot.robot), held_out, paths, true, frontend=frontend)
 
 
 def _ate_of_keyframes(robot: RobotRun, pairs: Paired) -> float | Absent:
@@ -221,8 +228,8 @@ def _team_section(run: RunFolder, truth: TruePaths) -> dict[str, Any]:
     ]
     missing = [s for s in solo if isinstance(s, Absent)]
     return {
-        "robots": len(run.robots),
-        "robots_in_largest_component": len(run.largest_component),
+        "robots": len({robot_of(name) for name in run.robots}),
+        "robots_in_largest_component": len({robot_of(name) for name in run.largest_component}),
         "ate_rmse_m": truth.team if isinstance(truth.team, Absent) else truth.team.ate_rmse_m,
         "ate_rmse_m_mean_of_robots": missing[0] if missing else mean(solo),
     }
@@ -284,7 +291,7 @@ def _rows_of(tree: Mapping[str, Any]) -> list[Row]:
         if isinstance(value, str) or path == ("schema",):
             continue
         scope, name = path[0].removesuffix("s") if path[0] == "robots" else path[0], path[-1]
-        robot = path[1] if path[0] == "robots" else ""
+        robot = path[1] if path[0] in ("robots", "coverage", "components") else ""
         view_set = "/".join(path[path.index("rendering") + 1 : -1]) if "rendering" in path else ""
         rows.append(
             Row(scope, robot, view_set, -1, name, value if isinstance(value, Absent) else float(value))

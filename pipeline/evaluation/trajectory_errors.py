@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import Trajectory, align, associate, rpe_rmse
 
-Array = NDArray[np.float64]
 ASSOCIATION_TOLERANCE_NS = 20_000_000  # that of the TUM tools
 
 

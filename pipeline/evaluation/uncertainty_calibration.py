@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.arrays import Array
 
-Array = NDArray[np.float64]
 BINS = 10
 Z_95 = 1.959963984540054
 

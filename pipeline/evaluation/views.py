@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from threading import local
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.evaluation import image_metrics
+from duagc.pipeline.evaluation.exposure import fitted_psnr
 from duagc.pipeline.evaluation.results import Absent, mean
-from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry import masks, se3
+from duagc.pipeline.geometry.exposure import Exposure
+from duagc.pipeline.geometry.masks import Mask
 from duagc.pipeline.splat.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -27,6 +30,8 @@ PSNR_CEILING_DB = 100.0  # of a render equal to its image: infinity has no place
 MS_SSIM_MIN_SIDE_PX = 176  # the 11 px window at the fifth scale
 MIN_ALPHA = 0.5
 NO_LAYER = Absent("the depth of one layer was not drawn")
+NO_PIXEL = Absent("the mask leaves no pixel of the image")
+NO_WINDOW = Absent("no window of SSIM has usable pixels only")
 NO_OTHER = Absent("no other map was drawn from this view")
 NO_LPIPS = Absent("LPIPS needs the weights of a trained network, which this build does not carry")
 
@@ -36,6 +41,10 @@ class ViewScore:
     """Scores of one rendered view; names and meanings as in metrics.json."""
 
     psnr_db: Score
+    psnr_interpolated_db: Score
+    psnr_exposure_db: Score
+    psnr_exposure_left_db: Score
+    psnr_exposure_right_db: Score
     ssim: Score
     ms_ssim: Score
     depth_l1_m: Score
@@ -58,34 +67,91 @@ def score_view(
     color: NDArray[np.uint8],
     depth_m: NDArray[np.float32],
     exact_m: Any,
+    *,
     layer_m: Any = NO_LAYER,
     common: NDArray[np.bool_] | None = None,
+    mask: Mask | None = None,
+    exposure: Exposure | None = None,
 ) -> ViewScore:
-    """Compare a render with the image of the same pose.
+    """Compare a render with the image of the same pose, on the pixels that may be used.
 
     Args:
-        render: of the map, at the pose of the frame, black background, no exposure fitted.
+        render: of the map, at the pose of the frame, black background.
         color: [h, w, 3] RGB.
         depth_m: recorded depth [h, w], 0 where there is none.
         exact_m: exact depth [h, w] in meters, or Absent.
         layer_m: depth of one layer per pixel (`Rasterizer.layer_depth`), [h, w] in meters, or Absent.
         common: [h, w], pixels that the maps that this one is compared with cover, too; None: there are none.
+        mask: bool [h, w], pixels that may be used: the others count in no score, and windows of SSIM that touch one
+            are left out; None: all.
+        exposure: of the view, by frames other than it, for `psnr_interpolated_db` alone. None: as the map.
     """
+    if mask is not None:
+        depth_m = np.where(mask, depth_m, np.float32(0))
+        exact_m = exact_m if isinstance(exact_m, Absent) else np.where(mask, exact_m, np.float32(0))
     image = color.astype(np.float64) / 255.0
     l1_m, completeness = _depth(render, depth_m, "recorded")
     side = min(image.shape[:2])
+    psnr_db = _psnr(render, image, mask)
+    fitted = _psnr_in_fitted_exposure(render, image, mask)
     return ViewScore(
-        psnr_db=min(image_metrics.psnr(render.color, image), PSNR_CEILING_DB),
-        ssim=image_metrics.ssim(render.color, image),
-        ms_ssim=image_metrics.ms_ssim(render.color, image)
-        if side >= MS_SSIM_MIN_SIDE_PX
-        else Absent(f"the shorter side is {side} px; five scales need {MS_SSIM_MIN_SIDE_PX} px"),
+        psnr_db=psnr_db,
+        psnr_interpolated_db=psnr_db
+        if exposure is None
+        else _psnr(in_exposure(render, exposure), image, mask),
+        psnr_exposure_db=fitted[0],
+        psnr_exposure_left_db=fitted[1],
+        psnr_exposure_right_db=fitted[2],
+        ssim=image_metrics.ssim(render.color, image, mask) if _has_windows(mask, 0) else NO_WINDOW,
+        ms_ssim=Absent(f"the shorter side is {side} px; five scales need {MS_SSIM_MIN_SIDE_PX} px")
+        if side < MS_SSIM_MIN_SIDE_PX
+        else image_metrics.ms_ssim(render.color, image, mask=mask)
+        if _has_windows(mask, len(image_metrics.MS_SSIM_WEIGHTS) - 1)
+        else NO_WINDOW,
         depth_l1_m=l1_m,
         depth_l1_exact_m=exact_m if isinstance(exact_m, Absent) else _depth(render, exact_m, "exact")[0],
         depth_l1_layer_m=layer_m if isinstance(layer_m, Absent) else _layer(layer_m, depth_m),
         depth_l1_common_m=NO_OTHER if common is None else _common(render, depth_m, common),
         depth_completeness=completeness,
     )
+
+
+def in_exposure(render: Render, exposure: Exposure | None) -> Render:
+    """A render of a map, on black, in the colors of an image.
+
+    Args:
+        render: in the colors of the map.
+        exposure: of the image; None: as the map.
+    """
+    if exposure is None:
+        return render
+    return replace(render, color=exposure.in_image(render.color, render.alpha))
+
+
+def _psnr(render: Render, image: NDArray[np.float64], mask: Mask | None) -> Score:
+    if mask is not None and not mask.any():
+        return NO_PIXEL
+    return min(image_metrics.psnr(render.color, image, mask), PSNR_CEILING_DB)
+
+
+def _psnr_in_fitted_exposure(
+    render: Render, image: NDArray[np.float64], mask: Mask | None
+) -> tuple[Score, Score, Score]:
+    """PSNR of the whole view, its left and its right half, each half in the exposure fitted on the other."""
+    found = fitted_psnr(render, image, mask)
+    if isinstance(found, Absent):
+        return found, found, found
+    both, left, right = (min(value, PSNR_CEILING_DB) for value in (found.both, found.left, found.right))
+    return both, left, right
+
+
+def _has_windows(mask: Mask | None, halvings: int) -> bool:
+    """Whether a window of SSIM touches usable pixels only, after so many halvings of the image."""
+    if mask is None:
+        return True
+    for _ in range(halvings):
+        mask = masks.halved(mask)
+    return bool(image_metrics.counted_windows(mask).any())
 
 
 def _layer(layer_m: NDArray[np.float32], depth_m: NDArray[np.float32]) -> Score:
@@ -122,16 +188,19 @@ class ScoredFrame:
     Attributes:
         frame: its image and depth.
         exact_depth_m: [h, w] in meters, or Absent with the reason.
+        exposure: of the frame, as its robot knows it from other frames; None: as the map.
     """
 
     frame: RgbdFrame
     exact_depth_m: Any
+    exposure: Exposure | None = None
 
 
 def score_maps(
     maps: Mapping[str, tuple[Gaussians, Mapping[int, NDArray[np.float64]]]],
     camera: PinholeCamera,
     views: Iterable[ScoredFrame],
+    *,
     threads: int,
     depth: DepthKind = "blended",
     compared: Sequence[str] = (),
@@ -172,8 +241,10 @@ def score_maps(
                 frame.color,
                 frame.depth,
                 view.exact_depth_m,
-                layer_m,
-                common,
+                layer_m=layer_m,
+                common=common,
+                mask=frame.mask,
+                exposure=view.exposure,
             )
         return frame.index, scores
 
@@ -202,6 +273,10 @@ def summary(scores: Sequence[ViewScore | Absent], reason_if_none: str) -> dict[s
         "views": len(rendered),
         "views_without_pose": len(scores) - len(rendered),
         "psnr_db": means["psnr_db"],
+        "psnr_interpolated_db": means["psnr_interpolated_db"],
+        "psnr_exposure_db": means["psnr_exposure_db"],
+        "psnr_exposure_left_db": means["psnr_exposure_left_db"],
+        "psnr_exposure_right_db": means["psnr_exposure_right_db"],
         "ssim": means["ssim"],
         "ms_ssim": means["ms_ssim"],
         "lpips": NO_LPIPS,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[Any]
+Numbers = NDArray[Any]
 
 # Okabe-Ito: distinguishable with every common color blindness; dark enough on white.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F6000", "#444444")
@@ -121,7 +121,7 @@ def top_view(ways: Sequence[Mapping[str, Any]]) -> Figure:
 
 @_styled
 def lines(
-    series: Mapping[str, tuple[Array, Array]],
+    series: Mapping[str, tuple[Numbers, Numbers]],
     x_label: str,
     y_label: str,
     *,
@@ -162,7 +162,7 @@ def lines(
 
 
 @_styled
-def stacked(x: Array, parts: Mapping[str, Array], x_label: str, y_label: str) -> Figure:
+def stacked(x: Numbers, parts: Mapping[str, Numbers], x_label: str, y_label: str) -> Figure:
     """Stacked areas: how a total divides into parts over a common axis."""
     from matplotlib.ticker import MaxNLocator
 
@@ -273,4 +273,43 @@ def map_sizes(robots: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
         axes.set_xlabel("most Gaussians")
         axes.set_ylabel(label)
         _legend_above(axes, 4)
+    return figure
+
+
+@_styled
+def robustness(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """ATE and PSNR of degraded cameras, a line for each dial, next to the clean one.
+
+    Args:
+        rows: of `duagc bench robustness`: "dial", "level", "ate_m", "psnr_db"; the first is the clean one.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    dials = list(dict.fromkeys(row["dial"] for row in rows))
+    levels = sorted({row["level"] for row in rows})
+    figure = Figure(figsize=(9.6, 1.2 + 0.32 * len(dials)), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, key, factor, label in (
+        (panels[0], "ate_m", 1000.0, "ATE, mm"),
+        (panels[1], "psnr_db", 1.0, "PSNR of own maps at held-out views, dB"),
+    ):
+        for i, level in enumerate(levels):
+            known = [row for row in rows if row["level"] == level and row.get(key) is not None]
+            axes.plot(
+                [factor * row[key] for row in known],
+                [dials.index(row["dial"]) for row in known],
+                linestyle="none",
+                marker=MARKS[i % len(MARKS)],
+                color=color_of(i),
+                label="clean" if level == 0 else f"{level:g} x middle",
+            )
+        if rows[0].get(key) is not None:
+            axes.axvline(factor * rows[0][key], color=FAINT, linewidth=1.0, linestyle=(0, (3, 2)))
+        axes.set_xlabel(label)
+    panels[0].set_xscale("log")
+    panels[0].set_yticks(range(len(dials)), dials)
+    panels[0].invert_yaxis()
+    panels[1].legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
     return figure

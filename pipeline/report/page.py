@@ -15,8 +15,9 @@ from duagc.pipeline.evaluation.cameras import CHANNELS
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.paths import Path3, paths, top_view_axes
 from duagc.pipeline.evaluation.results import Absent, reason_of
-from duagc.pipeline.recording import Recording
+from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.report import figures, labels, pictures
+from duagc.pipeline.report.coverage import coverage_content
 from duagc.pipeline.report.renders import rendered_views
 from duagc.pipeline.runs.folder import RunFolder
 
@@ -24,8 +25,15 @@ TEMPLATE = "page.html.j2"
 TEAM_ONLY = ("team.ate_rmse_m", "rendering.fused.peers.psnr_db", "rendering.refined.peers.psnr_db")
 """Values that a run of one robot cannot have: it shows no card for them."""
 
+EXPOSURE_NOTE = (
+    "A view is drawn in the exposure that the robot found of the mapped frames before and after it, if it found any. "
+    "Nothing is fitted to a view, but where a column says so: there each half of a view is compared in the exposure "
+    "(gain and offset of each channel) that was fitted on its other half."
+)
+
 SECTIONS = (
     ("paths", "Paths"),
+    ("coverage", "Coverage"),
     ("views", "Rendered views"),
     ("agreement", "Agreement"),
     ("exchange", "Exchange"),
@@ -81,12 +89,15 @@ def content(run: RunFolder, source: Recording) -> dict[str, Any]:
         "sections": SECTIONS,
         "cards": _cards(metrics, reasons),
         **_paths_content(run, source, metrics),
+        **coverage_content(run, metrics),
         "comparison_sets": [labels.VIEW_SETS[s] for s in labels.compared_sets(metrics)],
         "comparison_columns": list(labels.comparison_columns(metrics).values()),
         "comparison": labels.comparison_rows(metrics),
         **_rendering_content(metrics),
         "own_longer": labels.is_scored(metrics, "own_longer"),
-        "exposure_note": " ".join(["No exposure is fitted to a view.", *_cameras(metrics)]),
+        "exposure_note": " ".join(
+            [EXPOSURE_NOTE, *_cameras(metrics), *_masks(source), *_calibration(run, source)]
+        ),
         "views": shown_views,
         **_agreement_content(session, metrics, reasons),
         "exchange_charts": _exchange_charts(session),
@@ -118,6 +129,27 @@ def _cameras(metrics: dict[str, Any]) -> list[str]:
                 "robot's; peers' views are compared in the colors of the camera that took them."
             )
     return said
+
+
+def _masks(source: Recording) -> list[str]:
+    """How much of the images never shows the scene, a sentence if that is so of any robot."""
+    shares = []
+    for name in source.robots:
+        with open_rgbd(source.log(name)) as log:
+            if log.valid is not None:
+                shares.append(f"{np.mean(~log.valid):.1%} of {name}'s")
+    if not shares:
+        return []
+    return [
+        "Pixels that never show the scene count nowhere and are drawn as a checkerboard: "
+        f"{', '.join(shares)}."
+    ]
+
+
+def _calibration(run: RunFolder, source: Recording) -> list[str]:
+    """What a calibration changed in the recording, or why nothing, a sentence where one was asked for."""
+    said = source.calibration or run.calibration
+    return [f"Calibration from the recording's own images: {'; '.join(said)}."] if said else []
 
 
 def _count(number: int, noun: str) -> str:

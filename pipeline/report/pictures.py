@@ -36,7 +36,7 @@ def to_uint8(color: Image) -> NDArray[np.uint8]:
 
 
 def colored(
-    values: Image, low: float, high: float, valid: Image, palette: str = "viridis"
+    values: Image, low: float, high: float, *, valid: Image, palette: str = "viridis"
 ) -> NDArray[np.uint8]:
     """8-bit RGB [h, w, 3] of a scalar image [h, w]: `low` to `high` over a palette, gray where not valid."""
     import matplotlib as mpl
@@ -51,7 +51,7 @@ def colored(
 def scale_uri(palette: str) -> str:
     """data: URI of a horizontal strip from the low to the high end of a palette."""
     ramp = np.tile(np.linspace(0.0, 1.0, 256), (12, 1))
-    return jpeg_uri(colored(ramp, 0.0, 1.0, np.ones(ramp.shape, dtype=bool), palette), 256)
+    return jpeg_uri(colored(ramp, 0.0, 1.0, valid=np.ones(ramp.shape, dtype=bool), palette=palette), 256)
 
 
 def color_by(values: Image, low: float, high: float, palette: str = "viridis") -> NDArray[np.float32]:

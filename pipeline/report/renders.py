@@ -9,10 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.evaluation.rendering import in_colors_of, in_world, mates, poses_by_stamp
 from duagc.pipeline.evaluation.results import Absent
-from duagc.pipeline.evaluation.views import score_view, surface_depth
+from duagc.pipeline.evaluation.views import in_exposure, score_view, surface_depth
 from duagc.pipeline.geometry import se3
+from duagc.pipeline.geometry.exposure import Exposure
+from duagc.pipeline.geometry.masks import checkered
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.messages import GaussianMap
 from duagc.pipeline.recording import Recording, open_rgbd
@@ -24,7 +27,6 @@ if TYPE_CHECKING:
     from duagc.pipeline.kernels import Rasterizer, Render
     from duagc.pipeline.recording import RgbdFrame, RgbdLog
 
-Array = NDArray[np.float64]
 PICTURE_WIDTH_PX = 400
 VIEWS_PER_ROBOT = 2
 COLOR_ERROR_END = 0.3
@@ -43,12 +45,14 @@ def rendered_views(run: RunFolder, source: Recording) -> tuple[list[dict[str, An
     for i, (name, robot) in enumerate(run.robots.items()):
         head = {"robot": name, "color": figures.color_of(i), "where": ""}
         with open_rgbd(source.log(name)) as log:
+            log.move_depth_by(robot.folder / "frontend.mcap")
             frames = [log.frame(index) for index in _chosen_frames(robot, len(log))]
             shown += [head | view for view in _own_views(robot, log, frames, rasterizer)]
             if robot.fused_map.information is not None and frames:
                 colored.append(head | _information_view(robot, log, frames, rasterizer))
         for peer in mates(run, robot)[:1]:
             with open_rgbd(source.log(peer.robot)) as log:
+                log.move_depth_by(peer.folder / "frontend.mcap")
                 views = _peer_views(robot, peer, log, rasterizer)
                 shown += [head | {"where": f" of {peer.robot}"} | view for view in views]
     return shown, colored
@@ -62,7 +66,7 @@ def _own_views(
     kind, final = _final(robot)
     for frame in frames:
         maps = {"own": (robot.own_map, before[frame.stamp_ns]), kind: (final, after[frame.stamp_ns])}
-        yield _view(maps, log, frame, rasterizer)
+        yield _view(maps, log, frame, rasterizer, exposure=robot.exposures.at(frame.index))
 
 
 def _peer_views(
@@ -78,7 +82,8 @@ def _peer_views(
     for index in _chosen_frames(peer, len(log))[:1]:
         frame = log.frame(index)
         T = poses[frame.stamp_ns]
-        yield _view({"own": (moved, T), kind: (last, T)}, log, frame, rasterizer)
+        exposure = peer.exposures.at(index)
+        yield _view({"own": (moved, T), kind: (last, T)}, log, frame, rasterizer, exposure=exposure)
 
 
 def _final(robot: RobotRun) -> tuple[str, GaussianMap]:
@@ -98,34 +103,47 @@ def _chosen_frames(robot: RobotRun, frames: int) -> list[int]:
 
 
 def _view(
-    maps: Mapping[str, tuple[GaussianMap, Array]], log: RgbdLog, frame: RgbdFrame, rasterizer: Rasterizer
+    maps: Mapping[str, tuple[GaussianMap, Array]],
+    log: RgbdLog,
+    frame: RgbdFrame,
+    rasterizer: Rasterizer,
+    *,
+    exposure: Exposure | None,
 ) -> dict[str, Any]:
-    """Image and renders of maps at poses, their depths, their errors."""
-    renders = {
-        kind: rasterizer.forward(shown.gaussians, log.camera, se3.inverse(T), depth_kind=shown.depth)
-        for kind, (shown, T) in maps.items()
-    }
-    measured = frame.depth > 0
+    """Image and renders of maps at poses, in the exposure of the image; their depths, their errors."""
+
+    def draw(shown: GaussianMap, T: Array) -> Render:
+        T_camera_map = se3.inverse(T)
+        render = rasterizer.forward(shown.gaussians, log.camera, T_camera_map, depth_kind=shown.depth)
+        return in_exposure(render, exposure)
+
+    renders = {kind: draw(shown, T) for kind, (shown, T) in maps.items()}
+    measured = frame.usable_depth > 0
     low, high = _range_m(frame.depth[measured])
     depths = {kind: surface_depth(render) for kind, render in renders.items()}
 
     def depth_picture(depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
-        return pictures.colored(depth_m, low, high, depth_m > 0)
+        return pictures.colored(depth_m, low, high, valid=depth_m > 0)
 
     def depth_error_picture(depth_m: NDArray[np.float32]) -> NDArray[np.uint8]:
         return pictures.colored(
-            np.abs(depth_m - frame.depth), 0.0, DEPTH_ERROR_END_M, measured & (depth_m > 0), "magma"
+            np.abs(depth_m - frame.depth),
+            0.0,
+            DEPTH_ERROR_END_M,
+            valid=measured & (depth_m > 0),
+            palette="magma",
         )
 
     def color_error_picture(render: Render) -> NDArray[np.uint8]:
         error = np.abs(np.clip(render.color, 0, 1) - frame.color / np.float32(255)).mean(axis=2)
-        return pictures.colored(error, 0.0, COLOR_ERROR_END, np.ones(error.shape, dtype=bool), "magma")
+        usable = np.ones(error.shape, dtype=bool) if frame.mask is None else frame.mask
+        return pictures.colored(error, 0.0, COLOR_ERROR_END, valid=usable, palette="magma")
 
     kinds = tuple(renders)
     columns = [
-        ("image", frame.color),
+        (_image_caption(frame), checkered(frame.color, frame.mask)),
         *((f"{kind} map", pictures.to_uint8(renders[kind].color)) for kind in kinds),
-        ("recorded depth", depth_picture(frame.depth)),
+        ("recorded depth", depth_picture(frame.usable_depth)),
         *((f"depth, {kind} map", depth_picture(depths[kind])) for kind in kinds),
         (f"color error, {kinds[-1]} map", color_error_picture(renders[kinds[-1]])),
         *((f"depth error, {kind} map", depth_error_picture(depths[kind])) for kind in kinds),
@@ -142,10 +160,18 @@ def _view(
     }
 
 
+def _image_caption(frame: RgbdFrame) -> str:
+    """What the picture of a frame is called, with the share of its pixels that are masked."""
+    if frame.mask is None:
+        return "image"
+    return f"image ({np.mean(~frame.mask):.1%} masked)"
+
+
 def _view_numbers(render: Render, frame: RgbdFrame) -> str:
-    score = score_view(render, frame.color, frame.depth, NO_EXACT)
+    score = score_view(render, frame.color, frame.depth, NO_EXACT, mask=frame.mask)
     depth = labels.NONE if isinstance(score.depth_l1_m, Absent) else labels.meters_text(score.depth_l1_m)
-    return f"{score.psnr_db:.1f} dB, depth {depth}"
+    psnr = labels.NONE if isinstance(score.psnr_db, Absent) else f"{score.psnr_db:.1f} dB"
+    return f"{psnr}, depth {depth}"
 
 
 def _range_m(depths_m: NDArray[np.float32]) -> tuple[float, float]:
@@ -169,7 +195,9 @@ def _information_view(
         render = rasterizer.forward(
             gaussians, log.camera, se3.inverse(poses[frame.stamp_ns]), background=(1.0, 1.0, 1.0)
         )
-        shown.append({"caption": f"image, frame {frame.index}", "uri": _uri(frame.color)})
+        shown.append(
+            {"caption": f"image, frame {frame.index}", "uri": _uri(checkered(frame.color, frame.mask))}
+        )
         shown.append({"caption": "uncertainty", "uri": _uri(pictures.to_uint8(render.color))})
     scale = _scale(
         "plasma",

@@ -15,6 +15,7 @@ from duagc.pipeline.evaluation.paths import Path3, paths
 from duagc.pipeline.evaluation.rendering import poses_by_stamp
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.geometry import so3
+from duagc.pipeline.geometry.masks import checkered
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.report import labels
 from duagc.pipeline.report.figures import color_of
@@ -73,7 +74,7 @@ def _log_run(stream: rr.RecordingStream, run: RunFolder, source: Recording, max_
     for i, (name, robot) in enumerate(run.robots.items()):
         world = _world_of(run, robot.component)
         _log_map(stream, f"{world}/maps/{name}", robot, max_gaussians)
-        _log_keyframes(stream, f"{world}/cameras/{name}", robot, source, i)
+        _log_keyframes(stream, f"{world}/cameras/{name}", robot, source=source, index=i)
     _log_rounds(stream, session)
     _log_network(stream, session)
     stream.log("summary", rr.TextDocument(_summary(run), media_type=rr.MediaType.MARKDOWN), static=True)
@@ -131,13 +132,14 @@ def _splats(gaussians: Gaussians, colors: NDArray[np.float32]) -> Any:
 
 
 def _log_keyframes(
-    stream: rr.RecordingStream, entity: str, robot: RobotRun, source: Recording, index: int
+    stream: rr.RecordingStream, entity: str, robot: RobotRun, *, source: Recording, index: int
 ) -> None:
     """The camera with its image and depth at every keyframe, where consensus puts it."""
     import rerun as rr
 
     poses = poses_by_stamp(robot.trajectory)
     with open_rgbd(source.log(robot.robot)) as log:
+        log.move_depth_by(robot.folder / "frontend.mcap")
         pinhole = rr.Pinhole(
             image_from_camera=log.camera.matrix(),
             resolution=[log.camera.width, log.camera.height],
@@ -159,8 +161,9 @@ def _log_keyframes(
                     translation=T_world_camera[:3, 3], quaternion=rr.Quaternion(xyzw=quat[[1, 2, 3, 0]])
                 ),
             )
-            stream.log(f"{entity}/image", rr.Image(frame.color).compress(jpeg_quality=85))
-            millimeters = np.rint(np.minimum(frame.depth, 65.0) * 1000.0).astype(np.uint16)
+            shown = checkered(frame.color, frame.mask)
+            stream.log(f"{entity}/image", rr.Image(shown).compress(jpeg_quality=85))
+            millimeters = np.rint(np.minimum(frame.usable_depth, 65.0) * 1000.0).astype(np.uint16)
             stream.log(f"{entity}/depth", rr.DepthImage(millimeters, meter=1000.0))
     stream.reset_time()
 

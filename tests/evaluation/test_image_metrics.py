@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from duagc.pipeline.evaluation.image_metrics import depth_error, ms_ssim, psnr, ssim
+from duagc.pipeline.evaluation.image_metrics import counted_windows, depth_error, ms_ssim, psnr, ssim
 from duagc.pipeline.kernels import Render
 
 
@@ -64,3 +64,30 @@ def test_depth_error_counts_what_is_covered() -> None:
     assert error == pytest.approx(0.15, abs=1e-6)
     assert completeness == pytest.approx(2 / 3)
     assert np.isnan(depth_error(drawn, np.zeros_like(depth))[0])
+
+
+def test_windows_that_touch_a_masked_pixel_are_left_out() -> None:
+    """The mean over the others is that of the image without what is masked, whatever is there."""
+    r = np.random.default_rng(1)
+    x = r.uniform(0, 1, (40, 50, 3))
+    y = np.clip(x + r.normal(0, 0.1, x.shape), 0, 1)
+    mask = np.ones((40, 50), bool)
+    mask[:7], mask[:, -9:] = False, False
+    other = np.where(mask[..., None], x, r.uniform(0, 1, x.shape))
+    assert ssim(x, y, mask) == pytest.approx(ssim(x[7:, :-9], y[7:, :-9]), abs=1e-12)
+    assert ssim(other, y, mask) == ssim(x, y, mask)
+    assert ssim(x, y, np.ones_like(mask)) == ssim(x, y)
+    mask[20, 25] = False
+    assert np.count_nonzero(counted_windows(mask)) == 23 * 31 - 11 * 11
+    with pytest.raises(ValueError, match="no 11x11 window"):
+        ssim(x, y, np.zeros_like(mask))
+
+
+def test_masked_scales_count_pixels_all_parts_of_which_count() -> None:
+    r = np.random.default_rng(2)
+    x = np.clip(np.cumsum(r.normal(0, 0.02, (192, 208, 3)), axis=0) + 0.5, 0, 1)
+    y = np.clip(x + r.normal(0, 0.05, x.shape), 0, 1)
+    mask = np.ones((192, 208), bool)
+    mask[:16], mask[:, :16] = False, False
+    cut = np.s_[16:, 16:]
+    assert ms_ssim(x, y, mask=mask) == pytest.approx(ms_ssim(x[cut], y[cut]), abs=1e-12)

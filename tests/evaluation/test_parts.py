@@ -65,10 +65,10 @@ def test_the_depth_of_one_layer_is_a_figure_of_its_own():
     color, recorded = np.zeros((12, 14, 3), dtype=np.uint8), np.full((12, 14), 2.0, dtype=np.float32)
     layer = np.full((12, 14), 2.03, dtype=np.float32)
     recorded[0], layer[1] = 0.0, 0.0
-    score = views.score_view(a_render(), color, recorded, Absent("none"), layer)
+    score = views.score_view(a_render(), color, recorded, Absent("none"), layer_m=layer)
     assert score.depth_l1_layer_m == pytest.approx(0.03, abs=1e-6)
     assert score.depth_l1_m == pytest.approx(0.0, abs=1e-6)
-    without = views.score_view(a_render(), color, recorded, Absent("none"), np.zeros_like(layer))
+    without = views.score_view(a_render(), color, recorded, Absent("none"), layer_m=np.zeros_like(layer))
     assert isinstance(without.depth_l1_layer_m, Absent)
     assert views.score_view(a_render(), color, recorded, Absent("none")).depth_l1_layer_m == views.NO_LAYER
 

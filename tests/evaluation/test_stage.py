@@ -28,8 +28,10 @@ ROBOT = {
     "feature_agreement_px_of_truth": NUMBER,
 }  # fmt: skip
 VIEWS = {
-    "views": int, "views_without_pose": int, "psnr_db": NUMBER, "ssim": NUMBER, "ms_ssim": NUMBER, "lpips": NUMBER,
-    "st_lpips": NUMBER, "depth_l1_m": NUMBER, "depth_l1_exact_m": NUMBER,
+    "views": int, "views_without_pose": int, "psnr_db": NUMBER, "psnr_interpolated_db": NUMBER,
+    "psnr_exposure_db": NUMBER, "psnr_exposure_left_db": NUMBER, "psnr_exposure_right_db": NUMBER,
+    "ssim": NUMBER, "ms_ssim": NUMBER, "lpips": NUMBER, "st_lpips": NUMBER,
+    "depth_l1_m": NUMBER, "depth_l1_exact_m": NUMBER,
     "depth_l1_layer_m": NUMBER, "depth_l1_common_m": NUMBER, "depth_completeness": NUMBER,
 }  # fmt: skip
 COMPARED = {
@@ -57,6 +59,10 @@ SCHEMA = {
          "coverage_95_scaled", "sigma_scale", "gaussians", "gaussians_without_information"),
         NUMBER,
     ),
+    "coverage": {"*": {
+        "frames": int, "frames_without_pixel": int, "posed": int, "coverage": NUMBER, "submaps": int, "components": int,
+    }},
+    "components": {"*": {"robots": int, "posed": int, "coverage": NUMBER, "ate_rmse_m": NUMBER}},
     "exchange": {
         "sessions": int, "rounds": int, "messages": int, "packets_sent": int, "packets_dropped": int, "bytes_sent": int,
         "bytes_delivered": int, "bytes_setup": int, "bytes_per_round_per_robot_pair": NUMBER,
@@ -84,9 +90,10 @@ def check_against_schema(metrics: dict) -> None:
     def walk(value, schema, path):
         if isinstance(schema, dict):
             assert isinstance(value, dict), path
-            assert set(value) == set(schema), path
-            for key in schema:
-                walk(value[key], schema[key], (*path, key))
+            if "*" not in schema:
+                assert set(value) == set(schema), path
+            for key in value:
+                walk(value[key], schema.get("*") or schema[key], (*path, key))
         elif value is None:
             nulls.add(".".join(path))
         else:

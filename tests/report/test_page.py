@@ -138,7 +138,7 @@ def test_figures_stay_the_same_and_leave_the_settings_alone():
 
 def test_colors_of_a_scalar_image():
     values = np.array([[0.0, 1.0, 2.0, 5.0]])
-    rgb = pictures.colored(values, 0.0, 2.0, values < 4)
+    rgb = pictures.colored(values, 0.0, 2.0, valid=values < 4)
     assert rgb.shape == (1, 4, 3)
     assert tuple(rgb[0, 3]) == pictures.NOTHING
     assert rgb[0, 0].tolist() == [68, 1, 84]  # the ends of viridis

@@ -1,0 +1,141 @@
+"""PSNR with the exposure of a view fitted: each half of the image in the exposure that was fitted on the other half.
+
+A camera that sets its own exposure shows a surface brighter in one image than in the next, and PSNR counts that as an
+error of the map. Here gain and offset of each channel are fitted between render and image on one half and applied to
+the render of the other half, which alone is scored. So nothing is scored on pixels that it was fitted to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.evaluation.results import Absent
+from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma
+from duagc.pipeline.splat.losses import Rendered
+
+Array = NDArray[np.float64]
+MIN_ALPHA = 0.5
+"""Opacity from which on a pixel of the render takes part in the fit."""
+MIN_PIXELS = 100
+"""Pixels of a channel that a fit needs."""
+MOST_PIXELS = 10_000
+"""A fit uses no more than about so many, evenly spaced."""
+ROUNDS = 5
+"""Of reweighting."""
+HUBER_SIGMAS = 1.345
+"""Residuals beyond count linearly (Huber 1964: 95 % of the efficiency of least squares)."""
+PRIOR_SPREAD = 0.01
+"""Standard deviation of the rendered colors (0..1) below which the gain stays nearer to one than to its fit."""
+CLIPPED = (1.5 / 255, 253.5 / 255)
+"""Colors of the image beyond are black or saturated, and tell nothing of the gain."""
+
+
+@dataclass(frozen=True)
+class FittedPsnr:
+    """PSNR of the halves of a view, dB, each in the exposure fitted on the other half; infinite if equal.
+
+    Attributes:
+        left: of the left half.
+        right: of the right half.
+        both: of both halves together.
+    """
+
+    left: float
+    right: float
+    both: float
+
+
+def fit_exposure(drawn: Array, image: Array) -> tuple[float, float] | Absent:
+    """Gain and offset of one channel, by robust least squares: image = gain * drawn + offset.
+
+    Args:
+        drawn: rendered colors [n].
+        image: colors [n] in 0..1 of the same pixels; clipped ones are left out.
+
+    Returns:
+        Gain and offset, or why there are none.
+    """
+    usable = (image >= CLIPPED[0]) & (image <= CLIPPED[1])
+    count = int(np.count_nonzero(usable))
+    if count < MIN_PIXELS:
+        return Absent(
+            f"an exposure needs {MIN_PIXELS} pixels of a half that are neither uncovered, black nor white"
+        )
+    x, y = drawn[usable], image[usable]
+    weight: NDArray[np.floating] = np.ones_like(x)
+    gain, offset = 1.0, 0.0
+    for _ in range(ROUNDS):
+        total = float(weight.sum())
+        middle_x, middle_y = float(weight @ x) / total, float(weight @ y) / total
+        dx, dy = x - middle_x, y - middle_y
+        spread = PRIOR_SPREAD**2 * total
+        gain = (float(weight @ (dx * dy)) + spread) / (float(weight @ (dx * dx)) + spread)
+        offset = middle_y - gain * middle_x
+        residual = y - gain * x - offset
+        weight = 1.0 / huber_divisor(residual, HUBER_SIGMAS * mad_sigma(residual) + 1e-6)
+    return gain, offset
+
+
+def fitted_psnr(
+    render: Rendered, image: Array, valid: NDArray[np.bool_] | None = None
+) -> FittedPsnr | Absent:
+    """PSNR of each half of a view in the exposure that was fitted on the other half.
+
+    The exposure changes what the map shows, not the black background behind it.
+
+    Args:
+        render: of the map, on black.
+        image: colors [h, w, 3] in 0..1.
+        valid: bool [h, w], pixels that are fitted and scored; None: all.
+
+    Returns:
+        The scores, or why there are none.
+    """
+    height, width = image.shape[:2]
+    counted = np.ones((height, width), dtype=bool) if valid is None else valid
+    covered = counted & (render.alpha >= MIN_ALPHA)
+    halves = (slice(0, width // 2), slice(width // 2, width))
+    errors = []
+    for scored, other in (halves, halves[::-1]):
+        squares = _squared_errors(render, image, scored, other, covered=covered)
+        if isinstance(squares, Absent):
+            return squares
+        errors.append(squares[counted[:, scored]])
+    if not all(len(error) for error in errors):
+        return Absent("half of the image has no valid pixel")
+    return FittedPsnr(_psnr(errors[0]), _psnr(errors[1]), _psnr(np.concatenate(errors)))
+
+
+def _squared_errors(
+    render: Rendered, image: Array, scored: slice, fitted: slice, *, covered: NDArray[np.bool_]
+) -> Array | Absent:
+    """Squared errors [h, w', 3] of the scored columns in the exposure of the fitted columns."""
+    used = _thinned(covered[:, fitted])
+    squares = np.empty_like(image[:, scored])
+    alpha = render.alpha[:, scored].astype(np.float64)
+    for channel in range(3):
+        found = fit_exposure(
+            render.color[:, fitted, channel][used].astype(np.float64), image[:, fitted, channel][used]
+        )
+        if isinstance(found, Absent):
+            return found
+        gain, offset = found
+        shown = np.clip(gain * render.color[:, scored, channel].astype(np.float64) + offset * alpha, 0, 1)
+        squares[..., channel] = (shown - image[:, scored, channel]) ** 2
+    return squares
+
+
+def _thinned(used: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The pixels of a half on a grid of about `MOST_PIXELS`."""
+    stride = max(1, int(np.sqrt(used.size / MOST_PIXELS)))
+    grid = np.zeros_like(used)
+    grid[stride // 2 :: stride, stride // 2 :: stride] = True
+    return used & grid
+
+
+def _psnr(squares: Array) -> float:
+    mse = float(np.mean(squares))
+    return float("inf") if mse == 0 else float(-10.0 * np.log10(mse))
