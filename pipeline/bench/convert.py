@@ -49,7 +49,7 @@ def run(src: Path, options: Sequence[str], folder: Path) -> dict[str, Any]:
     try:
         for task in TASKS:
             target = folder / task
-            out[task] = {**_measured(task, src, target, topics, options), "bytes": _size(target)}
+            out[task] = {**_measured(task, src, target, topics, options=options), "bytes": _size(target)}
             _remove(target)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -69,7 +69,7 @@ def _topics(src: Path, options: Sequence[str]) -> list[str]:
 
 
 def _measured(
-    task: str, src: Path, target: Path, topics: Sequence[str], options: Sequence[str]
+    task: str, src: Path, target: Path, topics: Sequence[str], *, options: Sequence[str]
 ) -> dict[str, Any]:
     said = json.dumps([task, str(src.resolve()), str(target.resolve()), list(topics), list(options)])
     start = time.monotonic()

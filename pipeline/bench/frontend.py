@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -25,12 +25,10 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.open3d_import import import_open3d
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.base.workers import peak_memory_bytes, worker_pool
+from duagc.pipeline.bench.frontend_errors import agreement_of, map_errors_of, trajectory_errors_of
 from duagc.pipeline.bench.stopwatch import Calls, Stopwatch, counted, replaced, shares, summary
 from duagc.pipeline.config.frontend import FrontendConfig
-from duagc.pipeline.evaluation import groundtruth, map_agreement, trajectory_errors, views
-from duagc.pipeline.evaluation.rendering import PosedMap, RenderTask
-from duagc.pipeline.evaluation.results import Absent, split_reasons
-from duagc.pipeline.evaluation.trajectory_errors import Paired
+from duagc.pipeline.evaluation.results import split_reasons
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.runs.folder import RobotRun
@@ -58,7 +56,7 @@ ABLATION: dict[str, dict[str, Any]] = {
 FRAME_PARTS = {"pyramid": ("tracking.RgbdPyramid", "build"), "registration": ("tracking", "register")}
 KEYFRAME_PARTS = {"seeding": ("mapping.Mapper", "_seed"), "optimization": ("mapping.Mapper", "_optimize")}
 COUNTED = {
-    "frame": ("tracking.Tracker", "track"),
+    "frame": ("submaps.SubmapTracker", "track"),
     "step": ("align", "linearize_at"),
     "keyframe": ("mapping.Mapper", "add_keyframe"),
     "draw": ("mapping.Mapper", "_optimize"),
@@ -167,12 +165,13 @@ def changed(config: FrontendConfig, values: Mapping[str, Any]) -> FrontendConfig
 
 
 def _functions(parts: Mapping[str, tuple[str, str]]) -> dict[str, tuple[Any, str]]:
-    from duagc.pipeline.frontend import mapping, model_registration, stage, tracking
+    from duagc.pipeline.frontend import mapping, model_registration, pose_optimization, submaps, tracking
     from duagc.pipeline.registration import align
 
     modules: dict[str, ModuleType] = {
         "mapping": mapping,
-        "stage": stage,
+        "poses": pose_optimization,
+        "submaps": submaps,
         "tracking": tracking,
         "model": model_registration,
         "align": align,
@@ -187,11 +186,11 @@ def _functions(parts: Mapping[str, tuple[str, str]]) -> dict[str, tuple[Any, str
 # --- one run -----------------------------------------------------------------------------------------------------
 
 
-def measure(log: Path, folder: Path, config: FrontendConfig, seed: int, threads: int) -> dict[str, Any]:
+def measure(log: Path, folder: Path, config: FrontendConfig, *, seed: int, threads: int) -> dict[str, Any]:
     """Run the front end on a log into folder/frontend.mcap, in a fresh process; times and peak memory."""
     from duagc.pipeline.frontend.stage import run_frontend
 
-    whole = {"frame": ("tracking.Tracker", "track"), "poses": ("stage", "_optimize_poses")}
+    whole = {"frame": ("submaps.SubmapTracker", "track"), "poses": ("poses.PathOptimization", "run")}
     if config.mapping_enabled:
         whole |= {"keyframe": ("mapping.Mapper", "add_keyframe"), "final": ("mapping.Mapper", "finalize")}
         whole |= {"model": ("model.ModelTracker", "register")}
@@ -239,7 +238,7 @@ class _Inner:
 def _in_turn(config: FrontendConfig) -> Iterator[_Inner]:
     """Stopwatches of parts, which run only while the whole that they belong to does."""
     watches = {"frame": Stopwatch(_functions(FRAME_PARTS))}
-    wholes = {"frame": ("tracking.Tracker", "track")}
+    wholes = {"frame": ("submaps.SubmapTracker", "track")}
     if config.mapping_enabled:
         watches["keyframe"] = Stopwatch(_functions(KEYFRAME_PARTS))
         wholes["keyframe"] = ("mapping.Mapper", "add_keyframe")
@@ -322,9 +321,14 @@ def _row(plan: Plan, source: Recording, job: _Job) -> dict[str, Any]:
             measured = pool.submit(measure_open3d, log, OPEN3D[job.name]).result()
             estimated = Trajectory(measured.pop("stamps_ns"), measured.pop("poses"))
             return (
-                row | measured | {"frames": len(estimated)} | _trajectory_errors(source, job.robot, estimated)
+                row
+                | measured
+                | {"frames": len(estimated)}
+                | trajectory_errors_of(source, job.robot, estimated)
             )
-        measured = pool.submit(measure, log, folder, job.config, plan.seed, plan.threads).result()
+        measured = pool.submit(
+            measure, log, folder, job.config, seed=plan.seed, threads=plan.threads
+        ).result()
         robot = RobotRun(job.robot, folder)
         placed = [f for f in robot.frames if f.status != "lost"]
         estimated = Trajectory(
@@ -335,54 +339,11 @@ def _row(plan: Plan, source: Recording, job: _Job) -> dict[str, Any]:
             "lost": len(robot.frames) - len(placed),
             "keyframes": len(robot.keyframes),
         }
-        row |= _trajectory_errors(source, job.robot, estimated)
-        row |= _agreement(source, robot, estimated)
+        row |= trajectory_errors_of(source, job.robot, estimated)
+        row |= agreement_of(source, robot, estimated)
         if job.config.mapping_enabled:
             row |= {"max_gaussians": job.config.mapping.max_gaussians}
-            row |= _map_errors(source, robot, estimated, plan.threads)
-    return row
-
-
-def _trajectory_errors(source: Recording, robot: str, estimated: Trajectory) -> dict[str, Any]:
-    """ATE after an SE(3) alignment of its own and relative errors frame to frame, where there is ground truth."""
-    true = groundtruth.trajectory(source, robot)
-    if isinstance(true, Absent):
-        return dict.fromkeys(("ate_rmse_m", "rpe_trans_m", "rpe_rot_rad"), true)
-    pairs = trajectory_errors.pair(true, estimated)
-    relative = trajectory_errors.rpe(pairs)
-    trans_m, rot_rad = (relative, relative) if isinstance(relative, Absent) else relative
-    return {
-        "ate_rmse_m": trajectory_errors.ate_rmse_m(pairs),
-        "rpe_trans_m": trans_m,
-        "rpe_rot_rad": rot_rad,
-    }
-
-
-def _agreement(source: Recording, robot: RobotRun, estimated: Trajectory) -> dict[str, Any]:
-    """How well held-out views agree, under the estimate and under the ground truth."""
-    true = groundtruth.trajectory(source, robot.robot)
-    pairs: Paired | Absent = true if isinstance(true, Absent) else trajectory_errors.pair(true, estimated)
-    if not isinstance(pairs, Absent):
-        pairs = replace(pairs, positions_only=not groundtruth.knows_rotations(source, robot.robot))
-    held_out = {f.frame_index: f.stamp_ns for f in robot.frames if f.held_out and f.status != "lost"}
-    path = dict(zip(estimated.stamps_ns.tolist(), estimated.poses, strict=True))
-    return map_agreement.section(source.log(robot.robot), held_out, {"": path}, pairs)
-
-
-def _map_errors(source: Recording, robot: RobotRun, estimated: Trajectory, threads: int) -> dict[str, Any]:
-    """Scores of the map over the held-out views, after and before its final refinement."""
-    maps = {"refined": robot.own_map, "unrefined": robot.unrefined_map}
-    row: dict[str, Any] = {"gaussians": len(robot.own_map.gaussians)}
-    for name, found in maps.items():
-        if found is None:
-            row[name] = Absent("the front end wrote no map before its refinement")
-            continue
-        task = RenderTask({name: PosedMap(found.gaussians, estimated)}, robot, "held_out", found.depth)
-        scores = views.summary(
-            [s[name] for _, s in task.scores(source, threads, None)], "no view is held out"
-        )
-        kept = ("views", "psnr_db", "ssim", "depth_l1_m", "depth_l1_exact_m", "depth_l1_layer_m")
-        row[name] = {key: scores[key] for key in (*kept, "depth_completeness")}
+            row |= map_errors_of(source, robot, estimated, plan.threads)
     return row
 
 

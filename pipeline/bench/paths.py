@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from duagc.converters.simulate.settings import FRAME_RATE_HZ, camera_of, scene_of
+from duagc.converters.simulate.sensors.degradations import FRAME_RATE_HZ
+from duagc.converters.simulate.settings import camera_of, scene_of
 from duagc.converters.simulate.simulated_scenes import set_up
 from duagc.converters.simulate.trajectories import loops, paradigms
 from duagc.pipeline.base.errors import DuagError

@@ -292,7 +292,7 @@ class RasterView:
             "contributions": rasterizer.contributions,
             "forward_loss_backward": forward_loss_backward,
             "view_gradients": lambda: rasterizer.view_gradients(
-                *view, self.color, self.depth_m, weights, pose=True
+                *view, color=self.color, depth_m=self.depth_m, loss=weights, pose=True
             ),
         }
 

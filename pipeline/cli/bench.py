@@ -43,7 +43,7 @@ def bench_raster(
                 f"{name!r} is not one of {', '.join(available_isas())}", param_hint="--isa"
             )
     plan = raster.RasterPlan(
-        sizes=tuple(_sizes(sizes)),
+        sizes=tuple(sizes_of(sizes)),
         gaussians=tuple(_counts("--gaussians", "60k,300k,1M" if full else gaussians)),
         threads=tuple(_counts("--threads", threads)),
         rounds=max(rounds, 15) if full else rounds,
@@ -96,9 +96,9 @@ def bench_consensus(
     plan = consensus_modes.ConsensusPlan(
         robots=tuple(_counts("--robots", robots)),
         topologies=tuple(topology.split(",")),
-        losses=tuple(_numbers("--loss", loss, 0.0, 0.99)),
-        contrasts=tuple(_numbers("--contrast", contrast, 1.0, 1e8)),
-        unknown=tuple(_numbers("--unknown", unknown, 0.0, 0.99)),
+        losses=tuple(numbers("--loss", loss, 0.0, 0.99)),
+        contrasts=tuple(numbers("--contrast", contrast, 1.0, 1e8)),
+        unknown=tuple(numbers("--unknown", unknown, 0.0, 0.99)),
         modes=tuple(mode.split(",")),
         tracks=tracks,
         max_rounds=max_rounds,
@@ -154,7 +154,7 @@ def bench_team(
     run = RunFolder(run_folder)
     settings = load_config(RunConfig, run.config_file, overrides or [])
     source = Recording(run.recording if recording is None else recording)
-    result = team_faults.run(run, source, settings.exchange, settings.seed, chosen, seeds)
+    result = team_faults.run(run, source, settings.exchange, seed=settings.seed, checks=chosen, seeds=seeds)
     print(json.dumps(result, indent=2) if as_json else team_faults.format_table(result))
 
 
@@ -283,7 +283,7 @@ def bench_paths(
     counts = _counts("--robots", robots)
     if max(counts) > MAX_ROBOTS:
         raise typer.BadParameter(f"{max(counts)} is more than {MAX_ROBOTS}", param_hint="--robots")
-    asked = _numbers("--overlap", overlap, 0, 1)
+    asked = numbers("--overlap", overlap, 0, 1)
     rows = paths.run(scenes.split(","), paradigms.split(","), counts, asked, frames=frames, seed=seed, up=up)
     print(json.dumps(rows, indent=2) if as_json else paths.format_table(rows))
 
@@ -312,7 +312,7 @@ def bench_convert(
     print(json.dumps(result, indent=2) if as_json else convert.format_table(result))
 
 
-def _numbers(option: str, text: str, low: float, high: float) -> list[float]:
+def numbers(option: str, text: str, low: float, high: float) -> list[float]:
     """Numbers within limits out of text like 0,0.3."""
     numbers = []
     for word in text.split(","):
@@ -339,7 +339,7 @@ def _counts(option: str, text: str) -> list[int]:
     return counts
 
 
-def _sizes(text: str) -> list[tuple[int, int]]:
+def sizes_of(text: str) -> list[tuple[int, int]]:
     """Widths and heights out of text like 320x240,640x480."""
     sizes = []
     for word in text.split(","):

@@ -47,6 +47,6 @@ def posegraph(
     from duagc.pipeline.team_posegraph.solve import solve
     from duagc.pipeline.team_posegraph.table import format_result
 
-    config = settings(solver, robust, loss, seed, max_rounds)
+    config = settings(solver, robust, loss=loss, seed=seed, max_rounds=max_rounds)
     result = solve(path, config, robots, only_reference=only_reference)
     print(json.dumps(result, indent=2) if as_json else format_result(result))

@@ -1,8 +1,11 @@
 """Commands that make recordings and say what is in them."""
 
 import json
+import shutil
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,9 +18,13 @@ from duagc.pipeline.cli.common import (
     Json,
     Out,
     Overrides,
+    Workers,
     app,
     say,
 )
+
+if TYPE_CHECKING:
+    from duagc.pipeline.recording import Recording
 
 
 @app.command()
@@ -54,7 +61,42 @@ def simulate(
         float, typer.Option(help="Difference of the robots' cameras, by channel: factors of two of light.")
     ] = 0,
     clock_ms: Annotated[float, typer.Option(help="Largest offset of a robot's clock.")] = 0,
+    auto_exposure: Annotated[
+        float, typer.Option(help="Largest change of the gain by automatic exposure, a share: 0.3.")
+    ] = 0,
+    exposure_lag_ms: Annotated[float, typer.Option(help="Time constant of the automatic exposure.")] = 300,
+    white_balance: Annotated[
+        float, typer.Option(help="Largest drift of red against blue, a share of the light: 0.15.")
+    ] = 0,
+    vignette: Annotated[float, typer.Option(help="Share of the light that the corners lose: 0.4.")] = 0,
+    blur_px: Annotated[
+        float, typer.Option(help="Motion blur by pixels; sets how long the shutter is open.")
+    ] = 0,
+    lens_k1: Annotated[
+        float,
+        typer.Option(help="Radial distortion: -0.3; images are undistorted, with a rim and its mask."),
+    ] = 0,
+    depth_step_mm: Annotated[
+        float, typer.Option(help="Distance between measurable depths at 1 m; grows with its square.")
+    ] = 0,
+    depth_delay_ms: Annotated[float, typer.Option(help="How much older depth is than its time says.")] = 0,
+    missing: Annotated[float, typer.Option(help="Share of the frames that are missing: 0.2.")] = 0,
+    rate_hz: Annotated[float, typer.Option(help="Frames a second, of a path with 30.")] = 30,
     movers: Annotated[int, typer.Option(min=0, max=8, help="Figures that walk about, with masks.")] = 0,
+    cover: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ROBOT:FIRST:FRAMES",
+            help="A lens is covered for these frames while the robot moves on; repeatable.",
+        ),
+    ] = None,
+    triangles: Annotated[
+        bool,
+        typer.Option(
+            "--triangles",
+            help="Make triangles of the room, as lens, blur and rolling shutter do: the same paths as with these.",
+        ),
+    ] = False,
     preview: Annotated[
         Path | None,
         typer.Option(metavar="PNG", help="Contact sheet to write: paths from above, views over time."),
@@ -67,9 +109,12 @@ def simulate(
     Examples:
     `duagc simulate --robots 3 --noise kinect --out recordings/room`,
     `duagc simulate --scene office --robots 4 --paradigm crossing --preview office.png --out recordings/office`,
-    `duagc simulate --scene scans/house --width 640 --height 480 --frames 300 --out recordings/house`
+    `duagc simulate --scene scans/house --width 640 --height 480 --frames 300 --out recordings/house`,
+    `duagc simulate --noise kinect --auto-exposure 0.3 --blur-px 4 --missing 0.2 --out recordings/handheld`
     """
+    from duagc.converters.simulate.sensors.degradations import Degradations
     from duagc.converters.simulate.sensors.rig import Rig
+    from duagc.converters.simulate.settings import Cover
     from duagc.converters.simulate.team import simulate as simulate_recording
 
     simulate_recording(
@@ -82,6 +127,20 @@ def simulate(
         preview=preview,
         rig=Rig(sensor, readout_ms / 1000, exposure_ms / 1000, gain_stops, clock_ms / 1000, camera_stops),
         movers=movers,
+        covers=[Cover.parse(text) for text in cover or ()],
+        degradations=Degradations(
+            auto_exposure=auto_exposure,
+            exposure_lag_s=exposure_lag_ms / 1000,
+            white_balance=white_balance,
+            vignette=vignette,
+            blur_px=blur_px,
+            lens_k1=lens_k1,
+            depth_step_m=depth_step_mm / 1000,
+            depth_delay_s=depth_delay_ms / 1000,
+            missing=missing,
+            rate_hz=rate_hz,
+        ),
+        triangles=triangles,
         size=(width, height),
         overlap=overlap,
         noise=noise,
@@ -91,6 +150,26 @@ def simulate(
     )
     _say_warnings(out)
     print(out)
+
+
+def _convert_calibrated(convert_to: Callable[[Path, bool], None], out: Path, force: bool) -> None:
+    """Write a recording calibrated where that is better, else as it was converted; nothing is left of the other."""
+    from duagc.pipeline.base.atomic_folder import RECORDING, new_folder
+    from duagc.pipeline.config.run import RunConfig
+    from duagc.pipeline.recalibration import calibrated
+    from duagc.pipeline.recording import Recording
+
+    with new_folder(out, force, RECORDING) as folder:
+        plain = folder / "plain" / out.resolve().name  # a recording has the name of its folder
+        convert_to(plain, False)
+        outcomes, written = calibrated(Recording(plain), lambda: folder, plain.name, RunConfig())
+        for outcome in outcomes:
+            for line in outcome.lines():
+                say(line)
+        if not written:
+            for path in plain.iterdir():
+                path.rename(folder / path.name)
+        shutil.rmtree(folder / "plain")
 
 
 def _say_warnings(out: Path) -> None:
@@ -127,12 +206,27 @@ def convert(
             help="File of options, such as `duagc calibrate --out` writes; --set wins over it.",
         ),
     ] = None,
+    masks: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--mask",
+            metavar="PNG",
+            help="Pixels that show the scene: 0 = none, for example the robot itself. FILE or ROBOT=FILE; repeatable.",
+        ),
+    ] = None,
     time_source: Annotated[
         str | None,
         typer.Option(
             help="Of logs of other programs: header, log (recording) or publish.", show_default=False
         ),
     ] = None,
+    calibrate: Annotated[
+        bool,
+        typer.Option(
+            "--calibrate",
+            help="Calibrate the cameras from the images; deliver the calibrated recording if that is better.",
+        ),
+    ] = False,
     force: Force = False,
     list_datasets: Annotated[
         bool, typer.Option("--list", help="List the datasets and their options.")
@@ -141,7 +235,8 @@ def convert(
     """Convert a dataset, as it is distributed, into one log per robot.
 
     Examples: `duagc convert 7scenes ~/data/redkitchen --robots 2 --out recordings/redkitchen`,
-    `duagc convert 7scenes ~/data/redkitchen --robots 2 --options cameras.toml --out recordings/calibrated`
+    `duagc convert 7scenes ~/data/redkitchen --robots 2 --options cameras.toml --out recordings/calibrated`,
+    `duagc convert ros campus.bag --mask alpha=bumper.png --out recordings/campus`
     """
     from duagc.converters import registry
 
@@ -151,9 +246,23 @@ def convert(
     if dataset is None or source is None or out is None:
         raise typer.BadParameter("expected DATASET SRC --out REC, or --list")
     said = [*(options or []), *([f"time_source={time_source}"] if time_source else [])]
-    registry.convert(
-        dataset, source, out, robots=robots, force=force, options=said, options_file=options_file
-    )
+
+    def convert_to(folder: Path, force: bool) -> None:
+        registry.convert(
+            dataset,
+            source,
+            folder,
+            robots=robots,
+            force=force,
+            options=said,
+            options_file=options_file,
+            masks=masks or [],
+        )
+
+    if calibrate:
+        _convert_calibrated(convert_to, out, force)
+    else:
+        convert_to(out, force)
     _say_warnings(out)
     print(out)
 
@@ -197,6 +306,8 @@ def info(
 @app.command()
 def check(
     path: Annotated[Path, typer.Argument(help="A recording, or the log of one robot.", show_default=False)],
+    config: ConfigFile = None,
+    overrides: Overrides = None,
     as_json: Json = False,
 ) -> None:
     """Say whether a recording is sound: times, pairs, depth scale, calibration, what a run will take.
@@ -207,9 +318,11 @@ def check(
     """
     from duagc.pipeline.base import determinism
     from duagc.pipeline.checks import check
+    from duagc.pipeline.config.base import load_config
+    from duagc.pipeline.config.checks import ChecksConfig
 
     determinism.configure_opencv()
-    report = check.check(path)
+    report = check.check(path, load_config(ChecksConfig, config, overrides or []))
     print(json.dumps(report.plain(), indent=2) if as_json else check.format_report(report))
     if not report.sound:
         raise typer.Exit(EXIT_FAILED)
@@ -224,22 +337,35 @@ def calibrate(
             "--robot", help="Only this robot; repeatable. All, if none: they have one kind of camera."
         ),
     ] = None,
-    views: Annotated[int, typer.Option(min=12, help="Most views of each half of the recording.")] = 56,
+    views: Annotated[
+        int | None,
+        typer.Option(
+            min=12,
+            help="Most views of each half of the recording; else `calibration.views`.",
+            show_default=False,
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", metavar="TOML", help="File to write: options for `duagc convert`."),
     ] = None,
+    apply: Annotated[
+        Path | None,
+        typer.Option(metavar="REC", help="Recording to write: this one with the cameras that were found."),
+    ] = None,
+    workers: Workers = 1,
     force: Force = False,
     config: ConfigFile = None,
     overrides: Overrides = None,
     as_json: Json = False,
 ) -> None:
-    """Estimate lens, rotation between the cameras and depth error of an RGB-D recording from its own images.
+    """Estimate lens, rotation between the cameras, delay and depth error of an RGB-D recording from its own images.
 
-    Prints every number with its standard deviation, and a check of each half by the other. Ground truth is not looked
-    at. An error if the images do not determine the cameras.
+    Prints every number with its standard deviation, and how well views agree that were not used. Ground truth is not
+    looked at. An error, and nothing written, if the images do not determine the cameras or agree no better.
 
-    Example: `duagc calibrate recordings/redkitchen --out cameras.toml`, then
+    Examples: `duagc calibrate recordings/desk --apply recordings/desk-calibrated`,
+    `duagc calibrate recordings/redkitchen --out cameras.toml`, then
     `duagc convert 7scenes ~/data/redkitchen --robots 2 --options cameras.toml --out recordings/calibrated`
     """
     from duagc.pipeline.base import determinism
@@ -250,14 +376,39 @@ def calibrate(
     from duagc.pipeline.recording import Recording
 
     determinism.configure_opencv()
+    settings, recording = load_config(RunConfig, config, overrides or []), Recording(path)
     if out is not None:
-        report.check_out(out, force, Recording(path).description, path)
-    found = calibrate_recording(
-        path, load_config(RunConfig, config, overrides or []).frontend, robots or [], views
-    )
-    print(json.dumps(report.plain(found), indent=2) if as_json else report.format_calibration(found))
+        report.check_out(out, force, recording.description, path)
+    with ExitStack() as place:
+        folder = None if apply is None else _place_of_calibrated(place, recording, apply, force)
+        found = calibrate_recording(
+            path, settings.frontend, robots or [], views or settings.calibration.views, workers=workers
+        )
+        print(json.dumps(report.plain(found), indent=2) if as_json else report.format_calibration(found))
+        if refused := found.refusal(settings.calibration):
+            raise DuagError(f"{path}: found no better calibration than its own: {refused}")
+        if folder is not None and apply is not None:
+            from duagc.pipeline.recalibration import CalibrationOutcome, write
+
+            outcome = CalibrationOutcome.of(found, robots or recording.robots, settings.calibration)
+            write(recording, [outcome], folder, apply.resolve().name)
+            for line in outcome.lines():
+                say(line)
     if out is not None:
         report.write(found, out)
+
+
+def _place_of_calibrated(place: ExitStack, recording: "Recording", out: Path, force: bool) -> Path:
+    """Where to write a calibrated recording, before anything is measured."""
+    from duagc.converters.calibrated_copy import why_not
+    from duagc.pipeline.base.atomic_folder import RECORDING, new_folder
+
+    for robot in recording.robots:
+        if why := why_not(recording.log(robot)):
+            raise DuagError(why)
+    if out.resolve() == recording.path.resolve():
+        raise DuagError(f"{out}: is the recording itself, expected the name of another")
+    return place.enter_context(new_folder(out, force, RECORDING))
 
 
 @app.command()

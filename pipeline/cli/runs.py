@@ -51,12 +51,20 @@ def run(
     config: ConfigFile = None,
     overrides: Overrides = None,
     workers: Workers = 2,
+    calibrate: Annotated[
+        bool,
+        typer.Option(
+            "--calibrate",
+            help="First calibrate the cameras from the images; use that if it is better (OUT/calibrated).",
+        ),
+    ] = False,
     force: Force = False,
 ) -> None:
     """Run all stages on a recording: maps, information, exchange, fusion, metrics, report, view.
 
     Examples:
     `duagc run recordings/redkitchen --out outputs/redkitchen`,
+    `duagc run recordings/desk --calibrate --out outputs/desk`,
     `duagc run recordings/room --out outputs/lossy --set exchange.link.loss_probability=0.3`
     """
     from duagc.pipeline.config.base import load_config
@@ -64,7 +72,13 @@ def run(
     from duagc.pipeline.runner import run as run_stages
 
     run_stages(
-        recording, out, load_config(RunConfig, config, overrides or []), workers=workers, force=force, log=say
+        recording,
+        out,
+        load_config(RunConfig, config, overrides or []),
+        workers=workers,
+        force=force,
+        calibrate=calibrate,
+        log=say,
     )
     _print_outputs(out)
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import progress, random_streams
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.bench.tables import markdown
 from duagc.pipeline.config.network import LinkConfig, TransportConfig
 from duagc.pipeline.consensus.evidence import Evidence
@@ -37,7 +38,6 @@ from duagc.pipeline.network.packets import EVIDENCE_HEAD_BYTES, HEADER_BYTES, MA
 from duagc.pipeline.network.transport import Message, Transport
 from duagc.pipeline.splat.information import pack_information
 
-Array = NDArray[np.float64]
 PERIOD_NS = 100_000_000
 EVIDENCE_MODES = {
     "evidence": Kind.EVIDENCE,
@@ -217,7 +217,9 @@ def _rounds(team: Team, model: LinkModel, case: dict[str, Any], plan: ConsensusP
                 for part in agent.outgoing(peer).parts(MAX_PAYLOAD_BYTES - _PACKET_HEAD_BYTES):
                     size = HEADER_BYTES + _PACKET_HEAD_BYTES + part.size_bytes
                     cost.bytes += size
-                    if model.fate(name, peer, next(counter), round_index * PERIOD_NS, size).delivered:
+                    if model.fate(
+                        name, peer, sequence=next(counter), send_ns=round_index * PERIOD_NS, size=size
+                    ).delivered:
                         sent.append((name, peer, part))
         for name, peer, part in sent:
             agents[peer].receive(name, part)
@@ -246,7 +248,7 @@ def _evidence(team: Team, model: LinkModel, case: dict[str, Any], plan: Consensu
     }
     ids = {name: itertools.count(1) for name in team.names}
     ends = {
-        (n, peer): Transport(index[n], index[peer], peer, TransportConfig(), ids[n].__next__)
+        (n, peer): Transport(index[n], index[peer], peer, TransportConfig(), new_id=ids[n].__next__)
         for n in team.names
         for peer in team.linked[n]
     }
@@ -266,7 +268,9 @@ def _evidence(team: Team, model: LinkModel, case: dict[str, Any], plan: Consensu
                 packet = parse(out.packet)
                 size = len(out.packet)
                 cost.bytes += size
-                if model.fate(name, peer, packet.sequence, round_index * PERIOD_NS, size).delivered:
+                if model.fate(
+                    name, peer, sequence=packet.sequence, send_ns=round_index * PERIOD_NS, size=size
+                ).delivered:
                     sent.append((name, peer, packet))
         for name, peer, packet in sent:
             arrival = ends[peer, name].receive(packet, round_index)

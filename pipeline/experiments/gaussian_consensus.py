@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.base import Config
 from duagc.pipeline.consensus.weights import Weights
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 COORDINATES = 13
 

@@ -37,9 +37,15 @@ def own_longer(run: RunFolder, source: Recording, threads: int) -> dict[str, Gau
 
 def _trained(run: RunFolder, robot: RobotRun, source: Recording, threads: int) -> Gaussians:
     log = source.log(robot.robot)
-    files = AgentInput(robot.robot, log, robot.folder / "frontend.mcap", robot.folder / "information.mcap")
+    files = AgentInput(
+        robot.robot,
+        log,
+        robot.folder / "frontend.mcap",
+        robot.folder / "information.mcap",
+        run.config.thickness_floor_m,
+    )
     frames = [f for f in robot.frames if f.status != "lost"]
-    config = run.config.fusion.refine
+    config = run.config.fusion.finetune
     poses = np.array([f.T_map_camera for f in frames])
     own = robot.own_map
     with open_rgbd(log) as camera_log:
@@ -50,8 +56,8 @@ def _trained(run: RunFolder, robot: RobotRun, source: Recording, threads: int) -
     steps = sum(num_steps(config, len(views), 1))
     context = MapContext(
         camera,
-        FusionConfig(refine=config.model_copy(update={"steps_per_view": steps, "steps_max": steps})),
-        run.config.exchange.matching,
+        FusionConfig(finetune=config.model_copy(update={"steps_per_view": steps, "steps_max": steps})),
+        run.config.matching,
         own.depth,
         threads=threads,
         seed=run.config.seed,

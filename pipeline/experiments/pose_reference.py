@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.bench.tables import markdown
 from duagc.pipeline.config.frontend import FrontendConfig
@@ -31,7 +32,6 @@ from duagc.pipeline.registration import Level, Reference, RgbdPyramid
 from duagc.pipeline.registration.features import Features
 from duagc.pipeline.runs.folder import RobotRun, RunFolder
 
-Array = NDArray[np.float64]
 Poses = dict[str, Array]  # T_world_camera [n, 4, 4] of a robot's frames that have a true pose
 VIEWS = 20  # held-out ones of a robot whose depth images are compared
 CUTS = (2, 3, 4)
@@ -123,9 +123,11 @@ def _robot(robot: RobotRun, recording: Recording) -> Robot:
     rows = [row for stamp, row in row_of.items() if stamp in frame_of]
     frames = [frame_of[int(pairs.stamps_ns[row])] for row in rows]
     new_row = {row: k for k, row in enumerate(rows)}
+    log = open_rgbd(recording.log(robot.robot))
+    log.move_depth_by(robot.folder / "frontend.mcap")
     return Robot(
         robot,
-        open_rgbd(recording.log(robot.robot)),
+        log,
         Paired(pairs.stamps_ns[rows], pairs.true[rows], pairs.estimated[rows]),
         np.array([f.frame_index for f in frames]),
         np.array([new_row[row_of[stamp_of[f.keyframe_index]]] for f in frames]),
@@ -165,7 +167,12 @@ class _Team:
         frame = robot.log.frame(int(robot.frame_index[row]))
         color = frame.color * np.float32(1 / 255)
         return RgbdPyramid.build(
-            color, frame.usable_depth, robot.log.camera, levels, depth_sigma_m=frame.depth_sigma
+            color,
+            frame.usable_depth,
+            robot.log.camera,
+            levels,
+            depth_sigma_m=frame.depth_sigma,
+            mask=frame.mask,
         )
 
     def optimized(self, start: Poses, residuals: Literal["joint", "depth"]) -> Poses:

@@ -162,6 +162,7 @@ def run(
     run_folder: RunFolder,
     recording: Recording,
     config: ExchangeConfig,
+    *,
     seed: int,
     checks: Sequence[str],
     seeds: int,
@@ -225,7 +226,8 @@ def renamed(data: RobotData, name: str) -> RobotData:
 
 def _input(run: RunFolder, recording: Recording, robot: str) -> AgentInput:
     folder = run.robots[robot].folder
-    return AgentInput(robot, recording.log(robot), folder / "frontend.mcap", folder / "information.mcap")
+    files = recording.log(robot), folder / "frontend.mcap", folder / "information.mcap"
+    return AgentInput(robot, *files, thickness_floor_m=run.config.thickness_floor_m)
 
 
 def format_table(result: dict[str, Any]) -> str:

@@ -38,7 +38,7 @@ def team_of_run(run: RunFolder, topology: str) -> Team:
         own = shared_evidence(name, robot.own_map.gaussians, robot.information, T_map, kind="block")
         evidence[name] = _with_sampling(own.in_world(T_world[name]), run.config.fusion)
     pairs = {key: ids for key, ids in Session(run).pairs.items() if key[0] in names and key[1] in names}
-    found = tracks(evidence, pairs, run.config.exchange.matching)
+    found = tracks(evidence, pairs, run.config.matching)
     if not len(found.track):
         raise DuagError(f"{run.path}: no Gaussians were matched, expected a run in which robots met")
     count = int(found.track[-1]) + 1

@@ -15,7 +15,7 @@ from duagc.pipeline.base.atomic_folder import new_folder
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
 from tests.fixtures import fake_run
-from tests.fixtures.commands import ROOT, assert_one_line, duagc
+from tests.fixtures.commands import ROOT, assert_one_line, duagc, duagc_here
 from tests.fixtures.recording_logs import write_camera
 
 
@@ -25,7 +25,7 @@ def test_help_is_there_for_every_command() -> None:
     assert len(names) >= 10
     text = duagc("--help").stdout
     assert all(name in text for name in names)
-    assert "Example" in duagc("run", "--help").stdout
+    assert "Example" in duagc_here("run", "--help").stdout
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def test_help_is_there_for_every_command() -> None:
 )
 def test_bad_input_is_one_line(tmp_path: Path, arguments: tuple[str, ...]) -> None:
     (tmp_path / "empty").mkdir()
-    assert_one_line(duagc(*(a.format(tmp=tmp_path) for a in arguments)))
+    assert_one_line(duagc_here(*(a.format(tmp=tmp_path) for a in arguments)))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["empty"]
 
 
@@ -78,8 +78,8 @@ def test_force_replaces_only_what_a_run_has_written(tmp_path: Path) -> None:
 def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     for command in (("demo",), ("simulate",)):
-        assert_one_line(duagc(*command, "--out", tmp_path / "file", "--force"), "file")
-        assert_one_line(duagc(*command, "--out", tmp_path / "file" / "out"), "Not a directory")
+        assert_one_line(duagc_here(*command, "--out", tmp_path / "file", "--force"), "file")
+        assert_one_line(duagc_here(*command, "--out", tmp_path / "file" / "out"), "Not a directory")
     assert (tmp_path / "file").read_text() == "mine"
 
 
@@ -168,7 +168,7 @@ def test_an_interrupted_command_is_one_line(tmp_path: Path) -> None:
 
 def test_usage_errors_exit_with_2() -> None:
     assert duagc("run").returncode == 2
-    assert duagc("convert", "7scenes").returncode == 2
+    assert duagc_here("convert", "7scenes").returncode == 2
 
 
 def test_a_folder_appears_only_when_it_is_finished(tmp_path: Path) -> None:
@@ -190,7 +190,7 @@ def test_a_folder_appears_only_when_it_is_finished(tmp_path: Path) -> None:
 
 def test_recover_exits_with_3_if_something_was_lost(tmp_path: Path) -> None:
     whole = write_camera(tmp_path / "whole.mcap", frames=2500)  # chunks of 1 MiB
-    result = duagc("recover", whole, "--out", tmp_path / "copy.mcap")
+    result = duagc_here("recover", whole, "--out", tmp_path / "copy.mcap")
     assert (result.returncode, result.stderr) == (0, "")
     assert "nothing lost" in result.stdout
     cut = tmp_path / "cut.mcap"
@@ -211,7 +211,7 @@ def test_a_user_finds_why_a_loop_closure_was_rejected(tmp_path: Path) -> None:
     rejected = next(line for line in lines if "inconsistent" in line)
     assert rejected[:2] == ["alpha", "bravo"]
     assert rejected[-5:] == ["30", "of", "50", "matches", "agree"]
-    listed = json.loads(duagc("inspect", fake.run, "--loop-closures", "--json").stdout)
+    listed = json.loads(duagc_here("inspect", fake.run, "--loop-closures", "--json").stdout)
     assert listed["verdicts"] == {"outvoted": 1, "kept": 1, "inconsistent": 1, "few_matches": 1}
     assert listed["candidates"][1]["weight"] == 1.0
-    assert_one_line(duagc("inspect", fake.run, "--loop-closures", "--robot", "zulu"), "no robot 'zulu'")
+    assert_one_line(duagc_here("inspect", fake.run, "--loop-closures", "--robot", "zulu"), "no robot 'zulu'")
