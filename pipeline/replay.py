@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from duagc.pipeline.base import determinism
+from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file
 from duagc.pipeline.config.base import load_config
@@ -81,29 +82,31 @@ def replay(
     for robot in robots:
         folder = Path(tempfile.mkdtemp(prefix=f"duagc-replay-{robot}-"))
         try:
-            out += _replay_one(run, logs.log(robot), robot, folder, config, report)
+            out += _replay_one(run, logs.log(robot), robot, folder, config=config, report=report)
         finally:
             shutil.rmtree(folder)
     return out
 
 
 def _replay_one(
-    run: Path, log: Path, robot: str, folder: Path, config: RunConfig, report: Callable[[str], None]
+    run: Path, log: Path, robot: str, folder: Path, *, config: RunConfig, report: Callable[[str], None]
 ) -> list[Comparison]:
     from duagc.pipeline.exchange.replay import replay_agent
 
     report(f"{robot}: front end and information")
-    prepare_robot(log, robot, folder, config, threads_per_worker(1))
+    (folder / robot_of(robot)).mkdir()
+    prepare_robot(log, robot_of(robot), folder / robot_of(robot), config, threads=threads_per_worker(1))
+    folder = folder / robot
     report(f"{robot}: agent, from its delivered packets")
     result, sent = replay_agent(
-        agent_input(robot, log, folder),
+        agent_input(robot, log, folder, config),
         config.exchange,
         seed=config.seed,
         exchange_path=run / "exchange.mcap",
     )
     report(f"{robot}: fusion")
     with stages.FUSION.running(folder, robot):
-        fuse_robot(robot, log, folder, result, config)
+        fuse_robot(robot, log, folder, result, config=config)
     comparisons = [Comparison(robot, "packets sent", sent.recorded, sent.recomputed)]
     for name in ROBOT_RESULTS:
         recorded = digest_file(run / "robots" / robot / name)

@@ -17,11 +17,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from duagc import __version__
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.atomic_folder import new_folder
+from duagc.pipeline.base.component_names import component_name, robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.config.base import dump_config
@@ -31,6 +32,9 @@ from duagc.pipeline.runs.digest import digest_file, result_files
 from duagc.pipeline.runs.folder import SCHEMA
 from duagc.pipeline.runs.robot_data import AgentInput, SessionResult
 from duagc.pipeline.runs.stages import Stage
+
+if TYPE_CHECKING:
+    from duagc.pipeline.recording import Recording
 
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
 
@@ -56,11 +60,21 @@ class Timing:
         Raises:
             DuagError: the stage reads or writes what it did not declare.
         """
-        wall, cpu = time.perf_counter(), time.process_time()
-        with stage.running(folder, robot):
+        with self.measured(stage.name, robot), stage.running(folder, robot):
             yield
-        self.stages[f"{stage.name}.{robot}" if robot else stage.name] = {
-            "stage": stage.name,
+
+    @contextmanager
+    def measured(self, name: str, robot: str | None = None) -> Iterator[None]:
+        """Time what is done while the block runs.
+
+        Args:
+            name: of what is done.
+            robot: for whom; None for the whole team.
+        """
+        wall, cpu = time.perf_counter(), time.process_time()
+        yield
+        self.stages[f"{name}.{robot}" if robot else name] = {
+            "stage": name,
             "robot": robot,
             "wall_s": round(time.perf_counter() - wall, 3),
             "cpu_s": round(time.process_time() - cpu, 3),
@@ -73,13 +87,14 @@ def threads_per_worker(workers: int) -> int:
     return max(1, len(os.sched_getaffinity(0)) // workers)
 
 
-def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, threads: int) -> dict[str, Any]:
+def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, *, threads: int) -> dict[str, Any]:
     """Front end and Fisher information of one robot, from its own log alone.
 
     Args:
         log: the robot's log.
         robot: its name.
-        folder: where frontend.mcap and information.mcap go.
+        folder: where frontend.mcap and information.mcap go. A component that did not join the largest one gets a
+            folder of its own next to it, such as `alpha-2`.
         config: of the run.
         threads: of the kernels; changes no bit of the result.
 
@@ -100,16 +115,29 @@ def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, thread
             log, folder / "frontend.mcap", config.frontend, seed=config.seed, threads=threads, progress=True
         )
     timing.stages[f"frontend.{robot}"]["parts"] = parts
-    with timing.stage(stages.INFORMATION, folder, robot):
-        run_information(
-            log,
-            folder / "frontend.mcap",
-            folder / "information.mcap",
-            config=config.information,
-            moving=config.frontend.moving,
-            threads=threads,
-        )
+    for name, of_component in {robot: folder, **_component_folders(robot, folder)}.items():
+        with timing.stage(stages.INFORMATION, of_component, name):
+            run_information(
+                log,
+                of_component / "frontend.mcap",
+                of_component / "information.mcap",
+                config=config.information,
+                moving=config.frontend.moving,
+                thickness_floor_m=config.thickness_floor_m,
+                threads=threads,
+            )
     return timing.stages
+
+
+def _component_folders(robot: str, folder: Path) -> dict[str, Path]:
+    """Move the logs of further components into folders of their own; by name of the component."""
+    out = {}
+    for path in sorted(folder.glob("frontend.*.mcap"), key=lambda p: int(p.name.split(".")[1])):
+        name = component_name(robot, int(path.name.split(".")[1]))
+        out[name] = folder.with_name(name)
+        out[name].mkdir()
+        path.rename(out[name] / "frontend.mcap")
+    return out
 
 
 def prepare_robots(
@@ -119,7 +147,7 @@ def prepare_robots(
     threads = threads_per_worker(workers)
     timings: dict[str, Any] = {}
     with worker_pool(workers) as pool:
-        jobs = [pool.submit(prepare_robot, logs[r], r, folders[r], config, threads) for r in logs]
+        jobs = [pool.submit(prepare_robot, logs[r], r, folders[r], config, threads=threads) for r in logs]
         for job in jobs:
             timings.update(job.result())
     return timings
@@ -132,6 +160,7 @@ def run(
     *,
     workers: int = 2,
     force: bool = False,
+    calibrate: bool = False,
     log: Callable[[str], None] = lambda line: print(line, file=sys.stderr, flush=True),
 ) -> None:
     """Run all stages on a recording.
@@ -146,6 +175,8 @@ def run(
         config: settings of all stages.
         workers: robots prepared at the same time; changes no bit of the result.
         force: replace an earlier run in `out`.
+        calibrate: calibrate the cameras from the recording's own images first. Where views that were not used say
+            that it is better, the run is of the calibrated recording, which is kept in its folder `calibrated`.
         log: gets a line at the start of every stage, and every warning.
 
     Raises:
@@ -153,17 +184,19 @@ def run(
     """
     determinism.configure_determinism()
     if determinism.is_deterministic():
-        _run(recording_path, out, config, workers, force, log)
+        _run(recording_path, out, config, workers=workers, force=force, calibrate=calibrate, log=log)
     else:
-        _run_in_child(recording_path, out, config, workers, force, log)
+        _run_in_child(recording_path, out, config, workers=workers, force=force, calibrate=calibrate, log=log)
 
 
 def _run(
     recording_path: Path,
     out: Path,
     config: RunConfig,
+    *,
     workers: int,
     force: bool,
+    calibrate: bool,
     log: Callable[[str], None],
 ) -> None:
     from duagc.pipeline.evaluation import check_ground_truth
@@ -174,6 +207,9 @@ def _run(
         check_ground_truth(recording)
         timing = Timing()
         (folder / "config.toml").write_text(dump_config(config))
+        calibration: dict[str, Any] = {}
+        if calibrate:
+            recording, calibration = _calibrated(recording, folder, config, timing, workers=workers, log=log)
         logs = {robot: recording.log(robot) for robot in recording.robots}
         for path in logs.values():
             if (found := content_digest(path)) != (expected := recording.digest(path.name)):
@@ -185,28 +221,37 @@ def _run(
             path.mkdir(parents=True)
         log(f"front end and information: {len(logs)} robots, {min(workers, len(logs))} at a time")
         timing.stages.update(prepare_robots(logs, robots, config, min(workers, len(logs))))
+        names = sorted(path.name for path in (folder / "robots").iterdir())
+        for name in sorted(set(names) - set(logs)):
+            log(
+                f"warning: {name}: what {robot_of(name)} saw after it was lost did not join the rest of its path"
+            )
+        robots = {name: folder / "robots" / name for name in names}
+        logs = {name: recording.log(name) for name in names}
         log("exchange and consensus")
         results = _exchange(logs, folder, config, timing)
         for robot, result in results.items():
             log(f"fusion: {robot}")
             with timing.stage(stages.FUSION, robots[robot], robot):
-                left_out = fuse_robot(robot, logs[robot], robots[robot], result, config)
+                left_out = fuse_robot(robot, logs[robot], robots[robot], result, config=config)
             for neighbor, reason in left_out.items():
                 log(f"warning: {robot} uses nothing of {neighbor}'s map: {reason}")
-        _write_json(folder / "manifest.json", _manifest(recording, folder, config))
+        _write_json(folder / "manifest.json", _manifest(recording, folder, config) | calibration)
         _write_json(folder / "timing.json", {"stages": timing.stages})
         log("evaluation")
-        _evaluate(folder, recording_path, timing)
+        _evaluate(folder, recording.path, timing)
         log("report and view")
-        _present(folder, recording_path, timing)
+        _present(folder, recording.path, timing)
 
 
 def _run_in_child(
     recording_path: Path,
     out: Path,
     config: RunConfig,
+    *,
     workers: int,
     force: bool,
+    calibrate: bool,
     log: Callable[[str], None],
 ) -> None:
     """`_run` in a process that is started with the settings of `determinism`; its lines come back to `log`."""
@@ -220,7 +265,9 @@ def _run_in_child(
     relaying.start()
     try:
         with worker_pool(1, _keep_queue, (lines,)) as pool:
-            pool.submit(_run_and_send, recording_path, out, config, workers, force).result()
+            pool.submit(
+                _run_and_send, recording_path, out, config, workers=workers, force=force, calibrate=calibrate
+            ).result()
     finally:
         lines.put(None)
         relaying.join()
@@ -234,8 +281,36 @@ def _keep_queue(lines: SimpleQueue[str | None]) -> None:
     _lines.append(lines)
 
 
-def _run_and_send(recording_path: Path, out: Path, config: RunConfig, workers: int, force: bool) -> None:
-    _run(recording_path, out, config, workers, force, _lines[0].put)
+def _run_and_send(
+    recording_path: Path, out: Path, config: RunConfig, *, workers: int, force: bool, calibrate: bool
+) -> None:
+    _run(recording_path, out, config, workers=workers, force=force, calibrate=calibrate, log=_lines[0].put)
+
+
+def _calibrated(
+    recording: Recording,
+    folder: Path,
+    config: RunConfig,
+    timing: Timing,
+    *,
+    workers: int,
+    log: Callable[[str], None],
+) -> tuple[Recording, dict[str, Any]]:
+    """The recording that the run is of, and what the manifest says about its calibration."""
+    from duagc.pipeline.recalibration import calibrated
+    from duagc.pipeline.recording import Recording
+
+    def place() -> Path:
+        (folder / stages.CALIBRATED).mkdir()
+        return folder / stages.CALIBRATED
+
+    log("calibration")
+    with timing.measured("calibration"):
+        outcomes, written = calibrated(recording, place, recording.name, config, workers=workers)
+    for line in (line for outcome in outcomes for line in outcome.lines()):
+        log(line)
+    entry = {"of": os.path.relpath(recording.path, folder), "cameras": [o.plain() for o in outcomes]}
+    return Recording(folder / stages.CALIBRATED) if written else recording, {"calibration": entry}
 
 
 def _exchange(
@@ -244,7 +319,7 @@ def _exchange(
     from duagc.pipeline.exchange.session import run_session
 
     determinism.configure_opencv()
-    inputs = [agent_input(robot, log, folder / "robots" / robot) for robot, log in logs.items()]
+    inputs = [agent_input(robot, log, folder / "robots" / robot, config) for robot, log in logs.items()]
     with timing.stage(stages.EXCHANGE, folder):
         return run_session(
             inputs,
@@ -255,13 +330,14 @@ def _exchange(
         )
 
 
-def agent_input(robot: str, log: Path, folder: Path) -> AgentInput:
+def agent_input(robot: str, log: Path, folder: Path, config: RunConfig) -> AgentInput:
     """What the agent of a robot may know before the first packet: its own log and its own results."""
-    return AgentInput(robot, log, folder / "frontend.mcap", folder / "information.mcap")
+    files = folder / "frontend.mcap", folder / "information.mcap"
+    return AgentInput(robot, log, *files, thickness_floor_m=config.thickness_floor_m)
 
 
 def fuse_robot(
-    robot: str, log: Path, folder: Path, result: SessionResult, config: RunConfig
+    robot: str, log: Path, folder: Path, result: SessionResult, *, config: RunConfig
 ) -> dict[str, str]:
     """Fused map and corrected trajectory of one robot, into the folder of its own results; one robot at a time.
 
@@ -271,11 +347,11 @@ def fuse_robot(
     from duagc.pipeline.fusion.stage import run_fusion
 
     checks = run_fusion(
-        agent_input(robot, log, folder),
+        agent_input(robot, log, folder, config),
         result,
         folder,
         config=config.fusion,
-        matching=config.exchange.matching,
+        matching=config.matching,
         moving=config.frontend.moving,
         weights=config.exchange.weights,
         seed=config.seed,

@@ -12,12 +12,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.geometry.trajectory import Trajectory, read_tum
-from duagc.pipeline.messages import CorrectedKeyframes, GaussianInformation, GaussianMap, Keyframe, Odometry
-from duagc.pipeline.recording import read_log
+from duagc.pipeline.messages import (
+    CorrectedKeyframes,
+    GaussianInformation,
+    GaussianMap,
+    Keyframe,
+    Odometry,
+    Submap,
+)
+from duagc.pipeline.recording import read_exposures, read_log
 from duagc.pipeline.runs.digest import digest_file
 from duagc.schemas import topics
 
@@ -63,6 +72,16 @@ class RobotRun:
     def keyframes(self) -> list[Keyframe]:
         """Every keyframe, in order of its index."""
         return self._all("frontend.mcap", topics.KEYFRAME)
+
+    @cached_property
+    def submaps(self) -> list[Submap]:
+        """The submaps of this component, in the order in which they began; none if the robot has a single one."""
+        return self._all("frontend.mcap", topics.SUBMAP)
+
+    @cached_property
+    def exposures(self) -> ExposureTrack:
+        """Exposures of the frames; none where all are exposed as the map."""
+        return read_exposures(self.folder / "frontend.mcap", self.robot)
 
     @cached_property
     def own_map(self) -> GaussianMap:
@@ -130,6 +149,8 @@ class RobotRun:
 class RunFolder:
     """A run: its robots in order of their names, its settings and timings.
 
+    A component of a robot that did not join its largest one is among them, as "alpha-2" after "alpha".
+
     Attributes:
         path: the folder.
     """
@@ -152,7 +173,7 @@ class RunFolder:
 
     @cached_property
     def largest_component(self) -> tuple[str, ...]:
-        """The robots that agree to share one world, most robots first, then lowest names.
+        """The robots that agree to share one world, most robots first, then most components, then lowest names.
 
         A robot is a member if its own estimate of the component is the same as that of the others.
         """
@@ -160,7 +181,15 @@ class RunFolder:
         members = {
             claim: tuple(r for r in self.robots if self.robots[r].component == claim) for claim in claims
         }
-        return min(members.values(), key=lambda names: (-len(names), names))
+        return min(
+            members.values(), key=lambda names: (-len({robot_of(n) for n in names}), -len(names), names)
+        )
+
+    @property
+    def calibration(self) -> list[str]:
+        """What the calibration that the run began with found, in sentences; empty: it began with none."""
+        cameras = self._json("manifest.json").get("calibration", {}).get("cameras", [])
+        return [line for camera in cameras for line in camera["summary"]]
 
     @property
     def recording(self) -> Path:

@@ -10,7 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.config.mapping import THICKNESS_FLOOR_M
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.evidence import Evidence
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -19,25 +22,34 @@ from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.splat.gaussians import Gaussians
 from duagc.schemas import topics
 
-Array = NDArray[np.float64]
-
 
 class Images(NamedTuple):
-    """Images of a keyframe: RGB [h, w, 3], depth [h, w] (m, 0 = unknown), its sigma (m) where the log has it."""
+    """Images of a keyframe: RGB [h, w, 3], depth [h, w] (m, 0 = unknown), its sigma (m) where the log has it, and the
+    pixels that may be used, bool [h, w]; None: all."""
 
     color: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
     depth_sigma_m: NDArray[np.float32] | None = None
+    mask: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
 class AgentInput:
-    """The files of one robot."""
+    """The files of one robot, or of a component of it.
+
+    Attributes:
+        robot: its name, or that of the component.
+        log: of its sensors.
+        frontend: log of its front end.
+        information: log of the information of its map.
+        thickness_floor_m: least standard deviation of a Gaussian that the maps of the run were made with.
+    """
 
     robot: str
     log: Path
     frontend: Path
     information: Path
+    thickness_floor_m: float
 
 
 @dataclass(frozen=True)
@@ -51,6 +63,7 @@ class RobotData:
         images: gives color uint8 RGB [h, w, 3] and depth float32 [h, w] (m, 0 = unknown) of a keyframe.
         information: of the Gaussians, in the map frame, by the same ids.
         depth: of a Gaussian at a pixel, as the map was made.
+        thickness_floor_m: least standard deviation of a Gaussian, as the maps of the run were made.
     """
 
     robot: str
@@ -62,6 +75,7 @@ class RobotData:
     gaussians: Gaussians
     information: GaussianInformation
     depth: DepthKind = "blended"
+    thickness_floor_m: float = THICKNESS_FLOOR_M
 
     @property
     def keyframes(self) -> int:
@@ -150,19 +164,40 @@ def registrations_of(
     Args:
         frontend: file that both come from, for the complaint.
         keyframes: in order of their index.
+        factors: the registrations.
     Raises:
-        DuagError: a keyframe that no registration ties to an earlier one, or a registration of none.
+        DuagError: a registration of no keyframe, or a keyframe that no chain of registrations ties to the first.
     """
-    tied = {f.second_index for f in factors if 0 <= f.first_index < f.second_index}
-    expected = {k.keyframe_index for k in keyframes[1:]}
-    if tied != expected:
+    known = range(len(keyframes))
+    for f in factors:
+        if not (f.first_index in known and f.second_index in known and f.first_index < f.second_index):
+            raise DuagError(
+                f"{frontend}: a registration ties keyframes {f.first_index} and {f.second_index}, expected two of "
+                f"{len(keyframes)}, the earlier one first"
+            )
+    loose = sorted(set(known) - _tied(factors))
+    if loose:
         raise DuagError(
-            f"{frontend}: registrations tie keyframes {sorted(tied)} to earlier ones, expected {sorted(expected)}"
+            f"{frontend}: registrations tie keyframe {loose[0]} to no other, expected all to keyframe 0"
         )
     return [
         RelativePose(f.first_index, f.second_index, f.T_first_second, f.weight * f.information)
         for f in factors
     ]
+
+
+def _tied(factors: Sequence[KeyframeFactor]) -> set[int]:
+    """Keyframes that chains of registrations tie to keyframe 0, itself included."""
+    neighbors: dict[int, list[int]] = {}
+    for f in factors:
+        neighbors.setdefault(f.first_index, []).append(f.second_index)
+        neighbors.setdefault(f.second_index, []).append(f.first_index)
+    reached, border = {0}, [0]
+    while border:
+        new = set(neighbors.get(border.pop(), ())) - reached
+        reached |= new
+        border += sorted(new)
+    return reached
 
 
 def load(source: AgentInput) -> RobotData:
@@ -172,6 +207,7 @@ def load(source: AgentInput) -> RobotData:
         DuagError: a file lacks what it should hold, or two files do not belong together.
     """
     from duagc.pipeline.recording import open_rgbd, read_log
+    from duagc.pipeline.recording.moved_depth import tracked_frames
 
     robot = source.robot
     wanted = (topics.KEYFRAME.of(robot), topics.MAP.of(robot), topics.KEYFRAME_FACTOR.of(robot))
@@ -203,13 +239,16 @@ def load(source: AgentInput) -> RobotData:
     poses = np.array([k.T_map_camera for k in keyframes], dtype=np.float64).reshape(-1, 4, 4)
     with open_rgbd(source.log) as log:
         camera = log.camera
-        if log.robot != robot:
-            raise DuagError(f"{source.log}: is the log of {log.robot}, expected that of {robot}")
+        frames = tracked_frames(source.frontend) if log.pairing.largest_offset_ns else None
+        if log.robot != robot_of(robot):
+            raise DuagError(f"{source.log}: is the log of {log.robot}, expected that of {robot_of(robot)}")
 
     def images(keyframe: int) -> Images:
         with open_rgbd(source.log) as log:
+            if frames is not None:
+                log.move_depth(frames)
             frame = log.frame(keyframes[keyframe].frame_index)
-        return Images(frame.color, frame.usable_depth, frame.depth_sigma)
+        return Images(frame.color, frame.usable_depth, frame.depth_sigma, frame.mask)
 
     return RobotData(
         robot,
@@ -221,4 +260,5 @@ def load(source: AgentInput) -> RobotData:
         gaussians=gaussian_map.gaussians,
         information=information,
         depth=gaussian_map.depth,
+        thickness_floor_m=source.thickness_floor_m,
     )

@@ -24,12 +24,16 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+from duagc.pipeline.base.component_names import same_robot
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.recording.access import limited
 from duagc.schemas import topics
 from duagc.schemas.topics import Scope, Topic
 
 WHERE = "pipeline/runs/stages.py"
+CALIBRATED = "calibrated"
+"""Folder of a run with the recording that it calibrated; as in any recording, topics are what is limited."""
+CALIBRATED_FILES = f"{CALIBRATED}/*"
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 
 
@@ -120,7 +124,8 @@ class _Running:
         row = topics.find(topic)
         if row is None:
             return False
-        return row[0] in declared and self.robot in (None, row[1])
+        own = self.robot is None or same_robot(self.robot, row[1])
+        return row[0] in declared and own
 
     def _refuse(self, path: Path, what: str, field: str) -> None:
         of = "" if self.robot is None else f" of {self.robot}"
@@ -163,16 +168,18 @@ FRONTEND = Stage(
         topics.ODOMETRY,
         topics.KEYFRAME,
         topics.KEYFRAME_FACTOR,
+        topics.SUBMAP,
+        topics.EXPOSURE,
         topics.MAP_UPDATE,
         topics.MAP,
         topics.UNREFINED_MAP,
     ),
-    writes_files=("frontend.mcap",),
+    writes_files=("frontend.mcap", "frontend.*.mcap"),
     per_robot=True,
 )
 INFORMATION = Stage(
     "information",
-    reads=(*SENSORS, topics.ODOMETRY, topics.KEYFRAME, topics.MAP),
+    reads=(*SENSORS, topics.ODOMETRY, topics.KEYFRAME, topics.EXPOSURE, topics.MAP),
     writes=(topics.INFORMATION,),
     reads_files=("frontend.mcap",),
     writes_files=("information.mcap",),
@@ -180,7 +187,14 @@ INFORMATION = Stage(
 )
 EXCHANGE = Stage(
     "exchange",
-    reads=(*SENSORS, topics.KEYFRAME, topics.KEYFRAME_FACTOR, topics.MAP, topics.INFORMATION),
+    reads=(
+        *SENSORS,
+        topics.ODOMETRY,
+        topics.KEYFRAME,
+        topics.KEYFRAME_FACTOR,
+        topics.MAP,
+        topics.INFORMATION,
+    ),
     writes=(
         topics.PEER_MESSAGE,
         topics.PEER_PACKET,
@@ -189,7 +203,7 @@ EXCHANGE = Stage(
         topics.CONSENSUS_ROUND,
         topics.LOOP_CLOSURE_DECISION,
     ),
-    reads_files=("robots/*/frontend.mcap", "robots/*/information.mcap"),
+    reads_files=("robots/*/frontend.mcap", "robots/*/information.mcap", CALIBRATED_FILES),
     writes_files=("exchange.mcap", "consensus.mcap"),
 )
 FUSION = Stage(
@@ -198,6 +212,7 @@ FUSION = Stage(
         *SENSORS,
         topics.ODOMETRY,
         topics.KEYFRAME,
+        topics.EXPOSURE,
         topics.KEYFRAME_FACTOR,
         topics.MAP,
         topics.INFORMATION,
@@ -214,6 +229,7 @@ FUSION = Stage(
     per_robot=True,
 )
 _FINISHED = (
+    CALIBRATED_FILES,
     "config.toml",
     "manifest.json",
     "timing.json",
