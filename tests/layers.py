@@ -117,7 +117,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
     ),
     (
         _part("report", "the page of a run", "base geometry kernels fusion", _LOGS, "runs evaluation"),
-        _part("checks", "is a recording sound", "base geometry registration", _LOGS, "evaluation"),
+        _part("checks", "is a recording sound", "base config geometry registration", _LOGS, "evaluation"),
         _part("bench", "speed, side by side", _MATHEMATICS, "recording runs frontend evaluation converters"),
     ),
     (
@@ -138,10 +138,17 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
     ),
     (
         _part(
+            "recalibration",
+            "a recording with calibrated cameras",
+            "base config geometry recording converters camera_calibration",
+        ),
+    ),
+    (
+        _part(
             "runner",
             "carries a run",
             "base config runs frontend information recording exchange fusion",
-            "evaluation report viewing",
+            "evaluation report viewing recalibration",
         ),
     ),
     (_part("replay", "computes a robot again", "base config runs recording exchange runner"),),
@@ -150,7 +157,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             "cli",
             "the command",
             "base config kernels recording runs converters exchange fusion evaluation",
-            "report viewing checks camera_calibration team_posegraph bench experiments runner replay",
+            "report viewing checks camera_calibration recalibration team_posegraph bench experiments runner replay",
         ),
     ),
 )

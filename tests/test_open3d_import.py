@@ -31,12 +31,13 @@ def test_open3d_casts_rays_with_nothing_but_stand_ins() -> None:
     paths = [str(path_of(library)) for library in LIBRARIES]
     done = python(
         f"""
-import ctypes, numpy as np
+import ctypes, sys, numpy as np
 kept = [ctypes.CDLL(path) for path in {paths}]
 from duagc.pipeline.base.open3d_import import import_open3d
 o3d = import_open3d()
 loaded = {{line.split("/")[-1].strip() for line in open("/proc/self/maps") if "/" in line}}
 assert not loaded & {set(LIBRARIES)}, loaded
+assert "dash" not in sys.modules
 scene = o3d.t.geometry.RaycastingScene(nthreads=1)
 scene.add_triangles(
     o3d.core.Tensor(np.array([[0, 0, 2], [1, 0, 2], [0, 1, 2]], np.float32)),
@@ -44,6 +45,23 @@ scene.add_triangles(
 )
 ray = o3d.core.Tensor(np.array([[0.2, 0.2, 0.0, 0.0, 0.0, 1.0]], np.float32))
 assert abs(scene.cast_rays(ray)["t_hit"].numpy()[0] - 2.0) < 1e-5
+print("done")
+"""
+    )
+    assert done.stdout == "done\n", done.stderr
+
+
+def test_the_viewer_in_a_browser_is_imported_when_it_is_called() -> None:
+    done = python(
+        """
+import sys
+from duagc.pipeline.base.open3d_import import import_open3d
+o3d = import_open3d()
+assert not {"dash", "plotly"} & set(sys.modules)
+mesh = o3d.geometry.TriangleMesh.create_box()
+for _ in range(2):
+    assert type(o3d.visualization.get_plotly_fig([mesh])).__name__ == "Figure"
+assert "dash" in sys.modules
 print("done")
 """
     )

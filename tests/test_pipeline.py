@@ -25,17 +25,18 @@ from duagc.pipeline.exchange.session import run_session
 from duagc.pipeline.experiments import pose_reference, team_faults
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.replay import replay
-from duagc.pipeline.runner import agent_input, run
+from duagc.pipeline.runner import agent_input, fuse_robot, run
 from duagc.pipeline.runs.digest import digest, digest_file, result_files
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.viewing.inspection import Inspector, format_facts, format_loop_closures
+from tests.fixtures.late_program import run_late
 
 SMALL = (
     "frontend.mapping.max_gaussians=3000",
     "frontend.mapping.iterations=8",
     "frontend.mapping.final_iterations=8",
     "exchange.max_rounds=400",
-    "fusion.refine.steps_per_view=2",
+    "fusion.finetune.steps_per_view=2",
 )
 ROOT = Path(__file__).parents[1]
 
@@ -91,10 +92,40 @@ def finished(folder: Path, recording: Path, bare: dict[str, str]) -> Path:
     return out
 
 
+@pytest.fixture(scope="module")
+def other(folder: Path, recording: Path) -> tuple[Path, list[str]]:
+    """The run again, and what it said: without ground truth, with one worker, in a program that imports numpy first."""
+    blind = folder / "blind"
+    shutil.copytree(recording, blind, ignore=shutil.ignore_patterns("*groundtruth*"))
+    done = run_late(blind, folder / "run_blind", *SMALL)
+    assert done.returncode == 0, done.stderr
+    return folder / "run_blind", done.stdout.splitlines()
+
+
 def robots_digests(run_folder: Path) -> dict[str, str]:
     return {
         p.as_posix(): digest_file(run_folder / p) for p in result_files(run_folder) if p.parts[0] == "robots"
     }
+
+
+def exchanged_again(run_folder: Path, recording: Path, out: Path, *overrides: str) -> Path:
+    """The robots of a run, prepared already, exchange and fuse again."""
+    config = load_config(RunConfig, overrides=[*SMALL, *overrides])
+    logs = {robot: Recording(recording).log(robot) for robot in Recording(recording).robots}
+    for robot in logs:
+        (out / "robots" / robot).mkdir(parents=True)
+        for name in ("frontend.mcap", "information.mcap"):
+            shutil.copy(run_folder / "robots" / robot / name, out / "robots" / robot / name)
+    results = run_session(
+        [agent_input(robot, log, out / "robots" / robot, config) for robot, log in logs.items()],
+        config.exchange,
+        seed=config.seed,
+        exchange_path=out / "exchange.mcap",
+        consensus_path=out / "consensus.mcap",
+    )
+    for robot, log in logs.items():
+        fuse_robot(robot, log, out / "robots" / robot, results[robot], config=config)
+    return out
 
 
 def test_the_team_meets_and_everything_is_written(finished: Path) -> None:
@@ -127,14 +158,21 @@ def test_the_job_needs_no_open3d_and_no_optional_package(bare: dict[str, str], f
     assert (finished / "manifest.json").exists()
 
 
-def test_neither_workers_nor_ground_truth_change_a_bit(folder: Path, recording: Path, finished: Path) -> None:
-    blind = folder / "blind"
-    shutil.copytree(recording, blind, ignore=shutil.ignore_patterns("*groundtruth*"))
-    other = make_run(blind, folder / "run_blind", workers=1)
-    assert digest(other) == digest(finished)
-    metrics = json.loads((other / "metrics.json").read_text())
+def test_neither_workers_nor_ground_truth_change_a_bit(other: tuple[Path, list[str]], finished: Path) -> None:
+    assert digest(other[0]) == digest(finished)
+    metrics = json.loads((other[0] / "metrics.json").read_text())
     assert metrics["team"]["ate_rmse_m"] is None
     assert reason_of(metrics["reasons"], "team.ate_rmse_m")
+
+
+def test_a_program_that_imports_numpy_first_gets_the_results_of_the_command(
+    other: tuple[Path, list[str]], finished: Path
+) -> None:
+    run_folder, lines = other
+    assert lines[0].startswith("front end and information: 2 robots")
+    assert digest(run_folder) == digest(finished)
+    manifests = [json.loads((path / "manifest.json").read_text()) for path in (run_folder, finished)]
+    assert manifests[0]["outputs"] == manifests[1]["outputs"]
 
 
 def test_each_robot_replays_bit_for_bit(recording: Path, finished: Path) -> None:
@@ -200,7 +238,7 @@ def test_the_log_of_another_robot_is_refused(folder: Path, recording: Path) -> N
 
 def test_nothing_delivered_is_nothing_said(folder: Path, recording: Path, finished: Path) -> None:
     silent = make_run(recording, folder / "run_silent", "exchange.link.enabled=false")
-    deaf = make_run(recording, folder / "run_deaf", "exchange.link.loss_probability=1.0")
+    deaf = exchanged_again(silent, recording, folder / "run_deaf", "exchange.link.loss_probability=1.0")
     assert robots_digests(silent) == robots_digests(deaf)
     changed = robots_digests(finished)
     own = robots_digests(silent)
@@ -265,7 +303,12 @@ def test_the_exchange_of_a_run_can_be_repeated_under_faults(finished: Path, reco
     settings = load_config(RunConfig, finished / "config.toml", [])
     checks = ["frames", "names", "closures", "silence", "solver"]
     result = team_faults.run(
-        RunFolder(finished), Recording(recording), settings.exchange, settings.seed, checks, 1
+        RunFolder(finished),
+        Recording(recording),
+        settings.exchange,
+        seed=settings.seed,
+        checks=checks,
+        seeds=1,
     )
     stated = json.loads((finished / "metrics.json").read_text())["team"]["ate_rmse_m"]
     assert result["base"]["team_ate_rmse_m"] == pytest.approx(stated, abs=1e-9)
@@ -303,7 +346,7 @@ def test_a_signed_packet_can_be_asked_for(finished: Path, recording: Path, tmp_p
     logs = Recording(recording)
     (tmp_path / "robots").symlink_to(finished / "robots")
     run_session(
-        [agent_input(robot, logs.log(robot), tmp_path / "robots" / robot) for robot in logs.robots],
+        [agent_input(robot, logs.log(robot), tmp_path / "robots" / robot, settings) for robot in logs.robots],
         settings.exchange,
         seed=settings.seed,
         exchange_path=tmp_path / "exchange.mcap",

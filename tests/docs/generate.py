@@ -20,6 +20,7 @@ import duagc
 from duagc.converters.registry import DATASETS
 from duagc.pipeline.cli import app
 from duagc.pipeline.config.base import Config
+from duagc.pipeline.config.checks import ChecksConfig
 from duagc.pipeline.config.run import RunConfig
 from duagc.schemas import topics
 
@@ -112,6 +113,11 @@ def config_page() -> str:
         "A run stores the configuration that it used as `config.toml` in its folder.\n"
     )
     parts += list(_sections(RunConfig(), ""))
+    parts.append(
+        "## Settings of `duagc check`\n\n"
+        "`duagc check` takes these with `--set times.gap_ratio=2` or `--config FILE`; no run depends on them.\n"
+    )
+    parts += list(_sections(ChecksConfig(), ""))
     return "\n".join(parts)
 
 

@@ -20,6 +20,7 @@ import typer
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cli import app
 from duagc.pipeline.config.base import Config
+from duagc.pipeline.config.checks import ChecksConfig
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.exchange.verification import Verdict
 from duagc.pipeline.geometry import se3
@@ -130,7 +131,7 @@ def test_generated_pages_are_current(page: Path) -> None:
 def test_every_setting_is_on_its_page() -> None:
     text = (DOCS / "reference" / "config.md").read_text(encoding="utf-8")
     sections = dict(re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", text, re.DOTALL | re.MULTILINE))
-    for path in settings():
+    for path in (*settings(), *settings(ChecksConfig())):
         section, _, key = path.rpartition(".")
         if section:
             assert f"| `{key}` |" in sections[section], path

@@ -8,8 +8,10 @@ A change of a golden run is made on purpose, in a commit that says why.
 
 import argparse
 import json
+import operator
 import sys
 import tempfile
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +41,7 @@ def store(name: str, run: Path) -> None:
             }
             for file in dict.fromkeys(file for file, _ in found.topics)
         },
+        "metadata": found.metadata,
         "metrics": metrics_of(run),
     }
     (FOLDER / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
@@ -47,7 +50,7 @@ def store(name: str, run: Path) -> None:
 
 
 def differences(name: str, run: Path) -> list[str]:
-    """One line for every topic, file and metric that differs from what is stored; earlier stages first."""
+    """One line for every topic, metadata, file and metric that differs from what is stored; earlier stages first."""
     import numpy as np
 
     from tests.golden.runs import metrics_of
@@ -60,7 +63,7 @@ def differences(name: str, run: Path) -> list[str]:
             for file, of_file in content["topics"].items()
             for topic, stored in of_file.items()
         }
-    stored = RunSummary(content["digest"], content["files"], topics)
+    stored = RunSummary(content["digest"], content["files"], topics, content.get("metadata", {}))
     found = summarize(run)
     order = ["frontend", "information", "exchange", "fusion"]
     files = sorted({*stored.files, *found.files}, key=lambda file: (order.index(stage_of(file)), file))
@@ -79,7 +82,11 @@ def differences(name: str, run: Path) -> list[str]:
                 )
             )
         ]
-        lines += of_topics or [
+        of_metadata = [
+            f"{where}: metadata {line}"
+            for line in _table_differences(stored.metadata.get(file, {}), found.metadata.get(file, {}))
+        ]
+        lines += (of_topics + of_metadata) or [
             f"{where}: digest {found.files.get(file, 'absent')}, stored {stored.files.get(file, 'absent')}"
         ]
     return lines + _metric_differences(content["metrics"], metrics_of(run))
@@ -109,16 +116,30 @@ def _topic_difference(topic: str, stored: Any, found: Any) -> str | None:
 
 
 def _metric_differences(stored: dict[str, object], found: dict[str, object]) -> list[str]:
-    lines = []
-    for name in sorted({*stored, *found}):
-        old, new = stored.get(name), found.get(name)
+    def close(old: object, new: object) -> bool:
         if isinstance(old, float) and isinstance(new, float):
-            if abs(new - old) <= RELATIVE_TOLERANCE * abs(old):
-                continue
-            lines.append(f"evaluation: {name}: {new:.9g}, stored {old:.9g}")
-        elif old != new:
-            lines.append(f"evaluation: {name}: {new!r}, stored {old!r}")
-    return lines
+            return old == new or abs(new - old) <= RELATIVE_TOLERANCE * abs(old)
+        return old == new
+
+    return [f"evaluation: {line}" for line in _table_differences(stored, found, close)]
+
+
+def _table_differences(
+    stored: Mapping[str, object],
+    found: Mapping[str, object],
+    same: Callable[[object, object], bool] = operator.eq,
+) -> list[str]:
+    """One line for every name whose value differs."""
+
+    def text(table: Mapping[str, object], name: str) -> str:
+        value = table.get(name, "absent")
+        return f"{value:.9g}" if isinstance(value, float) else repr(value)
+
+    return [
+        f"{name}: {text(found, name)}, stored {text(stored, name)}"
+        for name in sorted({*stored, *found})
+        if not same(stored.get(name, "absent"), found.get(name, "absent"))
+    ]
 
 
 def main() -> None:

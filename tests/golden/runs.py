@@ -66,7 +66,7 @@ RUNS = {
             "frontend.mapping.max_gaussians=2000",
             "frontend.mapping.iterations=6",
             "frontend.mapping.final_iterations=6",
-            "fusion.refine.steps_per_view=2",
+            "fusion.finetune.steps_per_view=2",
         ),
     ),
 }

@@ -1,8 +1,9 @@
 """What a run computed, in few bytes: a digest of every file, topic and field, and 16 bits of every message."""
 
 import hashlib
+import json
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from duagc.pipeline.recording import read_log
+from duagc.pipeline.recording import log_metadata, read_log
 from duagc.pipeline.runs.digest import digest, result_files
 
 HEX = 16  # characters kept of a digest
@@ -42,11 +43,19 @@ class TopicSummary:
 
 @dataclass
 class RunSummary:
-    """A whole run: digest of the run, of every result file, and the topics of every log."""
+    """A whole run.
+
+    Attributes:
+        digest: of the run.
+        files: digest of every result file.
+        topics: of every log, by (file, topic).
+        metadata: of every log, by file; what is JSON is opened into dotted names.
+    """
 
     digest: str
     files: dict[str, str]
     topics: dict[tuple[str, str], TopicSummary]
+    metadata: dict[str, dict[str, Any]]
 
 
 def stage_of(file: str) -> str:
@@ -104,4 +113,18 @@ def summarize(run: Path) -> RunSummary:
         if file.endswith(".mcap")
         for topic, found in summarize_log(run / file).items()
     }
-    return RunSummary(digest(run), files, topics)
+    metadata = {file: flat(log_metadata(run / file)) for file in files if file.endswith(".mcap")}
+    return RunSummary(digest(run), files, topics, metadata)
+
+
+def flat(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """Metadata as one table: dotted names to values. A text that is a JSON object counts as that object."""
+    table: dict[str, Any] = {}
+    for name, value in metadata.items():
+        if isinstance(value, str) and value.startswith("{"):
+            value = json.loads(value)
+        if isinstance(value, dict):
+            table |= {f"{name}.{key}": inner for key, inner in flat(value).items()}
+        else:
+            table[name] = value
+    return table

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from duagc.pipeline.recording import LogWriter, log_metadata, read_log
+from tests.golden import command
 from tests.golden.command import differences
 from tests.golden.runs import RUNS, make_run
 
@@ -64,6 +65,22 @@ def test_a_changed_message_is_named(run: Path, tmp_path: Path) -> None:
         "frontend: robots/alpha/frontend.mcap: /alpha/odometry; "
         f"first message that differs: 5 at {time_ns} ns; fields overlap"
     ]
+
+
+def test_a_changed_setting_is_named(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "FOLDER", tmp_path)
+    command.store(QUICK, run)
+    assert differences(QUICK, run) == []
+    shutil.copytree(run, tmp_path / "run")
+    path = tmp_path / "run" / "exchange.mcap"
+    records, metadata = list(read_log(path)), log_metadata(path)
+    config = json.loads(metadata["config"])
+    config["link"]["loss_probability"] = 0.75
+    with LogWriter(path, metadata=metadata | {"config": json.dumps(config)}) as log:
+        for record in records:
+            log.write(record.topic, record.proto(), record.log_time_ns, record.publish_time_ns)
+    (line,) = differences(QUICK, tmp_path / "run")
+    assert line == "exchange: exchange.mcap: metadata config.link.loss_probability: 0.75, stored 0.3"
 
 
 def test_a_changed_metric_is_named(run: Path, tmp_path: Path) -> None:
