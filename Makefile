@@ -68,7 +68,7 @@ fuzz: setup
 sanitize: setup $(SANITIZED)
 	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
 	LD_PRELOAD="$$(c++ -print-file-name=libasan.so) $$(c++ -print-file-name=libstdc++.so)" \
-	DUAGC_RASTER=$$(echo $(dir $(SANITIZED))pipeline/kernels/_raster*.so) \
+	DUAGC_RASTER=$$(echo $(dir $(SANITIZED))duagc/pipeline/kernels/_raster*.so) \
 	$(BIN)/python -m pytest --capture=sys -p tests.kernels.other_build -m "not slow" tests/kernels
 
 $(SANITIZED): $(SOURCES)
