@@ -25,6 +25,7 @@ from duagc.pipeline.evaluation.network import Session, is_inlier
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.trajectory_errors import Paired
 from duagc.pipeline.frontend import bundle
+from duagc.pipeline.frontend.frame_images import pyramid_of
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 from duagc.pipeline.recording import Recording, RgbdLog, open_rgbd
@@ -165,15 +166,7 @@ class _Team:
     def images(self, keyframe: int, levels: int) -> RgbdPyramid:
         robot, row = self.where[keyframe]
         frame = robot.log.frame(int(robot.frame_index[row]))
-        color = frame.color * np.float32(1 / 255)
-        return RgbdPyramid.build(
-            color,
-            frame.usable_depth,
-            robot.log.camera,
-            levels,
-            depth_sigma_m=frame.depth_sigma,
-            mask=frame.mask,
-        )
+        return pyramid_of(frame, robot.log.camera, levels)
 
     def optimized(self, start: Poses, residuals: Literal["joint", "depth"]) -> Poses:
         """Where all images together put all robots, from a start."""

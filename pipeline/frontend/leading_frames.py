@@ -13,6 +13,7 @@ import numpy as np
 
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.color_only import LastGoodFrame
+from duagc.pipeline.frontend.frame_images import RgbdImages, pyramid_of
 from duagc.pipeline.frontend.submaps import TrackedLog
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.frontend.tracking import Tracker
@@ -20,7 +21,6 @@ from duagc.pipeline.frontend.tracking_state import RECENT_FRAMES, CurrentFrame, 
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import RgbdFrame, RgbdLog
-from duagc.pipeline.registration import RgbdPyramid
 
 
 class _Backward(Tracker):
@@ -40,14 +40,7 @@ class _Backward(Tracker):
         super().__init__(camera, config)
         state, strides = self.state, config.tracking.strides
         state.keyframes.append(keyframe)
-        pyramid = RgbdPyramid.build(
-            first.color * np.float32(1 / 255),
-            first.usable_depth,
-            camera,
-            len(strides),
-            depth_sigma_m=first.depth_sigma,
-            mask=first.mask,
-        )
+        pyramid = pyramid_of(first, camera, len(strides))
         state.last_good = LastGoodFrame(pyramid, strides, np.eye(4), None)
         state.intervals.update(0)
 
@@ -98,16 +91,12 @@ def track_leading_frames(log: RgbdLog, tracked: TrackedLog, config: FrontendConf
     )
     for k in reversed(leading):
         frame = log.frame(frames[k].frame_index)
-        found = backward.track(
-            frame.index,
-            start.stamp_ns - frame.stamp_ns,
-            frame.color * np.float32(1 / 255),
-            frame.depth,
-            mask=frame.mask,
-            depth_sigma_m=frame.depth_sigma,
+        images = replace(
+            RgbdImages.of(frame),
+            stamp_ns=start.stamp_ns - frame.stamp_ns,
             depth_offset_ns=-frame.depth_offset_ns,
-            depth_moved=frame.depth_moved,
         )
+        found = backward.track_frame(backward.prepared(images))
         if found.status is Status.LOST:
             break
         frames[k], submap_of[k] = replace(found, stamp_ns=frame.stamp_ns), submap.number

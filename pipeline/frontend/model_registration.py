@@ -15,6 +15,7 @@ import numpy as np
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import ModelConfig
 from duagc.pipeline.config.training import DepthKind
+from duagc.pipeline.frontend.frame_images import pyramid_of
 from duagc.pipeline.frontend.tracked import TrackedFrame
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -92,16 +93,7 @@ class ModelTracker:
         color = np.clip(drawn.color, np.float32(0), np.float32(1))
         model = RgbdPyramid.build(color, depth_m, self._camera, self._levels)
         reference = Reference.from_pyramid(model, self.config.strides[: self._levels])
-        image = frame.color * np.float32(1 / 255)
-        levels = self._levels + self.config.level
-        seen = RgbdPyramid.build(
-            image,
-            frame.usable_depth,
-            self._full,
-            levels,
-            depth_sigma_m=frame.depth_sigma,
-            mask=frame.mask,
-        )
+        seen = pyramid_of(frame, self._full, self._levels + self.config.level)
         target = RgbdPyramid(seen.levels[self.config.level :])
         return register(reference, target, np.eye(4), self._registration, prior_information=information)
 

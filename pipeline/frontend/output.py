@@ -50,6 +50,21 @@ class Maps:
     depth: DepthKind
 
 
+@dataclass(frozen=True)
+class BuiltMap:
+    """What mapping leaves.
+
+    Attributes:
+        updates: one per keyframe, and one for the final optimization.
+        maps: before and after the final optimization.
+        frames: of the log, those between keyframes registered to the map where that helped.
+    """
+
+    updates: list[MapUpdate]
+    maps: Maps
+    frames: list[TrackedFrame]
+
+
 def keyframe_messages(
     robot: str, keyframes: Sequence[TrackedKeyframe], solution: OptimizedKeyframes
 ) -> list[Keyframe]:

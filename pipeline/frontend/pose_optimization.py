@@ -35,14 +35,12 @@ class OptimizedPath:
         frames: every frame; lost if its keyframe was rejected.
         solution: poses of the keyframes.
         factors: of their pose graph.
-        places: index before of every keyframe.
     """
 
     keyframes: list[TrackedKeyframe]
     frames: list[TrackedFrame]
     solution: OptimizedKeyframes
     factors: Sequence[RelativePose]
-    places: list[int]
 
 
 @dataclass(frozen=True)
@@ -89,7 +87,7 @@ class PathOptimization:
     ) -> OptimizedPath:
         """Optimized poses that nothing contradicts."""
         solution, factors = self._optimized(keyframes, pairs)
-        path = OptimizedPath(list(keyframes), list(frames), solution, factors, list(range(len(keyframes))))
+        path = OptimizedPath(list(keyframes), list(frames), solution, factors)
         if not self.config.keyframes.judgment.enabled or len(keyframes) < 2:
             return path
         judgment = self._judged(path)
@@ -148,8 +146,8 @@ def _without_rejected(
     path: OptimizedPath, pairs: Sequence[RelativePose], contradicted: Mapping[int, Reason]
 ) -> tuple[OptimizedPath, list[RelativePose]]:
     """The path and its pairs without some keyframes; it starts from where it was optimized."""
-    places = [k for k in range(len(path.keyframes)) if k not in contradicted]
-    new = {before: k for k, before in enumerate(places)}
+    left = [k for k in range(len(path.keyframes)) if k not in contradicted]
+    new = {before: k for k, before in enumerate(left)}
     keyframes = []
     for before, index in new.items():
         previous = max((k for k in new if k <= path.keyframes[before].previous_index), default=-1)
@@ -170,4 +168,4 @@ def _without_rejected(
         elif frame.status is not Status.LOST:
             frame = lost(frame, contradicted[frame.keyframe_index])
         frames.append(replace(frame, keyframe_index=anchor, T_keyframe_camera=T_anchor_camera))
-    return OptimizedPath(keyframes, frames, path.solution, path.factors, places), kept
+    return OptimizedPath(keyframes, frames, path.solution, path.factors), kept

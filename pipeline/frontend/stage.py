@@ -7,7 +7,6 @@ The stage is offline in this sense; times in the log are those of the recording 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,13 +19,16 @@ from duagc.pipeline.base import progress as progress_bar
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.component_names import component_name, submap_of
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
+from duagc.pipeline.base.lap_times import LapTimes
+from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.bundle import Images
 from duagc.pipeline.frontend.components import Component
 from duagc.pipeline.frontend.exposure import ExposureEstimation
 from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.frame_images import RgbdImages, pyramid_of
 from duagc.pipeline.frontend.leading_frames import track_leading_frames
 from duagc.pipeline.frontend.output import (
+    BuiltMap,
     Maps,
     exposure_messages,
     factor_messages,
@@ -40,16 +42,14 @@ from duagc.pipeline.frontend.submap_joining import join_submaps
 from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.geometry.exposure import ExposureTrack
-from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.geometry.trajectory import Trajectory
-from duagc.pipeline.messages import Keyframe, MapUpdate
+from duagc.pipeline.messages import Keyframe
 from duagc.pipeline.recording import RgbdLog, open_rgbd
 from duagc.pipeline.registration import RgbdPyramid
-from duagc.pipeline.registration.moving import FreeSpace
 from duagc.pipeline.splat.gaussians import Gaussians
 
 if TYPE_CHECKING:
-    from duagc.pipeline.frontend.model_registration import ModelTracker
+    pass
 
 
 def run_frontend(
@@ -78,7 +78,7 @@ def run_frontend(
         DuagError: the log is broken or empty.
     """
     determinism.configure_opencv()
-    clock = _Clock()
+    clock = LapTimes()
     with open_rgbd(log_path) as log:
         if len(log) == 0:
             raise DuagError(f"{log_path}: has no image, expected at least one")
@@ -137,16 +137,7 @@ def _track(log: RgbdLog, config: FrontendConfig, progress: bool) -> TrackedLog:
     if progress:
         source = progress_bar.track(source, f"tracking {log.robot}", len(log))
     for frame in source:
-        tracker.track(
-            frame.index,
-            frame.stamp_ns,
-            frame.color.astype(np.float32) * np.float32(1 / 255),
-            frame.depth,
-            mask=frame.mask,
-            depth_sigma_m=frame.depth_sigma,
-            depth_offset_ns=frame.depth_offset_ns,
-            depth_moved=frame.depth_moved,
-        )
+        tracker.track(RgbdImages.of(frame))
     return tracker.finish()
 
 
@@ -184,16 +175,7 @@ def _images(log: RgbdLog) -> Images:
     """Reads the images of a frame, by its index and the number of pyramid levels."""
 
     def images(frame_index: int, levels: int) -> RgbdPyramid:
-        frame = log.frame(frame_index)
-        color = frame.color * np.float32(1 / 255)
-        return RgbdPyramid.build(
-            color,
-            frame.usable_depth,
-            log.camera,
-            levels,
-            depth_sigma_m=frame.depth_sigma,
-            mask=frame.mask,
-        )
+        return pyramid_of(log.frame(frame_index), log.camera, levels)
 
     return images
 
@@ -220,7 +202,7 @@ class _ComponentStage:
     threads: int
     progress: bool
     noise_m: float | None
-    clock: _Clock
+    clock: LapTimes
 
     def run(self, component: Component, frames: list[TrackedFrame], tracked: TrackedLog, path: Path) -> None:
         """Optimize the poses, map, and write the log.
@@ -246,26 +228,14 @@ class _ComponentStage:
             frames,
         )
         clock.lap("refinement_s")
-        updates, maps, frames = _map(
-            log,
-            keyframes,
-            frames,
-            self.config,
-            name=self.name,
-            exposures=exposures,
-            noise_m=self.noise_m,
-            seed=self.seed,
-            threads=self.threads,
-            progress=self.progress,
-            clock=clock,
-        )
+        built = self._map(keyframes, frames, exposures)
         clock.lap("final_refinement_s")
         notes = {
             "color_without_depth": str(len(log.pairing.color_alone)),
             "depth_without_color": str(len(log.pairing.depth_alone)),
             "depth_noise_m": "unknown" if self.noise_m is None else f"{self.noise_m:.6f}",
         }
-        odometry = [odometry_message(self.name, frame, solution.T_map_keyframe) for frame in frames]
+        odometry = [odometry_message(self.name, frame, solution.T_map_keyframe) for frame in built.frames]
         write_log(
             path,
             self.name,
@@ -273,95 +243,34 @@ class _ComponentStage:
             keyframes=keyframes,
             factors=factors,
             exposures=exposure_messages(self.name, exposures, odometry),
-            updates=updates,
+            updates=built.updates,
             submaps=submap_messages(self.name, component, tracked),
-            maps=maps,
+            maps=built.maps,
             notes=notes,
         )
         clock.lap("writing_s")
 
+    def _map(
+        self, keyframes: Sequence[Keyframe], frames: list[TrackedFrame], exposures: ExposureTrack
+    ) -> BuiltMap:
+        """Build the map, if the configuration asks for one."""
+        if not self.config.mapping_enabled:
+            self.clock.lap("mapping_s")
+            maps = Maps(Gaussians.empty(), None, self.config.mapping.depth_kind(self.noise_m))
+            return BuiltMap([], maps, frames)
+        from duagc.pipeline.frontend.map_building import MapBuilder
 
-def _map(
-    log: RgbdLog,
-    keyframes: Sequence[Keyframe],
-    frames: list[TrackedFrame],
-    config: FrontendConfig,
-    *,
-    name: str,
-    exposures: ExposureTrack,
-    noise_m: float | None,
-    seed: int,
-    threads: int,
-    progress: bool,
-    clock: _Clock,
-) -> tuple[list[MapUpdate], Maps, list[TrackedFrame]]:
-    """Grow the map at the keyframes' poses; one update per keyframe, and one for the final optimization.
-
-    All images are brought to one exposure, that of the map.
-    The other frames are registered to the grown map, and some of them, never held-out ones, support its optimization.
-    """
-    if not config.mapping_enabled:
-        clock.lap("mapping_s")
-        return [], Maps(Gaussians.empty(), None, config.mapping.depth_kind(noise_m)), frames
-    from duagc.pipeline.frontend.mapping import Mapper, MappingStats
-    from duagc.pipeline.frontend.model_registration import ModelTracker
-
-    def update(keyframe: Keyframe, stats: MappingStats) -> MapUpdate:
-        return MapUpdate(
-            stamp_ns=keyframe.stamp_ns,
-            robot=name,
-            keyframe_index=keyframe.keyframe_index,
-            inserted=stats.inserted,
-            pruned=stats.pruned,
-            total=stats.total,
-            loss_before=stats.loss_before,
-            loss_after=stats.loss_after,
+        builder = MapBuilder(
+            self.log,
+            self.config,
+            name=self.name,
+            exposures=exposures,
+            noise_m=self.noise_m,
+            seed=self.seed,
+            threads=self.threads,
+            progress=self.progress,
         )
-
-    mapper = Mapper(log.camera, config.mapping, seed, threads=threads, depth_noise_m=noise_m)
-    free = FreeSpace(log.camera, config.moving)
-    for keyframe in keyframes:
-        free.add(log.frame(keyframe.frame_index).usable_depth, keyframe.T_map_camera)
-    steps = progress_bar.track(keyframes, f"mapping {name}") if progress else keyframes
-    updates = []
-    for keyframe in steps:
-        frame = log.frame(keyframe.frame_index)
-        stats = mapper.add_keyframe(
-            keyframe.keyframe_index,
-            frame.color,
-            frame.depth,
-            keyframe.T_map_camera,
-            mask=free.usable(frame.usable_depth, keyframe.T_map_camera, frame.mask),
-            depth_sigma_m=frame.depth_sigma,
-            exposure=exposures.at(frame.index),
-        )
-        updates.append(update(keyframe, stats))
-    unrefined = mapper.gaussians
-    clock.lap("mapping_s")
-    model = ModelTracker(
-        unrefined,
-        mapper.depth,
-        log.camera,
-        config.model,
-        registration=config.tracking.registration,
-        threads=threads,
-    )
-    frames = _register_to_model(log, model, keyframes, frames, progress=progress)
-    clock.lap("model_s")
-    for supporting in _support(frames, keyframes, config):
-        frame = log.frame(supporting.frame_index)
-        T_map_camera = keyframes[supporting.keyframe_index].T_map_camera @ supporting.T_keyframe_camera
-        mapper.add_view(
-            supporting.keyframe_index,
-            frame.color,
-            frame.depth,
-            supporting.T_keyframe_camera,
-            mask=free.usable(frame.usable_depth, T_map_camera, frame.mask),
-            depth_sigma_m=frame.depth_sigma,
-            exposure=exposures.at(frame.index),
-        )
-    updates.append(update(keyframes[-1], mapper.finalize()))
-    return updates, Maps(mapper.gaussians, unrefined, mapper.depth), frames
+        return builder.build(keyframes, frames, self.clock)
 
 
 def depth_noise_m(frames: Sequence[TrackedFrame]) -> float | None:
@@ -379,54 +288,3 @@ def depth_noise_m(frames: Sequence[TrackedFrame]) -> float | None:
         if frame.status is Status.OK and frame.reason is Reason.NONE and frame.rms_depth_m > 0
     ]
     return float(np.median(rms_m)) if rms_m else None
-
-
-def _register_to_model(
-    log: RgbdLog,
-    model: ModelTracker,
-    keyframes: Sequence[Keyframe],
-    frames: Sequence[TrackedFrame],
-    *,
-    progress: bool,
-) -> list[TrackedFrame]:
-    """The frames with those between keyframes registered to the map, where that helps."""
-    taken = {keyframe.frame_index for keyframe in keyframes}
-    registered = []
-    for frame in progress_bar.track(frames, f"model {log.robot}") if progress else frames:
-        usable = frame.status is not Status.LOST and frame.reason is Reason.NONE
-        if model.worthwhile and usable and frame.frame_index not in taken:
-            T_map_keyframe = keyframes[frame.keyframe_index].T_map_camera
-            frame = model.register(frame, log.frame(frame.frame_index), T_map_keyframe)
-        registered.append(frame)
-    return registered
-
-
-def _support(
-    frames: Sequence[TrackedFrame], keyframes: Sequence[Keyframe], config: FrontendConfig
-) -> list[TrackedFrame]:
-    """Frames for the final optimization of the map: tracked, no keyframes, not held out; evenly spread over the log."""
-    taken = {keyframe.frame_index for keyframe in keyframes}
-    candidates = [
-        frame
-        for frame in frames
-        if frame.status is not Status.LOST
-        and frame.reason is Reason.NONE  # its depth and its color belong together
-        and frame.frame_index not in taken
-        and not is_held_out(frame.frame_index)
-    ]
-    count = min(config.mapping.support_views, len(candidates))
-    return [candidates[k] for k in evenly_spaced(len(candidates), count)]
-
-
-class _Clock:
-    """Wall times of the parts of a stage."""
-
-    def __init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        """End a part; `laps` holds its time under this name, summed over components."""
-        now = time.perf_counter()
-        self.laps[name] = round(self.laps.get(name, 0.0) + now - self._last, 3)
-        self._last = now

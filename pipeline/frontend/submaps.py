@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
-from duagc.pipeline.frontend.tracking import Image, Tracker
+from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.frontend.tracking_state import CurrentFrame
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.posegraph.relative_poses import RelativePose
@@ -97,40 +97,13 @@ class SubmapTracker:
         self._frames: list[TrackedFrame] = []
         self._submap_of: list[int] = []  # index of the tracker
 
-    def track(
-        self,
-        frame_index: int,
-        stamp_ns: int,
-        image: Image,
-        depth_m: Image,
-        *,
-        mask: NDArray[np.bool_] | None = None,
-        depth_sigma_m: Image | None = None,
-        depth_offset_ns: int = 0,
-        depth_moved: bool = False,
-    ) -> None:
-        """Track one frame; the arguments are those of `Tracker.track`.
+    def track(self, images: RgbdImages) -> None:
+        """Track one frame.
 
         Args:
-            frame_index: in the log.
-            stamp_ns: time of the frame, increasing.
-            image: color [h, w, 3] or gray [h, w], 0..1.
-            depth_m: [h, w], meters, 0 = unknown.
-            mask: bool [h, w], False where a pixel must not be used; None = all may.
-            depth_sigma_m: [h, w], standard deviation of the depth, meters; None: that of the sensor model.
-            depth_offset_ns: how much later the depth was taken.
-            depth_moved: whether it was moved from there.
+            images: of the frame; its time increases.
         """
-        frame = self._trackers[self._current].prepared(
-            frame_index,
-            stamp_ns,
-            image,
-            depth_m,
-            mask=mask,
-            depth_sigma_m=depth_sigma_m,
-            depth_offset_ns=depth_offset_ns,
-            depth_moved=depth_moved,
-        )
+        frame = self._trackers[self._current].prepared(images)
         tracked = self._trackers[self._current].track_frame(frame)
         searching = self.config.submaps.enabled and bool(self._trackers[0].keyframes)
         if searching and _is_lost(tracked):

@@ -24,6 +24,7 @@ from duagc.pipeline.frontend.failure import (
     shows_anything,
 )
 from duagc.pipeline.frontend.feature_initialization import initial_motions
+from duagc.pipeline.frontend.frame_images import Image, RgbdImages
 from duagc.pipeline.frontend.keyframe_graph import becomes_keyframe
 from duagc.pipeline.frontend.keyframe_insertion import insert_first_keyframe, insert_keyframe
 from duagc.pipeline.frontend.pose_checks import (
@@ -45,8 +46,6 @@ from duagc.pipeline.recording import MotionPrior
 from duagc.pipeline.recording.depth_sources import DepthImage
 from duagc.pipeline.recording.moved_depth import move_depth
 from duagc.pipeline.registration import Reference, Registration, RgbdPyramid, register
-
-Image = NDArray[np.floating]
 
 
 class Tracker:
@@ -105,62 +104,49 @@ class Tracker:
             stamp_ns: time of the frame, increasing.
             image: color [h, w, 3] or gray [h, w], 0..1.
             depth_m: [h, w], meters, 0 = unknown.
-            mask: bool [h, w], False where a pixel must not be used, neither its depth nor its color. None = all
-                may.
-            depth_sigma_m: [h, w], standard deviation of the depth, meters; None: that of the sensor model.
+            mask: as of `RgbdImages`.
+            depth_sigma_m: as of `RgbdImages`.
             depth_offset_ns: how much later the depth was taken.
-            depth_moved: whether it was moved from there; if not, depth of a time too far for a keyframe is moved by
-                the velocity of the camera, or left out where that is unknown. What is nearer stays: with most cameras
-                the depth of the keyframe is as late.
+            depth_moved: as of `RgbdImages`.
         """
         return self.track_frame(
             self.prepared(
-                frame_index,
-                stamp_ns,
-                image,
-                depth_m,
-                mask=mask,
-                depth_sigma_m=depth_sigma_m,
-                depth_offset_ns=depth_offset_ns,
-                depth_moved=depth_moved,
+                RgbdImages(
+                    frame_index=frame_index,
+                    stamp_ns=stamp_ns,
+                    image=image,
+                    depth_m=depth_m,
+                    mask=mask,
+                    depth_sigma_m=depth_sigma_m,
+                    depth_offset_ns=depth_offset_ns,
+                    depth_moved=depth_moved,
+                )
             )
         )
 
-    def prepared(
-        self,
-        frame_index: int,
-        stamp_ns: int,
-        image: Image,
-        depth_m: Image,
-        *,
-        mask: NDArray[np.bool_] | None = None,
-        depth_sigma_m: Image | None = None,
-        depth_offset_ns: int = 0,
-        depth_moved: bool = False,
-    ) -> CurrentFrame:
-        """A frame with the images that tracking needs; the state does not change.
+    def prepared(self, images: RgbdImages) -> CurrentFrame:
+        """A frame with all that tracking needs; the state does not change.
 
         Args:
-            frame_index: in the log.
-            stamp_ns: time of the frame.
-            image: color [h, w, 3] or gray [h, w], 0..1.
-            depth_m: [h, w], meters, 0 = unknown.
-            mask: bool [h, w], False where a pixel must not be used; None = all may.
-            depth_sigma_m: [h, w], standard deviation of the depth, meters; None: that of the sensor model.
-            depth_offset_ns: as of `track`.
-            depth_moved: as of `track`.
+            images: of the frame.
         """
-        tracking = self.state.config.tracking
-        if not depth_moved and not self._is_near(depth_offset_ns):
-            T_color_depth = self.state.depth_motion(stamp_ns, depth_offset_ns)
-            moved = DepthImage(np.zeros_like(depth_m), depth_sigma_m)
-            if T_color_depth is not None:
-                moved = move_depth(DepthImage(depth_m, depth_sigma_m), self.camera, T_color_depth)
-            depth_m, depth_sigma_m = moved.depth_m, moved.sigma_m
+        tracking, offset_ns = self.state.config.tracking, images.depth_offset_ns
+        depth = DepthImage(images.depth_m, images.depth_sigma_m)
+        if not images.depth_moved and not self._is_near(offset_ns):
+            T_color_depth = self.state.depth_motion(images.stamp_ns, offset_ns)
+            if T_color_depth is None:
+                depth = DepthImage(np.zeros_like(images.depth_m), images.depth_sigma_m)
+            else:
+                depth = move_depth(depth, self.camera, T_color_depth)
         pyramid = RgbdPyramid.build(
-            image, depth_m, self.camera, len(tracking.strides), depth_sigma_m=depth_sigma_m, mask=mask
+            images.image,
+            depth.depth_m,
+            self.camera,
+            len(tracking.strides),
+            depth_sigma_m=depth.sigma_m,
+            mask=images.mask,
         )
-        return CurrentFrame(frame_index, stamp_ns, pyramid, tracking.relocalization, depth_offset_ns)
+        return CurrentFrame(images.frame_index, images.stamp_ns, pyramid, tracking.relocalization, offset_ns)
 
     def track_frame(self, frame: CurrentFrame) -> TrackedFrame:
         """Track one frame; several trackers of the same settings may take it.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.experiments.disturbances import Undisturbed
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.pose_optimization import OptimizedPath, PathOptimization
-from duagc.pipeline.frontend.tracked import Status, TrackedFrame
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
 from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
@@ -53,17 +54,21 @@ def optimized(tracker: Tracker, frames: list[TrackedFrame]) -> OptimizedPath:
     return PathOptimization(images, CONFIG, 0, "alpha").run(tracker.keyframes, frames, tracker.pairs)
 
 
+def frame_indices(keyframes: Sequence[TrackedKeyframe]) -> list[int]:
+    return [keyframe.frame_index for keyframe in keyframes]
+
+
 def test_a_true_path_stays_as_it_is_optimized(tracked) -> None:
     tracker, frames = tracked
     path = optimized(tracker, frames)
-    assert path.places == list(range(len(tracker.keyframes)))
+    assert frame_indices(path.keyframes) == frame_indices(tracker.keyframes)
     assert path.frames == frames
 
 
 def test_features_correct_a_wrong_step(tracked) -> None:
     tracker, frames = tracked
     path = optimized(broken(tracker, len(tracker.keyframes) - 3), frames)
-    assert path.places == list(range(len(tracker.keyframes)))
+    assert frame_indices(path.keyframes) == frame_indices(tracker.keyframes)
     for keyframe, T in zip(tracker.keyframes, path.solution.T_map_keyframe, strict=True):
         assert se3.distance(keyframe.T_map_keyframe, T)[0] < 0.005
 
@@ -84,7 +89,7 @@ def test_what_cannot_be_corrected_is_lost(tracked) -> None:
     wrong.state.keyframes[at + 1 :] = []
     kept = [frame for frame in frames if frame.keyframe_index <= at]
     path = optimized(wrong, kept)
-    assert path.places == list(range(at))
+    assert frame_indices(path.keyframes) == frame_indices(wrong.keyframes[:at])
     lost = [frame for frame in kept if frame.keyframe_index == at]
     assert lost
     for frame in path.frames[-len(lost) :]:

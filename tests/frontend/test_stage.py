@@ -13,8 +13,9 @@ from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.registration import MovingConfig
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.keyframe_graph import solve_pose_graph
+from duagc.pipeline.frontend.map_building import supporting_frames
 from duagc.pipeline.frontend.output import LATENCY_NS
-from duagc.pipeline.frontend.stage import _support, depth_noise_m, run_frontend
+from duagc.pipeline.frontend.stage import depth_noise_m, run_frontend
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.trajectory import ate_rmse_m
@@ -164,7 +165,7 @@ def test_held_out_and_lost_frames_never_support_the_map(frontend_log: Path) -> N
     forbidden = {4, 7, 12, *(m.frame_index for m in keyframes)}
     for count in (0, 3, 100):
         config = TRACKING.model_copy(update={"mapping": MappingConfig(support_views=count)})
-        chosen = [f.frame_index for f in _support(frames, keyframes, config)]
+        chosen = [f.frame_index for f in supporting_frames(frames, keyframes, config)]
         assert chosen == sorted(set(chosen))
         assert not forbidden & set(chosen)
         assert len(chosen) == min(count, FRAMES - len(forbidden))

@@ -18,6 +18,7 @@ from duagc.pipeline.config.frontend import FrontendConfig, TrackingConfig
 from duagc.pipeline.experiments.disturbances import Shot
 from duagc.pipeline.frontend.components import Component
 from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.frame_images import RgbdImages
 from duagc.pipeline.frontend.stage import component_path, run_frontend
 from duagc.pipeline.frontend.submap_joining import join_submaps
 from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
@@ -54,7 +55,8 @@ def foreign_end(shots: Sequence[Shot], others: Sequence[Shot], begin: int) -> li
 def tracked(shots: Sequence[Shot], config: FrontendConfig = CONFIG) -> TrackedLog:
     tracker = SubmapTracker(SMALL, config)
     for s in shots:
-        tracker.track(s.index, s.stamp_ns, s.color.astype(np.float32) / 255, s.depth)
+        image = s.color.astype(np.float32) / 255
+        tracker.track(RgbdImages(frame_index=s.index, stamp_ns=s.stamp_ns, image=image, depth_m=s.depth))
     return tracker.finish()
 
 

@@ -1,0 +1,165 @@
+"""The map of a component, grown at the poses of its keyframes and optimized with other frames too.
+
+All images are brought to one exposure, that of the map. The frames between keyframes are registered to the grown map
+where that helps, and some of them, never held-out ones, support its final optimization.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from duagc.pipeline.base import progress as progress_bar
+from duagc.pipeline.base.lap_times import LapTimes
+from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
+from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.mapping import Mapper, MappingStats
+from duagc.pipeline.frontend.model_registration import ModelTracker
+from duagc.pipeline.frontend.output import BuiltMap, Maps
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame
+from duagc.pipeline.geometry.exposure import ExposureTrack
+from duagc.pipeline.geometry.statistics import evenly_spaced
+from duagc.pipeline.messages import Keyframe, MapUpdate
+from duagc.pipeline.recording import RgbdLog
+from duagc.pipeline.registration.moving import FreeSpace
+from duagc.pipeline.splat.gaussians import Gaussians
+
+
+class MapBuilder:
+    """Builds the map of one component."""
+
+    def __init__(
+        self,
+        log: RgbdLog,
+        config: FrontendConfig,
+        *,
+        name: str,
+        exposures: ExposureTrack,
+        noise_m: float | None,
+        seed: int,
+        threads: int = 1,
+        progress: bool = False,
+    ) -> None:
+        """Begin with an empty map.
+
+        Args:
+            log: of the robot.
+            config: of the front end.
+            name: of the component.
+            exposures: of its frames.
+            noise_m: of the depth images; None: unknown.
+            seed: of the run.
+            threads: of the rasterizer; changes no bit.
+            progress: whether it is shown.
+        """
+        self.log, self.config, self.name, self.exposures = log, config, name, exposures
+        self._threads, self._progress = threads, progress
+        self._mapper = Mapper(log.camera, config.mapping, seed, threads=threads, depth_noise_m=noise_m)
+        self._free = FreeSpace(log.camera, config.moving)
+
+    def build(
+        self, keyframes: Sequence[Keyframe], frames: Sequence[TrackedFrame], clock: LapTimes
+    ) -> BuiltMap:
+        """Grow the map, register the other frames to it, and optimize it.
+
+        Args:
+            keyframes: with their optimized poses.
+            frames: every frame of the log.
+            clock: its laps get the times of the parts.
+        """
+        for keyframe in keyframes:
+            self._free.add(self.log.frame(keyframe.frame_index).usable_depth, keyframe.T_map_camera)
+        steps = progress_bar.track(keyframes, f"mapping {self.name}") if self._progress else keyframes
+        updates = [self._update(keyframe, self._grow(keyframe)) for keyframe in steps]
+        unrefined = self._mapper.gaussians
+        clock.lap("mapping_s")
+        registered = self._registered(unrefined, keyframes, frames)
+        clock.lap("model_s")
+        for frame in supporting_frames(registered, keyframes, self.config):
+            self._support(frame, keyframes[frame.keyframe_index])
+        updates.append(self._update(keyframes[-1], self._mapper.finalize()))
+        return BuiltMap(updates, Maps(self._mapper.gaussians, unrefined, self._mapper.depth), registered)
+
+    def _grow(self, keyframe: Keyframe) -> MappingStats:
+        """Add a keyframe to the map."""
+        frame = self.log.frame(keyframe.frame_index)
+        return self._mapper.add_keyframe(
+            keyframe.keyframe_index,
+            frame.color,
+            frame.depth,
+            keyframe.T_map_camera,
+            mask=self._free.usable(frame.usable_depth, keyframe.T_map_camera, frame.mask),
+            depth_sigma_m=frame.depth_sigma,
+            exposure=self.exposures.at(frame.index),
+        )
+
+    def _support(self, supporting: TrackedFrame, keyframe: Keyframe) -> None:
+        """Add a frame to the views of the final optimization."""
+        frame = self.log.frame(supporting.frame_index)
+        T_map_camera = keyframe.T_map_camera @ supporting.T_keyframe_camera
+        self._mapper.add_view(
+            supporting.keyframe_index,
+            frame.color,
+            frame.depth,
+            supporting.T_keyframe_camera,
+            mask=self._free.usable(frame.usable_depth, T_map_camera, frame.mask),
+            depth_sigma_m=frame.depth_sigma,
+            exposure=self.exposures.at(frame.index),
+        )
+
+    def _registered(
+        self, gaussians: Gaussians, keyframes: Sequence[Keyframe], frames: Sequence[TrackedFrame]
+    ) -> list[TrackedFrame]:
+        """The frames with those between keyframes registered to the map, where that helps."""
+        model = ModelTracker(
+            gaussians,
+            self._mapper.depth,
+            self.log.camera,
+            self.config.model,
+            registration=self.config.tracking.registration,
+            threads=self._threads,
+        )
+        taken = {keyframe.frame_index for keyframe in keyframes}
+        registered = []
+        for frame in progress_bar.track(frames, f"model {self.log.robot}") if self._progress else frames:
+            usable = frame.status is not Status.LOST and frame.reason is Reason.NONE
+            if model.worthwhile and usable and frame.frame_index not in taken:
+                T_map_keyframe = keyframes[frame.keyframe_index].T_map_camera
+                frame = model.register(frame, self.log.frame(frame.frame_index), T_map_keyframe)
+            registered.append(frame)
+        return registered
+
+    def _update(self, keyframe: Keyframe, stats: MappingStats) -> MapUpdate:
+        """The message about a step of mapping."""
+        return MapUpdate(
+            stamp_ns=keyframe.stamp_ns,
+            robot=self.name,
+            keyframe_index=keyframe.keyframe_index,
+            inserted=stats.inserted,
+            pruned=stats.pruned,
+            total=stats.total,
+            loss_before=stats.loss_before,
+            loss_after=stats.loss_after,
+        )
+
+
+def supporting_frames(
+    frames: Sequence[TrackedFrame], keyframes: Sequence[Keyframe], config: FrontendConfig
+) -> list[TrackedFrame]:
+    """Frames for the final optimization of the map: tracked, no keyframes, not held out; evenly spread over the log.
+
+    Args:
+        frames: of the log.
+        keyframes: of the map.
+        config: of the front end.
+    """
+    taken = {keyframe.frame_index for keyframe in keyframes}
+    candidates = [
+        frame
+        for frame in frames
+        if frame.status is not Status.LOST
+        and frame.reason is Reason.NONE  # its depth and its color belong together
+        and frame.frame_index not in taken
+        and not is_held_out(frame.frame_index)
+    ]
+    count = min(config.mapping.support_views, len(candidates))
+    return [candidates[k] for k in evenly_spaced(len(candidates), count)]
