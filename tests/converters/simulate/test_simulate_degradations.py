@@ -14,12 +14,12 @@ from duagc.converters.simulate.sensors.degradations import FRAME_RATE_HZ, Degrad
 from duagc.converters.simulate.sensors.lens import Lens
 from duagc.converters.simulate.sensors.rig import GAMMA, MovingCamera, Rig
 from duagc.converters.simulate.settings import camera_of
-from duagc.converters.simulate.simulated_scenes import SimulatedMeshes, set_up
+from duagc.converters.simulate.simulated_scenes import SimulatedMeshes
 from duagc.converters.simulate.team import simulate, twists_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import Recording, open_rgbd
-from tests.fixtures.mesh_scenes import folder_of, some_poses
+from tests.fixtures.mesh_scenes import some_poses
 from tests.fixtures.recordings import true_poses
 
 CAMERA = camera_of((160, 120))
@@ -59,18 +59,6 @@ def edge_columns(image: np.ndarray) -> np.ndarray:
     """Column (px) of the step from black to white in every row of an image [h, w, 3], as if it were sharp."""
     whiteness = (image[..., 0] / 255.0) ** GAMMA
     return image.shape[1] - 0.5 - whiteness.sum(axis=1)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return folder_of(tmp_path_factory.mktemp("scene") / "flat", "obj")
-
-
-@pytest.fixture(scope="module")
-def stage(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> SimulatedMeshes:
-    stage = set_up(str(folder), "y", 0, tmp_path_factory.mktemp("cache"), as_meshes=True)
-    assert isinstance(stage, SimulatedMeshes)
-    return stage
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """Sensors and moving figures of the simulator, held against the exact scene."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,23 +21,11 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import Recording, open_rgbd
-from tests.fixtures.mesh_scenes import ROOM, folder_of, some_poses
+from tests.fixtures.mesh_scenes import ROOM, some_poses
 from tests.fixtures.recordings import true_poses
 
 CAMERA = camera_of((80, 60))
 TWIST = np.array([0.5, -0.2, 0.3, 0.4, 0.6, -0.3])
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return folder_of(tmp_path_factory.mktemp("scene") / "flat", "obj")
-
-
-@pytest.fixture(scope="module")
-def stage(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> SimulatedMeshes:
-    stage = set_up(str(folder), "y", 0, tmp_path_factory.mktemp("cache"), as_meshes=True)
-    assert isinstance(stage, SimulatedMeshes)
-    return stage
 
 
 @pytest.fixture(scope="module")
