@@ -12,7 +12,6 @@ from itertools import chain
 
 import numpy as np
 
-from duagc.converters.simulate.render.renderer import CameraRenderer
 from duagc.converters.simulate.trajectories.figures import APART_M, SHAPES, Figure, Ground, GroundPath, apart
 from duagc.converters.simulate.trajectories.loops import PathViews, look, shared
 from duagc.converters.simulate.trajectories.walks import (
@@ -23,7 +22,8 @@ from duagc.converters.simulate.trajectories.walks import (
     NEAR_M,
     VIEW_IMAGE,
     Terrain,
-    least_shown,
+    most_shown,
+    sees_enough,
 )
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
@@ -130,15 +130,17 @@ class _Search:
             for error, paths in self._teams(robots, size):
                 if error > NEAR_ENOUGH:
                     near.append((error, paths))
-                elif (shown := _shown(self.renderer, paths, self.sky)) is not None:
-                    good.append((shown, paths))
+                elif self._sees_enough(paths):
+                    good.append(paths)
                 if len(good) * robots >= SHOWN:
                     break
             if good:
-                return max(good, key=lambda each: each[0])[1]
+                return most_shown(self.renderer, good)
         near.sort(key=lambda each: each[0])
-        seen = (paths for _, paths in near if _shown(self.renderer, paths, self.sky) is not None)
-        return next(seen, None)
+        return next((paths for _, paths in near if self._sees_enough(paths)), None)
+
+    def _sees_enough(self, paths: list[Array]) -> bool:
+        return all(sees_enough(self.renderer, path, self.sky) for path in paths)
 
     def _teams(self, robots: int, size: float) -> Iterator[tuple[float, list[Array]]]:
         """Teams of figures of one size, each with its error; they stop when enough effort was spent."""
@@ -260,17 +262,6 @@ def _open(views: PathViews, sky: bool) -> bool:
         if np.mean(seen & (depth < NEAR_M)) > MAX_NEAR_SHARE or np.median(depth[seen]) < LEAST_MEDIAN_M:
             return False
     return True
-
-
-def _shown(renderer: CameraRenderer, paths: list[Array], sky: bool) -> float | None:
-    """Share of edges in the dullest view of all paths; None if one shows holes or something near."""
-    least = 1.0
-    for path in paths:
-        shown = least_shown(renderer, path, sky)
-        if shown is None:
-            return None
-        least = min(least, shown)
-    return least
 
 
 def _error(team: list[_Member], robots: int) -> float:

@@ -11,6 +11,7 @@ part of its view with the robot before.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 from typing import Protocol
 
 import numpy as np
@@ -118,11 +119,11 @@ def plan(
     for robot in track(range(robots), "plan walks"):
         found = _candidates(terrain, space, robot, frames, camera=camera, seed=seed)
         if robot == 0:
-            walks.append(max(found, key=lambda each: each[0])[1])
+            walks += most_shown(terrain.renderer(camera.scaled(*VIEW_IMAGE)), [[walk] for walk in found])
         else:
             before = look(small, walks[-1])
-            shares = [shared(small.camera, before, look(small, walk)) for _, walk in found]
-            walks.append(found[int(np.argmin(np.abs(np.array(shares) - overlap)))][1])
+            shares = [shared(small.camera, before, look(small, walk)) for walk in found]
+            walks.append(found[int(np.argmin(np.abs(np.array(shares) - overlap)))])
     return walks
 
 
@@ -239,11 +240,11 @@ def _graph(inside: NDArray[np.bool_], clearance: Array, cell_m: float) -> coo_ar
 
 def _candidates(
     terrain: Terrain, space: WalkableSpace, robot: int, frames: int, *, camera: PinholeCamera, seed: int
-) -> list[tuple[float, Array]]:
-    """Walks of a robot that keep clear and see something, each with how much its dullest view shows."""
+) -> list[Array]:
+    """Walks of a robot that keep clear and see something."""
     graph = space.graph.tocsr()
     renderer = terrain.renderer(camera.scaled(*VIEW_IMAGE))
-    found: list[tuple[float, Array]] = []
+    found: list[Array] = []
     reasons = {"too near to something": 0, "turns too fast": 0, "sees holes or a near wall": 0}
     for attempt in range(TRIES):
         rng = random_streams.generator(seed, "simulate.walk", robot=robot, attempt=attempt)
@@ -255,12 +256,10 @@ def _candidates(
             _body_clearance(terrain.clearance, poses[:, :2, 3], space.floor_m).min() < MIN_CLEARANCE_M - 0.05
         ):
             reasons["too near to something"] += 1
+        elif not sees_enough(renderer, poses, terrain.sky):
+            reasons["sees holes or a near wall"] += 1
         else:
-            shown = least_shown(renderer, poses, terrain.sky)
-            if shown is None:
-                reasons["sees holes or a near wall"] += 1
-            else:
-                found.append((shown, poses))
+            found.append(poses)
         if len(found) == ENOUGH:
             break
     if not found:
@@ -333,21 +332,42 @@ def _look_ahead(
     return None
 
 
-def least_shown(renderer: CameraRenderer, poses: Array, sky: bool) -> float | None:
-    """Share of edges in the view of a walk that has fewest of them; None if a view shows holes or a near wall."""
-    least = 1.0
-    for k in np.unique(np.linspace(0, len(poses) - 1, VIEWS).round().astype(np.int64)):
-        depth, _ = renderer.depth(poses[k])
+def sees_enough(renderer: CameraRenderer, poses: Array, sky: bool) -> bool:
+    """Whether no view of a walk shows holes or a near wall."""
+    for T in _some_views(poses):
+        depth, _ = renderer.depth(T)
         seen = depth > 0
         if (
             1 - seen.mean() > (MAX_SKY_SHARE if sky else MAX_HOLE_SHARE)
             or np.mean(seen & (depth < NEAR_M)) > MAX_NEAR_SHARE
         ):
-            return None
+            return False
         if np.median(depth[seen]) < LEAST_MEDIAN_M:
-            return None
-    for k in np.unique(np.linspace(0, len(poses) - 1, VIEWS).round().astype(np.int64)):
-        gray = renderer.render(poses[k]).color.astype(np.float64).mean(axis=2)
-        edges = np.hypot(*np.gradient(gray)) > EDGE_GRAY / 2
-        least = min(least, float(edges.mean()))
-    return least
+            return False
+    return True
+
+
+def most_shown(renderer: CameraRenderer, teams: list[list[Array]]) -> list[Array]:
+    """The first of the teams of paths whose dullest view, the one with fewest edges, shows most.
+
+    Args:
+        renderer: of the views.
+        teams: paths T_world_camera [frames, 4, 4] of every robot, per team.
+    """
+    most, best = -1.0, teams[0]
+    for paths in teams:
+        least = 1.0
+        for T in chain.from_iterable(map(_some_views, paths)):
+            gray = renderer.render(T).color.astype(np.float64).mean(axis=2)
+            edges = np.hypot(*np.gradient(gray)) > EDGE_GRAY / 2
+            least = min(least, float(edges.mean()))
+            if least <= most:  # it cannot become the best
+                break
+        else:
+            most, best = least, paths
+    return best
+
+
+def _some_views(poses: Array) -> Array:
+    """Poses [n, 4, 4] evenly spread over a walk."""
+    return poses[np.unique(np.linspace(0, len(poses) - 1, VIEWS).round().astype(np.int64))]
