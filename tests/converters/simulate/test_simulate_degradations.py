@@ -27,17 +27,6 @@ WALL_M = 2.0
 SIDEWAYS = np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
 PIXELS_A_SECOND = CAMERA.fx * SIDEWAYS[0] / WALL_M
 SMALL = {"frames": 6, "size": (64, 48), "workers": 1, "robots": 2}
-EVERYTHING = Degradations(
-    auto_exposure=0.3,
-    white_balance=0.15,
-    vignette=0.4,
-    blur_px=4.0,
-    lens_k1=-0.3,
-    depth_step_m=0.01,
-    depth_delay_s=0.03,
-    missing=0.2,
-    rate_hz=20.0,
-)
 
 
 class HalfWhiteWall(MeshRenderer):
@@ -68,8 +57,8 @@ def clean(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def simulated(folder: Path, out: Path, **dials: float) -> Path:
-    simulate(out, scene=str(folder), degradations=Degradations(**dials), **SMALL)
+def simulated(folder: Path, out: Path, robots: int = 2, **dials: float) -> Path:
+    simulate(out, scene=str(folder), degradations=Degradations(**dials), **SMALL | {"robots": robots})
     return out
 
 
@@ -234,7 +223,7 @@ def test_the_undistorted_image_holds_all_that_the_lens_saw_and_a_rim(k1: float) 
 def test_images_of_a_lens_are_those_of_a_pinhole_but_for_the_rim(
     folder: Path, stage: SimulatedMeshes, tmp_path: Path
 ) -> None:
-    recording = simulated(folder, tmp_path / "lens", lens_k1=-0.3)
+    recording = simulated(folder, tmp_path / "lens", robots=1, lens_k1=-0.3)
     lens = Lens(camera_of((64, 48)), -0.3)
     eye = stage.renderer(lens.pinhole)
     inside = lens.maps()[2]
@@ -272,7 +261,7 @@ def test_delayed_depth_is_that_of_the_pose_before(
     folder: Path, stage: SimulatedMeshes, tmp_path: Path
 ) -> None:
     delay_s = 0.03
-    recording = Recording(simulated(folder, tmp_path / "late", depth_delay_s=delay_s))
+    recording = Recording(simulated(folder, tmp_path / "late", robots=1, depth_delay_s=delay_s))
     path = true_poses(recording, "alpha")
     eye = stage.renderer(camera_of((64, 48)))
     late, in_time = [], []
@@ -325,19 +314,8 @@ def test_the_frames_that_remain_are_those_of_the_whole_recording(
 # --- all together
 
 
-def test_all_together_do_not_depend_on_the_number_of_workers(folder: Path, tmp_path: Path) -> None:
-    kind = {**SMALL, "scene": str(folder), "degradations": EVERYTHING, "rig": Rig(readout_s=0.03)}
-    kind["noise"] = "kinect"
-    for workers in (1, 2):
-        simulate(
-            tmp_path / str(workers) / "rec",
-            preview=tmp_path / f"{workers}.png",
-            **kind | {"workers": workers},
-        )
-    for path in sorted((tmp_path / "1" / "rec").iterdir()):
-        assert path.read_bytes() == (tmp_path / "2" / "rec" / path.name).read_bytes(), path.name
-    assert (tmp_path / "1.png").read_bytes() == (tmp_path / "2.png").read_bytes()
-    description = json.loads((tmp_path / "1" / "rec" / "recording.json").read_text())
+def test_all_together_are_in_the_description(all_degradations: Path) -> None:
+    description = json.loads((all_degradations / "recording.json").read_text())
     assert description["parameters"]["degradations"]["lens_k1"] == -0.3
     sensors = description["robots"]["alpha"]["sensors"]
     assert float(sensors["rolling_shutter_s"]) == 0.03

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from duagc.converters.simulate.settings import camera_of
-from duagc.converters.simulate.simulated_scenes import SimulatedMeshes, SimulatedRoom, set_up
+from duagc.converters.simulate.simulated_scenes import SimulatedRoom, set_up
 from duagc.converters.simulate.team import simulate
 from duagc.converters.simulate.trajectories import figures, paradigms, walks
 from duagc.converters.simulate.trajectories.loops import OVERLAP_IMAGE, shared_view
@@ -22,7 +22,7 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.bench import paths
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.recording import Recording, open_rgbd
-from tests.fixtures.mesh_scenes import HOUSE, folder_of
+from tests.fixtures.mesh_scenes import HOUSE
 from tests.fixtures.recordings import true_poses
 from tests.fixtures.sampling import sampled
 
@@ -32,8 +32,10 @@ CAMERA = camera_of((160, 120))
 
 
 @pytest.fixture(scope="module")
-def room() -> SimulatedRoom:
-    return SimulatedRoom(0)
+def room(tmp_path_factory: pytest.TempPathFactory) -> SimulatedRoom:
+    stage = set_up("room", "", 0, tmp_path_factory.mktemp("room"), as_meshes=False)
+    assert isinstance(stage, SimulatedRoom)
+    return stage
 
 
 def planned(room: SimulatedRoom, paradigm: str, overlap: float, robots: int) -> list[np.ndarray]:
@@ -74,31 +76,21 @@ def test_paths_are_smooth_clear_and_overlap_as_asked(room, paradigm, robots, ove
     assert paradigms.least_apart(ways) >= figures.APART_M
 
 
-@pytest.fixture
-def box(tmp_path: Path) -> SimulatedMeshes:
-    """A small room with a table, of meshes."""
-    (tmp_path / "cache").mkdir()
-    folder = folder_of(tmp_path / "flat", "obj")
-    stage = set_up(str(folder), "y", 0, tmp_path / "cache", as_meshes=True)
-    assert isinstance(stage, SimulatedMeshes)
-    return stage
-
-
-def test_who_asks_for_too_many_is_told_how_many_fit(box, monkeypatch):
-    monkeypatch.setattr(paradigms, "DRAWS", 16)
+def test_who_asks_for_too_many_is_told_how_many_fit(stage, monkeypatch):
+    monkeypatch.setattr(paradigms, "DRAWS", 8)
     kind = {"frames": 60, "overlap": 0.5, "camera": CAMERA, "seed": 0}
     with pytest.raises(
         DuagError, match=r"no room for crossing paths of 8 robots.* expected at most \d$"
     ) as stated:
-        paradigms.plan(box, "crossing", robots=8, **kind)
+        paradigms.plan(stage, "crossing", robots=8, **kind)
     fit = int(str(stated.value)[-1])
-    assert len(paradigms.plan(box, "crossing", robots=fit, **kind)) == fit
+    assert len(paradigms.plan(stage, "crossing", robots=fit, **kind)) == fit
 
 
-def test_an_overlap_that_cannot_be_is_the_nearest_one_and_said(tmp_path):
+def test_an_overlap_that_cannot_be_is_the_nearest_one_and_said(folder, tmp_path):
     """Two robots that cross never see exactly the same."""
     kind = {"frames": 4, "size": (32, 32), "overlap": 1.0, "paradigm": "crossing", "workers": 1}
-    simulate(tmp_path / "rec", scene=str(folder_of(tmp_path / "flat", "obj")), **kind)
+    simulate(tmp_path / "rec", scene=str(folder), **kind)
     (warning,) = json.loads((tmp_path / "rec" / "recording.json").read_text())["warnings"]
     assert re.fullmatch(r"neighbors share 0\.\d\d of the view \(.*\), expected 1\.00", warning)
 
@@ -192,8 +184,7 @@ def check_depth(out: Path, scene: str, cache: Path) -> None:
 
 
 @pytest.mark.parametrize("paradigm", sampled(FIGURES))
-def test_depth_is_that_of_the_recorded_pose(tmp_path, paradigm):
-    folder = folder_of(tmp_path / "flat", "obj")
+def test_depth_is_that_of_the_recorded_pose(folder, tmp_path, paradigm):
     out, sheet = tmp_path / "rec", tmp_path / "sheet.png"
     kind = {"robots": 2, "frames": 30, "size": (64, 48), "paradigm": paradigm, "workers": 1}
     simulate(out, scene=str(folder), preview=sheet, **kind)
