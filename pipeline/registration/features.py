@@ -148,15 +148,22 @@ def matches(ours: Descriptors, theirs: Descriptors, ratio: float) -> NDArray[np.
 def _squared_distances(ours: Descriptors, theirs: Descriptors) -> NDArray[np.float32]:
     """[n, m], exact integers."""
     a, b = ours.astype(np.float32), theirs.astype(np.float32)
-    return (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * (a @ b.T)
+    squared = a @ b.T
+    squared *= -2
+    squared += (a * a).sum(axis=1)[:, None]
+    squared += (b * b).sum(axis=1)
+    return squared
 
 
 def _matches(squared: NDArray[np.float32], ratio: float) -> NDArray[np.int64]:
+    """`matches` by squared distances [n, m], which are changed."""
     columns = np.arange(squared.shape[1])
     best = squared.argmin(axis=0)
-    second = np.partition(squared, 1, axis=0)[1]
     mutual = squared.argmin(axis=1)[best] == columns
-    good = mutual & (squared[best, columns] < np.float32(ratio) ** 2 * second)
+    least = squared[best, columns]
+    squared[best, columns] = np.inf
+    second = squared.min(axis=0)
+    good = mutual & (least < np.float32(ratio) ** 2 * second)
     return np.stack([best[good], columns[good]], axis=1)
 
 

@@ -68,7 +68,9 @@ def pose(k: int) -> np.ndarray:
     return se3.from_rotation_translation(so3.exp(turn), [0.8 - 0.1 * k, 0.3 * np.sin(k), -1.5 + 0.05 * k])
 
 
-def make_views(seed: int, noise_per_m: float = 0.001, count: int = 150) -> Views:
+def make_views(
+    seed: int, noise_per_m: float = 0.001, count: int = 150, landmarks_count: int = LANDMARKS
+) -> Views:
     """Views of the room as the true cameras see it, with noise of 1/z and samples, at poses that are a little wrong."""
     rng = np.random.default_rng(seed)
     T = np.array([pose(k) for k in range(VIEWS)])
@@ -90,24 +92,23 @@ def make_views(seed: int, noise_per_m: float = 0.001, count: int = 150) -> Views
         picked = rng.choice(len(v), count, replace=False)
         samples.append(np.stack([u[picked], v[picked]], axis=-1) << NORMALS_LEVEL)
     late_s = np.random.default_rng(100 + seed).uniform(-0.01, 0.01, VIEWS)
+    to_camera = se3.inverse(T)
+    to_exposure = se3.exp(-(TRUE.delay_s + late_s)[:, None] * velocity)
     points, seen_by, landmarks, pixels = [], [], [], []
-    for m in range(LANDMARKS):
+    for m in range(landmarks_count):
         k, u, v = rng.integers(VIEWS), rng.integers(5, 315), rng.integers(5, 235)
         points.append(se3.transform(T[k], (rays[v, u] * depths[k][v, u])[None])[0])
-        for i in range(VIEWS):
-            q = se3.transform(se3.inverse(T[i]), points[m][None])
-            if q[0, 2] < 0.1:
-                continue
-            later = TRUE.delay_s + late_s[i]
-            p = se3.transform(se3.exp(-later * velocity[i]), q) @ TRUE.R_color_depth.T
-            pixel = TRUE.project(p)[0][0]
-            if not (0 <= pixel[0] < 320 and 0 <= pixel[1] < 240 and np.hypot(*(p[0, :2] / p[0, 2])) < 0.75):
-                continue
+        q = se3.transform(to_camera, points[m][None])
+        p = (se3.transform(to_exposure, q) @ TRUE.R_color_depth.T)[:, 0]
+        pixel = TRUE.project(p)[0]
+        seen = (q[:, 0, 2] >= 0.1) & ((pixel >= 0) & (pixel < (320, 240))).all(axis=1)
+        seen &= np.hypot(*(p[:, :2] / p[:, 2:]).T) < 0.75
+        for i in np.flatnonzero(seen).tolist():
             ray = (points[m] - T[i, :3, 3])[None]
             if distance(T[i, :3, 3], ray)[0] > 0.999:
                 seen_by.append(i)
                 landmarks.append(m)
-                pixels.append(pixel + rng.normal(size=2) * 0.1)
+                pixels.append(pixel[i] + rng.normal(size=2) * 0.1)
     wrong = T @ se3.exp(rng.normal(size=(VIEWS, 6)) * 0.003)
     return Views(
         f"room {seed}",
@@ -120,7 +121,7 @@ def make_views(seed: int, noise_per_m: float = 0.001, count: int = 150) -> Views
         np.array(seen_by),
         np.array(landmarks),
         np.array(pixels),
-        np.array(points) + rng.normal(size=(LANDMARKS, 3)) * 0.01,
+        np.reshape(points, (-1, 3)) + rng.normal(size=(landmarks_count, 3)) * 0.01,
         np.arange(VIEWS),
         late_s,
     )
@@ -167,7 +168,7 @@ def test_derivatives_are_those_of_the_residuals(views: Views) -> None:
 
 def test_noise_of_depth_pushes_no_coefficient() -> None:
     """At the true poses and cameras only chance pulls at the error of depth, though depth is in its derivative."""
-    noisy = make_views(0, noise_per_m=0.006, count=2500)
+    noisy = make_views(0, noise_per_m=0.006, count=2500, landmarks_count=0)
     noisy.T_map_camera = np.array([pose(k) for k in range(VIEWS)])
     H, g = _of_planes(noisy, overlapping(noisy), TRUE, len(NAMES))
     pull = g[-6:] / np.sqrt(np.diag(H)[-6:])
@@ -196,14 +197,14 @@ def test_known_cameras_are_found(views: Views) -> None:
 
 def still_recording(folder: Path, contrast: int = 255) -> Path:
     """A camera that does not move, before a wall with a pattern."""
-    rng = np.random.default_rng(0)
-    pattern = cv2.GaussianBlur(rng.uniform(0, 255, (240, 320)), (0, 0), 2)
+    rng, camera = np.random.default_rng(0), CAMERA.scaled(160, 120)
+    pattern = cv2.GaussianBlur(rng.uniform(0, 255, (120, 160)), (0, 0), 2)
     pattern = cv2.normalize(
         pattern, None, (255 - contrast) // 2, (255 + contrast) // 2, cv2.NORM_MINMAX
     ).astype(np.uint8)
     png = cv2.imencode(".png", np.repeat(pattern[..., None], 3, axis=2))[1].tobytes()
-    depth = np.full((240, 320), 1500, np.uint16) + (np.arange(320) // 4).astype(np.uint16)
-    with RecordingWriter(folder) as recording, recording.robot("alpha", CAMERA, 0.001) as robot:
+    depth = np.full((120, 160), 1500, np.uint16) + (np.arange(160) // 2).astype(np.uint16)
+    with RecordingWriter(folder) as recording, recording.robot("alpha", camera, 0.001) as robot:
         for k in range(20):
             robot.add_frame(k * 33_000_000, png, "png", depth)
     return folder
