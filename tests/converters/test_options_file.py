@@ -27,7 +27,7 @@ def description(recording: Path) -> dict[str, object]:
 
 
 def test_a_file_is_as_good_as_set_and_set_wins(tmp_path: Path) -> None:
-    sequence = make_sequence(tmp_path / "seq")
+    sequence = make_sequence(tmp_path / "seq", frames=2)
     text = '# measured\ncolor_focal_px = 520\nbaseline_m = 0.03\ncolor_distortion = "0.01 0 0 0"\n'
     (tmp_path / "cameras.toml").write_text(text)
     filed = "7scenes", sequence, "--options", tmp_path / "cameras.toml"

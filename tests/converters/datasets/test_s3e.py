@@ -121,10 +121,10 @@ def test_lidar_is_unturned_by_the_gyroscope(dataset: Path, tmp_path: Path) -> No
                 assert known.mean() > 0.3
                 assert frame.depth_sigma is not None
                 errors.append((np.abs(frame.depth - truth) / truth)[known])
-        assert not checks_of(tmp_path / "rec")
         # 0.25 rad/s over 0.1 s are 7 px: without the gyroscope 0.5 % (median)
         assert np.median(np.concatenate(errors)) < 0.002
         assert np.mean(np.concatenate(errors) > 0.1) < 0.03
+    assert not checks_of(tmp_path / "rec")
 
 
 def test_bags_without_cameras_are_refused(dataset: Path, tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_bags_without_cameras_are_refused(dataset: Path, tmp_path: Path) -> None
     [
         ("transposed", "matched features lie .* px apart in rows"),
         ("meters", "last column of RIGHT.P is"),
-        ("other", "matched features lie .* px apart in rows"),
+        pytest.param("other", "matched features lie .* px apart in rows", marks=pytest.mark.slow),
         ("cut", "bob.yaml: "),
         ("missing", "bob.yaml: No such file"),
         ("text", "bob.yaml: "),
