@@ -75,7 +75,7 @@ def masked(source: Recording, out: Path, seed: int | None) -> Path:
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Path, Path]]:
     """Recording and run, of the frames as they were and with noise under the masks."""
     folder = tmp_path_factory.mktemp("masked")
-    simulate(folder / "plain", robots=2, frames=14, size=SIZE, seed=1, overlap=0.9, workers=1)
+    simulate(folder / "plain", robots=2, frames=10, size=SIZE, seed=1, overlap=0.9, workers=1)
     plain, out = Recording(folder / "plain"), []
     for seed in (None, 7):
         recording = masked(plain, folder / f"recording-{seed}", seed)

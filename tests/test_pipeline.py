@@ -237,7 +237,7 @@ def test_the_log_of_another_robot_is_refused(folder: Path, recording: Path) -> N
 
 
 def test_nothing_delivered_is_nothing_said(folder: Path, recording: Path, finished: Path) -> None:
-    silent = make_run(recording, folder / "run_silent", "exchange.link.enabled=false")
+    silent = make_run(recording, folder / "run_silent", "exchange.link.enabled=false", workers=1)
     deaf = exchanged_again(silent, recording, folder / "run_deaf", "exchange.link.loss_probability=1.0")
     assert robots_digests(silent) == robots_digests(deaf)
     changed = robots_digests(finished)

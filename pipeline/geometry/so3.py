@@ -71,7 +71,11 @@ def from_quat_wxyz(q: ArrayLike) -> Array:
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    R = np.empty((*q.shape[:-1], 3, 3))
+    for i in range(3):
+        for j in range(3):
+            R[..., i, j] = rows[i][j]
+    return R
 
 
 def to_quat_wxyz(R: ArrayLike) -> Array:

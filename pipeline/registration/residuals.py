@@ -20,7 +20,7 @@ from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.depth_noise import DepthNoise
-from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma
+from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma, median
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
 from duagc.pipeline.registration.reference import Reference
 
@@ -126,7 +126,7 @@ def linearize_at(
     v = np.float32(camera.fy) * q[1] / front + np.float32(camera.cy)
     inside = (q[2] > 0.05) & (u >= 1) & (u < camera.width - 2) & (v >= 1) & (v < camera.height - 2)
     seen = np.flatnonzero(inside)
-    q, u, v = q[:, seen], u[seen], v[seen]
+    q, u, v = q.take(seen, axis=1), u.take(seen), v.take(seen)
 
     gray, gu, gv, inverse_depth, *measured_sigma = _interpolate(level, u, v)
     with np.errstate(invalid="ignore"):
@@ -139,18 +139,20 @@ def linearize_at(
         agree = np.abs(off) < gate
         # beyond the gate in front of the surface: that space was seen to be free; behind it: hidden
         free = off >= gate
-    m = T_target_reference[:3, :3] @ samples.normals[seen].T
+    m = T_target_reference[:3, :3] @ samples.normals.take(seen, axis=0).T
     if config.normal_gate_rad > 0:
         agree &= _normals_agree(level, u, v, m, limit_rad=config.normal_gate_rad)
     agreeing = np.flatnonzero(agree)
     conflicts, judged = int(free.sum()), int(np.isfinite(z).sum())
     total = len(samples) - (len(seen) - judged)
 
-    q, m, u, v, z = q[:, agreeing], m[:, agreeing], u[agreeing], v[agreeing], z[agreeing]
-    gray, gu, gv = gray[agreeing], gu[agreeing], gv[agreeing]
-    intensities = samples.intensities[seen[agreeing]]
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy]).astype(np.float32)
-    surface = np.stack([rays[0] * z, rays[1] * z, z])
+    q, m = q.take(agreeing, axis=1), m.take(agreeing, axis=1)
+    u, v, z, gray, gu, gv = (each.take(agreeing) for each in (u, v, z, gray, gu, gv))
+    intensities = samples.intensities.take(seen.take(agreeing))
+    surface = np.empty((3, len(z)), dtype=np.float32)
+    surface[0] = ((u - camera.cx) / camera.fx).astype(np.float32) * z
+    surface[1] = ((v - camera.cy) / camera.fy).astype(np.float32) * z
+    surface[2] = z
     sigma = measured_sigma[0][agreeing] if measured_sigma else depth_noise(config).sigma_m(z)
     if measured_sigma and samples.depth_sigmas is not None:
         # of two views alike it stays the same, as that of the model
@@ -171,7 +173,7 @@ def linearize_at(
         view=len(seen) / max(len(samples), 1),
         conflict=conflicts / max(judged, 1),
         agreeing=len(agreeing),
-        median_depth_m=float(np.median(z)) if len(z) else 0.0,
+        median_depth_m=median(z) if len(z) else 0.0,
         sigma_mean_m=float(sigma.mean(dtype=np.float64)) if len(z) else 0.0,
     )
 
@@ -244,8 +246,8 @@ def _gray_residuals(
     gray, gu, gv = images
     if config.min_gradient > 0:
         keep = np.flatnonzero(gu * gu + gv * gv >= np.float32(config.min_gradient) ** 2)
-        gray, gu, gv, intensities, q = gray[keep], gu[keep], gv[keep], intensities[keep], q[:, keep]
-        pixels = (pixels[0][keep], pixels[1][keep])
+        gray, gu, gv, intensities = (each.take(keep) for each in (gray, gu, gv, intensities))
+        q, pixels = q.take(keep, axis=1), (pixels[0].take(keep), pixels[1].take(keep))
     dx, dy = gu * np.float32(camera.fx) / q[2], gv * np.float32(camera.fy) / q[2]
     d = np.stack([dx, dy, -(dx * q[0] + dy * q[1]) / q[2]])
     J = np.empty((len(gray), 8), dtype=np.float32)
@@ -258,7 +260,11 @@ def _gray_residuals(
 
 def _cross(a: Floats, b: Floats) -> Floats:
     """Cross products of vectors [3, n]."""
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    out = np.empty_like(a)
+    for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        np.multiply(a[i], b[j], out=out[k])
+        out[k] -= a[j] * b[i]
+    return out
 
 
 def _weighted(

@@ -4,7 +4,11 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,10 +30,21 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+class ThisProcess:
+    """Instead of a pool: what each run imports and allocates is of no interest here."""
+
+    def submit(self, function: Callable, *arguments: Any, **named: Any) -> Future:
+        done: Future = Future()
+        done.set_result(function(*arguments, **named))
+        return done
+
+
 @pytest.fixture(scope="module")
 def result(recording: Path) -> dict:
     config = bench.changed(FrontendConfig(), {**MAPPING, "model.enabled": True})
-    return bench.run(bench.Plan(recording, config, caps=(400, 3000), robots=("bravo",)))
+    with pytest.MonkeyPatch.context() as patch:  # the runs of other tests have processes of their own
+        patch.setattr(bench, "worker_pool", lambda workers: nullcontext(ThisProcess()))
+        return bench.run(bench.Plan(recording, config, caps=(400, 3000), robots=("bravo",)))
 
 
 def test_every_run_is_there_and_measured(result: dict) -> None:

@@ -278,7 +278,7 @@ def test_work_per_keyframe_does_not_grow_with_the_path(noisy: Walk, monkeypatch:
 
     monkeypatch.setattr(bundle, "linearize", counted("costs", bundle.linearize))
     monkeypatch.setattr(bundle, "overlap", counted("overlaps", bundle.overlap))
-    short, long = work(20), work(40)
+    short, long = work(16), work(32)
     assert long["overlaps"] > 8  # the limit is reached: many more keyframes see the place
     for name in counts:
         assert long[name] < 1.25 * short[name] + 1, name

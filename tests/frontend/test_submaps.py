@@ -133,7 +133,7 @@ def test_a_cut_recording_is_joined_and_as_exact_as_the_whole_one(walk, frontend)
 def test_a_place_that_is_never_seen_again_is_a_component_of_its_own(walk, frontend) -> None:
     shots, _ = walk
     other, truth = walk_around(5)
-    cut = covered(foreign_end(shots, other, COVERED.stop))[: COVERED.stop + 40]
+    cut = covered(foreign_end(shots, other, COVERED.stop))[: COVERED.stop + COVERED.start + 4]
     path = frontend("foreign", cut)
     rest = component_path(path, "alpha-1")
     largest, smaller = messages(path, topics.ODOMETRY), messages(rest, topics.ODOMETRY, "alpha-1")

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from duagc.pipeline.geometry.statistics import evenly_spaced, huber_divisor, mad_sigma, mad_sigmas
+from duagc.pipeline.geometry.statistics import evenly_spaced, huber_divisor, mad_sigma, mad_sigmas, median
 
 
 def test_the_scale_of_a_normal_distribution_is_its_standard_deviation_and_outliers_hardly_count() -> None:
@@ -15,6 +15,15 @@ def test_the_scale_of_a_normal_distribution_is_its_standard_deviation_and_outlie
     assert mad_sigma(draws) == pytest.approx(0.3, rel=0.03)
     columns = np.stack([draws, 2 * draws], axis=1)
     assert mad_sigmas(columns).tolist() == [mad_sigma(draws), mad_sigma(2 * draws)]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 999, 1000])
+def test_the_median_is_numpy_s_to_the_bit(dtype: type[np.floating], count: int) -> None:
+    values = np.random.default_rng(count).standard_normal(count).astype(dtype)
+    assert median(values) == float(np.median(values))
+    values[count // 2] = np.nan
+    assert np.isnan(median(values))
 
 
 def test_residuals_beyond_the_limit_count_linearly() -> None:
