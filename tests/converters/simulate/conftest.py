@@ -52,7 +52,7 @@ def stage(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> SimulatedMe
 
 @pytest.fixture(scope="session")
 def all_sensors(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of one worker, beside a preview."""
+    """A recording of one worker, next to a preview."""
     out = tmp_path_factory.mktemp("sensors") / "rec"
     simulate(out, scene=str(folder), workers=1, preview=out.with_suffix(".png"), **ALL_SENSORS)
     return out
@@ -60,7 +60,7 @@ def all_sensors(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def all_degradations(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of one worker, beside a preview."""
+    """A recording of one worker, next to a preview."""
     out = tmp_path_factory.mktemp("degradations") / "rec"
     simulate(out, scene=str(folder), workers=1, preview=out.with_suffix(".png"), **ALL_DEGRADATIONS)
     return out

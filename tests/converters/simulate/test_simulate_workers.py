@@ -11,7 +11,7 @@ from tests.fixtures.mesh_scenes import folder_of
 
 
 def check_two_workers(one: Path, two: Path, **settings: Any) -> None:
-    """`one` was written by one worker; its preview, if it has one, lies beside it."""
+    """`one` was written by one worker; its preview, if it has one, lies next to it."""
     preview = {"preview": two.with_suffix(".png")} if one.with_suffix(".png").exists() else {}
     simulate(two, workers=2, **preview, **settings)
     names = sorted(path.name for path in one.iterdir())
