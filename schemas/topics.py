@@ -206,6 +206,13 @@ PEER_MAP_REPORT = Topic(
     Scope.ROBOT,
     "check of a peer's map against own images, and whether it is used",
 )
+REJECTED_MATCHES = Topic(
+    "/<robot>/rejected_matches",
+    "duagc.v1.RejectedMatches",
+    "fusion",
+    Scope.ROBOT,
+    "matches of a pair of robots that it did not use",
+)
 PEER_COLORS = Topic(
     "/<robot>/peer_colors",
     "duagc.v1.PeerColors",
@@ -282,6 +289,7 @@ TOPICS: tuple[Topic, ...] = (
     REFINED_MAP,
     CORRECTED_KEYFRAMES,
     PEER_MAP_REPORT,
+    REJECTED_MATCHES,
     PEER_COLORS,
     PEER_MESSAGE,
     PEER_PACKET,

@@ -15,10 +15,11 @@ import pytest
 
 from duagc.converters.simulate.team import simulate
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.config.base import load_config
+from duagc.pipeline.config.base import dump_config, load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.evaluation import evaluate
 from duagc.pipeline.evaluation.network import Session
+from duagc.pipeline.evaluation.oracle import Gap, gap_to_oracle
 from duagc.pipeline.evaluation.results import reason_of
 from duagc.pipeline.exchange.record import read_session
 from duagc.pipeline.exchange.session import run_session
@@ -248,6 +249,26 @@ def test_nothing_delivered_is_nothing_said(folder: Path, recording: Path, finish
         assert changed[f"robots/{robot}/odometry.tum"] == own[f"robots/{robot}/odometry.tum"]
         assert changed[f"robots/{robot}/fused.ply"] != own[f"robots/{robot}/fused.ply"]
     assert changed["robots/bravo/trajectory.tum"] != own["robots/bravo/trajectory.tum"]
+
+
+def test_rejected_matches_are_no_gap_to_the_centralized_answer(
+    folder: Path, recording: Path, finished: Path
+) -> None:
+    """A third of the matches is false; what the robots reject is part of nobody's problem, and is counted."""
+    wrong = "exchange.injection.false_matches=0.33"
+    out = exchanged_again(finished, recording, folder / "run_false_matches", wrong)
+    (out / "config.toml").write_text(dump_config(load_config(RunConfig, overrides=[*SMALL, wrong])))
+    session = Session(RunFolder(out))
+    section = session.consensus_section()
+    assert 0.1 < section["rejected_matches_share"] < 0.4
+    assert section["gap_to_oracle_sigma_p99"] < 0.05
+    careless = RunFolder(out)  # an oracle that takes what nobody took
+    for robot in careless.robots.values():
+        vars(robot)["rejected_matches"] = {}
+    gap = gap_to_oracle(careless, session.loop_closures, session.pairs)
+    assert isinstance(gap, Gap)
+    assert isinstance(gap.sigma_p99, float)
+    assert gap.sigma_p99 > 0.3
 
 
 def test_what_happened_can_be_asked_for(finished: Path) -> None:

@@ -178,6 +178,21 @@ def _first_of_each(group: Index, d: Array, tie: Index) -> Index:
     return nearest[np.diff(group[nearest], prepend=-1) > 0]
 
 
+def without(pairs: Index, left_out: Index) -> Index:
+    """Pairs that are not among others, in their order.
+
+    Args:
+        pairs: int64 [n, 2], ids.
+        left_out: int64 [m, 2], likewise.
+    """
+    others = set(map(tuple, left_out.tolist()))
+    if not others:
+        return pairs
+    keep = [tuple(pair) not in others for pair in pairs.tolist()]
+    left: Index = pairs[np.array(keep, dtype=bool)]
+    return left
+
+
 @dataclass(frozen=True)
 class Tracks:
     """Groups of matched Gaussians over all robots, at most one of each robot in a group.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from duagc.pipeline.base.component_names import same_robot
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.evaluation.oracle import gap_to_oracle
+from duagc.pipeline.evaluation.oracle import NO_MATCHES, gap_to_oracle, matches_among
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT
 from duagc.pipeline.recording import read_log
@@ -257,7 +257,21 @@ class Session:
             late = ", ".join(sorted(together - set(agreed)))
             ticks = Absent(f"{late} did not get there in {self.summary.rounds} rounds")
         solver = SOLVERS[self.run.config.exchange.solver]
-        return {"solver": solver, "converged": self.summary.converged, "rounds_to_tolerance": ticks, **gaps}
+        return {
+            "solver": solver,
+            "converged": self.summary.converged,
+            "rounds_to_tolerance": ticks,
+            **gaps,
+            "rejected_matches_share": self.rejected_matches_share(),
+        }
+
+    def rejected_matches_share(self) -> float | Absent:
+        """Share of the matches of each robot's component that the robot did not use; all robots together."""
+        robots = self.run.robots.values()
+        matches = sum(len(ids) for r in robots for ids in matches_among(r.component, self.pairs).values())
+        if not matches:
+            return NO_MATCHES
+        return sum(len(ids) for r in robots for ids in r.rejected_matches.values()) / matches
 
     @property
     def period_ns(self) -> int:

@@ -3,7 +3,8 @@
 The objective is rebuilt from what the run recorded: registrations between own keyframes from every frontend.mcap,
 closures with their information and final robust weights from consensus.mcap, noise floors from config.toml; for the
 Gaussians the robots' maps and information as they are, not as they were rounded for the wire, and the matches of the
-session. Only who computes differs.
+session that the robot used. Only who computes differs: a match that a robot's own images or map contradict
+(`fusion.peer_validation`) is part of no objective of that robot, and how many these are is a figure of its own.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.consensus.matching import without
 from duagc.pipeline.consensus.pose_admm import with_floor
 from duagc.pipeline.consensus.weighting import in_world, self_information, shared_evidence
 from duagc.pipeline.consensus.weights import Weights
@@ -110,11 +112,40 @@ def _gap(
 ) -> Gap:
     """The gap of one component whose centralized poses are known."""
     meters, radians = pose_gap(poses, central)
-    among = {key: ids for key, ids in pairs.items() if key[0] in members and key[1] in members}
-    gaps = np.concatenate([_gaussian_gaps(run, name, members, central, pairs=among) for name in members])
+    among = {name: used_matches(run.robots[name], pairs) for name in members}
+    gaps = np.concatenate(
+        [_gaussian_gaps(run, name, members, central, pairs=among[name]) for name in members]
+    )
     if not len(gaps):
         return Gap(meters, radians, NO_MATCHES, NO_MATCHES)
     return Gap(meters, radians, float(gaps.max()), float(np.percentile(gaps, 99)))
+
+
+Pairs = Mapping[tuple[str, str], NDArray[np.int64]]
+
+
+def matches_among(members: Sequence[str], pairs: Pairs) -> Pairs:
+    """The matches of the session that concern a component.
+
+    Args:
+        members: of the component.
+        pairs: ids of matched Gaussians [n, 2] by robots.
+    """
+    return {key: ids for key, ids in pairs.items() if key[0] in members and key[1] in members}
+
+
+def used_matches(robot: RobotRun, pairs: Pairs) -> Pairs:
+    """The matches of the session that a robot's map is fused from: all in its component but those that it rejected.
+
+    Matches that did not reach the robot are among them: that is a loss of the exchange, which the gap shows.
+
+    Args:
+        robot: that fuses.
+        pairs: ids of matched Gaussians [n, 2] by robots.
+    """
+    rejected, none = robot.rejected_matches, np.zeros((0, 2), np.int64)
+    among = matches_among(robot.component, pairs)
+    return {key: without(ids, rejected.get(key, none)) for key, ids in among.items()}
 
 
 def pose_gap(poses: Mapping[str, Array], central: Mapping[str, Array]) -> tuple[float, float]:

@@ -29,7 +29,7 @@ from duagc.pipeline.config.fusion import PeerValidationConfig
 from duagc.pipeline.config.training import DepthKind
 from duagc.pipeline.consensus.colors import team_colors
 from duagc.pipeline.consensus.evidence import Evidence, rows_by_id
-from duagc.pipeline.consensus.matching import Pairs, gaussian_distance, threshold
+from duagc.pipeline.consensus.matching import Pairs, gaussian_distance, threshold, without
 from duagc.pipeline.fusion.context import MapContext
 from duagc.pipeline.geometry import se3, spd
 from duagc.pipeline.geometry.posed_rgbd import PosedRgbd
@@ -90,12 +90,15 @@ class ValidatedPeers:
         evidence: by name, in the world frame; empty of a peer that is not trusted.
         contradicted: by name, bool [n], which of these Gaussians own images contradict.
         pairs: (robot a, robot b) -> ids int64 [m, 2] of matched Gaussians.
+        rejected: likewise, matches that are not used though both Gaussians are here; only pairs of robots that have
+            any.
         checks: one per peer, in order of name.
     """
 
     evidence: dict[str, Evidence]
     contradicted: dict[str, NDArray[np.bool_]]
     pairs: dict[tuple[str, str], Index]
+    rejected: dict[tuple[str, str], Index]
     checks: tuple[PeerCheck, ...]
 
 
@@ -156,7 +159,8 @@ def validate_peer_maps(
             )
         )
     evidence = {name: world[name] for name in sorted(peers)}
-    return ValidatedPeers(evidence, contradicted, true, tuple(checks))
+    rejected = _rejected({own.owner: own, **peers}, pairs, true)
+    return ValidatedPeers(evidence, contradicted, true, rejected, tuple(checks))
 
 
 def _sizes_m(evidence: Evidence) -> Array:
@@ -202,6 +206,23 @@ def _true_pairs(
         other = _in_colors_of(world[a], world[b], near, matching)
         true[a, b] = near[gaussian_distance(world[a], i, other, j, config=matching) <= largest]
     return true
+
+
+def _rejected(received: Mapping[str, Evidence], pairs: Pairs, true: Pairs) -> dict[tuple[str, str], Index]:
+    """The pairs whose Gaussians were received but that are not among the true ones.
+
+    What never arrived is a matter of the exchange, not of a decision.
+    """
+    rejected = {}
+    for a, b in sorted(p for p in pairs if p[0] in received and p[1] in received):
+        here = [
+            rows_by_id(ids, received[r].ids) >= 0
+            for r, ids in ((a, pairs[a, b][:, 0]), (b, pairs[a, b][:, 1]))
+        ]
+        left = without(pairs[a, b][here[0] & here[1]], true.get((a, b), NO_PAIRS))
+        if len(left):
+            rejected[a, b] = left
+    return rejected
 
 
 class _ColorStatistics:

@@ -32,6 +32,7 @@ from duagc.pipeline.messages import (
     Odometry,
     PeerColors,
     PeerMapReport,
+    RejectedMatches,
 )
 from duagc.pipeline.recording import LogWriter, open_rgbd, read_exposures, read_log
 from duagc.pipeline.registration.moving import FreeSpace
@@ -55,12 +56,12 @@ class _Fusion:
     Attributes:
         fused: the fused map.
         refined: the finetuned map; None for a robot that met no other.
-        checks: of every peer's map.
+        valid: what was used of the peers' maps, and the checks.
     """
 
     fused: FusedMap
     refined: Gaussians | None
-    checks: tuple[PeerCheck, ...]
+    valid: ValidatedPeers
 
 
 def run_fusion(
@@ -111,7 +112,7 @@ def run_fusion(
     before = np.array([f.T_map_camera for f in frames])
     write_tum(folder / "odometry.tum", Trajectory(stamps, before))
     write_tum(folder / "trajectory.tum", Trajectory(stamps, T_world_camera))
-    return fusion.checks
+    return fusion.valid.checks
 
 
 def _fuse(own: RobotData, result: SessionResult, views: Sequence[PosedRgbd], context: MapContext) -> _Fusion:
@@ -146,7 +147,7 @@ def _fuse(own: RobotData, result: SessionResult, views: Sequence[PosedRgbd], con
         contradicted=valid.contradicted,
     )
     if len(result.component) < 2:
-        return _Fusion(fused, None, valid.checks)
+        return _Fusion(fused, None, valid)
     fused = update_opacities(
         fused,
         keyframe_views,
@@ -155,7 +156,7 @@ def _fuse(own: RobotData, result: SessionResult, views: Sequence[PosedRgbd], con
         color_sigma=own.information.color_sigma,
         pixels_per_sample=own.information.color_pixels_per_sample,
     )
-    return _Fusion(fused, _finetuned(own, result, fused, valid, views=views, context=context), valid.checks)
+    return _Fusion(fused, _finetuned(own, result, fused, valid, views=views, context=context), valid)
 
 
 def _finetuned(
@@ -267,9 +268,12 @@ def _write_log(path: Path, result: SessionResult, fusion: _Fusion, *, stamp_ns: 
                 matches=colors.matches,
             )
             log.write(topics.PEER_COLORS.of(robot), peer_colors, stamp_ns, stamp_ns)
-        for check in fusion.checks:
+        for check in fusion.valid.checks:
             report = _report(robot, check, stamp_ns)
             log.write(topics.PEER_MAP_REPORT.of(robot), report, stamp_ns, stamp_ns)
+        for (lower, higher), ids in sorted(fusion.valid.rejected.items()):
+            rejected = RejectedMatches(stamp_ns, robot, lower, higher, ids)
+            log.write(topics.REJECTED_MATCHES.of(robot), rejected, stamp_ns, stamp_ns)
 
 
 def _report(robot: str, check: PeerCheck, stamp_ns: int) -> PeerMapReport:

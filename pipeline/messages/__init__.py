@@ -25,7 +25,7 @@ from duagc.pipeline.messages.parts import (
     unpack_pose,
     unpack_stamp,
 )
-from duagc.pipeline.messages.peers import PeerColors, PeerMapReport
+from duagc.pipeline.messages.peers import PeerColors, PeerMapReport, RejectedMatches
 from duagc.pipeline.messages.sensors import (
     pack_calibration,
     pack_color,
@@ -57,6 +57,7 @@ __all__ = [
     "Odometry",
     "PeerColors",
     "PeerMapReport",
+    "RejectedMatches",
     "Submap",
     "camera_frame",
     "map_frame",

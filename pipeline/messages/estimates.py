@@ -25,7 +25,7 @@ from duagc.pipeline.messages.parts import (
     unpack_pose,
     unpack_stamp,
 )
-from duagc.pipeline.messages.peers import PeerColors, PeerMapReport
+from duagc.pipeline.messages.peers import PeerColors, PeerMapReport, RejectedMatches
 
 _STATUS = {"ok": 1, "lost": 2, "relocalized": 3}
 
@@ -360,6 +360,7 @@ _UNPACK: dict[str, Callable[[Any], Any]] = {
         CorrectedKeyframes,
         PeerColors,
         PeerMapReport,
+        RejectedMatches,
     )
 }
 

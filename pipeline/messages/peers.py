@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from duagc import schemas
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.messages.parts import numbers, pack_stamp, unpack_stamp
+from duagc.pipeline.messages.parts import numbers, pack_array, pack_stamp, unpack_array, unpack_stamp
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,46 @@ class PeerMapReport:
 def _reported() -> list[str]:
     """Fields of a PeerMapReport that have the same name and type in the message."""
     return [field.name for field in fields(PeerMapReport) if field.name != "stamp_ns"]
+
+
+@dataclass(frozen=True, eq=False)
+class RejectedMatches:
+    """Matches of two robots that a robot did not use, though it has both Gaussians of each.
+
+    Attributes:
+        stamp_ns: end of the run.
+        robot: that decided.
+        lower: one of the matched robots.
+        higher: the other one, the later name.
+        ids: int64 [n, 2], of the Gaussians of the two.
+    """
+
+    schema: ClassVar[str] = "duagc.v1.RejectedMatches"
+
+    stamp_ns: int
+    robot: str
+    lower: str
+    higher: str
+    ids: NDArray[np.int64]
+
+    def pack(self) -> Any:
+        """duagc.v1.RejectedMatches."""
+        message = schemas.new(
+            "RejectedMatches",
+            robot=self.robot,
+            lower=self.lower,
+            higher=self.higher,
+            count=len(self.ids),
+            ids_int64=pack_array(self.ids, "int64"),
+        )
+        pack_stamp(message, self.stamp_ns)
+        return message
+
+    @staticmethod
+    def unpack(m: Any) -> RejectedMatches:
+        """From duagc.v1.RejectedMatches."""
+        ids = unpack_array(m.ids_int64, "int64", (m.count, 2), "RejectedMatches.ids")
+        return RejectedMatches(unpack_stamp(m), m.robot, m.lower, m.higher, ids)
 
 
 @dataclass(frozen=True, eq=False)

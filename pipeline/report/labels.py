@@ -47,7 +47,7 @@ def text(name: str, value: Any) -> str:
         return f"{np.degrees(value):.3g}°"
     if unit == "B":
         return bytes_text(value)
-    if name == "depth_completeness" or name.startswith("coverage_95"):
+    if name in ("depth_completeness", "rejected_matches_share") or name.startswith("coverage_95"):
         return f"{100 * value:.1f} %"
     if isinstance(value, int):
         return f"{value:,}".replace(",", "\u202f")
@@ -143,6 +143,7 @@ CONSENSUS = {
     "gap_to_oracle_sigma_p99": ("Gap to oracle, 99 %", "of the matched Gaussians differ by less"),
     "gap_to_oracle_m": ("Gap to oracle, position", "largest difference of a keyframe from the centralized answer"),
     "gap_to_oracle_rad": ("Gap to oracle, rotation", "largest turn of a keyframe from the centralized answer"),
+    "rejected_matches_share": ("Matches not used", "share of the matches that a robot's own map or images contradict"),
 }  # fmt: skip
 
 CALIBRATION = {

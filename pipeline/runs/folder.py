@@ -115,6 +115,12 @@ class RobotRun:
         """Keyframe poses after consensus, and the component that the robot counts itself in."""
         return self._last("fused.mcap", topics.CORRECTED_KEYFRAMES)
 
+    @cached_property
+    def rejected_matches(self) -> dict[tuple[str, str], NDArray[np.int64]]:
+        """Ids [n, 2] of matched Gaussians that it did not use, by the two robots, lower name first."""
+        found = self._all("fused.mcap", topics.REJECTED_MATCHES)
+        return {(m.lower, m.higher): m.ids for m in found}
+
     @property
     def component(self) -> tuple[str, ...]:
         """Names of the robots that share this robot's world frame, itself among them."""

@@ -222,6 +222,7 @@ FUSION = Stage(
         topics.REFINED_MAP,
         topics.CORRECTED_KEYFRAMES,
         topics.PEER_MAP_REPORT,
+        topics.REJECTED_MATCHES,
         topics.PEER_COLORS,
     ),
     reads_files=("frontend.mcap", "information.mcap"),

@@ -72,6 +72,7 @@ SCHEMA = {
     "consensus": {
         "solver": str, "converged": bool, "rounds_to_tolerance": int, "gap_to_oracle_sigma": NUMBER,
         "gap_to_oracle_sigma_p99": NUMBER, "gap_to_oracle_m": NUMBER, "gap_to_oracle_rad": NUMBER,
+        "rejected_matches_share": NUMBER,
     },
     "protocol": dict.fromkeys(
         ("alignment", "ate", "team_ate", "rpe", "depth_agreement", "feature_agreement",

@@ -144,6 +144,19 @@ def test_matches_far_apart_unlike_or_of_nothing_are_refused(views):
     assert validated_by_alpha(views, white).checks[0].rejected_matches == 20
 
 
+def test_rejected_are_matches_of_what_was_received_and_no_others(views):
+    """Of a refused map all of them; a match with a Gaussian that never arrived is no decision of the robot."""
+    ids = 10 + np.arange(N)
+    everyone = {("alpha", "bravo"): np.stack([ids, ids], axis=1)}
+    assert validated_by_alpha(views, map_of("bravo"), everyone).rejected == {}
+    inverted = map_of("bravo", repaint(lambda c: 1 - c))
+    rejected = validated_by_alpha(views, inverted, everyone).rejected
+    np.testing.assert_array_equal(rejected["alpha", "bravo"], everyone["alpha", "bravo"])
+    late = inverted.select(slice(0, N - 30))
+    rejected = validated_by_alpha(views, late, everyone).rejected
+    np.testing.assert_array_equal(rejected["alpha", "bravo"], everyone["alpha", "bravo"][: N - 30])
+
+
 def test_a_neighbor_that_shares_no_view_is_not_judged(views):
     away = map_of("bravo", lambda theta: theta.__setitem__((slice(None), 2), -5.0))
     check = validated_by_alpha(views, replace(away, theta=away.theta)).checks[0]

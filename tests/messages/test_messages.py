@@ -78,6 +78,7 @@ def all_messages(seed: int, n: int) -> list[Any]:
         m.GaussianMap(stamp, "alpha", "alpha/map", gaussians(rng, n)),
         m.CorrectedKeyframes(stamp, "alpha", component, np.arange(k, dtype=np.int32), T),
         m.PeerColors(stamp, "alpha", "bravo", *rng.random((4, 3)), matches=n),
+        m.RejectedMatches(stamp, "charlie", "alpha", "bravo", rng.integers(0, 2**62, (n, 2))),
         m.PeerMapReport(
             stamp_ns=stamp,
             robot="alpha",
