@@ -37,6 +37,9 @@ class PeerRegistrationConfig(RegistrationConfig):
     max_gain: float = 4.0
     """The gain must lie between 1 / max_gain and max_gain. A covered lens, which less would find out, has no features
     that agree on a motion."""
+    gray_noise_of_depth: bool = True
+    """Count the error of a sample's depth in the noise of its gray value: robots meet at wide baselines, where gray
+    values are trusted too much without."""
 
 
 class VerificationConfig(GeometricVerificationConfig):

@@ -38,6 +38,9 @@ class RegistrationConfig(Config):
     """Smallest estimated noise of gray values as a multiple of the scale of the depth noise. A camera with poor depth
     also has depth registered to color only to a pixel, and texture turns that pixel into a gray error that is the
     same in all frames; without this the many sharp gray values overrule the depth (RedKitchen: 2.7 cm, with it 2.3)."""
+    gray_noise_of_depth: bool = False
+    """Count the error of a sample's depth in the noise of its gray value: it shifts the sample in the target along its
+    epipolar line, by pixels where the views are meters apart, and by next to nothing between following frames."""
     min_gradient: float = 0.0
     """Gray gradient (1/px) below which a sample's gray value is not used."""
     min_samples: int = 100

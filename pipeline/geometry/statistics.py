@@ -40,12 +40,14 @@ def mad_sigmas(deviations: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(MAD_TO_SIGMA * np.median(np.abs(deviations), axis=0))
 
 
-def huber_divisor(residuals: NDArray[np.floating], limit: float | np.float32) -> NDArray[np.floating]:
+def huber_divisor(
+    residuals: NDArray[np.floating], limit: float | np.float32 | NDArray[np.floating]
+) -> NDArray[np.floating]:
     """Divisor >= 1 of least-squares weights that makes residuals beyond a limit count linearly (Huber 1964).
 
     Args:
         residuals: of any sign.
-        limit: in the unit of the residuals.
+        limit: in the unit of the residuals; one for all, or one each.
     """
     return np.maximum(residuals.dtype.type(1), np.abs(residuals) / limit)
 

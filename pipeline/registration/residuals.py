@@ -6,6 +6,10 @@ For a sample p (reference frame) with normal n and intensity I, seen by the targ
     gray residual    r_g = gray(u) - (gain I + offset)   gain, offset: affine brightness between the views
 
 are each divided by their noise and weighted by Huber's function at a scale from the median absolute deviation.
+
+An error of the depth of a sample moves q along the ray of the reference. With t the reference in the frame of the
+target and p_z the depth of the sample, the gray value that it meets has the standard deviation
+sigma_z |d gray / d q . t| / p_z, which `gray_noise_of_depth` adds to the noise of the gray residual (`_weighted`).
 """
 
 from __future__ import annotations
@@ -22,9 +26,10 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.depth_noise import DepthNoise
 from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma, median
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
-from duagc.pipeline.registration.reference import Reference
+from duagc.pipeline.registration.reference import Reference, ReferenceLevel
 
 Floats = NDArray[np.floating]
+Index = NDArray[np.int64]
 
 MAD_STRIDE = 4  # residuals between those that estimate a scale, where there are thousands
 GATE_SIGMAS = 3  # of depth whose sigma is measured: the gate is no narrower
@@ -163,8 +168,20 @@ def linearize_at(
         depth = depth.nothing()
     floor = max(config.gray_sigma_floor, config.gray_sigma_of_depth * depth.scale)
     images = gray, gu, gv
+    by_depth = None
+    if config.gray_noise_of_depth:
+        ours = seen[agreeing]
+        by_depth = _displacement(samples, ours, T_target_reference[:3, 3], scale=depth.scale, config=config)
     photometric = _gray_residuals(
-        camera, images, intensities, q, exposure=exposure, floor=floor, pixels=(u, v), config=config
+        camera,
+        images,
+        intensities,
+        q,
+        by_depth=by_depth,
+        exposure=exposure,
+        floor=floor,
+        pixels=(u, v),
+        config=config,
     )
     return Linearization(
         depth.nothing() if config.residuals == "gray" else depth,
@@ -231,12 +248,25 @@ def _depth_residuals(
     return _weighted(J, residual, floor=floor, huber_sigmas=config.huber_sigmas, pixels=pixels)
 
 
+def _displacement(
+    samples: ReferenceLevel, index: Index, t: Floats, *, scale: float, config: RegistrationConfig
+) -> Floats:
+    """How far samples lie from where the target sees them by one sigma of their depth, [3, n], but for their own rays.
+
+    The scale of the depth residuals holds the noise of both views, so half of its square is the sample's.
+    """
+    z = samples.points[index, 2]
+    sigma = depth_noise(config).sigma_m(z) if samples.depth_sigmas is None else samples.depth_sigmas[index]
+    return -t[:, None] * (np.float32(scale * np.sqrt(0.5)) * sigma / z)
+
+
 def _gray_residuals(
     camera: PinholeCamera,
     images: tuple[Floats, Floats, Floats],
     intensities: Floats,
     q: Floats,
     *,
+    by_depth: Floats | None,
     exposure: Array,
     floor: float,
     pixels: tuple[Floats, Floats],
@@ -248,6 +278,7 @@ def _gray_residuals(
         keep = np.flatnonzero(gu * gu + gv * gv >= np.float32(config.min_gradient) ** 2)
         gray, gu, gv, intensities = (each.take(keep) for each in (gray, gu, gv, intensities))
         q, pixels = q.take(keep, axis=1), (pixels[0].take(keep), pixels[1].take(keep))
+        by_depth = None if by_depth is None else by_depth.take(keep, axis=1)
     dx, dy = gu * np.float32(camera.fx) / q[2], gv * np.float32(camera.fy) / q[2]
     d = np.stack([dx, dy, -(dx * q[0] + dy * q[1]) / q[2]])
     J = np.empty((len(gray), 8), dtype=np.float32)
@@ -255,7 +286,10 @@ def _gray_residuals(
     J[:, 3], J[:, 4], J[:, 5] = -_cross(q, d)
     J[:, 6], J[:, 7] = -intensities, -1
     residual = gray - (np.float32(exposure[0]) * intensities + np.float32(exposure[1]))
-    return _weighted(J, residual, floor=floor, huber_sigmas=config.huber_sigmas, pixels=pixels)
+    known = None if by_depth is None else np.sum(d * by_depth, axis=0) ** 2
+    return _weighted(
+        J, residual, floor=floor, huber_sigmas=config.huber_sigmas, pixels=pixels, known_variance=known
+    )
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
@@ -268,11 +302,26 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def _weighted(
-    J: Floats, residual: Floats, *, floor: float, huber_sigmas: float, pixels: tuple[Floats, Floats]
+    J: Floats,
+    residual: Floats,
+    *,
+    floor: float,
+    huber_sigmas: float,
+    pixels: tuple[Floats, Floats],
+    known_variance: Floats | None = None,
 ) -> Residuals:
-    """Scale by the median absolute deviation, weights by Huber: w = 1 / (scale^2 max(1, |r| / (k scale)))."""
+    """Scale by the median absolute deviation, weights by Huber: w = 1 / (scale^2 max(1, |r| / (k scale))).
+
+    Where a part of every residual's variance is known [n], the median of it is taken from the square of the scale, to
+    no less than the floor, and its own part is added to that for each residual.
+    """
     magnitude = np.abs(residual)
     part = magnitude[::MAD_STRIDE] if len(magnitude) > 1000 * MAD_STRIDE else magnitude
     scale = max(mad_sigma(part), floor) if len(residual) else floor
-    weight = 1 / (huber_divisor(magnitude, np.float32(huber_sigmas * scale)) * np.float32(scale**2))
+    if known_variance is None or not len(residual):
+        weight = 1 / (huber_divisor(magnitude, np.float32(huber_sigmas * scale)) * np.float32(scale**2))
+    else:
+        rest = max(scale**2 - median(known_variance), floor**2)
+        variance = np.float32(rest) + known_variance
+        weight = 1 / (huber_divisor(magnitude, np.float32(huber_sigmas) * np.sqrt(variance)) * variance)
     return Residuals(J, residual, weight, scale, pixels)

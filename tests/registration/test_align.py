@@ -116,6 +116,42 @@ def test_information_matches_the_scatter_over_noise_draws():
     assert 2 < np.mean(chi2) < 18
 
 
+def mean_chi2_across_a_wide_baseline(**settings: bool) -> float:
+    """Squared errors in the stated covariance, over draws of a noise of depth that shifts samples by a pixel."""
+    first, second = pose(x=-0.8, z=-1.2, yaw=0.24), pose(x=0.8, z=-1.2, yaw=-0.24)
+    truth, chi2 = se3.inverse(first) @ second, []
+    for seed in range(10):
+        noise = np.random.default_rng(seed)
+        views = []
+        for T in (first, second):
+            gray, depth = render(T)
+            edges = np.clip(0.5 + 6 * (gray - 0.5), 0, 1) + 0.005 * noise.standard_normal(gray.shape)
+            depth = depth + 0.01 * (depth / 2) ** 2 * noise.standard_normal(depth.shape)
+            views.append(RgbdPyramid.build(edges.astype(np.float32), depth.astype(np.float32), CAMERA))
+        result = register(Reference.sample(views[0], 1000), views[1], truth, RegistrationConfig(**settings))
+        assert result.ok
+        error = se3.log(se3.inverse(result.T_reference_target) @ truth)
+        chi2.append(error @ result.information @ error)
+    return float(np.mean(chi2))
+
+
+def test_errors_of_depth_count_as_noise_of_gray_values_across_a_wide_baseline():
+    """A sample whose depth is wrong meets another gray value; strong edges say less than their contrast."""
+    careful = mean_chi2_across_a_wide_baseline(gray_noise_of_depth=True)
+    assert 2 < careful < 8  # 6 degrees of freedom, ten draws
+    assert careful < 0.8 * mean_chi2_across_a_wide_baseline()
+
+
+def test_between_views_from_one_place_depth_adds_no_noise_to_gray_values(reference):
+    """The error moves a sample along its ray, which both cameras share."""
+    turned = START @ se3.exp(np.array([0, 0, 0, 0.02, -0.03, 0.01]))
+    views = [
+        register(reference, pyramid(turned), np.eye(4), RegistrationConfig(gray_noise_of_depth=on))
+        for on in (False, True)
+    ]
+    np.testing.assert_allclose(views[1].information, views[0].information, rtol=0.02)
+
+
 def test_information_is_in_the_right_tangent(reference, end):
     information = register(reference, end, T_START_END).information
     np.testing.assert_allclose(information, information.T)
