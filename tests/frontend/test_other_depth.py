@@ -106,11 +106,15 @@ def followed(walk: Walk, kind: str, out: Path, mapping: bool) -> tuple[list, lis
     return odometry, maps[:1], float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
 
 
+@pytest.fixture(scope="module")
+def mapped(walk: Walk, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[list, list, float]]:
+    out = tmp_path_factory.mktemp("mapped")
+    return {kind: followed(walk, kind, out / f"{kind}.mcap", True) for kind in walk.logs}
+
+
 @pytest.mark.parametrize(("kind", "most_m", "most_depth_m"), [("stereo", 0.006, 0.15), ("lidar", 0.004, 0.1)])
-def test_it_tracks_and_maps(
-    walk: Walk, tmp_path: Path, kind: str, most_m: float, most_depth_m: float
-) -> None:
-    odometry, (gaussians,), error_m = followed(walk, kind, tmp_path / "f.mcap", True)
+def test_it_tracks_and_maps(walk: Walk, mapped: dict, kind: str, most_m: float, most_depth_m: float) -> None:
+    odometry, (gaussians,), error_m = mapped[kind]
     assert len(odometry) == FRAMES
     assert error_m < most_m
     errors = []
@@ -122,9 +126,9 @@ def test_it_tracks_and_maps(
 
 
 def test_stereo_is_tracked_better_by_its_sigma_than_by_a_sensor_model(
-    walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    walk: Walk, mapped: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    odometry, _, error_m = followed(walk, "stereo", tmp_path / "stereo.mcap", False)
+    odometry, _, error_m = mapped["stereo"]  # maps change no pose: tests/bench/test_frontend.py
     frame = RgbdLog.frame
     monkeypatch.setattr(RgbdLog, "frame", lambda log, k: replace(frame(log, k), depth_sigma=None))
     model, _, without_m = followed(walk, "stereo", tmp_path / "model.mcap", False)

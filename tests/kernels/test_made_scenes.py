@@ -48,13 +48,13 @@ def assert_agreement(scene: Scene, depth: DepthKind = "blended") -> None:
 depths = st.sampled_from(DEPTH_KINDS)
 
 
-@examples(25)
+@examples(15)
 @given(scene=mixed_scenes(), depth=depths)
 def test_mixed_scenes(scene, depth):
     assert_agreement(scene, depth)
 
 
-@examples(6)
+@examples(4)
 @given(scene=crowded_scenes(most=1500), depth=depths)
 def test_thousands_on_one_pixel(scene, depth):
     assert_agreement(scene, depth)
