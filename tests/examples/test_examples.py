@@ -2,6 +2,7 @@
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -21,7 +22,10 @@ def test_every_numbered_example_is_tested() -> None:
     assert {path.name for path in (ROOT / "examples").glob("[0-9]*.py")} == set(PRINTED)
 
 
-@pytest.mark.parametrize("name", PRINTED)
+TEAM = "04_two_robots.py"  # starts processes itself
+
+
+@pytest.mark.parametrize("name", sorted(set(PRINTED) - {TEAM}))
 def test_example_runs(name: str, tmp_path: Path) -> None:
     out = subprocess.run(
         [sys.executable, ROOT / "examples" / name],
@@ -32,3 +36,13 @@ def test_example_runs(name: str, tmp_path: Path) -> None:
     )
     assert out.returncode == 0, out.stderr
     assert re.search(PRINTED[name], out.stdout), out.stdout
+
+
+def test_the_example_of_a_team_runs(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In this process, which has imported everything and baked the room."""
+    monkeypatch.setattr(sys, "argv", [TEAM])
+    runpy.run_path(str(ROOT / "examples" / TEAM), run_name="__main__")
+    printed = capsys.readouterr().out
+    assert re.search(PRINTED[TEAM], printed), printed
