@@ -15,8 +15,8 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from tests.fixtures.ros_bags import START_NS, STEP_NS, Ros
 
 CAMERA = PinholeCamera(640, 480, 525.0, 525.0, 319.5, 239.5)
-SHORT, LONG = 15, 115
-GROWTH_MB = 30  # the longer bag is 96 MB longer
+SHORT, LONG = 15, 150
+GROWTH_MB = 30  # the longer bag is 130 MB longer
 STEPS = {
     "convert": "from duagc.converters.registry import convert; convert('ros', Path({bag!r}), Path({rec!r}))",
     "info": "from duagc.pipeline.recording import info; info(Path({rec!r}))",
