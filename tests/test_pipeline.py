@@ -188,7 +188,13 @@ def test_a_changed_log_is_mentioned(folder: Path, recording: Path) -> None:
     shutil.copy(changed / "alpha.mcap", changed / "bravo.mcap")  # a sound log, but another one
     said: list[str] = []
     with pytest.raises(DuagError, match="is the log of alpha, expected that of bravo"):
-        run(changed, folder / "run_changed", load_config(RunConfig, overrides=SMALL), log=said.append)
+        run(
+            changed,
+            folder / "run_changed",
+            load_config(RunConfig, overrides=SMALL),
+            workers=1,
+            log=said.append,
+        )
     assert [line for line in said if "warning" in line and "bravo.mcap" in line]
 
 
@@ -200,7 +206,7 @@ def test_a_damaged_log_stops_the_run_with_one_line(folder: Path, recording: Path
     content[len(content) // 2] ^= 1
     log.write_bytes(content)
     with pytest.raises(DuagError, match=r"bravo\.mcap") as caught:
-        make_run(damaged, folder / "run_damaged")
+        make_run(damaged, folder / "run_damaged", workers=1)
     assert "\n" not in str(caught.value)
     assert not list(folder.glob("run_damaged*"))
 
@@ -233,7 +239,7 @@ def test_the_log_of_another_robot_is_refused(folder: Path, recording: Path) -> N
     shutil.copytree(recording, mixed)
     shutil.copyfile(mixed / "alpha.mcap", mixed / "bravo.mcap")
     with pytest.raises(DuagError, match=r"bravo\.mcap: is the log of alpha, expected that of bravo"):
-        make_run(mixed, folder / "run_mixed")
+        make_run(mixed, folder / "run_mixed", workers=1)
     assert not list(folder.glob("run_mixed*"))
 
 

@@ -31,7 +31,9 @@ def assert_same_poses(actual, expected, atol):
     np.testing.assert_allclose(from_first(actual), from_first(expected), atol=atol)
 
 
-@pytest.mark.parametrize(("loss", "limit"), [(0.0, 150), (0.3, 300), (0.6, 600), (0.9, 3000)])
+@pytest.mark.parametrize(
+    ("loss", "limit"), [(0.0, 150), (0.3, 300), (0.6, 600), pytest.param(0.9, 3000, marks=pytest.mark.slow)]
+)
 def test_agents_reach_the_central_optimum_whatever_is_lost(loss, limit):
     world = make_team(0, robots=3, ring=True)
     agents = world.agents(FINE)

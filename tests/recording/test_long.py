@@ -31,15 +31,15 @@ def write_bag(path: Path, frames: int) -> None:
     rng, r = np.random.default_rng(0), Ros(1)
     plain = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
     colors = [cv2.circle(plain.copy(), (50 * k, 200), 40, (90, 200, 50), -1) for k in range(5)]
+    jpegs = [cv2.imencode(".jpg", color)[1].tobytes() for color in colors]
     depths = [2000 + rng.integers(0, 500, plain.shape[:2]).astype(np.uint16) for _ in range(5)]
     topics = ("/c/color/image_raw", "/c/aligned_depth_to_color/image_raw")
     with Writer(path) as bag:
         connections = {}
         for i in range(frames):
             at = START_NS + i * STEP_NS
-            jpeg = cv2.imencode(".jpg", colors[i % 5])[1].tobytes()
             rows = [
-                (f"{topics[0]}/compressed", r.compressed(at, "c", jpeg, "jpeg")),
+                (f"{topics[0]}/compressed", r.compressed(at, "c", jpegs[i % 5], "jpeg")),
                 (topics[1], r.image(at, "c", depths[i % 5], "16UC1")),
             ]
             if i == 0:

@@ -50,7 +50,7 @@ ways_of = cache(planned)  # several tests look at the same ways
 @pytest.mark.parametrize(
     ("paradigm", "robots", "overlap"),
     [
-        ("concentric", 2, 0.6),
+        pytest.param("concentric", 2, 0.6, marks=pytest.mark.slow),
         ("leader-follower", 4, 0.8),
         ("crossing", 3, 0.4),
         ("parallel", 3, 0.6),
