@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -173,6 +173,16 @@ def _known(metrics: dict[str, Any]) -> str:
     ]
 
 
+def _in_exposure(
+    path: str, scores: Mapping[str, Any], meaning: Callable[[str, str, str], str]
+) -> list[tuple[str, str, str]]:
+    """The card of PSNR in the exposure of the view, where frames are not all exposed alike."""
+    name = "psnr_interpolated_db"
+    if scores[name] == scores["psnr_db"]:
+        return []
+    return [(f"{path}.{name}", "PSNR, in exposure", meaning("held_out", name, "in the exposure of the view"))]
+
+
 def _cards(metrics: dict[str, Any], reasons: dict[str, list[str]]) -> list[dict[str, str]]:
     """The few numbers to look at first."""
     own = metrics["rendering"]["own"]
@@ -186,6 +196,7 @@ def _cards(metrics: dict[str, Any], reasons: dict[str, list[str]]) -> list[dict[
         ("team.ate_rmse_m", *labels.TEAM["ate_rmse_m"]),
         ("team.ate_rmse_m_mean_of_robots", *labels.TEAM["ate_rmse_m_mean_of_robots"]),
         (f"{held_out}.psnr_db", "PSNR", meaning("held_out", "psnr_db", "views never mapped")),
+        *_in_exposure(held_out, metrics["rendering"][final]["held_out"], meaning),
         (f"{peers}.psnr_db", "PSNR, peers' views", meaning("peers", "psnr_db", "where the others stood")),
         (
             f"{held_out}.depth_l1_common_m",
