@@ -301,6 +301,8 @@ class ModelConfig(Config):
 
     enabled: bool = False
     """Gains a little on RedKitchen for twice the time of a frame, and harms the depth of a small stereo rig."""
+    color_only: bool = True
+    """Whether frames without depth, followed by their color, are registered to the map."""
     max_sigma_ratio: float = 3.0
     """A frame is moved only if the map determines its position no worse than this many times the keyframe's standard
     deviation: 50 times worse for exact depth, 9 times with simulated Kinect noise, about equally well in RedKitchen."""

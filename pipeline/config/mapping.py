@@ -62,10 +62,17 @@ class MappingConfig(Config):
     """Image pyramid level of these steps: 0 full size, 1 half size."""
     final_iterations: int = 90
     """Steps of the final optimization for every keyframe, at full size, shared by all views."""
+    final_iterations_view: int = 22
+    """The same for every view, keyframe or supporting frame; the larger number of steps counts."""
     final_iterations_max: int = 6000
     """Most steps of the final optimization in all."""
     support_views: int = 40
     """Most tracked frames between keyframes that take part in the final optimization; 0: keyframes only."""
+    pose_rate: float = Field(default=5e-4, ge=0.0)
+    """Largest step of the pose of a view in the final optimization, meters and radians, where depth is not exact; it
+    falls as the learning rates do. 0: poses stay where tracking and pose graph put them."""
+    support_seeds: bool = True
+    """Whether supporting frames insert Gaussians where no keyframe saw anything."""
     densify_rounds: int = 4
     """Times, in the first half of the final optimization, that Gaussians that contribute nothing are pruned and the
     room below the cap is seeded where the keyframes are drawn worst; 0: never. The last round fills the cap."""

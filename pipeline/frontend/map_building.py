@@ -8,7 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from duagc.pipeline.base import progress as progress_bar
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.lap_times import LapTimes
 from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
 from duagc.pipeline.frontend.failure import Reason
@@ -16,6 +19,7 @@ from duagc.pipeline.frontend.mapping import Mapper, MappingStats
 from duagc.pipeline.frontend.model_registration import ModelTracker
 from duagc.pipeline.frontend.output import BuiltMap, Maps
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
+from duagc.pipeline.frontend.view_poses import moved_frames
 from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.messages import Keyframe, MapUpdate
@@ -74,10 +78,26 @@ class MapBuilder:
         clock.lap("mapping_s")
         registered = self._registered(unrefined, keyframes, frames)
         clock.lap("model_s")
-        for frame in supporting_frames(registered, keyframes, self.config):
+        supporting = supporting_frames(registered, keyframes, self.config)
+        for frame in supporting:
             self._support(frame, keyframes[frame.keyframe_index])
         updates.append(self._update(keyframes[-1], self._mapper.finalize()))
-        return BuiltMap(updates, Maps(self._mapper.gaussians, unrefined, self._mapper.depth), registered)
+        maps = Maps(self._mapper.gaussians, unrefined, self._mapper.depth)
+        return BuiltMap(updates, maps, *self._refined_poses(keyframes, registered, supporting))
+
+    def _refined_poses(
+        self,
+        keyframes: Sequence[Keyframe],
+        frames: list[TrackedFrame],
+        supporting: Sequence[TrackedFrame],
+    ) -> tuple[list[TrackedFrame], Array]:
+        """The frames and the poses of the keyframes as the final optimization left them."""
+        before, after = np.array([k.T_map_camera for k in keyframes]), self._mapper.keyframe_poses
+        if np.array_equal(before, after):
+            return frames, before
+        views = {keyframe.frame_index: T for keyframe, T in zip(keyframes, after, strict=True)}
+        views |= {f.frame_index: T for f, T in zip(supporting, self._mapper.support_poses, strict=True)}
+        return moved_frames(frames, before, after, views), after
 
     def _grow(self, keyframe: Keyframe) -> MappingStats:
         """Add a keyframe to the map."""
@@ -121,9 +141,11 @@ class MapBuilder:
         taken = {keyframe.frame_index for keyframe in keyframes}
         registered = []
         for frame in progress_bar.track(frames, f"model {self.log.robot}") if self._progress else frames:
-            usable = frame.status is not Status.LOST and frame.reason is Reason.NONE
-            if model.worthwhile and usable and frame.frame_index not in taken:
-                T_map_keyframe = keyframes[frame.keyframe_index].T_map_camera
+            posed = frame.status is not Status.LOST and frame.frame_index not in taken
+            T_map_keyframe = keyframes[frame.keyframe_index].T_map_camera
+            if posed and frame.reason is Reason.NO_DEPTH:
+                frame = model.register_color(frame, self.log.frame(frame.frame_index), T_map_keyframe)
+            elif posed and frame.reason is Reason.NONE and model.worthwhile:
                 frame = model.register(frame, self.log.frame(frame.frame_index), T_map_keyframe)
             registered.append(frame)
         return registered

@@ -18,6 +18,7 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.frontend.mapping_views import Bytes, Image, View
+from duagc.pipeline.frontend.view_poses import PoseSteps
 from duagc.pipeline.frontend.view_selection import covisible, optimization_window
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -97,6 +98,16 @@ class Mapper:
         """The map so far, in the map frame."""
         return self._gaussians
 
+    @property
+    def keyframe_poses(self) -> NDArray[np.float64]:
+        """Poses [k, 4, 4] of the keyframes; `finalize` refines them."""
+        return np.array([view.T_map_camera for view in self._views]).reshape(-1, 4, 4)
+
+    @property
+    def support_poses(self) -> NDArray[np.float64]:
+        """Poses [m, 4, 4] of the supporting frames, in the order in which they were added; `finalize` refines them."""
+        return np.array([view.T_map_camera for view in self._support]).reshape(-1, 4, 4)
+
     def add_keyframe(
         self,
         keyframe_index: int,
@@ -158,7 +169,7 @@ class Mapper:
     ) -> None:
         """Let a tracked frame that is no keyframe take part in `finalize`.
 
-        It seeds no Gaussians. Never give a frame that is held out for evaluation.
+        It seeds Gaussians only where no keyframe saw anything. Never give a frame that is held out for evaluation.
 
         Args:
             keyframe_index: the keyframe that it is anchored to.
@@ -194,10 +205,13 @@ class Mapper:
         config = self.config
         views = [*self._views, *self._support]
         before = self._mean_loss()
-        inserted = pruned = 0
-        steps = min(config.final_iterations * len(self._views), config.final_iterations_max)
+        inserted, pruned = self._cover()
+        wanted = max(config.final_iterations * len(self._views), config.final_iterations_view * len(views))
+        steps = min(wanted, config.final_iterations_max)
         rounds = [steps * (k + 1) // (2 * config.densify_rounds + 2) for k in range(config.densify_rounds)]
         self._adam.freeze_after(None)
+        self._pose_steps = PoseSteps(len(views))
+        refined = self.depth == "blended"  # else depth is exact, and so are the poses
         order = np.zeros(0, np.int64)
         for step in range(steps):
             position = step % len(views)
@@ -209,9 +223,11 @@ class Mapper:
                 added, removed = self._densify(1.0 / (len(rounds) - rounds.index(step)))
                 inserted, pruned = inserted + added, pruned + removed
             elif step == steps // 2:
-                pruned += self._keep(self._contributions(self._views)[0] >= config.min_contribution)
-            rates = config.rates.times(smoothstep_decay(step, steps, config.final_rate_decay))
-            self._optimize(views[order[position]], 0, rates)
+                pruned += self._keep(self._contributions(views)[0] >= config.min_contribution)
+            share = smoothstep_decay(step, steps, config.final_rate_decay)
+            chosen = int(order[position])
+            rate = config.pose_rate * share if chosen and refined else 0.0
+            self._optimize_final(views, chosen, config.rates.times(share), pose_rate=rate)
         pruned += self._prune_degenerate()
         return MappingStats(inserted, pruned, len(self._gaussians), before, self._mean_loss())
 
@@ -245,6 +261,26 @@ class Mapper:
             rates=rates,
             least_log_scales=np.float32(np.log(self.config.seeding.thickness_m)),
         )
+
+    def _optimize_final(
+        self, views: Sequence[View], chosen: int, rates: LearningRates, *, pose_rate: float
+    ) -> None:
+        """One Adam step of all Gaussians in one view, and of its pose if `pose_rate` is not zero."""
+        view = views[chosen]
+        if not pose_rate:
+            self._optimize(view, 0, rates)
+            return
+        _, gradients = self._step.gradients(self._gaussians, self.cameras[0], view.training(0), pose=True)
+        self._gaussians = self._step.stepped(
+            self._gaussians,
+            gradients,
+            adam=self._adam,
+            rates=rates,
+            least_log_scales=np.float32(np.log(self.config.seeding.thickness_m)),
+        )
+        assert gradients.pose is not None
+        move = self._pose_steps.step(chosen, gradients.pose, pose_rate)
+        view.T_map_camera = view.T_map_camera @ se3.exp(move)
 
     # --- what is in the map -------------------------------------------------------------------------------------
 
@@ -299,13 +335,32 @@ class Mapper:
         self._adam.extend(len(new))
         self._contribution = np.concatenate([self._contribution, np.full(len(new), np.inf)])
 
+    def _cover(self) -> tuple[int, int]:
+        """Insert discs where supporting views see what no keyframe saw; numbers of inserted and pruned Gaussians."""
+        config = self.config
+        if not config.support_seeds or not self._support:
+            return 0, 0
+        inserted = 0
+        for view in self._support:
+            render = self._draw(view, 0)
+            color, depth_m = view.images(0)
+            thin = (depth_m > 0) & (render.alpha < config.seeding.min_alpha)
+            new = self._discs(
+                view, color, depth_m, thin, budget=int(config.keyframe_share * config.max_gaussians)
+            )
+            self._append(new)
+            inserted += len(new)
+        self._contribution = self._contributions([*self._views, *self._support])[0]
+        return inserted, self._prune_least(max(0, len(self._gaussians) - config.max_gaussians))
+
     def _densify(self, share: float) -> tuple[int, int]:
         """Replace what contributes nothing by discs where keyframes are drawn worst; numbers inserted and pruned.
 
         `share` of the room below the cap is used. Every keyframe gets an equal part of it, in turn, and sees what
         those before it inserted; no more than an eighth of its finest cells is seeded.
         """
-        pruned = self._keep(self._contributions(self._views)[0] >= self.config.min_contribution)
+        everything = [*self._views, *self._support]
+        pruned = self._keep(self._contributions(everything)[0] >= self.config.min_contribution)
         room = int(share * (self.config.max_gaussians - len(self._gaussians)))
         inserted = 0
         for k, view in enumerate(self._views):

@@ -83,6 +83,23 @@ class ModelTracker:
         self._unchanged = 0
         return replace(tracked, T_keyframe_camera=tracked.T_keyframe_camera @ found.T_reference_target)
 
+    def register_color(self, tracked: TrackedFrame, frame: RgbdFrame, T_map_keyframe: Array) -> TrackedFrame:
+        """Register the color of a frame without depth of its own to the map, which has depth wherever it was drawn.
+
+        What followed it before was the depth of another frame, and the error grew from frame to frame.
+
+        Args:
+            tracked: by its color alone.
+            frame: its images.
+            T_map_keyframe: [4, 4], of the keyframe that it is anchored to.
+        """
+        if not self.config.color_only:
+            return tracked
+        found = self._register(frame, T_map_keyframe @ tracked.T_keyframe_camera, tracked.information)
+        if not found.ok:
+            return tracked
+        return replace(tracked, T_keyframe_camera=tracked.T_keyframe_camera @ found.T_reference_target)
+
     def _register(self, frame: RgbdFrame, T_map_camera: Array, information: Array) -> Registration:
         """The frame against the map drawn at T_map_camera, known with `information`; the motion is from there."""
         drawn = self._rasterizer.forward(

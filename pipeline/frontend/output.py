@@ -58,11 +58,13 @@ class BuiltMap:
         updates: one per keyframe, and one for the final optimization.
         maps: before and after the final optimization.
         frames: of the log, those between keyframes registered to the map where that helped.
+        T_map_keyframe: [k, 4, 4], poses of the keyframes, refined with the map.
     """
 
     updates: list[MapUpdate]
     maps: Maps
     frames: list[TrackedFrame]
+    T_map_keyframe: Array
 
 
 def keyframe_messages(

@@ -8,7 +8,7 @@ The stage is offline in this sense; times in the log are those of the recording 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,6 +41,7 @@ from duagc.pipeline.frontend.pose_optimization import PathOptimization
 from duagc.pipeline.frontend.submap_joining import join_submaps
 from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
+from duagc.pipeline.frontend.view_poses import moved_factors
 from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.messages import Keyframe
@@ -219,7 +220,6 @@ class _ComponentStage:
         solution, frames = optimized.solution, optimized.frames
         log.move_depth(_trajectory(frames, solution.T_map_keyframe))
         keyframes = keyframe_messages(self.name, optimized.keyframes, solution)
-        factors = factor_messages(self.name, optimized.keyframes, optimized.factors, solution)
         estimation = ExposureEstimation(log.frame, log.camera, self.config.exposure)
         exposures = estimation.run(
             [keyframe.frame_index for keyframe in keyframes],
@@ -230,18 +230,20 @@ class _ComponentStage:
         clock.lap("refinement_s")
         built = self._map(keyframes, frames, exposures)
         clock.lap("final_refinement_s")
+        refined = replace(solution, T_map_keyframe=built.T_map_keyframe)
+        moved = moved_factors(optimized.factors, solution, built.T_map_keyframe)
         notes = {
             "color_without_depth": str(len(log.pairing.color_alone)),
             "depth_without_color": str(len(log.pairing.depth_alone)),
             "depth_noise_m": "unknown" if self.noise_m is None else f"{self.noise_m:.6f}",
         }
-        odometry = [odometry_message(self.name, frame, solution.T_map_keyframe) for frame in built.frames]
+        odometry = [odometry_message(self.name, frame, refined.T_map_keyframe) for frame in built.frames]
         write_log(
             path,
             self.name,
             odometry,
-            keyframes=keyframes,
-            factors=factors,
+            keyframes=keyframe_messages(self.name, optimized.keyframes, refined),
+            factors=factor_messages(self.name, optimized.keyframes, moved, refined),
             exposures=exposure_messages(self.name, exposures, odometry),
             updates=built.updates,
             submaps=submap_messages(self.name, component, tracked),
@@ -257,7 +259,7 @@ class _ComponentStage:
         if not self.config.mapping_enabled:
             self.clock.lap("mapping_s")
             maps = Maps(Gaussians.empty(), None, self.config.mapping.depth_kind(self.noise_m))
-            return BuiltMap([], maps, frames)
+            return BuiltMap([], maps, frames, np.array([k.T_map_camera for k in keyframes]))
         from duagc.pipeline.frontend.map_building import MapBuilder
 
         builder = MapBuilder(

@@ -54,9 +54,16 @@ class TrainingStep:
     depth_kind: DepthKind
 
     def gradients(
-        self, gaussians: Gaussians, camera: PinholeCamera, view: TrainingView
+        self, gaussians: Gaussians, camera: PinholeCamera, view: TrainingView, *, pose: bool = False
     ) -> tuple[ViewLoss, Gradients]:
-        """Loss of a view and its derivatives by the Gaussians."""
+        """Loss of a view and its derivatives by the Gaussians.
+
+        Args:
+            gaussians: in the frame of the view's pose.
+            camera: of the view.
+            view: an image with its pose.
+            pose: also differentiate by the right tangent of the pose.
+        """
         return self.rasterizer.view_gradients(
             gaussians,
             camera,
@@ -67,6 +74,7 @@ class TrainingStep:
             mask=view.mask,
             depth_kind=self.depth_kind,
             depth_certainty=view.depth_certainty,
+            pose=pose,
         )
 
     def __call__(
@@ -90,10 +98,31 @@ class TrainingStep:
             least_log_scales: log of meters, one for all or [n, 3]; no log-scale falls below.
         """
         loss, gradients = self.gradients(gaussians, camera, view)
+        return self.stepped(
+            gaussians, gradients, adam=adam, rates=rates, least_log_scales=least_log_scales
+        ), loss
+
+    @staticmethod
+    def stepped(
+        gaussians: Gaussians,
+        gradients: Gradients,
+        *,
+        adam: CompiledAdam,
+        rates: LearningRates,
+        least_log_scales: NDArray[np.float32] | np.float32,
+    ) -> Gaussians:
+        """The Gaussians after one step of Adam, within their limits.
+
+        Args:
+            gaussians: as many as `adam` has a state of.
+            gradients: of the loss by them.
+            adam: state of the optimization; changed.
+            rates: step lengths.
+            least_log_scales: log of meters, one for all or [n, 3]; no log-scale falls below.
+        """
         stepped = adam.step(gaussians, gradients, rates)
         limit = np.float32(LARGEST_LOGIT)
-        limited = stepped.replace(
+        return stepped.replace(
             log_scales=np.maximum(stepped.log_scales, least_log_scales),
             opacity_logits=np.clip(stepped.opacity_logits, -limit, limit),
         )
-        return limited, loss

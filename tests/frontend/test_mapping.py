@@ -144,6 +144,43 @@ def test_views_between_keyframes_help() -> None:
     assert drawn(helped, between)[0] > drawn(alone, between)[0] + 0.5
 
 
+def _wrong_by_m(mapper: Mapper, T_true: np.ndarray) -> float:
+    """Distance of the last keyframe from where it was."""
+    return float(se3.distance(mapper.keyframe_poses[-1], T_true)[0])
+
+
+@pytest.mark.parametrize("noise_m", [0.005, 0.0005])
+def test_a_pose_that_is_off_is_refined_unless_depth_is_exact(noise_m: float) -> None:
+    """Exact depth gives exact poses: what the map could add is less than what it lacks. A pixel is 6 cm here."""
+    config = MappingConfig(max_gaussians=4000, iterations=12, final_iterations=40, pose_rate=0.004)
+    mapper = Mapper(CAMERA, config, seed=5, depth_noise_m=noise_m)
+    off = POSES[2] @ se3.exp(np.array([0.06, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    for k, T in enumerate((POSES[0], POSES[1], off)):
+        mapper.add_keyframe(k, *shot(POSES[k]), T)
+    before_m = _wrong_by_m(mapper, POSES[2])
+    mapper.finalize()
+    np.testing.assert_array_equal(mapper.keyframe_poses[0], POSES[0])
+    if noise_m > config.exact_depth_m:
+        assert _wrong_by_m(mapper, POSES[2]) < 0.5 * before_m
+    else:
+        assert _wrong_by_m(mapper, POSES[2]) == before_m
+
+
+def test_what_only_a_supporting_view_saw_is_mapped() -> None:
+    config = MappingConfig(max_gaussians=4000, iterations=12, final_iterations=30)
+    aside = POSES[0] @ se3.exp(np.array([-0.3, 0.0, 0.0, 0.0, -0.6, 0.0]))
+    color, depth = shot(aside)
+    seen = {}
+    for seeds in (True, False):
+        mapper = Mapper(CAMERA, config.model_copy(update={"support_seeds": seeds}), seed=5)
+        mapper.add_keyframe(0, *shot(POSES[0]), POSES[0])
+        mapper.add_view(0, color, depth, se3.inverse(POSES[0]) @ aside)
+        mapper.finalize()
+        seen[seeds] = drawn(mapper, mapper.support_poses[0])[2]
+    assert seen[True] > 0.97
+    assert seen[False] < 0.8
+
+
 def test_a_map_without_anything_stays_empty() -> None:
     mapper = Mapper(CAMERA, QUICK, seed=0)
     assert mapper.finalize() == MappingStats(0, 0, 0, 0.0, 0.0)
