@@ -18,7 +18,7 @@ from duagc.pipeline.base import random_streams
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.frontend.mapping_views import Bytes, Image, View
-from duagc.pipeline.frontend.view_poses import PoseSteps
+from duagc.pipeline.frontend.view_poses import PoseStep, PoseSteps
 from duagc.pipeline.frontend.view_selection import covisible, optimization_window
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -194,7 +194,7 @@ class Mapper:
         self._support.append(view)
 
     def finalize(self) -> MappingStats:
-        """Optimize geometry and color over all views: `final_iterations` steps for each keyframe, at full size.
+        """Optimize geometry, color and, where depth is not exact, poses over all views at full size.
 
         The views come in random order, each once before any comes again. In the first half, what contributes
         nothing is replaced `densify_rounds` times by discs where the keyframes are drawn worst.
@@ -210,8 +210,8 @@ class Mapper:
         steps = min(wanted, config.final_iterations_max)
         rounds = [steps * (k + 1) // (2 * config.densify_rounds + 2) for k in range(config.densify_rounds)]
         self._adam.freeze_after(None)
-        self._pose_steps = PoseSteps(len(views))
-        refined = self.depth == "blended"  # else depth is exact, and so are the poses
+        poses = PoseSteps(len(views))
+        refined = self.depth == "blended" and config.pose_rate > 0  # where depth is exact, so are the poses
         order = np.zeros(0, np.int64)
         for step in range(steps):
             position = step % len(views)
@@ -226,8 +226,8 @@ class Mapper:
                 pruned += self._keep(self._contributions(views)[0] >= config.min_contribution)
             share = smoothstep_decay(step, steps, config.final_rate_decay)
             chosen = int(order[position])
-            rate = config.pose_rate * share if chosen and refined else 0.0
-            self._optimize_final(views, chosen, config.rates.times(share), pose_rate=rate)
+            pose_step = poses.of(chosen, config.pose_rate * share) if refined and chosen else None
+            self._optimize(views[chosen], 0, config.rates.times(share), pose_step=pose_step)
         pruned += self._prune_degenerate()
         return MappingStats(inserted, pruned, len(self._gaussians), before, self._mean_loss())
 
@@ -251,26 +251,13 @@ class Mapper:
     def _mean_loss(self) -> float:
         return float(np.mean([self._loss(view, 0) for view in self._views])) if self._views else 0.0
 
-    def _optimize(self, view: View, level: int, rates: LearningRates) -> None:
-        """One Adam step of all Gaussians in one view."""
-        self._gaussians, _ = self._step(
-            self._gaussians,
-            self.cameras[level],
-            view.training(level),
-            adam=self._adam,
-            rates=rates,
-            least_log_scales=np.float32(np.log(self.config.seeding.thickness_m)),
-        )
-
-    def _optimize_final(
-        self, views: Sequence[View], chosen: int, rates: LearningRates, *, pose_rate: float
+    def _optimize(
+        self, view: View, level: int, rates: LearningRates, *, pose_step: PoseStep | None = None
     ) -> None:
-        """One Adam step of all Gaussians in one view, and of its pose if `pose_rate` is not zero."""
-        view = views[chosen]
-        if not pose_rate:
-            self._optimize(view, 0, rates)
-            return
-        _, gradients = self._step.gradients(self._gaussians, self.cameras[0], view.training(0), pose=True)
+        """One Adam step of all Gaussians in one view, and of its pose where a step of it is given."""
+        _, gradients = self._step.gradients(
+            self._gaussians, self.cameras[level], view.training(level), pose=pose_step is not None
+        )
         self._gaussians = self._step.stepped(
             self._gaussians,
             gradients,
@@ -278,9 +265,8 @@ class Mapper:
             rates=rates,
             least_log_scales=np.float32(np.log(self.config.seeding.thickness_m)),
         )
-        assert gradients.pose is not None
-        move = self._pose_steps.step(chosen, gradients.pose, pose_rate)
-        view.T_map_camera = view.T_map_camera @ se3.exp(move)
+        if pose_step is not None and gradients.pose is not None:
+            view.T_map_camera = view.T_map_camera @ se3.exp(pose_step(gradients.pose))
 
     # --- what is in the map -------------------------------------------------------------------------------------
 

@@ -9,8 +9,9 @@ tracking; what one view had alone, another frame has not.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -32,6 +33,10 @@ SMALLEST_DEVIATION = 1e-3
 """Of a move from the median, meters and radians: what is nearer counts as equal."""
 
 
+PoseStep: TypeAlias = Callable[[Array], Array]
+"""From the gradient [6] by the right tangent of a pose to the tangent by which it moves."""
+
+
 class PoseSteps:
     """Adam on the poses of views, each by its own gradients."""
 
@@ -44,6 +49,15 @@ class PoseSteps:
         self._first = np.zeros((views, 6))
         self._second = np.zeros((views, 6))
         self._visits = np.zeros(views, np.int64)
+
+    def of(self, view: int, rate: float) -> PoseStep:
+        """The next step of a view, once its gradient is known.
+
+        Args:
+            view: its position.
+            rate: as of `step`.
+        """
+        return lambda gradient: self.step(view, gradient, rate)
 
     def step(self, view: int, gradient: Array, rate: float) -> Array:
         """How a view moves: a right tangent [6] of its pose (translation m, rotation rad).
