@@ -265,7 +265,8 @@ class Mapper:
             rates=rates,
             least_log_scales=np.float32(np.log(self.config.seeding.thickness_m)),
         )
-        if pose_step is not None and gradients.pose is not None:
+        if pose_step is not None:
+            assert gradients.pose is not None  # it was asked for
             view.T_map_camera = view.T_map_camera @ se3.exp(pose_step(gradients.pose))
 
     # --- what is in the map -------------------------------------------------------------------------------------
