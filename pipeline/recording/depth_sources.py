@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -13,6 +14,8 @@ from numpy.typing import NDArray
 from duagc.pipeline import messages
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.statistics import evenly_spaced
+from duagc.pipeline.recording.depth_steps import COARSE_PER_M, inverse_step_per_m, without_steps
 from duagc.pipeline.recording.lidar import lidar_depth
 from duagc.pipeline.recording.names import DEPTH_SCALE_KEY, RANGE_SIGMA_KEY
 from duagc.pipeline.recording.read import LogFile, Record
@@ -20,6 +23,9 @@ from duagc.pipeline.recording.register_depth import register_depth
 from duagc.schemas import topics as topic_table
 
 Value = TypeVar("Value")
+
+STEP_IMAGES = 5
+"""Depth images, spread over the log, in which the steps of a sensor are looked for."""
 
 
 @dataclass(frozen=True)
@@ -64,13 +70,14 @@ class Registered:
     def __init__(self, log: LogFile, robot: str, camera: PinholeCamera) -> None:
         self.topic, self.camera = topic_table.DEPTH.of(robot), camera
         self.scale = _meters(log, self.topic, DEPTH_SCALE_KEY)
+        self._steps = _Steps(log, self.topic, self.scale, camera)
         self._log, self._sigma_topic = log, topic_table.DEPTH_SIGMA.of(robot)
         self._sigma_at = log.entries_by_time(self._sigma_topic)
         if self._sigma_at:
             self._sigma_scale = _meters(log, self._sigma_topic, DEPTH_SCALE_KEY)
 
     def read(self, record: Record) -> DepthImage:
-        depth_m = _depth_image(record, self.scale, self.camera)
+        depth_m = self._steps.smoothed(_depth_image(record, self.scale, self.camera))
         if not self._sigma_at:
             return DepthImage(depth_m)
         entry = self._sigma_at.get(record.publish_time_ns)
@@ -93,9 +100,10 @@ class OtherCamera:
         self.depth_camera = constant(log, calibration, messages.unpack_calibration)
         transform = topic_table.RAW_DEPTH_TRANSFORM.of(robot)
         self.T_camera_depth = np.array(constant(log, transform, transform_rows))
+        self._steps = _Steps(log, self.topic, self.scale, self.depth_camera)
 
     def read(self, record: Record) -> DepthImage:
-        depth_m = _depth_image(record, self.scale, self.depth_camera)
+        depth_m = self._steps.smoothed(_depth_image(record, self.scale, self.depth_camera))
         return DepthImage(register_depth(depth_m, self.depth_camera, self.T_camera_depth, self.camera))
 
 
@@ -116,6 +124,24 @@ class Lidar:
         range_sigma_m = self._range_sigma_m or 0.0
         depth_m, sigma_m = lidar_depth(points, self.T_camera_lidar, self.camera, range_sigma_m)
         return DepthImage(depth_m, sigma_m if range_sigma_m else None)
+
+
+class _Steps:
+    """Takes the steps out of the depth images of a topic, where they are coarse; found in some of its images."""
+
+    def __init__(self, log: LogFile, topic: str, scale: float, camera: PinholeCamera) -> None:
+        self._log, self._topic, self._scale, self._camera = log, topic, scale, camera
+
+    @cached_property
+    def _step_per_m(self) -> float:
+        entries = self._log.entries(self._topic)
+        some = [entries[k] for k in evenly_spaced(len(entries), min(STEP_IMAGES, len(entries)))]
+        records = [self._log.record_at(self._topic, entry) for entry in some]
+        return inverse_step_per_m([_depth_image(r, self._scale, self._camera) for r in records], self._scale)
+
+    def smoothed(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """A depth image as it is, or without steps if they are coarse."""
+        return without_steps(depth_m, self._step_per_m) if self._step_per_m >= COARSE_PER_M else depth_m
 
 
 def constant(log: LogFile, topic: str, unpack: Callable[[Any], Value]) -> Value:
