@@ -297,22 +297,15 @@ class TrackingConfig(Config):
 
 
 class ModelConfig(Config):
-    """Registering frames between keyframes to the map, once it is grown."""
+    """Registering the color of frames to the finished map."""
 
-    enabled: bool = False
-    """Gains a little on RedKitchen for twice the time of a frame, and harms the depth of a small stereo rig."""
-    color_only: bool = True
-    """Whether frames without depth, followed by their color, are registered to the map."""
-    max_sigma_ratio: float = 3.0
-    """A frame is moved only if the map determines its position no worse than this many times the keyframe's standard
-    deviation: 50 times worse for exact depth, 9 times with simulated Kinect noise, about equally well in RedKitchen."""
-    patience: int = 60
-    """Frames in a row that are not moved after which no other is tried."""
-    level: int = 1
-    """Image size at which the map is drawn: 0 full, 1 half."""
+    enabled: bool = True
+    """Where depth is not exact, frames that did not make the map are registered to it; so are those without depth."""
+    max_pixels: int = Field(default=160_000, ge=1)
+    """The map is drawn at the image size halved until it has no more pixels: half of 640 x 480, but 320 x 240 whole."""
     min_alpha: float = 0.9
     """Opacity of the drawn map below which a pixel is not used."""
-    strides: tuple[int, ...] = (2, 1, 1)
+    strides: tuple[int, ...] = (2, 2, 1)
     """Pixels between samples of the drawn map, finest level first."""
 
 

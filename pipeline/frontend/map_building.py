@@ -1,7 +1,7 @@
 """The map of a component, grown at the poses of its keyframes and optimized with other frames too.
 
-All images are brought to one exposure, that of the map. The frames between keyframes are registered to the grown map
-where that helps, and some of them, never held-out ones, support its final optimization.
+All images are brought to one exposure, that of the map. Some frames between keyframes, never held-out ones, support its
+final optimization; the others are registered to the finished map where depth is not exact.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class MapBuilder:
     def build(
         self, keyframes: Sequence[Keyframe], frames: Sequence[TrackedFrame], clock: LapTimes
     ) -> BuiltMap:
-        """Grow the map, register the other frames to it, and optimize it.
+        """Grow the map, optimize it, and register the other frames to it.
 
         Args:
             keyframes: with their optimized poses.
@@ -76,28 +76,20 @@ class MapBuilder:
         updates = [self._update(keyframe, self._grow(keyframe)) for keyframe in steps]
         unrefined = self._mapper.gaussians
         clock.lap("mapping_s")
-        registered = self._registered(unrefined, keyframes, frames)
-        clock.lap("model_s")
-        supporting = supporting_frames(registered, keyframes, self.config)
+        supporting = supporting_frames(frames, keyframes, self.config)
         for frame in supporting:
             self._support(frame, keyframes[frame.keyframe_index])
         updates.append(self._update(keyframes[-1], self._mapper.finalize()))
+        clock.lap("final_refinement_s")
         maps = Maps(self._mapper.gaussians, unrefined, self._mapper.depth)
-        return BuiltMap(updates, maps, *self._refined_poses(keyframes, registered, supporting))
-
-    def _refined_poses(
-        self,
-        keyframes: Sequence[Keyframe],
-        frames: list[TrackedFrame],
-        supporting: Sequence[TrackedFrame],
-    ) -> tuple[list[TrackedFrame], Array]:
-        """The frames and the poses of the keyframes as the final optimization left them."""
         before, after = np.array([k.T_map_camera for k in keyframes]), self._mapper.keyframe_poses
-        if np.array_equal(before, after):
-            return frames, before
         views = {keyframe.frame_index: T for keyframe, T in zip(keyframes, after, strict=True)}
         views |= {f.frame_index: T for f, T in zip(supporting, self._mapper.support_poses, strict=True)}
-        return moved_frames(frames, before, after, views), after
+        if not np.array_equal(before, after):
+            frames = moved_frames(frames, before, after, views)
+        registered = self._registered(frames, after, frozenset(views))
+        clock.lap("model_s")
+        return BuiltMap(updates, maps, registered, after)
 
     def _grow(self, keyframe: Keyframe) -> MappingStats:
         """Add a keyframe to the map."""
@@ -110,6 +102,7 @@ class MapBuilder:
             mask=self._free.usable(frame.usable_depth, keyframe.T_map_camera, frame.mask),
             depth_sigma_m=frame.depth_sigma,
             exposure=self.exposures.at(frame.index),
+            information=keyframe.information,
         )
 
     def _support(self, supporting: TrackedFrame, keyframe: Keyframe) -> None:
@@ -124,31 +117,34 @@ class MapBuilder:
             mask=self._free.usable(frame.usable_depth, T_map_camera, frame.mask),
             depth_sigma_m=frame.depth_sigma,
             exposure=self.exposures.at(frame.index),
+            information=supporting.information,
         )
 
     def _registered(
-        self, gaussians: Gaussians, keyframes: Sequence[Keyframe], frames: Sequence[TrackedFrame]
+        self, frames: Sequence[TrackedFrame], T_map_keyframe: Array, views: frozenset[int]
     ) -> list[TrackedFrame]:
-        """The frames with those between keyframes registered to the map, where that helps."""
+        """The frames with those that did not make the map registered to it, where that says more than tracking.
+
+        T_map_keyframe: [k, 4, 4]. views: indices of the frames that made the map.
+        """
+        if not self.config.model.enabled:
+            return list(frames)
         model = ModelTracker(
-            gaussians,
+            self._mapper.gaussians,
             self._mapper.depth,
             self.log.camera,
             self.config.model,
             registration=self.config.tracking.registration,
             threads=self._threads,
         )
-        taken = {keyframe.frame_index for keyframe in keyframes}
-        registered = []
-        for frame in progress_bar.track(frames, f"model {self.log.robot}") if self._progress else frames:
-            posed = frame.status is not Status.LOST and frame.frame_index not in taken
-            T_map_keyframe = keyframes[frame.keyframe_index].T_map_camera
-            if posed and frame.reason is Reason.NO_DEPTH:
-                frame = model.register_color(frame, self.log.frame(frame.frame_index), T_map_keyframe)
-            elif posed and frame.reason is Reason.NONE and model.worthwhile:
-                frame = model.register(frame, self.log.frame(frame.frame_index), T_map_keyframe)
-            registered.append(frame)
-        return registered
+        reasons = {Reason.NO_DEPTH} if self._mapper.exact_depth else {Reason.NO_DEPTH, Reason.NONE}
+        out = []
+        for frame in progress_bar.track(frames, f"registering {self.name}") if self._progress else frames:
+            if frame.status is not Status.LOST and frame.reason in reasons and frame.frame_index not in views:
+                images = self.log.frame(frame.frame_index)
+                frame = model.register(frame, images, T_map_keyframe[frame.keyframe_index])
+            out.append(frame)
+        return out
 
     def _update(self, keyframe: Keyframe, stats: MappingStats) -> MapUpdate:
         """The message about a step of mapping."""

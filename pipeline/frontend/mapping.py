@@ -99,6 +99,11 @@ class Mapper:
         return self._gaussians
 
     @property
+    def exact_depth(self) -> bool:
+        """Whether the map has the depth kind of exact depth images."""
+        return self.depth == "ray_plane"
+
+    @property
     def keyframe_poses(self) -> NDArray[np.float64]:
         """Poses [k, 4, 4] of the keyframes; `finalize` refines them."""
         return np.array([view.T_map_camera for view in self._views]).reshape(-1, 4, 4)
@@ -118,6 +123,7 @@ class Mapper:
         mask: NDArray[np.bool_] | None = None,
         depth_sigma_m: Image | None = None,
         exposure: Exposure | None = None,
+        information: NDArray[np.float64] | None = None,
     ) -> MappingStats:
         """Seed what the map does not explain of a new keyframe and optimize the window around it.
 
@@ -129,6 +135,7 @@ class Mapper:
             mask: bool [H, W], False where a pixel neither seeds nor counts in a loss; None = all count.
             depth_sigma_m: [H, W], standard deviation of the depth, meters; None: not known pixel by pixel.
             exposure: of the image; None: as the map.
+            information: [6, 6] of the pose; None: nothing is known of it.
         """
         if keyframe_index != len(self._views):
             raise ValueError(f"keyframe {keyframe_index} added after {len(self._views)} keyframes")
@@ -141,6 +148,7 @@ class Mapper:
             depth_sigma_m=depth_sigma_m,
             huber_m=self._loss_weights.depth_huber_m,
             exposure=exposure,
+            information=information,
         )
         self._views.append(view)
         self._adam.freeze_after(self.config.stable_steps or None)
@@ -166,6 +174,7 @@ class Mapper:
         mask: NDArray[np.bool_] | None = None,
         depth_sigma_m: Image | None = None,
         exposure: Exposure | None = None,
+        information: NDArray[np.float64] | None = None,
     ) -> None:
         """Let a tracked frame that is no keyframe take part in `finalize`.
 
@@ -179,6 +188,7 @@ class Mapper:
             mask: bool [H, W], False where a pixel does not count; None = all count.
             depth_sigma_m: [H, W], standard deviation of the depth, meters; None: not known pixel by pixel.
             exposure: of the image; None: as the map.
+            information: [6, 6] of the pose; None: nothing is known of it.
         """
         T_map_camera = self._views[keyframe_index].T_map_camera @ T_keyframe_camera
         view = View.of(
@@ -190,6 +200,7 @@ class Mapper:
             depth_sigma_m=depth_sigma_m,
             huber_m=self._loss_weights.depth_huber_m,
             exposure=exposure,
+            information=information,
         )
         self._support.append(view)
 
@@ -210,8 +221,8 @@ class Mapper:
         steps = min(wanted, config.final_iterations_max)
         rounds = [steps * (k + 1) // (2 * config.densify_rounds + 2) for k in range(config.densify_rounds)]
         self._adam.freeze_after(None)
-        poses = PoseSteps(len(views))
-        refined = self.depth == "blended" and config.pose_rate > 0  # where depth is exact, so are the poses
+        poses = PoseSteps([view.information for view in views])
+        refined = config.pose_rate > 0 and not self.exact_depth  # where depth is exact, so are the poses
         order = np.zeros(0, np.int64)
         for step in range(steps):
             position = step % len(views)

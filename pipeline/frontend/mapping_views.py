@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ class View:
         certainty: [H, W], factors of the depth residuals (`splat.losses.depth_certainty`); None = all 1.
         half_certainty: at half size.
         exposure: of the image; None = as the map.
+        information: [6, 6] of the pose, by tracking (right tangent: translation m, rotation rad).
     """
 
     index: int
@@ -50,6 +51,7 @@ class View:
     certainty: Image | None = None
     half_certainty: Image | None = None
     exposure: Exposure | None = None
+    information: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)))
 
     @classmethod
     def of(
@@ -63,6 +65,7 @@ class View:
         depth_sigma_m: Image | None,
         huber_m: float,
         exposure: Exposure | None = None,
+        information: NDArray[np.float64] | None = None,
     ) -> View:
         """A view of images that are kept, not copied, but for depth where a mask forbids pixels.
 
@@ -75,6 +78,7 @@ class View:
             depth_sigma_m: [H, W], standard deviation of the depth, meters; None = not known pixel by pixel.
             huber_m: depth sigmas up to it change nothing.
             exposure: of the image; None = as the map.
+            information: [6, 6] of the pose; None = nothing is known of it.
         """
         if color.dtype != np.uint8:
             raise ValueError(f"color is an array of {color.dtype}, expected uint8")
@@ -97,6 +101,7 @@ class View:
             certainty=certainty,
             half_certainty=None if certainty is None else halve(certainty),
             exposure=exposure,
+            information=np.zeros((6, 6)) if information is None else information,
         )
 
     @property

@@ -1,7 +1,7 @@
 """The front-end stage: from one robot's sensor log to its odometry, keyframes and Gaussian map.
 
 Passes over the log: all frames are tracked; the keyframe poses are optimized together, with loop closures; the map is
-grown at these poses; the other frames are registered to it where that helps. Frames are anchored to keyframes.
+made at these poses; the other frames are registered to it where that helps. Frames are anchored to keyframes.
 The stage is offline in this sense; times in the log are those of the recording all the same.
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -48,9 +47,6 @@ from duagc.pipeline.messages import Keyframe
 from duagc.pipeline.recording import RgbdLog, open_rgbd
 from duagc.pipeline.registration import RgbdPyramid
 from duagc.pipeline.splat.gaussians import Gaussians
-
-if TYPE_CHECKING:
-    pass
 
 
 def run_frontend(
@@ -229,7 +225,6 @@ class _ComponentStage:
         )
         clock.lap("refinement_s")
         built = self._map(keyframes, frames, exposures)
-        clock.lap("final_refinement_s")
         refined = replace(solution, T_map_keyframe=built.T_map_keyframe)
         moved = moved_factors(optimized.factors, solution, built.T_map_keyframe)
         notes = {

@@ -24,6 +24,8 @@ from duagc.pipeline.posegraph.relative_poses import RelativePose
 FIRST_MOMENT, SECOND_MOMENT = 0.8, 0.9
 """Memory of Adam, in visits of a view; a view is visited a few dozen times."""
 EPSILON = 1e-12
+LARGEST_SIGMA = 0.01
+"""Standard deviation of a pose, meters and radians, from which a view moves no faster."""
 SHARED_S = 0.2
 """Time over which frames share an error of tracking (standard deviation of the weights)."""
 FARTHEST = 1e-9
@@ -38,14 +40,20 @@ PoseStep: TypeAlias = Callable[[Array], Array]
 
 
 class PoseSteps:
-    """Adam on the poses of views, each by its own gradients."""
+    """Adam on the poses of views, each by its own gradients and in units of what tracking left open.
 
-    def __init__(self, views: int) -> None:
+    A pose that tracking determined well moves little, and one that it determined poorly moves most where it is open.
+    """
+
+    def __init__(self, information: Sequence[Array]) -> None:
         """Begin with no gradient.
 
         Args:
-            views: how many there are.
+            information: [6, 6] of the pose of every view, by tracking.
         """
+        views = len(information)
+        floor = LARGEST_SIGMA**-2.0 * np.eye(6)
+        self._roots = [np.linalg.cholesky(np.linalg.inv(of_view + floor)) for of_view in information]
         self._first = np.zeros((views, 6))
         self._second = np.zeros((views, 6))
         self._visits = np.zeros(views, np.int64)
@@ -65,15 +73,16 @@ class PoseSteps:
         Args:
             view: its position.
             gradient: [6], of the loss by that tangent.
-            rate: length of the step, meters and radians, while the gradient keeps its sign.
+            rate: length of the step, in standard deviations of the pose, while the gradient keeps its sign.
         """
+        gradient = self._roots[view].T @ gradient
         self._visits[view] += 1
         visits = int(self._visits[view])
         first = self._first[view] = FIRST_MOMENT * self._first[view] + (1 - FIRST_MOMENT) * gradient
         second = self._second[view] = SECOND_MOMENT * self._second[view] + (1 - SECOND_MOMENT) * gradient**2
         mean = first / (1 - FIRST_MOMENT**visits)
         spread = np.sqrt(second / (1 - SECOND_MOMENT**visits))
-        return np.asarray(-rate * mean / (spread + EPSILON))
+        return np.asarray(self._roots[view] @ (-rate * mean / (spread + EPSILON)))
 
 
 def moved_factors(

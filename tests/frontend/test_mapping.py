@@ -152,7 +152,7 @@ def _wrong_by_m(mapper: Mapper, T_true: np.ndarray) -> float:
 @pytest.mark.parametrize("noise_m", [0.005, 0.0005])
 def test_a_pose_that_is_off_is_refined_unless_depth_is_exact(noise_m: float) -> None:
     """Exact depth gives exact poses: what the map could add is less than what it lacks. A pixel is 6 cm here."""
-    config = MappingConfig(max_gaussians=4000, iterations=12, final_iterations=40, pose_rate=0.004)
+    config = MappingConfig(max_gaussians=4000, iterations=12, final_iterations=40, pose_rate=0.4)
     mapper = Mapper(CAMERA, config, seed=5, depth_noise_m=noise_m)
     off = POSES[2] @ se3.exp(np.array([0.06, 0.0, 0.0, 0.0, 0.0, 0.0]))
     for k, T in enumerate((POSES[0], POSES[1], off)):

@@ -1,4 +1,4 @@
-"""Frames registered to a map: noise goes where the map is better than one view, exact poses stay where it is worse."""
+"""Frames registered to a map by their color, with tracking as the prior."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ KEYFRAME = pose(z=-0.9)
 FRAME = pose(x=0.06, z=-0.88, yaw=0.04)
 T_KEYFRAME_FRAME = se3.inverse(KEYFRAME) @ FRAME
 OFF = se3.exp(np.array([0.006, -0.004, 0.005, 0.003, -0.004, 0.002]))
-CONFIG = ModelConfig(enabled=True, level=0, strides=(2, 1, 1))
+CONFIG = ModelConfig()
 
 
 def image(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -30,9 +30,11 @@ def image(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module")
 def gaussians() -> Gaussians:
     """The room from three places; the map frame is the keyframe's camera."""
-    mapper = Mapper(CAMERA, MappingConfig(max_gaussians=6000, iterations=20), seed=0)
+    config = MappingConfig(max_gaussians=20000, iterations=20, final_iterations=30, pose_rate=0.0)
+    mapper = Mapper(CAMERA, config, seed=0, depth_noise_m=0.005)
     for k, T in enumerate((KEYFRAME, pose(x=-0.1, z=-0.9), pose(x=0.12, z=-0.85, yaw=0.05))):
         mapper.add_keyframe(k, *image(T), se3.inverse(KEYFRAME) @ T)
+    mapper.finalize()
     return mapper.gaussians
 
 
@@ -56,7 +58,7 @@ def tracked(sigma_m: float) -> TrackedFrame:
 
 def seen(color: np.ndarray | None = None) -> RgbdFrame:
     exact, depth = image(FRAME)
-    return RgbdFrame(1, 10, exact if color is None else color, depth)
+    return RgbdFrame(1, 10, exact if color is None else color, np.full_like(depth, 9.0))  # depth is not used
 
 
 def tracker(gaussians: Gaussians, config: ModelConfig = CONFIG, threads: int = 1) -> ModelTracker:
@@ -69,19 +71,25 @@ def test_a_poor_pose_becomes_a_good_one(gaussians: Gaussians) -> None:
     before = tracked(0.02)
     after = tracker(gaussians).register(before, seen(), np.eye(4))
     error = [se3.distance(f.T_keyframe_camera, T_KEYFRAME_FRAME) for f in (before, after)]
-    assert error[1][0] < 0.4 * error[0][0]
-    assert error[1][1] < 0.4 * error[0][1]
+    assert error[1][0] < 0.5 * error[0][0]  # of a pixel of 6 mm
+    assert error[1][1] < 0.5 * error[0][1]
     np.testing.assert_array_equal(after.information, before.information)
     assert (after.frame_index, after.status, after.keyframe_index) == (1, Status.OK, 0)
 
 
-def test_a_pose_that_is_known_better_stays(gaussians: Gaussians) -> None:
-    model = tracker(gaussians, CONFIG.model_copy(update={"patience": 2}))
-    sure = tracked(1e-6)
-    assert model.register(sure, seen(), np.eye(4)) is sure
-    assert model.worthwhile
-    assert model.register(sure, seen(), np.eye(4)) is sure
-    assert not model.worthwhile
+def test_a_pose_that_is_known_exactly_stays(gaussians: Gaussians) -> None:
+    before = tracked(1e-7)
+    after = tracker(gaussians).register(before, seen(), np.eye(4))
+    moved = se3.distance(before.T_keyframe_camera, after.T_keyframe_camera)
+    assert max(moved) < 1e-6
+
+
+def test_large_images_are_registered_at_a_smaller_size(gaussians: Gaussians) -> None:
+    small = ModelConfig(max_pixels=CAMERA.width * CAMERA.height - 1)
+    before = tracked(0.02)
+    after = tracker(gaussians, small).register(before, seen(), np.eye(4))
+    error = [se3.distance(f.T_keyframe_camera, T_KEYFRAME_FRAME)[0] for f in (before, after)]
+    assert error[1] < 0.7 * error[0]
 
 
 def test_a_frame_that_the_map_does_not_show_stays(gaussians: Gaussians) -> None:
@@ -90,7 +98,6 @@ def test_a_frame_that_the_map_does_not_show_stays(gaussians: Gaussians) -> None:
     assert tracker(Gaussians.empty()).register(poor, seen(), np.eye(4)) is poor
 
 
-def test_threads_change_no_bit_and_the_setting_turns_it_off(gaussians: Gaussians) -> None:
+def test_threads_change_no_bit(gaussians: Gaussians) -> None:
     one, three = (tracker(gaussians, threads=n).register(tracked(0.02), seen(), np.eye(4)) for n in (1, 3))
     np.testing.assert_array_equal(one.T_keyframe_camera, three.T_keyframe_camera)
-    assert not tracker(gaussians, ModelConfig(enabled=False)).worthwhile

@@ -117,7 +117,7 @@ def test_two_runs_write_the_same_log(sensor_log: Path, frontend_log: Path) -> No
     again = sensor_log.with_name("again.mcap")
     timing = run_frontend(sensor_log, again, TRACKING)
     assert content_digest(again) == content_digest(frontend_log)
-    assert set(timing) == {"tracking_s", "refinement_s", "mapping_s", "final_refinement_s", "writing_s"}
+    assert set(timing) == {"tracking_s", "refinement_s", "mapping_s", "writing_s"}
 
 
 def test_map_is_grown_at_the_refined_keyframes(sensor_log: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from duagc.pipeline.frontend.keyframe_graph import solve_pose_graph
 from duagc.pipeline.frontend.tracked import Status, TrackedFrame
-from duagc.pipeline.frontend.view_poses import PoseSteps, moved_factors, moved_frames
+from duagc.pipeline.frontend.view_poses import LARGEST_SIGMA, PoseSteps, moved_factors, moved_frames
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.posegraph.relative_poses import RelativePose
 
@@ -71,10 +71,22 @@ def test_without_a_view_nothing_moves() -> None:
 
 
 def test_a_first_step_has_the_length_of_the_rate_and_goes_downhill() -> None:
-    steps = PoseSteps(2)
+    sigmas = np.array([2e-3, 1e-3, 4e-3, 1e-3, 3e-3, 1e-3])
+    steps = PoseSteps([np.zeros((6, 6)), np.diag(sigmas**-2)])
     gradient = np.array([1.0, -2.0, 0.5, 1e-3, -1e-3, 3.0])
-    np.testing.assert_allclose(steps.step(1, gradient, 1e-3), -1e-3 * np.sign(gradient), rtol=1e-6)
-    np.testing.assert_allclose(steps.step(0, -gradient, 1e-3), 1e-3 * np.sign(gradient), rtol=1e-6)
+    np.testing.assert_allclose(steps.step(1, gradient, 0.1), -0.1 * sigmas * np.sign(gradient), rtol=0.1)
+    # of a pose of which nothing is known, sigma is LARGEST_SIGMA
+    np.testing.assert_allclose(steps.step(0, -gradient, 0.1), 0.1 * LARGEST_SIGMA * np.sign(gradient))
+
+
+def test_a_view_moves_where_tracking_left_it_open() -> None:
+    """Turning left looks as moving left: what the images open together moves together, whatever the gradient."""
+    open_direction = np.array([1.0, 0.0, 0.0, 0.0, -1.0, 0.0]) / np.sqrt(2)
+    information = 1e8 * (np.eye(6) - 0.9999 * np.outer(open_direction, open_direction))
+    gradient = np.random.default_rng(4).normal(size=6)
+    step = PoseSteps([information]).step(0, gradient, 0.1)
+    assert abs(step @ open_direction) > 10 * np.linalg.norm(step - (step @ open_direction) * open_direction)
+    assert step @ gradient < 0
 
 
 def test_factors_keep_their_residuals() -> None:
