@@ -29,7 +29,7 @@ from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs.folder import RunFolder
 
 CLEAN, ALL = "clean", "all"
-ATE_RATIO, PSNR_LOSS_DB, WORST_M = 3.0, 3.0, 0.1
+ATE_RATIO, PSNR_LOSS_DB, WORST_M, GAP_SIGMA = 3.0, 3.0, 0.1, 0.05
 """Bounds at the middle values: ATE and PSNR against the clean cell, and the error of a pose called good."""
 
 UNSCORED = ("fusion.finetune.steps_per_view=0",)
@@ -276,6 +276,7 @@ def measured(run_folder: RunFolder, recording: Recording) -> dict[str, Any]:
         "robots": metrics["team"]["robots"],
         "joined": metrics["team"]["robots_in_largest_component"],
         "worst_good_m": worst_good_m(run_folder, recording),
+        "gap_sigma": metrics["consensus"].get("gap_to_oracle_sigma_p99"),
     }
 
 
@@ -321,6 +322,7 @@ def bounds_met(row: dict[str, Any], clean: dict[str, Any]) -> dict[str, bool] | 
         "psnr": row["psnr_db"] is not None and row["psnr_db"] >= clean["psnr_db"] - PSNR_LOSS_DB,
         "component": row["components"] == 1,
         "worst": _within(row["worst_good_m"], WORST_M),
+        "gap": _within(row["gap_sigma"], GAP_SIGMA),
     }
 
 

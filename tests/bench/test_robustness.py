@@ -40,7 +40,7 @@ def row(dial: str, ate_m: float, psnr_db: float, **more: object) -> dict:
     known = {"level": float(dial != bench.CLEAN), "value": "x", "frames": 100, "tracked_share": 1.0}
     known |= {"ate_m": ate_m, "ate_team_m": ate_m, "psnr_db": psnr_db, "psnr_exposure_db": psnr_db + 1}
     known |= {"robots": 2, "joined": 2, "components": 1, "submaps": 2, "lost": []}
-    return {"dial": dial, **known, "worst_good_m": 0.01} | more
+    return {"dial": dial, **known, "worst_good_m": 0.01, "gap_sigma": 0.02} | more
 
 
 def test_each_dial_turns_one_thing_and_all_turns_everything() -> None:
@@ -148,9 +148,11 @@ def test_the_worst_pose_counts_if_it_was_called_good(tmp_path: Path) -> None:
 def test_bounds_are_ratios_to_the_clean_cell() -> None:
     clean = row("clean", 0.002, 30.0)
     met = bench.bounds_met(row("blur", 0.0059, 27.1), clean)
-    assert met == {"ate": True, "psnr": True, "component": True, "worst": True}
-    missed = bench.bounds_met(row("blur", 0.0061, 26.9, components=2, worst_good_m=0.11), clean)
-    assert missed == {"ate": False, "psnr": False, "component": False, "worst": False}
+    assert met == {"ate": True, "psnr": True, "component": True, "worst": True, "gap": True}
+    missed = bench.bounds_met(
+        row("blur", 0.0061, 26.9, components=2, worst_good_m=0.11, gap_sigma=0.06), clean
+    )
+    assert missed == {"ate": False, "psnr": False, "component": False, "worst": False, "gap": False}
     assert bench.bounds_met(row("blur", 0.1, 26.9) | {"ate_m": None}, clean) is not None
     assert bench.bounds_met(row("all", 1.0, 10.0), clean) is None
     assert bench.bounds_met({"dial": "lens", "failed": "no"}, clean) is None
@@ -193,7 +195,18 @@ def test_the_command_refuses_dials_that_it_does_not_know(tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_a_cell_of_a_real_run_is_the_same_again(tmp_path: Path) -> None:
-    args = ["bench", "robustness", "--only", "missing", "--frames", "24", "--size", "96x72", "--workers", "1"]
+    args = [
+        "bench",
+        "robustness",
+        "--only",
+        "missing",
+        "--frames",
+        "24",
+        "--size",
+        "160x120",
+        "--workers",
+        "1",
+    ]
     args += ["--set", "frontend.mapping.final_iterations=2"]
     texts = []
     for name in ("one", "two"):
