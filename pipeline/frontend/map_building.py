@@ -25,7 +25,6 @@ from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.messages import Keyframe, MapUpdate
 from duagc.pipeline.recording import RgbdLog
 from duagc.pipeline.registration.moving import FreeSpace
-from duagc.pipeline.splat.gaussians import Gaussians
 
 
 class MapBuilder:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import LearningRates
+from duagc.pipeline.frontend.growing_map import GrowingMap
 from duagc.pipeline.frontend.mapping_views import Bytes, Image, View
 from duagc.pipeline.frontend.view_poses import PoseStep, PoseSteps
 from duagc.pipeline.frontend.view_selection import covisible, optimization_window
@@ -24,7 +25,6 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.exposure import Exposure
 from duagc.pipeline.kernels import (
-    CompiledAdam,
     FisherSums,
     Gradients,
     LossWeights,
@@ -86,17 +86,14 @@ class Mapper:
         self.depth = config.depth_kind(depth_noise_m)
         self._loss_weights = LossWeights(**config.loss.of(self.depth).model_dump())
         self._step = TrainingStep(self.rasterizer, self._loss_weights, self.depth)
-        self._gaussians = Gaussians.empty()
-        self._adam = CompiledAdam(threads=threads)
+        self._map = GrowingMap(config, threads=threads)
         self._views: list[View] = []
         self._support: list[View] = []
-        self._next_id = 0
-        self._contribution = np.zeros(0)  # of every Gaussian, as last measured; infinite if never
 
     @property
     def gaussians(self) -> Gaussians:
         """The map so far, in the map frame."""
-        return self._gaussians
+        return self._map.gaussians
 
     @property
     def exact_depth(self) -> bool:
@@ -151,7 +148,7 @@ class Mapper:
             information=information,
         )
         self._views.append(view)
-        self._adam.freeze_after(self.config.stable_steps or None)
+        self._map.adam.freeze_after(self.config.stable_steps or None)
         inserted, pruned = self._seed(
             view, self.config.first_share if keyframe_index == 0 else self.config.keyframe_share
         )
@@ -160,9 +157,9 @@ class Mapper:
             self._views, view, self.config, camera=self.cameras[0], seed=self.seed
         ):
             self._optimize(other, self.config.iterations_level, self.config.rates)
-        pruned += self._prune_degenerate()
+        pruned += self._map.prune_degenerate()
         after = self._loss(view, self.config.iterations_level)
-        return MappingStats(inserted, pruned, len(self._gaussians), before, after)
+        return MappingStats(inserted, pruned, len(self._map), before, after)
 
     def add_view(
         self,
@@ -220,7 +217,7 @@ class Mapper:
         wanted = max(config.final_iterations * len(self._views), config.final_iterations_view * len(views))
         steps = min(wanted, config.final_iterations_max)
         rounds = [steps * (k + 1) // (2 * config.densify_rounds + 2) for k in range(config.densify_rounds)]
-        self._adam.freeze_after(None)
+        self._map.adam.freeze_after(None)
         poses = PoseSteps([view.information for view in views])
         refined = config.pose_rate > 0 and not self.exact_depth  # where depth is exact, so are the poses
         order = np.zeros(0, np.int64)
@@ -234,19 +231,19 @@ class Mapper:
                 added, removed = self._densify(1.0 / (len(rounds) - rounds.index(step)))
                 inserted, pruned = inserted + added, pruned + removed
             elif step == steps // 2:
-                pruned += self._keep(self._contributions(views)[0] >= config.min_contribution)
+                pruned += self._map.keep(self._contributions(views)[0] >= config.min_contribution)
             share = smoothstep_decay(step, steps, config.final_rate_decay)
             chosen = int(order[position])
             pose_step = poses.of(chosen, config.pose_rate * share) if refined and chosen else None
             self._optimize(views[chosen], 0, config.rates.times(share), pose_step=pose_step)
-        pruned += self._prune_degenerate()
-        return MappingStats(inserted, pruned, len(self._gaussians), before, self._mean_loss())
+        pruned += self._map.prune_degenerate()
+        return MappingStats(inserted, pruned, len(self._map), before, self._mean_loss())
 
     # --- one view -----------------------------------------------------------------------------------------------
 
     def _draw(self, view: View, level: int, mask: NDArray[np.bool_] | None = None) -> Render:
         return self.rasterizer.forward(
-            self._gaussians,
+            self._map.gaussians,
             self.cameras[level],
             se3.inverse(view.T_map_camera),
             mask=mask,
@@ -257,7 +254,7 @@ class Mapper:
         return self._view_gradients(view, level)[0].value
 
     def _view_gradients(self, view: View, level: int) -> tuple[ViewLoss, Gradients]:
-        return self._step.gradients(self._gaussians, self.cameras[level], view.training(level))
+        return self._step.gradients(self._map.gaussians, self.cameras[level], view.training(level))
 
     def _mean_loss(self) -> float:
         return float(np.mean([self._loss(view, 0) for view in self._views])) if self._views else 0.0
@@ -267,12 +264,12 @@ class Mapper:
     ) -> None:
         """One Adam step of all Gaussians in one view, and of its pose where a step of it is given."""
         _, gradients = self._step.gradients(
-            self._gaussians, self.cameras[level], view.training(level), pose=pose_step is not None
+            self._map.gaussians, self.cameras[level], view.training(level), pose=pose_step is not None
         )
-        self._gaussians = self._step.stepped(
-            self._gaussians,
+        self._map.gaussians = self._step.stepped(
+            self._map.gaussians,
             gradients,
-            adam=self._adam,
+            adam=self._map.adam,
             rates=rates,
             least_log_scales=np.float32(np.log(self.config.seeding.thickness_m)),
         )
@@ -288,23 +285,18 @@ class Mapper:
         budget = int(share * config.max_gaussians)
         color, depth_m = view.images(0)
         wanted = depth_m > 0  # zero where the mask forbids a pixel
-        if len(self._gaussians):
+        if len(self._map):
             render = self._draw(view, 0)
             color = self._as_drawn(view, color, render)
             wanted = unexplained(render, color, depth_m, config.seeding, depth_sigma_m=view.depth_sigma_m)
         new = self._discs(view, color, depth_m, wanted, budget=budget)
-        excess = len(self._gaussians) + len(new) - config.max_gaussians
-        self._measure(
-            covisible(
-                self._views,
-                view,
-                config.sweep_keyframes,
-                candidates=config.candidates,
-                camera=self.cameras[0],
-            )
+        excess = len(self._map) + len(new) - config.max_gaussians
+        swept = covisible(
+            self._views, view, config.sweep_keyframes, candidates=config.candidates, camera=self.cameras[0]
         )
-        pruned = self._prune_least(excess) if excess > 0 else 0
-        self._append(new)
+        self._map.update_contributions(*self._contributions(swept))
+        pruned = self._map.prune_least(excess) if excess > 0 else 0
+        self._map.append(new)
         return len(new), pruned
 
     def _as_drawn(self, view: View, color: Image, render: Render) -> Image:
@@ -322,16 +314,10 @@ class Mapper:
             self.cameras[0],
             T_map_camera=view.T_map_camera,
             budget=budget,
-            first_id=self._next_id,
+            first_id=self._map.next_id,
             anchor=view.index,
             config=self.config.seeding,
         )
-
-    def _append(self, new: Gaussians) -> None:
-        self._next_id += len(new)
-        self._gaussians = Gaussians.concatenate([self._gaussians, new])
-        self._adam.extend(len(new))
-        self._contribution = np.concatenate([self._contribution, np.full(len(new), np.inf)])
 
     def _cover(self) -> tuple[int, int]:
         """Insert discs where supporting views see what no keyframe saw; numbers of inserted and pruned Gaussians."""
@@ -346,10 +332,10 @@ class Mapper:
             new = self._discs(
                 view, color, depth_m, thin, budget=int(config.keyframe_share * config.max_gaussians)
             )
-            self._append(new)
+            self._map.append(new)
             inserted += len(new)
-        self._contribution = self._contributions([*self._views, *self._support])[0]
-        return inserted, self._prune_least(max(0, len(self._gaussians) - config.max_gaussians))
+        self._map.contribution = self._contributions([*self._views, *self._support])[0]
+        return inserted, self._map.prune_least(max(0, len(self._map) - config.max_gaussians))
 
     def _densify(self, share: float) -> tuple[int, int]:
         """Replace what contributes nothing by discs where keyframes are drawn worst; numbers inserted and pruned.
@@ -358,8 +344,8 @@ class Mapper:
         those before it inserted; no more than an eighth of its finest cells is seeded.
         """
         everything = [*self._views, *self._support]
-        pruned = self._keep(self._contributions(everything)[0] >= self.config.min_contribution)
-        room = int(share * (self.config.max_gaussians - len(self._gaussians)))
+        pruned = self._map.keep(self._contributions(everything)[0] >= self.config.min_contribution)
+        room = int(share * (self.config.max_gaussians - len(self._map)))
         inserted = 0
         for k, view in enumerate(self._views):
             budget = room * (k + 1) // len(self._views) - room * k // len(self._views)
@@ -369,7 +355,7 @@ class Mapper:
             budget = min(budget, depth_m.size // (8 * self.config.seeding.cell_sizes_px[-1] ** 2))
             wanted = worst_drawn(render, color, depth_m, count=budget, config=self.config.seeding)
             new = self._discs(view, color, depth_m, wanted, budget=budget)
-            self._append(new)
+            self._map.append(new)
             inserted += len(new)
         return inserted, pruned
 
@@ -380,7 +366,7 @@ class Mapper:
         factor's derivative times (1 - opacity), so the Gauss-Newton information of the logit divided by
         (1 - opacity)^2 is exactly the sum of squared changes.
         """
-        sums = FisherSums(len(self._gaussians))
+        sums = FisherSums(len(self._map))
         camera = self.cameras[1]
         inverse_color = np.full(
             (camera.height, camera.width), self.config.contribution_color_sigma**-2, np.float32
@@ -391,36 +377,5 @@ class Mapper:
             if view.half_certainty is not None:
                 inverse_depth = inverse_depth * view.half_certainty**2
             self.rasterizer.fisher(inverse_color, inverse_depth, sums)
-        transparency = 1.0 / (1.0 + np.exp(self._gaussians.opacity_logits.astype(np.float64)))
+        transparency = 1.0 / (1.0 + np.exp(self._map.gaussians.opacity_logits.astype(np.float64)))
         return sums.opacity / transparency**2, sums.observations > 0
-
-    def _measure(self, views: Sequence[View]) -> None:
-        """Update the contributions of the Gaussians that these views see; the others keep theirs.
-
-        Views that are left out may still need a Gaussian: its last contribution decays by a tenth at a time. A
-        Gaussian that was never measured counts as needed.
-        """
-        found, seen = self._contributions(views)
-        faded = np.where(np.isinf(self._contribution), 0.0, 0.9 * self._contribution)
-        self._contribution = np.where(seen, np.maximum(found, faded), self._contribution)
-
-    def _prune_least(self, count: int) -> int:
-        """Remove the `count` Gaussians with the least contribution; ties go by position."""
-        order = np.argsort(self._contribution, kind="stable")
-        keep = np.ones(len(self._gaussians), bool)
-        keep[order[:count]] = False
-        return self._keep(keep)
-
-    def _prune_degenerate(self) -> int:
-        """Remove Gaussians that are transparent or huge."""
-        config = self.config
-        logit = np.log(config.min_opacity / (1 - config.min_opacity))
-        huge = self._gaussians.log_scales.max(axis=1, initial=-np.inf) > np.log(config.max_scale_m)
-        return self._keep((self._gaussians.opacity_logits >= logit) & ~huge)
-
-    def _keep(self, mask: NDArray[np.bool_]) -> int:
-        if not mask.all():
-            self._gaussians = self._gaussians.select(mask)
-            self._adam.select(mask)
-            self._contribution = self._contribution[mask]
-        return int(np.count_nonzero(~mask))

@@ -193,7 +193,7 @@ def test_a_map_without_anything_stays_empty() -> None:
 def test_what_contributes_least_goes_first() -> None:
     mapper, _ = build(views=1)
     contributions, _ = mapper._contributions(mapper._views)
-    mapper._measure(mapper._views)
+    mapper._map.update_contributions(*mapper._contributions(mapper._views))
     camera = CAMERA.halved()
 
     def change(index: int) -> float:
@@ -214,7 +214,7 @@ def test_what_contributes_least_goes_first() -> None:
         assert contributions[index] == pytest.approx(change(index), rel=0.05)
     keep = np.argsort(contributions, kind="stable")[5:]
     ids = mapper.gaussians.ids[np.sort(keep)]
-    mapper._prune_least(5)
+    mapper._map.prune_least(5)
     np.testing.assert_array_equal(mapper.gaussians.ids, ids)
 
 
