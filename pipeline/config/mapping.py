@@ -68,7 +68,7 @@ class MappingConfig(Config):
     """Most steps of the final optimization in all."""
     support_views: int = 40
     """Most tracked frames between keyframes that take part in the final optimization; 0: keyframes only."""
-    pose_rate: float = Field(default=0.15, ge=0.0)
+    pose_rate: float = Field(default=0.25, ge=0.0)
     """Largest step of the pose of a view in the final optimization, in standard deviations by tracking, where depth is
     not exact; it falls as the learning rates do. 0: poses stay where tracking and pose graph put them."""
     support_seeds: bool = True

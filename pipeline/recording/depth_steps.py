@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 
 COARSE_PER_M = 5e-3
-"""Steps of inverse depth from which depth is smoothed: 20 mm at 2 m. A first Kinect has 0.0029; its noise exceeds them."""
+"""Steps of inverse depth from which depth is smoothed: 20 mm at 2 m. Of a first Kinect, 0.0029, noise exceeds them."""
 RADII_PX = (32, 32, 16, 16, 8, 8, 4, 4, 2, 2, 1, 1)
 SAME_SURFACE_STEPS = 1.3
 """Difference of neighboring pixels, in steps, up to which they are one surface."""
 LEAST_UNITS = 3
-"""Steps, in units of the image, from which they can be told from its rounding."""
+"""Steps, in units of the image, from which they differ from its rounding."""
 LEAST_GAPS = 8
 ON_LATTICE = 0.2
 """Distance of a gap between two values from a whole number of steps, in steps, up to which it is one."""
