@@ -229,9 +229,12 @@ struct AdamStep {
 
 enum class Status { ok, bad_gaussians, bad_first_image, bad_second_image, bad_third_image, too_many_intersections };
 
+struct RegistrationKernels;  // registration_data.h
+
 // One build of the kernels for one instruction set.
 struct Kernels {
     const char* name;
+    const RegistrationKernels* registration;
     // Images other than color may be null in the backward pass: zero.
     Status (*forward)(Frame&, const GaussianArrays&, float* color, float* depth, float* alpha);
     Status (*backward)(Frame&, const GaussianArrays&, const float* d_color, const float* d_depth,

@@ -1,38 +1,8 @@
 // The Python module: picks the build for this processor and hands numpy arrays to it.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/pair.h>
-#include <nanobind/stl/string.h>
-#include <nanobind/stl/vector.h>
-
-#include <algorithm>
-#include <atomic>
-#include <cstdlib>
-#include <iterator>
-#include <mutex>
-#include <new>
-#include <stdexcept>
-#include <string>
-#include <utility>
-#include <vector>
-
-#include "frame.h"
-
-namespace nb = nanobind;
-using namespace nb::literals;
+#include "module_arrays.h"
+#include "registration_module.h"
 
 namespace raster {
-
-#if defined(HAVE_AVX512)
-extern const Kernels kernels_avx512;
-#endif
-#if defined(HAVE_AVX2)
-extern const Kernels kernels_avx2;
-#endif
-#if defined(HAVE_NEON)
-extern const Kernels kernels_neon;
-#endif
-extern const Kernels kernels_portable;
 
 void* allocate_aligned(size_t bytes) {
     void* memory = nullptr;
@@ -90,46 +60,6 @@ private:
     std::mutex mutex_;
     std::vector<Loan> free_;
 };
-
-// The builds that this processor can run, fastest first.
-static std::vector<const Kernels*> usable_kernels() {
-    std::vector<const Kernels*> usable;
-#if defined(HAVE_AVX512)
-    if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512cd") &&
-        __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-        usable.push_back(&kernels_avx512);
-#endif
-#if defined(HAVE_AVX2)
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2"))
-        usable.push_back(&kernels_avx2);
-#endif
-#if defined(HAVE_NEON)
-    usable.push_back(&kernels_neon);  // part of every 64-bit ARM processor
-#endif
-    usable.push_back(&kernels_portable);
-    return usable;
-}
-
-template <class T>
-using Array = nb::ndarray<T, nb::numpy, nb::c_contig, nb::device::cpu>;
-using Floats = Array<float>;
-using Inputs = Array<const float>;
-using Bytes = Array<const uint8_t>;  // empty: not given
-
-template <class A>
-static auto data_or_null(const A& array) {
-    return array.size() ? array.data() : nullptr;
-}
-static GaussianArrays arrays_of(const Inputs& means, const Inputs& quats, const Inputs& log_scales, const Inputs& colors,
-                                const Inputs& logits) {
-    return {means.shape(0), means.data(), quats.data(), log_scales.data(), colors.data(), logits.data()};
-}
-
-static const Kernels* kernels_named(const std::string& isa) {
-    for (const Kernels* kernels : usable_kernels())
-        if (isa == "auto" || isa == kernels->name) return kernels;
-    throw std::invalid_argument("isa: " + isa + " is not available on this processor");
-}
 
 // Peaks of the machine, over `seconds`: GFLOP/s of multiply-adds; GB/s of reading and of copying.
 static double fma_rate(const std::string& isa, int threads, double seconds) {
@@ -323,6 +253,7 @@ NB_MODULE(_raster, m) {
     m.def("empty", &raster::OutputPool::array);
     m.def("fma_rate", &raster::fma_rate);
     m.def("bandwidth", &raster::bandwidth);
+    raster::define_registration(m);
     m.def("available_isas", [] {
         std::vector<std::string> names;
         for (const raster::Kernels* kernels : raster::usable_kernels()) names.push_back(kernels->name);

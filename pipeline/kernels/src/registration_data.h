@@ -1,0 +1,111 @@
+// What the registration of RGB-D views takes and gives: plain data, shared by all builds and the Python module.
+#pragma once
+
+#include "frame.h"
+
+namespace raster {
+
+constexpr int PARAMETERS = 8;                // of a registration: translation, rotation, gain, offset
+constexpr int POSE_PARAMETERS = 6;
+constexpr int MOST_LEVELS = 16;
+constexpr int TILE_COLUMNS = 10, TILE_ROWS = 8;  // of the tiles over which correlated residuals are summed
+constexpr int ALIGNMENT_TILES = TILE_COLUMNS * TILE_ROWS;
+
+// Samples of one level of the reference.
+struct SampleArrays {
+    size_t count;
+    const float *points, *normals, *intensities;  // [n, 3], [n, 3], [n]
+    const float* depth_sigmas;                    // [n] or null
+};
+
+// One level of the target. Depths are inverse, 0 where unknown; pixel centers are the integers.
+struct TargetImages {
+    int width, height;
+    float fx, fy, cx, cy;
+    bool has_depth;  // if not, inverse_depth is positive where pixels may be used
+    const float *gray, *inverse_depth;
+    const float* depth_sigma;  // meters, or null
+    const float* normals;      // [h, w, 3] or null: not compared
+};
+
+struct AlignmentSettings {
+    bool use_depth, use_gray, gray_noise_of_depth;
+    float depth_gate_m, depth_gate_relative, gate_sigmas, min_normal_cosine;
+    float sigma_base_m, sigma_quadratic_per_m, sigma_nearest_m;
+    double depth_scale_floor, gray_scale_floor, gray_floor_of_depth, huber_sigmas;
+    float min_gradient;
+    size_t mad_stride, mad_from;  // every so many residuals estimate a scale, where there are more than so many
+};
+
+// Normal equations of one kind of residuals. The statistics are set if they were asked for.
+struct NormalEquations {
+    double H[PARAMETERS][PARAMETERS], gradient[PARAMETERS];
+    double scale;
+    size_t count;
+    double squares, weights;                            // sums of weight * residual^2 and weight
+    double tile_gradients[PARAMETERS][ALIGNMENT_TILES];
+};
+
+struct AlignmentSystem {
+    NormalEquations depth, gray;
+    size_t seen, judged, conflicts, agreeing;
+    double median_depth_m, sigma_mean_m;  // statistics
+};
+
+// From the coarsest level to the finest. Poses are T_reference_target, row by row.
+struct AlignmentSearch {
+    int levels;
+    int iterations[MOST_LEVELS];  // at most, by level
+    size_t min_samples;
+    double tolerance, coarse_tolerance;  // of steps, m and rad: smaller ones end a level
+    const double* prior;       // [6, 6], information of the right tangent of the guess, or null
+    const double* projection;  // [6, 6], takes a tangent to its determined part, or null
+};
+struct AlignmentState {
+    double T[16], exposure[2];
+    int steps;
+};
+
+// One resolution of a frame, [h, w] each; see registration.pyramid.
+struct LevelImages {
+    int width, height;
+    const float *gray, *inverse_depth;
+    const float* depth_sigma;  // or null
+    const uint8_t* mask;       // of the half-size image; or null
+};
+struct HalvedImages {
+    float *gray, *inverse_depth;
+    float* depth_sigma;  // null where that of the level is
+};
+
+// Where normals are computed: pixels, and the camera.
+struct NormalPixels {
+    size_t rows, columns;              // a grid of pixels
+    const int32_t *of_row, *of_column;
+    float fx, fy, cx, cy;
+};
+
+// Memory of one thread, kept between calls.
+struct AlignmentScratch {
+    Scratch<float> floats;
+    Scratch<int32_t> indices;
+    Scratch<uint32_t> keys;
+};
+
+// One build of these kernels for one instruction set.
+struct RegistrationKernels {
+    // The system of one level at a pose T_reference_target [4, 4], with statistics.
+    void (*align_at)(const SampleArrays&, const TargetImages&, int level, const double* T, const double* exposure, const AlignmentSettings&,
+                     bool statistics, AlignmentScratch&, AlignmentSystem&);
+    // From the guess in the state to the minimum, and the system there, with statistics, at the finest level.
+    void (*align)(const SampleArrays*, const TargetImages*, const AlignmentSettings&, const AlignmentSearch&, AlignmentScratch&,
+                  AlignmentState&, AlignmentSystem&);
+    void (*gray_of_bytes)(const uint8_t* color, size_t pixels, float* gray);
+    void (*gray_of_floats)(const float* color, size_t pixels, float* gray);
+    // mask and sigma may be null.
+    void (*invert_depth)(const float* depth_m, const uint8_t* mask, const float* sigma, size_t pixels, float* inverse, float* known_sigma);
+    void (*halve)(const LevelImages&, const HalvedImages&);
+    void (*surface_normals)(const LevelImages&, const NormalPixels&, float* normals);
+};
+
+}  // namespace raster
