@@ -39,7 +39,7 @@ BUDGET_S = {
     "messages": 1,
     "posegraph": 12,
     "recording": 14,
-    "registration": 2,
+    "registration": 5,
     "report": 5,
     "runs": 2,
     "schemas": 1,

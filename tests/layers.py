@@ -56,13 +56,24 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
     ),
     (
         _part("splat", "Gaussians, losses, seeding, optimizer", _ARRAYS, estimator=True),
-        _part("registration", "dense RGB-D alignment, features", _ARRAYS, estimator=True),
         _part("posegraph", "relative poses, solvers, loop closures", _ARRAYS, estimator=True),
         _part("network", "packets, transport, link model", "base config", estimator=True),
     ),
     (
-        _part("kernels", "rasterizer and its definition", _ARRAYS, "splat", estimator=True),
+        _part(
+            "kernels",
+            "compiled passes: rasterizer, registration, pyramids",
+            _ARRAYS,
+            "splat",
+            estimator=True,
+        ),
         _part("messages", "arrays to messages and back", _ARRAYS, "schemas splat"),
+    ),
+    (
+        _part("registration", "dense RGB-D alignment, features", _ARRAYS, "kernels", estimator=True),
+        _part("recording", "logs and recordings", _ARRAYS, "schemas messages"),
+    ),
+    (
         _part(
             "consensus",
             "pose ADMM, elimination, evidence, matching",
@@ -71,7 +82,6 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             estimator=True,
         ),
     ),
-    (_part("recording", "logs and recordings", _ARRAYS, "schemas messages"),),
     (
         _part("frontend", "stage: track and map", _MATHEMATICS, _LOGS, "posegraph", estimator=True),
         _part("information", "stage: Fisher information", _MATHEMATICS, _LOGS, estimator=True),

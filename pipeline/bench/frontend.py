@@ -57,7 +57,7 @@ FRAME_PARTS = {"pyramid": ("tracking.RgbdPyramid", "build"), "registration": ("t
 KEYFRAME_PARTS = {"seeding": ("mapping.Mapper", "_seed"), "optimization": ("mapping.Mapper", "_optimize")}
 COUNTED = {
     "frame": ("submaps.SubmapTracker", "track"),
-    "step": ("align", "linearize_at"),
+    "step": ("alignment", "align"),
     "keyframe": ("mapping.Mapper", "add_keyframe"),
     "draw": ("mapping.Mapper", "_optimize"),
 }
@@ -166,7 +166,7 @@ def changed(config: FrontendConfig, values: Mapping[str, Any]) -> FrontendConfig
 
 def _functions(parts: Mapping[str, tuple[str, str]]) -> dict[str, tuple[Any, str]]:
     from duagc.pipeline.frontend import mapping, model_registration, pose_optimization, submaps, tracking
-    from duagc.pipeline.registration import align
+    from duagc.pipeline.kernels import alignment
 
     modules: dict[str, ModuleType] = {
         "mapping": mapping,
@@ -174,7 +174,7 @@ def _functions(parts: Mapping[str, tuple[str, str]]) -> dict[str, tuple[Any, str
         "submaps": submaps,
         "tracking": tracking,
         "model": model_registration,
-        "align": align,
+        "alignment": alignment,
     }
     found = {}
     for label, (path, name) in parts.items():
@@ -196,9 +196,9 @@ def measure(log: Path, folder: Path, config: FrontendConfig, *, seed: int, threa
         whole |= {"model": ("model.ModelTracker", "register")}
     counts = _functions(COUNTED)
     with ExitStack() as stack:
-        steps = stack.enter_context(counted(counts["frame"], counts["step"]))
+        steps = stack.enter_context(counted(counts["frame"], counts["step"], lambda found, *_: found[3]))
         drawn = stack.enter_context(
-            counted(counts["keyframe"], counts["draw"], lambda mapper, *_: mapper.rasterizer.visible)
+            counted(counts["keyframe"], counts["draw"], lambda _, mapper, *__: mapper.rasterizer.visible)
         )
         outer = stack.enter_context(Stopwatch(_functions(whole)))
         inner = stack.enter_context(_in_turn(config))

@@ -110,14 +110,14 @@ class Work:
 def counted(
     whole: tuple[Any, str], part: tuple[Any, str], amount: Callable[..., int] = lambda *_: 1
 ) -> Iterator[Work]:
-    """Add up `amount` of the arguments of the calls of a part while the whole runs; noted at the end of its calls."""
+    """Add up `amount` of the calls of a part, their result and arguments, while the whole runs; noted when it ends."""
     work = Work()
 
     def counting(function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
             result = function(*args, **kwargs)
-            work.total += amount(*args)
+            work.total += amount(result, *args)
             return result
 
         return call

@@ -21,8 +21,9 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.masks import distance_px
 from duagc.pipeline.recording import RgbdLog, open_rgbd
+from duagc.pipeline.registration.definition import SAME_SURFACE
 from duagc.pipeline.registration.features import DIMENSIONS, matches, root_sift
-from duagc.pipeline.registration.pyramid import SAME_SURFACE, RgbdPyramid
+from duagc.pipeline.registration.pyramid import RgbdPyramid
 from duagc.pipeline.runs.folder import RobotRun
 
 FEATURES = 1200

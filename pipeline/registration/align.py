@@ -18,16 +18,12 @@ import numpy as np
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import RegistrationConfig
-from duagc.pipeline.geometry import se3, so3
+from duagc.pipeline.geometry import se3
+from duagc.pipeline.registration import compiled, search
+from duagc.pipeline.registration.normal_equations import System, regular
 from duagc.pipeline.registration.pyramid import RgbdPyramid
 from duagc.pipeline.registration.reference import Reference
-from duagc.pipeline.registration.residuals import Linearization, linearize_at
-
-STEP_TOLERANCE = (
-    4e-6  # m, rad: steps shrink by a third or more each, so less than half of the last one is left
-)
-STEP_TOLERANCE_COARSE = 4e-5  # the next level begins with an error of its own size anyway
-TILES = (10, 8)  # columns and rows of the tiles over which correlated residuals are summed
+from duagc.pipeline.registration.search import ALL_DIRECTIONS, orthonormal
 
 
 class Outcome(Enum):
@@ -106,14 +102,14 @@ def register(
         The motion with an outcome; if that is not OK, the motion is the best found and must not be trusted.
     """
     config = config or RegistrationConfig()
-    guess = _orthonormal(np.asarray(T_reference_target_guess, dtype=np.float64))
-    T, exposure, system = _minimize(
-        reference, pyramid, guess, config, prior_information=prior_information, projection=_ALL_DIRECTIONS
+    guess = orthonormal(np.asarray(T_reference_target_guess, dtype=np.float64))
+    T, exposure, system = compiled.minimize(
+        reference, pyramid, guess, config, prior_information=prior_information, projection=ALL_DIRECTIONS
     )
     found = _Determined.by(system, config)
     if len(found.weak) and system.agreeing >= config.min_samples:
         # once more without the weak directions: what was found along them is noise
-        T, exposure, system = _minimize(
+        T, exposure, system = compiled.minimize(
             reference,
             pyramid,
             guess,
@@ -151,77 +147,15 @@ def linearize(
         quadratic. Along weak directions there is no step and no information. The outcome is that of `register`.
     """
     config = config or RegistrationConfig()
-    T = _orthonormal(np.asarray(T_reference_target, dtype=np.float64))
+    T = orthonormal(np.asarray(T_reference_target, dtype=np.float64))
     start = np.array(exposure)
-    system = linearize_at(reference, pyramid, level, T, exposure=start, config=config)
+    system = compiled.linearize_at(reference, pyramid, level, T, exposure=start, config=config)
     found = _Determined.by(system, config)
-    step = _step(system, T, T, None, projection=found.projection)
+    step = search.step(system, T, T, None, projection=found.projection)
     T_minimum, exposure_minimum = T @ se3.exp(step[:6]), start + step[6:]
     return _judge(
         system, found, T_minimum, T, exposure=exposure_minimum, config=config, prior_information=None
     )
-
-
-_ALL_DIRECTIONS = np.eye(6)
-
-
-def _minimize(
-    reference: Reference,
-    pyramid: RgbdPyramid,
-    guess: Array,
-    config: RegistrationConfig,
-    *,
-    prior_information: Array | None,
-    projection: Array,
-) -> tuple[Array, Array, Linearization]:
-    """Pose, (gain, offset) and residuals at the minimum, from the coarsest level to the finest.
-
-    projection: [6, 6] P; the images count only along P x of a step x.
-    """
-    T, exposure = guess, np.array([1.0, 0.0])
-    levels = min(len(pyramid.levels), len(config.iterations), len(reference.levels))
-    for index in reversed(range(levels)):
-        for _ in range(config.iterations[index]):
-            system = linearize_at(reference, pyramid, index, T, exposure=exposure, config=config)
-            if system.agreeing < config.min_samples:
-                break
-            step = _step(system, T, guess, prior_information, projection=projection)
-            T = _orthonormal(T @ se3.exp(step[:6]))
-            exposure = exposure + step[6:]
-            if np.max(np.abs(step[:6])) < (STEP_TOLERANCE if index == 0 else STEP_TOLERANCE_COARSE):
-                break
-    return T, exposure, linearize_at(reference, pyramid, 0, T, exposure=exposure, config=config)
-
-
-def _orthonormal(T: Array) -> Array:
-    """The same motion with an exact rotation: predictions from predictions would double the rounding every time."""
-    return se3.from_rotation_translation(so3.project(T[:3, :3]), T[:3, 3])
-
-
-def _step(
-    system: Linearization, T: Array, guess: Array, prior_information: Array | None, *, projection: Array
-) -> Array:
-    """Gauss-Newton step [8], slightly damped, limited to 0.3 m and 0.3 rad."""
-    H, gradient = system.normal_equations()
-    if projection is not _ALL_DIRECTIONS:
-        P = np.eye(8)
-        P[:6, :6] = projection
-        H, gradient = P.T @ H @ P, P.T @ gradient
-    if prior_information is not None:
-        H[:6, :6] += prior_information
-        gradient[:6] += prior_information @ se3.log(se3.inverse(guess) @ T)
-    # brightness is not observable on an untextured view: a weak pull keeps the system regular
-    H[6:, 6:] += np.eye(2)
-    step = -np.linalg.solve(_regular(H + 1e-6 * np.diag(np.diag(H))), gradient)
-    if prior_information is None:
-        step[:6] = projection @ step[:6]
-    largest = np.max(np.abs(step[:6]))
-    return np.asarray(step * min(1.0, 0.3 / largest) if largest > 0 else step)
-
-
-def _regular(H: Array) -> Array:
-    """A normal matrix that can be solved even where nothing was seen: then the answer stays near zero."""
-    return H + (1e-10 * np.trace(H) / len(H) + 1e-300) * np.eye(len(H))
 
 
 @dataclass(frozen=True)
@@ -243,7 +177,7 @@ class _Determined:
     condition: float
 
     @staticmethod
-    def by(system: Linearization, config: RegistrationConfig) -> _Determined:
+    def by(system: System, config: RegistrationConfig) -> _Determined:
         """From the residuals, by the limits of a configuration."""
         H, _ = system.normal_equations()
         overconfidence = _overconfidence(system, H)
@@ -254,7 +188,7 @@ class _Determined:
         lever = _lever(system)
         values, vectors = np.linalg.eigh(information * np.outer(lever, lever))
         known = values * config.max_sigma_m**2 >= 1
-        strong, projection = vectors[:, known], _ALL_DIRECTIONS
+        strong, projection = vectors[:, known], ALL_DIRECTIONS
         if not known.all():
             projection = (lever[:, None] * strong) @ (strong.T / lever)
             information = (strong * values[known]) @ strong.T / np.outer(lever, lever)
@@ -276,13 +210,13 @@ class _Determined:
         )
 
 
-def _lever(system: Linearization) -> Array:
+def _lever(system: System) -> Array:
     """Scales of the tangent [6] by which a rotation counts as the displacement at the median depth."""
     return np.array([1.0, 1.0, 1.0, *[1.0 / max(system.median_depth_m, 0.1)] * 3])
 
 
 def _judge(
-    system: Linearization,
+    system: System,
     found: _Determined,
     T: Array,
     guess: Array,
@@ -302,7 +236,7 @@ def _judge(
     elif (
         system.conflict > config.max_conflict
         or system.depth.scale > config.max_depth_scale
-        or system.gray.rms() > config.max_gray_rms
+        or system.gray.rms > config.max_gray_rms
         or not 1 / config.max_gain < gain < config.max_gain
     ):
         outcome = Outcome.RESIDUAL
@@ -319,8 +253,8 @@ def _judge(
         overlap=system.overlap,
         view=system.view,
         conflict=system.conflict,
-        rms_depth_m=system.depth.rms() * system.sigma_mean_m,
-        rms_gray=system.gray.rms(),
+        rms_depth_m=system.depth.rms * system.sigma_mean_m,
+        rms_gray=system.gray.rms,
         exposure=(float(exposure[0]), float(exposure[1])),
         samples=system.agreeing,
         overconfidence=found.overconfidence,
@@ -329,7 +263,7 @@ def _judge(
     )
 
 
-def _overconfidence(system: Linearization, H: Array) -> float:
+def _overconfidence(system: System, H: Array) -> float:
     """The factor by which the normal matrix exceeds the information, at least 1: the larger of two estimates.
 
     Correlation. Neighboring residuals share noise, calibration and model errors. If they did not, the outer
@@ -342,22 +276,15 @@ def _overconfidence(system: Linearization, H: Array) -> float:
     solutions in units of their covariance, should be 6. What exceeds it is calibration error that no image noise
     explains (Birge ratio).
     """
-    columns, rows = TILES
-    parts = [part for part in (system.depth, system.gray) if len(part.residual)]
+    parts = [part for part in (system.depth, system.gray) if part.count]
     if not parts:
         return 1.0
-    u_max = max(float(part.pixels[0].max()) for part in parts) + 1
-    v_max = max(float(part.pixels[1].max()) for part in parts) + 1
     outer, depth_color_chi2 = np.zeros((8, 8)), 0.0
     for part in parts:
-        u, v = part.pixels
-        tile = (v * (rows / v_max)).astype(np.int64) * columns + (u * (columns / u_max)).astype(np.int64)
-        scaled = part.jacobian * (part.weight * part.residual)[:, None]
-        sums = np.stack([np.bincount(tile, scaled[:, k], rows * columns) for k in range(8)])
-        outer = outer + sums @ sums.T
+        outer = outer + part.tile_gradients @ part.tile_gradients.T
     for part in parts if len(parts) == 2 else []:
-        H_part, gradient = part.normal_equations()
-        answer = np.linalg.solve(_regular(H_part[:6, :6] + 1e-3 * H[:6, :6]), gradient[:6])
-        depth_color_chi2 += float(gradient[:6] @ answer)
-    correlation = float(np.trace(np.linalg.solve(_regular(H), outer))) / 8
+        gradient = part.gradient[:6]
+        answer = np.linalg.solve(regular(part.H[:6, :6] + 1e-3 * H[:6, :6]), gradient)
+        depth_color_chi2 += float(gradient @ answer)
+    correlation = float(np.trace(np.linalg.solve(regular(H), outer))) / 8
     return max(1.0, correlation, depth_color_chi2 / 6)

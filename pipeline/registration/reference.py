@@ -61,8 +61,9 @@ class Reference:
             rows = np.arange(MARGIN, level.camera.height - MARGIN, stride)
             columns = np.arange(MARGIN, level.camera.width - MARGIN, stride)
             v, u = (axis.ravel() for axis in np.meshgrid(rows, columns, indexing="ij"))
-            known = _has_normal(level)[v, u]
-            levels.append(_samples(level, v[known], u[known]))
+            normals = level.normals_at(rows, columns).reshape(-1, 3)
+            known = np.flatnonzero(normals[:, 2])
+            levels.append(_samples(level, v[known], u[known], normals[known]))
         return Reference(tuple(levels))
 
     @staticmethod
@@ -85,7 +86,7 @@ class Reference:
             _strongest_of_tiles(strength, textured), _centers_of_tiles(known, count - textured)
         )
         v, u = np.divmod(chosen, finest.camera.width)
-        samples = _samples(finest, v, u)
+        samples = _samples(finest, v, u, finest.normals[v, u])
         levels = [samples]
         for index, level in enumerate(pyramid.levels[1:], start=1):
             scale = 2.0**index
@@ -114,12 +115,12 @@ def _usable_at_all_levels(pyramid: RgbdPyramid) -> NDArray[np.bool_]:
     return usable
 
 
-def _samples(level: Level, v: NDArray[np.int64], u: NDArray[np.int64]) -> ReferenceLevel:
-    """The samples at pixels (u, v), each [n], of known depth and normal."""
+def _samples(level: Level, v: NDArray[np.int64], u: NDArray[np.int64], normals: Samples) -> ReferenceLevel:
+    """The samples at pixels (u, v), each [n], of known depth and normals [n, 3]."""
     camera, z = level.camera, 1 / level.inverse_depth[v, u].astype(np.float64)
     points = back_project(camera, u, v, z)
     sigmas = None if level.depth_sigma_m is None else level.depth_sigma_m[v, u]
-    return ReferenceLevel(points.astype(np.float32), level.normals[v, u], level.gray[v, u], sigmas)
+    return ReferenceLevel(points.astype(np.float32), normals, level.gray[v, u], sigmas)
 
 
 def _tiles(image: Samples, count: int) -> tuple[Samples, int, NDArray[np.int64]]:

@@ -1,5 +1,7 @@
 """The residuals of a registration at one pose: point-to-plane distances and gray differences with their weights.
 
+What `compiled.linearize_at` sums up, to be read and to test against.
+
 For a sample p (reference frame) with normal n and intensity I, seen by the target at q = T_reference_target^-1 p,
 
     depth residual   r_d = m . (x z(u) - q),             m = R^T n, u = project(q), x the ray and z the depth there
@@ -25,6 +27,8 @@ from duagc.pipeline.geometry import se3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.depth_noise import DepthNoise
 from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma, median
+from duagc.pipeline.kernels.alignment import TILE_COLUMNS, TILE_ROWS
+from duagc.pipeline.registration.normal_equations import NormalEquations, System
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
 from duagc.pipeline.registration.reference import Reference, ReferenceLevel
 
@@ -58,6 +62,21 @@ class Residuals:
         J = self.jacobian.astype(np.float64)
         Jw = J * self.weight[:, None]
         return Jw.T @ J, Jw.T @ self.residual.astype(np.float64)
+
+    def summed(self, u_max: float, v_max: float) -> NormalEquations:
+        """Normal equations, with the gradient of every tile of the image.
+
+        Args:
+            u_max: largest column of a residual, px.
+            v_max: largest row.
+        """
+        u, v = self.pixels
+        row = (v * (TILE_ROWS / (v_max + 1))).astype(np.int64)
+        tile = row * TILE_COLUMNS + (u * (TILE_COLUMNS / (u_max + 1))).astype(np.int64)
+        forces = self.jacobian * (self.weight * self.residual)[:, None]
+        tiles = [np.bincount(tile, forces[:, k], TILE_ROWS * TILE_COLUMNS) for k in range(8)]
+        H, gradient = self.normal_equations()
+        return NormalEquations(H, gradient, self.scale, len(self.residual), self.rms(), np.stack(tiles))
 
     def nothing(self) -> Residuals:
         """The same kind and scale without any residual."""
@@ -96,11 +115,21 @@ class Linearization:
     median_depth_m: float
     sigma_mean_m: float
 
-    def normal_equations(self) -> tuple[Array, Array]:
-        """H [8, 8] and gradient [8] of both kinds together."""
-        H_depth, g_depth = self.depth.normal_equations()
-        H_gray, g_gray = self.gray.normal_equations()
-        return H_depth + H_gray, g_depth + g_gray
+    def system(self) -> System:
+        """What a registration needs of it."""
+        parts = [part for part in (self.depth, self.gray) if len(part.residual)]
+        u_max = max((float(part.pixels[0].max()) for part in parts), default=0.0)
+        v_max = max((float(part.pixels[1].max()) for part in parts), default=0.0)
+        return System(
+            self.depth.summed(u_max, v_max),
+            self.gray.summed(u_max, v_max),
+            overlap=self.overlap,
+            view=self.view,
+            conflict=self.conflict,
+            agreeing=self.agreeing,
+            median_depth_m=self.median_depth_m,
+            sigma_mean_m=self.sigma_mean_m,
+        )
 
 
 def linearize_at(
@@ -125,7 +154,7 @@ def linearize_at(
     samples, level = reference.levels[index], pyramid.levels[index]
     camera = level.camera
     T_target_reference = se3.inverse(T_reference_target).astype(np.float32)
-    q = T_target_reference[:3, :3] @ samples.points.T + T_target_reference[:3, 3:]
+    q = _rotated(T_target_reference, samples.points.T) + T_target_reference[:3, 3:]
     front = np.maximum(q[2], np.float32(0.05))
     u = np.float32(camera.fx) * q[0] / front + np.float32(camera.cx)
     v = np.float32(camera.fy) * q[1] / front + np.float32(camera.cy)
@@ -144,7 +173,7 @@ def linearize_at(
         agree = np.abs(off) < gate
         # beyond the gate in front of the surface: that space was seen to be free; behind it: hidden
         free = off >= gate
-    m = T_target_reference[:3, :3] @ samples.normals.take(seen, axis=0).T
+    m = _rotated(T_target_reference, samples.normals.take(seen, axis=0).T)
     if config.normal_gate_rad > 0:
         agree &= _normals_agree(level, u, v, m, limit_rad=config.normal_gate_rad)
     agreeing = np.flatnonzero(agree)
@@ -195,12 +224,29 @@ def linearize_at(
     )
 
 
+def _rotated(T: Floats, vectors: Floats) -> Floats:
+    """Vectors [3, n], rotated."""
+    x, y, z = vectors
+    return np.stack([T[k, 0] * x + T[k, 1] * y + T[k, 2] * z for k in range(3)])
+
+
+def _channels(level: Level) -> Floats:
+    """(gray, d/du, d/dv, inverse depth or NaN, and sigma where known) for interpolation, [h * w, 4 or 5].
+
+    NaN makes every value that touches an unknown depth unknown, and fails every gate.
+    """
+    depths = level.usable_inverse_depth
+    sigma = [] if level.depth_sigma_m is None else [level.depth_sigma_m]
+    known = np.where(depths > 0, depths, np.float32(np.nan))
+    return np.stack([level.gray, *level.gradients, known, *sigma], axis=-1).reshape(-1, 4 + len(sigma))
+
+
 def _interpolate(level: Level, u: Floats, v: Floats) -> tuple[Floats, ...]:
     """Gray value, its two derivatives, inverse depth (NaN where unknown) and sigma if known, at pixels inside."""
     width = level.camera.width
     u0, v0 = u.astype(np.int32), v.astype(np.int32)
-    a, b = (u - u0)[:, None], (v - v0)[:, None]
-    corner, channels = v0 * width + u0, level.channels
+    a, b = ((pixel - corner.astype(np.float32))[:, None] for pixel, corner in ((u, u0), (v, v0)))
+    corner, channels = v0 * width + u0, _channels(level)
     top = channels.take(corner, axis=0)
     top += a * (channels.take(corner + 1, axis=0) - top)
     bottom = channels.take(corner + width, axis=0)

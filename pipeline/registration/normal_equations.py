@@ -1,0 +1,68 @@
+"""What a registration needs of its residuals at one pose: normal equations, and how the samples were seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from duagc.pipeline.base.arrays import Array
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """The residuals of one kind, summed.
+
+    Attributes:
+        H: [8, 8], by (translation, rotation, gain, offset).
+        gradient: [8].
+        scale: robust standard deviation of the residuals.
+        count: of the residuals.
+        rms: root of the weighted mean square of the residuals, Huber's weight only, in units of the noise given.
+        tile_gradients: [8, t], parts of the gradient, by tiles of the image.
+    """
+
+    H: Array
+    gradient: Array
+    scale: float
+    count: int
+    rms: float
+    tile_gradients: Array
+
+
+@dataclass(frozen=True)
+class System:
+    """The normal equations at one pose and level, and how the samples were seen.
+
+    Attributes:
+        depth: of point-to-plane distances.
+        gray: of gray differences.
+        overlap: as in `Registration`.
+        view: as in `Registration`.
+        conflict: as in `Registration`.
+        agreeing: number of samples on the same surface.
+        median_depth_m: of these.
+        sigma_mean_m: mean noise of their depth.
+    """
+
+    depth: NormalEquations
+    gray: NormalEquations
+    overlap: float
+    view: float
+    conflict: float
+    agreeing: int
+    median_depth_m: float
+    sigma_mean_m: float
+
+    def normal_equations(self) -> tuple[Array, Array]:
+        """H [8, 8] and gradient [8] of both kinds together."""
+        return self.depth.H + self.gray.H, self.depth.gradient + self.gray.gradient
+
+
+def regular(H: Array) -> Array:
+    """A normal matrix that can be solved even where nothing was seen: then the answer stays near zero.
+
+    Args:
+        H: [n, n].
+    """
+    return np.asarray(H + (1e-10 * np.trace(H) / len(H) + 1e-300) * np.eye(len(H)))
