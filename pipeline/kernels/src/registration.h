@@ -123,17 +123,20 @@ struct Tiles {
     float per_u, per_v;
 };
 
-static Tiles make_tiles(const Agreeing& all) {
+// Over the pixels of the samples that have a flag.
+static Tiles make_tiles(const Samples& all, Flag flag) {
     float u = 0.0f, v = 0.0f;  // pixels are at 1 and more
-    for (size_t i = 0; i < all.count; i++) {
-        u = all[U][i] > u ? all[U][i] : u;
-        v = all[V][i] > v ? all[V][i] : v;
+    for (size_t i = 0; i < all.of->count; i++) {
+        const bool counts = (all.flags[i] & flag) != 0;
+        u = counts && all[U][i] > u ? all[U][i] : u;
+        v = counts && all[V][i] > v ? all[V][i] : v;
     }
     return {static_cast<float>(TILE_COLUMNS / (static_cast<double>(u) + 1.0)), static_cast<float>(TILE_ROWS / (static_cast<double>(v) + 1.0))};
 }
 
-static void add_statistics(const Rows& rows, size_t begin, int count, const Agreeing& all, Tiles tiles, int parameters, NormalEquations& out) {
+static void add_statistics(const Rows& rows, size_t begin, int count, const Samples& all, Tiles tiles, int parameters, NormalEquations& out) {
     for (int i = 0; i < count; i++) {
+        if (rows.weight[i] == 0.0f) continue;  // its pixel may lie in none of the tiles
         const float weight = rows.weight[i], force = weight * rows.residual[i];
         const double residual = rows.residual[i];
         out.weights += weight;
@@ -144,14 +147,16 @@ static void add_statistics(const Rows& rows, size_t begin, int count, const Agre
     }
 }
 
-// Runs fill(begin, count, rows) for every batch and sums what it leaves.
+// Runs fill(begin, count, rows) for every batch and sums what it leaves of the samples that have a flag.
 template <int COUNT, class Fill>
-static void sum_batches(const Agreeing& all, const Tiles* tiles, NormalEquations& out, Fill fill) {
+static void sum_batches(const Samples& all, Flag flag, const Tiles* tiles, NormalEquations& out, Fill fill) {
     LaneSums sums = {};
     Rows rows;
-    for (size_t begin = 0; begin < all.count; begin += BATCH) {
-        const int count = static_cast<int>(all.count - begin < BATCH ? all.count - begin : BATCH);
+    for (size_t begin = 0; begin < all.of->count; begin += BATCH) {
+        const int count = static_cast<int>(all.of->count - begin < BATCH ? all.of->count - begin : BATCH);
         fill(begin, count, rows);
+        const int32_t* const flags = all.flags + begin;
+        for (int i = 0; i < count; i++) rows.weight[i] = flags[i] & flag ? rows.weight[i] : 0.0f;
         for (int i = count; i % LANES; i++) {
             for (int k = 0; k < COUNT; k++) rows.jacobian[k][i] = 0.0f;
             rows.residual[i] = rows.weight[i] = 0.0f;
@@ -160,52 +165,12 @@ static void sum_batches(const Agreeing& all, const Tiles* tiles, NormalEquations
         if (tiles) add_statistics(rows, begin, count, all, *tiles, COUNT, out);
     }
     write_sums(sums, COUNT, out);
-    out.count = all.count;
 }
 
-// --- residuals of depth ---------------------------------------------------------------------------------------------
+// --- rows of depth --------------------------------------------------------------------------------------------------
 
-ALWAYS_INLINE inline float model_sigma(const AlignmentSettings& s, float z) {
-    const float beyond = z - s.sigma_nearest_m;
-    return s.sigma_base_m + s.sigma_quadratic_per_m * (beyond * beyond);
-}
-
-// Normals into the frame of the target.
-NO_INLINE static void rotate_normals(const float* __restrict T, size_t count, float* __restrict x, float* __restrict y, float* __restrict z) {
-    const float rows[3][3] = {{T[0], T[1], T[2]}, {T[4], T[5], T[6]}, {T[8], T[9], T[10]}};
-    for (size_t i = 0; i < count; i++) {
-        const float nx = x[i], ny = y[i], nz = z[i];
-        x[i] = rotated(rows[0], nx, ny, nz), y[i] = rotated(rows[1], nx, ny, nz), z[i] = rotated(rows[2], nx, ny, nz);
-    }
-}
-
-static void set_sigmas(const SampleArrays& samples, const TargetImages& image, const AlignmentSettings& settings, Agreeing& all) {
-    float *__restrict sigma = all.column[SIGMA];
-    const float* __restrict z = all[Z];
-    if (!image.depth_sigma) {
-        for (size_t i = 0; i < all.count; i++) sigma[i] = model_sigma(settings, z[i]);
-    } else if (samples.depth_sigmas) {
-        for (size_t i = 0; i < all.count; i++) {
-            const float ours = samples.depth_sigmas[all.index[i]];
-            sigma[i] = __builtin_sqrtf(0.5f * (sigma[i] * sigma[i] + ours * ours));
-        }
-    }
-}
-
-ALWAYS_INLINE inline float ray(float pixel, float center, float focal) { return (pixel - center) / focal; }
-
-NO_INLINE static void depth_residuals(const TargetImages& image, size_t count, const Agreeing& all, float* __restrict out) {
-    const float *qx = all[QX], *qy = all[QY], *qz = all[QZ], *mx = all[MX], *my = all[MY], *mz = all[MZ], *u = all[U], *v = all[V];
-    const float *z = all[Z], *sigma = all[SIGMA];
-    const float fx = image.fx, fy = image.fy, cx = image.cx, cy = image.cy;
-    for (size_t i = 0; i < count; i++) {
-        const float x = ray(u[i], cx, fx) * z[i], y = ray(v[i], cy, fy) * z[i];
-        out[i] = (mx[i] * (x - qx[i]) + my[i] * (y - qy[i]) + mz[i] * (z[i] - qz[i])) / sigma[i];
-    }
-}
-
-// Of the columns from `begin`: m / sigma by v, surface x m / sigma by w.
-NO_INLINE static void depth_rows(const TargetImages& image, const Agreeing& all, size_t begin, int count, double scale, double huber_sigmas,
+// From sample `begin` on: m / sigma by v, surface x m / sigma by w.
+NO_INLINE static void depth_rows(const TargetImages& image, const Samples& all, size_t begin, int count, double scale, double huber_sigmas,
                                  Rows* __restrict rows) {
     const float *mx = all[MX] + begin, *my = all[MY] + begin, *mz = all[MZ] + begin, *u = all[U] + begin, *v = all[V] + begin;
     const float *z = all[Z] + begin, *sigma = all[SIGMA] + begin, *residual = all[DEPTH_RESIDUAL] + begin;
@@ -223,24 +188,7 @@ NO_INLINE static void depth_rows(const TargetImages& image, const Agreeing& all,
     }
 }
 
-// --- residuals of gray values ---------------------------------------------------------------------------------------
-
-// Leaves out what has too small a gradient.
-static void keep_gradients(float min_gradient, Agreeing& all) {
-    const float least = min_gradient * min_gradient;
-    size_t kept = 0;
-    for (size_t i = 0; i < all.count; i++) {
-        for (Column k : {QX, QY, QZ, U, V, GRAY, BY_U, BY_V, INTENSITY}) all.column[k][kept] = all[k][i];
-        all.index[kept] = all.index[i];
-        kept += all[BY_U][i] * all[BY_U][i] + all[BY_V][i] * all[BY_V][i] >= least;
-    }
-    all.count = kept;
-}
-
-NO_INLINE static void gray_residuals(size_t count, const float* __restrict gray, const float* __restrict intensity, float gain, float offset,
-                                     float* __restrict out) {
-    for (size_t i = 0; i < count; i++) out[i] = gray[i] - (gain * intensity[i] + offset);
-}
+// --- rows of gray values --------------------------------------------------------------------------------------------
 
 // d gray / d q.
 ALWAYS_INLINE inline void gray_by_point(float fx, float fy, float by_u, float by_v, float qx, float qy, float qz, float* d) {
@@ -248,19 +196,20 @@ ALWAYS_INLINE inline void gray_by_point(float fx, float fy, float by_u, float by
     d[2] = -(d[0] * qx + d[1] * qy) / qz;
 }
 
-// The variance that the error of a sample's depth adds to its gray residual.
-static void set_variances(const SampleArrays& samples, const TargetImages& image, const float* T, double depth_scale,
-                          const AlignmentSettings& settings, Agreeing& all) {
+// The variance that the error of a sample's depth adds to its gray residual, and in the list that of those with one.
+static void set_variances(const TargetImages& image, const float* T, double depth_scale, const AlignmentSettings& settings, Samples& all) {
+    const SampleArrays& samples = *all.of;
     const float share = static_cast<float>(depth_scale * __builtin_sqrt(0.5));
-    for (size_t i = 0; i < all.count; i++) {
-        const size_t sample = static_cast<size_t>(all.index[i]);
-        const float z = samples.points[3 * sample + 2];
-        const float sigma = samples.depth_sigmas ? samples.depth_sigmas[sample] : model_sigma(settings, z);
+    size_t listed = 0;
+    for (size_t i = 0; i < samples.count; i++) {
+        const float z = samples.points[3 * i + 2];
+        const float sigma = samples.depth_sigmas ? samples.depth_sigmas[i] : model_sigma(settings, z);
         const float relative = share * sigma / z;
         float d[3];
         gray_by_point(image.fx, image.fy, all[BY_U][i], all[BY_V][i], all[QX][i], all[QY][i], all[QZ][i], d);
         const float change = d[0] * (-T[3] * relative) + d[1] * (-T[7] * relative) + d[2] * (-T[11] * relative);
-        all.column[VARIANCE][i] = change * change;
+        all.column[VARIANCE][i] = all.column[LIST_OF_GRAY][listed] = change * change;
+        listed += all.flags[i] & HAS_GRAY ? 1 : 0;
     }
 }
 
@@ -270,11 +219,11 @@ struct GrayWeights {
     float limit, huber_sigmas;
 };
 
-// Of the columns from `begin`: -d by v, -(q x d) by w, -I and -1 by gain and offset.
-NO_INLINE static void gray_rows(const TargetImages& image, const Agreeing& all, size_t begin, int count, const GrayWeights& weights,
+// From sample `begin` on: -d by v, -(q x d) by w, -I and -1 by gain and offset.
+NO_INLINE static void gray_rows(const TargetImages& image, const Samples& all, size_t begin, int count, const GrayWeights& weights,
                                 Rows* __restrict rows) {
     const float *qx = all[QX] + begin, *qy = all[QY] + begin, *qz = all[QZ] + begin, *by_u = all[BY_U] + begin, *by_v = all[BY_V] + begin;
-    const float *intensity = all[INTENSITY] + begin, *residual = all[GRAY_RESIDUAL] + begin, *known = all[VARIANCE] + begin;
+    const float *intensity = all.of->intensities + begin, *residual = all[GRAY_RESIDUAL] + begin, *known = all[VARIANCE] + begin;
     const float fx = image.fx, fy = image.fy;
     for (int i = 0; i < count; i++) {
         float d[3];
@@ -303,55 +252,57 @@ NO_INLINE static void gray_rows(const TargetImages& image, const Agreeing& all, 
 
 // --- all of a level -------------------------------------------------------------------------------------------------
 
-static void add_statistics_of_depth(const Agreeing& all, AlignmentScratch& scratch, AlignmentSystem& system) {
-    if (!all.count) return;
+static void add_statistics_of_depth(Samples& all, AlignmentScratch& scratch, AlignmentSystem& system) {
+    if (!all.agreeing) return;
     double total = 0.0;
-    for (size_t i = 0; i < all.count; i++) total += all[SIGMA][i];
-    system.sigma_mean_m = total / static_cast<double>(all.count);
-    system.median_depth_m = median_magnitude(all[Z], all.count, 1, scratch.keys);
+    size_t listed = 0;
+    float* const depths = all.column[VARIANCE];
+    for (size_t i = 0; i < all.of->count; i++) {
+        const bool agrees = (all.flags[i] & AGREES) != 0;
+        if (agrees) total += all[SIGMA][i];
+        depths[listed] = all[Z][i];
+        listed += agrees;
+    }
+    system.sigma_mean_m = total / static_cast<double>(listed);
+    system.median_depth_m = median_magnitude(depths, listed, 1, scratch.keys);
 }
 
 // T: T_target_reference [3, 4]; level: 0 the finest.
 static void align_level(const SampleArrays& samples, const TargetImages& image, int level, const float* T, const double* exposure,
                         const AlignmentSettings& settings, bool statistics, AlignmentScratch& scratch, AlignmentSystem& system) {
     system = {};
-    Agreeing all = make_agreeing(scratch, samples.count);
-    find_agreeing(samples, image, T, settings, all, system);
-    rotate_normals(T, all.count, all.column[MX], all.column[MY], all.column[MZ]);
-    set_sigmas(samples, image, settings, all);
+    Samples all = make_samples(samples, scratch);
+    view_samples(image, T, {static_cast<float>(exposure[0]), static_cast<float>(exposure[1])}, settings, all, system);
     if (statistics) add_statistics_of_depth(all, scratch, system);
 
-    depth_residuals(image, all.count, all, all.column[DEPTH_RESIDUAL]);
     double floor = settings.depth_scale_floor;
     for (int k = 0; k < level; k++) floor *= 4.0;
-    system.depth.scale = robust_scale(all[DEPTH_RESIDUAL], all.count, floor, settings, scratch);
+    system.depth.scale = robust_scale(all[LIST_OF_DEPTH], all.agreeing, floor, settings, scratch);
     const bool use_depth = settings.use_depth && image.has_depth;
     Tiles tiles = {};
+    if (statistics) tiles = make_tiles(all, use_depth ? AGREES : HAS_GRAY);
     if (use_depth) {
-        if (statistics) tiles = make_tiles(all);
-        sum_batches<POSE_PARAMETERS>(all, statistics ? &tiles : nullptr, system.depth, [&](size_t begin, int count, Rows& rows) {
+        sum_batches<POSE_PARAMETERS>(all, AGREES, statistics ? &tiles : nullptr, system.depth, [&](size_t begin, int count, Rows& rows) {
             depth_rows(image, all, begin, count, system.depth.scale, settings.huber_sigmas, &rows);
         });
+        system.depth.count = all.agreeing;
     }
 
-    if (settings.min_gradient > 0.0f) keep_gradients(settings.min_gradient, all);
-    if (statistics && !use_depth) tiles = make_tiles(all);
-    gray_residuals(all.count, all[GRAY], all[INTENSITY], static_cast<float>(exposure[0]), static_cast<float>(exposure[1]),
-                   all.column[GRAY_RESIDUAL]);
     const double by_depth = settings.gray_floor_of_depth * system.depth.scale;
     const double gray_floor = by_depth > settings.gray_scale_floor ? by_depth : settings.gray_scale_floor;
-    const double scale = system.gray.scale = robust_scale(all[GRAY_RESIDUAL], all.count, gray_floor, settings, scratch);
+    const double scale = system.gray.scale = robust_scale(all[LIST_OF_GRAY], all.gray, gray_floor, settings, scratch);
     if (!settings.use_gray) return;
-    GrayWeights weights = {settings.gray_noise_of_depth && all.count, static_cast<float>(scale * scale),
+    GrayWeights weights = {settings.gray_noise_of_depth && all.gray, static_cast<float>(scale * scale),
                            static_cast<float>(settings.huber_sigmas * scale), static_cast<float>(settings.huber_sigmas)};
     if (weights.known) {
-        set_variances(samples, image, T, system.depth.scale, settings, all);
-        const double rest = scale * scale - static_cast<double>(median_magnitude(all[VARIANCE], all.count, 1, scratch.keys));
+        set_variances(image, T, system.depth.scale, settings, all);
+        const double rest = scale * scale - static_cast<double>(median_magnitude(all[LIST_OF_GRAY], all.gray, 1, scratch.keys));
         const double least = gray_floor * gray_floor;
         weights.variance = static_cast<float>(rest > least ? rest : least);
     }
-    sum_batches<PARAMETERS>(all, statistics ? &tiles : nullptr, system.gray,
-                           [&](size_t begin, int count, Rows& rows) { gray_rows(image, all, begin, count, weights, &rows); });
+    sum_batches<PARAMETERS>(all, HAS_GRAY, statistics ? &tiles : nullptr, system.gray,
+                            [&](size_t begin, int count, Rows& rows) { gray_rows(image, all, begin, count, weights, &rows); });
+    system.gray.count = all.gray;
 }
 
 }  // namespace KERNEL_ISA
