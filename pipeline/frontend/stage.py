@@ -25,6 +25,7 @@ from duagc.pipeline.frontend.components import Component
 from duagc.pipeline.frontend.exposure import ExposureEstimation
 from duagc.pipeline.frontend.failure import Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages, pyramid_of
+from duagc.pipeline.frontend.kept_pyramids import KeptPyramids
 from duagc.pipeline.frontend.leading_frames import track_leading_frames
 from duagc.pipeline.frontend.output import (
     BuiltMap,
@@ -169,12 +170,12 @@ def _trajectory(frames: Sequence[TrackedFrame], T_map_keyframe: Array) -> Trajec
 
 
 def _images(log: RgbdLog) -> Images:
-    """Reads the images of a frame, by its index and the number of pyramid levels."""
+    """Reads the images of a frame, by its index and the number of pyramid levels; depth must not be moved in between."""
 
     def images(frame_index: int, levels: int) -> RgbdPyramid:
         return pyramid_of(log.frame(frame_index), log.camera, levels)
 
-    return images
+    return KeptPyramids(images)
 
 
 @dataclass(frozen=True, kw_only=True)
