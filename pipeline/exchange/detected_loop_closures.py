@@ -98,9 +98,10 @@ class KeyframeDatabase:
 
     def _build_pyramid(self, keyframe: int) -> RgbdPyramid:
         images = self.data.images(keyframe)
-        color = images.color.astype(np.float32) / np.float32(255)
         camera, sigma_m = self.data.camera, images.depth_sigma_m
-        return RgbdPyramid.build(color, images.depth_m, camera, depth_sigma_m=sigma_m, mask=images.mask)
+        return RgbdPyramid.build(
+            images.color, images.depth_m, camera, depth_sigma_m=sigma_m, mask=images.mask
+        )
 
     @property
     def digest(self) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import RgbdFrame
 from duagc.pipeline.registration import RgbdPyramid
 
-Image = NDArray[np.floating]
+Image = NDArray[Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +22,7 @@ class RgbdImages:
     Attributes:
         frame_index: in the log.
         stamp_ns: time of the frame.
-        image: color [h, w, 3] or gray [h, w], 0..1.
+        image: color [h, w, 3], uint8 or 0..1, or gray [h, w], 0..1.
         depth_m: [h, w], meters, 0 = unknown.
         mask: bool [h, w], False where a pixel must not be used, neither its depth nor its color; None = all may.
         depth_sigma_m: [h, w], standard deviation of the depth, meters; None: that of the sensor model.
@@ -50,7 +51,7 @@ class RgbdImages:
         return RgbdImages(
             frame_index=frame.index,
             stamp_ns=frame.stamp_ns,
-            image=_scaled(frame.color),
+            image=frame.color,
             depth_m=frame.depth,
             mask=frame.mask,
             depth_sigma_m=frame.depth_sigma,
@@ -68,15 +69,10 @@ def pyramid_of(frame: RgbdFrame, camera: PinholeCamera, levels: int) -> RgbdPyra
         levels: of the pyramid.
     """
     return RgbdPyramid.build(
-        _scaled(frame.color),
+        frame.color,
         frame.usable_depth,
         camera,
         levels,
         depth_sigma_m=frame.depth_sigma,
         mask=frame.mask,
     )
-
-
-def _scaled(color: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Color 0..255 as float32 0..1."""
-    return color.astype(np.float32) * np.float32(1 / 255)
