@@ -21,6 +21,8 @@ from duagc.pipeline.registration import Level, RegistrationConfig, RgbdPyramid
 
 Image = NDArray[np.floating]
 
+ROWS_COMPARED_FIRST = 16  # every so many: two images of a moving camera differ in most pixels
+
 
 class Reason(Enum):
     """Why a frame has no pose, or only part of it was used; recorded in the log.
@@ -90,6 +92,10 @@ class FrozenImageDetector:
 
     def _same(self, image: Image, before: Image) -> bool:
         """Whether nearly all measured pixels have the very value that they had before."""
+        rows, rows_before = image[::ROWS_COMPARED_FIRST], before[::ROWS_COMPARED_FIRST]
+        changed = int(np.count_nonzero((rows != rows_before) & (rows != 0)))
+        if changed > (1 - self.config.frozen_share) * image.size + 1:
+            return False
         known = int(np.count_nonzero(image))
         same = int(np.count_nonzero((image == before) & (image != 0)))
         return known > 0 and same >= self.config.frozen_share * known
@@ -144,7 +150,7 @@ def saturated_share(level: Level) -> float:
         level: of a frame.
     """
     gray = level.gray if level.mask is None else level.gray[level.mask]
-    return float(np.mean((gray <= 0.01) | (gray >= 0.99))) if gray.size else 1.0
+    return np.count_nonzero((gray <= 0.01) | (gray >= 0.99)) / gray.size if gray.size else 1.0
 
 
 def shows_anything(pyramid: RgbdPyramid, config: FailureConfig) -> bool:
