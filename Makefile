@@ -69,7 +69,7 @@ sanitize: setup $(SANITIZED)
 	ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1 \
 	LD_PRELOAD="$$(c++ -print-file-name=libasan.so) $$(c++ -print-file-name=libstdc++.so)" \
 	DUAGC_RASTER=$$(echo $(dir $(SANITIZED))duagc/pipeline/kernels/_raster*.so) \
-	$(BIN)/python -m pytest --capture=sys -p tests.kernels.other_build -m "not slow" tests/kernels
+	$(BIN)/python -m pytest --capture=sys -p tests.kernels.other_build -m "not slow" tests/kernels tests/registration/test_compiled.py
 
 $(SANITIZED): $(SOURCES)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --upgrade --target $(dir $@) \

@@ -170,7 +170,7 @@ def _trajectory(frames: Sequence[TrackedFrame], T_map_keyframe: Array) -> Trajec
 
 
 def _images(log: RgbdLog) -> Images:
-    """Reads the images of a frame, by its index and the number of pyramid levels; depth must not be moved in between."""
+    """Reads the images of a frame, by its index and the number of pyramid levels, as long as no depth is moved."""
 
     def images(frame_index: int, levels: int) -> RgbdPyramid:
         return pyramid_of(log.frame(frame_index), log.camera, levels)
@@ -212,8 +212,9 @@ class _ComponentStage:
             path: of the log.
         """
         log, clock = self.log, self.clock
-        optimization = PathOptimization(_images(log), self.config, self.seed, log.robot)
-        optimized = optimization.run(component.keyframes, frames, component.pairs)
+        optimized = PathOptimization(_images(log), self.config, self.seed, log.robot).run(
+            component.keyframes, frames, component.pairs
+        )
         solution, frames = optimized.solution, optimized.frames
         log.move_depth(_trajectory(frames, solution.T_map_keyframe))
         keyframes = keyframe_messages(self.name, optimized.keyframes, solution)
