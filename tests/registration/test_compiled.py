@@ -11,6 +11,7 @@ from duagc.pipeline.kernels import pyramid as compiled_pyramid
 from duagc.pipeline.registration import (
     Level,
     Reference,
+    ReferenceLevel,
     RegistrationConfig,
     RgbdPyramid,
     compiled,
@@ -87,6 +88,26 @@ def test_normal_equations_are_those_of_the_residuals(reference, target, settings
                 assert getattr(found, name) == getattr(wanted, name), name
     no_normals = target == "without depth" and settings == "all gates"
     assert (found.agreeing == 0) == (target == "nothing" or no_normals)
+
+
+def test_images_of_a_few_pixels_show_nothing(reference):
+    rng = np.random.default_rng(0)
+    for width, height in ((1, 1), (3, 5), (5, 3), (4, 4)):
+        camera = replace(CAMERA, width=width, height=height, fx=2.0, fy=2.0, cx=1.5, cy=1.5)
+        images = rng.uniform(0.5, 2.5, (2, height, width)).astype(np.float32)
+        at = (reference, RgbdPyramid.build(*images, camera, 1), 0, OFF)
+        for config in (SETTINGS["usual"], SETTINGS["all gates"]):
+            wanted = residuals.linearize_at(*at, exposure=EXPOSURE, config=config).system()
+            found = compiled.linearize_at(*at, exposure=EXPOSURE, config=config)
+            assert (found.view, found.agreeing) == (wanted.view, wanted.agreeing)
+            assert_same_equations(found.gray, wanted.gray)
+    nothing = Reference(
+        tuple(ReferenceLevel(*np.zeros((2, 0, 3), np.float32), np.zeros(0, np.float32)) for _ in STRIDES)
+    )
+    empty = compiled.linearize_at(
+        nothing, TARGETS["plain"], 0, OFF, exposure=EXPOSURE, config=RegistrationConfig()
+    )
+    assert (empty.agreeing, empty.view, empty.gray.count) == (0, 0.0, 0)
 
 
 def without_sigmas(reference: Reference) -> Reference:

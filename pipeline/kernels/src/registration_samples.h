@@ -72,6 +72,7 @@ NO_INLINE static void project_samples(const float* __restrict points, int count,
 ALWAYS_INLINE inline void copy_pair(float* to, const float* from) { std::memcpy(to, from, 2 * sizeof(float)); }
 
 static void gather_pixels(const TargetImages& image, Batch& b, int count) {
+    if (image.width < 4 || image.height < 4) return;  // no sample is inside
     const std::ptrdiff_t width = image.width;
     for (int i = 0; i < count; i++) {
         const std::ptrdiff_t corner = static_cast<int32_t>(b.v[i]) * width + static_cast<int32_t>(b.u[i]);
@@ -155,6 +156,7 @@ NO_INLINE static void rotate_normals(const float* __restrict T, const float* __r
 // Samples whose normal is not that of the target at the nearest pixel do not agree.
 static void compare_normals(const TargetImages& image, float min_cosine, const Samples& all, size_t begin, int count, Batch& b) {
     for (int i = 0; i < count; i++) {
+        if (!(b.flags[i] & AGREES)) continue;
         const size_t pixel = static_cast<size_t>(b.v[i] + 0.5f) * static_cast<size_t>(image.width) + static_cast<size_t>(b.u[i] + 0.5f);
         const float* const n = image.normals + 3 * pixel;
         const float cosine = n[0] * all[MX][begin + i] + n[1] * all[MY][begin + i] + n[2] * all[MZ][begin + i];
@@ -212,7 +214,7 @@ NO_INLINE static void residuals(const TargetImages& image, const Exposure exposu
 static void view_samples(const TargetImages& image, const float* T, Exposure exposure, const AlignmentSettings& settings, Samples& all,
                          AlignmentSystem& system) {
     const SampleArrays& samples = *all.of;
-    Batch b;
+    Batch b = {};
     for (size_t begin = 0; begin < samples.count; begin += BATCH) {
         const int count = static_cast<int>(samples.count - begin < BATCH ? samples.count - begin : BATCH);
         const auto at = [&](Column k) { return all.column[k] + begin; };
