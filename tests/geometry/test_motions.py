@@ -52,6 +52,14 @@ def test_batches_equal_single_motions() -> None:
     )
 
 
+@given(xi=tangents())
+@example(np.array([0, 0, 0, np.pi, 0, 0.0]))
+@example(np.zeros(6))
+def test_the_logarithm_of_one_rotation_has_the_bits_of_a_batch(xi: np.ndarray) -> None:
+    R = so3.exp(xi[3:])
+    np.testing.assert_array_equal(so3.log(R), so3.log(R[None])[0])
+
+
 def test_projection_finds_the_nearest_rotation() -> None:
     rng = np.random.default_rng(1)
     R = so3.exp(rng.normal(size=3))
