@@ -76,13 +76,13 @@ def minimize(
         projection: [6, 6] P; the images count only along P x of a step x.
         isa: instruction set of the kernels.
     """
-    count = levels_used(reference, pyramid, config)
+    count = max(1, levels_used(reference, pyramid, config))  # without any step, the guess is judged
     levels = [
         _level_arrays(samples, level, config)
         for samples, level in zip(reference.levels[:count], pyramid.levels[:count], strict=True)
     ]
     search = alignment.Search(
-        iterations=config.iterations[:count],
+        iterations=config.iterations[:count] or (0,),
         min_samples=config.min_samples,
         tolerance=STEP_TOLERANCE,
         coarse_tolerance=STEP_TOLERANCE_COARSE,

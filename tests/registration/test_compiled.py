@@ -176,6 +176,16 @@ def test_the_minimum_is_that_of_the_definition(reference, how):
     assert abs(its_system.agreeing - system.agreeing) <= 2
 
 
+def test_without_a_step_the_guess_is_judged(reference):
+    config = RegistrationConfig(iterations=())
+    options = {"prior_information": None, "projection": search.ALL_DIRECTIONS}
+    for minimize in (search.minimize, compiled.minimize):
+        T, exposure, system = minimize(reference, TARGETS["plain"], OFF, config, **options)
+        np.testing.assert_array_equal(T, OFF)
+        np.testing.assert_array_equal(exposure, [1, 0])
+        assert system.agreeing > 1000
+
+
 def test_a_prior_far_from_the_pose_pulls_as_the_logarithm_says():
     """Nothing is seen; the prior is all there is, and what it does to the first step is known."""
     T = se3.exp(np.array([0.2, -0.1, 0.05, 0.9, -1.2, 0.4]))
