@@ -36,7 +36,7 @@ static Samples make_samples(const SampleArrays& arrays, AlignmentScratch& scratc
     return all;
 }
 
-struct Batch {
+struct SampleBatch {
     alignas(64) float qx[BATCH], qy[BATCH], qz[BATCH], u[BATCH], v[BATCH];
     alignas(64) int32_t flags[BATCH];
     // Around the pixel, two neighbors at a time: gray[r] at row v0 - 1 + r, in gray[1] and gray[2] first those at u0 - 1 and
@@ -51,7 +51,7 @@ ALWAYS_INLINE inline float rotated(const float* row, float x, float y, float z) 
 
 // Frame and pixel in the target, and whether the pixel and its neighbors lie inside; if not, the pixel is (1, 1).
 NO_INLINE static void project_samples(const float* __restrict points, int count, const float* __restrict T, const TargetImages& image,
-                                      Batch* __restrict b) {
+                                      SampleBatch* __restrict b) {
     const float rows[3][4] = {{T[0], T[1], T[2], T[3]}, {T[4], T[5], T[6], T[7]}, {T[8], T[9], T[10], T[11]}};
     const float fx = image.fx, fy = image.fy, cx = image.cx, cy = image.cy;
     const float right = static_cast<float>(image.width - 2), bottom = static_cast<float>(image.height - 2);
@@ -71,7 +71,7 @@ NO_INLINE static void project_samples(const float* __restrict points, int count,
 
 ALWAYS_INLINE inline void copy_pair(float* to, const float* from) { std::memcpy(to, from, 2 * sizeof(float)); }
 
-static void gather_pixels(const TargetImages& image, Batch& b, int count) {
+static void gather_pixels(const TargetImages& image, SampleBatch& b, int count) {
     if (image.width < 4 || image.height < 4) return;  // no sample is inside
     const std::ptrdiff_t width = image.width;
     for (int i = 0; i < count; i++) {
@@ -101,7 +101,7 @@ ALWAYS_INLINE inline float bilinear(float a, float b, float tl, float tr, float 
 }
 
 // Interpolates at the pixels.
-NO_INLINE static void interpolate(int count, Batch* __restrict b) {
+NO_INLINE static void interpolate(int count, SampleBatch* __restrict b) {
     for (int i = 0; i < count; i++) {
         const float s = fraction(b->u[i]), t = fraction(b->v[i]);
         const float a1 = b->above[2 * i], a2 = b->above[2 * i + 1], d1 = b->below[2 * i], d2 = b->below[2 * i + 1];
@@ -113,14 +113,14 @@ NO_INLINE static void interpolate(int count, Batch* __restrict b) {
     }
 }
 
-NO_INLINE static void interpolate_sigma(int count, Batch* __restrict b) {
+NO_INLINE static void interpolate_sigma(int count, SampleBatch* __restrict b) {
     for (int i = 0; i < count; i++)
         b->noise[i] = bilinear(fraction(b->u[i]), fraction(b->v[i]), b->sigma[0][2 * i], b->sigma[0][2 * i + 1], b->sigma[1][2 * i],
                                b->sigma[1][2 * i + 1]);
 }
 
 // Compares depths.
-NO_INLINE static void judge(const TargetImages& image, const AlignmentSettings& settings, int count, Batch* __restrict b) {
+NO_INLINE static void judge(const TargetImages& image, const AlignmentSettings& settings, int count, SampleBatch* __restrict b) {
     if (image.has_depth)
         for (int i = 0; i < count; i++)
             b->z[i] = 1.0f / bilinear(fraction(b->u[i]), fraction(b->v[i]), b->depth[0][2 * i], b->depth[0][2 * i + 1], b->depth[1][2 * i],
@@ -154,7 +154,7 @@ NO_INLINE static void rotate_normals(const float* __restrict T, const float* __r
 }
 
 // Samples whose normal is not that of the target at the nearest pixel do not agree.
-static void compare_normals(const TargetImages& image, float min_cosine, const Samples& all, size_t begin, int count, Batch& b) {
+static void compare_normals(const TargetImages& image, float min_cosine, const Samples& all, size_t begin, int count, SampleBatch& b) {
     for (int i = 0; i < count; i++) {
         if (!(b.flags[i] & AGREES)) continue;
         const size_t pixel = static_cast<size_t>(b.v[i] + 0.5f) * static_cast<size_t>(image.width) + static_cast<size_t>(b.u[i] + 0.5f);
@@ -164,7 +164,7 @@ static void compare_normals(const TargetImages& image, float min_cosine, const S
     }
 }
 
-static void compare_gradients(float min_gradient, int count, Batch& b) {
+static void compare_gradients(float min_gradient, int count, SampleBatch& b) {
     const float least = min_gradient * min_gradient;
     for (int i = 0; i < count; i++)
         if (!(b.by_u[i] * b.by_u[i] + b.by_v[i] * b.by_v[i] >= least)) b.flags[i] &= ~HAS_GRAY;
@@ -178,7 +178,7 @@ ALWAYS_INLINE inline float ray(float pixel, float center, float focal) { return 
 
 // Noise of the depth at the samples that agree.
 NO_INLINE static void set_sigmas(const TargetImages& image, const AlignmentSettings& s, const float* __restrict ours, int count,
-                                 Batch* __restrict b) {
+                                 SampleBatch* __restrict b) {
     const AlignmentSettings settings = s;
     if (!image.depth_sigma)
         for (int i = 0; i < count; i++) b->noise[i] = model_sigma(settings, b->z[i]);
@@ -187,7 +187,7 @@ NO_INLINE static void set_sigmas(const TargetImages& image, const AlignmentSetti
 }
 
 // Harmless values where a sample does not agree.
-NO_INLINE static void clear_others(int count, Batch* __restrict b) {
+NO_INLINE static void clear_others(int count, SampleBatch* __restrict b) {
     for (int i = 0; i < count; i++) {
         const bool agrees = (b->flags[i] & AGREES) != 0;
         b->qx[i] = agrees ? b->qx[i] : 0.0f, b->qy[i] = agrees ? b->qy[i] : 0.0f, b->qz[i] = agrees ? b->qz[i] : 1.0f;
@@ -201,7 +201,7 @@ struct Exposure {
 
 NO_INLINE static void residuals(const TargetImages& image, const Exposure exposure, int count, const float* __restrict mx,
                                 const float* __restrict my, const float* __restrict mz, const float* __restrict intensities,
-                                const Batch* __restrict b, float* __restrict of_depth, float* __restrict of_gray) {
+                                const SampleBatch* __restrict b, float* __restrict of_depth, float* __restrict of_gray) {
     const float fx = image.fx, fy = image.fy, cx = image.cx, cy = image.cy;
     for (int i = 0; i < count; i++) {
         const float z = b->z[i], x = ray(b->u[i], cx, fx) * z, y = ray(b->v[i], cy, fy) * z;
@@ -214,7 +214,7 @@ NO_INLINE static void residuals(const TargetImages& image, const Exposure exposu
 static void view_samples(const TargetImages& image, const float* T, Exposure exposure, const AlignmentSettings& settings, Samples& all,
                          AlignmentSystem& system) {
     const SampleArrays& samples = *all.of;
-    Batch b = {};
+    SampleBatch b = {};
     for (size_t begin = 0; begin < samples.count; begin += BATCH) {
         const int count = static_cast<int>(samples.count - begin < BATCH ? samples.count - begin : BATCH);
         const auto at = [&](Column k) { return all.column[k] + begin; };
