@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.frontend import FailureConfig
 from duagc.pipeline.geometry import se3
-from duagc.pipeline.geometry.projection import FREE, back_project, free_space, largest_of_3x3
+from duagc.pipeline.geometry.projection import FREE, free_space
 from duagc.pipeline.registration import Level, RegistrationConfig, RgbdPyramid
 
 Image = NDArray[np.floating]
@@ -198,12 +198,9 @@ def free_space_violations(
     Returns:
         Number of violations, and number of pixels whose place the keyframe measured.
     """
-    v, u = np.nonzero(level.inverse_depth)
-    z = 1 / level.inverse_depth[v, u].astype(np.float64)
-    points = se3.transform(T_keyframe_camera, back_project(level.camera, u, v, z))
     _, where = free_space(
-        points,
-        largest_of_3x3(keyframe.inverse_depth),
+        se3.transform(T_keyframe_camera, level.points),
+        keyframe.nearest,
         level.camera,
         gate_m=config.free_space_gate_m,
         gate_relative=config.free_space_gate_relative,

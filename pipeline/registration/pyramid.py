@@ -14,8 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.geometry import masks
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.geometry.projection import back_project, largest_of_3x3
 from duagc.pipeline.kernels import pyramid as compiled
 
 Image = NDArray[Any]
@@ -59,6 +61,17 @@ class Level:
         if self.mask is None:
             return depths
         return np.where(masks.whole_windows(self.mask, 1), depths, np.float32(0))
+
+    @cached_property
+    def points(self) -> Array:
+        """Points [n, 3] of the pixels of known depth, row by row; meters, camera frame."""
+        v, u = np.nonzero(self.inverse_depth)
+        return back_project(self.camera, u, v, 1 / self.inverse_depth[v, u].astype(np.float64))
+
+    @cached_property
+    def nearest(self) -> Image:
+        """Largest inverse depth [h, w] in the 3x3 pixels around every pixel, 1/m, 0 where none is known."""
+        return largest_of_3x3(self.inverse_depth)
 
     @cached_property
     def normals(self) -> Image:
