@@ -60,13 +60,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
         _part("network", "packets, transport, link model", "base config", estimator=True),
     ),
     (
-        _part(
-            "kernels",
-            "compiled passes: rasterizer, registration, pyramids",
-            _ARRAYS,
-            "splat",
-            estimator=True,
-        ),
+        _part("kernels", "rasterizer, registration", _ARRAYS, "splat", estimator=True),
         _part("messages", "arrays to messages and back", _ARRAYS, "schemas splat"),
     ),
     (
