@@ -15,10 +15,11 @@ from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.runner import agent_input, fuse_robot, prepare_robot, threads_per_worker
+from duagc.pipeline.runner import prepare_robot
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.digest import ROBOT_RESULTS, digest_file
 from duagc.pipeline.runs.folder import RunFolder
+from duagc.pipeline.steps import agent_input, fuse_robot, threads_per_worker
 
 
 @dataclass(frozen=True)

@@ -148,20 +148,30 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
         ),
     ),
     (
+        _part("cache", "what was computed before", "base config recording runs"),
         _part(
-            "runner",
-            "carries a run",
-            "base config runs frontend information recording exchange fusion",
-            "evaluation report viewing recalibration",
+            "steps",
+            "how each stage is called",
+            "base config runs frontend information recording exchange fusion evaluation report viewing",
         ),
     ),
-    (_part("replay", "computes a robot again", "base config runs recording exchange runner"),),
+    (_part("chain", "the stages in their order", "base recording runs cache steps"),),
+    (
+        _part(
+            "job",
+            "a run that is made",
+            "base config runs recording evaluation recalibration cache steps chain",
+        ),
+    ),
+    (_part("runner", "carries a run", "base config runs steps job"),),
+    (_part("replay", "computes a robot again", "base config runs recording exchange steps runner"),),
     (
         _part(
             "cli",
             "the command",
             "base config kernels recording runs converters exchange fusion evaluation",
-            "report viewing checks camera_calibration recalibration team_posegraph bench experiments runner replay",
+            "report viewing checks camera_calibration recalibration team_posegraph bench experiments",
+            "cache steps job runner replay",
         ),
     ),
 )

@@ -26,9 +26,10 @@ from duagc.pipeline.exchange.session import run_session
 from duagc.pipeline.experiments import pose_reference, team_faults
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.replay import replay
-from duagc.pipeline.runner import agent_input, fuse_robot, run
+from duagc.pipeline.runner import run
 from duagc.pipeline.runs.digest import digest, digest_file, result_files
 from duagc.pipeline.runs.folder import RunFolder
+from duagc.pipeline.steps import agent_input, fuse_robot
 from duagc.pipeline.viewing.inspection import Inspector, format_facts, format_loop_closures
 from tests.fixtures.late_program import run_late
 

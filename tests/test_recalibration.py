@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from duagc.converters.datasets import tum
 from duagc.converters.simulate.team import simulate
 from duagc.converters.writer import RecordingWriter
-from duagc.pipeline import recalibration, runner
+from duagc.pipeline import job, recalibration, runner
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.camera_calibration import calibrate as calibrating
 from duagc.pipeline.camera_calibration.adjustment import Quality
@@ -26,9 +26,9 @@ from duagc.pipeline.geometry import so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.recording import Recording, format_info, info, open_rgbd
 from duagc.pipeline.replay import replay
-from duagc.pipeline.runner import Timing
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.runs.stages import CALIBRATED
+from duagc.pipeline.runs.timing import Timing
 
 CAMERAS = [PinholeCamera(64, 48, f, f, 31.5, 23.5) for f in (60.0, 70.0)]
 SMALL = (
@@ -190,7 +190,9 @@ def test_a_run_keeps_the_calibrated_recording(tmp_path: Path, answers: Answers) 
     for after in (SAME, BETTER):
         answers({60.0: after})
         timing = Timing()
-        used, entry = runner._calibrated(recording, folder, RunConfig(), timing, workers=1, log=said.append)
+        used, entry = job.calibrated_recording(
+            recording, folder, RunConfig(), timing, workers=1, log=said.append
+        )
         assert json.loads(json.dumps(entry))["calibration"]["of"] == "../rec"
         assert "calibration" in timing.stages
         if after is SAME:

@@ -31,6 +31,15 @@ Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b=VALUE", help="Change one setting; repeatable.")
 ]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="TOML file; see `duagc config show`.")]
+StoreFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "--store",
+        metavar="DIR",
+        help="Results that are not computed again; else $DUAGC_STORE, else .duagc-store next to the run.",
+        show_default=False,
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on standard output.")]
 
 

@@ -13,6 +13,7 @@ from duagc.pipeline.cli.common import (
     Json,
     Out,
     Overrides,
+    StoreFolder,
     Workers,
     app,
     say,
@@ -34,13 +35,21 @@ def demo(
     """
     from duagc.converters.simulate.team import simulate as simulate_recording
     from duagc.pipeline.base.atomic_folder import new_folder
+    from duagc.pipeline.cache.store import default_store
     from duagc.pipeline.config.run import RunConfig
     from duagc.pipeline.runner import run as run_stages
 
     with new_folder(out, force) as folder:
         say(f"simulate: {robots} robots, {frames} frames each")
         simulate_recording(folder / "recording", robots=robots, frames=frames, seed=seed, workers=workers)
-        run_stages(folder / "recording", folder / "run", RunConfig(seed=seed), workers=workers, log=say)
+        run_stages(
+            folder / "recording",
+            folder / "run",
+            RunConfig(seed=seed),
+            workers=workers,
+            store=default_store(out),
+            log=say,
+        )
     _print_outputs(out / "run")
 
 
@@ -58,37 +67,120 @@ def run(
             help="First calibrate the cameras from the images; use that if it is better (OUT/calibrated).",
         ),
     ] = False,
+    since: Annotated[
+        str | None,
+        typer.Option(
+            "--from",
+            metavar="STAGE",
+            help="Compute this stage and those after it, also if their results are stored.",
+            show_default=False,
+        ),
+    ] = None,
+    until: Annotated[
+        str,
+        typer.Option(
+            metavar="STAGE",
+            help="Last stage: frontend, information, exchange, fusion, evaluation, report, rrd.",
+        ),
+    ] = "rrd",
+    why: Annotated[
+        bool, typer.Option("--why", help="Compute nothing; say what would be computed, and what changed.")
+    ] = False,
+    store: StoreFolder = None,
+    no_cache: Annotated[
+        bool, typer.Option("--no-cache", help="Neither take results from the store nor keep any.")
+    ] = False,
     force: Force = False,
 ) -> None:
     """Run all stages on a recording: maps, information, exchange, fusion, metrics, report, view.
 
+    Stages whose code, settings and inputs did not change are taken from the store: a run that was stopped goes on
+    where it was.
+
     Examples:
     `duagc run recordings/redkitchen --out outputs/redkitchen`,
     `duagc run recordings/desk --calibrate --out outputs/desk`,
-    `duagc run recordings/room --out outputs/lossy --set exchange.link.loss_probability=0.3`
+    `duagc run recordings/room --out outputs/lossy --set exchange.link.loss_probability=0.3`,
+    `duagc run recordings/room --out outputs/room --until frontend`
     """
+    from duagc.pipeline.cache.store import default_store
     from duagc.pipeline.config.base import load_config
     from duagc.pipeline.config.run import RunConfig
+
+    if no_cache and (store is not None or since is not None or why):
+        raise typer.BadParameter("expected without --store, --from, --why", param_hint="--no-cache")
+    settings = load_config(RunConfig, config, overrides or [])
+    place = None if no_cache else store or default_store(out)
+    if why:
+        from duagc.pipeline.job import Plan
+        from duagc.pipeline.job import why as say_why
+
+        plan = Plan(workers, force, calibrate, store=place, since=since, until=until)
+        for line in say_why(recording, out, settings, plan):
+            print(line)
+        return
     from duagc.pipeline.runner import run as run_stages
 
     run_stages(
         recording,
         out,
-        load_config(RunConfig, config, overrides or []),
+        settings,
         workers=workers,
         force=force,
         calibrate=calibrate,
+        store=place,
+        since=since,
+        until=until,
         log=say,
     )
     _print_outputs(out)
 
 
+@app.command()
+def gc(
+    store: StoreFolder = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="A run; else the store next to it.", show_default=False)
+    ] = None,
+    largest: Annotated[
+        str, typer.Option("--max", metavar="SIZE", help="k, M, G and T are understood.")
+    ] = "20G",
+    dry: Annotated[bool, typer.Option("--dry-run", help="Remove nothing; only say what would go.")] = False,
+) -> None:
+    """Bound the store of results: what was not used for longest is removed.
+
+    Runs keep their own copies, and may be going on meanwhile. Without --store, $DUAGC_STORE, else that of outputs/.
+
+    Example: `duagc gc --max 5G`
+    """
+    from duagc.pipeline.cache.garbage import collect
+    from duagc.pipeline.cache.store import default_store
+
+    place = store or default_store(out or Path("outputs/run"))
+    done = collect(place, _bytes("--max", largest), dry)
+    verb = "would be removed" if dry else "removed"
+    print(f"{place}: {done.entries} results {verb}, {done.freed_bytes / 1e6:.1f} MB")
+    print(f"{done.kept_entries} results remain, {done.kept_bytes / 1e6:.1f} MB")
+
+
+def _bytes(option: str, text: str) -> int:
+    number, unit = text[:-1], text[-1:]
+    factor = {"k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}.get(unit)
+    try:
+        return int(float(number) * factor) if factor else int(text)
+    except (ValueError, OverflowError) as error:
+        raise typer.BadParameter(f"{text!r} is not a size such as 20G", param_hint=option) from error
+
+
 def _print_outputs(run_folder: Path) -> None:
-    print(f"report     {run_folder / 'report' / 'index.html'}")
-    print(f"view       {run_folder / 'run.rrd'}")
-    for path in sorted(run_folder.glob("robots/*/refined.ply")):
-        print(f"map        {path}")
-    print(f"metrics    {run_folder / 'metrics.json'}")
+    for name, pattern in (
+        ("report", "report/index.html"),
+        ("view", "run.rrd"),
+        ("map", "robots/*/refined.ply"),
+        ("metrics", "metrics.json"),
+    ):
+        for path in sorted(run_folder.glob(pattern)):
+            print(f"{name:<10} {path}")
 
 
 @app.command()
@@ -137,9 +229,9 @@ def evaluate(
     """
     from duagc.pipeline.evaluation import evaluate as evaluate_run
     from duagc.pipeline.report.labels import comparison_text
-    from duagc.pipeline.runner import threads_per_worker
     from duagc.pipeline.runs.folder import RunFolder
     from duagc.pipeline.runs.stages import EVALUATION
+    from duagc.pipeline.steps import threads_per_worker
 
     run = RunFolder(run_folder)
     source, threads = recording or run.recording, threads_per_worker(1)

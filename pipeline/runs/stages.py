@@ -5,7 +5,7 @@ To add a stage `NAME`:
 1. `schemas/topics.py`: one `Topic` for each new topic, `producer="NAME"`.
 2. Here: `NAME = Stage("NAME", reads=..., writes=..., reads_files=..., writes_files=...)`, and its place in `STAGES`.
 3. `pipeline/NAME/stage.py`: a function from paths to paths; it reads with `read_log` and writes with `LogWriter`.
-4. `pipeline/runner.py`: call it inside `with timing.stage(stages.NAME, folder, robot):`.
+4. `pipeline/steps.py`: a function that calls it, named by `code` of the declaration; `pipeline/runner.py`: its place.
 5. `pipeline/runs/digest.py`: the files that it writes, so that digests cover them.
 6. `tests/layers.py`: the folder, and what it may import.
 
@@ -49,6 +49,9 @@ class Stage:
             if `per_robot`, else that of the run. Files elsewhere, such as the recording, are not limited by name.
         writes_files: files that it writes inside its folder; it may also read these.
         per_robot: whether it is run for one robot at a time, from that robot's topics alone.
+        settings: of the run that it uses, by dotted name; a section stands for all that is in it, "" for all settings.
+        code: `module:function` that computes it; results are found again as long as neither it nor what it imports
+            changes. "": its results are not kept.
     """
 
     name: str
@@ -57,6 +60,8 @@ class Stage:
     reads_files: tuple[str, ...] = ()
     writes_files: tuple[str, ...] = ()
     per_robot: bool = False
+    settings: tuple[str, ...] = ()
+    code: str = ""
 
     def __post_init__(self) -> None:
         for topic in self.writes:
@@ -159,6 +164,9 @@ def _install_hook() -> None:
 
 SENSORS = tuple(topic for topic in topics.TOPICS if topic.scope is Scope.SENSOR)
 TRUTH = tuple(topic for topic in topics.TOPICS if topic.scope is Scope.TRUTH)
+STEPS = "duagc.pipeline.steps"
+THICKNESS = "frontend.mapping.seeding.thickness_m"
+ALL_SETTINGS = ("",)
 RESULTS = tuple(topic for topic in topics.TOPICS if topic.scope in (Scope.ROBOT, Scope.TEAM))
 
 FRONTEND = Stage(
@@ -176,6 +184,8 @@ FRONTEND = Stage(
     ),
     writes_files=("frontend.mcap", "frontend.*.mcap"),
     per_robot=True,
+    settings=("seed", "frontend"),
+    code=f"{STEPS}:frontend",
 )
 INFORMATION = Stage(
     "information",
@@ -184,6 +194,8 @@ INFORMATION = Stage(
     reads_files=("frontend.mcap",),
     writes_files=("information.mcap",),
     per_robot=True,
+    settings=("information", "frontend.moving", THICKNESS),
+    code=f"{STEPS}:information",
 )
 EXCHANGE = Stage(
     "exchange",
@@ -204,7 +216,9 @@ EXCHANGE = Stage(
         topics.LOOP_CLOSURE_DECISION,
     ),
     reads_files=("robots/*/frontend.mcap", "robots/*/information.mcap", CALIBRATED_FILES),
-    writes_files=("exchange.mcap", "consensus.mcap"),
+    writes_files=("exchange.mcap", "consensus.mcap", "robots/*/session.npz"),
+    settings=("seed", "exchange", THICKNESS),
+    code=f"{STEPS}:exchange",
 )
 FUSION = Stage(
     "fusion",
@@ -225,9 +239,11 @@ FUSION = Stage(
         topics.REJECTED_MATCHES,
         topics.PEER_COLORS,
     ),
-    reads_files=("frontend.mcap", "information.mcap"),
+    reads_files=("frontend.mcap", "information.mcap", "session.npz"),
     writes_files=("fused.mcap", "fused.ply", "refined.ply", "trajectory.tum", "odometry.tum"),
     per_robot=True,
+    settings=("seed", "fusion", "exchange.matching", "exchange.weights", "frontend.moving", THICKNESS),
+    code=f"{STEPS}:fusion",
 )
 _FINISHED = (
     CALIBRATED_FILES,
@@ -244,18 +260,24 @@ EVALUATION = Stage(
     reads=(*SENSORS, *TRUTH, *RESULTS),
     reads_files=_FINISHED,
     writes_files=("metrics.json", "metrics.parquet"),
+    settings=ALL_SETTINGS,
+    code=f"{STEPS}:evaluation",
 )
 REPORT = Stage(
     "report",
     reads=(*SENSORS, *TRUTH, *RESULTS),
     reads_files=(*_FINISHED, "metrics.json", "metrics.parquet"),
     writes_files=("report/index.html",),
+    settings=ALL_SETTINGS,
+    code=f"{STEPS}:report",
 )
 VIEW = Stage(
     "rrd",
     reads=(*SENSORS, *TRUTH, *RESULTS),
     reads_files=(*_FINISHED, "metrics.json", "metrics.parquet"),
     writes_files=("run.rrd",),
+    settings=ALL_SETTINGS,
+    code=f"{STEPS}:view",
 )
 STAGES = (FRONTEND, INFORMATION, EXCHANGE, FUSION, EVALUATION, REPORT, VIEW)
 """In the order in which a run takes them."""

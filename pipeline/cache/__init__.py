@@ -1,0 +1,1 @@
+"""Never compute twice: the identity of a computation, and a store of results by it."""

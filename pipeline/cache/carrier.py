@@ -1,0 +1,249 @@
+"""Stages of a run that are computed once: taken from a store where that has them, else computed and kept."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+from duagc.pipeline.cache.file_digests import FileDigest, FileDigests
+from duagc.pipeline.cache.stage_key import StageKey
+from duagc.pipeline.cache.store import DamagedEntryError, Entry, Store
+from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.runs.declared_settings import DeclaredSettings
+from duagc.pipeline.runs.stages import Stage
+from duagc.pipeline.runs.timing import Timing, label
+
+
+class NotStoredError(Exception):
+    """A stage would have to be computed."""
+
+    def __init__(self, key: StageKey) -> None:
+        super().__init__(label(key.stage, key.robot))
+        self.key = key
+
+
+@dataclass(frozen=True)
+class Carried:
+    """A stage that is done.
+
+    Attributes:
+        entry: its results.
+        executed: whether it was computed now.
+    """
+
+    entry: Entry
+    executed: bool
+
+    @property
+    def label(self) -> str:
+        """Name of the stage, and of the robot."""
+        return label(self.entry.key.stage, self.entry.key.robot)
+
+    def content(self, name: str) -> str:
+        """Content digest of a file.
+
+        Args:
+            name: of it, in the folder of the run.
+        """
+        return self.entry.files[name].content
+
+
+@dataclass
+class Carrier:
+    """Carries out stages in the folder of a run.
+
+    Attributes:
+        folder: of the run.
+        config: of the run.
+        store: of results; None: everything is computed, nothing is kept.
+        again: names of stages that are computed whatever the store has.
+        say: gets a line when something is unusual.
+        looking: only look whether the results are there; nothing is copied or computed.
+        earlier: what an earlier run in the same place has, by label; `place` is its folder.
+        found: gets every stage that is there while only looking.
+        begun: called before a stage is computed, or, with True, when it was taken from the store.
+    """
+
+    folder: Path
+    config: RunConfig
+    store: Store | None
+    say: Callable[[str], None]
+    again: frozenset[str] = frozenset()
+    looking: bool = False
+    earlier: Mapping[str, Any] = field(default_factory=dict)
+    place: Path | None = None
+    found: Callable[[Carried], None] = lambda carried: None
+    begun: Callable[[StageKey, bool], None] = lambda key, stored: None
+
+    def settings_of(self, stage: Stage) -> RunConfig:
+        """The settings that a stage declares; reading any other one is an error.
+
+        Args:
+            stage: of the run.
+        """
+        return cast(RunConfig, DeclaredSettings(self.config, stage.name, stage.settings))
+
+    def key(self, stage: Stage, robot: str | None, inputs: Mapping[str, str]) -> StageKey:
+        """What the results of a stage depend on.
+
+        Args:
+            stage: of the run.
+            robot: whose; None: the team's.
+            inputs: content digests, by what they are of.
+        """
+        if self.store is None:
+            return StageKey(stage.name, robot, {}, {}, {}, {})
+        code = self.store.code.version_of(stage.code)
+        settings = DeclaredSettings(self.config, stage.name, stage.settings).plain()
+        return StageKey(stage.name, robot, code.modules, code.libraries, settings, dict(inputs))
+
+    def carry(
+        self,
+        stage: Stage,
+        robot: str | None,
+        inputs: Mapping[str, str],
+        compute: Callable[[Timing], Any],
+        *,
+        files: Callable[[], Iterator[Path]] | None = None,
+    ) -> Carried:
+        """Do a stage, once.
+
+        Args:
+            stage: of the run.
+            robot: whose; None: the team's.
+            inputs: content digests, by what they are of.
+            compute: does it, measured, and returns plain values that belong to its results.
+            files: that it has written, when it is done; by default those that it declares.
+
+        Raises:
+            NotStoredError: it would have to be computed, and `looking` forbids that.
+            DuagError: as the stage.
+        """
+        key = self.key(stage, robot, inputs)
+        if self.looking:
+            entry = self._find(key)
+            if entry is None:
+                raise NotStoredError(key)
+            carried = Carried(entry, False)
+            self.found(carried)
+            return carried
+        if (entry := self._take(key)) is not None:
+            return Carried(entry, False)
+        if self.store is None:
+            return Carried(self._compute(key, stage, compute, files), True)
+        with self.store.claimed(
+            key, lambda: self.say(f"{_words(key)}: another process computes it; waiting")
+        ):
+            if (entry := self._take(key)) is not None:
+                return Carried(entry, False)
+            entry = self._compute(key, stage, compute, files)
+            self._keep(entry)
+            return Carried(entry, True)
+
+    def changes(self, key: StageKey, earlier: str | None = None) -> list[str]:
+        """What is other than in stored results, in words.
+
+        Args:
+            key: of a stage.
+            earlier: digest of the key of these results; None: those that are most like it.
+        """
+        if self.store is None:
+            return ["there is no store"]
+        stored = self.store.latest(key) if earlier is None else self.store.earlier(key, earlier)
+        if stored is None:
+            return [
+                "it was never computed"
+                if earlier is None
+                else "its key differs, and the store forgot that one"
+            ]
+        return key.changes(stored.key)
+
+    def _find(self, key: StageKey) -> Entry | None:
+        if self.store is None or key.stage in self.again:
+            return None
+        if (entry := self.store.find(key, self.say)) is not None:
+            return entry
+        stored = self.earlier.get(label(key.stage, key.robot), {})
+        if stored.get("key") != key.digest:
+            return None
+        files = {name: FileDigest(**digest) for name, digest in stored["files"].items()}
+        return Entry(key, files, stored["result"], stored["timing"])
+
+    def _take(self, key: StageKey) -> Entry | None:
+        """Results of the store, or of the earlier run, in the folder of this one; None if there are none."""
+        entry = self._find(key)
+        if entry is None or self.store is None:
+            return None
+        try:
+            self.store.take(entry, self.folder, self.place)
+        except DamagedEntryError as error:
+            self.say(f"{error}; {_words(key)} is computed again")
+            self.store.forget(key)
+            return None
+        self.begun(key, True)
+        return entry
+
+    def _compute(
+        self,
+        key: StageKey,
+        stage: Stage,
+        compute: Callable[[Timing], Any],
+        files: Callable[[], Iterator[Path]] | None,
+    ) -> Entry:
+        timing = Timing()
+        self.begun(key, False)
+        result = compute(timing)
+        written = self._declared(stage, key.robot) if files is None else files()
+        digests = FileDigests(None) if self.store is None else self.store.files
+        found = {path.relative_to(self.folder).as_posix(): digests.of(path) for path in sorted(written)}
+        return Entry(key, found, result, timing.stages[label(key.stage, key.robot)])
+
+    def _declared(self, stage: Stage, robot: str | None) -> Iterator[Path]:
+        folder = self.folder if robot is None else self.folder / "robots" / robot
+        for pattern in stage.writes_files:
+            yield from folder.glob(pattern)
+
+    def _keep(self, entry: Entry) -> None:
+        """Keep results; a run goes on where a store has no room for them."""
+        assert self.store is not None
+        if entry.key.stage in self.again and (stored := self.store.find(entry.key)) is not None:
+            names = sorted({*stored.files, *entry.files})
+            other = [n for n in names if _content(stored, n) != _content(entry, n)]
+            if other:
+                self.say(
+                    f"warning: {_words(entry.key)}: {other[0]} has digest {_content(entry, other[0])[:12]}, "
+                    f"expected {_content(stored, other[0])[:12]} as computed before from the same"
+                )
+        try:
+            self.store.keep(entry, self.folder)
+        except OSError as error:
+            self.say(
+                f"warning: {self.store.folder}: {error.strerror or error}; {_words(entry.key)} is not kept"
+            )
+
+
+def intact(folder: Path, entry: Entry, digests: FileDigests) -> str:
+    """The first file of results that is not in a folder as it was computed; "" if all are.
+
+    Args:
+        folder: of a run.
+        entry: the results.
+        digests: of files.
+    """
+    for name, digest in entry.files.items():
+        path = folder / name
+        if not path.is_file() or os.path.getsize(path) != digest.size or digests.raw(path) != digest.raw:
+            return name
+        digests.keep(path, digest)
+    return ""
+
+
+def _content(entry: Entry, name: str) -> str:
+    return entry.files[name].content if name in entry.files else "nothing"
+
+
+def _words(key: StageKey) -> str:
+    return f"{key.stage} of {key.robot}" if key.robot else key.stage

@@ -1,0 +1,233 @@
+"""The version of the code of a stage: of its entry, and of everything in this package that it imports.
+
+A module counts by its syntax tree without docstrings, so comments, layout and documentation change nothing. Imports are
+followed from the text, those inside functions included; of the module of the entry only what the entry itself uses.
+Compiled modules count by their bytes, and files that a package reads, such as templates, too.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+import sys
+from dataclasses import dataclass
+from importlib import metadata
+from importlib.machinery import EXTENSION_SUFFIXES
+from pathlib import Path
+from typing import Any
+
+import duagc
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.cache.publish import publish
+
+PACKAGE = "duagc"
+DATA_SUFFIXES = (".binpb", ".j2", ".css")
+DISTRIBUTIONS = {
+    "cv2": "opencv-python-headless",
+    "google": "protobuf",
+    "foxglove_schemas_protobuf": "foxglove-schemas-protobuf",
+    "rerun": "rerun-sdk",
+    "open3d": "open3d-cpu",
+}
+"""Distributions of the modules that are not named as they are."""
+SHOWN_ONLY = frozenset({"rich", "typer", "lazy_loader", "tomlkit"})
+"""Libraries that no result depends on."""
+PYTHON = f"{sys.version_info.major}.{sys.version_info.minor}"
+_RULES = f"1 {PYTHON}"  # of what is counted; part of every stored digest
+
+
+@dataclass(frozen=True)
+class CodeVersion:
+    """What a computation was done with.
+
+    Attributes:
+        modules: digest of every module and data file, by its path in the package.
+        libraries: versions of the libraries that these modules import, and of Python.
+    """
+
+    modules: dict[str, str]
+    libraries: dict[str, str]
+
+
+@dataclass(frozen=True)
+class _Text:
+    """What counts of a piece of code: its digest, the modules that it may name, and libraries."""
+
+    digest: str
+    names: tuple[str, ...]
+    libraries: tuple[str, ...]
+
+
+class CodeReader:
+    """Reads versions of code. What it parsed once it finds again, by the digest of the file."""
+
+    def __init__(self, known: Path | None = None, root: Path | None = None) -> None:
+        """Set up.
+
+        Args:
+            known: file in which parsed modules are kept between processes; None: nothing is kept.
+            root: folder of the package, if it is not the one that runs.
+        """
+        self.root = Path(duagc.__file__).parent if root is None else root
+        self._known = known
+        self._parsed = _stored(known)
+        self._new = False
+        self._texts: dict[Path, _Text] = {}
+        self._paths: dict[str, Path | None] = {}
+        self._versions: dict[str, CodeVersion] = {}
+
+    def version_of(self, entry: str) -> CodeVersion:
+        """The version of a function and of everything that it imports.
+
+        Args:
+            entry: `module:function`.
+
+        Raises:
+            DuagError: there is no such module, or no such function in it.
+        """
+        if entry not in self._versions:
+            self._versions[entry] = self._version_of(entry)
+        return self._versions[entry]
+
+    def _version_of(self, entry: str) -> CodeVersion:
+        module, _, function = entry.partition(":")
+        path = self._path_of(module)
+        if path is None:
+            raise DuagError(f"{module}: no such module of the package, expected the code of a stage")
+        first = _function(path, function)
+        digests, libraries = {f"{self._label(path)}:{function}": first.digest}, set[str]()
+        queue, seen = [first], {path}
+        while queue:
+            text = queue.pop()
+            libraries.update(text.libraries)
+            for found in self._files_of(text.names) - seen:
+                seen.add(found)
+                if found.suffix == ".py":
+                    queue.append(self._text(found))
+                    digests[self._label(found)] = queue[-1].digest
+                else:
+                    digests[self._label(found)] = _digest(found.read_bytes())
+        self._save()
+        versions = {name: version for name in sorted(libraries) if (version := _version(name))}
+        return CodeVersion(dict(sorted(digests.items())), {"python": PYTHON} | versions)
+
+    def _label(self, path: Path) -> str:
+        return path.relative_to(self.root).as_posix()
+
+    def _path_of(self, module: str) -> Path | None:
+        """The file of a module of the package; None if it is none of its modules."""
+        if module not in self._paths:
+            base = self.root.joinpath(*module.split(".")[1:])
+            candidates = [base / "__init__.py"]
+            if base != self.root:
+                candidates.append(base.with_suffix(".py"))
+                candidates += [base.with_name(base.name + suffix) for suffix in EXTENSION_SUFFIXES]
+            self._paths[module] = next((path for path in candidates if path.is_file()), None)
+        return self._paths[module]
+
+    def _files_of(self, names: tuple[str, ...]) -> set[Path]:
+        """Files of modules, of the packages that they are in, and the data files of these packages."""
+        modules = set[str]()
+        for name in names:
+            words = name.split(".")
+            modules |= {".".join(words[:end]) for end in range(1, len(words) + 1)}
+        files = {path for module in modules if (path := self._path_of(module)) is not None}
+        packages = {path.parent for path in files if path.name == "__init__.py" and path.parent != self.root}
+        return files | {p for folder in packages for p in folder.iterdir() if p.suffix in DATA_SUFFIXES}
+
+    def _text(self, path: Path) -> _Text:
+        if path not in self._texts:
+            raw = path.read_bytes()
+            key = _digest(raw)
+            if key not in self._parsed:
+                found = _count(_tree(path, raw).body)
+                self._parsed[key] = [found.digest, found.names, found.libraries]
+                self._new = True
+            digest, names, libraries = self._parsed[key]
+            self._texts[path] = _Text(digest, tuple(names), tuple(libraries))
+        return self._texts[path]
+
+    def _save(self) -> None:
+        """Keep what was parsed; of several processes that do so the last one wins."""
+        if self._known is None or not self._new:
+            return
+        self._new = False
+        try:
+            publish(self._known, json.dumps({"rules": _RULES, "parsed": self._parsed}).encode())
+        except OSError:
+            self._known = None  # a store that can only be read
+
+
+def _stored(known: Path | None) -> dict[str, Any]:
+    """What an earlier process parsed; nothing where that is damaged or was made by other rules."""
+    try:
+        content = json.loads(known.read_bytes()) if known is not None else {}
+        return dict(content["parsed"]) if content["rules"] == _RULES else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _function(path: Path, name: str) -> _Text:
+    """A function with what it uses of its module: other functions, classes, constants, imports."""
+    body = _tree(path, path.read_bytes()).body
+    defined = {n.name: n for n in body if isinstance(n, ast.FunctionDef | ast.ClassDef)}
+    if name not in defined:
+        raise DuagError(f"{path}: found no function {name!r}, expected the code of a stage")
+    used, queue = {name}, [name]
+    while queue:
+        for node in ast.walk(defined[queue.pop()]):
+            if isinstance(node, ast.Name) and node.id in defined and node.id not in used:
+                used.add(node.id)
+                queue.append(node.id)
+    unused = [node for name, node in defined.items() if name not in used]
+    return _count([node for node in body if node not in unused])
+
+
+def _tree(path: Path, raw: bytes) -> ast.Module:
+    try:
+        return ast.parse(raw)
+    except SyntaxError as error:
+        raise DuagError(f"{path}: line {error.lineno}: {error.msg}, expected Python") from error
+
+
+def _count(body: list[ast.stmt]) -> _Text:
+    """Digest and imports of statements."""
+    names, libraries = set[str](), set[str]()
+    kept = _Stripped().visit(ast.Module(body=list(body), type_ignores=[]))
+    for node in ast.walk(kept):
+        found: list[str] = []
+        if isinstance(node, ast.Import):
+            found = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found = [f"{node.module}.{alias.name}" for alias in node.names]
+        names.update(name for name in found if name.split(".")[0] == PACKAGE)
+        libraries.update(name.split(".")[0] for name in found)
+    libraries -= {PACKAGE, *SHOWN_ONLY, *sys.stdlib_module_names}
+    return _Text(_digest(ast.dump(kept).encode()), tuple(sorted(names)), tuple(sorted(libraries)))
+
+
+class _Stripped(ast.NodeTransformer):
+    """Takes out what computes nothing: texts that stand alone, and what only type checkers read."""
+
+    def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
+        """Drop documentation."""
+        alone = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if alone else self.generic_visit(node)
+
+    def visit_If(self, node: ast.If) -> ast.AST | None:
+        """Drop `if TYPE_CHECKING:`."""
+        checked = isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING" and not node.orelse
+        return None if checked else self.generic_visit(node)
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _version(library: str) -> str:
+    """Version of an installed library; "" if it is not installed."""
+    try:
+        return metadata.version(DISTRIBUTIONS.get(library, library))
+    except metadata.PackageNotFoundError:
+        return ""

@@ -1,0 +1,155 @@
+"""The stages of a run in their order, each with what it is computed from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from duagc.pipeline import steps
+from duagc.pipeline.cache.carrier import Carried, Carrier
+from duagc.pipeline.cache.file_digests import FileDigests
+from duagc.pipeline.recording import RECORDING_FILE, Recording
+from duagc.pipeline.runs import stages
+from duagc.pipeline.runs.session_file import NAME as SESSION
+from duagc.pipeline.runs.timing import Timing, label
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A robot, or a component of it, with its own results."""
+
+    frontend: Carried
+    information: Carried | None
+
+
+class Chain:
+    """The stages of a run in their order, each with what it is computed from."""
+
+    def __init__(self, recording: Recording, carrier: Carrier, digests: FileDigests) -> None:
+        """Set up.
+
+        Args:
+            recording: that the run is of.
+            carrier: does the stages.
+            digests: of the files of the recording.
+        """
+        self._recording, self._carrier, self._digests = recording, carrier, digests
+
+    def robot(self, robot: str, *, threads: int, alone: bool = False) -> dict[str, Prepared]:
+        """Front end and Fisher information of one robot, from its own log alone; by name of the component.
+
+        Args:
+            robot: its name.
+            threads: of the kernels; changes no bit of the result.
+            alone: leave the information out.
+        """
+        log, carrier = self._recording.log(robot), self._carrier
+        folder = carrier.folder / "robots" / robot
+        digest = self._digests.of(log).content if carrier.store is not None else ""
+
+        def track_and_map(timing: Timing) -> None:
+            folder.mkdir(parents=True, exist_ok=True)
+            settings = carrier.settings_of(stages.FRONTEND)
+            with timing.stage(stages.FRONTEND, folder, robot):
+                parts = steps.frontend(log, robot, folder, settings, threads=threads)
+            timing.stages[label("frontend", robot)]["parts"] = parts
+
+        def written() -> Iterator[Path]:
+            for of_component in steps.move_components(robot, folder).values():
+                yield of_component / "frontend.mcap"
+
+        front = carrier.carry(stages.FRONTEND, robot, {"log": digest}, track_and_map, files=written)
+        names = [Path(name).parts[1] for name in front.entry.files]
+        if alone:
+            return {name: Prepared(front, None) for name in names}
+        return {name: Prepared(front, self._information(name, front, digest, threads)) for name in names}
+
+    def _information(self, name: str, front: Carried, log_digest: str, threads: int) -> Carried:
+        log, carrier = self._recording.log(name), self._carrier
+        folder = carrier.folder / "robots" / name
+
+        def inform(timing: Timing) -> None:
+            settings = carrier.settings_of(stages.INFORMATION)
+            with timing.stage(stages.INFORMATION, folder, name):
+                steps.information(log, folder, settings, threads=threads)
+
+        inputs = {"log": log_digest, "frontend": front.content(f"robots/{name}/frontend.mcap")}
+        return carrier.carry(stages.INFORMATION, name, inputs, inform)
+
+    def exchange(self, prepared: Mapping[str, Prepared]) -> Carried:
+        """The exchange of the team.
+
+        Args:
+            prepared: every robot, by name.
+        """
+        logs = {name: self._recording.log(name) for name in sorted(prepared)}
+        carrier = self._carrier
+
+        def meet(timing: Timing) -> None:
+            settings = carrier.settings_of(stages.EXCHANGE)
+            with timing.stage(stages.EXCHANGE, carrier.folder):
+                steps.exchange(logs, carrier.folder, settings)
+
+        inputs: dict[str, str] = {}
+        for name, robot in sorted(prepared.items()):
+            inputs |= {f"{part} of {name}": digest for part, digest in _own(name, robot).items()}
+        return carrier.carry(stages.EXCHANGE, None, inputs, meet)
+
+    def fusion(self, name: str, robot: Prepared, exchange: Carried) -> Carried:
+        """The fused map of one robot.
+
+        Args:
+            name: of the robot.
+            robot: with its own results.
+            exchange: of the team.
+        """
+        log, carrier = self._recording.log(name), self._carrier
+        folder = carrier.folder / "robots" / name
+
+        def fuse(timing: Timing) -> dict[str, str]:
+            settings = carrier.settings_of(stages.FUSION)
+            with timing.stage(stages.FUSION, folder, name):
+                return steps.fusion(name, log, folder, settings)
+
+        session = exchange.content(f"robots/{name}/{SESSION}")
+        return carrier.carry(stages.FUSION, name, _own(name, robot) | {"session": session}, fuse)
+
+    def reader(self, stage: stages.Stage, done: Sequence[Carried], more: Mapping[str, str]) -> Carried:
+        """Evaluation, report or view: of everything that is there.
+
+        Args:
+            stage: one of these.
+            done: all stages before.
+            more: digests of what else it reads.
+        """
+        carrier, recording = self._carrier, self._recording.path
+        step = getattr(steps, "view" if stage is stages.VIEW else stage.name)
+
+        def read(timing: Timing) -> None:
+            with timing.stage(stage, carrier.folder):
+                step(carrier.folder, recording)
+
+        inputs = {name: d.content for c in done for name, d in c.entry.files.items()}
+        inputs |= {f"recording: {name}": digest for name, digest in self._recorded().items()}
+        return carrier.carry(stage, None, {**inputs, **more}, read)
+
+    def _recorded(self) -> dict[str, str]:
+        """Digests of all that the recording names, true poses and geometry among it."""
+        recording = self._recording
+        if self._carrier.store is None:
+            return {}
+        files = [recording.path / RECORDING_FILE, recording.geometry()]
+        for robot in recording.robots:
+            files += [recording.log(robot), recording.groundtruth(robot)]
+        return {path.name: self._digests.of(path).content for path in files if path is not None}
+
+
+def _own(name: str, robot: Prepared) -> dict[str, str]:
+    """What a robot's own results are computed from, and these."""
+    assert robot.information is not None
+    return {
+        "log": robot.frontend.entry.key.inputs.get("log", ""),
+        "frontend": robot.frontend.content(f"robots/{name}/frontend.mcap"),
+        "information": robot.information.content(f"robots/{name}/information.mcap"),
+    }

@@ -1,0 +1,482 @@
+"""A run that is being made: its stages in order, robots in parallel, and what it says about itself."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from duagc import __version__
+from duagc.pipeline.base.component_names import robot_of
+from duagc.pipeline.base.errors import DuagError, closest
+from duagc.pipeline.base.workers import worker_pool
+from duagc.pipeline.cache.carrier import Carried, Carrier, NotStoredError, intact
+from duagc.pipeline.cache.file_digests import FileDigests
+from duagc.pipeline.cache.stage_key import StageKey
+from duagc.pipeline.cache.store import Store
+from duagc.pipeline.chain import Chain, Prepared
+from duagc.pipeline.config.base import dump_config
+from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.recording import Recording
+from duagc.pipeline.runs import stages
+from duagc.pipeline.runs.digest import RESULT_SUFFIXES, digest_file
+from duagc.pipeline.runs.folder import SCHEMA
+from duagc.pipeline.runs.timing import Timing, label
+from duagc.pipeline.steps import threads_per_worker
+
+LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
+NAMES = tuple(stage.name for stage in stages.STAGES)
+LAST: str = stages.VIEW.name
+TITLES = {
+    stages.EXCHANGE.name: "exchange and consensus",
+    stages.FUSION.name: "fusion",
+    stages.EVALUATION.name: "evaluation",
+    stages.REPORT.name: "report",
+    stages.VIEW.name: "view",
+}
+"""Stages that this process does, as they are announced."""
+Say = Callable[[str], None]
+
+
+def say(line: str) -> None:
+    """Say something on standard error."""
+    print(line, file=sys.stderr, flush=True)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a run is carried out; nothing here changes a bit of its results.
+
+    Attributes:
+        workers: robots prepared at the same time.
+        force: replace an earlier run in the same place.
+        calibrate: calibrate the cameras from the recording's own images first. Where views that were not used say
+            that it is better, the run is of the calibrated recording, which is kept in its folder `calibrated`.
+        store: folder of results that are not computed again; None: everything is computed, and nothing is kept.
+        since: the first stage that is computed whatever the store has; None: none is.
+        until: the last stage that is done.
+    """
+
+    workers: int = 2
+    force: bool = False
+    calibrate: bool = False
+    store: Path | None = None
+    since: str | None = None
+    until: str = LAST
+
+    def __post_init__(self) -> None:
+        for option, name in (("--from", self.since), ("--until", self.until)):
+            if name is not None and name not in NAMES:
+                raise DuagError(f"{option} {name}: is no stage, {closest(name, NAMES, 'a stage')}")
+        if self.since is not None and NAMES.index(self.since) > NAMES.index(self.until):
+            raise DuagError(f"--from {self.since}: comes after --until {self.until}, expected it before")
+
+    @property
+    def again(self) -> frozenset[str]:
+        """Stages that are computed whatever the store has."""
+        return frozenset() if self.since is None else frozenset(NAMES[NAMES.index(self.since) :])
+
+    def has(self, stage: stages.Stage) -> bool:
+        """Whether a stage is done.
+
+        Args:
+            stage: of the run.
+        """
+        return NAMES.index(stage.name) <= NAMES.index(self.until)
+
+
+class Job:
+    """A run that is being made, or looked at."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        folder: Path,
+        config: RunConfig,
+        plan: Plan,
+        log: Say,
+        *,
+        place: Path,
+        looking: bool = False,
+    ) -> None:
+        """Set up.
+
+        Args:
+            recording: that the run is of.
+            folder: of the run.
+            config: settings of all stages.
+            plan: how it is done.
+            log: gets a line at the start of every stage, and every warning.
+            place: where an earlier run may be.
+            looking: only look what is there: nothing is computed or written.
+        """
+        self.recording, self.folder, self.config, self.plan, self.log = recording, folder, config, plan, log
+        self.store = None if plan.store is None else Store(plan.store)
+        self.digests = FileDigests(None) if self.store is None else self.store.files
+        self.carrier = Carrier(
+            folder,
+            config,
+            self.store,
+            log,
+            again=plan.again,
+            looking=looking,
+            earlier={} if self.store is None else stages_of(place),
+            place=place,
+            begun=self._announce,
+        )
+        self.missing: list[StageKey] = []
+        self._calibration: dict[str, Any] = {}
+        self._timing = Timing()
+        self._place = place
+
+    def run(self) -> None:
+        """Do everything.
+
+        Raises:
+            DuagError: what a user can fix.
+        """
+        if self.plan.has(stages.EVALUATION) and (self.plan.calibrate or not self._is_stored()):
+            from duagc.pipeline.evaluation import check_ground_truth
+
+            check_ground_truth(self.recording)  # before minutes of work
+        (self.folder / "config.toml").write_text(dump_config(self.config))
+        if self.plan.calibrate:
+            self.recording, self._calibration = calibrated_recording(
+                self.recording,
+                self.folder,
+                self.config,
+                self._timing,
+                workers=self.plan.workers,
+                log=self.log,
+            )
+        for robot in self.recording.robots:
+            path = self.recording.log(robot)
+            if (found := self._digest(path)) != (expected := self.recording.digest(path.name)):
+                self.log(
+                    f"warning: {path}: has digest {found[:12]}, expected {expected[:12]} as in recording.json"
+                )
+        self.stages()
+
+    def stages(self) -> list[Carried]:
+        """All stages of the plan, in their order.
+
+        Raises:
+            NotStoredError: one would have to be computed while only looking; `missing` has those that are known.
+            DuagError: as the stages.
+        """
+        plan, chain = self.plan, Chain(self.recording, self.carrier, self.digests)
+        prepared = self._prepared(chain)
+        own = [c for robot in prepared.values() for c in (robot.frontend, robot.information) if c is not None]
+        done = list({c.label: c for c in own}.values())
+        if plan.has(stages.EXCHANGE):
+            exchange = self._noted(chain.exchange, prepared)
+            done.append(exchange)
+        if plan.has(stages.FUSION):
+            done += self._fused(chain, prepared, exchange)
+        self._write(done)
+        notes = {"calibration": _digest_of(self._calibration)} if self._calibration else {}
+        if plan.has(stages.EVALUATION):
+            done.append(self._noted(chain.reader, stages.EVALUATION, done, notes))
+            self._write(done)
+        readers = []
+        if plan.has(stages.REPORT):
+            shown = {
+                "config.toml": _digest_of(dump_config(self.config)),
+                "times": _digest_of(self._times(done)),
+            }
+            readers.append(self._noted(chain.reader, stages.REPORT, done, notes | shown))
+        if plan.has(stages.VIEW):
+            readers.append(self._noted(chain.reader, stages.VIEW, done, notes))
+        self._write([*done, *readers])
+        return [*done, *readers]
+
+    def look(self) -> tuple[list[Carried], list[StageKey]]:
+        """What is there, and what would have to be computed as far as that can be told."""
+        found: dict[str, Carried] = {}
+
+        def note(carried: Carried) -> None:
+            found[carried.label] = carried
+
+        self.carrier.found = note
+        with suppress(NotStoredError):
+            self.stages()
+        return list(found.values()), self.missing
+
+    def _announce(self, key: StageKey, stored: bool) -> None:
+        """Say that a stage begins, and why where an earlier result of it is there."""
+        title = TITLES.get(key.stage)
+        if title is None:
+            return
+        title = f"{title}: {key.robot}" if key.robot else title
+        self.log(f"{title}: from the store" if stored else title)
+
+    def _noted(self, do: Callable[..., Carried], *arguments: Any) -> Carried:
+        try:
+            return do(*arguments)
+        except NotStoredError as error:
+            self.missing.append(error.key)
+            raise
+
+    def _fused(self, chain: Chain, prepared: dict[str, Prepared], exchange: Carried) -> list[Carried]:
+        done = []
+        for name, robot in prepared.items():
+            try:
+                done.append(self._noted(chain.fusion, name, robot, exchange))
+            except NotStoredError:
+                continue
+            if not self.carrier.looking:
+                for neighbor, reason in done[-1].entry.result.items():
+                    self.log(f"warning: {name} uses nothing of {neighbor}'s map: {reason}")
+        if self.missing:
+            raise NotStoredError(self.missing[0])
+        return done
+
+    def _prepared(self, chain: Chain) -> dict[str, Prepared]:
+        """Every robot with its own results, by name; `workers` at a time in processes of their own."""
+        alone = not self.plan.has(stages.INFORMATION)
+        looking = Chain(self.recording, self._looking_carrier(), self.digests)
+        found: dict[str, Prepared] = {}
+        absent = []
+        for robot in self.recording.robots:
+            try:
+                found |= looking.robot(robot, threads=1, alone=alone)
+            except NotStoredError as error:
+                self.missing.append(error.key)
+                absent.append(robot)
+        if self.carrier.looking:
+            if absent:
+                raise NotStoredError(self.missing[0])
+            return dict(sorted(found.items()))
+        self.missing.clear()
+        for robot in set(self.recording.robots) - set(absent):
+            found |= chain.robot(robot, threads=threads_per_worker(1), alone=alone)
+        if absent:
+            workers = min(self.plan.workers, len(absent))
+            self.log(f"front end and information: {len(absent)} robots, {workers} at a time")
+            found |= self._prepared_in_workers(absent, workers, alone)
+        else:
+            self.log(f"front end and information: {len(found)} robots from the store")
+        for name in sorted(set(found) - set(self.recording.robots)):
+            self.log(
+                f"warning: {name}: what {robot_of(name)} saw after it was lost did not join the rest of its path"
+            )
+        return dict(sorted(found.items()))
+
+    def _prepared_in_workers(self, robots: list[str], workers: int, alone: bool) -> dict[str, Prepared]:
+        threads = threads_per_worker(workers)
+        found: dict[str, Prepared] = {}
+        with worker_pool(workers) as pool:
+            job = self.recording.path, self.folder, self.config, self.plan
+            tasks = [
+                pool.submit(_prepare, *job, robot=robot, place=self._place, threads=threads, alone=alone)
+                for robot in robots
+            ]
+            for task in tasks:
+                found |= task.result()
+        return found
+
+    def _looking_carrier(self) -> Carrier:
+        return replace(self.carrier, looking=True)
+
+    def _is_stored(self) -> bool:
+        """Whether nothing would be computed."""
+        looking = Job(
+            self.recording,
+            self.folder,
+            self.config,
+            self.plan,
+            self.log,
+            place=self._place,
+            looking=True,
+        )
+        try:
+            looking.stages()
+        except NotStoredError:
+            return False
+        return True
+
+    def _digest(self, path: Path) -> str:
+        return digest_file(path) if self.store is None else self.digests.of(path).content
+
+    def _times(self, done: list[Carried]) -> dict[str, Any]:
+        """What each stage took when it was computed."""
+        return self._timing.stages | {carried.label: dict(carried.entry.timing) for carried in done}
+
+    def _write(self, done: list[Carried]) -> None:
+        """manifest.json and timing.json, of what is done."""
+        if self.carrier.looking:
+            return
+        executed = {carried.label: carried.executed for carried in done}
+        times = {
+            name: row | {"executed": executed.get(name, True)} for name, row in self._times(done).items()
+        }
+        _write_json(self.folder / "timing.json", {"stages": times})
+        _write_json(self.folder / "manifest.json", self._manifest(done) | self._calibration)
+
+    def _manifest(self, done: list[Carried]) -> dict[str, Any]:
+        """What went in and what came out, by digest."""
+        from importlib.metadata import version
+
+        files = {name: digest.content for carried in done for name, digest in carried.entry.files.items()}
+        manifest = {
+            "schema": SCHEMA,
+            "duagc": __version__,
+            "libraries": {name: version(name) for name in LIBRARIES},
+            "recording": os.path.relpath(self.recording.path, self.folder),
+            "config": digest_file(self.folder / "config.toml"),
+            "inputs": {robot: self._digest(self.recording.log(robot)) for robot in self.recording.robots},
+            "outputs": {n: digest for n, digest in files.items() if Path(n).suffix in RESULT_SUFFIXES},
+        }
+        if self.store is not None:
+            manifest["stages"] = {carried.label: _row(carried) for carried in done}
+        return manifest
+
+
+def _row(carried: Carried) -> dict[str, Any]:
+    entry = carried.entry
+    plain = entry.plain()
+    return {"key": entry.key.digest, "inputs": dict(entry.key.inputs)} | {
+        name: plain[name] for name in ("files", "result", "timing")
+    }
+
+
+def stages_of(run: Path) -> dict[str, Any]:
+    """What the manifest of a run says of its stages; empty if there is none, or none that says it.
+
+    Args:
+        run: folder of the run.
+    """
+    try:
+        content = json.loads((run / "manifest.json").read_bytes())
+        rows = content["stages"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+    return rows if isinstance(rows, dict) else {}
+
+
+def _prepare(
+    recording: Path,
+    folder: Path,
+    config: RunConfig,
+    plan: Plan,
+    *,
+    robot: str,
+    place: Path,
+    threads: int,
+    alone: bool,
+) -> dict[str, Prepared]:
+    """One robot, in a process of its own."""
+    job = Job(Recording(recording), folder, config, plan, lambda line: say(f"duagc: {line}"), place=place)
+    return Chain(job.recording, job.carrier, job.digests).robot(robot, threads=threads, alone=alone)
+
+
+def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: Plan, log: Say) -> bool:
+    """Whether a run is what it would be now; False: it is the beginning of that, or a file of it is damaged.
+
+    Args:
+        recording: that the run is of.
+        out: folder of an earlier run.
+        config: settings of all stages.
+        plan: how it is done; with a store.
+        log: gets a line about what is damaged.
+
+    Raises:
+        DuagError: it is another run, or none.
+    """
+    earlier = stages_of(out)
+    if not earlier:
+        raise DuagError(f"{out}: exists already; choose another --out or give --force")
+    job = Job(recording, out, config, replace(plan, since=None), log, place=out, looking=True)
+    done, keys = job.look()
+    for key in [*(carried.entry.key for carried in done), *keys]:
+        name = label(key.stage, key.robot)
+        if name in earlier and earlier[name]["key"] != key.digest:
+            changes = "; ".join(job.carrier.changes(key, earlier[name]["key"]))
+            raise DuagError(
+                f"{out}: exists already, and {name} differs ({changes}); choose another --out or give --force"
+            )
+    if keys or plan.since is not None or any(carried.label not in earlier for carried in done):
+        return False
+    for carried in done:
+        if name := intact(out, carried.entry, job.digests):
+            log(f"{out / name}: is not what was computed; taken from the store")
+            return False
+    return True
+
+
+def why(recording_path: Path, out: Path, config: RunConfig, plan: Plan) -> list[str]:
+    """What a run would compute, and what changed; nothing is computed.
+
+    Args:
+        recording_path: folder of the recording.
+        out: folder of the run.
+        config: settings of all stages.
+        plan: how it is done.
+
+    Returns:
+        A line for every stage that can be told now.
+    """
+    if plan.store is None:
+        return ["every stage is computed: there is no store"]
+    job = Job(Recording(recording_path), out, config, plan, lambda line: None, place=out, looking=True)
+    done, missing = job.look()
+    lines = [f"{carried.label}: in the store" for carried in done]
+    for key in missing:
+        reason = "--from" if key.stage in plan.again else "; ".join(job.carrier.changes(key))
+        lines.append(f"{label(key.stage, key.robot)}: computed: {reason}")
+    if missing:
+        last = max(NAMES.index(key.stage) for key in missing)
+        if later := NAMES[last + 1 : NAMES.index(plan.until) + 1]:
+            lines.append(f"{', '.join(later)}: computed unless the results before turn out as they were")
+    return lines
+
+
+def calibrated_recording(
+    recording: Recording,
+    folder: Path,
+    config: RunConfig,
+    timing: Timing,
+    *,
+    workers: int,
+    log: Callable[[str], None],
+) -> tuple[Recording, dict[str, Any]]:
+    """Calibrate a recording from its own images.
+
+    Args:
+        recording: as it is.
+        folder: of the run; gets a folder `calibrated` if that is better.
+        config: settings.
+        timing: of the run.
+        workers: robots that are tracked at the same time.
+        log: gets what was found, in sentences.
+
+    Returns:
+        The recording that the run is of, and what the manifest says about its calibration.
+    """
+    from duagc.pipeline.recalibration import calibrated
+
+    def place() -> Path:
+        (folder / stages.CALIBRATED).mkdir()
+        return folder / stages.CALIBRATED
+
+    log("calibration")
+    with timing.measured("calibration"):
+        outcomes, written = calibrated(recording, place, recording.name, config, workers=workers)
+    for line in (line for outcome in outcomes for line in outcome.lines()):
+        log(line)
+    entry = {"of": os.path.relpath(recording.path, folder), "cameras": [o.plain() for o in outcomes]}
+    return Recording(folder / stages.CALIBRATED) if written else recording, {"calibration": entry}
+
+
+def _digest_of(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n")

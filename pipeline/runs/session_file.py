@@ -1,0 +1,138 @@
+"""What a robot takes home from a session, as a file: the exchange writes it and the fusion of that robot reads it."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import check_file, new_file
+from duagc.pipeline.consensus.evidence import Evidence
+from duagc.pipeline.runs.robot_data import LoopClosureRecord, SessionResult
+
+NAME = "session.npz"
+SCHEMA = 1
+_FAST = 1  # level of the compression: evidence is noise for the most part
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # equal results are equal bytes
+
+
+def write_session_result(path: Path, result: SessionResult) -> None:
+    """Write the result of a session.
+
+    Args:
+        path: of the file.
+        result: of one robot.
+    """
+    arrays = _Arrays()
+    plain = {
+        "schema": SCHEMA,
+        "robot": result.robot,
+        "component": list(result.component),
+        "T_world_keyframe": arrays.add(result.T_world_keyframe),
+        "T_world_keyframe_of": {name: arrays.add(T) for name, T in result.T_world_keyframe_of.items()},
+        "own_evidence": _plain_evidence(result.own_evidence, arrays),
+        "evidence": {name: _plain_evidence(e, arrays) for name, e in result.evidence.items()},
+        "depth_of": result.depth_of,
+        "pairs": [[lower, higher, arrays.add(ids)] for (lower, higher), ids in result.pairs.items()],
+        "closures": [_plain_closure(closure, arrays) for closure in result.closures],
+        "agreed": result.agreed,
+        "converged": result.converged,
+        "rounds": result.rounds,
+        "rounds_to_agreement": result.rounds_to_agreement,
+        "refused": result.refused,
+    }
+    with (
+        new_file(path) as part,
+        zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=_FAST) as file,
+    ):
+        file.writestr(zipfile.ZipInfo("result.json", _EPOCH), json.dumps(plain))
+        for number, array in enumerate(arrays.arrays):
+            with file.open(zipfile.ZipInfo(f"{number}.npy", _EPOCH), "w", force_zip64=True) as stream:
+                np.lib.format.write_array(stream, np.ascontiguousarray(array), allow_pickle=False)
+
+
+def read_session_result(path: Path) -> SessionResult:
+    """Read the result of a session.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        DuagError: it is missing, damaged or of another version.
+    """
+    check_file(path, "the result of a session")
+    try:
+        with zipfile.ZipFile(path) as file:
+            plain = json.loads(file.read("result.json"))
+            if plain["schema"] != SCHEMA:
+                raise DuagError(f"{path}: schema is {plain['schema']}, expected {SCHEMA}")
+            return _result(plain, _Reader(file))
+    except (zipfile.BadZipFile, OSError, ValueError, KeyError, TypeError) as error:
+        raise DuagError(f"{path}: {error}, expected the result of a session") from error
+
+
+@dataclass
+class _Arrays:
+    """Arrays by number, as they stand in the file."""
+
+    arrays: list[NDArray[Any]] = field(default_factory=list)
+
+    def add(self, array: NDArray[Any]) -> int:
+        self.arrays.append(array)
+        return len(self.arrays) - 1
+
+
+@dataclass(frozen=True)
+class _Reader:
+    file: zipfile.ZipFile
+
+    def __call__(self, number: int | None) -> Any:
+        if number is None:
+            return None
+        with self.file.open(f"{number}.npy") as stream:
+            return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def _plain_evidence(evidence: Evidence, arrays: _Arrays) -> dict[str, Any]:
+    parts = ("ids", "anchors", "theta", "information")
+    return {"owner": evidence.owner, **{part: arrays.add(getattr(evidence, part)) for part in parts}}
+
+
+def _plain_closure(closure: LoopClosureRecord, arrays: _Arrays) -> dict[str, Any]:
+    found = {"T_own_peer": closure.T_own_peer, "information": closure.information}
+    numbers = {name: None if array is None else arrays.add(array) for name, array in found.items()}
+    return asdict(replace(closure, T_own_peer=None, information=None)) | numbers
+
+
+def _evidence(plain: dict[str, Any], array: _Reader) -> Evidence:
+    return Evidence(**{name: value if name == "owner" else array(value) for name, value in plain.items()})
+
+
+def _closure(plain: dict[str, Any], array: _Reader) -> LoopClosureRecord:
+    arrays = {name: array(plain[name]) for name in ("T_own_peer", "information")}
+    return LoopClosureRecord(**(plain | arrays))
+
+
+def _result(plain: dict[str, Any], array: _Reader) -> SessionResult:
+    return SessionResult(
+        robot=plain["robot"],
+        component=tuple(plain["component"]),
+        T_world_keyframe=array(plain["T_world_keyframe"]),
+        T_world_keyframe_of={name: array(T) for name, T in plain["T_world_keyframe_of"].items()},
+        own_evidence=_evidence(plain["own_evidence"], array),
+        evidence={name: _evidence(e, array) for name, e in plain["evidence"].items()},
+        depth_of=plain["depth_of"],
+        pairs={(lower, higher): array(ids) for lower, higher, ids in plain["pairs"]},
+        closures=tuple(_closure(closure, array) for closure in plain["closures"]),
+        agreed=plain["agreed"],
+        converged=plain["converged"],
+        rounds=plain["rounds"],
+        rounds_to_agreement=plain["rounds_to_agreement"],
+        refused=plain["refused"],
+    )

@@ -1,0 +1,62 @@
+"""What the stages of a run took. None of it is part of any digest."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from duagc.pipeline.runs.stages import Stage
+
+
+def label(stage: str, robot: str | None) -> str:
+    """Name of a stage of one robot, or of the team, in timing.json and manifest.json.
+
+    Args:
+        stage: its name.
+        robot: whose; None: the team's.
+    """
+    return f"{stage}.{robot}" if robot else stage
+
+
+class Timing:
+    """Runs stages inside their declarations, and keeps wall time, processor time and peak memory of each."""
+
+    def __init__(self) -> None:
+        self.stages: dict[str, dict[str, Any]] = {}
+
+    @contextmanager
+    def stage(self, stage: Stage, folder: Path, robot: str | None = None) -> Iterator[None]:
+        """Enforce and time a stage while the block runs.
+
+        Args:
+            stage: with what it declares.
+            folder: of the robot if the stage is per robot, else of the run.
+            robot: whose stage it is; None for a stage of the whole team.
+
+        Raises:
+            DuagError: the stage reads or writes what it did not declare.
+        """
+        with self.measured(stage.name, robot), stage.running(folder, robot):
+            yield
+
+    @contextmanager
+    def measured(self, name: str, robot: str | None = None) -> Iterator[None]:
+        """Time what is done while the block runs.
+
+        Args:
+            name: of what is done.
+            robot: for whom; None for the whole team.
+        """
+        wall, cpu = time.perf_counter(), time.process_time()
+        yield
+        self.stages[label(name, robot)] = {
+            "stage": name,
+            "robot": robot,
+            "wall_s": round(time.perf_counter() - wall, 3),
+            "cpu_s": round(time.process_time() - cpu, 3),
+            "peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+        }

@@ -1,0 +1,205 @@
+"""What a run does, step by step: how each stage is called, on which files, with which settings.
+
+A step gets no setting but those that its stage declares, and a stored result of it counts for as long as the function
+here and all that it imports stay the same. So imports are inside the functions.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from duagc.pipeline.base import determinism
+from duagc.pipeline.base.component_names import component_name
+from duagc.pipeline.base.errors import DuagError
+
+if TYPE_CHECKING:
+    from duagc.pipeline.config.run import RunConfig
+    from duagc.pipeline.runs.robot_data import AgentInput, SessionResult
+
+
+def threads_per_worker(workers: int) -> int:
+    """Threads of each of `workers` processes on this machine."""
+    return max(1, len(os.sched_getaffinity(0)) // workers)
+
+
+def frontend(log: Path, robot: str, folder: Path, config: RunConfig, *, threads: int) -> dict[str, float]:
+    """Track and map one robot.
+
+    Args:
+        log: the robot's log.
+        robot: its name.
+        folder: where frontend.mcap goes; frontend.2.mcap, of a component that did not join the largest one, too.
+        config: of the run.
+        threads: of the kernels; changes no bit of the result.
+
+    Returns:
+        Wall times of its parts.
+
+    Raises:
+        DuagError: the log is damaged, or another robot's.
+    """
+    from duagc.pipeline.frontend.stage import run_frontend
+    from duagc.pipeline.recording import open_rgbd
+
+    determinism.configure_opencv()
+    with open_rgbd(log) as camera:
+        if camera.robot != robot:
+            raise DuagError(f"{log}: is the log of {camera.robot}, expected that of {robot}")
+    return run_frontend(
+        log, folder / "frontend.mcap", config.frontend, seed=config.seed, threads=threads, progress=True
+    )
+
+
+def move_components(robot: str, folder: Path) -> dict[str, Path]:
+    """Move the logs of further components into folders of their own; all folders by name, the robot's first.
+
+    Args:
+        robot: whose they are.
+        folder: of the robot.
+    """
+    out = {robot: folder}
+    for path in sorted(folder.glob("frontend.*.mcap"), key=lambda p: int(p.name.split(".")[1])):
+        name = component_name(robot, int(path.name.split(".")[1]))
+        out[name] = folder.with_name(name)
+        out[name].mkdir(exist_ok=True)
+        path.rename(out[name] / "frontend.mcap")
+    return out
+
+
+def information(log: Path, folder: Path, config: RunConfig, *, threads: int) -> None:
+    """Fisher information of one robot's map.
+
+    Args:
+        log: the robot's log.
+        folder: with frontend.mcap; gets information.mcap.
+        config: of the run.
+        threads: of the kernels; changes no bit of the result.
+    """
+    from duagc.pipeline.information.stage import run_information
+
+    determinism.configure_opencv()
+    run_information(
+        log,
+        folder / "frontend.mcap",
+        folder / "information.mcap",
+        config=config.information,
+        moving=config.frontend.moving,
+        thickness_floor_m=config.frontend.mapping.seeding.thickness_m,
+        threads=threads,
+    )
+
+
+def agent_input(robot: str, log: Path, folder: Path, config: RunConfig) -> AgentInput:
+    """What the agent of a robot may know before the first packet: its own log and its own results."""
+    from duagc.pipeline.runs.robot_data import AgentInput
+
+    files = folder / "frontend.mcap", folder / "information.mcap"
+    thickness_m = config.frontend.mapping.seeding.thickness_m
+    return AgentInput(robot, log, *files, thickness_floor_m=thickness_m)
+
+
+def exchange(logs: dict[str, Path], folder: Path, config: RunConfig) -> None:
+    """Let the team meet.
+
+    Args:
+        logs: of the robots' sensors, by name of the component.
+        folder: of the run; gets exchange.mcap, consensus.mcap, and what each robot takes home.
+        config: of the run.
+    """
+    from duagc.pipeline.exchange.session import run_session
+    from duagc.pipeline.runs.session_file import NAME, write_session_result
+
+    determinism.configure_opencv()
+    inputs = [agent_input(robot, log, folder / "robots" / robot, config) for robot, log in logs.items()]
+    results = run_session(
+        inputs,
+        config.exchange,
+        seed=config.seed,
+        exchange_path=folder / "exchange.mcap",
+        consensus_path=folder / "consensus.mcap",
+    )
+    for robot, result in results.items():
+        write_session_result(folder / "robots" / robot / NAME, result)
+
+
+def fusion(robot: str, log: Path, folder: Path, config: RunConfig) -> dict[str, str]:
+    """Fused map and corrected trajectory of one robot, from what it took home.
+
+    Args:
+        robot: its name.
+        log: of its sensors.
+        folder: of its own results.
+        config: of the run.
+
+    Returns:
+        Neighbors of whose maps nothing is used, and why.
+    """
+    from duagc.pipeline.runs.session_file import NAME, read_session_result
+
+    return fuse_robot(robot, log, folder, read_session_result(folder / NAME), config=config)
+
+
+def fuse_robot(
+    robot: str, log: Path, folder: Path, result: SessionResult, *, config: RunConfig
+) -> dict[str, str]:
+    """Fused map and corrected trajectory of one robot, into the folder of its own results; one robot at a time.
+
+    Returns:
+        Neighbors of whose maps nothing is used, and why.
+    """
+    from duagc.pipeline.fusion.stage import run_fusion
+
+    determinism.configure_opencv()
+    checks = run_fusion(
+        agent_input(robot, log, folder, config),
+        result,
+        folder,
+        config=config.fusion,
+        matching=config.exchange.matching.of_maps(config.frontend.mapping.seeding.thickness_m),
+        moving=config.frontend.moving,
+        weights=config.exchange.weights,
+        seed=config.seed,
+        threads=threads_per_worker(1),
+    )
+    return {check.peer: check.reason for check in checks if not check.trusted}
+
+
+def evaluation(folder: Path, recording: Path) -> None:
+    """Measure the run.
+
+    Args:
+        folder: of the run; gets metrics.json and metrics.parquet.
+        recording: folder of its recording.
+    """
+    from duagc.pipeline.evaluation import evaluate
+
+    determinism.configure_opencv()
+    evaluate(folder, recording, threads=threads_per_worker(1))
+
+
+def report(folder: Path, recording: Path) -> None:
+    """Write the page of the run.
+
+    Args:
+        folder: of the run; gets report/index.html.
+        recording: folder of its recording.
+    """
+    from duagc.pipeline.report import write_report
+
+    determinism.configure_opencv()
+    write_report(folder, recording)
+
+
+def view(folder: Path, recording: Path) -> None:
+    """Write the run as Rerun shows it.
+
+    Args:
+        folder: of the run; gets run.rrd.
+        recording: folder of its recording.
+    """
+    from duagc.pipeline.viewing.run_rrd import write_rrd
+
+    determinism.configure_opencv()
+    write_rrd(folder, recording, folder / "run.rrd")
