@@ -49,10 +49,11 @@ class Chain:
         digest = self._digests.of(log).content if carrier.store is not None else ""
 
         def track_and_map(timing: Timing) -> None:
+            steps.check_log(log, robot)
             folder.mkdir(parents=True, exist_ok=True)
             settings = carrier.settings_of(stages.FRONTEND)
             with timing.stage(stages.FRONTEND, folder, robot):
-                parts = steps.frontend(log, robot, folder, settings, threads=threads)
+                parts = steps.frontend(log, folder, settings, threads=threads)
             timing.stages[label("frontend", robot)]["parts"] = parts
 
         def written() -> Iterator[Path]:

@@ -37,9 +37,10 @@ def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, *, thr
     Returns:
         The timings of the stages.
     """
+    steps.check_log(log, robot)
     timing = Timing()
     with timing.stage(stages.FRONTEND, folder, robot):
-        parts = steps.frontend(log, robot, folder, config, threads=threads)
+        parts = steps.frontend(log, folder, config, threads=threads)
     timing.stages[label("frontend", robot)]["parts"] = parts
     for name, of_component in steps.move_components(robot, folder).items():
         with timing.stage(stages.INFORMATION, of_component, name):

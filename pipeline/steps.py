@@ -24,29 +24,39 @@ def threads_per_worker(workers: int) -> int:
     return max(1, len(os.sched_getaffinity(0)) // workers)
 
 
-def frontend(log: Path, robot: str, folder: Path, config: RunConfig, *, threads: int) -> dict[str, float]:
-    """Track and map one robot.
+def check_log(log: Path, robot: str) -> None:
+    """Refuse the log of another robot, before the front end would stumble over it.
 
     Args:
-        log: the robot's log.
-        robot: its name.
-        folder: where frontend.mcap goes; frontend.2.mcap, of a component that did not join the largest one, too.
-        config: of the run.
-        threads: of the kernels; changes no bit of the result.
-
-    Returns:
-        Wall times of its parts.
+        log: that the recording names.
+        robot: whose it should be.
 
     Raises:
         DuagError: the log is damaged, or another robot's.
     """
-    from duagc.pipeline.frontend.stage import run_frontend
     from duagc.pipeline.recording import open_rgbd
 
     determinism.configure_opencv()
     with open_rgbd(log) as camera:
         if camera.robot != robot:
             raise DuagError(f"{log}: is the log of {camera.robot}, expected that of {robot}")
+
+
+def frontend(log: Path, folder: Path, config: RunConfig, *, threads: int) -> dict[str, float]:
+    """Track and map one robot.
+
+    Args:
+        log: the robot's log.
+        folder: where frontend.mcap goes; frontend.2.mcap, of a component that did not join the largest one, too.
+        config: of the run.
+        threads: of the kernels; changes no bit of the result.
+
+    Returns:
+        Wall times of its parts.
+    """
+    from duagc.pipeline.frontend.stage import run_frontend
+
+    determinism.configure_opencv()
     return run_frontend(
         log, folder / "frontend.mcap", config.frontend, seed=config.seed, threads=threads, progress=True
     )

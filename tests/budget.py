@@ -22,6 +22,7 @@ BUDGET_S = {
     "camera_calibration": 8,
     "checks": 23,
     "cli": 6,
+    "cache": 4,
     "config": 1,
     "consensus": 9,
     "converters": 112,

@@ -163,7 +163,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             "base config runs recording evaluation recalibration cache steps chain",
         ),
     ),
-    (_part("runner", "carries a run", "base config runs steps job"),),
+    (_part("runner", "carries a run", "base config runs recording steps job"),),
     (_part("replay", "computes a robot again", "base config runs recording exchange steps runner"),),
     (
         _part(

@@ -31,6 +31,7 @@ from duagc.pipeline.runs.digest import digest, digest_file, result_files
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.steps import agent_input, fuse_robot
 from duagc.pipeline.viewing.inspection import Inspector, format_facts, format_loop_closures
+from tests.fixtures.commands import assert_one_line, duagc_here
 from tests.fixtures.late_program import run_late
 
 SMALL = (
@@ -389,3 +390,76 @@ def test_a_signed_packet_can_be_asked_for(finished: Path, recording: Path, tmp_p
     assert facts["bytes"] == 34 + 8 + 1100 + 64
     state = next(k for k, p in enumerate(packets) if p.kind_name == "STATE")
     assert inspector.packet(state)["content"]["bytes_of_poses"] == 0
+
+
+def again(recording: Path, out: Path, *options: str) -> tuple[int, list[str], str]:
+    """`duagc run` as `finished` was made: exit code, what it said, and what it printed."""
+    settings = [word for line in SMALL for word in ("--set", line)]
+    result = duagc_here("run", recording, "--out", out, *settings, *options)
+    return result.returncode, result.stderr.splitlines(), result.stdout
+
+
+def executed(run_folder: Path) -> list[str]:
+    rows = json.loads((run_folder / "timing.json").read_text())["stages"]
+    return [name for name, row in rows.items() if row["executed"]]
+
+
+def test_a_run_that_is_there_already_is_up_to_date(recording: Path, finished: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
+    assert len(executed(finished)) == 10
+    code, lines, printed = again(recording, finished)
+    assert (code, lines) == (0, [f"duagc: {finished}: up to date"])
+    assert "refined.ply" in printed
+    assert {path: path.stat().st_mtime_ns for path in finished.rglob("*")} == before
+
+
+def test_a_damaged_result_of_a_run_is_taken_from_the_store(
+    folder: Path, recording: Path, finished: Path
+) -> None:
+    damaged = folder / "damaged_run"
+    shutil.copytree(finished, damaged)
+    (damaged / "robots" / "alpha" / "odometry.tum").write_text("nothing")
+    code, lines, _ = again(recording, damaged)
+    assert code == 0
+    assert "odometry.tum: is not what was computed; taken from the store" in lines[0]
+    assert digest(damaged) == digest(finished)
+    assert executed(damaged) == []
+
+
+def test_another_consensus_computes_nothing_upstream_and_going_back_nothing_at_all(
+    folder: Path, recording: Path, finished: Path
+) -> None:
+    other = "--set=exchange.link.loss_probability=0.2"
+    code, _, printed = again(recording, finished, other, "--why")
+    assert code == 0
+    assert printed.splitlines() == [
+        "frontend.alpha: in the store",
+        "information.alpha: in the store",
+        "frontend.bravo: in the store",
+        "information.bravo: in the store",
+        "exchange: computed: settings: exchange.link.loss_probability 0.0 -> 0.2",
+        "fusion, evaluation, report, rrd: computed unless the results before turn out as they were",
+    ]
+    code, lines, _ = again(recording, finished, other)
+    assert code == 1
+    assert "exchange differs (settings: exchange.link.loss_probability 0.0 -> 0.2)" in lines[0]
+    again(recording, folder / "run_other", other, "--until", "exchange")
+    assert executed(folder / "run_other") == ["exchange"]
+    code, lines, _ = again(recording, folder / "run_other", "--force")
+    assert code == 0
+    assert executed(folder / "run_other") == []
+    assert digest(folder / "run_other") == digest(finished)
+    for name in ("metrics.json", "report/index.html"):
+        assert (folder / "run_other" / name).read_bytes() == (finished / name).read_bytes()
+
+
+def test_stages_have_names(recording: Path, folder: Path) -> None:
+    for option in ("--from", "--until"):
+        assert_one_line(
+            duagc_here("run", recording, "--out", folder / "none", option, "fussion"), "perhaps fusion"
+        )
+    assert_one_line(
+        duagc_here("run", recording, "--out", folder / "none", "--from", "fusion", "--until", "exchange"),
+        "comes after --until exchange",
+    )
+    assert duagc_here("run", recording, "--out", folder / "none", "--no-cache", "--why").returncode == 2

@@ -1,0 +1,131 @@
+"""The version of a stage's code changes with what it computes by, and with nothing else."""
+
+from pathlib import Path
+
+import pytest
+
+from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.cache.code_identity import CodeReader
+from duagc.pipeline.runs import stages
+
+ENTRY = "duagc.steps:track"
+STEPS = '''"""How stages are called."""
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from duagc.unread import Nothing
+
+
+def track():
+    """Track."""
+    from duagc.front.stage import run
+    return helper(run())
+
+
+def helper(value):
+    return value
+
+
+def fuse():
+    from duagc.fusion import run
+    return run()
+'''
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    files = {
+        "__init__.py": "",
+        "steps.py": STEPS,
+        "front/__init__.py": "",
+        "front/stage.py": "import numpy as np\nfrom duagc.base import two\n\ndef run():\n    return two() + np.pi\n",
+        "front/page.j2": "<p>",
+        "base.py": "def two():\n    return 2\n",
+        "fusion.py": "def run():\n    return 1\n",
+        "unread.py": "class Nothing: ...\n",
+    }
+    for name, text in files.items():
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    return tmp_path
+
+
+def version(package: Path) -> dict[str, str]:
+    return CodeReader(root=package).version_of(ENTRY).modules
+
+
+def change(package: Path, name: str, old: str, new: str) -> None:
+    text = (package / name).read_text()
+    assert old in text
+    (package / name).write_text(text.replace(old, new))
+
+
+def test_it_has_what_is_imported_also_inside_functions_and_nothing_else(package: Path) -> None:
+    assert list(version(package)) == [
+        "__init__.py",
+        "base.py",
+        "front/__init__.py",
+        "front/page.j2",
+        "front/stage.py",
+        "steps.py:track",
+    ]
+    assert CodeReader(root=package).version_of(ENTRY).libraries.keys() == {"python", "numpy"}
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("base.py", "def two():\n", 'def two():\n    """Two."""\n'),
+        ("base.py", "return 2", "return  2  # as ever"),
+        ("steps.py", '"""Track."""', '"""Track and map."""'),
+        ("steps.py", "return run()\n", "return 2 * run()\n"),  # of another stage
+        ("fusion.py", "return 1", "return 2"),
+        ("unread.py", "...", "x = 1"),
+    ],
+)
+def test_words_and_other_stages_change_nothing(package: Path, name: str, old: str, new: str) -> None:
+    before = version(package)
+    change(package, name, old, new)
+    assert version(package) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "changed"),
+    [
+        ("base.py", "return 2", "return 3", "base.py"),
+        ("front/page.j2", "<p>", "<b>", "front/page.j2"),
+        ("steps.py", "return value", "return -value", "steps.py:track"),
+    ],
+)
+def test_what_it_computes_by_changes_it(package: Path, name: str, old: str, new: str, changed: str) -> None:
+    before = version(package)
+    change(package, name, old, new)
+    after = version(package)
+    assert [name for name in before if before[name] != after[name]] == [changed]
+
+
+def test_what_was_parsed_is_found_again_and_damage_there_changes_nothing(package: Path) -> None:
+    known = package / "code.json"
+    fresh = CodeReader(known, package).version_of(ENTRY)
+    assert known.is_file()
+    assert CodeReader(known, package).version_of(ENTRY) == fresh
+    known.write_text(known.read_text()[:100])
+    assert CodeReader(known, package).version_of(ENTRY) == fresh
+
+
+def test_a_step_that_is_not_there_is_one_line(package: Path) -> None:
+    for entry in ("duagc.steps:nothing", "duagc.nowhere:track"):
+        with pytest.raises(DuagError, match="expected the code of a stage"):
+            CodeReader(root=package).version_of(entry)
+
+
+def test_every_stage_counts_its_own_folder_and_the_compiled_kernels() -> None:
+    reader = CodeReader()
+    of = {stage.name: reader.version_of(stage.code).modules for stage in stages.STAGES}
+    assert any("/_raster." in name for name in of["frontend"])
+    assert "pipeline/frontend/tracking.py" in of["frontend"]
+    assert "pipeline/report/page.html.j2" in of["report"]
+    assert "schemas/descriptors.binpb" in of["exchange"]
+    for name, other in (("frontend", "fusion"), ("information", "frontend"), ("fusion", "exchange")):
+        assert not [module for module in of[name] if module.startswith(f"pipeline/{other}/")]
