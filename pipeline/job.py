@@ -197,7 +197,7 @@ class Job:
         return [*done, *readers]
 
     def look(self) -> tuple[list[Carried], list[StageKey]]:
-        """What is there, and what would have to be computed as far as that can be told."""
+        """What is there, and what would have to be computed as far as that is known."""
         found: dict[str, Carried] = {}
 
         def note(carried: Carried) -> None:
@@ -420,7 +420,7 @@ def why(recording_path: Path, out: Path, config: RunConfig, plan: Plan) -> list[
         plan: how it is done.
 
     Returns:
-        A line for every stage that can be told now.
+        A line for every stage that can be named now.
     """
     if plan.store is None:
         return ["every stage is computed: there is no store"]

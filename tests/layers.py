@@ -104,6 +104,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
         ),
     ),
     (
+        _part("comparison", "what differs between runs", "base config geometry splat recording runs"),
         _part(
             "team_posegraph",
             "public pose graphs by a team",
@@ -155,6 +156,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             "base config runs frontend information recording exchange fusion evaluation report viewing",
         ),
     ),
+    (_part("doctor", "what a machine has", "base kernels"),),
     (_part("chain", "the stages in their order", "base recording runs cache steps"),),
     (
         _part(
@@ -171,7 +173,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             "the command",
             "base config kernels recording runs converters exchange fusion evaluation",
             "report viewing checks camera_calibration recalibration team_posegraph bench experiments",
-            "cache steps job runner replay",
+            "cache comparison doctor steps job runner replay",
         ),
     ),
 )

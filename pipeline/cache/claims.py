@@ -73,7 +73,7 @@ def claim(folder: Path, done: Callable[[], bool], waiting: Callable[[], None]) -
     Raises:
         OSError: no folder can be made there.
     """
-    told = False
+    announced = False
     watch = _Watch(folder)
     while True:
         try:
@@ -86,8 +86,8 @@ def claim(folder: Path, done: Callable[[], bool], waiting: Callable[[], None]) -
         if watch.is_dead():
             _remove(folder, watch.owner)
             continue
-        if not told:
-            told = True
+        if not announced:
+            announced = True
             waiting()
         time.sleep(POLL_S)
 

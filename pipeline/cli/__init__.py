@@ -11,6 +11,7 @@ from duagc.pipeline.cli.common import EXIT_FAILED, app
 # isort: off
 from duagc.pipeline.cli import recordings
 from duagc.pipeline.cli import runs
+from duagc.pipeline.cli import compare
 from duagc.pipeline.cli import inspect
 from duagc.pipeline.cli import posegraph
 from duagc.pipeline.cli import settings
@@ -18,7 +19,18 @@ from duagc.pipeline.cli import bench
 from duagc.pipeline.cli import robustness
 # isort: on
 
-__all__ = ["app", "bench", "inspect", "main", "posegraph", "recordings", "robustness", "runs", "settings"]
+__all__ = [
+    "app",
+    "bench",
+    "compare",
+    "inspect",
+    "main",
+    "posegraph",
+    "recordings",
+    "robustness",
+    "runs",
+    "settings",
+]
 
 TYPER_INTERRUPTED = 130  # what typer makes of Ctrl-C, without a word
 COMPILED_KERNELS = "duagc.pipeline.kernels._raster"  # a module that a source tree lacks before it is built

@@ -19,7 +19,11 @@ app = typer.Typer(
 )
 config_app = typer.Typer(no_args_is_help=True, help="Settings of a run and their documentation.")
 bench_app = typer.Typer(no_args_is_help=True, help="Speed, side by side with something else in the same run.")
+golden_app = typer.Typer(
+    no_args_is_help=True, help="A few bytes that stand for a run, to compare later ones with."
+)
 app.add_typer(config_app, name="config")
+app.add_typer(golden_app, name="golden")
 app.add_typer(bench_app, name="bench")
 
 Out = Annotated[

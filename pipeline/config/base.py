@@ -1,13 +1,13 @@
 """Configuration: frozen models with defaults and documentation, overridden by a TOML file or by `a.b=value`."""
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.files import read_text
 
 
@@ -48,10 +48,61 @@ def load_config(model: type[Model], path: Path | None = None, overrides: Sequenc
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            raise DuagError(f"{source}: {name} is not a known setting; see `duagc config show`") from error
+            nearest = _nearest(model, [str(part) for part in first["loc"]])
+            raise DuagError(
+                f"{source}: {name} is not a known setting, {nearest}; see `duagc config show`"
+            ) from error
         if first["type"] == "value_error":
             raise DuagError(f"{source}: {first['ctx']['error']}") from error
         raise DuagError(f"{source}: {name} = {first['input']!r}: {first['msg']}") from error
+
+
+def _nearest(model: type[Config], path: Sequence[str]) -> str:
+    """What was perhaps meant by an unknown name: one of the same section, else the same name in another section."""
+    section: type[Any] | None = model
+    for part in path[:-1]:
+        field = (
+            section.model_fields.get(part) if section is not None and issubclass(section, Config) else None
+        )
+        section = field.annotation if field is not None and isinstance(field.annotation, type) else None
+    known = list(section.model_fields) if section is not None and issubclass(section, Config) else []
+    said = closest(path[-1], known, "a setting")
+    if said.startswith("expected perhaps"):
+        return _prefixed(said, path[:-1])
+    elsewhere = [name for name in _names(model) if name.rpartition(".")[2] == path[-1]]
+    return f"expected perhaps {elsewhere[0]}" if elsewhere else said
+
+
+def _prefixed(said: str, section: Sequence[str]) -> str:
+    head, _, name = said.rpartition(" ")
+    return f"{head} {'.'.join([*section, name])}"
+
+
+def _names(model: type[Config], prefix: str = "") -> Iterator[str]:
+    """Dotted names of all settings."""
+    for name, field in model.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Config):
+            yield from _names(field.annotation, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}"
+
+
+def differing_settings(first: Config, second: Config, prefix: str = "") -> list[tuple[str, Any, Any]]:
+    """Settings that differ, by dotted name, with both values.
+
+    Args:
+        first: settings.
+        second: others of the same kind.
+        prefix: of every name.
+    """
+    out: list[tuple[str, Any, Any]] = []
+    for name in type(first).model_fields:
+        one, other = getattr(first, name), getattr(second, name)
+        if isinstance(one, Config) and type(one) is type(other):
+            out += differing_settings(one, other, f"{prefix}{name}.")
+        elif one != other:
+            out.append((f"{prefix}{name}", one, other))
+    return out
 
 
 def _apply(values: dict[str, Any], override: str) -> None:

@@ -215,11 +215,11 @@ def claimant(folder: Path, seconds: float) -> subprocess.Popen[str]:
 def test_a_claim_is_waited_for_and_that_of_a_killed_process_is_taken(tmp_path: Path) -> None:
     from duagc.pipeline.cache.claims import claim
 
-    told: list[str] = []
+    announced: list[str] = []
     process = claimant(tmp_path / "claim", 0.3)
-    taken = claim(tmp_path / "claim", lambda: False, lambda: told.append("waiting"))
+    taken = claim(tmp_path / "claim", lambda: False, lambda: announced.append("waiting"))
     assert process.wait() == 0
-    assert told == ["waiting"]
+    assert announced == ["waiting"]
     assert taken is not None
     with taken:
         assert claim(tmp_path / "claim", lambda: True, lambda: None) is None  # done meanwhile

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.config.base import Config, dump_config, load_config
+from duagc.pipeline.config.base import Config, differing_settings, dump_config, load_config
 from duagc.pipeline.config.run import RunConfig
 
 
@@ -45,7 +45,16 @@ def test_overrides_win_over_the_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "expected"),
     [
-        ("link.los=1", "link.los is not a known setting"),
+        ("link.los=1", "link.los is not a known setting, expected one of loss_probability, name; see"),
+        (
+            "link.loss_probabilty=1",
+            "link.loss_probabilty is not a known setting, expected perhaps link.loss_probability;",
+        ),
+        ("lnk.name=1", "lnk is not a known setting, expected perhaps link;"),
+        (
+            "loss_probability=1",
+            "loss_probability is not a known setting, expected perhaps link.loss_probability;",
+        ),
         ("link.loss_probability=much", "link.loss_probability = 'much'"),
         ("seed", "expected section.name=value"),
         ("seed.x=1", "seed = {'x': 1}"),
@@ -76,3 +85,9 @@ def test_a_run_has_one_thickness_floor() -> None:
     for other in ("information.thickness_floor_m", "exchange.matching.thickness_floor_m"):
         with pytest.raises(DuagError, match=f"{other} is not a known setting"):
             load_config(RunConfig, overrides=[f"{other}=0.002"])
+
+
+def test_settings_that_differ_are_named_with_both_values() -> None:
+    first, second = Whole(seed=7), Whole(link=Link(name="wire"))
+    assert differing_settings(first, second) == [("seed", 7, 0), ("link.name", "radio", "wire")]
+    assert differing_settings(first, first) == []

@@ -1,6 +1,5 @@
 """The golden runs: small recordings, and what they are run with. `make test` makes the smallest of them."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,18 +85,3 @@ def make_run(name: str, folder: Path) -> Path:
     config = load_config(RunConfig, overrides=golden.overrides)
     run(folder / "recording", folder / "run", config, workers=SCRIPT_WORKERS, log=lambda line: None)
     return folder / "run"
-
-
-def metrics_of(run_folder: Path) -> dict[str, object]:
-    """The metrics of a run as one flat table: dotted names to numbers, texts and None."""
-    flat: dict[str, object] = {}
-
-    def visit(name: str, value: object) -> None:
-        if isinstance(value, dict):
-            for key, inner in value.items():
-                visit(f"{name}.{key}" if name else key, inner)
-        elif not isinstance(value, list):
-            flat[name] = value
-
-    visit("", json.loads((run_folder / "metrics.json").read_text()))
-    return flat

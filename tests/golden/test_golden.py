@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
+from duagc.pipeline.comparison.golden import differences, store
 from duagc.pipeline.recording import LogWriter, log_metadata, read_log
-from tests.golden import command
-from tests.golden.command import differences
+from tests.golden.command import golden_of
 from tests.golden.runs import RUNS, make_run
 
 QUICK = "tiny3"
@@ -22,7 +22,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_small_run_is_as_stored(run: Path) -> None:
-    assert differences(QUICK, run) == []
+    assert differences(golden_of(QUICK), run) == []
 
 
 @pytest.mark.slow
@@ -31,7 +31,7 @@ def test_every_run_is_as_stored(name: str, tmp_path: Path) -> None:
     needs = RUNS[name].needs
     if needs is not None and not needs.is_dir():
         pytest.skip(f"needs {needs}")
-    assert differences(name, make_run(name, tmp_path)) == []
+    assert differences(golden_of(name), make_run(name, tmp_path)) == []
 
 
 def changed_log(path: Path, topic: str, index: int, **fields: Any) -> int:
@@ -61,16 +61,16 @@ def test_a_changed_message_is_named(run: Path, tmp_path: Path) -> None:
     shutil.copytree(run, tmp_path / "run")
     log = tmp_path / "run" / "robots" / "alpha" / "frontend.mcap"
     time_ns = changed_log(log, "/alpha/odometry", 5, overlap=0.125)
-    assert differences(QUICK, tmp_path / "run") == [
+    assert differences(golden_of(QUICK), tmp_path / "run") == [
         "frontend: robots/alpha/frontend.mcap: /alpha/odometry; "
         f"first message that differs: 5 at {time_ns} ns; fields overlap"
     ]
 
 
-def test_a_changed_setting_is_named(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "FOLDER", tmp_path)
-    command.store(QUICK, run)
-    assert differences(QUICK, run) == []
+def test_a_changed_setting_is_named(run: Path, tmp_path: Path) -> None:
+    golden = tmp_path / "golden.json"
+    store(golden, run)
+    assert differences(golden, run) == []
     shutil.copytree(run, tmp_path / "run")
     path = tmp_path / "run" / "exchange.mcap"
     records, metadata = list(read_log(path)), log_metadata(path)
@@ -79,7 +79,7 @@ def test_a_changed_setting_is_named(run: Path, tmp_path: Path, monkeypatch: pyte
     with LogWriter(path, metadata=metadata | {"config": json.dumps(config)}) as log:
         for record in records:
             log.write(record.topic, record.proto(), record.log_time_ns, record.publish_time_ns)
-    (line,) = differences(QUICK, tmp_path / "run")
+    (line,) = differences(golden, tmp_path / "run")
     assert line == "exchange: exchange.mcap: metadata config.link.loss_probability: 0.75, stored 0.3"
 
 
@@ -89,5 +89,5 @@ def test_a_changed_metric_is_named(run: Path, tmp_path: Path) -> None:
     metrics = json.loads(path.read_text())
     metrics["team"]["ate_rmse_m"] += 0.25
     path.write_text(json.dumps(metrics))
-    (line,) = differences(QUICK, tmp_path / "run")
+    (line,) = differences(golden_of(QUICK), tmp_path / "run")
     assert line.startswith("evaluation: team.ate_rmse_m: 0.2")

@@ -11,16 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.files import read_text
 from duagc.pipeline.recording import log_metadata, read_log
 from duagc.pipeline.runs.digest import digest, result_files
 
 HEX = 16  # characters kept of a digest
+ORDER = ("frontend", "information", "exchange", "fusion", "evaluation")
+"""Stages, earlier ones first."""
 STAGES = {
     "frontend.mcap": "frontend",
     "odometry.tum": "frontend",
     "information.mcap": "information",
     "exchange.mcap": "exchange",
     "consensus.mcap": "exchange",
+    "metrics.json": "evaluation",
 }
 """Stage that writes a file; every other file is fusion's."""
 
@@ -59,7 +63,11 @@ class RunSummary:
 
 
 def stage_of(file: str) -> str:
-    """The stage that writes a result file of a run."""
+    """The stage that writes a result file of a run.
+
+    Args:
+        file: relative to the run.
+    """
     return STAGES.get(Path(file).name, "fusion")
 
 
@@ -79,7 +87,11 @@ def _fields(proto: Any, prefix: str = "") -> Iterator[tuple[str, bytes]]:
 
 
 def summarize_log(path: Path) -> dict[str, TopicSummary]:
-    """Every topic of a log."""
+    """Every topic of a log.
+
+    Args:
+        path: of the log.
+    """
     hashes: dict[str, dict[str, Any]] = {}
     crcs: dict[str, list[int]] = {}
     schemas: dict[str, str] = {}
@@ -105,7 +117,11 @@ def summarize_log(path: Path) -> dict[str, TopicSummary]:
 
 
 def summarize(run: Path) -> RunSummary:
-    """A finished run."""
+    """A finished run.
+
+    Args:
+        run: its folder.
+    """
     files = {path.as_posix(): digest(run / path)[:HEX] for path in result_files(run)}
     topics = {
         (file, topic): found
@@ -118,7 +134,11 @@ def summarize(run: Path) -> RunSummary:
 
 
 def flat(metadata: Mapping[str, Any]) -> dict[str, Any]:
-    """Metadata as one table: dotted names to values. A text that is a JSON object counts as that object."""
+    """Metadata as one table: dotted names to values. A text that is a JSON object counts as that object.
+
+    Args:
+        metadata: of a log.
+    """
     table: dict[str, Any] = {}
     for name, value in metadata.items():
         if isinstance(value, str) and value.startswith("{"):
@@ -128,3 +148,25 @@ def flat(metadata: Mapping[str, Any]) -> dict[str, Any]:
         else:
             table[name] = value
     return table
+
+
+def metrics_of(run_folder: Path) -> dict[str, object]:
+    """The metrics of a run as one flat table: dotted names to numbers, texts and None.
+
+    Args:
+        run_folder: of the run; empty if it was not evaluated.
+    """
+    path = run_folder / "metrics.json"
+    if not path.is_file():
+        return {}
+    flat: dict[str, object] = {}
+
+    def visit(name: str, value: object) -> None:
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                visit(f"{name}.{key}" if name else key, inner)
+        elif not isinstance(value, list):
+            flat[name] = value
+
+    visit("", json.loads(read_text(path, "the metrics of a run")))
+    return flat

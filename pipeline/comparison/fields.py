@@ -1,0 +1,144 @@
+"""Values that two messages hold under one name, compared."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Unequal:
+    """A field that differs.
+
+    Attributes:
+        name: dotted.
+        place: of the first element that differs, as in "[3, 1]"; "" for a value that has no elements.
+        first: the value there, on the first side, as text.
+        second: on the other side.
+        count: elements that differ.
+        largest: absolute difference; None if that makes no sense.
+        scale: absolute value on the first side where the difference is largest.
+    """
+
+    name: str
+    place: str
+    first: str
+    second: str
+    count: int = 1
+    largest: float | None = None
+    scale: float = 0.0
+
+    def text(self) -> str:
+        """In words."""
+        more = "" if self.count == 1 else f", {self.count} values differ"
+        most = "" if self.largest is None or self.count == 1 else f", by {self.largest:.3g} at most"
+        return f"{self.name}{self.place}: {self.first} and {self.second}{more}{most}"
+
+
+def leaves(value: Any, name: str = "") -> dict[str, Any]:
+    """Values of a message by dotted name: dataclasses, protobuf messages and tables are opened.
+
+    Args:
+        value: a message, or a part of one.
+        name: of it.
+    """
+    return dict(_leaves(value, name))
+
+
+def _leaves(value: Any, name: str) -> Iterator[tuple[str, Any]]:
+    inner: list[tuple[str, Any]] | None = None
+    if is_dataclass(value) and not isinstance(value, type):
+        inner = [(f.name, getattr(value, f.name)) for f in fields(value)]
+    elif hasattr(value, "ListFields"):
+        inner = [(descriptor.name, part) for descriptor, part in value.ListFields()]
+    elif isinstance(value, dict):
+        inner = list(value.items())
+    if inner is None:
+        yield name, value
+        return
+    for key, part in inner:
+        yield from _leaves(part, f"{name}.{key}" if name else str(key))
+
+
+def unequal(first: Any, second: Any) -> list[Unequal]:
+    """Fields that differ between two messages, in their order.
+
+    Args:
+        first: a message.
+        second: another one of the same kind.
+    """
+    one, other = leaves(first), leaves(second)
+    names = [*one, *(name for name in other if name not in one)]
+    out = []
+    for name in names:
+        if name not in one or name not in other:
+            sides = [_text(side[name]) if name in side else "absent" for side in (one, other)]
+            out.append(Unequal(name, "", sides[0], sides[1]))
+        elif (found := _compare(name, one[name], other[name])) is not None:
+            out.append(found)
+    return out
+
+
+def _compare(name: str, first: Any, second: Any) -> Unequal | None:
+    a, b = _array(first), _array(second)
+    if a is None or b is None:
+        return None if _plain(first) == _plain(second) else Unequal(name, "", _text(first), _text(second))
+    if a.shape != b.shape:
+        return Unequal(name, "", f"shape {list(a.shape)}", f"shape {list(b.shape)}")
+    differ = ~((a == b) | _both_nan(a, b))
+    if a.dtype == b.dtype and a.dtype.kind == "f":
+        differ |= (np.signbit(a) != np.signbit(b)) & ~_both_nan(a, b)
+    if not differ.any():
+        return None
+    place = tuple(int(i) for i in np.argwhere(differ)[0])
+    largest, scale = None, 0.0
+    if a.dtype.kind in "fiu" and b.dtype.kind in "fiu":
+        with np.errstate(invalid="ignore", over="ignore"):
+            gap = np.where(differ, np.abs(a.astype(np.float64) - b.astype(np.float64)), 0.0)
+        gap = np.where(np.isnan(gap), np.inf, gap)
+        largest = float(gap.max())
+        scale = float(np.abs(a.astype(np.float64).ravel()[int(gap.argmax())]))
+    shown = f"[{', '.join(map(str, place))}]" if place else ""
+    return Unequal(
+        name, shown, _text(a[place].item()), _text(b[place].item()), int(differ.sum()), largest, scale
+    )
+
+
+def _both_nan(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:
+    if a.dtype.kind == "f" and b.dtype.kind == "f":
+        return np.isnan(a) & np.isnan(b)
+    return np.zeros(a.shape, dtype=bool)
+
+
+def _array(value: Any) -> NDArray[Any] | None:
+    """Numbers, also a single one, as an array; None of anything else."""
+    if isinstance(value, bytes):
+        return np.frombuffer(value, np.uint8)
+    if isinstance(value, np.ndarray):
+        return value if value.dtype.kind in "fiub" else None
+    if isinstance(value, bool | int | float | np.number):
+        found = np.asarray(value)
+        return found if found.dtype.kind in "fiub" else None
+    if (
+        hasattr(value, "__len__")
+        and not isinstance(value, str)
+        and len(value)
+        and isinstance(value[0], int | float)
+    ):
+        return np.asarray(value)
+    return None
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if hasattr(value, "__len__") and not isinstance(value, str) else value
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return repr(value)
+    text = str(value).replace("\n", " ")
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,76 @@
+"""A run that is killed goes on where it was: nothing that was finished is computed again, and no bit is other."""
+
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from duagc.converters.simulate.team import simulate
+from duagc.pipeline.runs.digest import digest
+from tests.fixtures.commands import ROOT
+
+KILLS = 50
+SETTINGS = (
+    "frontend.mapping.max_gaussians=2000",
+    "frontend.mapping.iterations=4",
+    "frontend.mapping.final_iterations=4",
+    "exchange.max_rounds=400",
+    "fusion.finetune.steps_per_view=2",
+)
+
+
+def start(recording: Path, out: Path) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-c", "from duagc.pipeline.cli import main; main()", "run", str(recording)]
+    settings = [word for line in SETTINGS for word in ("--set", line)]
+    return subprocess.Popen(
+        [*command, "--out", str(out), *settings],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+
+
+def entries(folder: Path) -> dict[str, int]:
+    """Results of the store; a result that is computed again gets another inode."""
+    found = (folder / ".duagc-store" / "entries").rglob("*.json")
+    return {path.name: path.stat().st_ino for path in found}
+
+
+@pytest.mark.slow
+def test_a_killed_run_resumes_and_finished_stages_are_never_computed_again(tmp_path: Path) -> None:
+    recording = tmp_path / "recording"
+    simulate(recording, robots=2, frames=12, size=(160, 120), seed=1, overlap=0.9, workers=1)
+    moments = random.Random(0)
+    undisturbed = tmp_path / "undisturbed"
+    begin = time.monotonic()
+    assert start(recording, undisturbed / "run").wait() == 0
+    duration_s = time.monotonic() - begin
+    expected, stages = digest(undisturbed / "run"), len(entries(undisturbed))
+    kills = completed = 0
+    while kills < KILLS:
+        attempt = tmp_path / f"attempt{completed}"
+        known: dict[str, int] = {}
+        while not (attempt / "run").exists():
+            process = start(recording, attempt / "run")
+            try:
+                process.wait(moments.uniform(0.0, 1.2 * duration_s))
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)  # workers as well, as a power failure does
+                process.wait()
+                kills += 1
+            now = entries(attempt)
+            assert {name: now.get(name) for name in known} == known
+            known = now
+        assert digest(attempt / "run") == expected
+        assert len(known) == stages
+        assert sorted(p.name for p in attempt.iterdir()) == [".duagc-store", "run"]
+        shutil.rmtree(attempt)
+        completed += 1
+    assert completed
