@@ -16,7 +16,7 @@ from duagc import __version__
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.workers import worker_pool
-from duagc.pipeline.cache.carrier import Carried, Carrier, NotStoredError, intact
+from duagc.pipeline.cache.carrier import Carried, Carrier, NotStoredError, intact, words
 from duagc.pipeline.cache.file_digests import FileDigests
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.cache.store import Store
@@ -50,7 +50,7 @@ def say(line: str) -> None:
 
 
 @dataclass(frozen=True)
-class Plan:
+class RunPlan:
     """How a run is carried out; nothing here changes a bit of its results.
 
     Attributes:
@@ -99,9 +99,9 @@ class Job:
         recording: Recording,
         folder: Path,
         config: RunConfig,
-        plan: Plan,
-        log: Say,
+        plan: RunPlan,
         *,
+        log: Say,
         place: Path,
         looking: bool = False,
     ) -> None:
@@ -291,7 +291,7 @@ class Job:
             self.folder,
             self.config,
             self.plan,
-            self.log,
+            log=self.log,
             place=self._place,
             looking=True,
         )
@@ -364,7 +364,7 @@ def _prepare(
     recording: Path,
     folder: Path,
     config: RunConfig,
-    plan: Plan,
+    plan: RunPlan,
     *,
     robot: str,
     place: Path,
@@ -372,11 +372,11 @@ def _prepare(
     alone: bool,
 ) -> dict[str, Prepared]:
     """One robot, in a process of its own."""
-    job = Job(Recording(recording), folder, config, plan, lambda line: say(f"duagc: {line}"), place=place)
+    job = Job(Recording(recording), folder, config, plan, log=lambda line: say(f"duagc: {line}"), place=place)
     return Chain(job.recording, job.carrier, job.digests).robot(robot, threads=threads, alone=alone)
 
 
-def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: Plan, log: Say) -> bool:
+def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunPlan, *, log: Say) -> bool:
     """Whether a run is what it would be now; False: it is the beginning of that, or a file of it is damaged.
 
     Args:
@@ -392,14 +392,14 @@ def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: Plan
     earlier = stages_of(out)
     if not earlier:
         raise DuagError(f"{out}: exists already; choose another --out or give --force")
-    job = Job(recording, out, config, replace(plan, since=None), log, place=out, looking=True)
+    job = Job(recording, out, config, replace(plan, since=None), log=log, place=out, looking=True)
     done, keys = job.look()
     for key in [*(carried.entry.key for carried in done), *keys]:
         name = label(key.stage, key.robot)
         if name in earlier and earlier[name]["key"] != key.digest:
             changes = "; ".join(job.carrier.changes(key, earlier[name]["key"]))
             raise DuagError(
-                f"{out}: exists already, and {name} differs ({changes}); choose another --out or give --force"
+                f"{out}: exists already, and {words(key)} differs ({changes}); choose another --out or give --force"
             )
     if keys or plan.since is not None or any(carried.label not in earlier for carried in done):
         return False
@@ -410,7 +410,7 @@ def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: Plan
     return True
 
 
-def why(recording_path: Path, out: Path, config: RunConfig, plan: Plan) -> list[str]:
+def why(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan) -> list[str]:
     """What a run would compute, and what changed; nothing is computed.
 
     Args:
@@ -424,12 +424,12 @@ def why(recording_path: Path, out: Path, config: RunConfig, plan: Plan) -> list[
     """
     if plan.store is None:
         return ["every stage is computed: there is no store"]
-    job = Job(Recording(recording_path), out, config, plan, lambda line: None, place=out, looking=True)
+    job = Job(Recording(recording_path), out, config, plan, log=lambda line: None, place=out, looking=True)
     done, missing = job.look()
-    lines = [f"{carried.label}: in the store" for carried in done]
+    lines = [f"{words(carried.entry.key)}: in the store" for carried in done]
     for key in missing:
         reason = "--from" if key.stage in plan.again else "; ".join(job.carrier.changes(key))
-        lines.append(f"{label(key.stage, key.robot)}: computed: {reason}")
+        lines.append(f"{words(key)}: computed: {reason}")
     if missing:
         last = max(NAMES.index(key.stage) for key in missing)
         if later := NAMES[last + 1 : NAMES.index(plan.until) + 1]:

@@ -18,7 +18,7 @@ from duagc.pipeline.base import determinism
 from duagc.pipeline.base.atomic_folder import new_folder
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.job import LAST, Job, Plan, Say, is_up_to_date, say
+from duagc.pipeline.job import LAST, Job, RunPlan, Say, is_up_to_date, say
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.timing import Timing, label
 
@@ -84,29 +84,29 @@ def run(
     Raises:
         DuagError: what a user can fix; nothing is left under the name `out`.
     """
-    plan = Plan(workers, force, calibrate, store=store, since=since, until=until)
+    plan = RunPlan(workers, force, calibrate, store=store, since=since, until=until)
     determinism.configure_determinism()
     if determinism.is_deterministic():
-        _run(recording_path, out, config, plan, log)
+        _run(recording_path, out, config, plan, log=log)
     else:
-        _run_in_child(recording_path, out, config, plan, log)
+        _run_in_child(recording_path, out, config, plan, log=log)
 
 
-def _run(recording_path: Path, out: Path, config: RunConfig, plan: Plan, log: Say) -> None:
+def _run(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan, *, log: Say) -> None:
     from duagc.pipeline.recording import Recording
 
     recording = Recording(recording_path)
     force = plan.force
     if out.exists() and not force and plan.store is not None and not plan.calibrate:
-        if is_up_to_date(recording, out, config, plan, log):
+        if is_up_to_date(recording, out, config, plan, log=log):
             log(f"{out}: up to date")
             return
         force = True
     with new_folder(out, force) as folder:
-        Job(recording, folder, config, plan, log, place=out).run()
+        Job(recording, folder, config, plan, log=log, place=out).run()
 
 
-def _run_in_child(recording_path: Path, out: Path, config: RunConfig, plan: Plan, log: Say) -> None:
+def _run_in_child(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan, *, log: Say) -> None:
     """`_run` in a process that is started with the settings of `determinism`; its lines come back to `log`."""
     lines: SimpleQueue[str | None] = multiprocessing.get_context("spawn").SimpleQueue()
 
@@ -132,5 +132,5 @@ def _keep_queue(lines: SimpleQueue[str | None]) -> None:
     _lines.append(lines)
 
 
-def _run_and_send(recording_path: Path, out: Path, config: RunConfig, plan: Plan) -> None:
-    _run(recording_path, out, config, plan, _lines[0].put)
+def _run_and_send(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan) -> None:
+    _run(recording_path, out, config, plan, log=_lines[0].put)

@@ -433,10 +433,10 @@ def test_another_consensus_computes_nothing_upstream_and_going_back_nothing_at_a
     code, _, printed = again(recording, finished, other, "--why")
     assert code == 0
     assert printed.splitlines() == [
-        "frontend.alpha: in the store",
-        "information.alpha: in the store",
-        "frontend.bravo: in the store",
-        "information.bravo: in the store",
+        "frontend of alpha: in the store",
+        "information of alpha: in the store",
+        "frontend of bravo: in the store",
+        "information of bravo: in the store",
         "exchange: computed: settings: exchange.link.loss_probability 0.0 -> 0.2",
         "fusion, evaluation, report, rrd: computed unless the results before turn out as they were",
     ]

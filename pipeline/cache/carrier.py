@@ -10,7 +10,7 @@ from typing import Any, cast
 
 from duagc.pipeline.cache.file_digests import FileDigest, FileDigests
 from duagc.pipeline.cache.stage_key import StageKey
-from duagc.pipeline.cache.store import DamagedEntryError, Entry, Store
+from duagc.pipeline.cache.store import DamagedEntryError, Store, StoredResults
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.runs.declared_settings import DeclaredSettings
 from duagc.pipeline.runs.stages import Stage
@@ -34,7 +34,7 @@ class Carried:
         executed: whether it was computed now.
     """
 
-    entry: Entry
+    entry: StoredResults
     executed: bool
 
     @property
@@ -134,9 +134,7 @@ class Carrier:
             return Carried(entry, False)
         if self.store is None:
             return Carried(self._compute(key, stage, compute, files), True)
-        with self.store.claimed(
-            key, lambda: self.say(f"{_words(key)}: another process computes it; waiting")
-        ):
+        with self.store.claimed(key, lambda: self.say(f"{words(key)}: another process computes it; waiting")):
             if (entry := self._take(key)) is not None:
                 return Carried(entry, False)
             entry = self._compute(key, stage, compute, files)
@@ -161,7 +159,7 @@ class Carrier:
             ]
         return key.changes(stored.key)
 
-    def _find(self, key: StageKey) -> Entry | None:
+    def _find(self, key: StageKey) -> StoredResults | None:
         if self.store is None or key.stage in self.again:
             return None
         if (entry := self.store.find(key, self.say)) is not None:
@@ -170,9 +168,9 @@ class Carrier:
         if stored.get("key") != key.digest:
             return None
         files = {name: FileDigest(**digest) for name, digest in stored["files"].items()}
-        return Entry(key, files, stored["result"], stored["timing"])
+        return StoredResults(key, files, stored["result"], stored["timing"])
 
-    def _take(self, key: StageKey) -> Entry | None:
+    def _take(self, key: StageKey) -> StoredResults | None:
         """Results of the store, or of the earlier run, in the folder of this one; None if there are none."""
         entry = self._find(key)
         if entry is None or self.store is None:
@@ -180,7 +178,7 @@ class Carrier:
         try:
             self.store.take(entry, self.folder, self.place)
         except DamagedEntryError as error:
-            self.say(f"{error}; {_words(key)} is computed again")
+            self.say(f"{error}; {words(key)} is computed again")
             self.store.forget(key)
             return None
         self.begun(key, True)
@@ -192,21 +190,21 @@ class Carrier:
         stage: Stage,
         compute: Callable[[Timing], Any],
         files: Callable[[], Iterator[Path]] | None,
-    ) -> Entry:
+    ) -> StoredResults:
         timing = Timing()
         self.begun(key, False)
         result = compute(timing)
         written = self._declared(stage, key.robot) if files is None else files()
         digests = FileDigests(None) if self.store is None else self.store.files
         found = {path.relative_to(self.folder).as_posix(): digests.of(path) for path in sorted(written)}
-        return Entry(key, found, result, timing.stages[label(key.stage, key.robot)])
+        return StoredResults(key, found, result, timing.stages[label(key.stage, key.robot)])
 
     def _declared(self, stage: Stage, robot: str | None) -> Iterator[Path]:
         folder = self.folder if robot is None else self.folder / "robots" / robot
         for pattern in stage.writes_files:
             yield from folder.glob(pattern)
 
-    def _keep(self, entry: Entry) -> None:
+    def _keep(self, entry: StoredResults) -> None:
         """Keep results; a run goes on where a store has no room for them."""
         assert self.store is not None
         if entry.key.stage in self.again and (stored := self.store.find(entry.key)) is not None:
@@ -214,18 +212,18 @@ class Carrier:
             other = [n for n in names if _content(stored, n) != _content(entry, n)]
             if other:
                 self.say(
-                    f"warning: {_words(entry.key)}: {other[0]} has digest {_content(entry, other[0])[:12]}, "
+                    f"warning: {words(entry.key)}: {other[0]} has digest {_content(entry, other[0])[:12]}, "
                     f"expected {_content(stored, other[0])[:12]} as computed before from the same"
                 )
         try:
             self.store.keep(entry, self.folder)
         except OSError as error:
             self.say(
-                f"warning: {self.store.folder}: {error.strerror or error}; {_words(entry.key)} is not kept"
+                f"warning: {self.store.folder}: {error.strerror or error}; {words(entry.key)} is not kept"
             )
 
 
-def intact(folder: Path, entry: Entry, digests: FileDigests) -> str:
+def intact(folder: Path, entry: StoredResults, digests: FileDigests) -> str:
     """The first file of results that is not in a folder as it was computed; "" if all are.
 
     Args:
@@ -241,9 +239,14 @@ def intact(folder: Path, entry: Entry, digests: FileDigests) -> str:
     return ""
 
 
-def _content(entry: Entry, name: str) -> str:
+def _content(entry: StoredResults, name: str) -> str:
     return entry.files[name].content if name in entry.files else "nothing"
 
 
-def _words(key: StageKey) -> str:
+def words(key: StageKey) -> str:
+    """A stage and whose it is.
+
+    Args:
+        key: of the stage.
+    """
     return f"{key.stage} of {key.robot}" if key.robot else key.stage

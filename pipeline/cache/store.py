@@ -39,7 +39,7 @@ class DamagedEntryError(Exception):
 
 
 @dataclass(frozen=True)
-class Entry:
+class StoredResults:
     """The results of one computation.
 
     Attributes:
@@ -94,7 +94,7 @@ class Store:
         self.files = FileDigests(self.folder / "files")
         self.code = CodeReader(self.folder / "code.json")
 
-    def find(self, key: StageKey, say: Callable[[str], None] = lambda line: None) -> Entry | None:
+    def find(self, key: StageKey, say: Callable[[str], None] = lambda line: None) -> StoredResults | None:
         """The results for a key; None if there are none.
 
         Args:
@@ -115,7 +115,7 @@ class Store:
             os.utime(path)  # `gc` removes what was not used for longest
         return entry
 
-    def take(self, entry: Entry, folder: Path, also: Path | None = None) -> None:
+    def take(self, entry: StoredResults, folder: Path, also: Path | None = None) -> None:
         """Copy the files of an entry, and compare them with their digests.
 
         Args:
@@ -146,7 +146,7 @@ class Store:
                 part.unlink(missing_ok=True)
             self.files.keep(target, digest)
 
-    def keep(self, entry: Entry, folder: Path) -> None:
+    def keep(self, entry: StoredResults, folder: Path) -> None:
         """Store results: the files first, so that an entry names what is there.
 
         Args:
@@ -195,14 +195,14 @@ class Store:
         with taken:
             yield True
 
-    def latest(self, key: StageKey) -> Entry | None:
+    def latest(self, key: StageKey) -> StoredResults | None:
         """The entry of the same stage and robot whose key is most like another one; of equals the last one used.
 
         Args:
             key: that has no entry, or whose entry is not meant.
         """
         paths = [(path.stat().st_mtime_ns, path) for path in self._entry(key).parent.glob("*.json")]
-        best: tuple[int, Entry] | None = None
+        best: tuple[int, StoredResults] | None = None
         for _, path in sorted(paths, reverse=True)[:50]:
             try:
                 entry = _read(path)
@@ -213,7 +213,7 @@ class Store:
                 best = distance, entry
         return None if best is None else best[1]
 
-    def earlier(self, key: StageKey, digest: str) -> Entry | None:
+    def earlier(self, key: StageKey, digest: str) -> StoredResults | None:
         """The results of the same stage and robot for another key; None if they are gone.
 
         Args:
@@ -248,7 +248,7 @@ class Store:
             raise
 
 
-def _read(path: Path) -> Entry:
+def _read(path: Path) -> StoredResults:
     """An entry, compared with the digest in its first line."""
     digest, _, content = path.read_text(encoding="utf-8").partition("\n")
     if hashlib.sha256(content.rstrip("\n").encode()).hexdigest() != digest:
@@ -257,7 +257,7 @@ def _read(path: Path) -> Entry:
     if plain["schema"] != SCHEMA:
         raise ValueError(f"schema {plain['schema']}, expected {SCHEMA}")
     files = {name: FileDigest(**digest) for name, digest in plain["files"].items()}
-    return Entry(StageKey(**plain["key"]), files, plain["result"], plain["timing"])
+    return StoredResults(StageKey(**plain["key"]), files, plain["result"], plain["timing"])
 
 
 def _copy_digest(source: Path, write: Callable[[bytes], Any]) -> str:

@@ -51,7 +51,7 @@ class Difference:
 
 
 @dataclass
-class Comparison:
+class Compared:
     """What was found.
 
     Attributes:
@@ -91,7 +91,7 @@ class Comparison:
         return "\n".join([*lines, f"{verdict}: {counts}{tolerated}"])
 
 
-def compare(first: Path, second: Path, tolerances: Tolerances = NOTHING) -> Comparison:
+def compare(first: Path, second: Path, tolerances: Tolerances = NOTHING) -> Compared:
     """Compare two runs, two recordings or two logs.
 
     Args:
@@ -105,7 +105,7 @@ def compare(first: Path, second: Path, tolerances: Tolerances = NOTHING) -> Comp
     kinds = [_kind(path) for path in (first, second)]
     if kinds[0] != kinds[1]:
         raise DuagError(f"{second}: is {kinds[1]}, expected {kinds[0]} as {first}")
-    out = Comparison(str(first), str(second))
+    out = Compared(str(first), str(second))
     if kinds[0] == "a log":
         out.files = 1
         _compare_logs(out, first, second, stage="log", name="", tolerances=tolerances)
@@ -159,7 +159,7 @@ def _settings(first: Path, second: Path) -> list[str]:
 
 
 def _compare_files(
-    out: Comparison, first: Path, second: Path, *, stage: str, name: str, tolerances: Tolerances
+    out: Compared, first: Path, second: Path, *, stage: str, name: str, tolerances: Tolerances
 ) -> None:
     if name.endswith(".mcap"):
         _compare_logs(out, first, second, stage=stage, name=name, tolerances=tolerances)
@@ -194,14 +194,14 @@ def _content(path: Path) -> dict[str, Any]:
         raise DuagError(f"{path}: not valid JSON: {error}") from error
 
 
-def _beyond(out: Comparison, where: str, found: list[Unequal], tolerances: Tolerances) -> list[Unequal]:
+def _beyond(out: Compared, where: str, found: list[Unequal], tolerances: Tolerances) -> list[Unequal]:
     beyond = [f for f in found if not tolerances.allow(where, f)]
     out.tolerated += sum(f.count for f in found) - sum(f.count for f in beyond)
     return beyond
 
 
 def _compare_logs(
-    out: Comparison, first: Path, second: Path, *, stage: str, name: str, tolerances: Tolerances
+    out: Compared, first: Path, second: Path, *, stage: str, name: str, tolerances: Tolerances
 ) -> None:
     check_file(first, "a log")
     check_file(second, "a log")
@@ -227,7 +227,9 @@ def _compare_logs(
             time_ns = None if at is None else one[at].log_time_ns
             plain = tuple(map(_plain, fields))
             text = "; ".join(texts)
-            out.differences.append(Difference(stage, name, topic, text, at, time_ns, plain))
+            out.differences.append(
+                Difference(stage, name, topic, text, index=at, time_ns=time_ns, fields=plain)
+            )
 
 
 def _text(fields: list[Unequal], most: int = 4) -> str:

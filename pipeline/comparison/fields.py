@@ -103,9 +103,9 @@ def _compare(name: str, first: Any, second: Any) -> Unequal | None:
         largest = float(gap.max())
         scale = float(np.abs(a.astype(np.float64).ravel()[int(gap.argmax())]))
     shown = f"[{', '.join(map(str, place))}]" if place else ""
-    return Unequal(
-        name, shown, _text(a[place].item()), _text(b[place].item()), int(differ.sum()), largest, scale
-    )
+    first_text, second_text = _text(a[place].item()), _text(b[place].item())
+    count = int(differ.sum())
+    return Unequal(name, shown, first_text, second_text, count=count, largest=largest, scale=scale)
 
 
 def _both_nan(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.bool_]:

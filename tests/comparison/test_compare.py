@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.comparison.compare import Comparison, compare
+from duagc.pipeline.comparison.compare import Compared, compare
 from duagc.pipeline.comparison.fields import unequal
 from duagc.pipeline.comparison.tolerances import Tolerances, read_tolerances
 from duagc.pipeline.evaluation import evaluate
@@ -123,7 +123,7 @@ def test_tolerances_count_per_field_and_have_reasons(
     flip_bit(other / "robots" / "alpha" / "frontend.mcap", "/alpha/odometry", 5, nudge)
     path = tmp_path / "tolerances.toml"
 
-    def compared(text: str) -> Comparison:
+    def compared(text: str) -> Compared:
         path.write_text(text)
         return compare(fake.run, other, read_tolerances(path))
 
