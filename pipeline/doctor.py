@@ -43,6 +43,8 @@ OPTIONAL = {
         "exchange.transport.signatures = 'ed25519'",
         "pip install 'duagc[signed]'",
     ),
+    "submitit": ("submitit", "`duagc batch --engine slurm`", "pip install 'duagc[slurm]'"),
+    "ray": ("ray", "`duagc batch --engine ray`", "pip install 'duagc[ray]'"),
     "pytest": ("pytest", "the tests", "pip install 'duagc[test]'"),
     "grpc_tools": ("grpcio-tools", "new messages: python -m duagc.schemas.build", "pip install 'duagc[dev]'"),
 }

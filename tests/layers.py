@@ -166,6 +166,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
         ),
     ),
     (_part("runner", "carries a run", "base config runs recording steps job"),),
+    (_part("batch", "many runs at once", "base config recording cache comparison job runner"),),
     (_part("replay", "computes a robot again", "base config runs recording exchange steps runner"),),
     (
         _part(
@@ -173,7 +174,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             "the command",
             "base config kernels recording runs converters exchange fusion evaluation",
             "report viewing checks camera_calibration recalibration team_posegraph bench experiments",
-            "cache comparison doctor steps job runner replay",
+            "batch cache comparison doctor steps job runner replay",
         ),
     ),
 )

@@ -11,6 +11,7 @@ from duagc.pipeline.cli.common import EXIT_FAILED, app
 # isort: off
 from duagc.pipeline.cli import recordings
 from duagc.pipeline.cli import runs
+from duagc.pipeline.cli import batch
 from duagc.pipeline.cli import compare
 from duagc.pipeline.cli import inspect
 from duagc.pipeline.cli import posegraph
@@ -21,6 +22,7 @@ from duagc.pipeline.cli import robustness
 
 __all__ = [
     "app",
+    "batch",
     "bench",
     "compare",
     "inspect",

@@ -1,0 +1,175 @@
+"""One cell of a suite, in a process of its own: `python -m duagc.pipeline.batch.cell SUITE --out DIR --cell NAME`.
+
+What it comes to stands in `cells/<name>.json`, what it says in `cells/<name>.log`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+import traceback
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from duagc.pipeline.base import determinism
+from duagc.pipeline.base.errors import DuagError
+
+RUNS, CELLS = "runs", "cells"
+State = Literal["waiting", "running", "done", "failed"]
+
+
+@dataclass(frozen=True)
+class CellState:
+    """How far a cell is.
+
+    Attributes:
+        state: "waiting", "running", "done", "failed".
+        attempts: how often it was begun.
+        wall_s: that the last attempt took.
+        error: the line of the last failure; "".
+        pid: of the process.
+    """
+
+    state: State = "waiting"
+    attempts: int = 0
+    wall_s: float = 0.0
+    error: str = ""
+    pid: int = 0
+
+
+def run_folder(out: Path, name: str) -> Path:
+    """Folder of the run of a cell.
+
+    Args:
+        out: folder of the batch.
+        name: of the cell.
+    """
+    return out / RUNS / name
+
+
+def read_state(out: Path, name: str) -> CellState:
+    """How far a cell is; one that was begun by a process that is gone waits again.
+
+    Args:
+        out: folder of the batch.
+        name: of the cell.
+    """
+    try:
+        content = json.loads((out / CELLS / f"{name}.json").read_bytes())
+        return CellState(**content)
+    except (OSError, ValueError, TypeError):
+        return CellState()
+
+
+def write_state(out: Path, name: str, state: CellState) -> None:
+    """Say how far a cell is.
+
+    Args:
+        out: folder of the batch.
+        name: of the cell.
+        state: of it.
+    """
+    from duagc.pipeline.cache.publish import publish
+
+    publish(out / CELLS / f"{name}.json", json.dumps(asdict(state)).encode())
+
+
+def run_cell(suite_path: Path, out: Path, name: str, store: Path) -> str:
+    """Run a cell, and say what it came to.
+
+    Args:
+        suite_path: of the suite.
+        out: folder of the batch.
+        name: of the cell.
+        store: of results.
+
+    Returns:
+        The line of what went wrong; "" if nothing did.
+    """
+    begin = time.monotonic()
+    attempts = read_state(out, name).attempts + 1
+    write_state(out, name, CellState("running", attempts, pid=os.getpid()))
+    error = ""
+    try:
+        _run(suite_path, out, name, store)
+    except DuagError as failure:
+        error = str(failure)
+    except Exception as failure:  # one cell must not take the others with it
+        traceback.print_exc()
+        error = f"{type(failure).__name__}: {failure}"
+    if error:
+        print(f"duagc: {error}", file=sys.stderr, flush=True)
+    wall_s = round(time.monotonic() - begin, 3)
+    write_state(out, name, CellState("failed" if error else "done", attempts, wall_s, error))
+    return error
+
+
+def _run(suite_path: Path, out: Path, name: str, store: Path) -> None:
+    from duagc.pipeline.batch.suite import read_suite
+    from duagc.pipeline.job import RunPlan, is_up_to_date
+    from duagc.pipeline.recording import Recording
+    from duagc.pipeline.runner import run
+
+    def say(line: str) -> None:
+        print(f"duagc: {line}", file=sys.stderr, flush=True)
+
+    cell = read_suite(suite_path).cells[name]
+    folder = run_folder(out, name)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    workers = max(1, min(2, len(os.sched_getaffinity(0))))
+    if folder.exists():
+        plan = RunPlan(workers, store=store)
+        try:
+            if is_up_to_date(Recording(cell.folder), folder, cell.config, plan, log=say):
+                say(f"{folder}: up to date")
+                return
+        except DuagError as error:  # the suite is another one than it was; its runs are ours to replace
+            say(str(error))
+    run(cell.folder, folder, cell.config, workers=workers, force=folder.exists(), store=store, log=say)
+
+
+def enter(arguments: Mapping[str, str], processors: tuple[int, ...] = ()) -> None:
+    """Be the process of a cell; its exit code is 1 if the cell failed.
+
+    Args:
+        arguments: `suite`, `out`, `cell`, `store`.
+        processors: that it may use; empty: all.
+    """
+    if processors:
+        os.sched_setaffinity(0, processors)
+    out, name = Path(arguments["out"]), arguments["cell"]
+    (out / CELLS).mkdir(parents=True, exist_ok=True)
+    log = os.open(out / CELLS / f"{name}.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    error = run_cell(Path(arguments["suite"]), out, name, Path(arguments["store"]))
+    sys.exit(1 if error else 0)
+
+
+def main() -> None:
+    """Entry point of `python -m duagc.pipeline.batch.cell`."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("suite")
+    parser.add_argument("--out", required=True)
+    parser.add_argument("--store", required=True)
+    parser.add_argument("--cell", help="its name")
+    parser.add_argument("--index", type=int, help="its place in the suite, as a task of an array has it")
+    arguments = parser.parse_args()
+    name = arguments.cell
+    if name is None:
+        from duagc.pipeline.batch.suite import read_suite
+
+        name = list(read_suite(Path(arguments.suite)).cells)[arguments.index]
+    enter({"suite": arguments.suite, "out": arguments.out, "cell": name, "store": arguments.store})
+
+
+if __name__ == "__main__":
+    determinism.configure_determinism()
+    main()
