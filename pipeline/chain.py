@@ -9,10 +9,11 @@ from pathlib import Path
 from duagc.pipeline import steps
 from duagc.pipeline.cache.carrier import Carried, Carrier
 from duagc.pipeline.cache.file_digests import FileDigests
-from duagc.pipeline.recording import RECORDING_FILE, Recording
+from duagc.pipeline.recording import RECORDING_FILE, Recording, read_log
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.session_file import NAME as SESSION
 from duagc.pipeline.runs.timing import Timing, label
+from duagc.schemas import topics
 
 
 @dataclass(frozen=True)
@@ -48,13 +49,15 @@ class Chain:
         folder = carrier.folder / "robots" / robot
         digest = self._digests.of(log).content if carrier.store is not None else ""
 
-        def track_and_map(timing: Timing) -> None:
-            steps.check_log(log, robot)
+        def track_and_map(timing: Timing) -> dict[str, int]:
+            size = steps.check_log(log, robot)
             folder.mkdir(parents=True, exist_ok=True)
             settings = carrier.settings_of(stages.FRONTEND)
             with timing.stage(stages.FRONTEND, folder, robot):
                 parts = steps.frontend(log, folder, settings, threads=threads)
             timing.stages[label("frontend", robot)]["parts"] = parts
+            made = [sum(1 for _ in read_log(path, [topics.KEYFRAME])) for path in folder.glob("*.mcap")]
+            return size | {"keyframes": sum(made)}
 
         def written() -> Iterator[Path]:
             for of_component in steps.move_components(robot, folder).values():

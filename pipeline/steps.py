@@ -24,12 +24,15 @@ def threads_per_worker(workers: int) -> int:
     return max(1, len(os.sched_getaffinity(0)) // workers)
 
 
-def check_log(log: Path, robot: str) -> None:
+def check_log(log: Path, robot: str) -> dict[str, int]:
     """Refuse the log of another robot, before the front end would stumble over it.
 
     Args:
         log: that the recording names.
         robot: whose it should be.
+
+    Returns:
+        Its frames, and the pixels of an image.
 
     Raises:
         DuagError: the log is damaged, or another robot's.
@@ -40,6 +43,7 @@ def check_log(log: Path, robot: str) -> None:
     with open_rgbd(log) as camera:
         if camera.robot != robot:
             raise DuagError(f"{log}: is the log of {camera.robot}, expected that of {robot}")
+        return {"frames": len(camera), "pixels": camera.camera.width * camera.camera.height}
 
 
 def frontend(log: Path, folder: Path, config: RunConfig, *, threads: int) -> dict[str, float]:

@@ -104,6 +104,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
         ),
     ),
     (
+        _part("cache", "what was computed before", "base config recording runs"),
         _part("comparison", "what differs between runs", "base config geometry splat recording runs"),
         _part(
             "team_posegraph",
@@ -122,7 +123,13 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
     ),
     (
         _part("report", "the page of a run", "base geometry kernels fusion", _LOGS, "runs evaluation"),
-        _part("checks", "is a recording sound", "base config geometry registration", _LOGS, "evaluation"),
+        _part(
+            "checks",
+            "is a recording sound",
+            "base config geometry registration",
+            _LOGS,
+            "evaluation cache runs",
+        ),
         _part("bench", "speed, side by side", _MATHEMATICS, "recording runs frontend evaluation converters"),
     ),
     (
@@ -149,7 +156,6 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
         ),
     ),
     (
-        _part("cache", "what was computed before", "base config recording runs"),
         _part(
             "steps",
             "how each stage is called",
@@ -157,7 +163,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
         ),
     ),
     (_part("doctor", "what a machine has", "base kernels"),),
-    (_part("chain", "the stages in their order", "base recording runs cache steps"),),
+    (_part("chain", "the stages in their order", "base schemas recording runs cache steps"),),
     (
         _part(
             "job",

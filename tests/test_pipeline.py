@@ -408,7 +408,8 @@ def test_a_run_that_is_there_already_is_up_to_date(recording: Path, finished: Pa
     before = {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
     assert len(executed(finished)) == 10
     code, lines, printed = again(recording, finished)
-    assert (code, lines) == (0, [f"duagc: {finished}: up to date"])
+    assert (code, lines[0]) == (0, f"duagc: {finished}: up to date")
+    assert [line.split()[1] for line in lines[-4:]] == ["fusion", "evaluation", "report", "rrd"]
     assert "refined.ply" in printed
     assert {path: path.stat().st_mtime_ns for path in finished.rglob("*")} == before
 

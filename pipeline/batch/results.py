@@ -11,7 +11,7 @@ from typing import Any
 
 from duagc.pipeline.base.files import new_file, read_text
 from duagc.pipeline.batch.cell import CellState, read_state, run_folder
-from duagc.pipeline.batch.suite import Cell, Suite
+from duagc.pipeline.batch.suite import BatchCell, Suite
 from duagc.pipeline.comparison.summary import metrics_of
 
 TABLE, PAGE = "results.parquet", "index.html"
@@ -163,7 +163,7 @@ def paired(
     return PairedDifference(math.fsum(gaps) / len(gaps), min(gaps), max(gaps), len(gaps))
 
 
-def _cells_of(suite: Suite, recording: str) -> Iterator[Cell]:
+def _cells_of(suite: Suite, recording: str) -> Iterator[BatchCell]:
     return (cell for cell in suite.cells.values() if cell.recording == recording)
 
 
@@ -212,7 +212,7 @@ def _rows(suite: Suite, done: Mapping[str, Mapping[str, Any]], recording: str) -
 
 
 def _shown(
-    suite: Suite, done: Mapping[str, Mapping[str, Any]], cells: Sequence[Cell], column: Column
+    suite: Suite, done: Mapping[str, Mapping[str, Any]], cells: Sequence[BatchCell], column: Column
 ) -> dict[str, str]:
     """The mean over the seeds, and the paired difference to the first configuration."""
     values = [

@@ -55,7 +55,7 @@ class SuiteFile(Config):
 
 
 @dataclass(frozen=True)
-class Cell:
+class BatchCell:
     """One run of a suite.
 
     Attributes:
@@ -89,7 +89,7 @@ class Suite:
     """
 
     path: Path
-    cells: Mapping[str, Cell]
+    cells: Mapping[str, BatchCell]
     configurations: tuple[str, ...]
 
 
@@ -149,7 +149,7 @@ def _check_exclusions(path: Path, file: SuiteFile) -> None:
                 raise DuagError(f"{path}: exclude: {kind} {value}: is not in the suite, {hint}")
 
 
-def _cells(path: Path, file: SuiteFile) -> Iterator[Cell]:
+def _cells(path: Path, file: SuiteFile) -> Iterator[BatchCell]:
     from duagc.pipeline.recording import Recording
 
     folders = {name: path.parent / folder for name, folder in file.recordings.items()}
@@ -163,7 +163,7 @@ def _cells(path: Path, file: SuiteFile) -> Iterator[Cell]:
             continue
         settings = None if of_name.file is None else path.parent / of_name.file
         config = load_config(RunConfig, settings, [*of_name.set, f"seed={seed}"])
-        yield Cell(recording_name, name, seed, folders[recording_name], config)
+        yield BatchCell(recording_name, name, seed, folders[recording_name], config)
 
 
 def _applies(row: Exclusion, cell: Mapping[str, Any]) -> bool:

@@ -213,6 +213,20 @@ class Store:
                 best = distance, entry
         return None if best is None else best[1]
 
+    def recent(self, stage: str, most: int) -> list[StoredResults]:
+        """Results of a stage, last used first; damaged ones are left out.
+
+        Args:
+            stage: its name.
+            most: how many.
+        """
+        paths = [(p.stat().st_mtime_ns, p) for p in (self.folder / "entries" / stage).glob("*/*.json")]
+        out = []
+        for _, path in sorted(paths, reverse=True)[:most]:
+            with suppress(OSError, ValueError, KeyError, TypeError):
+                out.append(_read(path))
+        return out
+
     def earlier(self, key: StageKey, digest: str) -> StoredResults | None:
         """The results of the same stage and robot for another key; None if they are gone.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
-from duagc.pipeline.checks import estimate, geometry, images, scale, stamps
+from duagc.pipeline.checks import estimate, geometry, images, measured, scale, stamps
 from duagc.pipeline.checks.findings import Finding, Report, Severity, judged, lines
 from duagc.pipeline.config.checks import ChecksConfig, MotionChecks
 from duagc.pipeline.evaluation import groundtruth
@@ -23,12 +23,13 @@ __all__ = ["Finding", "Report", "Severity", "check", "format_report"]
 _DEFAULT = ChecksConfig()
 
 
-def check(path: Path, config: ChecksConfig = _DEFAULT) -> Report:
+def check(path: Path, config: ChecksConfig = _DEFAULT, *, store: Path | None = None) -> Report:
     """Check a recording, or the log of one robot.
 
     Args:
         path: folder of the recording, or the log.
         config: from which value on something is reported.
+        store: results of earlier runs, which say how fast this machine is; None: there are none.
 
     Returns:
         All findings; `Report.sound` is whether there is no error among them.
@@ -50,7 +51,8 @@ def check(path: Path, config: ChecksConfig = _DEFAULT) -> Report:
             advice = "duagc recover may save it" if log else ""
             report.findings.append(_unreadable(robot, error, advice))
     report.findings += images.check_colors(sights, config.images)
-    report.estimate = estimate.estimate(report.robots)
+    speed = measured.MachineSpeed() if store is None else measured.speed_of(store)
+    report.estimate = estimate.estimate(report.robots, speed.ratios) | {"measured_stages": speed.stages}
     report.findings += estimate.check_disk(path.parent, report.estimate["bytes"])
     report.findings = list(judged(report.findings, config.sure, config.likely))
     return report
@@ -168,8 +170,9 @@ def format_report(report: Report) -> str:
     e = report.estimate
     unit, name = (60, "minutes") if e["seconds_to"] > 120 else (1, "seconds")
     span = f"{e['seconds_from'] / unit:.0f} to {e['seconds_to'] / unit:.0f} {name}"
+    here = f" (as {e['measured_stages']:.0f} stages took here)" if e["measured_stages"] else ""
     if report.robots:
-        out.append(f"a run takes {span} on two idle cores, and about {e['bytes'] / 1e6:.0f} MB of disk")
+        out.append(f"a run takes {span} on two idle cores{here}, and about {e['bytes'] / 1e6:.0f} MB of disk")
     out += lines(report.findings)
     counts = [f"{len(found)} {s.value}{'s' * (len(found) != 1)}" for s in Severity if (found := report.of(s))]
     return "\n".join([*out, ", ".join(counts) or "nothing found"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ FUSION_S = (6.0, 60.0)  # of a robot that has peers: in any case, and for every 
 EVALUATION_S = 0.35  # for every million pixels of all frames
 EXCHANGE_S = 4.0  # of a pair of robots, and of the team
 RANGE = (0.6, 1.7)  # of the sum: textures decide how long a map is trained, and robots may not meet
+MEASURED_RANGE = (0.7, 1.4)  # where the machine was measured
 BYTES_PER_ROBOT = 50_000_000  # maps at their cap of Gaussians with information; report and Rerun file
 BYTES_PER_FRAME = 25_000
 
@@ -43,25 +45,45 @@ def keyframes(moved: Sequence[Move], frames: int, duration_ns: int) -> int:
     return min(frames, 1 + round(lost / (1 - KeyframeConfig().min_overlap)))
 
 
-def estimate(robots: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+def front_end_s(robot: Mapping[str, Any]) -> float:
+    """Processor time of the front end of a robot.
+
+    Args:
+        robot: `frames`, `pixels` of an image and `keyframes`.
+    """
+    megapixels = robot["pixels"] * 1e-6
+    return ROBOT_S + megapixels * (FRAME_S * robot["frames"] + KEYFRAME_S * robot["keyframes"])
+
+
+def evaluation_s(robots: Sequence[Mapping[str, Any]]) -> float:
+    """Time of the evaluation of a team.
+
+    Args:
+        robots: `frames` and `pixels` of an image of every robot.
+    """
+    return EVALUATION_S * sum(robot["pixels"] * 1e-6 * robot["frames"] for robot in robots)
+
+
+def estimate(
+    robots: Mapping[str, Mapping[str, Any]], ratios: Mapping[str, float] = MappingProxyType({})
+) -> dict[str, float]:
     """Seconds (from, to) of a run on two idle cores and bytes on disk.
 
     Args:
         robots: `frames`, `pixels` of an image and `keyframes` of every robot.
+        ratios: what stages take on this machine, as a share of what is predicted, by their names.
     """
     rows, count = list(robots.values()), len(robots)
     megapixels = [row["pixels"] * 1e-6 for row in rows]
-    front_ends = [
-        ROBOT_S + m * (FRAME_S * row["frames"] + KEYFRAME_S * row["keyframes"])
-        for row, m in zip(rows, megapixels, strict=True)
-    ]
+    front_ends = [ratios.get("frontend", 1.0) * front_end_s(row) for row in rows]
     seconds = RUN_S + max([*front_ends, sum(front_ends) / 2], default=0.0)
-    seconds += EVALUATION_S * sum(m * row["frames"] for row, m in zip(rows, megapixels, strict=True))
+    seconds += ratios.get("evaluation", 1.0) * evaluation_s(rows)
     if count > 1:
         seconds += EXCHANGE_S * (1 + count * (count - 1) / 2)
         seconds += sum(FUSION_S[0] + FUSION_S[1] * m for m in megapixels)
     size = sum(BYTES_PER_ROBOT + BYTES_PER_FRAME * row["frames"] for row in rows)
-    return {"seconds_from": RANGE[0] * seconds, "seconds_to": RANGE[1] * seconds, "bytes": float(size)}
+    low, high = MEASURED_RANGE if "frontend" in ratios else RANGE
+    return {"seconds_from": low * seconds, "seconds_to": high * seconds, "bytes": float(size)}
 
 
 def check_disk(folder: Path, needed: float) -> Iterator[Finding]:

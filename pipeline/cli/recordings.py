@@ -18,6 +18,7 @@ from duagc.pipeline.cli.common import (
     Json,
     Out,
     Overrides,
+    StoreFolder,
     Workers,
     app,
     say,
@@ -308,21 +309,25 @@ def check(
     path: Annotated[Path, typer.Argument(help="A recording, or the log of one robot.", show_default=False)],
     config: ConfigFile = None,
     overrides: Overrides = None,
+    store: StoreFolder = None,
     as_json: Json = False,
 ) -> None:
     """Say whether a recording is sound: times, pairs, depth scale, calibration, what a run will take.
 
+    Where the store has results that were computed here, the time that a run takes is predicted from what these took.
     Exit code 1 if there is an error; warnings and notes leave it 0.
 
     Example: `duagc check recordings/redkitchen`
     """
     from duagc.pipeline.base import determinism
+    from duagc.pipeline.cache.store import default_store
     from duagc.pipeline.checks import check
     from duagc.pipeline.config.base import load_config
     from duagc.pipeline.config.checks import ChecksConfig
 
     determinism.configure_opencv()
-    report = check.check(path, load_config(ChecksConfig, config, overrides or []))
+    settings = load_config(ChecksConfig, config, overrides or [])
+    report = check.check(path, settings, store=store or default_store(Path("outputs") / "run"))
     print(json.dumps(report.plain(), indent=2) if as_json else check.format_report(report))
     if not report.sound:
         raise typer.Exit(EXIT_FAILED)

@@ -133,6 +133,7 @@ def run(
         until=until,
         log=say,
     )
+    _say_times(out)
     _print_outputs(out)
 
 
@@ -170,6 +171,19 @@ def _bytes(option: str, text: str) -> int:
         return int(float(number) * factor) if factor else int(text)
     except (ValueError, OverflowError) as error:
         raise typer.BadParameter(f"{text!r} is not a size such as 20G", param_hint=option) from error
+
+
+def _say_times(run_folder: Path) -> None:
+    """What every stage took, and the most memory that its process held."""
+    from duagc.pipeline.runs.stages import STAGES
+
+    rows = json.loads((run_folder / "timing.json").read_text())["stages"].values()
+    order = [stage.name for stage in STAGES]
+    for row in sorted(rows, key=lambda row: order.index(row["stage"]) if row["stage"] in order else -1):
+        name = f"{row['stage']} of {row['robot']}" if row["robot"] else row["stage"]
+        wall, cpu, peak = row["wall_s"], row["cpu_s"], row["peak_rss_mb"]
+        stored = "" if row["executed"] else "   from the store"
+        say(f"{name:<24}{wall:>8.1f} s {cpu:>8.1f} s of processor {peak:>6.0f} MB{stored}")
 
 
 def _print_outputs(run_folder: Path) -> None:

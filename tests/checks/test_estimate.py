@@ -1,10 +1,19 @@
 """What a run takes is predicted from what was measured."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from duagc.pipeline.checks.estimate import estimate, keyframes
+from duagc.pipeline.cache.stage_key import StageKey
+from duagc.pipeline.cache.store import Store, StoredResults
+from duagc.pipeline.checks.estimate import estimate, evaluation_s, front_end_s, keyframes
 from duagc.pipeline.checks.geometry import Move
+from duagc.pipeline.checks.measured import MachineSpeed, speed_of
+from duagc.pipeline.config.base import load_config
+from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.runs.declared_settings import DeclaredSettings
+from duagc.pipeline.runs.stages import EVALUATION, FRONTEND, Stage
 
 # frames, pixels and predicted keyframes of every robot, and seconds that the stages of a run took on two idle cores
 MEASURED = {
@@ -44,3 +53,35 @@ def test_keyframes_come_as_often_as_views_are_lost() -> None:
     assert keyframes(moves([0.0] * 8), 100, 4_000_000_000) == 1
     assert keyframes(moves([1.0] * 8), 100, 4_000_000_000) == 100  # no more than there are frames
     assert keyframes([Move(0, 1, None)], 30, 10**9) == 30
+
+
+SIZE = {"frames": 200, "pixels": 640 * 480, "keyframes": 10}
+
+
+def keep(store: Path, stage: Stage, inputs: dict[str, str], cpu_s: float, *overrides: str) -> None:
+    """A result in a store, as a run leaves it."""
+    config = load_config(RunConfig, overrides=overrides)
+    settings = DeclaredSettings(config, stage.name, stage.settings).plain()
+    key = StageKey(stage.name, "alpha" if stage.per_robot else None, {}, {}, settings, inputs)
+    result = SIZE if stage is FRONTEND else None
+    Store(store).keep(StoredResults(key, {}, result, {"cpu_s": cpu_s}), store)
+
+
+def test_a_machine_that_was_slow_is_predicted_to_be_slow(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    assert speed_of(store) == MachineSpeed()
+    keep(store, FRONTEND, {"log": "a"}, 2.5 * front_end_s(SIZE))
+    keep(store, FRONTEND, {"log": "b"}, 3.5 * front_end_s(SIZE), "seed=7")
+    keep(store, FRONTEND, {"log": "c"}, 9.0 * front_end_s(SIZE), "frontend.mapping.iterations=99")
+    team = {"recording: alpha.mcap": "a", "robots/alpha/frontend.mcap": "x"}
+    keep(store, EVALUATION, team, 2.0 * evaluation_s([SIZE]))
+    keep(
+        store, EVALUATION, team | {"robots/bravo/frontend.mcap": "y"}, 9.0
+    )  # of a robot whose size is unknown
+    speed = speed_of(store)
+    assert speed.ratios == pytest.approx({"frontend": 3.0, "evaluation": 2.0})
+    assert speed.stages == 3
+    slow, usual = (estimate({"alpha": SIZE}, ratios) for ratios in (speed.ratios, {}))
+    expected = 6.0 + 3.0 * front_end_s(SIZE) + 2.0 * evaluation_s([SIZE])
+    assert slow["seconds_from"] < expected < slow["seconds_to"]
+    assert slow["seconds_to"] / slow["seconds_from"] <= 2.0 < usual["seconds_to"] / usual["seconds_from"]
