@@ -42,7 +42,7 @@ def suite(fake: fake_run.FakeRun, tmp_path: Path) -> Suite:
 
 
 class Pretended:
-    """An engine whose cells end as they are told to."""
+    """An engine whose cells end as they are asked to."""
 
     slots = 2
 
