@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from duagc.pipeline import steps
 from duagc.pipeline.cache.carrier import Carried, Carrier
@@ -36,6 +37,21 @@ class Chain:
             digests: of the files of the recording.
         """
         self._recording, self._carrier, self._digests = recording, carrier, digests
+
+    def calibration(self, workers: int) -> Carried:
+        """The recording with its cameras calibrated, if that is better; no file, if it is not.
+
+        Args:
+            workers: robots that are tracked at the same time; changes no bit of the result.
+        """
+        carrier, recording = self._carrier, self._recording
+
+        def calibrate(timing: Timing) -> dict[str, Any]:
+            settings = carrier.settings_of(stages.CALIBRATION)
+            with timing.measured(stages.CALIBRATION.name):
+                return steps.calibration(recording, carrier.folder, settings, workers=workers)
+
+        return carrier.carry(stages.CALIBRATION, None, self._recorded(), calibrate)
 
     def robot(self, robot: str, *, threads: int, alone: bool = False) -> dict[str, Prepared]:
         """Front end and Fisher information of one robot, from its own log alone; by name of the component.

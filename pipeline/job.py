@@ -27,13 +27,14 @@ from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.digest import RESULT_SUFFIXES, digest_file
 from duagc.pipeline.runs.folder import SCHEMA
-from duagc.pipeline.runs.timing import Timing, label
+from duagc.pipeline.runs.timing import label
 from duagc.pipeline.steps import threads_per_worker
 
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
 NAMES = tuple(stage.name for stage in stages.STAGES)
 LAST: str = stages.VIEW.name
 TITLES = {
+    stages.CALIBRATION.name: "calibration",
     stages.EXCHANGE.name: "exchange and consensus",
     stages.FUSION.name: "fusion",
     stages.EVALUATION.name: "evaluation",
@@ -132,7 +133,7 @@ class Job:
         )
         self.missing: list[StageKey] = []
         self._calibration: dict[str, Any] = {}
-        self._timing = Timing()
+        self._before: list[Carried] = []
         self._place = place
 
     def run(self) -> None:
@@ -146,15 +147,7 @@ class Job:
 
             check_ground_truth(self.recording)  # before minutes of work
         (self.folder / "config.toml").write_text(dump_config(self.config))
-        if self.plan.calibrate:
-            self.recording, self._calibration = calibrated_recording(
-                self.recording,
-                self.folder,
-                self.config,
-                self._timing,
-                workers=self.plan.workers,
-                log=self.log,
-            )
+        self.calibrate()
         for robot in self.recording.robots:
             path = self.recording.log(robot)
             if (found := self._digest(path)) != (expected := self.recording.digest(path.name)):
@@ -162,6 +155,28 @@ class Job:
                     f"warning: {path}: has digest {found[:12]}, expected {expected[:12]} as in recording.json"
                 )
         self.stages()
+
+    def calibrate(self) -> None:
+        """Go on with the calibrated recording, if the plan asks for one and it is better.
+
+        Raises:
+            NotStoredError: it would have to be computed while only looking.
+        """
+        if not self.plan.calibrate:
+            return
+        chain = Chain(self.recording, self.carrier, self.digests)
+        carried = self._noted(chain.calibration, self.plan.workers)
+        cameras, lines = carried.entry.result["cameras"], carried.entry.result["lines"]
+        for line in lines if not self.carrier.looking else ():
+            self.log(line)
+        of = os.path.relpath(self.recording.path, self.folder)
+        self._calibration = {"calibration": {"of": of, "cameras": cameras}}
+        self._before = [carried]
+        if carried.entry.files:
+            place = self.folder / stages.CALIBRATED
+            if not place.is_dir():
+                raise NotStoredError(carried.entry.key)  # only looking: nobody has taken it from the store
+            self.recording = Recording(place)
 
     def stages(self) -> list[Carried]:
         """All stages of the plan, in their order.
@@ -180,7 +195,8 @@ class Job:
         if plan.has(stages.FUSION):
             done += self._fused(chain, prepared, exchange)
         self._write(done)
-        notes = {"calibration": _digest_of(self._calibration)} if self._calibration else {}
+        cameras = self._calibration.get("calibration", {}).get("cameras")
+        notes = {"calibration": _digest_of(cameras)} if cameras else {}
         if plan.has(stages.EVALUATION):
             done.append(self._noted(chain.reader, stages.EVALUATION, done, notes))
             self._write(done)
@@ -194,7 +210,7 @@ class Job:
         if plan.has(stages.VIEW):
             readers.append(self._noted(chain.reader, stages.VIEW, done, notes))
         self._write([*done, *readers])
-        return [*done, *readers]
+        return [*self._before, *done, *readers]
 
     def look(self) -> tuple[list[Carried], list[StageKey]]:
         """What is there, and what would have to be computed as far as that is known."""
@@ -205,6 +221,7 @@ class Job:
 
         self.carrier.found = note
         with suppress(NotStoredError):
+            self.calibrate()
             self.stages()
         return list(found.values()), self.missing
 
@@ -306,7 +323,7 @@ class Job:
 
     def _times(self, done: list[Carried]) -> dict[str, Any]:
         """What each stage took when it was computed."""
-        return self._timing.stages | {carried.label: dict(carried.entry.timing) for carried in done}
+        return {carried.label: dict(carried.entry.timing) for carried in [*self._before, *done]}
 
     def _write(self, done: list[Carried]) -> None:
         """manifest.json and timing.json, of what is done."""
@@ -334,7 +351,7 @@ class Job:
             "outputs": {n: digest for n, digest in files.items() if Path(n).suffix in RESULT_SUFFIXES},
         }
         if self.store is not None:
-            manifest["stages"] = {carried.label: _row(carried) for carried in done}
+            manifest["stages"] = {carried.label: _row(carried) for carried in [*self._before, *done]}
         return manifest
 
 
@@ -431,47 +448,10 @@ def why(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan) -> li
         reason = "--from" if key.stage in plan.again else "; ".join(job.carrier.changes(key))
         lines.append(f"{words(key)}: computed: {reason}")
     if missing:
-        last = max(NAMES.index(key.stage) for key in missing)
+        last = max(NAMES.index(key.stage) if key.stage in NAMES else -1 for key in missing)
         if later := NAMES[last + 1 : NAMES.index(plan.until) + 1]:
             lines.append(f"{', '.join(later)}: computed unless the results before turn out as they were")
     return lines
-
-
-def calibrated_recording(
-    recording: Recording,
-    folder: Path,
-    config: RunConfig,
-    timing: Timing,
-    *,
-    workers: int,
-    log: Callable[[str], None],
-) -> tuple[Recording, dict[str, Any]]:
-    """Calibrate a recording from its own images.
-
-    Args:
-        recording: as it is.
-        folder: of the run; gets a folder `calibrated` if that is better.
-        config: settings.
-        timing: of the run.
-        workers: robots that are tracked at the same time.
-        log: gets what was found, in sentences.
-
-    Returns:
-        The recording that the run is of, and what the manifest says about its calibration.
-    """
-    from duagc.pipeline.recalibration import calibrated
-
-    def place() -> Path:
-        (folder / stages.CALIBRATED).mkdir()
-        return folder / stages.CALIBRATED
-
-    log("calibration")
-    with timing.measured("calibration"):
-        outcomes, written = calibrated(recording, place, recording.name, config, workers=workers)
-    for line in (line for outcome in outcomes for line in outcome.lines()):
-        log(line)
-    entry = {"of": os.path.relpath(recording.path, folder), "cameras": [o.plain() for o in outcomes]}
-    return Recording(folder / stages.CALIBRATED) if written else recording, {"calibration": entry}
 
 
 def _digest_of(value: Any) -> str:

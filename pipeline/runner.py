@@ -97,7 +97,7 @@ def _run(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan, *, l
 
     recording = Recording(recording_path)
     force = plan.force
-    if out.exists() and not force and plan.store is not None and not plan.calibrate:
+    if out.exists() and not force and plan.store is not None:
         if is_up_to_date(recording, out, config, plan, log=log):
             log(f"{out}: up to date")
             return

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.component_names import component_name
@@ -16,12 +16,39 @@ from duagc.pipeline.base.errors import DuagError
 
 if TYPE_CHECKING:
     from duagc.pipeline.config.run import RunConfig
+    from duagc.pipeline.recording import Recording
     from duagc.pipeline.runs.robot_data import AgentInput, SessionResult
 
 
 def threads_per_worker(workers: int) -> int:
     """Threads of each of `workers` processes on this machine."""
     return max(1, len(os.sched_getaffinity(0)) // workers)
+
+
+def calibration(recording: Recording, folder: Path, config: RunConfig, *, workers: int) -> dict[str, Any]:
+    """Calibrate a recording from its own images.
+
+    Args:
+        recording: as it is.
+        folder: of the run; gets a folder `calibrated` if that is better.
+        config: of the run.
+        workers: robots that are tracked at the same time; changes no bit of the result.
+
+    Returns:
+        What was found, of every camera and in sentences.
+    """
+    from duagc.pipeline.recalibration import calibrated
+    from duagc.pipeline.runs.stages import CALIBRATED
+
+    def place() -> Path:
+        (folder / CALIBRATED).mkdir()
+        return folder / CALIBRATED
+
+    outcomes, _ = calibrated(recording, place, recording.name, config, workers=workers)
+    return {
+        "cameras": [outcome.plain() for outcome in outcomes],
+        "lines": [line for outcome in outcomes for line in outcome.lines()],
+    }
 
 
 def check_log(log: Path, robot: str) -> dict[str, int]:

@@ -160,6 +160,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             "steps",
             "how each stage is called",
             "base config runs frontend information recording exchange fusion evaluation report viewing",
+            "recalibration",
         ),
     ),
     (_part("doctor", "what a machine has", "base kernels"),),
@@ -168,7 +169,7 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
         _part(
             "job",
             "a run that is made",
-            "base config runs recording evaluation recalibration cache steps chain",
+            "base config runs recording evaluation cache steps chain",
         ),
     ),
     (_part("runner", "carries a run", "base config runs recording steps job"),),

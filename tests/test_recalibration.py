@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from duagc.converters.datasets import tum
 from duagc.converters.simulate.team import simulate
 from duagc.converters.writer import RecordingWriter
-from duagc.pipeline import job, recalibration, runner
+from duagc.pipeline import recalibration, runner
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.camera_calibration import calibrate as calibrating
 from duagc.pipeline.camera_calibration.adjustment import Quality
@@ -24,11 +24,11 @@ from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.geometry import so3
 from duagc.pipeline.geometry.camera import PinholeCamera
+from duagc.pipeline.job import Job, RunPlan
 from duagc.pipeline.recording import Recording, format_info, info, open_rgbd
 from duagc.pipeline.replay import replay
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.runs.stages import CALIBRATED
-from duagc.pipeline.runs.timing import Timing
 
 CAMERAS = [PinholeCamera(64, 48, f, f, 31.5, 23.5) for f in (60.0, 70.0)]
 SMALL = (
@@ -184,24 +184,38 @@ def test_convert_delivers_the_better_recording(
 
 
 def test_a_run_keeps_the_calibrated_recording(tmp_path: Path, answers: Answers) -> None:
-    folder = tmp_path / "run.part"
-    folder.mkdir()
-    recording, said = Recording(write(tmp_path / "rec", CAMERAS[0])), list[str]()
-    for after in (SAME, BETTER):
-        answers({60.0: after})
-        timing = Timing()
-        used, entry = job.calibrated_recording(
-            recording, folder, RunConfig(), timing, workers=1, log=said.append
-        )
-        assert json.loads(json.dumps(entry))["calibration"]["of"] == "../rec"
-        assert "calibration" in timing.stages
+    recording = Recording(write(tmp_path / "rec", CAMERAS[0]))
+    for after, plan in ((SAME, RunPlan(1, calibrate=True)), (BETTER, RunPlan(1, calibrate=True))):
+        asked, said = answers({60.0: after}), list[str]()
+        folder = tmp_path / f"run{after is SAME}.part"
+        folder.mkdir()
+        job = Job(recording, folder, RunConfig(), plan, log=said.append, place=folder)
+        job.calibrate()
+        assert len(asked) == 1
         if after is SAME:
-            assert used is recording
+            assert job.recording is recording
             assert not list(folder.iterdir())
-    assert used.path == folder / CALIBRATED
-    assert used.name == "rec"
+    assert job.recording.path == folder / CALIBRATED
+    assert job.recording.name == "rec"
     assert said[0] == "calibration"
     assert "alpha: calibrated" in said
+
+
+def test_a_calibration_is_computed_once(tmp_path: Path, answers: Answers) -> None:
+    recording = Recording(write(tmp_path / "rec", CAMERAS[0]))
+    asked, said = answers({60.0: BETTER}), list[str]()
+    plan = RunPlan(1, calibrate=True, store=tmp_path / "store")
+    for number in range(2):
+        folder = tmp_path / f"run{number}"
+        folder.mkdir()
+        job = Job(recording, folder, RunConfig(), plan, log=said.append, place=folder)
+        job.calibrate()
+        assert job.recording.path == folder / CALIBRATED
+    assert len(asked) == 1
+    assert "calibration: from the store" in said
+    assert said.count("alpha: calibrated") == 2
+    logs = [tmp_path / run / CALIBRATED / "alpha.mcap" for run in ("run0", "run1")]
+    assert logs[0].read_bytes() == logs[1].read_bytes()
 
 
 @pytest.mark.slow

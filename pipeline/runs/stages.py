@@ -279,5 +279,13 @@ VIEW = Stage(
     settings=ALL_SETTINGS,
     code=f"{STEPS}:view",
 )
+CALIBRATION = Stage(
+    "calibration",
+    reads=SENSORS,
+    writes_files=(CALIBRATED_FILES,),
+    settings=("calibration", "frontend"),
+    code=f"{STEPS}:calibration",
+)
+"""Before a run, if it is asked for. Its declaration is not enforced: it copies what it does not look at."""
 STAGES = (FRONTEND, INFORMATION, EXCHANGE, FUSION, EVALUATION, REPORT, VIEW)
 """In the order in which a run takes them."""
