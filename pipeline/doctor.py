@@ -15,6 +15,7 @@ from typing import Literal
 
 from duagc import __version__
 from duagc.pipeline.base.determinism import SETTINGS
+from duagc.pipeline.base.machine import memory_bytes
 
 REQUIRED = {
     "numpy": "numpy",
@@ -50,7 +51,6 @@ OPTIONAL = {
 }
 """Modules that a run does without: the package, what lacks without it, and what installs it."""
 LEAST_MEMORY_BYTES, LEAST_DISK_BYTES = 2_000_000_000, 2_000_000_000
-_UNLIMITED = 1 << 60  # a control group without a limit says a number like this
 
 
 @dataclass(frozen=True)
@@ -116,23 +116,6 @@ def _machine() -> Iterator[Found]:
         yield Found("memory", "note", text, "runs of several robots at a time", "duagc run --workers 1")
     else:
         yield Found("memory", "ok", text)
-
-
-def memory_bytes() -> tuple[int | None, int | None]:
-    """Memory that this process may have in all, and what is free of it; None: unknown."""
-    total = free = None
-    with suppress(OSError, ValueError):
-        rows = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
-        total, free = (int(rows[name].split()[0]) * 1024 for name in ("MemTotal", "MemAvailable"))
-    for limit, used in (
-        ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
-        ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
-    ):
-        with suppress(OSError, ValueError):
-            most, now = int(Path(limit).read_text()), int(Path(used).read_text())
-            if most < min(total or _UNLIMITED, _UNLIMITED):
-                total, free = most, min(most - now, free if free is not None else most)
-    return total, free
 
 
 def _processor_share() -> float | None:

@@ -13,11 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from duagc import __version__
+from duagc.pipeline import steps
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError, closest
+from duagc.pipeline.base.machine import memory_bytes
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.cache.carrier import Carried, Carrier, NotStoredError, intact, words
 from duagc.pipeline.cache.file_digests import FileDigests
+from duagc.pipeline.cache.footprint import fitting, robot_bytes
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.cache.store import Store
 from duagc.pipeline.chain import Chain, Prepared
@@ -32,7 +35,9 @@ from duagc.pipeline.steps import threads_per_worker
 
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
 NAMES = tuple(stage.name for stage in stages.STAGES)
+MEASURED = 20  # results of front ends that memory is estimated from
 LAST: str = stages.VIEW.name
+READERS = (stages.EVALUATION.name, stages.REPORT.name, stages.VIEW.name)
 TITLES = {
     stages.CALIBRATION.name: "calibration",
     stages.EXCHANGE.name: "exchange and consensus",
@@ -274,7 +279,7 @@ class Job:
         for robot in set(self.recording.robots) - set(absent):
             found |= chain.robot(robot, threads=threads_per_worker(1), alone=alone)
         if absent:
-            workers = min(self.plan.workers, len(absent))
+            workers = self._fitting(absent)
             self.log(f"front end and information: {len(absent)} robots, {workers} at a time")
             found |= self._prepared_in_workers(absent, workers, alone)
         else:
@@ -284,6 +289,23 @@ class Job:
                 f"warning: {name}: what {robot_of(name)} saw after it was lost did not join the rest of its path"
             )
         return dict(sorted(found.items()))
+
+    def _fitting(self, robots: list[str]) -> int:
+        """How many of some robots are prepared at the same time, so that they fit into memory."""
+        asked = min(self.plan.workers, len(robots))
+        if asked == 1:
+            return 1
+        measured = [] if self.store is None else self.store.recent(stages.FRONTEND.name, MEASURED)
+        sizes = [steps.check_log(self.recording.log(robot), robot) for robot in robots]
+        needed = [robot_bytes(size, measured) for size in sizes]
+        _, free = memory_bytes()
+        workers = fitting(asked, needed, free)
+        if workers < asked and free is not None:
+            self.log(
+                f"{workers} at a time instead of {asked}: a robot may take {max(needed) / 1e9:.1f} GB of memory, "
+                f"found {free / 1e9:.1f} GB free"
+            )
+        return workers
 
     def _prepared_in_workers(self, robots: list[str], workers: int, alone: bool) -> dict[str, Prepared]:
         threads = threads_per_worker(workers)
@@ -413,15 +435,20 @@ def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunP
     done, keys = job.look()
     for key in [*(carried.entry.key for carried in done), *keys]:
         name = label(key.stage, key.robot)
-        if name in earlier and earlier[name]["key"] != key.digest:
-            changes = "; ".join(job.carrier.changes(key, earlier[name]["key"]))
+        known = earlier[name].get("key") if isinstance(earlier.get(name), dict) else None
+        if name in earlier and known != key.digest:
+            changes = "; ".join(job.carrier.changes(key, str(known)))
             raise DuagError(
                 f"{out}: exists already, and {words(key)} differs ({changes}); choose another --out or give --force"
             )
     if keys or plan.since is not None or any(carried.label not in earlier for carried in done):
         return False
     for carried in done:
-        if name := intact(out, carried.entry, job.digests):
+        if carried.entry.key.stage in READERS:  # `duagc evaluate` and `duagc report` write these again
+            name = next((name for name in carried.entry.files if not (out / name).is_file()), "")
+        else:
+            name = intact(out, carried.entry, job.digests)
+        if name:
             log(f"{out / name}: is not what was computed; taken from the store")
             return False
     return True

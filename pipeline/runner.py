@@ -8,6 +8,7 @@ Everything is written into a temporary folder next to the output, which gets its
 from __future__ import annotations
 
 import multiprocessing
+import shutil
 import threading
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
@@ -96,14 +97,25 @@ def _run(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan, *, l
     from duagc.pipeline.recording import Recording
 
     recording = Recording(recording_path)
-    force = plan.force
+    force, completed = plan.force, False
     if out.exists() and not force and plan.store is not None:
         if is_up_to_date(recording, out, config, plan, log=log):
             log(f"{out}: up to date")
             return
-        force = True
+        force = completed = True
     with new_folder(out, force) as folder:
         Job(recording, folder, config, plan, log=log, place=out).run()
+        if completed:
+            _keep_others(out, folder)
+
+
+def _keep_others(out: Path, folder: Path) -> None:
+    """Bring what somebody else put into a run over to its completed version."""
+    for path in sorted(out.rglob("*")):
+        target = folder / path.relative_to(out)
+        if path.is_file() and not target.exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(path, target)
 
 
 def _run_in_child(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan, *, log: Say) -> None:

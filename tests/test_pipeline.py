@@ -420,11 +420,20 @@ def test_a_damaged_result_of_a_run_is_taken_from_the_store(
     damaged = folder / "damaged_run"
     shutil.copytree(finished, damaged)
     (damaged / "robots" / "alpha" / "odometry.tum").write_text("nothing")
+    (damaged / "notes").mkdir()
+    (damaged / "notes" / "mine.txt").write_text("mine")
     code, lines, _ = again(recording, damaged)
     assert code == 0
+    assert (damaged / "notes" / "mine.txt").read_text() == "mine"
     assert "odometry.tum: is not what was computed; taken from the store" in lines[0]
     assert digest(damaged) == digest(finished)
     assert executed(damaged) == []
+    (damaged / "metrics.json").write_text("{}")  # as `duagc evaluate --own-longer` writes it again
+    assert "up to date" in again(recording, damaged)[1][0]
+    (damaged / "manifest.json").write_text('{"schema": 1, "stages": {"exchange": "mine"}}')
+    code, lines, _ = again(recording, damaged)
+    assert code == 1
+    assert "exists already, and exchange differs" in lines[0]
 
 
 def test_another_consensus_computes_nothing_upstream_and_going_back_nothing_at_all(

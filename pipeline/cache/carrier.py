@@ -165,10 +165,13 @@ class Carrier:
         if (entry := self.store.find(key, self.say)) is not None:
             return entry
         stored = self.earlier.get(label(key.stage, key.robot), {})
-        if stored.get("key") != key.digest:
+        try:
+            if stored["key"] != key.digest:
+                return None
+            files = {name: FileDigest(**digest) for name, digest in stored["files"].items()}
+            return StoredResults(key, files, stored["result"], stored["timing"])
+        except (KeyError, TypeError, AttributeError):  # somebody has written into that manifest
             return None
-        files = {name: FileDigest(**digest) for name, digest in stored["files"].items()}
-        return StoredResults(key, files, stored["result"], stored["timing"])
 
     def _take(self, key: StageKey) -> StoredResults | None:
         """Results of the store, or of the earlier run, in the folder of this one; None if there are none."""

@@ -51,7 +51,7 @@ def collect(folder: Path, largest_bytes: int, dry: bool = False) -> Collected:
         raise DuagError(f"{folder}: has no entries, expected a store; see `--store` and $DUAGC_STORE")
     now_ns = _now_ns(folder)
     needed, entries = _by_use(folder)
-    sizes = {path.name: path.stat().st_size for path in _files(folder / "objects") if len(path.name) == 64}
+    sizes = {path.name: found.st_size for path, found in _files(folder / "objects") if len(path.name) == 64}
     total, kept, users = 0, 0, dict[str, int]()
     removed: list[Path] = []
     for path in entries:  # last used first
@@ -67,11 +67,11 @@ def collect(folder: Path, largest_bytes: int, dry: bool = False) -> Collected:
     for path in removed:
         if not dry:
             path.unlink(missing_ok=True)
-    for path in _files(folder):
-        old = now_ns - path.stat().st_mtime_ns > LEFTOVER_NS
+    for path, found in _files(folder):
+        old = now_ns - found.st_mtime_ns > LEFTOVER_NS
         unnamed = path.parent.parent.name == "objects" and path.name not in users
         if (unnamed and (old or path.name in orphans)) or (path.suffix == ".part" and old):
-            freed += path.stat().st_size
+            freed += found.st_size
             if not dry:
                 path.unlink(missing_ok=True)
     if not dry:
@@ -105,12 +105,12 @@ def _by_use(folder: Path) -> tuple[dict[Path, list[str]], list[Path]]:
     return needed, sorted(used, key=lambda path: (-used[path], path.name))
 
 
-def _files(folder: Path) -> Iterator[Path]:
+def _files(folder: Path) -> Iterator[tuple[Path, os.stat_result]]:
+    """Files with their sizes and times; other processes may remove some meanwhile."""
     for where, _, names in os.walk(folder):
         for name in names:
-            path = Path(where, name)
-            if path.is_file():
-                yield path
+            with suppress(OSError):
+                yield Path(where, name), Path(where, name).stat()
 
 
 def _forget_files(folder: Path) -> None:

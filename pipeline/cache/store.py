@@ -14,7 +14,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -201,13 +201,8 @@ class Store:
         Args:
             key: that has no entry, or whose entry is not meant.
         """
-        paths = [(path.stat().st_mtime_ns, path) for path in self._entry(key).parent.glob("*.json")]
         best: tuple[int, StoredResults] | None = None
-        for _, path in sorted(paths, reverse=True)[:50]:
-            try:
-                entry = _read(path)
-            except (OSError, ValueError, KeyError, TypeError):
-                continue
+        for entry in _newest(self._entry(key).parent.glob("*.json"), 50):
             distance = key.distance(entry.key)
             if distance and (best is None or distance < best[0]):
                 best = distance, entry
@@ -220,12 +215,7 @@ class Store:
             stage: its name.
             most: how many.
         """
-        paths = [(p.stat().st_mtime_ns, p) for p in (self.folder / "entries" / stage).glob("*/*.json")]
-        out = []
-        for _, path in sorted(paths, reverse=True)[:most]:
-            with suppress(OSError, ValueError, KeyError, TypeError):
-                out.append(_read(path))
-        return out
+        return list(_newest((self.folder / "entries" / stage).glob("*/*.json"), most))
 
     def earlier(self, key: StageKey, digest: str) -> StoredResults | None:
         """The results of the same stage and robot for another key; None if they are gone.
@@ -260,6 +250,17 @@ class Store:
             with suppress(OSError):
                 part.unlink(missing_ok=True)
             raise
+
+
+def _newest(paths: Iterable[Path], most: int) -> Iterator[StoredResults]:
+    """Sound entries, last used first; other processes may remove some meanwhile."""
+    used = []
+    for path in paths:
+        with suppress(OSError):
+            used.append((path.stat().st_mtime_ns, path))
+    for _, path in sorted(used, reverse=True)[:most]:
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            yield _read(path)
 
 
 def _read(path: Path) -> StoredResults:
