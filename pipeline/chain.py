@@ -127,7 +127,7 @@ class Chain:
         log, carrier = self._recording.log(name), self._carrier
         folder = carrier.folder / "robots" / name
 
-        def fuse(timing: Timing) -> dict[str, str]:
+        def fuse(timing: Timing) -> dict[str, Any]:
             settings = carrier.settings_of(stages.FUSION)
             with timing.stage(stages.FUSION, folder, name):
                 return steps.fusion(name, log, folder, settings)

@@ -253,7 +253,7 @@ class Job:
             except NotStoredError:
                 continue
             if not self.carrier.looking:
-                for neighbor, reason in done[-1].entry.result.items():
+                for neighbor, reason in done[-1].entry.result["left_out"].items():
                     self.log(f"warning: {name} uses nothing of {neighbor}'s map: {reason}")
         if self.missing:
             raise NotStoredError(self.missing[0])

@@ -165,7 +165,7 @@ def exchange(logs: dict[str, Path], folder: Path, config: RunConfig) -> None:
         write_session_result(folder / "robots" / robot / NAME, result)
 
 
-def fusion(robot: str, log: Path, folder: Path, config: RunConfig) -> dict[str, str]:
+def fusion(robot: str, log: Path, folder: Path, config: RunConfig) -> dict[str, Any]:
     """Fused map and corrected trajectory of one robot, from what it took home.
 
     Args:
@@ -175,11 +175,13 @@ def fusion(robot: str, log: Path, folder: Path, config: RunConfig) -> dict[str, 
         config: of the run.
 
     Returns:
-        Neighbors of whose maps nothing is used, and why.
+        `left_out`: neighbors of whose maps nothing is used, and why; `robots`: in its component.
     """
     from duagc.pipeline.runs.session_file import NAME, read_session_result
 
-    return fuse_robot(robot, log, folder, read_session_result(folder / NAME), config=config)
+    result = read_session_result(folder / NAME)
+    left_out = fuse_robot(robot, log, folder, result, config=config)
+    return {"left_out": left_out, "robots": len(result.component)}
 
 
 def fuse_robot(

@@ -55,6 +55,15 @@ def front_end_s(robot: Mapping[str, Any]) -> float:
     return ROBOT_S + megapixels * (FRAME_S * robot["frames"] + KEYFRAME_S * robot["keyframes"])
 
 
+def fusion_s(robot: Mapping[str, Any]) -> float:
+    """Time of the fusion of a robot that has peers.
+
+    Args:
+        robot: `pixels` of an image.
+    """
+    return FUSION_S[0] + FUSION_S[1] * robot["pixels"] * 1e-6
+
+
 def evaluation_s(robots: Sequence[Mapping[str, Any]]) -> float:
     """Time of the evaluation of a team.
 
@@ -74,13 +83,12 @@ def estimate(
         ratios: what stages take on this machine, as a share of what is predicted, by their names.
     """
     rows, count = list(robots.values()), len(robots)
-    megapixels = [row["pixels"] * 1e-6 for row in rows]
     front_ends = [ratios.get("frontend", 1.0) * front_end_s(row) for row in rows]
     seconds = RUN_S + max([*front_ends, sum(front_ends) / 2], default=0.0)
     seconds += ratios.get("evaluation", 1.0) * evaluation_s(rows)
     if count > 1:
         seconds += EXCHANGE_S * (1 + count * (count - 1) / 2)
-        seconds += sum(FUSION_S[0] + FUSION_S[1] * m for m in megapixels)
+        seconds += ratios.get("fusion", 1.0) * sum(map(fusion_s, rows))
     size = sum(BYTES_PER_ROBOT + BYTES_PER_FRAME * row["frames"] for row in rows)
     low, high = MEASURED_RANGE if "frontend" in ratios else RANGE
     return {"seconds_from": low * seconds, "seconds_to": high * seconds, "bytes": float(size)}

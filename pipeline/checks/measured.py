@@ -12,7 +12,7 @@ from duagc.pipeline.cache.store import Store, StoredResults
 from duagc.pipeline.checks import estimate
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.runs.declared_settings import DeclaredSettings
-from duagc.pipeline.runs.stages import EVALUATION, FRONTEND, Stage
+from duagc.pipeline.runs.stages import EVALUATION, FRONTEND, FUSION, Stage
 
 LAST = 20  # results of a stage that are looked at: a machine and a version change
 
@@ -45,12 +45,21 @@ def speed_of(store: Path) -> MachineSpeed:
         FRONTEND.name: [
             entry.timing["cpu_s"] / estimate.front_end_s(entry.result) for entry in fronts if entry.result
         ],
+        FUSION.name: list(_fusions(opened, sizes)),
         EVALUATION.name: list(_evaluations(opened, sizes)),
     }
     found = {name: values for name, values in measured.items() if values}
     return MachineSpeed(
         {name: median(values) for name, values in found.items()}, sum(map(len, found.values()))
     )
+
+
+def _fusions(store: Store, sizes: Mapping[str, Mapping[str, Any]]) -> Iterator[float]:
+    """Of robots that had peers."""
+    for entry in store.recent(FUSION.name, LAST):
+        size = sizes.get(entry.key.inputs["log"])
+        if size is not None and entry.result["robots"] > 1 and _is_default(entry, FUSION):
+            yield entry.timing["cpu_s"] / estimate.fusion_s(size)
 
 
 def _evaluations(store: Store, sizes: Mapping[str, Mapping[str, Any]]) -> Iterator[float]:

@@ -7,13 +7,13 @@ import pytest
 
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.cache.store import Store, StoredResults
-from duagc.pipeline.checks.estimate import estimate, evaluation_s, front_end_s, keyframes
+from duagc.pipeline.checks.estimate import estimate, evaluation_s, front_end_s, fusion_s, keyframes
 from duagc.pipeline.checks.geometry import Move
 from duagc.pipeline.checks.measured import MachineSpeed, speed_of
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.runs.declared_settings import DeclaredSettings
-from duagc.pipeline.runs.stages import EVALUATION, FRONTEND, Stage
+from duagc.pipeline.runs.stages import EVALUATION, FRONTEND, FUSION, Stage
 
 # frames, pixels and predicted keyframes of every robot, and seconds that the stages of a run took on two idle cores
 MEASURED = {
@@ -63,7 +63,7 @@ def keep(store: Path, stage: Stage, inputs: dict[str, str], cpu_s: float, *overr
     config = load_config(RunConfig, overrides=overrides)
     settings = DeclaredSettings(config, stage.name, stage.settings).plain()
     key = StageKey(stage.name, "alpha" if stage.per_robot else None, {}, {}, settings, inputs)
-    result = SIZE if stage is FRONTEND else None
+    result = SIZE if stage is FRONTEND else {"robots": len(inputs["log"])}
     Store(store).keep(StoredResults(key, {}, result, {"cpu_s": cpu_s}), store)
 
 
@@ -73,7 +73,8 @@ def test_a_machine_that_was_slow_is_predicted_to_be_slow(tmp_path: Path) -> None
     keep(store, FRONTEND, {"log": "a"}, 2.5 * front_end_s(SIZE))
     keep(store, FRONTEND, {"log": "b"}, 3.5 * front_end_s(SIZE), "seed=7")
     keep(store, FRONTEND, {"log": "c"}, 9.0 * front_end_s(SIZE), "frontend.mapping.iterations=99")
-    team = {"recording: alpha.mcap": "a", "robots/alpha/frontend.mcap": "x"}
+    keep(store, FUSION, {"log": "a"}, 99.0)  # alone: it says nothing of a robot that has peers
+    team = {"log": "", "recording: alpha.mcap": "a", "robots/alpha/frontend.mcap": "x"}
     keep(store, EVALUATION, team, 2.0 * evaluation_s([SIZE]))
     keep(
         store, EVALUATION, team | {"robots/bravo/frontend.mcap": "y"}, 9.0
@@ -83,5 +84,8 @@ def test_a_machine_that_was_slow_is_predicted_to_be_slow(tmp_path: Path) -> None
     assert speed.stages == 3
     slow, usual = (estimate({"alpha": SIZE}, ratios) for ratios in (speed.ratios, {}))
     expected = 6.0 + 3.0 * front_end_s(SIZE) + 2.0 * evaluation_s([SIZE])
+    keep(store, FRONTEND, {"log": "dd"}, 3.0 * front_end_s(SIZE))
+    keep(store, FUSION, {"log": "dd"}, 4.0 * fusion_s(SIZE))
+    assert speed_of(store).ratios["fusion"] == pytest.approx(4.0)
     assert slow["seconds_from"] < expected < slow["seconds_to"]
     assert slow["seconds_to"] / slow["seconds_from"] <= 2.0 < usual["seconds_to"] / usual["seconds_from"]
