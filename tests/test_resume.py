@@ -60,7 +60,7 @@ def test_a_killed_run_resumes_and_finished_stages_are_never_computed_again(tmp_p
         while not (attempt / "run").exists():
             process = start(recording, attempt / "run")
             try:
-                process.wait(moments.uniform(0.0, 1.2 * duration_s))
+                process.wait(moments.uniform(0.0, 0.8 * duration_s))
             except subprocess.TimeoutExpired:
                 os.killpg(process.pid, signal.SIGKILL)  # workers as well, as a power failure does
                 process.wait()
