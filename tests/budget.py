@@ -32,7 +32,7 @@ BUDGET_S = {
     "evaluation": 9,
     "examples": 16,
     "exchange": 32,
-    "frontend": 98,
+    "frontend": 95,
     "fusion": 2,
     "fuzz": 10,
     "geometry": 1,
