@@ -20,6 +20,7 @@ def main() -> None:
         duagc.simulate(folder / "recording", robots=2, frames=20, size=(160, 120))
         small = [
             "frontend.mapping.max_gaussians=3000",
+            "frontend.mapping.final_iterations_view=4",
             "fusion.finetune.steps_per_view=4",
         ]  # quicker, less detail
         config = duagc.load_config(duagc.RunConfig, overrides=["exchange.link.loss_probability=0.2", *small])

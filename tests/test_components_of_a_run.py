@@ -23,6 +23,7 @@ SETTINGS = (
     "frontend.mapping.max_gaussians=2000",
     "frontend.mapping.iterations=4",
     "frontend.mapping.final_iterations=4",
+    "frontend.mapping.final_iterations_view=0",
 )
 
 

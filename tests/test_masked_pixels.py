@@ -22,6 +22,7 @@ SMALL = (
     "frontend.mapping.max_gaussians=3000",
     "frontend.mapping.iterations=8",
     "frontend.mapping.final_iterations=8",
+    "frontend.mapping.final_iterations_view=0",
     "exchange.max_rounds=400",
     "fusion.finetune.steps_per_view=2",
 )

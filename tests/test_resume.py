@@ -20,6 +20,7 @@ SETTINGS = (
     "frontend.mapping.max_gaussians=2000",
     "frontend.mapping.iterations=4",
     "frontend.mapping.final_iterations=4",
+    "frontend.mapping.final_iterations_view=0",
     "exchange.max_rounds=400",
     "fusion.finetune.steps_per_view=2",
 )

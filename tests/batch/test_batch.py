@@ -207,6 +207,7 @@ def test_cells_share_what_they_have_in_common(tmp_path: Path) -> None:
         "frontend.mapping.max_gaussians=2000",
         "frontend.mapping.iterations=4",
         "frontend.mapping.final_iterations=4",
+        "frontend.mapping.final_iterations_view=0",
         "fusion.finetune.steps_per_view=2",
     ]
     path.write_text(

@@ -26,6 +26,7 @@ SMALL = [
     "frontend.mapping.max_gaussians=2000",
     "frontend.mapping.iterations=4",
     "frontend.mapping.final_iterations=4",
+    "frontend.mapping.final_iterations_view=0",
     "fusion.finetune.steps_per_view=2",
 ]
 

@@ -20,7 +20,12 @@ from duagc.pipeline.bench import frontend_tables, stopwatch
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.report import figures
 
-MAPPING = {"mapping.final_iterations": 2, "mapping.iterations": 8, "mapping.support_views": 2}
+MAPPING = {
+    "mapping.final_iterations": 2,
+    "mapping.final_iterations_view": 0,
+    "mapping.iterations": 8,
+    "mapping.support_views": 2,
+}
 
 
 @pytest.fixture(scope="module")

@@ -189,7 +189,7 @@ STAGE = FrontendConfig(
     tracking=TrackingConfig(strides=(2, 1, 1, 1)),
     keyframes=KeyframeConfig(min_overlap=0.97),
     exposure=CONFIG,
-    mapping=MappingConfig(max_gaussians=3000, iterations=8, final_iterations=30),
+    mapping=MappingConfig(max_gaussians=3000, iterations=8, final_iterations=30, final_iterations_view=0),
 )
 
 

@@ -19,7 +19,8 @@ def test_what_moves_is_not_in_the_map(tmp_path: Path) -> None:
     with open_rgbd(sensor_log) as log:
         camera, frames = log.camera, list(log.frames())
     config = FrontendConfig()
-    quick = config.mapping.model_copy(update={"final_iterations": 5, "max_gaussians": 20_000})
+    few = {"final_iterations": 5, "final_iterations_view": 0, "max_gaussians": 20_000}
+    quick = config.mapping.model_copy(update=few)
     run_frontend(sensor_log, tmp_path / "frontend.mcap", config.model_copy(update={"mapping": quick}))
     messages = {record.topic: record.message() for record in read_log(tmp_path / "frontend.mcap")}
     centers = messages["/alpha/map"].gaussians.means

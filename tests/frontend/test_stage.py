@@ -122,7 +122,7 @@ def test_two_runs_write_the_same_log(sensor_log: Path, frontend_log: Path) -> No
 
 def test_map_is_grown_at_the_refined_keyframes(sensor_log: Path) -> None:
     out = sensor_log.with_name("mapped.mcap")
-    small = MappingConfig(max_gaussians=300, iterations=2, final_iterations=1)
+    small = MappingConfig(max_gaussians=300, iterations=2, final_iterations=1, final_iterations_view=0)
     run_frontend(sensor_log, out, TRACKING.model_copy(update={"mapping_enabled": True, "mapping": small}))
     final = messages(out, topics.MAP)
     updates = messages(out, topics.MAP_UPDATE)
@@ -192,7 +192,9 @@ def test_what_moves_is_not_mapped(tmp_path: Path) -> None:
         config = TRACKING.model_copy(
             update={
                 "mapping_enabled": True,
-                "mapping": MappingConfig(max_gaussians=3000, iterations=4, final_iterations=2),
+                "mapping": MappingConfig(
+                    max_gaussians=3000, iterations=4, final_iterations=2, final_iterations_view=0
+                ),
                 "keyframes": KeyframeConfig(max_translation_of_depth=0.04),
                 "moving": MovingConfig(enabled=enabled, halvings=1, grow_px=2),
             }
