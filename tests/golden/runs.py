@@ -65,6 +65,7 @@ RUNS = {
             "frontend.mapping.max_gaussians=2000",
             "frontend.mapping.iterations=6",
             "frontend.mapping.final_iterations=6",
+            "frontend.mapping.final_iterations_view=0",
             "fusion.finetune.steps_per_view=2",
         ),
     ),
