@@ -107,7 +107,7 @@ def register(
         reference, pyramid, guess, config, prior_information=prior_information, projection=ALL_DIRECTIONS
     )
     found = _Determined.by(system, config)
-    if len(found.weak) and system.agreeing >= config.min_samples:
+    if len(found.weak) and system.seen.agreeing >= config.min_samples:
         # once more without the weak directions: what was found along them is noise
         T, exposure, system = compiled.minimize(
             reference,
@@ -212,7 +212,7 @@ class _Determined:
 
 def _lever(system: System) -> Array:
     """Scales of the tangent [6] by which a rotation counts as the displacement at the median depth."""
-    return np.array([1.0, 1.0, 1.0, *[1.0 / max(system.median_depth_m, 0.1)] * 3])
+    return np.array([1.0, 1.0, 1.0, *[1.0 / max(system.seen.median_depth_m, 0.1)] * 3])
 
 
 def _judge(
@@ -231,10 +231,10 @@ def _judge(
     weakest = float(np.linalg.eigvalsh(known * np.outer(lever, lever))[0])
     moved_m, turned_rad = se3.distance(guess, T)
     gain = exposure[0]
-    if system.agreeing < config.min_samples or system.overlap < config.min_overlap:
+    if system.seen.agreeing < config.min_samples or system.seen.overlap < config.min_overlap:
         outcome = Outcome.LOW_OVERLAP
     elif (
-        system.conflict > config.max_conflict
+        system.seen.conflict > config.max_conflict
         or system.depth.scale > config.max_depth_scale
         or system.gray.rms > config.max_gray_rms
         or not 1 / config.max_gain < gain < config.max_gain
@@ -248,15 +248,15 @@ def _judge(
         outcome = Outcome.OK
     return Registration(
         T,
-        found.information if system.agreeing >= config.min_samples else np.zeros((6, 6)),
+        found.information if system.seen.agreeing >= config.min_samples else np.zeros((6, 6)),
         outcome,
-        overlap=system.overlap,
-        view=system.view,
-        conflict=system.conflict,
-        rms_depth_m=system.depth.rms * system.sigma_mean_m,
+        overlap=system.seen.overlap,
+        view=system.seen.view,
+        conflict=system.seen.conflict,
+        rms_depth_m=system.depth.rms * system.seen.sigma_mean_m,
         rms_gray=system.gray.rms,
         exposure=(float(exposure[0]), float(exposure[1])),
-        samples=system.agreeing,
+        samples=system.seen.agreeing,
         overconfidence=found.overconfidence,
         condition=found.condition,
         weak=found.weak,

@@ -11,7 +11,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.registration import RegistrationConfig
 from duagc.pipeline.geometry.depth_noise import NEAREST_M
 from duagc.pipeline.kernels import alignment
-from duagc.pipeline.registration.normal_equations import NormalEquations, System
+from duagc.pipeline.registration.normal_equations import NormalEquations, SamplesSeen, System
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
 from duagc.pipeline.registration.reference import Reference, ReferenceLevel
 from duagc.pipeline.registration.residuals import GATE_SIGMAS, MAD_STRIDE
@@ -135,14 +135,16 @@ def _system(numbers: Array, samples: int) -> System:
     seen, judged, conflicts, agreeing = (int(number) for number in numbers[:4])
     depth, gray = numbers[6:].reshape(2, -1)
     return System(
-        _normal_equations(depth),
-        _normal_equations(gray),
-        overlap=agreeing / max(samples - (seen - judged), 1),
-        view=seen / max(samples, 1),
-        conflict=conflicts / max(judged, 1),
-        agreeing=agreeing,
-        median_depth_m=float(numbers[4]),
-        sigma_mean_m=float(numbers[5]),
+        depth=_normal_equations(depth),
+        gray=_normal_equations(gray),
+        seen=SamplesSeen(
+            overlap=agreeing / max(samples - (seen - judged), 1),
+            view=seen / max(samples, 1),
+            conflict=conflicts / max(judged, 1),
+            agreeing=agreeing,
+            median_depth_m=float(numbers[4]),
+            sigma_mean_m=float(numbers[5]),
+        ),
     )
 
 

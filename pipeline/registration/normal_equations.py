@@ -30,13 +30,11 @@ class NormalEquations:
     tile_gradients: Array
 
 
-@dataclass(frozen=True)
-class System:
-    """The normal equations at one pose and level, and how the samples were seen.
+@dataclass(frozen=True, kw_only=True)
+class SamplesSeen:
+    """How the samples of a reference are seen from one pose.
 
     Attributes:
-        depth: of point-to-plane distances.
-        gray: of gray differences.
         overlap: as in `Registration`.
         view: as in `Registration`.
         conflict: as in `Registration`.
@@ -45,14 +43,27 @@ class System:
         sigma_mean_m: mean noise of their depth.
     """
 
-    depth: NormalEquations
-    gray: NormalEquations
     overlap: float
     view: float
     conflict: float
     agreeing: int
     median_depth_m: float
     sigma_mean_m: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class System:
+    """The normal equations at one pose and level, and how the samples were seen.
+
+    Attributes:
+        depth: of point-to-plane distances.
+        gray: of gray differences.
+        seen: how the samples were seen.
+    """
+
+    depth: NormalEquations
+    gray: NormalEquations
+    seen: SamplesSeen
 
     def normal_equations(self) -> tuple[Array, Array]:
         """H [8, 8] and gradient [8] of both kinds together."""

@@ -28,7 +28,7 @@ from duagc.pipeline.geometry.camera import PinholeCamera
 from duagc.pipeline.geometry.depth_noise import DepthNoise
 from duagc.pipeline.geometry.statistics import huber_divisor, mad_sigma, median
 from duagc.pipeline.kernels.alignment import TILE_COLUMNS, TILE_ROWS
-from duagc.pipeline.registration.normal_equations import NormalEquations, System
+from duagc.pipeline.registration.normal_equations import NormalEquations, SamplesSeen, System
 from duagc.pipeline.registration.pyramid import Level, RgbdPyramid
 from duagc.pipeline.registration.reference import Reference, ReferenceLevel
 
@@ -91,45 +91,27 @@ class Residuals:
         return float(np.sqrt(np.sum(w * self.residual.astype(np.float64) ** 2) / np.sum(w)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Linearization:
     """Residuals at one pose and level, and how the samples were seen.
 
     Attributes:
         depth: point-to-plane distances.
         gray: gray differences.
-        overlap: as in `Registration`.
-        view: as in `Registration`.
-        conflict: as in `Registration`.
-        agreeing: number of samples on the same surface.
-        median_depth_m: of these.
-        sigma_mean_m: mean noise of their depth.
+        seen: how the samples were seen.
     """
 
     depth: Residuals
     gray: Residuals
-    overlap: float
-    view: float
-    conflict: float
-    agreeing: int
-    median_depth_m: float
-    sigma_mean_m: float
+    seen: SamplesSeen
 
     def system(self) -> System:
         """What a registration needs of it."""
         parts = [part for part in (self.depth, self.gray) if len(part.residual)]
         u_max = max((float(part.pixels[0].max()) for part in parts), default=0.0)
         v_max = max((float(part.pixels[1].max()) for part in parts), default=0.0)
-        return System(
-            self.depth.summed(u_max, v_max),
-            self.gray.summed(u_max, v_max),
-            overlap=self.overlap,
-            view=self.view,
-            conflict=self.conflict,
-            agreeing=self.agreeing,
-            median_depth_m=self.median_depth_m,
-            sigma_mean_m=self.sigma_mean_m,
-        )
+        depth, gray = (part.summed(u_max, v_max) for part in (self.depth, self.gray))
+        return System(depth=depth, gray=gray, seen=self.seen)
 
 
 def linearize_at(
@@ -213,14 +195,16 @@ def linearize_at(
         config=config,
     )
     return Linearization(
-        depth.nothing() if config.residuals == "gray" else depth,
-        photometric.nothing() if config.residuals == "depth" else photometric,
-        overlap=len(agreeing) / max(total, 1),
-        view=len(seen) / max(len(samples), 1),
-        conflict=conflicts / max(judged, 1),
-        agreeing=len(agreeing),
-        median_depth_m=median(z) if len(z) else 0.0,
-        sigma_mean_m=float(sigma.mean(dtype=np.float64)) if len(z) else 0.0,
+        depth=depth.nothing() if config.residuals == "gray" else depth,
+        gray=photometric.nothing() if config.residuals == "depth" else photometric,
+        seen=SamplesSeen(
+            overlap=len(agreeing) / max(total, 1),
+            view=len(seen) / max(len(samples), 1),
+            conflict=conflicts / max(judged, 1),
+            agreeing=len(agreeing),
+            median_depth_m=median(z) if len(z) else 0.0,
+            sigma_mean_m=float(sigma.mean(dtype=np.float64)) if len(z) else 0.0,
+        ),
     )
 
 

@@ -45,7 +45,7 @@ def minimize(
     for index in reversed(range(levels_used(reference, pyramid, config))):
         for _ in range(config.iterations[index]):
             system = linearize_at(reference, pyramid, index, T, exposure=exposure, config=config).system()
-            if system.agreeing < config.min_samples:
+            if system.seen.agreeing < config.min_samples:
                 break
             change = step(system, T, guess, prior_information, projection=projection)
             T = orthonormal(T @ se3.exp(change[:6]))

@@ -116,7 +116,7 @@ def without_sigmas(reference: Reference) -> Reference:
 
 def flat(system: System) -> np.ndarray:
     parts = [system.depth.H, system.depth.gradient, system.gray.H, system.gray.gradient]
-    numbers = [system.depth.scale, system.gray.scale, system.depth.rms, system.gray.rms, system.overlap]
+    numbers = [system.depth.scale, system.gray.scale, system.depth.rms, system.gray.rms, system.seen.overlap]
     return np.concatenate([*(part.ravel() for part in parts), numbers])
 
 
@@ -173,7 +173,7 @@ def test_the_minimum_is_that_of_the_definition(reference, how):
     np.testing.assert_allclose(found, T, atol=1e-7)  # m; steps end at 4e-6
     np.testing.assert_allclose(its_exposure, exposure, atol=1e-6)
     np.testing.assert_allclose(found[:3, :3].T @ found[:3, :3], np.eye(3), atol=1e-15)
-    assert abs(its_system.agreeing - system.agreeing) <= 2
+    assert abs(its_system.agreeing - system.seen.agreeing) <= 2
 
 
 def test_without_a_step_the_guess_is_judged(reference):
@@ -183,7 +183,7 @@ def test_without_a_step_the_guess_is_judged(reference):
         T, exposure, system = minimize(reference, TARGETS["plain"], OFF, config, **options)
         np.testing.assert_array_equal(T, OFF)
         np.testing.assert_array_equal(exposure, [1, 0])
-        assert system.agreeing > 1000
+        assert system.seen.agreeing > 1000
 
 
 def test_a_prior_far_from_the_pose_pulls_as_the_logarithm_says():
