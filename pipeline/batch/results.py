@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from duagc.pipeline.base.files import new_file, read_text
+from duagc.pipeline.base.templates import filled
 from duagc.pipeline.batch.cell import CellState, read_state, run_folder
 from duagc.pipeline.batch.suite import BatchCell, Suite
 from duagc.pipeline.comparison.summary import metrics_of
@@ -175,18 +176,11 @@ def page(suite: Suite, states: Mapping[str, CellState], done: Mapping[str, Mappi
         states: of the cells.
         done: numbers of those that are done.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("duagc.pipeline.batch", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     recordings = list(dict.fromkeys(cell.recording for cell in suite.cells.values()))
     counted = {state: sum(s.state == state for s in states.values()) for state in ("done", "failed")}
-    return environment.get_template("page.html.j2").render(
+    return filled(
+        "duagc.pipeline.batch",
+        "page.html.j2",
         title=suite.path.stem,
         subtitle=f"{counted['done']} of {len(suite.cells)} runs done, {counted['failed']} failed",
         base=suite.configurations[0],

@@ -11,6 +11,7 @@ import numpy as np
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import new_file
+from duagc.pipeline.base.templates import filled
 from duagc.pipeline.evaluation.cameras import CHANNELS
 from duagc.pipeline.evaluation.network import Session
 from duagc.pipeline.evaluation.paths import Path3, paths, top_view_axes
@@ -55,21 +56,12 @@ def write_report(run_dir: Path, recording: Path) -> Path:
     Raises:
         DuagError: the run was not evaluated, or run and recording do not fit together.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     run, source = RunFolder(run_dir), Recording(recording)
     if not run.metrics:
         raise DuagError(
             f"{run_dir / 'metrics.json'}: not found, expected an evaluated run; `duagc evaluate` writes it"
         )
-    environment = Environment(
-        loader=PackageLoader("duagc.pipeline.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    html = environment.get_template(TEMPLATE).render(**content(run, source))
+    html = filled("duagc.pipeline.report", TEMPLATE, **content(run, source))
     path = run_dir / "report" / "index.html"
     path.parent.mkdir(exist_ok=True)
     with new_file(path) as part:

@@ -1,0 +1,25 @@
+"""Templates of pages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def filled(package: str, template: str, **content: Any) -> str:
+    """A page, from the template next to the code that fills it; a value that it lacks is an error.
+
+    Args:
+        package: of the template.
+        template: name of its file.
+        content: values by name; their text is escaped.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader(package, "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(**content)
