@@ -36,8 +36,8 @@ def inverse_step_per_m(depths_m: Sequence[Image], unit_m: float) -> float:
         depths_m: [h, w] each, meters, 0 = unknown: some images of it.
         unit_m: meters per unit of the images.
     """
-    known = [depth[depth > 0] for depth in depths_m]
-    values = np.unique(np.concatenate(known)).astype(np.float64) if known else np.zeros(0)
+    units = [np.rint(depth[depth > 0] / np.float32(unit_m)).astype(np.int64) for depth in depths_m]
+    values = unit_m * np.flatnonzero(np.bincount(np.concatenate([np.zeros(0, np.int64), *units])))
     if len(values) <= LEAST_GAPS:
         return 0.0
     gaps_m, inverse_gaps = np.diff(values), -np.diff(1 / values)
