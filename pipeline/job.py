@@ -8,17 +8,16 @@ import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from duagc import __version__
 from duagc.pipeline import steps
 from duagc.pipeline.base.component_names import robot_of
-from duagc.pipeline.base.errors import DuagError, closest
 from duagc.pipeline.base.machine import memory_bytes
 from duagc.pipeline.base.workers import worker_pool
-from duagc.pipeline.cache.carrier import Carried, Carrier, NotStoredError, intact, words
+from duagc.pipeline.cache.carrier import Carried, Carrier, NotStoredError
 from duagc.pipeline.cache.file_digests import FileDigests
 from duagc.pipeline.cache.footprint import fitting, robot_bytes
 from duagc.pipeline.cache.stage_key import StageKey
@@ -27,16 +26,14 @@ from duagc.pipeline.chain import Chain, Prepared
 from duagc.pipeline.config.base import dump_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.recording import Recording
+from duagc.pipeline.run_plan import RunPlan
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.digest import RESULT_SUFFIXES, digest_file
 from duagc.pipeline.runs.folder import SCHEMA
-from duagc.pipeline.runs.timing import label
 from duagc.pipeline.steps import threads_per_worker
 
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
-NAMES = tuple(stage.name for stage in stages.STAGES)
 MEASURED = 20  # results of front ends that memory is estimated from
-LAST: str = stages.VIEW.name
 READERS = (stages.EVALUATION.name, stages.REPORT.name, stages.VIEW.name)
 TITLES = {
     stages.CALIBRATION.name: "calibration",
@@ -53,48 +50,6 @@ Say = Callable[[str], None]
 def say(line: str) -> None:
     """Say something on standard error."""
     print(line, file=sys.stderr, flush=True)
-
-
-@dataclass(frozen=True)
-class RunPlan:
-    """How a run is carried out; nothing here changes a bit of its results.
-
-    Attributes:
-        workers: robots prepared at the same time.
-        force: replace an earlier run in the same place.
-        calibrate: calibrate the cameras from the recording's own images first. Where views that were not used say
-            that it is better, the run is of the calibrated recording, which is kept in its folder `calibrated`.
-        store: folder of results that are not computed again; None: everything is computed, and nothing is kept.
-        since: the first stage that is computed whatever the store has; None: none is.
-        until: the last stage that is done.
-    """
-
-    workers: int = 2
-    force: bool = False
-    calibrate: bool = False
-    store: Path | None = None
-    since: str | None = None
-    until: str = LAST
-
-    def __post_init__(self) -> None:
-        for option, name in (("--from", self.since), ("--until", self.until)):
-            if name is not None and name not in NAMES:
-                raise DuagError(f"{option} {name}: is no stage, {closest(name, NAMES, 'a stage')}")
-        if self.since is not None and NAMES.index(self.since) > NAMES.index(self.until):
-            raise DuagError(f"--from {self.since}: comes after --until {self.until}, expected it before")
-
-    @property
-    def again(self) -> frozenset[str]:
-        """Stages that are computed whatever the store has."""
-        return frozenset() if self.since is None else frozenset(NAMES[NAMES.index(self.since) :])
-
-    def has(self, stage: stages.Stage) -> bool:
-        """Whether a stage is done.
-
-        Args:
-            stage: of the run.
-        """
-        return NAMES.index(stage.name) <= NAMES.index(self.until)
 
 
 class Job:
@@ -413,72 +368,6 @@ def _prepare(
     """One robot, in a process of its own."""
     job = Job(Recording(recording), folder, config, plan, log=lambda line: say(f"duagc: {line}"), place=place)
     return Chain(job.recording, job.carrier, job.digests).robot(robot, threads=threads, alone=alone)
-
-
-def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunPlan, *, log: Say) -> bool:
-    """Whether a run is what it would be now; False: it is the beginning of that, or a file of it is damaged.
-
-    Args:
-        recording: that the run is of.
-        out: folder of an earlier run.
-        config: settings of all stages.
-        plan: how it is done; with a store.
-        log: gets a line about what is damaged.
-
-    Raises:
-        DuagError: it is another run, or none.
-    """
-    earlier = stages_of(out)
-    if not earlier:
-        raise DuagError(f"{out}: exists already; choose another --out or give --force")
-    job = Job(recording, out, config, replace(plan, since=None), log=log, place=out, looking=True)
-    done, keys = job.look()
-    for key in [*(carried.entry.key for carried in done), *keys]:
-        name = label(key.stage, key.robot)
-        known = earlier[name].get("key") if isinstance(earlier.get(name), dict) else None
-        if name in earlier and known != key.digest:
-            changes = "; ".join(job.carrier.changes(key, str(known)))
-            raise DuagError(
-                f"{out}: exists already, and {words(key)} differs ({changes}); choose another --out or give --force"
-            )
-    if keys or plan.since is not None or any(carried.label not in earlier for carried in done):
-        return False
-    for carried in done:
-        if carried.entry.key.stage in READERS:  # `duagc evaluate` and `duagc report` write these again
-            name = next((name for name in carried.entry.files if not (out / name).is_file()), "")
-        else:
-            name = intact(out, carried.entry, job.digests)
-        if name:
-            log(f"{out / name}: is not what was computed; taken from the store")
-            return False
-    return True
-
-
-def why(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan) -> list[str]:
-    """What a run would compute, and what changed; nothing is computed.
-
-    Args:
-        recording_path: folder of the recording.
-        out: folder of the run.
-        config: settings of all stages.
-        plan: how it is done.
-
-    Returns:
-        A line for every stage that can be named now.
-    """
-    if plan.store is None:
-        return ["every stage is computed: there is no store"]
-    job = Job(Recording(recording_path), out, config, plan, log=lambda line: None, place=out, looking=True)
-    done, missing = job.look()
-    lines = [f"{words(carried.entry.key)}: in the store" for carried in done]
-    for key in missing:
-        reason = "--from" if key.stage in plan.again else "; ".join(job.carrier.changes(key))
-        lines.append(f"{words(key)}: computed: {reason}")
-    if missing:
-        last = max(NAMES.index(key.stage) if key.stage in NAMES else -1 for key in missing)
-        if later := NAMES[last + 1 : NAMES.index(plan.until) + 1]:
-            lines.append(f"{', '.join(later)}: computed unless the results before turn out as they were")
-    return lines
 
 
 def _digest_of(value: Any) -> str:

@@ -9,17 +9,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from duagc.pipeline import steps
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file
 from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.runner import prepare_robot
 from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.digest import ROBOT_RESULTS, digest_file
 from duagc.pipeline.runs.folder import RunFolder
-from duagc.pipeline.steps import agent_input, fuse_robot, threads_per_worker
 
 
 @dataclass(frozen=True)
@@ -95,21 +94,32 @@ def _replay_one(
     from duagc.pipeline.exchange.replay import replay_agent
 
     report(f"{robot}: front end and information")
-    (folder / robot_of(robot)).mkdir()
-    prepare_robot(log, robot_of(robot), folder / robot_of(robot), config, threads=threads_per_worker(1))
+    _prepare(log, robot_of(robot), folder / robot_of(robot), config)
     folder = folder / robot
     report(f"{robot}: agent, from its delivered packets")
     result, sent = replay_agent(
-        agent_input(robot, log, folder, config),
+        steps.agent_input(robot, log, folder, config),
         config.exchange,
         seed=config.seed,
         exchange_path=run / "exchange.mcap",
     )
     report(f"{robot}: fusion")
     with stages.FUSION.running(folder, robot):
-        fuse_robot(robot, log, folder, result, config=config)
+        steps.fuse_robot(robot, log, folder, result, config=config)
     comparisons = [Comparison(robot, "packets sent", sent.recorded, sent.recomputed)]
     for name in ROBOT_RESULTS:
         recorded = digest_file(run / "robots" / robot / name)
         comparisons.append(Comparison(robot, name, recorded, digest_file(folder / name)))
     return comparisons
+
+
+def _prepare(log: Path, robot: str, folder: Path, config: RunConfig) -> None:
+    """Front end and information of a robot and its components, each of these in a folder next to the robot's."""
+    steps.check_log(log, robot)
+    folder.mkdir()
+    threads = steps.threads_per_worker(1)
+    with stages.FRONTEND.running(folder, robot):
+        steps.frontend(log, folder, config, threads=threads)
+    for name, of_component in steps.move_components(robot, folder).items():
+        with stages.INFORMATION.running(of_component, name):
+            steps.information(log, of_component, config, threads=threads)

@@ -12,41 +12,14 @@ import shutil
 import threading
 from multiprocessing.queues import SimpleQueue
 from pathlib import Path
-from typing import Any
 
-from duagc.pipeline import steps
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base.atomic_folder import new_folder
 from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.config.run import RunConfig
-from duagc.pipeline.job import LAST, Job, RunPlan, Say, is_up_to_date, say
-from duagc.pipeline.runs import stages
-from duagc.pipeline.runs.timing import Timing, label
-
-
-def prepare_robot(log: Path, robot: str, folder: Path, config: RunConfig, *, threads: int) -> dict[str, Any]:
-    """Front end and Fisher information of one robot, from its own log alone, without any store.
-
-    Args:
-        log: the robot's log.
-        robot: its name.
-        folder: where frontend.mcap and information.mcap go. A component that did not join the largest one gets a
-            folder of its own next to it, such as `alpha-2`.
-        config: of the run.
-        threads: of the kernels; changes no bit of the result.
-
-    Returns:
-        The timings of the stages.
-    """
-    steps.check_log(log, robot)
-    timing = Timing()
-    with timing.stage(stages.FRONTEND, folder, robot):
-        parts = steps.frontend(log, folder, config, threads=threads)
-    timing.stages[label("frontend", robot)]["parts"] = parts
-    for name, of_component in steps.move_components(robot, folder).items():
-        with timing.stage(stages.INFORMATION, of_component, name):
-            steps.information(log, of_component, config, threads=threads)
-    return timing.stages
+from duagc.pipeline.existing_run import is_up_to_date
+from duagc.pipeline.job import Job, Say, say
+from duagc.pipeline.run_plan import LAST, RunPlan
 
 
 def run(

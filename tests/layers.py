@@ -163,25 +163,39 @@ LAYERS: tuple[tuple[Part, ...], ...] = (
             "recalibration",
         ),
     ),
-    (_part("doctor", "what a machine has", "base kernels"),),
+    (
+        _part("doctor", "what a machine has", "base kernels"),
+        _part("run_plan", "how a run is carried out", "base runs"),
+    ),
     (_part("chain", "the stages in their order", "base schemas recording runs cache steps"),),
     (
         _part(
             "job",
             "a run that is made",
-            "base config runs recording evaluation cache steps chain",
+            "base config runs recording evaluation cache steps chain run_plan",
         ),
     ),
-    (_part("runner", "carries a run", "base config runs recording steps job"),),
-    (_part("batch", "many runs at once", "base config recording cache comparison job runner"),),
-    (_part("replay", "computes a robot again", "base config runs recording exchange steps runner"),),
+    (
+        _part(
+            "existing_run", "whether an earlier run stands", "base config runs recording cache job run_plan"
+        ),
+    ),
+    (_part("runner", "carries a run", "base config recording job run_plan existing_run"),),
+    (
+        _part(
+            "batch",
+            "many runs at once",
+            "base config recording cache comparison run_plan existing_run runner",
+        ),
+    ),
+    (_part("replay", "computes a robot again", "base config runs recording exchange steps"),),
     (
         _part(
             "cli",
             "the command",
             "base config kernels recording runs converters exchange fusion evaluation",
             "report viewing checks camera_calibration recalibration team_posegraph bench experiments",
-            "batch cache comparison doctor steps job runner replay",
+            "batch cache comparison doctor steps run_plan existing_run runner replay",
         ),
     ),
 )

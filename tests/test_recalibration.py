@@ -24,9 +24,10 @@ from duagc.pipeline.config.base import load_config
 from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.geometry import so3
 from duagc.pipeline.geometry.camera import PinholeCamera
-from duagc.pipeline.job import Job, RunPlan
+from duagc.pipeline.job import Job
 from duagc.pipeline.recording import Recording, format_info, info, open_rgbd
 from duagc.pipeline.replay import replay
+from duagc.pipeline.run_plan import RunPlan
 from duagc.pipeline.runs.folder import RunFolder
 from duagc.pipeline.runs.stages import CALIBRATED
 

@@ -111,8 +111,9 @@ def run_cell(suite_path: Path, out: Path, name: str, store: Path) -> str:
 
 def _run(suite_path: Path, out: Path, name: str, store: Path) -> None:
     from duagc.pipeline.batch.suite import read_suite
-    from duagc.pipeline.job import RunPlan, is_up_to_date
+    from duagc.pipeline.existing_run import is_up_to_date
     from duagc.pipeline.recording import Recording
+    from duagc.pipeline.run_plan import RunPlan
     from duagc.pipeline.runner import run
 
     def say(line: str) -> None:

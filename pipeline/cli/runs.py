@@ -112,8 +112,8 @@ def run(
     settings = load_config(RunConfig, config, overrides or [])
     place = None if no_cache else store or default_store(out)
     if why:
-        from duagc.pipeline.job import RunPlan
-        from duagc.pipeline.job import why as say_why
+        from duagc.pipeline.existing_run import why as say_why
+        from duagc.pipeline.run_plan import RunPlan
 
         plan = RunPlan(workers, force, calibrate, store=place, since=since, until=until)
         for line in say_why(recording, out, settings, plan):
