@@ -83,11 +83,11 @@ def test_normal_equations_are_those_of_the_residuals(reference, target, settings
             found = compiled.linearize_at(*at, exposure=EXPOSURE, config=config)
             assert_same_equations(found.depth, wanted.depth)
             assert_same_equations(found.gray, wanted.gray)
-            assert found.sigma_mean_m == pytest.approx(wanted.sigma_mean_m, rel=1e-12)
+            assert found.seen.sigma_mean_m == pytest.approx(wanted.seen.sigma_mean_m, rel=1e-12)
             for name in ("overlap", "view", "conflict", "agreeing", "median_depth_m"):
-                assert getattr(found, name) == getattr(wanted, name), name
+                assert getattr(found.seen, name) == getattr(wanted.seen, name), name
     no_normals = target == "without depth" and settings == "all gates"
-    assert (found.agreeing == 0) == (target == "nothing" or no_normals)
+    assert (found.seen.agreeing == 0) == (target == "nothing" or no_normals)
 
 
 def test_images_of_a_few_pixels_show_nothing(reference):
@@ -99,7 +99,7 @@ def test_images_of_a_few_pixels_show_nothing(reference):
         for config in (SETTINGS["usual"], SETTINGS["all gates"]):
             wanted = residuals.linearize_at(*at, exposure=EXPOSURE, config=config).system()
             found = compiled.linearize_at(*at, exposure=EXPOSURE, config=config)
-            assert (found.view, found.agreeing) == (wanted.view, wanted.agreeing)
+            assert (found.seen.view, found.seen.agreeing) == (wanted.seen.view, wanted.seen.agreeing)
             assert_same_equations(found.gray, wanted.gray)
     nothing = Reference(
         tuple(ReferenceLevel(*np.zeros((2, 0, 3), np.float32), np.zeros(0, np.float32)) for _ in STRIDES)
@@ -107,7 +107,7 @@ def test_images_of_a_few_pixels_show_nothing(reference):
     empty = compiled.linearize_at(
         nothing, TARGETS["plain"], 0, OFF, exposure=EXPOSURE, config=RegistrationConfig()
     )
-    assert (empty.agreeing, empty.view, empty.gray.count) == (0, 0.0, 0)
+    assert (empty.seen.agreeing, empty.seen.view, empty.gray.count) == (0, 0.0, 0)
 
 
 def without_sigmas(reference: Reference) -> Reference:
@@ -173,7 +173,7 @@ def test_the_minimum_is_that_of_the_definition(reference, how):
     np.testing.assert_allclose(found, T, atol=1e-7)  # m; steps end at 4e-6
     np.testing.assert_allclose(its_exposure, exposure, atol=1e-6)
     np.testing.assert_allclose(found[:3, :3].T @ found[:3, :3], np.eye(3), atol=1e-15)
-    assert abs(its_system.agreeing - system.seen.agreeing) <= 2
+    assert abs(its_system.seen.agreeing - system.seen.agreeing) <= 2
 
 
 def test_without_a_step_the_guess_is_judged(reference):
