@@ -23,6 +23,7 @@ from duagc.converters.layouts.validity import Maps, of_maps
 from duagc.pipeline import messages
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.files import decode_image
 from duagc.pipeline.base.progress import track
 from duagc.pipeline.geometry import depth_error
 from duagc.pipeline.geometry.camera import PinholeCamera
@@ -186,7 +187,11 @@ class _Copy:
             )
         self._has_color = True
         message = record.proto()
-        message.data, message.format = resampled(message.data, self._maps), "png"
+        image = decode_image(message.data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if image is None:
+            where = f"{record.path}: {record.topic} at {record.publish_time_ns} ns"
+            raise DuagError(f"{where}: no decoder reads it, expected a color image")
+        message.data, message.format = resampled(image, self._maps), "png"
         self._writer.write(record.topic, message, record.log_time_ns, record.publish_time_ns)
 
     def _mask(self, record: Record) -> None:

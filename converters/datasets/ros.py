@@ -33,6 +33,7 @@ from duagc.converters.logs.sources import sources_of
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
 from duagc.converters.writer import RecordingWriter
 from duagc.pipeline.base import determinism
+from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import decode_image
 from duagc.pipeline.base.progress import track
@@ -135,16 +136,22 @@ def _write_frames(robot: RobotWriter, source: RobotLog, max_ratio: float, gap: i
     check = ReprojectionCheck(source.camera, len(pairs), gap)
     without = empty = far = cut = 0
     written: set[int] = set()
-    progress = track(source.frames(), f"convert {robot.name}", len(pairs))
-    for index, (stamp_ns, color, depth) in enumerate(progress):
+
+    def pictured(frame: tuple[int, Any, Any]) -> tuple[int, Picture | None, int]:
+        stamp_ns, color, depth = frame
         if is_cut_short(color) or is_cut_short(depth):
+            return stamp_ns, None, 0
+        if derived:
+            return stamp_ns, derived.picture(color, depth, stamp_ns, pairs[stamp_ns]), 0
+        return stamp_ns, *_measured(source, stamp_ns, color, depth)
+
+    # what is derived may depend on the frames before
+    found = in_order(pictured, source.frames(), threads=1 if derived else None)
+    for index, (stamp_ns, picture, beyond) in enumerate(track(found, f"convert {robot.name}", len(pairs))):
+        if picture is None:
             cut += 1
             continue
-        if derived:
-            picture = derived.picture(color, depth, stamp_ns, pairs[stamp_ns])
-        else:
-            picture, beyond = _measured(source, stamp_ns, color, depth)
-            far += beyond
+        far += beyond
         T = source.truth.at(stamp_ns, settings.max_pose_gap_s) if source.truth else None
         T = None if T is None else T @ source.T_color_camera
         without += T is None

@@ -27,6 +27,7 @@ from duagc.converters.layouts.validity import of_maps
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
+from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
@@ -289,11 +290,15 @@ def _write_robot(
     maps = None if lens.is_pinhole else lens.maps()
     robot.set_valid(None if maps is None else of_maps(maps, WIDTH, HEIGHT))
     holes = invalid = 0
-    for index, files in enumerate(track(frames, f"convert {robot.name}")):
+
+    def images(files: SevenScenesFrame) -> tuple[bytes, str, Depth]:
         depth = register(correct(_depth_m(files.depth), options.depth_camera(), correction))
-        color, color_format = read_color(files.color, (WIDTH, HEIGHT))
-        if maps is not None:
-            color, color_format = resampled(color, maps), "png"
+        color, color_format, image = read_color(files.color, (WIDTH, HEIGHT))
+        return (color, color_format, depth) if maps is None else (resampled(image, maps), "png", depth)
+
+    found = zip(frames, in_order(images, frames), strict=True)
+    titled = track(found, f"convert {robot.name}", total=len(frames))
+    for index, (files, (color, color_format, depth)) in enumerate(titled):
         T_world_camera = _true_pose(files, reference, options)
         check.add(index, depth, T_world_camera)
         stamp_ns = (files.number - frames[0].number) * NANOSECONDS // options.rate_hz

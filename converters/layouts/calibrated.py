@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
-from duagc.pipeline.base.files import decode_image
 from duagc.pipeline.geometry import depth_error, se3, so3
 from duagc.pipeline.geometry.camera import PinholeCamera
 
@@ -87,12 +86,10 @@ class ColorLens:
         return np.ascontiguousarray(u), np.ascontiguousarray(v)
 
 
-def resampled(data: bytes, maps: tuple[NDArray[np.float32], NDArray[np.float32]]) -> bytes:
-    """An encoded color image at the pixels of `ColorLens.maps`, as PNG; beyond its border the border is repeated."""
+def resampled(image: NDArray[np.uint8], maps: tuple[NDArray[np.float32], NDArray[np.float32]]) -> bytes:
+    """A color image [h, w, 3] at the pixels of `ColorLens.maps`, as PNG; beyond its border the border is repeated."""
     import cv2
 
-    image = decode_image(data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    assert image is not None  # whoever read it has decoded it
     moved = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return cv2.imencode(".png", moved)[1].tobytes()
 

@@ -32,8 +32,8 @@ def options_of(model: type[Options], values: Mapping[str, Any], dataset: str) ->
         raise DuagError(f"{dataset}: {name} = {first['input']!r}: {first['msg']}") from error
 
 
-def read_color(path: Path, size: tuple[int, int]) -> tuple[bytes, str]:
-    """Bytes of a color image as they are, known to decode to `size` (width, height), and their format."""
+def read_color(path: Path, size: tuple[int, int]) -> tuple[bytes, str, NDArray[np.uint8]]:
+    """A color image of `size` (width, height): its bytes as they are, their format, and BGR [H, W, 3]."""
     import cv2
 
     data = read_bytes(path, "a color image")
@@ -42,9 +42,9 @@ def read_color(path: Path, size: tuple[int, int]) -> tuple[bytes, str]:
         raise DuagError(f"{path}: {len(data)} bytes that no decoder reads, expected a color image")
     check_size(path, image.shape, size)
     if data.startswith(b"\x89PNG"):
-        return data, "png"
+        return data, "png", image
     if data.startswith(b"\xff\xd8\xff"):
-        return data, "jpeg"
+        return data, "jpeg", image
     raise DuagError(f"{path}: is neither JPEG nor PNG, expected one of them")
 
 

@@ -21,6 +21,7 @@ from duagc.converters.layouts.validity import of_maps
 from duagc.converters.robot_writer import NANOSECONDS, RobotWriter
 from duagc.converters.writer import RecordingWriter, robot_names
 from duagc.pipeline.base import determinism
+from duagc.pipeline.base.ahead import in_order
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.progress import track
@@ -165,22 +166,28 @@ def _write_clip(robot: RobotWriter, clip: Clip, lens: _Lens, label: str) -> dict
     empty = count = 0
     size = clip.camera.width, clip.camera.height
     start_ns = _start_ns(clip)
-    written: set[Path] = set()
     seen: NDArray[np.uint16] | None = None
-    for index, files in enumerate(track(clip.frames, f"convert {robot.name}")):
-        color, color_format = lens.color(files.color)
+
+    def images(task: tuple[FrameFiles, bool]) -> tuple[bytes, str, NDArray[np.uint16] | None]:
+        files, new_depth = task
         raw = None
+        if new_depth and files.depth is not None:
+            raw = read_depth(files.depth, size)
+            raw = lens.depth(np.where(np.isin(raw, clip.no_depth), 0, raw).astype(np.uint16))
+        return *lens.color(files.color), raw
+
+    tasks = list(zip(clip.frames, _with_new_depth(clip.frames), strict=True))
+    found = zip(clip.frames, in_order(images, tasks), strict=True)
+    titled = track(found, f"convert {robot.name}", total=len(tasks))
+    for index, (files, (color, color_format, raw)) in enumerate(titled):
+        if raw is not None:
+            empty, count, seen = empty + int((raw == 0).sum()), count + 1, raw
         if files.depth is not None:
-            # depth with a time of its own is written once; frames that share it come one after the other
-            if files.depth not in written or files.depth_stamp_ns is None:
-                raw = read_depth(files.depth, size)
-                raw = lens.depth(np.where(np.isin(raw, clip.no_depth), 0, raw).astype(np.uint16))
-                empty, count, seen = empty + int((raw == 0).sum()), count + 1, raw
-            written.add(files.depth)
             assert seen is not None
             at_color = files.depth_stamp_ns is None
             T_world_depth = files.T_world_camera if at_color else files.T_world_depth
-            check.add(index, seen.astype(np.float64) * clip.depth_scale, T_world_depth)
+            if check.needs(index, T_world_depth):
+                check.add(index, seen.astype(np.float64) * clip.depth_scale, T_world_depth)
         robot.add_frame(
             files.stamp_ns - start_ns,
             color,
@@ -189,10 +196,24 @@ def _write_clip(robot: RobotWriter, clip: Clip, lens: _Lens, label: str) -> dict
             T_world_camera=files.T_world_camera,
             depth_stamp_ns=None if files.depth_stamp_ns is None else files.depth_stamp_ns - start_ns,
         )
-    if not written:
+    if not count:
         raise DuagError(f"{label}: none of {len(clip.frames)} images has depth near in time, expected some")
     pixels = count * size[0] * size[1]
     return {"without_depth": empty / pixels, **check.result(label)}
+
+
+def _with_new_depth(frames: Sequence[FrameFiles]) -> list[bool]:
+    """Whether the depth of each frame is written with it.
+
+    Depth with a time of its own is written once; frames that share it come one after the other.
+    """
+    written: set[Path] = set()
+    new = []
+    for files in frames:
+        new.append(files.depth is not None and (files.depth not in written or files.depth_stamp_ns is None))
+        if files.depth is not None:
+            written.add(files.depth)
+    return new
 
 
 def _start_ns(clip: Clip) -> int:
@@ -229,11 +250,9 @@ class _Lens:
         """Encoded color: the file's own bytes, or a PNG of what was resampled."""
         import cv2
 
-        data, color_format = read_color(path, self._size)
+        data, color_format, image = read_color(path, self._size)
         if self._maps is None:
             return data, color_format
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        assert image is not None  # read_color has decoded it
         moved = cv2.remap(image, *self._maps, cv2.INTER_LINEAR)
         return cv2.imencode(".png", moved)[1].tobytes(), "png"
 

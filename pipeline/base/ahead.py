@@ -1,0 +1,41 @@
+"""Work on the items of a sequence by threads, its results in order: decoding and encoding of images."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+EACH = 2  # items that are under way or wait to be taken, for each thread
+
+
+def in_order(
+    work: Callable[[Item], Result], items: Iterable[Item], threads: int | None = None
+) -> Iterator[Result]:
+    """Results of all items, in their order; a few are computed ahead of the one that is taken.
+
+    What `work` raises is raised in the place of its result; what was begun after it is dropped.
+
+    Args:
+        work: done by threads; it must not depend on the order of the items.
+        items: read by the caller's thread only.
+        threads: how many; None: as many as this process may use.
+    """
+    threads = threads or len(os.sched_getaffinity(0))
+    waiting: deque[Future[Result]] = deque()
+    left = iter(items)
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            waiting.extend(pool.submit(work, item) for item in islice(left, EACH * threads))
+            while waiting:
+                yield waiting.popleft().result()
+                waiting.extend(pool.submit(work, item) for item in islice(left, 1))
+        finally:
+            for future in waiting:
+                future.cancel()
