@@ -6,7 +6,7 @@ A loop closure that both ends' files hold counts once; both ends know it, as in 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import read_text
+from duagc.pipeline.posegraph.cut import owners, spanning_forest
 from duagc.pipeline.posegraph.edges import Edges, Key, read_g2o, read_kimera
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, isotropic_information
 
@@ -83,8 +84,8 @@ def read_team_graph(path: Path, robots: int | None = None, *, only_reference: bo
     Args:
         path: a `.g2o` file; a folder of one `.g2o` per robot with gtsam symbols as keys; a folder of
             Kimera-Multi `robot*/measurements.csv`; or a folder with one `.g2o`.
-        robots: cut a single graph into so many blocks of consecutive keys (default 4); for a team's own
-            files, at most a check.
+        robots: cut a single graph among so many (default 4): into blocks of consecutive keys or, where one of them
+            is not connected, along its edges; for a team's own files, at most a check.
         only_reference: leave out loops and loop closures that the reference next to the graph does not name
             as true.
     Raises:
@@ -93,17 +94,21 @@ def read_team_graph(path: Path, robots: int | None = None, *, only_reference: bo
     edges, ignored = _read(path)
     names = sorted({key[0] for key in (*edges.i, *edges.j)})
     if names == [""]:
-        edges = _cut(edges, 4 if robots is None else robots, path)
+        edges, order = _cut(edges, 4 if robots is None else robots, path)
     elif robots is not None and robots != len(names):
         raise DuagError(
             f"{path}: --robots {robots}, but the graph is that of {len(names)} robots: {', '.join(names)}"
         )
+    else:
+        order = {(robot, key): at for robot, own in _indices(edges).items() for key, at in own.items()}
     edges, reference = _with_reference(edges, path)
+    consecutive = _consecutive(edges, order)
     if only_reference:
         if edges.inlier is None:
             raise DuagError(f"{path}: no reference next to it, expected {' or '.join(_REFERENCES)}")
-        edges = edges.select(edges.inlier | _consecutive(edges))
-    return _team(edges, reference, ignored, path)
+        keep = edges.inlier | consecutive
+        edges, consecutive = edges.select(keep), consecutive[keep]
+    return _team(edges, consecutive, reference, ignored, path=path)
 
 
 def _read(path: Path) -> tuple[Edges, tuple[str, ...]]:
@@ -155,15 +160,16 @@ def _merge(graphs: Sequence[Edges]) -> Edges:
     return Edges(i, j, joined("T_i_j"), joined("kappa"), joined("tau"))
 
 
-def _cut(edges: Edges, robots: int, path: Path) -> Edges:
-    """One graph cut into blocks of consecutive keys, as equal as they can be."""
+def _cut(edges: Edges, robots: int, path: Path) -> tuple[Edges, dict[Key, int]]:
+    """One graph cut among robots, and the place of every key in the order of all keys."""
     keys = sorted({key[1] for key in (*edges.i, *edges.j)})
-    if robots > len(keys) // 2:
-        raise DuagError(f"{path}: {len(keys)} poses cannot be cut into {robots} robots of two poses or more")
+    rank = {key: at for at, key in enumerate(keys)}
+    ends = [(rank[i[1]], rank[j[1]]) for i, j in zip(edges.i, edges.j, strict=True)]
     width = len(str(robots - 1))
-    owner = {key: f"robot{min(at * robots // len(keys), robots - 1):0{width}}" for at, key in enumerate(keys)}
-    i, j = [(owner[key[1]], key[1]) for key in edges.i], [(owner[key[1]], key[1]) for key in edges.j]
-    return Edges(i, j, edges.T_i_j, edges.kappa, edges.tau, edges.inlier)
+    names = [f"robot{robot:0{width}}" for robot in owners(len(keys), ends, robots, path)]
+    i, j = [(names[a], keys[a]) for a, _ in ends], [(names[b], keys[b]) for _, b in ends]
+    order = {(names[at], key): at for key, at in rank.items()}
+    return Edges(i, j, edges.T_i_j, edges.kappa, edges.tau, edges.inlier), order
 
 
 def _with_reference(edges: Edges, path: Path) -> tuple[Edges, str | None]:
@@ -207,11 +213,15 @@ def _indices(edges: Edges) -> dict[str, dict[int, int]]:
     return {robot: {key: at for at, key in enumerate(sorted(own))} for robot, own in sorted(keys.items())}
 
 
-def _consecutive(edges: Edges) -> NDArray[np.bool_]:
-    """Edges between neighboring keyframes of one robot: its odometry."""
-    at = _indices(edges)
+def _consecutive(edges: Edges, order: Mapping[Key, int]) -> NDArray[np.bool_]:
+    """Edges between neighboring keyframes of one robot: its odometry.
+
+    Args:
+        edges: of the whole graph.
+        order: place of a keyframe among its robot's own, or among all if one graph was cut.
+    """
     pairs = zip(edges.i, edges.j, strict=True)
-    return np.array([a == b and abs(at[a][p] - at[b][q]) == 1 for (a, p), (b, q) in pairs], dtype=bool)
+    return np.array([i[0] == j[0] and abs(order[i] - order[j]) == 1 for i, j in pairs], dtype=bool)
 
 
 @dataclass
@@ -222,12 +232,18 @@ class _Own:
     loops: list[int] = field(default_factory=list)
 
 
-def _team(edges: Edges, reference: str | None, ignored: tuple[str, ...], path: Path) -> TeamGraph:
+def _team(
+    edges: Edges,
+    consecutive: NDArray[np.bool_],
+    reference: str | None,
+    ignored: tuple[str, ...],
+    *,
+    path: Path,
+) -> TeamGraph:
     """Give every edge to the robots that it concerns."""
     at = _indices(edges)
     own = {robot: _Own() for robot in at}
     pairs: dict[tuple[str, str], list[int]] = {}
-    consecutive = _consecutive(edges)
     for k, ((a, _), (b, _)) in enumerate(zip(edges.i, edges.j, strict=True)):
         if a == b:
             (own[a].odometry if consecutive[k] else own[a].loops).append(k)
@@ -273,25 +289,13 @@ def _tie(own: _Own, edges: Edges, at: dict[int, int], *, name: str, path: Path) 
     Raises:
         DuagError: they fall apart even so.
     """
-    group = list(range(len(at)))
-
-    def root(k: int) -> int:
-        while group[k] != k:
-            k = group[k] = group[group[k]]
-        return k
-
-    loops = []
-    for k in (*own.odometry, *own.loops):
-        a, b = root(at[edges.i[k][1]]), root(at[edges.j[k][1]])
-        group[max(a, b)] = min(a, b)
-        if k in own.odometry:
-            continue
-        if a == b:
-            loops.append(k)
-        else:
-            own.odometry.append(k)
-    own.loops = loops
-    pieces = len({root(k) for k in range(len(at))})
+    rows = [*own.odometry, *own.loops]
+    ends = [(at[edges.i[k][1]], at[edges.j[k][1]]) for k in rows]
+    used, piece = spanning_forest(len(at), ends)
+    tying = {rows[position] for position in used if position >= len(own.odometry)}
+    own.odometry += [k for k in own.loops if k in tying]
+    own.loops = [k for k in own.loops if k not in tying]
+    pieces = len(np.unique(piece))
     if pieces > 1:
         raise DuagError(
             f"{path}: the own keyframes of {name} fall into {pieces} pieces without the other robots; expected one"
