@@ -1,4 +1,4 @@
-"""The command that solves public pose graphs."""
+"""The commands that solve public pose graphs, and make large ones."""
 
 import json
 from pathlib import Path
@@ -15,7 +15,7 @@ def posegraph(
         Path, typer.Argument(help="A .g2o file, or a folder of a team's pose graphs.", show_default=False)
     ],
     robots: Annotated[
-        int | None, typer.Option(min=1, help="Cut a single graph into so many robots. [default: 4]")
+        int | None, typer.Option(min=1, help="Cut a single graph among so many robots. [default: 4]")
     ] = None,
     loss: Annotated[float, typer.Option(min=0, max=1, help="Share of the packets that are lost.")] = 0.0,
     solver: Annotated[
@@ -41,7 +41,8 @@ def posegraph(
     Examples:
     `duagc posegraph sphere2500.g2o --robots 8`,
     `duagc posegraph parking-garage.g2o --solver elimination`,
-    `duagc posegraph kimera_campus_outdoor --robust gnc --loss 0.3 --json`
+    `duagc posegraph kimera_campus_outdoor --robust gnc --loss 0.3 --json`,
+    `duagc generate-posegraph town` and then `duagc posegraph town --robust gnc`
     """
     from duagc.pipeline.config.posegraph import settings
     from duagc.pipeline.team_posegraph.solve import solve
@@ -50,3 +51,31 @@ def posegraph(
     config = settings(solver, robust, loss=loss, seed=seed, max_rounds=max_rounds)
     result = solve(path, config, robots, only_reference=only_reference)
     print(json.dumps(result, indent=2) if as_json else format_result(result))
+
+
+@app.command("generate-posegraph")
+def generate_posegraph(
+    out: Annotated[Path, typer.Argument(help="The folder to write.", show_default=False)],
+    robots: Annotated[int, typer.Option(min=1, max=99, help="Number of robots.")] = 8,
+    keyframes: Annotated[int, typer.Option(min=10, help="Keyframes of each.")] = 1000,
+    closures: Annotated[int, typer.Option(min=0, help="Loop closures of the whole team.")] = 3000,
+    false: Annotated[float, typer.Option(min=0, max=1, help="Share of them that is false.")] = 0.6,
+    seed: Annotated[int, typer.Option(help="Of walks, noise and loop closures.")] = 0,
+    force: Annotated[bool, typer.Option("--force", help="Replace a pose graph that is there.")] = False,
+) -> None:
+    """Make the pose graph of a team in a town, with false loop closures in clusters that agree among themselves.
+
+    Writes the tables of Kimera-Multi, with a reference of what is true; `duagc posegraph` reads them.
+
+    Examples:
+    `duagc generate-posegraph town`,
+    `duagc generate-posegraph small --robots 3 --keyframes 100 --closures 80 --false 0.5 --seed 1`
+    """
+    from duagc.pipeline.experiments import team_graphs
+
+    graph = team_graphs.generate(robots, keyframes, closures, false, seed=seed)
+    team_graphs.write(graph, out, force=force)
+    print(
+        f"{out}: {robots} robots, {robots * keyframes} keyframes, {len(graph.closures)} loop closures, "
+        f"{sum(not true for true in graph.true)} of them false"
+    )
