@@ -15,7 +15,7 @@ from duagc.pipeline.posegraph.gnc import controls, graduated_weights
 from duagc.pipeline.posegraph.pose_graph import solve_pose_graph
 from duagc.pipeline.posegraph.relative_poses import RelativePoses
 
-_STEPS = 3  # Gauss-Newton steps per step of the graduated weights
+_HELD = 1e6  # of the stiffest factor: only fixes the gauge
 
 
 def chordal(factors: RelativePoses, n: int) -> Array:
@@ -67,10 +67,45 @@ def own_start(
     if not (config.robust and len(loops)):
         return solve_pose_graph(both, chordal(both, n)).poses, kept
     T = solve_pose_graph(odometry, chordal(odometry, n)).poses
-    c2, trusted = config.truncation**2, np.ones(len(odometry))
+    T = graduated(odometry, loops, T, config)
+    kept = least_squares.squared_residuals(loops, T) <= config.truncation**2
+    return solve_pose_graph(RelativePoses.concatenate([odometry, loops.select(kept)]), T).poses, kept
+
+
+def graduated(trusted: RelativePoses, loops: RelativePoses, T: Array, config: PoseConsensusConfig) -> Array:
+    """Poses that as many relative poses as possible agree on, by graduated non-convexity.
+
+    One Gauss-Newton step per step of the schedule: the weights change slowly, and poses follow them. It ends when all
+    weights are zero or one, or with the schedule.
+
+    Args:
+        trusted: relative poses of weight one.
+        loops: relative poses that may be false.
+        T: [n, 4, 4], to start from; pose 0 is held.
+        config: threshold and schedule.
+    """
+    c2 = config.truncation**2
     for mu in controls(config):
-        squared = least_squares.squared_residuals(loops, T)
-        weights = graduated_weights(squared, c2, mu)
-        T = solve_pose_graph(both, T, np.concatenate([trusted, weights]), iterations=_STEPS).poses
-    kept = least_squares.squared_residuals(loops, T) <= c2
-    return solve_pose_graph(both, T, np.concatenate([trusted, kept])).poses, kept
+        weights = graduated_weights(least_squares.squared_residuals(loops, T), c2, mu)
+        if np.all((weights == 0.0) | (weights == 1.0)):
+            break
+        counts = weights > 0.0  # the others would only fill the factorization
+        graph = RelativePoses.concatenate([trusted, loops.select(counts)])
+        T = gauss_newton(graph, T, np.concatenate([np.ones(len(trusted)), weights[counts]]))
+    return T
+
+
+def gauss_newton(graph: RelativePoses, T: Array, weights: Array) -> Array:
+    """Poses [n, 4, 4] after one Gauss-Newton step; pose 0 is held.
+
+    Args:
+        graph: m relative poses.
+        T: [n, 4, 4], to start from.
+        weights: [m].
+    """
+    g, jacobians = least_squares.gradient(graph, weights, T)
+    scale = max(float((J**2).sum(axis=1).max(initial=0.0)) for J in jacobians)
+    diagonal = np.full_like(g, 1e-12 * scale)
+    diagonal[0] = _HELD * scale
+    step = least_squares.factorized(least_squares.curvature_matrix(graph, jacobians, diagonal))(g.ravel())
+    return least_squares.retract(T, -step.reshape(-1, 6))

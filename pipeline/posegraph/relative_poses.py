@@ -96,7 +96,13 @@ class RelativePoses:
         Args:
             index: mask [n], slice or indices; the order of the result is that of the index.
         """
-        return RelativePoses(self.i[index], self.j[index], self.T_i_j[index], self.information[index])
+        return RelativePoses._of_arrays(
+            self.i[index],
+            self.j[index],
+            self.T_i_j[index],
+            self.information[index],
+            whitening=self.whitening[index],
+        )
 
     def renamed(self, new_index: ArrayLike) -> RelativePoses:
         """Rename the variables.
@@ -105,7 +111,9 @@ class RelativePoses:
             new_index: new index of every variable, int [variables].
         """
         names = np.asarray(new_index, dtype=np.int64)
-        return RelativePoses(names[self.i], names[self.j], self.T_i_j, self.information)
+        return RelativePoses._of_arrays(
+            names[self.i], names[self.j], self.T_i_j, self.information, whitening=self.whitening
+        )
 
     @staticmethod
     def concatenate(parts: Sequence[RelativePoses]) -> RelativePoses:
@@ -116,12 +124,33 @@ class RelativePoses:
         """
         if not parts:
             return RelativePoses.empty()
-        return RelativePoses(
+        return RelativePoses._of_arrays(
             np.concatenate([p.i for p in parts]),
             np.concatenate([p.j for p in parts]),
             np.concatenate([p.T_i_j for p in parts]),
             np.concatenate([p.information for p in parts]),
+            whitening=np.concatenate([p.whitening for p in parts]),
         )
+
+    @staticmethod
+    def _of_arrays(
+        i: Index, j: Index, T_i_j: Array, information: Array, *, whitening: Array
+    ) -> RelativePoses:
+        """From arrays of others: the square roots of their information are known.
+
+        They are laid out in memory as `_whitening` lays them out: products round by it.
+        """
+        out = object.__new__(RelativePoses)
+        whitening = np.ascontiguousarray(np.swapaxes(whitening, -1, -2)).swapaxes(-1, -2)
+        for name, array in (
+            ("i", i),
+            ("j", j),
+            ("T_i_j", T_i_j),
+            ("information", information),
+            ("whitening", whitening),
+        ):
+            object.__setattr__(out, name, array)
+        return out
 
 
 @dataclass(frozen=True)
