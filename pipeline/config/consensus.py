@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 from pydantic import Field
@@ -32,6 +33,23 @@ class LoopClosureConfig(Config):
     """Scale of the Cauchy weights of the relative frame, translation."""
     frame_sigma_rad: float = Field(default=0.05, gt=0.0)
     """Scale of the Cauchy weights of the relative frame, rotation."""
+
+
+@dataclass(frozen=True)
+class TeamSchedule:
+    """What large teams with many false loop closures add to the schedule of robust weights; by default nothing.
+
+    Attributes:
+        first_mu: least first mu between robots.
+        checks: after the schedule, truncate anew at most so often, until nothing changes and the link is steady.
+        check_packets: packets received between two of these.
+        drop_idle: after the schedule, share only keyframes that a loop closure with weight names.
+    """
+
+    first_mu: float = 0.0
+    checks: int = 0
+    check_packets: int = 10
+    drop_idle: bool = False
 
 
 class PoseConsensusConfig(Config):
@@ -83,6 +101,10 @@ class PoseConsensusConfig(Config):
     """The same for rotations (rad)."""
     closures: LoopClosureConfig = LoopClosureConfig()
     """Noise and consistency of loop closures."""
+
+    def team_schedule(self) -> TeamSchedule:
+        """What is added to the schedule of robust weights."""
+        return TeamSchedule()
 
 
 class ColorConfig(Config):

@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from duagc.pipeline.config.base import Config
-from duagc.pipeline.config.consensus import LoopClosureConfig, PoseConsensusConfig
+from duagc.pipeline.config.consensus import LoopClosureConfig, PoseConsensusConfig, TeamSchedule
 
 Solver = Literal["admm", "elimination", "paper"]
 Robust = Literal["none", "gnc"]
@@ -15,6 +15,26 @@ _AS_GIVEN = LoopClosureConfig(
     frame_sigma_m=5.0, frame_sigma_rad=0.1,
 )  # fmt: skip
 _ROBUST_PENALTY = 0.1
+
+
+class TeamConsensusConfig(PoseConsensusConfig):
+    """Pose consensus where loop closures come from a file, and most of them may be false."""
+
+    first_mu: float = Field(default=1e-3, gt=0.0)
+    """Least first mu between robots, whose own graphs and relative frames are robust already; a robot alone begins at
+    the least mu."""
+    checks: int = Field(default=12, ge=0)
+    """After the schedule, truncate anew at most so often, until nothing changes any more and the link is steady."""
+    check_packets: int = Field(default=10, ge=1)
+    """Packets received between two of these."""
+    drop_idle: bool = True
+    """After the schedule, share only keyframes that a loop closure with weight names: the others slow the rest."""
+
+    def team_schedule(self) -> TeamSchedule:
+        """What is added to the schedule of robust weights."""
+        if not self.robust:
+            return TeamSchedule()
+        return TeamSchedule(self.first_mu, self.checks, self.check_packets, self.drop_idle)
 
 
 class PoseGraphConfig(Config):
@@ -28,7 +48,7 @@ class PoseGraphConfig(Config):
     """Of the losses; nothing else is random."""
     max_rounds: int = Field(default=5000, ge=1)
     """A round is one burst of every robot to every neighbor; the run ends here whatever has been agreed."""
-    consensus: PoseConsensusConfig = PoseConsensusConfig(
+    consensus: TeamConsensusConfig = TeamConsensusConfig(
         tolerance=1e-5,
         wire="float32",
         odometry_floor_m=0,
@@ -59,7 +79,12 @@ def settings(
     default = PoseGraphConfig()
     consensus = default.consensus
     if robust == "gnc":  # penalties stay as they are while weights change, and long chains want small ones
-        consensus = consensus.model_copy(update={"robust": True, "penalty_start": _ROBUST_PENALTY})
+        consensus = consensus.model_copy(
+            update={
+                "robust": True,
+                "penalty_start": _ROBUST_PENALTY,
+            }
+        )
     return PoseGraphConfig(
         solver=solver, loss_probability=loss, seed=seed, max_rounds=max_rounds, consensus=consensus
     )

@@ -92,6 +92,10 @@ class AdmmEdge:
     adapting_from: float = 0.0  # received_total when the robust weights became final after their schedule
     newest: NDArray[np.int64] = field(init=False)  # [s] sequence last used
     newest_header: int = 0
+    active: NDArray[np.bool_] = field(
+        init=False
+    )  # [s] shared keyframes that some loop closure with weight names
+    active_version: int = 0  # of the mask
     changes: Array = field(init=False)  # [s, REMEMBERED] by the last arrivals (m, rad), the newest last
     reference: tuple[Array, Array] | None = None  # force and poses when the curvature window began
     peer_curvature: Array | None = None
@@ -101,6 +105,7 @@ class AdmmEdge:
         self.offset = np.zeros((len(self.keyframes), 6))
         self.newest = np.zeros(len(self.keyframes), np.int64)
         self.changes = np.full((len(self.keyframes), REMEMBERED), np.inf)
+        self.active = np.ones(len(self.keyframes), dtype=bool)
 
     @property
     def holds(self) -> bool:
@@ -109,7 +114,7 @@ class AdmmEdge:
 
     def penalty(self) -> Array:
         """Diagonal penalty [s, 6]."""
-        return self.metric * self.penalties[BLOCK]
+        return self.metric * self.penalties[BLOCK] * self.active[:, None]
 
     def force(self) -> Array:
         """W (x - y) [s, 6]: the multiplier of this end (dual)."""
@@ -122,6 +127,27 @@ class AdmmEdge:
     def largest_change(self) -> float:
         """Largest change of an edge variable by the last arrivals (m, rad); infinite before the first."""
         return float(self.changes[:, -1].max())
+
+    def activate(self, active: NDArray[np.bool_], version: int) -> None:
+        """Let only some shared keyframes pull; the others begin anew when they do again.
+
+        Args:
+            active: bool [s].
+            version: of the mask; an older one than the present one has no effect.
+        """
+        if version <= self.active_version:
+            return
+        self.offset[~active] = 0.0
+        self.changes[~active] = 0.0
+        self.changes[active & ~self.active] = np.inf
+        self.active, self.active_version = active, version
+
+    def carrying(self) -> NDArray[np.bool_]:
+        """Bool [s]: which copies some loop closure with weight names, at the end that holds the loop closures."""
+        carrying = np.zeros(len(self.keyframes), dtype=bool)
+        named = np.array([c.peer_keyframe for c in self.closures], dtype=np.int64)
+        carrying[np.searchsorted(self.keyframes, named[self.robust.weights > 0])] = True
+        return carrying
 
     def largest_recent_change(self) -> float:
         """The same over the last arrivals; infinite before there were so many.

@@ -43,7 +43,7 @@ def curvature(link: AdmmEdge, T: Array, config: PoseConsensusConfig) -> Array | 
     force, poses = link.reference
     root = np.sqrt(link.metric)
     d_force = (link.force() - force) / root
-    d_pose = difference(T, poses) * root
+    d_pose = difference(T, poses) * root * link.active[:, None]
     stiffness = []
     for block in (slice(0, 3), slice(3, 6)):
         moved = float(np.linalg.norm(d_pose[:, block]))

@@ -25,7 +25,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
@@ -87,6 +87,8 @@ class PoseAgent:
         self.step_change = np.inf
         self._copies_start: dict[str, Array] = {}
         self._started = False
+        self.masks: dict[str, tuple[int, NDArray[np.bool_]]] = {}  # by neighbor, to be sent
+        self._adapts = False  # the weights have had their schedule
         self._x = self.T_map_keyframe.copy()
         self._factors = RelativePoses.concatenate([self.odometry, self.loops])
         self._collect_weights()
@@ -180,7 +182,11 @@ class PoseAgent:
 
     def _collect_weights(self) -> None:
         held = [link.robust.weights for link in self.links.values() if link.holds]
-        self._weights = np.concatenate([np.ones(len(self.odometry)), self.loop_weights.weights, *held])
+        weights = np.concatenate([np.ones(len(self.odometry)), self.loop_weights.weights, *held])
+        counts = weights != 0.0  # the others would only fill the factorization
+        everything = bool(counts.all()) or not self.config.team_schedule().drop_idle
+        self._counted = self._factors if everything else self._factors.select(counts)
+        self._weights = weights if everything else weights[counts]
         self._solve = None
 
     # ---- one round ----
@@ -198,15 +204,16 @@ class PoseAgent:
             self._weigh(link)
             self._decide(link)
         force_before = {peer: link.force() for peer, link in self.links.items()}
-        g, jacobians = least_squares.gradient(self._factors, self._weights, self._x)
+        g, jacobians = least_squares.gradient(self._counted, self._weights, self._x)
         for peer, link in self.links.items():
             g[link.slots] += force_before[peer]
         if self._solve is None or self._moved_rad > self.config.relinearize_rad:
             diagonal = np.zeros_like(g)
             for link in self.links.values():
                 diagonal[link.slots] += link.penalty()
-            diagonal += 1e-9 * diagonal.max()  # a variable without any factor stays where it is
-            H = least_squares.curvature_matrix(self._factors, jacobians, diagonal)
+            stiffest = diagonal.max() or max(float(link.metric.max()) for link in self.links.values())
+            diagonal += 1e-9 * stiffest  # a variable without any factor stays where it is
+            H = least_squares.curvature_matrix(self._counted, jacobians, diagonal)
             self._solve, self._moved_rad = least_squares.factorized(H), 0.0
             self.factorizations += 1
         delta = -self._solve(g.ravel()).reshape(-1, 6)
@@ -266,12 +273,18 @@ class PoseAgent:
         m = se3.from_quat_translation(
             packet.quats_wxyz[newer].astype(np.float64), packet.translations[newer].astype(np.float64)
         )
+        if not link.active.all():  # nothing pulls at the others: a copy is where its owner has it
+            active = link.active[at]
+            if link.holds:
+                self._x[link.slots[at[~active]]] = m[~active]
+            link.newest[at[~active]] = packet.sequence
+            at, m = at[active], m[active]
         y = retract(self._x[link.slots[at]], -link.offset[at])
         delta = self.config.relaxation * difference(m, y)
         link.offset[at] -= delta
         link.newest[at] = packet.sequence
         link.moved(at, np.abs(delta).max(axis=1))
-        share = len(at) / len(link.keyframes)
+        share = int(newer.sum()) / len(link.keyframes)
         link.received += share
         link.received_total += share
         return True
@@ -280,7 +293,7 @@ class PoseAgent:
 
     def _curvature(self, link: AdmmEdge) -> Array | None:
         """Curvature [2] since the last change of penalties; None before enough was received or if nothing moved."""
-        if not (self.config.adaptive and self.robust_done):
+        if not (self.config.adaptive and self._scheduled):
             return None
         return admm_penalties.curvature(link, self._x[link.slots], self.config)
 
@@ -305,7 +318,7 @@ class PoseAgent:
 
         if link.robust.advance(link.received_total, self._steady(link), squared):
             self._reweighted()
-            if link.robust.done:
+            if link.robust.scheduled:
                 link.reference, link.received = None, 0.0
 
     def _weigh_loops(self) -> None:
@@ -323,13 +336,50 @@ class PoseAgent:
         """Some weights changed; when the last are final, penalties begin to adapt as if the links were new."""
         self._collect_weights()
         groups = [self.loop_weights, *(link.robust for link in self.links.values())]
-        if self.robust_done and any(group.graduated for group in groups):
+        if self.config.team_schedule().drop_idle:
+            self._drop_idle()
+        if self._scheduled and not self._adapts and any(group.graduated for group in groups):
+            self._adapts = True
             for link in self.links.values():
                 link.adapting_from = link.received_total
+
+    def _drop_idle(self) -> None:
+        """After its schedule, a link shares only the keyframes that loop closures with weight name."""
+        for link in self.links.values():
+            if link.holds and link.robust.scheduled:
+                carrying = link.carrying()
+                if not np.array_equal(carrying, link.active):
+                    link.activate(carrying, link.active_version + 1)
+                    self.masks[link.peer] = (link.active_version, carrying)
+
+    def shared_with(self, peer: str) -> int:
+        """How many keyframes a link shares; zero if there is none."""
+        return len(self.links[peer].keyframes) if peer in self.links else 0
+
+    def take_mask(self, peer: str, version: int, active: NDArray[np.bool_]) -> None:
+        """The neighbor that holds the loop closures says which shared keyframes they still name.
+
+        Args:
+            peer: its name.
+            version: of the mask.
+            active: bool [s].
+        Raises:
+            ValueError: it is not what a holder of loop closures says.
+        """
+        link = self.links[peer]
+        if link.holds or len(active) != len(link.keyframes):
+            raise ValueError("mask: not from a holder of loop closures, or not of its keyframes")
+        link.activate(active, version)
+        self._solve = None
 
     def _steady(self, link: AdmmEdge) -> bool:
         """Whether a link is past its initial transient."""
         return link.received_total >= self.config.penalty_period and link.largest_change() < _STEADY
+
+    @property
+    def _scheduled(self) -> bool:
+        """Whether the schedules of all weights are over."""
+        return self.loop_weights.scheduled and all(link.robust.scheduled for link in self.links.values())
 
     # ---- results ----
 
@@ -387,7 +437,7 @@ class PoseAgent:
         return {
             "primal": max(changes, default=0.0) / self.config.relaxation,
             "dual": self._dual_change,
-            "cost": least_squares.cost(self._factors, self._x, self._weights) if self._started else 0.0,
+            "cost": least_squares.cost(self._counted, self._x, self._weights) if self._started else 0.0,
             "step": self.step_change,
             "penalties": {peer: tuple(link.penalties.tolist()) for peer, link in self.links.items()},
             "versions": {peer: link.version for peer, link in self.links.items()},

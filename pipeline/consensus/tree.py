@@ -258,7 +258,8 @@ class TreeNode:
             def squared(factors: RelativePoses = factors) -> Array:
                 return least_squares.squared_residuals(factors, self.poses)
 
-            changed |= robust.advance(received, False, squared)
+            steady = robust.scheduled and self.largest_step < self.tolerance
+            changed |= robust.advance(received, steady, squared)
         return changed
 
     def _weights(self) -> Array:

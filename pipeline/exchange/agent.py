@@ -374,6 +374,8 @@ class Agent:
             if self.loop_closing.revokes and (undecided := self.alignment.undecided):
                 self._revoke_links(self.alignment.revoked | undecided)
                 return
+            if not self._closures_selected(joined):
+                return
             self._start_poses()
         assert self.poses is not None
         if not self._all_agreed():
@@ -397,6 +399,16 @@ class Agent:
             self.agreed, self.converged_hops = True, WHOLE_COMPONENT
             self.rounds_to_agreement = self.round
             self.sharing.add_poses(self.poses.T_world_keyframe, self.graph.T_map_keyframe[0])
+
+    def _closures_selected(self, joined: Sequence[Neighbor]) -> bool:
+        """Whether both ends of all links know which loop closures the solver gets."""
+        waiting = [n.loop_closing for n in joined if n.loop_closing and not n.loop_closing.selected]
+        if waiting:
+            own = self.alignment.T_world_first(self.own)
+            for n in joined:
+                if n.loop_closing in waiting:
+                    n.loop_closing.select(own, self.alignment.T_world_first(n.index), self.radio.sender(n))
+        return all(protocol.selected for protocol in waiting)
 
     def _start_poses(self) -> None:
         """Give the solver the own graph where it was placed, and the joined neighbors."""

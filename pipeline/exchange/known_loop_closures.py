@@ -3,14 +3,21 @@
 The end that copies fewer keyframes by holding them decides; the other end sends it the keyframes that they name
 
     KEYFRAMES    own keyframes that the loop closures name, in the own map    ->    the end that decides
+
+If loop closures may be false, those that cannot be true where the team was placed take no part in the solver. When all
+relative frames are known, the end that decides says which ones take part
+
+    REQUEST      one bit per loop closure, the first in the lowest bit        ->    the other end
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import PoseConsensusConfig
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes, link_metric
 from duagc.pipeline.exchange.loop_closing import JoinedPair, LoopClosureProtocol, Send, join
@@ -19,7 +26,15 @@ from duagc.pipeline.exchange.wire import loop_closing_wire
 from duagc.pipeline.exchange.wire.loop_closing_wire import NamedKeyframes
 from duagc.pipeline.geometry import se3
 from duagc.pipeline.network.packets import Kind, MalformedError
-from duagc.pipeline.posegraph.loop_closures import Group, KeyframePoses, consistent, holder, robust_frame
+from duagc.pipeline.posegraph.loop_closures import (
+    Group,
+    KeyframePoses,
+    holder,
+    plausible,
+    robust_frame,
+    within,
+)
+from duagc.pipeline.posegraph.pair_consistency import agreeing
 from duagc.pipeline.posegraph.relative_poses import LoopClosure
 
 
@@ -69,7 +84,11 @@ class KnownLoopClosures:
 
 
 class KnownPair(LoopClosureProtocol):
-    """One end of a pair whose loop closures are known."""
+    """One end of a pair whose loop closures are known.
+
+    Attributes:
+        in_solver: bool per loop closure of the file, whether it takes part in the solver.
+    """
 
     def __init__(self, source: KnownLoopClosures, peer: str) -> None:
         super().__init__(source.own.robot, peer)
@@ -77,13 +96,16 @@ class KnownPair(LoopClosureProtocol):
         self.decides = holder(self.own, peer, self.closures) == self.own
         self._holds = self.decides or source.held_by_both
         self._peer_holds = not self.decides or source.held_by_both
+        self.selected = source.trusted
+        self.in_solver = np.ones(len(self.closures), dtype=bool)
         if not self._holds:
             self.decided, self.joined = True, JoinedPair(self._shared_at_peer())
 
     def _shared_at_peer(self) -> SharedKeyframes:
         """The own keyframes that the other end copies; it finds the same metric."""
-        keyframes = np.unique([c.own_keyframe for c in self.closures])
-        mirrored = [c.reversed() for c in self.closures]
+        selected = self._selected_closures()
+        keyframes = np.unique([c.own_keyframe for c in selected])
+        mirrored = [c.reversed() for c in selected]
         metric = link_metric(mirrored, keyframes, self.source.config.closures)
         return SharedKeyframes(keyframes.astype(np.int32), metric)
 
@@ -94,7 +116,42 @@ class KnownPair(LoopClosureProtocol):
             keyframes = NamedKeyframes(named, own.T_first_keyframe[named], own.drift[named])
             send(Kind.KEYFRAMES, loop_closing_wire.write_keyframes(keyframes, self.source.precision))
 
+    def _selected_closures(self) -> list[LoopClosure]:
+        return [c for c, selected in zip(self.closures, self.in_solver.tolist(), strict=True) if selected]
+
+    def select(self, T_world_own: Array, T_world_peer: Array, send: Send) -> None:
+        if not self._holds:
+            return
+        assert self.joined is not None
+        assert self.peer_keyframes is not None
+        config = self.source.config.closures
+        own, peer = self.source.own.from_first.moved(T_world_own), self.peer_keyframes.moved(T_world_peer)
+        possible = plausible(self.closures, own, peer, config)
+        self.in_solver = possible if possible.any() else self.joined.groups[0]
+        selected = self._selected_closures()
+        keyframes = np.unique([c.peer_keyframe for c in selected])
+        shared = SharedKeyframes(keyframes.astype(np.int32), link_metric(selected, keyframes, config))
+        near = within(self.closures, own, peer, config)
+        groups = tuple((group & near)[self.in_solver] for group in self.joined.groups)
+        self.joined = replace(self.joined, shared=shared, closures=tuple(selected), groups=groups)
+        self.selected = True
+        send(Kind.REQUEST, np.packbits(self.in_solver, bitorder="little").tobytes())
+
+    def _take_selection(self, payload: bytes) -> None:
+        """What the other end selected."""
+        bits = np.unpackbits(np.frombuffer(payload, np.uint8), bitorder="little")
+        count = len(self.closures)
+        if len(payload) != -(-count // 8) or bits[count:].any() or not bits.any():
+            raise MalformedError(
+                f"selection: {len(payload)} bytes that do not select of {count} loop closures"
+            )
+        self.in_solver, self.selected = bits[:count].astype(bool), True
+        self.joined = JoinedPair(self._shared_at_peer())
+
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
+        if kind is Kind.REQUEST and not self._holds and not self.selected:
+            self._take_selection(payload)
+            return
         if kind is not Kind.KEYFRAMES or not self._holds or self.decided:
             raise MalformedError(f"{kind.name} is not for this end, or came twice")
         expected = np.unique([c.peer_keyframe for c in self.closures]).astype(np.int32)
@@ -123,6 +180,4 @@ class KnownPair(LoopClosureProtocol):
             T_own_peer = np.array([c.T_own_peer for c in self.closures])
             frames = own.T_first_keyframe[i] @ T_own_peer @ se3.inverse(peer.T_frame_keyframe[j])
             return [Group(np.ones(len(self.closures), dtype=bool), robust_frame(frames, config))]
-        found = consistent(self.closures, own.from_first, peer, config)
-        assert found.T_ownmap_peermap is not None, "one loop closure joins two robots here"
-        return [Group(found.keep, found.T_ownmap_peermap)]  # no cycle of robots chooses another one
+        return [agreeing(self.closures, own.from_first, peer, self.source.config)]

@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.consensus import LoopClosureConfig
 from duagc.pipeline.consensus.admm_edge import SharedKeyframes, link_metric
 from duagc.pipeline.exchange.place_recognition import Candidate
@@ -96,9 +97,11 @@ class LoopClosureProtocol:
         joined: what they share; None as long as they do not.
         tried: every candidate that this end examined.
         peer_keyframes: of the neighbor as seen from its first, at an end that holds loop closures.
+        selected: both ends know which of the loop closures the solver gets.
     """
 
     decides = False
+    selected = True
 
     def __init__(self, own: str, peer: str) -> None:
         self.own, self.peer = own, peer
@@ -109,6 +112,15 @@ class LoopClosureProtocol:
 
     def begin(self, send: Send) -> None:
         """Called once, when the ends know their roles."""
+
+    def select(self, T_world_own: Array, T_world_peer: Array, send: Send) -> None:
+        """Called until `selected`, once the whole component knows where its maps lie; default: all are selected.
+
+        Args:
+            T_world_own: [4, 4], where the first own keyframe was placed.
+            T_world_peer: [4, 4], where the first keyframe of the neighbor was placed.
+            send: queues a message for the neighbor.
+        """
 
     def take(self, kind: Kind, payload: bytes, send: Send) -> None:
         """Use one complete message of this protocol.

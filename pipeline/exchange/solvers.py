@@ -17,7 +17,7 @@ from duagc.pipeline.consensus.elimination import Variable
 from duagc.pipeline.consensus.pose_admm import PoseAgent, with_floor
 from duagc.pipeline.consensus.tree import TreeGraph, TreeNode, TreePlace
 from duagc.pipeline.exchange.own_graph import OwnGraph
-from duagc.pipeline.exchange.wire import elimination_wire
+from duagc.pipeline.exchange.wire import elimination_wire, poses_wire
 from duagc.pipeline.exchange.wire.poses_wire import read_poses, write_poses_in_parts
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT, RobustWeights
 from duagc.pipeline.posegraph.relative_poses import LoopClosure, closures_as_relative_poses
@@ -131,6 +131,8 @@ class AdmmSolver:
         """
         self.own, self.config = start.index, config
         self.refused: list[str] = []
+        self._arrived: list[tuple[int, bytes]] = []
+        self._names = {link.index: link.name for link in start.links}
         own = start.own
         self.agent = PoseAgent(
             own.robot,
@@ -149,6 +151,13 @@ class AdmmSolver:
                 self.agent.add_link(link.name, shared=link.shared)
 
     def advance(self) -> None:
+        for sender, payload in self._arrived:
+            name = self._names.get(sender, "")
+            try:
+                self.agent.take_mask(name, *poses_wire.read_mask(payload, self.agent.shared_with(name)))
+            except ValueError as error:
+                self.refused.append(str(error))
+        self._arrived.clear()
         self.agent.step()
 
     def states(self, neighbor: LinkStart, room_bytes: int) -> list[bytes]:
@@ -160,10 +169,13 @@ class AdmmSolver:
         self.agent.receive(neighbor.name, poses)
 
     def messages(self) -> list[tuple[int, bytes]]:
-        return []
+        index = {name: k for k, name in self._names.items()}
+        sent = [(index[peer], poses_wire.write_mask(*mask)) for peer, mask in self.agent.masks.items()]
+        self.agent.masks.clear()
+        return sent
 
     def take_message(self, sender: int, payload: bytes) -> None:
-        """Edge-ADMM knows no reliable messages; there is nothing to keep."""
+        self._arrived.append((sender, payload))
 
     @property
     def converged(self) -> bool:

@@ -29,6 +29,7 @@ def graduated_weights(squared: Array, c2: float, mu: float) -> Array:
 def first_control(squared: Array, config: PoseConsensusConfig) -> float:
     """Where the schedule begins: a share of the control parameter at which the worst factor is just convex."""
     c2, (least, last) = config.truncation**2, config.robust_mu
+    least = max(least, config.team_schedule().first_mu)
     beyond = 2 * float(squared.max()) - c2
     convex = c2 / beyond if beyond > 0 else last
     return min(max(least, config.robust_convexity * convex), last)
@@ -46,13 +47,15 @@ class RobustWeights:
 
     Attributes:
         weights: [m], the start until the warm-up is over.
+        scheduled: the schedule is over; the weights are zero or one, and change only if residuals say so.
         done: they are final.
     """
 
     def __init__(self, start: Array, config: PoseConsensusConfig) -> None:
         self.weights, self.config = start, config
-        self.done = not (config.robust and len(start))
+        self.scheduled = self.done = not (config.robust and len(start))
         self._mu: float | None = None  # None while warming up
+        self._checks = 0
         self._changed_at = 0.0  # packets received when the weights last changed
 
     def advance(self, received: float, steady: bool, squared_residuals: Callable[[], Array]) -> bool:
@@ -65,6 +68,8 @@ class RobustWeights:
             squared_residuals: [m], computed only when needed.
         """
         c, c2 = self.config, self.config.truncation**2
+        if self.scheduled and not self.done:
+            return self._check(received, steady, squared_residuals)
         wait = c.robust_warm_up if self._mu is None else c.robust_packets
         least = 0.0 if self._mu is None else _LEAST_PACKETS
         waited = received - self._changed_at
@@ -92,5 +97,18 @@ class RobustWeights:
         return self._mu is not None
 
     def _finish(self, weights: Array) -> bool:
-        self.weights, self.done = weights, True
+        self.weights, self.scheduled, self.done = weights, True, not self.config.team_schedule().checks
         return True
+
+    def _check(self, received: float, steady: bool, squared_residuals: Callable[[], Array]) -> bool:
+        """Truncate anew: what was far off when the schedule ended may fit since others' weights have changed."""
+        schedule = self.config.team_schedule()
+        if received - self._changed_at < schedule.check_packets:
+            return False
+        weights = (squared_residuals() <= self.config.truncation**2).astype(np.float64)
+        changed = not np.array_equal(weights, self.weights)
+        self._changed_at = received
+        self._checks += 1
+        self.done = (steady and not changed) or self._checks >= schedule.checks
+        self.weights = weights
+        return changed

@@ -19,6 +19,7 @@ from duagc.pipeline.posegraph.relative_poses import LoopClosure, RelativePoses, 
 
 CHI2_3_999 = 16.27  # 99.9 % quantile of chi^2 with 3 degrees of freedom
 _OTHER_GROUPS = 2  # further than the largest, that a cycle of three robots may find to be the right ones
+_SCALES = 8.0  # of a relative frame, that a placement may be off
 _CANDIDATES = 150  # relative frames tried as the start of the mean
 
 
@@ -170,6 +171,36 @@ def plausible(
     Returns:
         bool [m].
     """
+    translation_m, rotation_rad = _off(closures, own, peer)
+    variance = _whole_variance(closures, own, peer, config)
+    limit = CHI2_3_999 * config.margin * variance
+    return (rotation_rad**2 < limit[:, 1]) & (translation_m**2 < limit[:, 0])
+
+
+def within(
+    closures: Sequence[LoopClosure], own: KeyframePoses, peer: KeyframePoses, config: LoopClosureConfig
+) -> NDArray[np.bool_]:
+    """Which loop closures fit to where the alignment of the component places the two robots, within its own error.
+
+    That error is a few times the scale of relative frames, however far the odometry of both robots may drift: it does
+    for a start that graduated weights correct.
+
+    Args:
+        closures: m of one pair.
+        own: keyframes of this end in the common frame.
+        peer: keyframes of the peer in the common frame.
+        config: scale of relative frames.
+    Returns:
+        bool [m].
+    """
+    translation_m, rotation_rad = _off(closures, own, peer)
+    return (translation_m < _SCALES * config.frame_sigma_m) & (
+        rotation_rad < _SCALES * config.frame_sigma_rad
+    )
+
+
+def _off(closures: Sequence[LoopClosure], own: KeyframePoses, peer: KeyframePoses) -> tuple[Array, Array]:
+    """Distances (m, rad) [m] of the peer's keyframes from where loop closures see them."""
     i = np.array([c.own_keyframe for c in closures], dtype=np.int64)
     j = np.array([c.peer_keyframe for c in closures], dtype=np.int64)
     T_peer = peer.T_frame_keyframe[j]
@@ -178,9 +209,7 @@ def plausible(
     )
     translation_m = np.linalg.norm(measured[:, :3, 3] - T_peer[:, :3, 3], axis=1)
     rotation_rad = np.linalg.norm(so3.log(np.swapaxes(measured[:, :3, :3], 1, 2) @ T_peer[:, :3, :3]), axis=1)
-    variance = _whole_variance(closures, own, peer, config)
-    limit = CHI2_3_999 * config.margin * variance
-    return (rotation_rad**2 < limit[:, 1]) & (translation_m**2 < limit[:, 0])
+    return translation_m, rotation_rad
 
 
 def frame_variance(

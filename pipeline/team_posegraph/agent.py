@@ -12,10 +12,10 @@ from duagc.pipeline.config.exchange import ExchangeConfig
 from duagc.pipeline.config.network import LinkConfig, TransportConfig
 from duagc.pipeline.config.posegraph import PoseGraphConfig
 from duagc.pipeline.exchange.agent import Agent
-from duagc.pipeline.exchange.known_loop_closures import KnownLoopClosures
+from duagc.pipeline.exchange.known_loop_closures import KnownLoopClosures, KnownPair
 from duagc.pipeline.exchange.own_graph import OwnGraph
 from duagc.pipeline.exchange.sharing import NoSharing
-from duagc.pipeline.exchange.solvers import EliminationSolver, PoseSolver, SolverStart
+from duagc.pipeline.exchange.solvers import EliminationSolver, LinkStart, PoseSolver, SolverStart
 from duagc.pipeline.posegraph.files import RobotGraph
 from duagc.pipeline.posegraph.initialization import own_start
 from duagc.pipeline.posegraph.loop_closures import drift
@@ -94,11 +94,18 @@ class PoseGraphAgent(Agent):
         """
         if self.poses is None:
             return self.graph.keep_loops.astype(np.float64), {}
-        held = {
-            link.name: self.poses.weights(link.name) for link in self.links.values() if len(link.closures)
-        }
+        held = {link.name: self._kept_of(link) for link in self.links.values() if len(link.closures)}
         revoked = {n.name: np.zeros(len(n.link.weights)) for n in self.neighbors.values() if n.link.weights}
         return self.poses.loop_weights, held | revoked
+
+    def _kept_of(self, link: LinkStart) -> Array:
+        """Weights of all loop closures of a pair; zero for those that the solver did not get."""
+        assert self.poses is not None
+        pair = self.neighbors[link.index].loop_closing
+        assert isinstance(pair, KnownPair)
+        weights = np.zeros(len(pair.closures))
+        weights[pair.in_solver] = self.poses.weights(link.name)
+        return weights
 
 
 def _own_graph(part: RobotGraph, config: PoseConsensusConfig) -> OwnGraph:

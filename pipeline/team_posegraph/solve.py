@@ -17,6 +17,7 @@ from duagc.pipeline.base.arrays import Array
 from duagc.pipeline.config.posegraph import PoseGraphConfig
 from duagc.pipeline.network.packets import HEADER_BYTES, MAX_PAYLOAD_BYTES
 from duagc.pipeline.posegraph import least_squares
+from duagc.pipeline.posegraph.certificate import is_global_minimum
 from duagc.pipeline.posegraph.files import TeamGraph, read_team_graph
 from duagc.pipeline.posegraph.gnc import INLIER_WEIGHT
 from duagc.pipeline.posegraph.initialization import chordal
@@ -114,13 +115,19 @@ def _central(component: _Component) -> PoseGraphSolution:
     return solve_pose_graph(component.graph.relative_poses, start)
 
 
+def _solve_counted(component: _Component, T: Array, weights: Array) -> PoseGraphSolution:
+    """A minimum of what has weight: the rest would only fill the factorization."""
+    counts = weights != 0.0
+    return solve_pose_graph(component.graph.relative_poses.select(counts), T, weights[counts])
+
+
 def _truncated(component: _Component, T: Array, kept: NDArray[np.bool_], c2: float) -> PoseGraphSolution:
     """Truncated least squares in one place, from poses and a selection of what may be false: solve, select, repeat."""
     weights = component.trusted.astype(np.float64)
     best = None
     for _ in range(_TRUNCATIONS):
         weights[~component.trusted] = kept
-        found = solve_pose_graph(component.graph.relative_poses, T, weights)
+        found = _solve_counted(component, T, weights)
         T = found.poses
         cost = component.cost(T, c2)
         if best is None or cost < best.cost:
@@ -217,7 +224,10 @@ def _kept(component: _Component, agents: dict[str, PoseGraphAgent]) -> NDArray[n
 def _against_reference(
     component: _Component, kept: NDArray[np.bool_], T: Array, c2: float | None
 ) -> dict[str, Any]:
-    """Precision and recall of loops and closures together, and of closures between robots alone."""
+    """Precision and recall of loops and closures together, and of closures between robots alone.
+
+    With c2 also the optimum of what the reference calls true, and how far the agents' poses are from it.
+    """
     assert component.true is not None
     true = component.true
 
@@ -235,8 +245,12 @@ def _against_reference(
     if c2 is not None:
         weights = component.trusted.astype(np.float64)
         weights[~component.trusted] = true
-        solved = solve_pose_graph(component.graph.relative_poses, T, weights)
+        solved = _solve_counted(component, T, weights)
         result["cost_of_reference"] = component.cost(solved.poses, c2)
+        inliers = component.graph.relative_poses.select(weights > 0)
+        result["optimum"] = solved.cost
+        result["certified"] = is_global_minimum(inliers, solved.poses)
+        result["gap"] = least_squares.cost(inliers, T) / solved.cost - 1 if solved.cost > 0 else None
     return result
 
 

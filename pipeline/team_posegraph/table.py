@@ -56,6 +56,10 @@ def _component(c: dict[str, Any]) -> list[str]:
         )
         if "cost_of_reference" in ref:
             lines.append(f"{'cost of the reference':<28}{ref['cost_of_reference']:.8g}")
+            certified = "certified" if ref["certified"] else "not certified"
+            lines.append(
+                f"{'optimum of its inliers':<28}{ref['optimum']:.8g}  ({certified}; gap {_gap(ref['gap'])})"
+            )
     return [*lines, ""]
 
 

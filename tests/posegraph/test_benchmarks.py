@@ -8,6 +8,7 @@ import json
 import pytest
 
 from duagc.pipeline.config.posegraph import settings
+from duagc.pipeline.experiments.team_graphs import generate, write
 from duagc.pipeline.team_posegraph import solve
 from tests.fixtures.pose_worlds import POSE_GRAPHS
 
@@ -76,3 +77,26 @@ def test_a_third_of_the_closures_is_false(solver):
     assert reference["recall"] > 0.98
     assert reference["precision"] > 0.98
     assert result["cost"] <= reference["cost_of_reference"] * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("seed", [0])
+def test_most_loop_closures_of_a_large_team_are_false(tmp_path, seed):
+    """8 robots with 1,000 keyframes each; 60 % of the loop closures are false, in clusters that agree."""
+    write(generate(8, 1000, 3000, 0.6, seed=seed), tmp_path / "town")
+    result = solve.solve(tmp_path / "town", settings("admm", "gnc"))
+    reference = result["components"][0]["reference"]
+    print(json.dumps({k: v for k, v in result.items() if k != "components"} | {"reference": reference}))
+    assert result["converged"]
+    assert reference["precision"] == 1.0
+    assert reference["certified"]
+    assert reference["gap"] <= 1e-6
+    assert result["rounds_to"]["1e-6"] <= 350
+    assert result["bytes"] <= 45e6
+
+
+def test_grid1000_cut_among_four():
+    result = run(TEAMS + "grid1000_30p_outliers", 4, settings("admm", "gnc"))
+    reference = result["components"][0]["reference"]
+    assert result["converged"]
+    assert reference["precision"] == reference["recall"] == 1.0
+    assert abs(reference["gap"]) < 1e-6

@@ -9,16 +9,19 @@ from duagc.pipeline.config.posegraph import settings
 from duagc.pipeline.network.packets import parse, serialize
 from duagc.pipeline.posegraph.files import read_team_graph
 from duagc.pipeline.team_posegraph.agent import PoseGraphAgent
-from tests.fixtures.pose_graphs import helix_edges, write_g2o
+from tests.fixtures.pose_graphs import helix_edges, wild_edges, write_g2o
 
 
-@pytest.mark.parametrize("solver", ["admm", "elimination", "paper"])
-def test_changed_payloads_crash_nobody(tmp_path, solver):
-    team = read_team_graph(write_g2o(tmp_path / "helix.g2o", helix_edges(24)), 3)
+@pytest.mark.parametrize(
+    ("solver", "robust"), [("admm", "none"), ("elimination", "none"), ("paper", "none"), ("admm", "gnc")]
+)
+def test_changed_payloads_crash_nobody(tmp_path, solver, robust):
+    rows = helix_edges(24) + (wild_edges(24, 4) if robust == "gnc" else [])
+    team = read_team_graph(write_g2o(tmp_path / "helix.g2o", rows), 3)
     rng = np.random.default_rng(0)
     refused = changed = 0
     for _ in range(12):
-        config = settings(solver, max_rounds=40)
+        config = settings(solver, robust, max_rounds=40)
         agents = {n: PoseGraphAgent(team.robots[n], sorted(team.robots), config) for n in team.robots}
         waiting = {name: [] for name in agents}
         for k in range(40):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from duagc.pipeline.consensus.elimination import BackSubstitution, Block
-from duagc.pipeline.exchange.wire import elimination_wire, loop_closing_wire, state_wire
+from duagc.pipeline.exchange.wire import elimination_wire, loop_closing_wire, poses_wire, state_wire
 from duagc.pipeline.exchange.wire.loop_closing_wire import NamedKeyframes
 from duagc.pipeline.exchange.wire.state_wire import State
 from duagc.pipeline.geometry import se3
@@ -104,3 +104,17 @@ def test_what_is_cut_short_or_does_not_fit_is_refused():
         )
     with pytest.raises(MalformedError, match="expected 3"):
         elimination_wire.read_block(elimination_wire.write_block(0, block, "float64"), 3)
+
+
+@pytest.mark.parametrize("count", [1, 8, 13])
+def test_masks_come_back_and_name_no_other_keyframe(count):
+    active = np.arange(count) % 3 == 0
+    data = poses_wire.write_mask(7, active)
+    version, back = poses_wire.read_mask(data, count)
+    assert version == 7
+    np.testing.assert_array_equal(back, active)
+    with pytest.raises(MalformedError, match="mask"):
+        poses_wire.read_mask(data + b"\0", count)
+    if count % 8:
+        with pytest.raises(MalformedError, match="more than"):
+            poses_wire.read_mask(data[:-1] + b"\xff", count)

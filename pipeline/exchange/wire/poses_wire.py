@@ -131,3 +131,32 @@ def read_poses(data: bytes, shared: NDArray[np.int32], from_decider: bool) -> Po
         curvature=curvature,
         converged=converged,
     )
+
+
+# --- which shared keyframes still pull
+
+
+_VERSION = struct.Struct("<I")
+
+
+def write_mask(version: int, active: NDArray[np.bool_]) -> bytes:
+    """Bytes of a mask of the shared keyframes [s]: its version, then one bit each."""
+    return _VERSION.pack(version) + np.packbits(active, bitorder="little").tobytes()
+
+
+def read_mask(data: bytes, count: int) -> tuple[int, NDArray[np.bool_]]:
+    """Version and mask [count] of shared keyframes.
+
+    Args:
+        data: of the message.
+        count: number of keyframes that the link shares.
+    Raises:
+        MalformedError: another length, or bits beyond the last keyframe.
+    """
+    if len(data) != _VERSION.size + -(-count // 8):
+        raise MalformedError(f"mask: {len(data)} bytes for {count} shared keyframes")
+    (version,) = _VERSION.unpack_from(data)
+    bits = np.unpackbits(np.frombuffer(data, np.uint8, offset=_VERSION.size), bitorder="little")
+    if bits[count:].any():
+        raise MalformedError(f"mask: names more than {count} shared keyframes")
+    return version, bits[:count].astype(bool)
