@@ -152,7 +152,9 @@ class PoseAgent:
             slots=np.asarray(shared.keyframes, dtype=np.int64),
             closures=closures,
             factors=RelativePoses.empty(),
-            robust=RobustWeights(kept.astype(np.float64), self.config),
+            robust=RobustWeights(
+                kept.astype(np.float64), self.config, first_mu=self.config.team_schedule().first_mu
+            ),
             penalties=np.full(2, np.float64(np.float32(self.config.penalty_start))),
         )
         self.links = {name: self.links[name] for name in sorted(self.links)}

@@ -252,7 +252,9 @@ class EliminationSolver:
             slots = len(variables) + np.searchsorted(link.shared.keyframes, peer)
             own = [c.own_keyframe for c in link.closures]
             factors = closures_as_relative_poses(link.closures, own, slots, self.config.closures)
-            self._held[link.name] = RobustWeights(link.keep.astype(np.float64), self.config)
+            first_mu = self.config.team_schedule().first_mu
+            keep = link.keep.astype(np.float64)
+            self._held[link.name] = RobustWeights(keep, self.config, first_mu=first_mu)
             weighted.append((factors, self._held[link.name]))
             copies: list[Variable] = [(link.index, k) for k in keyframes]
             variables += copies

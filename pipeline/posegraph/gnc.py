@@ -26,10 +26,16 @@ def graduated_weights(squared: Array, c2: float, mu: float) -> Array:
     return np.where(squared <= low, 1.0, np.where(squared >= high, 0.0, between))
 
 
-def first_control(squared: Array, config: PoseConsensusConfig) -> float:
-    """Where the schedule begins: a share of the control parameter at which the worst factor is just convex."""
+def first_control(squared: Array, config: PoseConsensusConfig, first_mu: float = 0.0) -> float:
+    """Where the schedule begins: a share of the control parameter at which the worst factor is just convex.
+
+    Args:
+        squared: [m], squared residuals.
+        config: the least and the greatest control parameter, and the share.
+        first_mu: at least this.
+    """
     c2, (least, last) = config.truncation**2, config.robust_mu
-    least = max(least, config.team_schedule().first_mu)
+    least = max(least, first_mu)
     beyond = 2 * float(squared.max()) - c2
     convex = c2 / beyond if beyond > 0 else last
     return min(max(least, config.robust_convexity * convex), last)
@@ -51,7 +57,15 @@ class RobustWeights:
         done: they are final.
     """
 
-    def __init__(self, start: Array, config: PoseConsensusConfig) -> None:
+    def __init__(self, start: Array, config: PoseConsensusConfig, *, first_mu: float = 0.0) -> None:
+        """Before the schedule.
+
+        Args:
+            start: [m], the weights until the warm-up is over.
+            config: threshold and schedule.
+            first_mu: the schedule begins here at the least.
+        """
+        self.first_mu = first_mu
         self.weights, self.config = start, config
         self.scheduled = self.done = not (config.robust and len(start))
         self._mu: float | None = None  # None while warming up
@@ -79,7 +93,7 @@ class RobustWeights:
         if self._mu is None:
             if c.robust_skip and np.all(squared <= c2):  # no outlier: every truncated weight is one
                 return self._finish(np.ones(len(squared)))
-            self._mu = first_control(squared, c)
+            self._mu = first_control(squared, c, self.first_mu)
         else:
             self._mu *= c.robust_growth
         self._changed_at = received
