@@ -67,7 +67,7 @@ def test_walks_that_meet_too_rarely_are_refused():
 
 def test_both_solvers_find_a_better_selection_than_the_reference(tmp_path):
     """In a small town false clusters may fit; nothing true is lost, and the truncated cost is below the truth's."""
-    write(generate(3, 60, 60, 0.5, seed=0), tmp_path / "town")
+    write(generate(3, 50, 40, 0.5, seed=0), tmp_path / "town")
     costs = []
     for solver in ("admm", "elimination"):
         result = solve.solve(tmp_path / "town", settings(solver, "gnc"))
