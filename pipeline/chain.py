@@ -64,13 +64,16 @@ class Chain:
         log, carrier = self._recording.log(robot), self._carrier
         folder = carrier.folder / "robots" / robot
         digest = self._digests.of(log).content if carrier.store is not None else ""
+        inputs = {"log": digest}
 
         def track_and_map(timing: Timing) -> dict[str, int]:
             size = steps.check_log(log, robot)
             folder.mkdir(parents=True, exist_ok=True)
             settings = carrier.settings_of(stages.FRONTEND)
+            checkpoints = carrier.checkpoints(carrier.key(stages.FRONTEND, robot, inputs))
             with timing.stage(stages.FRONTEND, folder, robot):
-                parts = steps.frontend(log, folder, settings, threads=threads)
+                parts = steps.frontend(log, folder, settings, threads=threads, checkpoints=checkpoints)
+            timing.went_on(label("frontend", robot), *checkpoints.before_s)
             timing.stages[label("frontend", robot)]["parts"] = parts
             made = [sum(1 for _ in read_log(path, [topics.KEYFRAME])) for path in folder.glob("*.mcap")]
             return size | {"keyframes": sum(made)}
@@ -79,7 +82,7 @@ class Chain:
             for of_component in steps.move_components(robot, folder).values():
                 yield of_component / "frontend.mcap"
 
-        front = carrier.carry(stages.FRONTEND, robot, {"log": digest}, track_and_map, files=written)
+        front = carrier.carry(stages.FRONTEND, robot, inputs, track_and_map, files=written)
         names = [Path(name).parts[1] for name in front.entry.files]
         if alone:
             return {name: Prepared(front, None) for name in names}

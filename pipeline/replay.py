@@ -11,6 +11,7 @@ from pathlib import Path
 
 from duagc.pipeline import steps
 from duagc.pipeline.base import determinism
+from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.files import check_file
@@ -119,7 +120,7 @@ def _prepare(log: Path, robot: str, folder: Path, config: RunConfig) -> None:
     folder.mkdir()
     threads = steps.threads_per_worker(1)
     with stages.FRONTEND.running(folder, robot):
-        steps.frontend(log, folder, config, threads=threads)
+        steps.frontend(log, folder, config, threads=threads, checkpoints=Checkpoints())
     for name, of_component in steps.move_components(robot, folder).items():
         with stages.INFORMATION.running(of_component, name):
             steps.information(log, of_component, config, threads=threads)

@@ -15,6 +15,7 @@ from duagc.pipeline.base.component_names import component_name
 from duagc.pipeline.base.errors import DuagError
 
 if TYPE_CHECKING:
+    from duagc.pipeline.base.checkpoints import Checkpoints
     from duagc.pipeline.config.run import RunConfig
     from duagc.pipeline.recording import Recording
     from duagc.pipeline.runs.robot_data import AgentInput, SessionResult
@@ -73,7 +74,9 @@ def check_log(log: Path, robot: str) -> dict[str, int]:
         return {"frames": len(camera), "pixels": camera.camera.width * camera.camera.height}
 
 
-def frontend(log: Path, folder: Path, config: RunConfig, *, threads: int) -> dict[str, float]:
+def frontend(
+    log: Path, folder: Path, config: RunConfig, *, threads: int, checkpoints: Checkpoints
+) -> dict[str, float]:
     """Track and map one robot.
 
     Args:
@@ -81,6 +84,7 @@ def frontend(log: Path, folder: Path, config: RunConfig, *, threads: int) -> dic
         folder: where frontend.mcap goes; frontend.2.mcap, of a component that did not join the largest one, too.
         config: of the run.
         threads: of the kernels; changes no bit of the result.
+        checkpoints: from which it goes on, and to which it saves; they change no bit of the result.
 
     Returns:
         Wall times of its parts.
@@ -89,7 +93,13 @@ def frontend(log: Path, folder: Path, config: RunConfig, *, threads: int) -> dic
 
     determinism.configure_opencv()
     return run_frontend(
-        log, folder / "frontend.mcap", config.frontend, seed=config.seed, threads=threads, progress=True
+        log,
+        folder / "frontend.mcap",
+        config.frontend,
+        seed=config.seed,
+        threads=threads,
+        progress=True,
+        checkpoints=checkpoints,
     )
 
 

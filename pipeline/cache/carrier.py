@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
+from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.cache.file_digests import FileDigest, FileDigests
 from duagc.pipeline.cache.stage_key import StageKey
 from duagc.pipeline.cache.store import DamagedEntryError, Store, StoredResults
@@ -137,9 +138,24 @@ class Carrier:
         with self.store.claimed(key, lambda: self.say(f"{words(key)}: another process computes it; waiting")):
             if (entry := self._take(key)) is not None:
                 return Carried(entry, False)
+            if key.stage in self.again:
+                self.store.forget_checkpoints(key)
             entry = self._compute(key, stage, compute, files)
-            self._keep(entry)
+            if self._keep(entry):
+                self.store.forget_checkpoints(key)
             return Carried(entry, True)
+
+    def checkpoints(
+        self, key: StageKey, report: Callable[[str, int, int], None] = lambda part, done, total: None
+    ) -> Checkpoints:
+        """Where a stage saves how far it is, and from where it goes on.
+
+        Args:
+            key: of the stage.
+            report: gets every step of it.
+        """
+        folder = None if self.store is None else self.store.checkpoints(key)
+        return Checkpoints(folder, say=lambda line: self.say(f"{words(key)}: {line}"), report=report)
 
     def changes(self, key: StageKey, earlier: str | None = None) -> list[str]:
         """What is other than in stored results, in words.
@@ -184,6 +200,7 @@ class Carrier:
             self.say(f"{error}; {words(key)} is computed again")
             self.store.forget(key)
             return None
+        self.store.forget_checkpoints(key)
         self.begun(key, True)
         return entry
 
@@ -207,8 +224,8 @@ class Carrier:
         for pattern in stage.writes_files:
             yield from folder.glob(pattern)
 
-    def _keep(self, entry: StoredResults) -> None:
-        """Keep results; a run goes on where a store has no room for them."""
+    def _keep(self, entry: StoredResults) -> bool:
+        """Keep results, if the store has room for them; the run goes on anyway."""
         assert self.store is not None
         if entry.key.stage in self.again and (stored := self.store.find(entry.key)) is not None:
             names = sorted({*stored.files, *entry.files})
@@ -224,6 +241,8 @@ class Carrier:
             self.say(
                 f"warning: {self.store.folder}: {error.strerror or error}; {words(entry.key)} is not kept"
             )
+            return False
+        return True
 
 
 def intact(folder: Path, entry: StoredResults, digests: FileDigests) -> str:

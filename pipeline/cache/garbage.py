@@ -11,7 +11,7 @@ from pathlib import Path
 
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.cache.publish import publish
-from duagc.pipeline.cache.store import LEFTOVER_S, _read
+from duagc.pipeline.cache.store import CHECKPOINTS, LEFTOVER_S, _read
 
 LEFTOVER_NS = LEFTOVER_S * 1_000_000_000
 
@@ -74,6 +74,12 @@ def collect(folder: Path, largest_bytes: int, dry: bool = False) -> Collected:
             freed += found.st_size
             if not dry:
                 path.unlink(missing_ok=True)
+    for unfinished in (folder / CHECKPOINTS).glob("*"):
+        states = [found for _, found in _files(unfinished)]
+        if now_ns - max((found.st_mtime_ns for found in states), default=0) > LEFTOVER_NS:
+            freed += sum(found.st_size for found in states)
+            if not dry:
+                shutil.rmtree(unfinished, ignore_errors=True)
     if not dry:
         _forget_files(folder)
         for claimed in (folder / "claims").glob("*.dead"):

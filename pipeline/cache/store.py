@@ -3,6 +3,7 @@
     objects/<2 hex>/<64 hex>              bytes of a result, named by their SHA-256
     entries/<stage>/<robot>/<64 hex>.json results of a computation, named by its key
     claims/<64 hex>/                      computations that somebody does now
+    checkpoints/<64 hex>/                 where a computation is that was not finished (`base.checkpoints`)
     files/*.json, code.json               digests of files and of code, so that they are not read twice
 
 Everything appears by rename, and every object is compared with its name when it is used. Nothing needs a lock.
@@ -28,6 +29,7 @@ from duagc.pipeline.cache.publish import publish, temporary
 from duagc.pipeline.cache.stage_key import StageKey
 
 ENVIRONMENT, FOLDER = "DUAGC_STORE", ".duagc-store"
+CHECKPOINTS = "checkpoints"
 SCHEMA = 1
 TEAM = "team"  # in place of a robot, which cannot be named so in a folder of entries of a stage of the team
 LEFTOVER_S = 3600  # a file without its final name that is older was left by a process that is dead
@@ -170,6 +172,22 @@ class Store:
         """
         with suppress(OSError):
             self._entry(key).unlink()
+
+    def checkpoints(self, key: StageKey) -> Path:
+        """The folder in which a computation saves where it is.
+
+        Args:
+            key: of the computation.
+        """
+        return self.folder / CHECKPOINTS / key.digest
+
+    def forget_checkpoints(self, key: StageKey) -> None:
+        """Remove them.
+
+        Args:
+            key: of the computation, which is finished or begins anew.
+        """
+        shutil.rmtree(self.checkpoints(key), ignore_errors=True)
 
     @contextmanager
     def claimed(self, key: StageKey, waiting: Callable[[], None]) -> Iterator[bool]:

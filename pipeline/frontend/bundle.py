@@ -13,11 +13,13 @@ keyframes, the best few become pairs, and the number of rounds is bounded. Only 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Protocol
+from functools import partial
+from typing import Any, Protocol
 
 import numpy as np
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.frontend import KeyframeConfig
 from duagc.pipeline.frontend.keyframe_graph import OptimizedKeyframes, overlap, solve_pose_graph
 from duagc.pipeline.geometry import se3
@@ -71,6 +73,8 @@ def optimize(
     *,
     config: KeyframeConfig,
     registration: RegistrationConfig,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
+    part: str = "bundle",
 ) -> tuple[OptimizedKeyframes, list[RelativePose]]:
     """Keyframe poses that explain the images of all overlapping keyframes best; the first keyframe stays.
 
@@ -82,6 +86,8 @@ def optimize(
             images of a pair cannot be compared.
         config: numbers of rounds and neighbors.
         registration: settings of the costs.
+        checkpoints: of the stage.
+        part: its name there.
 
     Returns:
         The poses, and one factor per pair of keyframes: sum of factors = the joint cost at the answer, to second order.
@@ -92,7 +98,11 @@ def optimize(
     coarse_rounds = config.coarse_rounds if _is_far(T_map_keyframes, tracked, config.coarse_from) else 0
     factors = list(tracked)
     ends: list[Ends] = []
-    for index in range(config.optimization_rounds):
+    first = 0
+    if (saved := checkpoints.resume(part)) is not None:
+        first, (solution, factors, ends, expanded) = saved
+        costs.go_on(expanded)
+    for index in range(first, config.optimization_rounds):
         T = solution.T_map_keyframe
         if index in (0, coarse_rounds, config.optimization_rounds // 2):
             ends = _in_order({(pair.i, pair.j) for pair in tracked} | set(neighborhood.pairs(T)))
@@ -102,7 +112,16 @@ def optimize(
         moved_m, turned_rad = se3.distance(T, solution.T_map_keyframe)
         if index > coarse_rounds and max(moved_m.max(), turned_rad.max()) < CONVERGED:
             break
+        state = partial(_state, solution, factors, ends, costs)
+        checkpoints.at(part, index + 1, config.optimization_rounds, state)
     return solution, factors
+
+
+def _state(
+    solution: OptimizedKeyframes, factors: list[RelativePose], ends: list[Ends], costs: _Costs
+) -> tuple[Any, ...]:
+    """From which the optimization can go on."""
+    return solution, factors, ends, costs.expanded()
 
 
 def _in_order(pairs: Iterable[Ends]) -> list[Ends]:
@@ -134,6 +153,18 @@ class _Costs:
         self._found: dict[Ends, RelativePose | None] = {}  # None: the images cannot be compared
         self._where: dict[Ends, tuple[Array, int]] = {}  # motion and level of the last expansion
         self._exposures: dict[Ends, tuple[float, float]] = {}  # of (reference, target)
+
+    def expanded(self) -> tuple[Any, ...]:
+        """All that was expanded; `go_on` takes it."""
+        return self._found, self._where, self._exposures
+
+    def go_on(self, expanded: tuple[Any, ...]) -> None:
+        """Go on from what was expanded before.
+
+        Args:
+            expanded: by other costs of the same keyframes.
+        """
+        self._found, self._where, self._exposures = expanded
 
     def factors(self, ends: Sequence[Ends]) -> list[RelativePose]:
         """The quadratics of pairs; of one that cannot be compared, the registration of tracking, if there is one.

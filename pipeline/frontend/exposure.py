@@ -11,11 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.exposure import ExposureConfig
 from duagc.pipeline.config.frontend import is_held_out
 from duagc.pipeline.frontend.failure import Reason
@@ -156,11 +158,15 @@ class ExposureEstimation:
         read: a frame of the log, by its index.
         camera: of all frames.
         config: settings.
+        checkpoints: of the stage.
+        part: its name there.
     """
 
     read: Callable[[int], RgbdFrame]
     camera: PinholeCamera
     config: ExposureConfig
+    checkpoints: Checkpoints = NO_CHECKPOINTS
+    part: str = "exposures"
 
     def run(
         self,
@@ -182,31 +188,40 @@ class ExposureEstimation:
         if self.config.mode == "off":
             return ExposureTrack()
         blocks = [self._blocks(index) for index in keyframes]
-        compared = []
-        for i, j in sorted(set(pairs)):
+
+        def of_pair(pair: Pair) -> list[ComparedPair]:
+            i, j = pair
             T_i_j = se3.inverse(T_map_keyframe[i]) @ T_map_keyframe[j]
-            compared += compare((keyframes[i], blocks[i]), (keyframes[j], blocks[j]), T_i_j, self.config)
+            return compare((keyframes[i], blocks[i]), (keyframes[j], blocks[j]), T_i_j, self.config)
+
+        of_pairs = self.checkpoints.each(f"{self.part}.keyframes", sorted(set(pairs)), of_pair)
+        compared = list(chain.from_iterable(of_pairs))
         usable = _usable(frames, keyframes)
         first = set(evenly_spaced(len(usable), min(FRAMES_TO_DECIDE, len(usable))))
-        compared += self._compared([usable[k] for k in sorted(first)], keyframes, blocks)
+        compared += self._compared("some", [usable[k] for k in sorted(first)], keyframes, blocks)
         if self.config.mode == "auto" and not differ(compared, self.config):
             return ExposureTrack()
         others = [frame for k, frame in enumerate(usable) if k not in first]
-        return solve_exposures([*compared, *self._compared(others, keyframes, blocks)], self.config)
+        return solve_exposures([*compared, *self._compared("frames", others, keyframes, blocks)], self.config)
 
     def _blocks(self, frame_index: int) -> ColorBlocks:
         return ColorBlocks.of(self.read(frame_index), self.camera, self.config.width_px)
 
     def _compared(
-        self, frames: Iterable[TrackedFrame], keyframes: Sequence[int], blocks: Sequence[ColorBlocks]
+        self,
+        which: str,
+        frames: Sequence[TrackedFrame],
+        keyframes: Sequence[int],
+        blocks: Sequence[ColorBlocks],
     ) -> list[ComparedPair]:
         """Frames compared with their keyframes."""
-        compared = []
-        for frame in frames:
+
+        def of_frame(frame: TrackedFrame) -> list[ComparedPair]:
             k, own = frame.keyframe_index, self._blocks(frame.frame_index)
             ends = (keyframes[k], blocks[k]), (frame.frame_index, own)
-            compared += compare(*ends, frame.T_keyframe_camera, self.config)
-        return compared
+            return compare(*ends, frame.T_keyframe_camera, self.config)
+
+        return list(chain.from_iterable(self.checkpoints.each(f"{self.part}.{which}", frames, of_frame)))
 
 
 def _usable(frames: Sequence[TrackedFrame], keyframes: Sequence[int]) -> list[TrackedFrame]:

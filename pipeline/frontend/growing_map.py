@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,6 +40,19 @@ class GrowingMap:
 
     def __len__(self) -> int:
         return len(self.gaussians)
+
+    def state(self) -> tuple[Any, ...]:
+        """All that it knows; `go_on` takes it."""
+        return self.gaussians, self.contribution, self.next_id, self.adam.state()
+
+    def go_on(self, state: tuple[Any, ...]) -> None:
+        """Go on from where another one was.
+
+        Args:
+            state: of that one.
+        """
+        self.gaussians, self.contribution, self.next_id, adam = state
+        self.adam.go_on(adam)
 
     def append(self, new: Gaussians) -> None:
         """Add Gaussians, whose contribution is not measured yet.

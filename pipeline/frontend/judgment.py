@@ -15,6 +15,7 @@ from enum import Enum
 
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.frontend import FrontendConfig, JudgmentConfig
 from duagc.pipeline.frontend.bundle import KeyframeView
 from duagc.pipeline.frontend.failure import Reason, free_space_violations
@@ -63,6 +64,8 @@ def judge(
     *,
     seed: int,
     robot: str,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
+    part: str = "judgment",
 ) -> Judgment:
     """Judge the poses of all keyframes.
 
@@ -73,10 +76,16 @@ def judge(
         config: limits.
         seed: of the random stream.
         robot: of the random stream.
+        checkpoints: of the stage.
+        part: its name there.
     """
     verdicts: dict[Ends, PairVerdict] = {}
     by_features: list[RelativePose] = []
-    for ends in _judged(len(views), factors, config.keyframes.judgment):
+    pairs = _judged(len(views), factors, config.keyframes.judgment)
+    done = 0
+    if (saved := checkpoints.resume(part)) is not None:
+        done, (verdicts, by_features) = saved
+    for count, ends in enumerate(pairs[done:], done + 1):
         first, second = ends
         T_first_second = se3.inverse(T_map_keyframes[first]) @ T_map_keyframes[second]
         rng = random_streams.generator(seed, "frontend.judgment", robot=robot, first=first, second=second)
@@ -91,6 +100,7 @@ def judge(
         else:
             verdicts[ends] = PairVerdict.FEATURES
             by_features.append(RelativePose(first, second, found.T_first_second, found.information))
+        checkpoints.at(part, count, len(pairs), lambda: (verdicts, by_features))
     parts = _parts(len(views), verdicts)
     sizes = {part: parts.count(part) for part in set(parts)}
     main = max(sizes, key=lambda part: (sizes[part], -part))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.frontend import LoopConfig
 from duagc.pipeline.frontend.bundle import Images, KeyframeView
 from duagc.pipeline.frontend.keyframe_graph import overlap
@@ -26,6 +27,8 @@ def find_loops(
     registration: RegistrationConfig,
     seed: int,
     robot: str,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
+    part: str = "loops",
 ) -> list[RelativePose]:
     """Pairs of keyframes that show the same place although by their poses they overlap little or not at all.
 
@@ -40,10 +43,12 @@ def find_loops(
         registration: settings of the registrations.
         seed: of the random stream.
         robot: of the random stream.
+        checkpoints: of the stage.
+        part: its name there.
     """
-    found = []
+    first_left, found = checkpoints.resume(part) or (config.min_gap, [])
     places = Places([view.features.descriptors[: config.features_compared] for view in views])
-    for second in range(config.min_gap, len(views)):
+    for second in range(first_left, len(views)):
         candidates = _resembling(views, second, places, config)
         for first in candidates:
             T_first_second = se3.inverse(T_map_keyframes[first]) @ T_map_keyframes[second]
@@ -60,6 +65,7 @@ def find_loops(
             )
             if verified.failure is None:
                 found.append(RelativePose(first, second, verified.T_first_second, verified.information))
+        checkpoints.at(part, second + 1, len(views), lambda: found)
     return found
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from duagc.pipeline.base import random_streams
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.bundle import Images
 from duagc.pipeline.frontend.failure import Reason, free_space_violations
@@ -50,6 +51,8 @@ def found_afterwards(
     images: Images,
     *,
     config: FrontendConfig,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
+    part: str = "lost frames",
 ) -> list[TrackedFrame]:
     """The frames, with poses of those lost ones that are found between their neighbors.
 
@@ -59,12 +62,15 @@ def found_afterwards(
         T_map_keyframes: [k, 4, 4], optimized.
         images: reads the images of a frame of the log, by its index.
         config: of the front end.
+        checkpoints: of the stage.
+        part: its name there.
     """
     if not config.tracking.relocalization.look_again:
         return list(frames)
     posed = [k for k, frame in enumerate(frames) if frame.status is not Status.LOST]
-    out = list(frames)
-    for k, frame in enumerate(frames):
+    done, out = checkpoints.resume(part) or (0, list(frames))
+    for k, frame in enumerate(frames[done:], done):
+        checkpoints.at(part, k, len(frames), lambda: out)
         after = int(np.searchsorted(posed, k))
         if frame.status is not Status.LOST or frame.reason not in LOOKED_FOR or after in (0, len(posed)):
             continue

@@ -6,12 +6,14 @@ final optimization; the others are registered to the finished map where depth is
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
 from duagc.pipeline.base import progress as progress_bar
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.base.lap_times import LapTimes
 from duagc.pipeline.config.frontend import FrontendConfig, is_held_out
 from duagc.pipeline.frontend.failure import Reason
@@ -25,6 +27,8 @@ from duagc.pipeline.geometry.statistics import evenly_spaced
 from duagc.pipeline.messages import Keyframe, MapUpdate
 from duagc.pipeline.recording import RgbdLog
 from duagc.pipeline.registration.moving import FreeSpace
+
+Result = TypeVar("Result")
 
 
 class MapBuilder:
@@ -41,6 +45,7 @@ class MapBuilder:
         seed: int,
         threads: int = 1,
         progress: bool = False,
+        checkpoints: Checkpoints = NO_CHECKPOINTS,
     ) -> None:
         """Begin with an empty map.
 
@@ -53,7 +58,9 @@ class MapBuilder:
             seed: of the run.
             threads: of the rasterizer; changes no bit.
             progress: whether it is shown.
+            checkpoints: of the stage.
         """
+        self._checkpoints = checkpoints
         self.log, self.config, self.name, self.exposures = log, config, name, exposures
         self._threads, self._progress = threads, progress
         self._mapper = Mapper(log.camera, config.mapping, seed, threads=threads, depth_noise_m=noise_m)
@@ -71,14 +78,18 @@ class MapBuilder:
         """
         for keyframe in keyframes:
             self._free.add(self.log.frame(keyframe.frame_index).usable_depth, keyframe.T_map_camera)
-        steps = progress_bar.track(keyframes, f"mapping {self.name}") if self._progress else keyframes
-        updates = [self._update(keyframe, self._grow(keyframe)) for keyframe in steps]
+        save = self._checkpoints
+        updates, state = save.done(f"{self.name}.mapping", lambda: self._grown(keyframes))
+        self._restore(keyframes, state)
         unrefined = self._mapper.gaussians
         clock.lap("mapping_s")
         supporting = supporting_frames(frames, keyframes, self.config)
         for frame in supporting:
             self._support(frame, keyframes[frame.keyframe_index])
-        updates.append(self._update(keyframes[-1], self._mapper.finalize()))
+        part = f"{self.name}.final"
+        stats, state = save.done(part, lambda: (self._mapper.finalize(save, part), self._mapper.state()))
+        self._mapper.go_on(state)
+        updates.append(self._update(keyframes[-1], stats))
         clock.lap("final_refinement_s")
         maps = Maps(self._mapper.gaussians, unrefined, self._mapper.depth)
         before, after = np.array([k.T_map_camera for k in keyframes]), self._mapper.keyframe_poses
@@ -90,10 +101,32 @@ class MapBuilder:
         clock.lap("model_s")
         return BuiltMap(updates, maps, registered, after)
 
-    def _grow(self, keyframe: Keyframe) -> MappingStats:
-        """Add a keyframe to the map."""
+    def _grown(self, keyframes: Sequence[Keyframe]) -> tuple[list[MapUpdate], Any]:
+        """Add all keyframes to the map; the messages about it, and the state of the map."""
+        part = f"{self.name}.mapping"
+        updates: list[MapUpdate] = []
+        done, state = 0, None
+        if (saved := self._checkpoints.resume(part)) is not None:
+            done, (updates, state) = saved
+        self._restore(keyframes[:done], state)
+        left = keyframes[done:]
+        for keyframe in progress_bar.track(left, f"mapping {self.name}") if self._progress else left:
+            stats = self._with_images(self._mapper.add_keyframe, keyframe)
+            updates.append(self._update(keyframe, stats))
+            self._checkpoints.at(part, len(updates), len(keyframes), lambda: (updates, self._mapper.state()))
+        return updates, self._mapper.state()
+
+    def _restore(self, keyframes: Sequence[Keyframe], state: Any) -> None:
+        """Bring the mapper to a state, with images of the log."""
+        for keyframe in keyframes[len(self._mapper.keyframe_poses) :]:
+            self._with_images(self._mapper.put_back, keyframe)
+        if state is not None:
+            self._mapper.go_on(state)
+
+    def _with_images(self, do: Callable[..., Result], keyframe: Keyframe) -> Result:
+        """Hand a keyframe to the mapper."""
         frame = self.log.frame(keyframe.frame_index)
-        return self._mapper.add_keyframe(
+        return do(
             keyframe.keyframe_index,
             frame.color,
             frame.depth,
@@ -137,13 +170,14 @@ class MapBuilder:
             threads=self._threads,
         )
         reasons = {Reason.NO_DEPTH} if self._mapper.exact_depth else {Reason.NO_DEPTH, Reason.NONE}
-        out = []
-        for frame in progress_bar.track(frames, f"registering {self.name}") if self._progress else frames:
+
+        def registered(frame: TrackedFrame) -> TrackedFrame:
             if frame.status is not Status.LOST and frame.reason in reasons and frame.frame_index not in views:
                 images = self.log.frame(frame.frame_index)
-                frame = model.register(frame, images, T_map_keyframe[frame.keyframe_index])
-            out.append(frame)
-        return out
+                return model.register(frame, images, T_map_keyframe[frame.keyframe_index])
+            return frame
+
+        return self._checkpoints.each(f"{self.name}.model", frames, registered)
 
     def _update(self, keyframe: Keyframe, stats: MappingStats) -> MapUpdate:
         """The message about a step of mapping."""

@@ -10,11 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from duagc.pipeline.base import random_streams
+from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.mapping import MappingConfig
 from duagc.pipeline.config.training import LearningRates
 from duagc.pipeline.frontend.growing_map import GrowingMap
@@ -110,6 +113,30 @@ class Mapper:
         """Poses [m, 4, 4] of the supporting frames, in the order in which they were added; `finalize` refines them."""
         return np.array([view.T_map_camera for view in self._support]).reshape(-1, 4, 4)
 
+    def state(self) -> tuple[Any, ...]:
+        """The map and the poses of the views; `go_on` takes it."""
+        return self._map.state(), [view.T_map_camera for view in (*self._views, *self._support)]
+
+    def go_on(self, state: tuple[Any, ...]) -> None:
+        """Go on from where another one was.
+
+        Args:
+            state: of that one, which had the views that are here now.
+        """
+        of_map, poses = state
+        self._map.go_on(of_map)
+        for view, T_map_camera in zip((*self._views, *self._support), poses, strict=True):
+            view.T_map_camera = T_map_camera
+
+    def put_back(self, *view: Any, **more: Any) -> None:
+        """Take in a keyframe of which a state follows, and do nothing for it.
+
+        Args:
+            view: as of `add_keyframe`.
+            more: as of `add_keyframe`.
+        """
+        self._views.append(View.of(*view, huber_m=self._loss_weights.depth_huber_m, **more))
+
     def add_keyframe(
         self,
         keyframe_index: int,
@@ -201,30 +228,37 @@ class Mapper:
         )
         self._support.append(view)
 
-    def finalize(self) -> MappingStats:
+    def finalize(self, checkpoints: Checkpoints = NO_CHECKPOINTS, part: str = "final") -> MappingStats:
         """Optimize geometry, color and, where depth is not exact, poses over all views at full size.
 
         The views come in random order, each once before any comes again. In the first half, what contributes
         nothing is replaced `densify_rounds` times by discs where the keyframes are drawn worst.
+
+        Args:
+            checkpoints: of the stage.
+            part: its name there.
 
         Returns:
             Counts of the whole optimization, losses as means over all keyframes at full size.
         """
         config = self.config
         views = [*self._views, *self._support]
-        before = self._mean_loss()
-        inserted, pruned = self._cover()
+        first, found = checkpoints.resume(part) or (0, None)
+        before, inserted, pruned = (self._mean_loss(), *self._cover()) if found is None else found[0]
         wanted = max(config.final_iterations * len(self._views), config.final_iterations_view * len(views))
         steps = min(wanted, config.final_iterations_max)
         rounds = [steps * (k + 1) // (2 * config.densify_rounds + 2) for k in range(config.densify_rounds)]
         self._map.adam.freeze_after(None)
         poses = PoseSteps([view.information for view in views])
         refined = config.pose_rate > 0 and not self.exact_depth  # where depth is exact, so are the poses
-        order = np.zeros(0, np.int64)
-        for step in range(steps):
+        if found is not None:
+            poses.go_on(found[1])
+            self.go_on(found[2])
+        for step in range(first, steps):
             position = step % len(views)
-            if position == 0:
-                order = random_streams.generator(self.seed, "mapping.finish", start=step).permutation(
+            if position == 0 or step == first:
+                start = step - position
+                order = random_streams.generator(self.seed, "mapping.finish", start=start).permutation(
                     len(views)
                 )
             if step in rounds:
@@ -236,8 +270,14 @@ class Mapper:
             chosen = int(order[position])
             pose_step = poses.of(chosen, config.pose_rate * share) if refined and chosen else None
             self._optimize(views[chosen], 0, config.rates.times(share), pose_step=pose_step)
+            state = partial(self._optimized, (before, inserted, pruned), poses)
+            checkpoints.at(part, step + 1, steps, state)
         pruned += self._map.prune_degenerate()
         return MappingStats(inserted, pruned, len(self._map), before, self._mean_loss())
+
+    def _optimized(self, so_far: tuple[float, int, int], poses: PoseSteps) -> tuple[Any, ...]:
+        """From which the final optimization can go on."""
+        return so_far, poses.state(), self.state()
 
     # --- one view -----------------------------------------------------------------------------------------------
 

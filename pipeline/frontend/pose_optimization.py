@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from duagc.pipeline.base.checkpoints import NO_CHECKPOINTS, Checkpoints
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend import bundle, loops
 from duagc.pipeline.frontend.bundle import Images
@@ -52,12 +53,16 @@ class PathOptimization:
         config: of the front end.
         seed: of the random streams.
         robot: of the random streams.
+        checkpoints: of the stage.
+        part: its name there.
     """
 
     images: Images
     config: FrontendConfig
     seed: int
     robot: str
+    checkpoints: Checkpoints = NO_CHECKPOINTS
+    part: str = "poses"
 
     def run(
         self,
@@ -75,7 +80,13 @@ class PathOptimization:
         path = self._consistent_path(keyframes, frames, pairs)
         T_map_keyframes = path.solution.T_map_keyframe
         found = found_afterwards(
-            path.frames, path.keyframes, T_map_keyframes, self.images, config=self.config
+            path.frames,
+            path.keyframes,
+            T_map_keyframes,
+            self.images,
+            config=self.config,
+            checkpoints=self.checkpoints,
+            part=f"{self.part}.lost",
         )
         return replace(path, frames=found)
 
@@ -86,31 +97,50 @@ class PathOptimization:
         pairs: Sequence[RelativePose],
     ) -> OptimizedPath:
         """Optimized poses that nothing contradicts."""
-        solution, factors = self._optimized(keyframes, pairs)
+        solution, factors = self._optimized(keyframes, pairs, 1)
         path = OptimizedPath(list(keyframes), list(frames), solution, factors)
         if not self.config.keyframes.judgment.enabled or len(keyframes) < 2:
             return path
-        judgment = self._judged(path)
+        judgment = self._judged(path, 1)
         if not judgment.contradicted:
             return path
         pairs = _corrected(pairs, judgment)
-        solution, factors = self._optimized(keyframes, pairs)
+        solution, factors = self._optimized(keyframes, pairs, 2)
         path = replace(path, solution=solution, factors=factors)
-        judgment = self._judged(path)
+        judgment = self._judged(path, 2)
         if not judgment.contradicted:
             return path
         path, pairs = _without_rejected(path, _corrected(pairs, judgment), judgment.contradicted)
-        solution, factors = self._optimized(path.keyframes, pairs)
+        solution, factors = self._optimized(path.keyframes, pairs, 3)
         return replace(path, solution=solution, factors=factors)
 
-    def _judged(self, path: OptimizedPath) -> Judgment:
-        T = path.solution.T_map_keyframe
-        return judge(T, path.keyframes, path.factors, self.config, seed=self.seed, robot=self.robot)
+    def _judged(self, path: OptimizedPath, attempt: int) -> Judgment:
+        part = f"{self.part}.judgment{attempt}"
+
+        def judged() -> Judgment:
+            return judge(
+                path.solution.T_map_keyframe,
+                path.keyframes,
+                path.factors,
+                self.config,
+                seed=self.seed,
+                robot=self.robot,
+                checkpoints=self.checkpoints,
+                part=part,
+            )
+
+        return self.checkpoints.done(part, judged)
 
     def _optimized(
-        self, keyframes: Sequence[TrackedKeyframe], pairs: Sequence[RelativePose]
+        self, keyframes: Sequence[TrackedKeyframe], pairs: Sequence[RelativePose], attempt: int
     ) -> tuple[OptimizedKeyframes, Sequence[RelativePose]]:
         """Keyframe poses by all their images together, and the factors of the pose graph."""
+        part = f"{self.part}.optimized{attempt}"
+        return self.checkpoints.done(part, lambda: self._solved(keyframes, pairs, part))
+
+    def _solved(
+        self, keyframes: Sequence[TrackedKeyframe], pairs: Sequence[RelativePose], part: str
+    ) -> tuple[OptimizedKeyframes, Sequence[RelativePose]]:
         settings, registration = self.config.keyframes, self.config.tracking.registration
         start = np.array([keyframe.T_map_keyframe for keyframe in keyframes])
         if len(keyframes) < 2 or not (settings.local_optimization or settings.loops.enabled):
@@ -121,19 +151,33 @@ class PathOptimization:
 
         if settings.loops.enabled:
             tracked = solve_pose_graph(start, pairs, settings.huber_sigmas).T_map_keyframe
-            found = loops.find_loops(
-                tracked,
-                keyframes,
-                images,
-                config=settings.loops,
-                registration=registration,
-                seed=self.seed,
-                robot=self.robot,
+            found = self.checkpoints.done(
+                f"{part}.loops",
+                lambda: loops.find_loops(
+                    tracked,
+                    keyframes,
+                    images,
+                    config=settings.loops,
+                    registration=registration,
+                    seed=self.seed,
+                    robot=self.robot,
+                    checkpoints=self.checkpoints,
+                    part=f"{part}.loops",
+                ),
             )
             pairs = [*pairs, *consistent_loops(tracked, pairs, found, settings.loops)]
         if not settings.local_optimization:
             return solve_pose_graph(start, pairs, settings.huber_sigmas), pairs
-        return bundle.optimize(start, keyframes, images, pairs, config=settings, registration=registration)
+        return bundle.optimize(
+            start,
+            keyframes,
+            images,
+            pairs,
+            config=settings,
+            registration=registration,
+            checkpoints=self.checkpoints,
+            part=f"{part}.bundle",
+        )
 
 
 def _corrected(pairs: Sequence[RelativePose], judgment: Judgment) -> list[RelativePose]:

@@ -7,7 +7,7 @@ The stage is offline in this sense; times in the log are those of the recording 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,14 +16,16 @@ import numpy as np
 from duagc.pipeline.base import determinism
 from duagc.pipeline.base import progress as progress_bar
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.checkpoints import Checkpoints
 from duagc.pipeline.base.component_names import component_name, submap_of
 from duagc.pipeline.base.errors import DuagError
 from duagc.pipeline.base.lap_times import LapTimes
+from duagc.pipeline.config.base import Config
 from duagc.pipeline.config.frontend import FrontendConfig
 from duagc.pipeline.frontend.bundle import Images
 from duagc.pipeline.frontend.components import Component
 from duagc.pipeline.frontend.exposure import ExposureEstimation
-from duagc.pipeline.frontend.failure import Reason
+from duagc.pipeline.frontend.failure import FrameIntervals, FrozenImageDetector, OcclusionDetector, Reason
 from duagc.pipeline.frontend.frame_images import RgbdImages, pyramid_of
 from duagc.pipeline.frontend.kept_pyramids import KeptPyramids
 from duagc.pipeline.frontend.leading_frames import track_leading_frames
@@ -38,14 +40,16 @@ from duagc.pipeline.frontend.output import (
     write_log,
 )
 from duagc.pipeline.frontend.pose_optimization import PathOptimization
+from duagc.pipeline.frontend.relocalization import Relocalizer
 from duagc.pipeline.frontend.submap_joining import join_submaps
 from duagc.pipeline.frontend.submaps import SubmapTracker, TrackedLog
-from duagc.pipeline.frontend.tracked import Status, TrackedFrame
+from duagc.pipeline.frontend.tracked import Status, TrackedFrame, TrackedKeyframe
+from duagc.pipeline.frontend.tracking import Tracker
 from duagc.pipeline.frontend.view_poses import moved_factors
 from duagc.pipeline.geometry.exposure import ExposureTrack
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.messages import Keyframe
-from duagc.pipeline.recording import RgbdLog, open_rgbd
+from duagc.pipeline.recording import MotionPrior, RgbdLog, open_rgbd
 from duagc.pipeline.registration import RgbdPyramid
 from duagc.pipeline.splat.gaussians import Gaussians
 
@@ -58,6 +62,7 @@ def run_frontend(
     seed: int = 0,
     threads: int = 1,
     progress: bool = False,
+    checkpoints: Checkpoints | None = None,
 ) -> dict[str, float]:
     """Track and map one robot's log.
 
@@ -68,6 +73,7 @@ def run_frontend(
         seed: of the run, for the mapping.
         threads: of the rasterizer; changes no bit of the result.
         progress: whether it is shown on standard error.
+        checkpoints: of this stage and robot, from which it goes on, and to which it saves; they change no bit.
 
     Returns:
         Wall times in seconds of tracking, pose optimization, mapping, final optimization of the map and writing.
@@ -76,11 +82,18 @@ def run_frontend(
         DuagError: the log is broken or empty.
     """
     determinism.configure_opencv()
-    clock = LapTimes()
+    clock, save = LapTimes(), checkpoints or Checkpoints()
     with open_rgbd(log_path) as log:
+        motion = log.motion_prior()
+        save.consist_of(
+            clock,
+            once=(TrackedKeyframe,),
+            allowed=_state_classes(),
+            known={"config": config, "motion": motion},
+        )
         if len(log) == 0:
             raise DuagError(f"{log_path}: has no image, expected at least one")
-        tracked = _track_moved(log, config, progress)
+        tracked = _Tracking(log, config, motion, progress, save).run()
         if not tracked.submaps[0].keyframes:
             reasons = ", ".join(sorted({frame.reason.value for frame in tracked.frames}))
             size = f"{log.camera.width} x {log.camera.height}"
@@ -90,7 +103,9 @@ def run_frontend(
             )
         noise_m = depth_noise_m(tracked.frames)
         clock.lap("tracking_s")
-        components = join_submaps(tracked.submaps, _images(log), config, seed=seed, robot=log.robot)
+        components = save.done(
+            "joined", lambda: join_submaps(tracked.submaps, _images(log), config, seed=seed, robot=log.robot)
+        )
         frames = [component.frames(tracked) for component in components]
         for name, at in _named(log.robot, components, frames):
             stage = _ComponentStage(
@@ -102,6 +117,7 @@ def run_frontend(
                 progress=progress,
                 noise_m=noise_m,
                 clock=clock,
+                checkpoints=save,
             )
             path = out_path if name == log.robot else component_path(out_path, name)
             stage.run(components[at], frames[at], tracked, path)
@@ -128,28 +144,58 @@ def _named(
     return [(robot, largest), *others]
 
 
-def _track(log: RgbdLog, config: FrontendConfig, progress: bool) -> TrackedLog:
-    """Track all frames in order."""
-    tracker = SubmapTracker(log.camera, config, log.motion_prior())
-    source = log.frames()
-    if progress:
-        source = progress_bar.track(source, f"tracking {log.robot}", len(log))
-    for frame in source:
-        tracker.track(RgbdImages.of(frame))
-    return tracker.finish()
+def _state_classes() -> tuple[type, ...]:
+    """What the state of the front end has besides data classes."""
+    from scipy.sparse import csc_array
+
+    return (Config, Tracker, Relocalizer, FrameIntervals, FrozenImageDetector, OcclusionDetector, csc_array)
 
 
-def _track_moved(log: RgbdLog, config: FrontendConfig, progress: bool) -> TrackedLog:
-    """Track all frames; where color and depth are of different times, again with depth moved by the first result."""
-    tracked = _track(log, config, progress)
-    if log.pairing.largest_offset_ns and tracked.submaps[0].keyframes:
-        log.move_depth(*_trajectories(tracked))
-        tracked = _track(log, config, progress)
-    if not tracked.submaps[0].keyframes:
+@dataclass(frozen=True)
+class _Tracking:
+    """Tracks all frames of a log in order."""
+
+    log: RgbdLog
+    config: FrontendConfig
+    motion: MotionPrior | None
+    progress: bool
+    checkpoints: Checkpoints
+
+    def run(self) -> TrackedLog:
+        """Track; where color and depth are of different times, again with depth moved by the first result."""
+        log = self.log
+        tracked = self.checkpoints.done("tracked", lambda: self._leading(self._pass()))
+        if tracked.submaps[0].keyframes:
+            log.move_depth(*_trajectories(tracked))
         return tracked
-    tracked = track_leading_frames(log, tracked, config)
-    log.move_depth(*_trajectories(tracked))
-    return tracked
+
+    def _leading(self, tracked: TrackedLog) -> TrackedLog:
+        if not tracked.submaps[0].keyframes:
+            return tracked
+        return track_leading_frames(self.log, tracked, self.config)
+
+    def _pass(self) -> TrackedLog:
+        log = self.log
+        tracked = self.checkpoints.done("tracked first", lambda: self._frames("tracking"))
+        if log.pairing.largest_offset_ns and tracked.submaps[0].keyframes:
+            log.move_depth(*_trajectories(tracked))
+            return self._frames("tracking again")
+        return tracked
+
+    def _frames(self, part: str) -> TrackedLog:
+        log, save = self.log, self.checkpoints
+        tracker = SubmapTracker(log.camera, self.config, self.motion)
+        begin = 0
+        if (saved := save.resume(part)) is not None:
+            begin, state = saved
+            tracker.go_on(state)
+        left: Iterable[int] = range(begin, len(log))
+        if self.progress:
+            left = progress_bar.track(left, f"{part} {log.robot}", len(log) - begin)
+        for index in left:
+            tracker.track(RgbdImages.of(log.frame(index)))
+            save.at(part, index + 1, len(log), tracker.state)
+        return tracker.finish()
 
 
 def _trajectories(tracked: TrackedLog) -> list[Trajectory]:
@@ -191,6 +237,7 @@ class _ComponentStage:
         progress: whether it is shown.
         noise_m: noise of the depth images.
         clock: of the stage.
+        checkpoints: of the stage.
     """
 
     log: RgbdLog
@@ -201,6 +248,7 @@ class _ComponentStage:
     progress: bool
     noise_m: float | None
     clock: LapTimes
+    checkpoints: Checkpoints
 
     def run(self, component: Component, frames: list[TrackedFrame], tracked: TrackedLog, path: Path) -> None:
         """Optimize the poses, map, and write the log.
@@ -211,19 +259,23 @@ class _ComponentStage:
             tracked: the log as it was tracked.
             path: of the log.
         """
-        log, clock = self.log, self.clock
-        optimized = PathOptimization(_images(log), self.config, self.seed, log.robot).run(
-            component.keyframes, frames, component.pairs
-        )
+        log, clock, save = self.log, self.clock, self.checkpoints
+        part = f"{self.name}.poses"
+        optimization = PathOptimization(_images(log), self.config, self.seed, log.robot, save, part)
+        optimized = save.done(part, lambda: optimization.run(component.keyframes, frames, component.pairs))
         solution, frames = optimized.solution, optimized.frames
         log.move_depth(_trajectory(frames, solution.T_map_keyframe))
         keyframes = keyframe_messages(self.name, optimized.keyframes, solution)
-        estimation = ExposureEstimation(log.frame, log.camera, self.config.exposure)
-        exposures = estimation.run(
-            [keyframe.frame_index for keyframe in keyframes],
-            solution.T_map_keyframe,
-            [(factor.i, factor.j) for factor in optimized.factors],
-            frames,
+        part = f"{self.name}.exposures"
+        estimation = ExposureEstimation(log.frame, log.camera, self.config.exposure, save, part)
+        exposures = save.done(
+            part,
+            lambda: estimation.run(
+                [keyframe.frame_index for keyframe in keyframes],
+                solution.T_map_keyframe,
+                [(factor.i, factor.j) for factor in optimized.factors],
+                frames,
+            ),
         )
         clock.lap("refinement_s")
         built = self._map(keyframes, frames, exposures)
@@ -268,6 +320,7 @@ class _ComponentStage:
             seed=self.seed,
             threads=self.threads,
             progress=self.progress,
+            checkpoints=self.checkpoints,
         )
         return builder.build(keyframes, frames, self.clock)
 

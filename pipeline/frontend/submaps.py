@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -96,6 +97,18 @@ class SubmapTracker:
         self._candidate: _Candidate | None = None
         self._frames: list[TrackedFrame] = []
         self._submap_of: list[int] = []  # index of the tracker
+
+    def state(self) -> tuple[object, ...]:
+        """All that it knows; `go_on` takes it."""
+        return self._trackers, self._current, self._candidate, self._frames, self._submap_of
+
+    def go_on(self, state: tuple[Any, ...]) -> None:
+        """Go on from where another one was.
+
+        Args:
+            state: of that one.
+        """
+        self._trackers, self._current, self._candidate, self._frames, self._submap_of = state
 
     def track(self, images: RgbdImages) -> None:
         """Track one frame.

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -57,6 +57,18 @@ class PoseSteps:
         self._first = np.zeros((views, 6))
         self._second = np.zeros((views, 6))
         self._visits = np.zeros(views, np.int64)
+
+    def state(self) -> tuple[Any, ...]:
+        """All that it knows of gradients; `go_on` takes it."""
+        return self._first, self._second, self._visits
+
+    def go_on(self, state: tuple[Any, ...]) -> None:
+        """Go on from where another one was.
+
+        Args:
+            state: of that one.
+        """
+        self._first, self._second, self._visits = state
 
     def of(self, view: int, rate: float) -> PoseStep:
         """The next step of a view, once its gradient is known.

@@ -60,3 +60,15 @@ class Timing:
             "cpu_s": round(time.process_time() - cpu, 3),
             "peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
         }
+
+    def went_on(self, name: str, wall_s: float, cpu_s: float) -> None:
+        """Count what processes did of a stage that went on from where they were killed.
+
+        Args:
+            name: label of the stage, which is over.
+            wall_s: time of theirs.
+            cpu_s: processor time of theirs.
+        """
+        row = self.stages[name]
+        row["wall_s"] = round(row["wall_s"] + wall_s, 3)
+        row["cpu_s"] = round(row["cpu_s"] + cpu_s, 3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,18 @@ class Adam:
 
     def __len__(self) -> int:
         return len(self._steps)
+
+    def state(self) -> tuple[Any, ...]:
+        """All that it knows of the Gaussians; `go_on` takes it."""
+        return self._first, self._second, self._steps, self._corrections
+
+    def go_on(self, state: tuple[Any, ...]) -> None:
+        """Go on from where another one was.
+
+        Args:
+            state: of that one.
+        """
+        self._first, self._second, self._steps, self._corrections = state
 
     def freeze_after(self, steps: int | None) -> None:
         """From now on Gaussians freeze after so many steps, and their moments too.

@@ -260,6 +260,31 @@ def test_gc_removes_what_was_not_used_for_longest(bench: Bench) -> None:
     assert not list((store / "objects").rglob("*/*"))
 
 
+def test_gc_removes_where_a_computation_was_that_nobody_goes_on_with(bench: Bench) -> None:
+    key = bench.carry().entry.key
+    for name, old in (("old", True), ("new", False)):
+        other = bench.store.checkpoints(replace(key, inputs={"terms": name}))
+        other.mkdir(parents=True)
+        (other / "tracking.state").write_bytes(bytes(1000))
+        if old:
+            long_ago_ns = time.time_ns() - 2 * LEFTOVER_NS
+            os.utime(other / "tracking.state", ns=(long_ago_ns, long_ago_ns))
+    assert collect(bench.store.folder, 10**9, dry=True).freed_bytes == 1000
+    assert collect(bench.store.folder, 10**9).freed_bytes == 1000
+    assert len(list((bench.store.folder / "checkpoints").iterdir())) == 1
+
+
+def test_a_stage_that_is_finished_leaves_no_checkpoint(bench: Bench) -> None:
+    key = bench.carry().entry.key
+    places = [bench.store.checkpoints(k) for k in (key, replace(key, inputs={"terms": "b"}))]
+    for place in places:
+        place.mkdir(parents=True)
+    bench.carry()
+    assert not places[0].exists()
+    bench.carry(inputs="b")
+    assert not places[1].exists()
+
+
 def test_gc_of_no_store_is_one_line(tmp_path: Path) -> None:
     assert_one_line(duagc_here("gc", "--store", tmp_path), "expected a store")
     assert duagc_here("gc", "--store", tmp_path, "--max", "much").returncode == 2

@@ -1,0 +1,167 @@
+"""A front end that is killed goes on from its last checkpoint, and no bit of its log is other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from duagc.converters.simulate.team import simulate
+from duagc.pipeline.base.checkpoints import Checkpoints
+from duagc.pipeline.config.base import load_config
+from duagc.pipeline.config.frontend import FrontendConfig
+from duagc.pipeline.config.run import RunConfig
+from duagc.pipeline.frontend.stage import run_frontend
+from duagc.pipeline.recording import content_digest
+from tests.fixtures.films import walk_around
+from tests.frontend import test_depth_times, test_submaps
+
+SMALL = (
+    "frontend.mapping.max_gaussians=500",
+    "frontend.mapping.iterations=4",
+    "frontend.mapping.final_iterations=4",
+    "frontend.mapping.final_iterations_view=0",
+    "frontend.keyframes.min_overlap=0.85",
+)
+CONFIG = load_config(RunConfig, overrides=[*SMALL, "frontend.tracking.strides=[2, 1, 1, 1]"]).frontend
+
+
+class KilledError(Exception):
+    """In place of a signal."""
+
+
+@dataclass
+class Runs:
+    """A front end that is killed again and again."""
+
+    log: Path
+    folder: Path
+    config: FrontendConfig = CONFIG
+    said: list[str] = field(default_factory=list)
+    steps: list[str] = field(default_factory=list)
+
+    def run(self, most: float = math.inf) -> str | None:
+        """The digest of its log; None if it was killed after so many steps."""
+        begin = len(self.steps)
+
+        def report(part: str, done: int, total: int) -> None:
+            assert 0 <= done <= total
+            if len(self.steps) - begin == most:
+                raise KilledError
+            self.steps.append(part)
+
+        checkpoints = Checkpoints(
+            self.folder / "checkpoints",
+            say=self.said.append,
+            every_s=0.0,
+            largest_share=math.inf,
+            report=report,
+        )
+        out = self.folder / "frontend.mcap"
+        try:
+            run_frontend(self.log, out, self.config, checkpoints=checkpoints)
+        except KilledError:
+            return None
+        return content_digest(out)
+
+    def until_done(self, most: int) -> str:
+        """The digest of its log, with so many steps between two kills."""
+        while (found := self.run(most)) is None:
+            pass
+        return found
+
+
+def undisturbed(log: Path, config: FrontendConfig, folder: Path) -> tuple[str, int]:
+    """Digest and number of steps."""
+    steps: list[str] = []
+    out = folder / "undisturbed.mcap"
+    report = Checkpoints(report=lambda part, done, total: steps.append(part))
+    run_frontend(log, out, config, checkpoints=report)
+    return content_digest(out), len(steps)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return test_depth_times.write(tmp_path_factory.mktemp("checkpoints") / "recording", 0)
+
+
+@pytest.fixture(scope="module")
+def expected(log: Path) -> tuple[str, int]:
+    return undisturbed(log, CONFIG, log.parent)
+
+
+def test_killed_again_and_again_it_ends_with_the_same_bits(
+    log: Path, expected: tuple[str, int], tmp_path: Path
+) -> None:
+    digest, steps = expected
+    runs = Runs(log, tmp_path)
+    assert runs.until_done(9) == digest
+    kills = len([line for line in runs.said if "goes on at" in line])
+    assert kills >= 4
+    parts = {line.split(":")[0] for line in runs.said}
+    assert {"tracking", "alpha.final"} <= parts
+    assert len(runs.steps) <= steps + 2 * (
+        len(runs.steps) // 9 + 1
+    )  # at most the step that the kill fell into
+
+
+def test_what_is_damaged_is_named_and_computed_again(
+    log: Path, expected: tuple[str, int], tmp_path: Path
+) -> None:
+    runs = Runs(log, tmp_path)
+    assert runs.run(expected[1] - 14) is None
+    for path in (tmp_path / "checkpoints").iterdir():
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 4
+        path.write_bytes(data)
+    assert runs.run() == expected[0]
+    assert any("has digest" in line and "computed again" in line for line in runs.said), runs.said
+
+
+def test_without_room_it_says_so_once_and_goes_on(
+    log: Path, expected: tuple[str, int], tmp_path: Path
+) -> None:
+    (tmp_path / "checkpoints").write_text("a file in the place of the folder")
+    runs = Runs(log, tmp_path)
+    assert runs.run() == expected[0]
+    assert [line for line in runs.said if "without checkpoints" in line] == runs.said
+    assert len(runs.said) == 1
+
+
+def late_depth(folder: Path) -> tuple[Path, FrontendConfig]:
+    """Depth of other times than color, and none at first: tracked twice, and backward."""
+    return test_depth_times.write(folder / "late", 5, 14_000_000, early=True), test_depth_times.CONFIG
+
+
+def covered_lens(folder: Path) -> tuple[Path, FrontendConfig]:
+    """Lost twice; two submaps that are joined."""
+    shots, _ = walk_around(0)
+    return test_submaps.write(folder / "cut", test_submaps.covered(shots)), test_submaps.CONFIG
+
+
+def noisy_depth(folder: Path) -> tuple[Path, FrontendConfig]:
+    """Poses refined with the map, and frames registered to it."""
+    simulate(folder / "noisy", robots=2, frames=24, size=(160, 120), seed=2, overlap=0.9, workers=1)
+    settings = ["frontend.mapping.depth=blended", "frontend.exposure.mode=on", *SMALL]
+    return folder / "noisy" / "alpha.mcap", load_config(RunConfig, overrides=settings).frontend
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [late_depth, covered_lens, noisy_depth])
+@pytest.mark.parametrize("most", [1, 7, 40])
+def test_at_every_step_of_any_log(
+    make: Callable[[Path], tuple[Path, FrontendConfig]], most: int, tmp_path: Path
+) -> None:
+    log, config = make(tmp_path)
+    digest, steps = undisturbed(log, config, tmp_path)
+    runs = Runs(log, tmp_path, config)
+    found = None
+    for _ in range(3 * steps):
+        # a part whose first step is killed begins again: with one step, more are granted in turn
+        found = runs.run(most + (len(runs.steps) % 2 if most == 1 else 0))
+        if found is not None:
+            break
+    assert found == digest
