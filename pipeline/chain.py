@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -138,20 +138,27 @@ class Chain:
         session = exchange.content(f"robots/{name}/{SESSION}")
         return carrier.carry(stages.FUSION, name, _own(name, robot) | {"session": session}, fuse)
 
-    def reader(self, stage: stages.Stage, done: Sequence[Carried], more: Mapping[str, str]) -> Carried:
+    def reader(
+        self,
+        stage: stages.Stage,
+        done: Sequence[Carried],
+        more: Mapping[str, str],
+        workers: Callable[[], int],
+    ) -> Carried:
         """Evaluation, report or view: of everything that is there.
 
         Args:
             stage: one of these.
             done: all stages before.
             more: digests of what else it reads.
+            workers: how many robots it looks at at the same time, asked if it is computed; changes no bit.
         """
         carrier, recording = self._carrier, self._recording.path
         step = getattr(steps, "view" if stage is stages.VIEW else stage.name)
 
         def read(timing: Timing) -> None:
             with timing.stage(stage, carrier.folder):
-                step(carrier.folder, recording)
+                step(carrier.folder, recording, workers())
 
         inputs = {name: d.content for c in done for name, d in c.entry.files.items()}
         inputs |= {f"recording: {name}": digest for name, digest in self._recorded().items()}

@@ -11,6 +11,7 @@ from duagc.pipeline.config.run import RunConfig
 from duagc.pipeline.job import READERS, Job, Say, stages_of
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.run_plan import NAMES, RunPlan
+from duagc.pipeline.runs import stages
 from duagc.pipeline.runs.timing import label
 
 
@@ -30,10 +31,14 @@ def is_up_to_date(recording: Recording, out: Path, config: RunConfig, plan: RunP
     earlier = stages_of(out)
     if not earlier:
         raise DuagError(f"{out}: exists already; choose another --out or give --force")
-    job = Job(recording, out, config, replace(plan, since=None), log=log, place=out, looking=True)
+    evaluated = stages.EVALUATION.name in earlier
+    looked_for = replace(plan, since=None, evaluated=plan.evaluated or evaluated)
+    job = Job(recording, out, config, looked_for, log=log, place=out, looking=True)
     done, keys = job.look()
     for key in [*(carried.entry.key for carried in done), *keys]:
         name = label(key.stage, key.robot)
+        if key.stage == stages.VIEW.name and not evaluated:
+            continue  # it shows the metrics, which the earlier run did not have
         known = earlier[name].get("key") if isinstance(earlier.get(name), dict) else None
         if name in earlier and known != key.digest:
             changes = "; ".join(job.carrier.changes(key, str(known)))
@@ -75,6 +80,7 @@ def why(recording_path: Path, out: Path, config: RunConfig, plan: RunPlan) -> li
         lines.append(f"{words(key)}: computed: {reason}")
     if missing:
         last = max(NAMES.index(key.stage) if key.stage in NAMES else -1 for key in missing)
-        if later := NAMES[last + 1 : NAMES.index(plan.until) + 1]:
+        later = [stage.name for stage in stages.STAGES[last + 1 :] if plan.has(stage)]
+        if later:
             lines.append(f"{', '.join(later)}: computed unless the results before turn out as they were")
     return lines

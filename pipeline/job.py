@@ -6,9 +6,10 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ from duagc.pipeline.runs.folder import SCHEMA
 from duagc.pipeline.steps import threads_per_worker
 
 LIBRARIES = ("numpy", "scipy", "opencv-python-headless", "mcap", "protobuf")
+READER_SHARE = 2.0  # memory of the evaluation of a robot, relative to its preparation
 MEASURED = 20  # results of front ends that memory is estimated from
 READERS = (stages.EVALUATION.name, stages.REPORT.name, stages.VIEW.name)
 TITLES = {
@@ -155,10 +157,11 @@ class Job:
         if plan.has(stages.FUSION):
             done += self._fused(chain, prepared, exchange)
         self._write(done)
+        workers = cache(lambda: self._fitting(self.recording.robots, READER_SHARE))
         cameras = self._calibration.get("calibration", {}).get("cameras")
         notes = {"calibration": _digest_of(cameras)} if cameras else {}
         if plan.has(stages.EVALUATION):
-            done.append(self._noted(chain.reader, stages.EVALUATION, done, notes))
+            done.append(self._noted(chain.reader, stages.EVALUATION, done, notes, workers))
             self._write(done)
         readers = []
         if plan.has(stages.REPORT):
@@ -166,9 +169,9 @@ class Job:
                 "config.toml": _digest_of(dump_config(self.config)),
                 "times": _digest_of(self._times(done)),
             }
-            readers.append(self._noted(chain.reader, stages.REPORT, done, notes | shown))
+            readers.append(self._noted(chain.reader, stages.REPORT, done, notes | shown, workers))
         if plan.has(stages.VIEW):
-            readers.append(self._noted(chain.reader, stages.VIEW, done, notes))
+            readers.append(self._noted(chain.reader, stages.VIEW, done, notes, workers))
         self._write([*done, *readers])
         return [*self._before, *done, *readers]
 
@@ -245,14 +248,17 @@ class Job:
             )
         return dict(sorted(found.items()))
 
-    def _fitting(self, robots: list[str]) -> int:
-        """How many of some robots are prepared at the same time, so that they fit into memory."""
+    def _fitting(self, robots: Sequence[str], share: float = 1.0) -> int:
+        """How many of some robots are looked at at the same time, so that they fit into memory.
+
+        share: of memory, relative to the preparation of a robot.
+        """
         asked = min(self.plan.workers, len(robots))
         if asked == 1:
             return 1
         measured = [] if self.store is None else self.store.recent(stages.FRONTEND.name, MEASURED)
         sizes = [steps.check_log(self.recording.log(robot), robot) for robot in robots]
-        needed = [robot_bytes(size, measured) for size in sizes]
+        needed = [share * robot_bytes(size, measured) for size in sizes]
         _, free = memory_bytes()
         workers = fitting(asked, needed, free)
         if workers < asked and free is not None:

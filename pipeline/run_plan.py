@@ -24,6 +24,7 @@ class RunPlan:
         store: folder of results that are not computed again; None: everything is computed, and nothing is kept.
         since: the first stage that is computed whatever the store has; None: none is.
         until: the last stage that is done.
+        evaluated: whether the run is measured, and gets a report.
     """
 
     workers: int = 2
@@ -32,6 +33,7 @@ class RunPlan:
     store: Path | None = None
     since: str | None = None
     until: str = LAST
+    evaluated: bool = True
 
     def __post_init__(self) -> None:
         for option, name in (("--from", self.since), ("--until", self.until)):
@@ -51,4 +53,5 @@ class RunPlan:
         Args:
             stage: of the run.
         """
-        return NAMES.index(stage.name) <= NAMES.index(self.until)
+        wanted = self.evaluated or stage not in (stages.EVALUATION, stages.REPORT)
+        return wanted and NAMES.index(stage.name) <= NAMES.index(self.until)

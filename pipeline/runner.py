@@ -33,6 +33,7 @@ def run(
     store: Path | None = None,
     since: str | None = None,
     until: str = LAST,
+    evaluated: bool = True,
     log: Say = say,
 ) -> None:
     """Run all stages on a recording.
@@ -53,12 +54,13 @@ def run(
         store: folder of results that are not computed again; None: everything is computed, and nothing is kept.
         since: the first stage that is computed whatever the store has; None: none is.
         until: the last stage that is done.
+        evaluated: whether the run is measured, and gets a report.
         log: gets a line at the start of every stage, and every warning.
 
     Raises:
         DuagError: what a user can fix; nothing is left under the name `out`.
     """
-    plan = RunPlan(workers, force, calibrate, store=store, since=since, until=until)
+    plan = RunPlan(workers, force, calibrate, store=store, since=since, until=until, evaluated=evaluated)
     determinism.configure_determinism()
     if determinism.is_deterministic():
         _run(recording_path, out, config, plan, log=log)

@@ -219,38 +219,41 @@ def fuse_robot(
     return {check.peer: check.reason for check in checks if not check.trusted}
 
 
-def evaluation(folder: Path, recording: Path) -> None:
+def evaluation(folder: Path, recording: Path, workers: int = 1) -> None:
     """Measure the run.
 
     Args:
         folder: of the run; gets metrics.json and metrics.parquet.
         recording: folder of its recording.
+        workers: robots measured at the same time; changes no bit of the result.
     """
     from duagc.pipeline.evaluation import evaluate
 
     determinism.configure_opencv()
-    evaluate(folder, recording, threads=threads_per_worker(1))
+    evaluate(folder, recording, threads=threads_per_worker(workers), workers=workers)
 
 
-def report(folder: Path, recording: Path) -> None:
+def report(folder: Path, recording: Path, workers: int = 1) -> None:
     """Write the page of the run.
 
     Args:
         folder: of the run; gets report/index.html.
         recording: folder of its recording.
+        workers: robots drawn at the same time; changes no bit of the result.
     """
     from duagc.pipeline.report import write_report
 
     determinism.configure_opencv()
-    write_report(folder, recording)
+    write_report(folder, recording, workers=workers)
 
 
-def view(folder: Path, recording: Path) -> None:
+def view(folder: Path, recording: Path, workers: int = 1) -> None:
     """Write the run as Rerun shows it.
 
     Args:
         folder: of the run; gets run.rrd.
         recording: folder of its recording.
+        workers: as of the other readers; one process does it.
     """
     from duagc.pipeline.viewing.run_rrd import write_rrd
 

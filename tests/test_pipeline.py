@@ -26,6 +26,7 @@ from duagc.pipeline.exchange.session import run_session
 from duagc.pipeline.experiments import pose_reference, team_faults
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.replay import replay
+from duagc.pipeline.report import write_report
 from duagc.pipeline.runner import run
 from duagc.pipeline.runs.digest import digest, digest_file, result_files
 from duagc.pipeline.runs.folder import RunFolder
@@ -462,6 +463,49 @@ def test_another_consensus_computes_nothing_upstream_and_going_back_nothing_at_a
     assert digest(folder / "run_other") == digest(finished)
     for name in ("metrics.json", "report/index.html"):
         assert (folder / "run_other" / name).read_bytes() == (finished / name).read_bytes()
+
+
+def test_metrics_and_report_can_be_left_out_and_come_later(
+    folder: Path, recording: Path, finished: Path
+) -> None:
+    out = folder / "run_bare"
+    code, _, printed = again(recording, out, "--no-evaluation")
+    assert code == 0
+    assert executed(out) == ["rrd"]
+    assert "refined.ply" in printed
+    assert not (out / "metrics.json").exists()
+    assert not (out / "report").exists()
+    assert digest(out) == digest(finished)
+    assert "up to date" in again(recording, out, "--no-evaluation")[1][0]
+    assert again(recording, out)[0] == 0
+    assert executed(out) == []
+    assert "up to date" in again(recording, out, "--no-evaluation")[1][0]
+    for name in ("metrics.json", "metrics.parquet", "report/index.html"):
+        assert (out / name).read_bytes() == (finished / name).read_bytes()
+
+
+def test_metrics_do_not_depend_on_how_many_processes_make_them(
+    folder: Path, recording: Path, finished: Path
+) -> None:
+    """The run was evaluated by two."""
+    alone = folder / "evaluated_alone"
+    shutil.copytree(finished, alone)
+    evaluate(alone, recording, workers=1, threads=1, progress=False)
+    for name in ("metrics.json", "metrics.parquet"):
+        assert (alone / name).read_bytes() == (finished / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_a_run_of_three_robots_is_the_same_with_one_two_and_four_workers(tmp_path: Path) -> None:
+    recording = tmp_path / "recording"
+    simulate(recording, robots=3, frames=12, size=(160, 120), seed=5, overlap=0.9, workers=1)
+    runs = [make_run(recording, tmp_path / f"run{workers}", workers=workers) for workers in (1, 2, 4)]
+    pages = [write_report(runs[0], recording, workers=workers).read_bytes() for workers in (1, 2, 4)]
+    assert len(set(pages)) == 1
+    for made in runs[1:]:
+        assert digest(made) == digest(runs[0])
+        for name in ("metrics.json", "metrics.parquet"):
+            assert (made / name).read_bytes() == (runs[0] / name).read_bytes()
 
 
 def test_stages_have_names(recording: Path, folder: Path) -> None:

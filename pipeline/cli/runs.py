@@ -90,6 +90,9 @@ def run(
     no_cache: Annotated[
         bool, typer.Option("--no-cache", help="Neither take results from the store nor keep any.")
     ] = False,
+    no_evaluation: Annotated[
+        bool, typer.Option("--no-evaluation", help="Leave out metrics and report.")
+    ] = False,
     force: Force = False,
 ) -> None:
     """Run all stages on a recording: maps, information, exchange, fusion, metrics, report, view.
@@ -115,7 +118,9 @@ def run(
         from duagc.pipeline.existing_run import why as say_why
         from duagc.pipeline.run_plan import RunPlan
 
-        plan = RunPlan(workers, force, calibrate, store=place, since=since, until=until)
+        plan = RunPlan(
+            workers, force, calibrate, store=place, since=since, until=until, evaluated=not no_evaluation
+        )
         for line in say_why(recording, out, settings, plan):
             print(line)
         return
@@ -131,6 +136,7 @@ def run(
         store=place,
         since=since,
         until=until,
+        evaluated=not no_evaluation,
         log=say,
     )
     _say_times(out)

@@ -7,7 +7,7 @@ drawn in the colors of the camera that took the view.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
@@ -94,57 +94,72 @@ class RenderingSections:
     rows: list[Row]
 
 
-def rendering_sections(
+Scored = tuple[str, str, int, views.ViewScore | Absent]
+"""Of a view: the map, the set of views, the index of the frame, and the score."""
+
+
+def robot_scores(
     run: RunFolder,
     source: Recording,
+    name: str,
     *,
     threads: int,
     progress: bool,
-    own_longer: Mapping[str, Gaussians],
-) -> RenderingSections:
-    """Scores of all maps over all sets of views: of all robots together, and of each.
+    longer: Gaussians | None,
+) -> list[Scored]:
+    """Scores of the maps of one robot at all its views, and at those of its peers.
 
     Args:
         run: the run.
         source: its recording.
+        name: of the robot.
         threads: views rendered at the same time; changes no bit of the result.
         progress: show it on standard error.
-        own_longer: own maps that were trained longer, by robot, in the robots' map frames; scored as the own
-            maps are.
+        longer: its own map, trained longer, in its map frame; None: there is none.
     """
-    found = _Found([], bool(own_longer))
-    for name, robot in run.robots.items():
-        maps = _maps(robot)
-        if name in own_longer:
-            maps["own_longer"] = own_longer[name]
-        own = {kind: PosedMap(g, _own_trajectory(robot, kind)) for kind, g in maps.items()}
-        task = RenderTask(own, robot, "held_out", robot.own_map.depth)
-        for index, scores in task.scores(source, threads, f"render maps of {name}" if progress else None):
-            for kind, score in scores.items():
-                found.add(name, kind, "held_out", index=index, score=score)
-        task = RenderTask({k: own[k] for k in ("own", "fused")}, robot, "keyframes", robot.own_map.depth)
-        for index, scores in task.scores(
-            source, threads, f"render keyframes of {name}" if progress else None
-        ):
-            for kind, score in scores.items():
-                found.add(name, kind, "training", index=index, score=score)
-        world = {kind: in_world(robot, kind, g) for kind, g in maps.items() if kind in COMPARED}
-        colors = read_peer_colors(robot.folder / "fused.mcap", name)
-        for peer in mates(run, robot):
-            seen = {kind: in_colors_of(colors.get(peer.robot), g) for kind, g in world.items()}
-            there = {kind: PosedMap(g, peer.trajectory) for kind, g in seen.items()}
-            task = RenderTask(there, peer, "held_out", robot.own_map.depth)
-            title = f"render maps of {name} from {peer.robot}" if progress else None
-            for index, scores in task.scores(source, threads, title):
-                for kind, score in scores.items():
-                    found.add(name, kind, "peers", index=index, score=score)
-    robots_of_run = list(run.robots)
+    found: list[Scored] = []
+    robot = run.robots[name]
+    maps = _maps(robot)
+    if longer is not None:
+        maps["own_longer"] = longer
+    own = {kind: PosedMap(g, _own_trajectory(robot, kind)) for kind, g in maps.items()}
+
+    def score(task: RenderTask, view_set: str, title: str) -> None:
+        for index, scores in task.scores(source, threads, title if progress else None):
+            found.extend((kind, view_set, index, score) for kind, score in scores.items())
+
+    score(RenderTask(own, robot, "held_out", robot.own_map.depth), "held_out", f"render maps of {name}")
+    mapped = {kind: own[kind] for kind in ("own", "fused")}
+    task = RenderTask(mapped, robot, "keyframes", robot.own_map.depth)
+    score(task, "training", f"render keyframes of {name}")
+    world = {kind: in_world(robot, kind, g) for kind, g in maps.items() if kind in COMPARED}
+    colors = read_peer_colors(robot.folder / "fused.mcap", name)
+    for peer in mates(run, robot):
+        seen = {kind: in_colors_of(colors.get(peer.robot), g) for kind, g in world.items()}
+        there = {kind: PosedMap(g, peer.trajectory) for kind, g in seen.items()}
+        task = RenderTask(there, peer, "held_out", robot.own_map.depth)
+        score(task, "peers", f"render maps of {name} from {peer.robot}")
+    return found
+
+
+def rendering_sections(of_robots: Mapping[str, Sequence[Scored]], *, longer: bool) -> RenderingSections:
+    """Scores of all maps over all sets of views: of all robots together, and of each.
+
+    Args:
+        of_robots: scores of every robot, by name.
+        longer: whether own maps that were trained longer are among them.
+    """
+    found = _Found([], longer)
+    for name, scored in of_robots.items():
+        for kind, view_set, index, score in scored:
+            found.add(name, kind, view_set, index=index, score=score)
+    robots_of_run = list(of_robots)
     sets: dict[str, tuple[str, ...]] = dict.fromkeys(COMPARED, COMPARED_SETS)
     sets |= {"own_unrefined": ("held_out",)} | dict.fromkeys(("own", "fused"), (*COMPARED_SETS, "training"))
     team = {kind: {s: found.summary(robots_of_run, kind, s) for s in sets[kind]} for kind in sets}
     robots = {
         name: {kind: {s: found.summary([name], kind, s) for s in COMPARED_SETS} for kind in COMPARED}
-        for name in run.robots
+        for name in of_robots
     }
     return RenderingSections(team, robots, found.rows)
 

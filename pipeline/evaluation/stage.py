@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base import determinism
 from duagc.pipeline.base.component_names import robot_of
 from duagc.pipeline.base.errors import DuagError
+from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.evaluation import (
     cameras,
     coverage,
@@ -23,7 +25,7 @@ from duagc.pipeline.evaluation import (
     uncertainty_calibration,
 )
 from duagc.pipeline.evaluation.network import Session
-from duagc.pipeline.evaluation.rendering import poses_by_stamp, rendering_sections
+from duagc.pipeline.evaluation.rendering import Scored, poses_by_stamp, rendering_sections, robot_scores
 from duagc.pipeline.evaluation.results import (
     Absent,
     Row,
@@ -38,6 +40,7 @@ from duagc.pipeline.evaluation.trajectory_errors import Paired, TeamError
 from duagc.pipeline.geometry.trajectory import Trajectory
 from duagc.pipeline.recording import Recording
 from duagc.pipeline.runs.folder import METRICS_SCHEMA, RobotRun, RunFolder
+from duagc.pipeline.runs.stages import EVALUATION
 from duagc.pipeline.splat.gaussians import Gaussians
 
 PROTOCOL = {
@@ -79,6 +82,7 @@ def evaluate(
     recording: Path,
     *,
     threads: int = 2,
+    workers: int = 1,
     progress: bool = True,
     own_longer: Mapping[str, Gaussians] | None = None,
 ) -> dict[str, Any]:
@@ -88,6 +92,7 @@ def evaluate(
         run_dir: folder of the run.
         recording: folder of its recording; its ground truth is optional.
         threads: views rendered at the same time; changes no bit of the result.
+        workers: robots measured at the same time, in processes of their own if more than one; changes no bit either.
         progress: show it on standard error.
         own_longer: own maps trained as long as the final ones, by robot, to be scored too
             (`experiments.own_longer`).
@@ -103,15 +108,15 @@ def evaluate(
     if unknown:
         raise DuagError(f"{recording}: has no robot {unknown[0]}, expected the robots of {run_dir}")
     truth, session = TruePaths.of(run, source), Session(run)
-    rows: list[Row] = []
-    rendering = rendering_sections(
-        run, source, threads=threads, progress=progress, own_longer=own_longer or {}
-    )
+    longer, rows = own_longer or {}, list[Row]()
+    task = _Task(Path(run_dir), Path(recording), threads, progress)
+    measured = _measured(task, run, source, truth, workers=workers, own_longer=longer)
+    rendering = rendering_sections({name: m.scores for name, m in measured.items()}, longer=bool(longer))
     tree = {
         "schema": METRICS_SCHEMA,
         "robots": {
             name: _robot_section(robot, truth)
-            | _agreement_section(robot, source, truth)
+            | measured[name].agreement
             | {"camera": cameras.section(robot), "rendering": rendering.robots[name]}
             for name, robot in run.robots.items()
         },
@@ -119,7 +124,7 @@ def evaluate(
         "coverage": coverage.of_robots(run),
         "components": coverage.of_components(run, truth.after),
         "rendering": rendering.team,
-        "calibration": _calibration_section(run, source, truth, rows),
+        "calibration": _calibration_section(source, measured, rows),
         "exchange": session.exchange_section(),
         "consensus": session.consensus_section(),
         "protocol": PROTOCOL,
@@ -129,6 +134,71 @@ def evaluate(
     write_json(run_dir / "metrics.json", metrics)
     write_parquet(run_dir / "metrics.parquet", [*_rows_of(tree), *rendering.rows, *rows])
     return metrics
+
+
+# --- one robot ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RobotMeasures:
+    """What is measured of one robot by itself, and takes its time.
+
+    Attributes:
+        scores: of its maps, by view.
+        agreement: of its images with each other at its poses.
+        calibration: scores of its fused map next to the true surface; a reason where there is none.
+        reliability: of these, rows of the long table.
+    """
+
+    scores: list[Scored]
+    agreement: dict[str, Any]
+    calibration: dict[str, Any]
+    reliability: list[Row]
+
+
+@dataclass(frozen=True)
+class _Task:
+    """Measures robots of a run; also in a process of its own."""
+
+    run_dir: Path
+    recording: Path
+    threads: int
+    progress: bool
+
+    def in_worker(self, name: str, longer: Gaussians | None) -> RobotMeasures:
+        """In a process that knows nothing of the run yet."""
+        determinism.configure_opencv()
+        with EVALUATION.running(self.run_dir):
+            run, source = RunFolder(self.run_dir), Recording(self.recording)
+            return self.of(name, run, source, truth=TruePaths.of(run, source), longer=longer)
+
+    def of(
+        self, name: str, run: RunFolder, source: Recording, *, truth: TruePaths, longer: Gaussians | None
+    ) -> RobotMeasures:
+        """In this process."""
+        robot = run.robots[name]
+        scores = robot_scores(run, source, name, threads=self.threads, progress=self.progress, longer=longer)
+        calibration, rows = _calibration_of(robot, source, truth)
+        return RobotMeasures(scores, _agreement_section(robot, source, truth), calibration, rows)
+
+
+def _measured(
+    task: _Task,
+    run: RunFolder,
+    source: Recording,
+    truth: TruePaths,
+    *,
+    workers: int,
+    own_longer: Mapping[str, Gaussians],
+) -> dict[str, RobotMeasures]:
+    """Every robot, by name."""
+    if min(workers, len(run.robots)) == 1:
+        return {
+            name: task.of(name, run, source, truth=truth, longer=own_longer.get(name)) for name in run.robots
+        }
+    with worker_pool(min(workers, len(run.robots))) as pool:
+        begun = {name: pool.submit(task.in_worker, name, own_longer.get(name)) for name in run.robots}
+        return {name: result.result() for name, result in begun.items()}
 
 
 # --- trajectories ------------------------------------------------------------------------------------------------
@@ -238,22 +308,28 @@ def _team_section(run: RunFolder, truth: TruePaths) -> dict[str, Any]:
 # --- calibration -------------------------------------------------------------------------------------------------
 
 
+def _calibration_of(robot: RobotRun, source: Recording, truth: TruePaths) -> tuple[dict[str, Any], list[Row]]:
+    """The calibration of a fused map, and how errors and sigmas go together."""
+    surface = groundtruth.surface(source)
+    if isinstance(surface, Absent):
+        return dict.fromkeys(map_errors.NAMES, surface), []
+    T_gt_world = truth.T_gt_world(robot.robot)
+    if isinstance(T_gt_world, Absent):
+        return dict.fromkeys(map_errors.NAMES, T_gt_world), []
+    errors = map_errors.map_errors(robot.fused_map, surface, T_gt_world)
+    return map_errors.scores(errors, robot.robot), _reliability_rows(robot.robot, errors)
+
+
 def _calibration_section(
-    run: RunFolder, source: Recording, truth: TruePaths, rows: list[Row]
+    source: Recording, measured: Mapping[str, RobotMeasures], rows: list[Row]
 ) -> dict[str, Any]:
     """Mean over robots of the calibration of their fused maps; the values of each robot go into rows."""
     surface = groundtruth.surface(source)
     if isinstance(surface, Absent):
         return dict.fromkeys(map_errors.NAMES, surface)
-    of_robots: dict[str, dict[str, Any]] = {}
-    for name, robot in run.robots.items():
-        T_gt_world = truth.T_gt_world(name)
-        if isinstance(T_gt_world, Absent):
-            of_robots[name] = dict.fromkeys(map_errors.NAMES, T_gt_world)
-            continue
-        errors = map_errors.map_errors(robot.fused_map, surface, T_gt_world)
-        of_robots[name] = map_errors.scores(errors, name)
-        rows += _reliability_rows(name, errors)
+    of_robots = {name: robot.calibration for name, robot in measured.items()}
+    for robot in measured.values():
+        rows += robot.reliability
     for name, values in of_robots.items():
         rows += [Row("calibration", name, "", -1, key, value) for key, value in values.items()]
     return {

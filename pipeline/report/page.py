@@ -45,12 +45,13 @@ SECTIONS = (
 )
 
 
-def write_report(run_dir: Path, recording: Path) -> Path:
+def write_report(run_dir: Path, recording: Path, *, workers: int = 1) -> Path:
     """Write report/index.html of an evaluated run: one file that needs no network.
 
     Args:
         run_dir: folder of the run, with metrics.json.
         recording: folder of its recording.
+        workers: robots drawn at the same time, in processes of their own if more than one; changes no bit.
     Returns:
         The path of the page.
     Raises:
@@ -61,7 +62,7 @@ def write_report(run_dir: Path, recording: Path) -> Path:
         raise DuagError(
             f"{run_dir / 'metrics.json'}: not found, expected an evaluated run; `duagc evaluate` writes it"
         )
-    html = filled("duagc.pipeline.report", TEMPLATE, **content(run, source))
+    html = filled("duagc.pipeline.report", TEMPLATE, **content(run, source, workers))
     path = run_dir / "report" / "index.html"
     path.parent.mkdir(exist_ok=True)
     with new_file(path) as part:
@@ -69,12 +70,12 @@ def write_report(run_dir: Path, recording: Path) -> Path:
     return path
 
 
-def content(run: RunFolder, source: Recording) -> dict[str, Any]:
+def content(run: RunFolder, source: Recording, workers: int) -> dict[str, Any]:
     """Everything that the template shows, by name."""
     metrics = run.metrics
     reasons = metrics["reasons"]
     session = Session(run)
-    shown_views, information_views = rendered_views(run, source)
+    shown_views, information_views = rendered_views(run, source, workers)
     return {
         "title": f"{source.name}: {_count(len(run.robots), 'robot')}",
         "subtitle": _subtitle(metrics),

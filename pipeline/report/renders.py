@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from duagc.pipeline.base import determinism
 from duagc.pipeline.base.arrays import Array
+from duagc.pipeline.base.workers import worker_pool
 from duagc.pipeline.evaluation.rendering import in_colors_of, in_world, mates, poses_by_stamp
 from duagc.pipeline.evaluation.results import Absent
 from duagc.pipeline.evaluation.views import in_exposure, score_view, surface_depth
@@ -22,6 +25,7 @@ from duagc.pipeline.recording import Recording, open_rgbd
 from duagc.pipeline.report import figures, labels, pictures
 from duagc.pipeline.runs.folder import RobotRun, RunFolder, position_information
 from duagc.pipeline.runs.peer_colors import read_peer_colors
+from duagc.pipeline.runs.stages import REPORT
 
 if TYPE_CHECKING:
     from duagc.pipeline.kernels import Rasterizer, Render
@@ -35,26 +39,55 @@ NO_EXACT = Absent("not needed for a picture")
 UNDETERMINED_GRAY = 0.75
 
 
-def rendered_views(run: RunFolder, source: Recording) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+Views = list[dict[str, Any]]
+
+
+def rendered_views(run: RunFolder, source: Recording, workers: int = 1) -> tuple[Views, Views]:
     """Renders next to images, and the fused map colored by its uncertainty, for a few held-out views per robot, and
-    next to the image of a peer."""
+    next to the image of a peer.
+
+    Args:
+        run: the run.
+        source: its recording.
+        workers: robots drawn at the same time, in processes of their own if more than one; changes no bit.
+    """
+    numbered = list(enumerate(run.robots))
+    if min(workers, len(numbered)) == 1:
+        drawn = [_views_of(run, source, name, number) for number, name in numbered]
+    else:
+        with worker_pool(min(workers, len(numbered))) as pool:
+            begun = [
+                pool.submit(_views_in_worker, run.path, source.path, name, number)
+                for number, name in numbered
+            ]
+            drawn = [result.result() for result in begun]
+    return [view for shown, _ in drawn for view in shown], [view for _, colored in drawn for view in colored]
+
+
+def _views_in_worker(run: Path, recording: Path, name: str, number: int) -> tuple[Views, Views]:
+    determinism.configure_opencv()
+    with REPORT.running(run):
+        return _views_of(RunFolder(run), Recording(recording), name, number)
+
+
+def _views_of(run: RunFolder, source: Recording, name: str, number: int) -> tuple[Views, Views]:
+    """Of one robot."""
     from duagc.pipeline.kernels import Rasterizer
 
     rasterizer = Rasterizer(threads=1)
-    shown, colored = [], []
-    for i, (name, robot) in enumerate(run.robots.items()):
-        head = {"robot": name, "color": figures.color_of(i), "where": ""}
-        with open_rgbd(source.log(name)) as log:
-            log.move_depth_by(robot.folder / "frontend.mcap")
-            frames = [log.frame(index) for index in _chosen_frames(robot, len(log))]
-            shown += [head | view for view in _own_views(robot, log, frames, rasterizer)]
-            if robot.fused_map.information is not None and frames:
-                colored.append(head | _information_view(robot, log, frames, rasterizer))
-        for peer in mates(run, robot)[:1]:
-            with open_rgbd(source.log(peer.robot)) as log:
-                log.move_depth_by(peer.folder / "frontend.mcap")
-                views = _peer_views(robot, peer, log, rasterizer)
-                shown += [head | {"where": f" of {peer.robot}"} | view for view in views]
+    shown, colored, robot = Views(), Views(), run.robots[name]
+    head = {"robot": name, "color": figures.color_of(number), "where": ""}
+    with open_rgbd(source.log(name)) as log:
+        log.move_depth_by(robot.folder / "frontend.mcap")
+        frames = [log.frame(index) for index in _chosen_frames(robot, len(log))]
+        shown += [head | view for view in _own_views(robot, log, frames, rasterizer)]
+        if robot.fused_map.information is not None and frames:
+            colored.append(head | _information_view(robot, log, frames, rasterizer))
+    for peer in mates(run, robot)[:1]:
+        with open_rgbd(source.log(peer.robot)) as log:
+            log.move_depth_by(peer.folder / "frontend.mcap")
+            views = _peer_views(robot, peer, log, rasterizer)
+            shown += [head | {"where": f" of {peer.robot}"} | view for view in views]
     return shown, colored
 
 
